@@ -24,8 +24,7 @@ from ident.checks.plausible_modes import PairKind, kind_of_pair
 from workflow.config.excitations import Multisine, Prbs
 from workflow.config.run_config import SimulatedRecord, SimulatedSource, built_in_config
 from workflow.tasks.log_identification import identify_records
-from workflow.tasks.simulated_rig import simulate_record
-from workflow.tasks.truth import truth_of
+from workflow.tasks.simulated_rig import simulate_record, truth_of
 
 EXPERIMENTS = (
     SimulatedRecord(

@@ -21,8 +21,7 @@ from ident.checks.plausible_modes import PairKind, kind_of_pair
 from workflow.config.run_config import SimulatedSource, built_in_config
 from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.tasks.log_identification import identify_records
-from workflow.tasks.simulated_rig import simulate_record
-from workflow.tasks.truth import truth_of
+from workflow.tasks.simulated_rig import simulate_record, truth_of
 
 EXCITED_HZ = 50.0  # the machine's third mode, at 91 Hz, is not asked for
 

@@ -33,16 +33,17 @@ from tests.workflow.report_examples import (
 )
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
 from workflow.engine.errors import InputError
-from workflow.tasks.controller_files import filter_file, law_bytes
 from workflow.tasks.design import (
     bracket_numbers,
     certify_asked,
     find_bracket,
     find_design,
+    find_filter,
     joint_numbers,
+    model_answer,
     undrawable,
 )
-from workflow.tasks.reference_filter import find_filter, model_answer
+from workflow.tasks.exports import filter_file, law_bytes
 from workflow.tasks.results import (
     AchievablePerformance,
     CertifyResult,

@@ -5,7 +5,7 @@ import sys
 import pytest
 from jinja2 import DictLoader, Environment
 
-from workflow.text.compiled import CompiledTemplates
+from workflow.text.templates import CompiledTemplates
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from tests.ident.benchmark_plants import P2_HZ, p2
 from tests.workflow.test_report import ATTACK, Page, is_one_file
 from workflow.commands.identify import identify_logs
 from workflow.engine.errors import InputError
-from workflow.tasks.model_files import read_model
+from workflow.tasks.exports import read_model
 from workflow.text.formats import interval
 
 DT_S = 0.005

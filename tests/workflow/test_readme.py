@@ -20,7 +20,7 @@ from plant import linear_arm
 from plant.presets import paper_link
 from tests.golden import margins
 from tests.workflow.command import ROOT
-from workflow.tasks.model_files import read_model
+from workflow.tasks.exports import read_model
 
 README, MAKEFILE = ((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "Makefile"))
 COMMANDS = [

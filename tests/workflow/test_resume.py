@@ -26,8 +26,8 @@ from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import render
 from workflow.report import run_report
-from workflow.report.stage import REPORT
-from workflow.tasks.controller_files import write_controller
+from workflow.report.run_report import REPORT
+from workflow.tasks.exports import write_controller
 from workflow.tasks.results import ClosedLoopResult, RunResults
 from workflow.tasks.stages import STAGES
 

@@ -35,13 +35,12 @@ from workflow.engine.executor import LocalProcesses
 from workflow.figures.style import PREDICTED, render
 from workflow.report.rendering import render_page
 from workflow.study.columns import COLUMNS, numbers_of
-from workflow.study.keys import last_name, parse_key, with_values
 from workflow.study.page import StudyView
 from workflow.study.pareto import draw_pareto
 from workflow.study.points import Point, short
 from workflow.study.rows import PointRow, pareto_front
 from workflow.study.run import run_study
-from workflow.study.settings import Axis, ParetoPlot, load_study, tidy
+from workflow.study.settings import Axis, ParetoPlot, last_name, load_study, parse_key, tidy, with_values
 from workflow.study.task import Task
 from workflow.tasks.results import (
     AchievablePerformance,

@@ -11,7 +11,7 @@ import pytest
 from plant import linear_arm
 from workflow.config.run_config import built_in_config
 from workflow.engine.errors import InputError
-from workflow.tasks import truth
+from workflow.tasks import simulated_rig as truth
 from workflow.tasks.results import IdentifiedChannel, ModelMode
 from workflow.tasks.simulated_rig import rig_of
 from workflow.text.templates import said
@@ -52,7 +52,7 @@ def test_a_pair_that_is_no_mode_says_so_and_has_no_truth():
 def test_truth_is_read_beside_the_logs_of_one_folder_only(tmp_path):
     (tmp_path / "other").mkdir()
     written = truth.Truth(modes={"y": (truth.TrueMode(frequency_Hz=2.0, damping=0.1),)})
-    place = tmp_path / truth.FILE_NAME
+    place = tmp_path / truth.TRUTH_FILE
     place.write_text(written.model_dump_json())
     assert truth.truth_beside([tmp_path / "a.csv", tmp_path / "b.csv"], "y") == written.modes["y"]
     assert truth.truth_beside([tmp_path / "a.csv"], "z") == ()

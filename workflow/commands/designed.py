@@ -14,10 +14,17 @@ from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
-from workflow.tasks.controller_files import SUFFIXES, filter_file, targets, write_controller
-from workflow.tasks.design import bracket_numbers, certify_asked, find_bracket, find_design, joint_numbers
+from workflow.tasks.design import (
+    bracket_numbers,
+    certify_asked,
+    check_filter,
+    find_bracket,
+    find_design,
+    find_filter,
+    joint_numbers,
+)
 from workflow.tasks.design_source import load_sources
-from workflow.tasks.reference_filter import check_filter, find_filter
+from workflow.tasks.exports import SUFFIXES, filter_file, targets, write_controller
 from workflow.tasks.results import AchievablePerformance, CertifyResult, DesignResult, ReferenceFilterResult
 from workflow.tasks.summary import RunSummary
 from workflow.text.templates import rows_of, said

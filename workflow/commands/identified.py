@@ -14,11 +14,11 @@ from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.engine import codec, interrupts, storage
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
-from workflow.tasks import truth
+from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
 from workflow.tasks.log_identification import LogIdentification, identify_records
-from workflow.tasks.model_files import MODEL_SUFFIXES, model_bytes
 from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
 from workflow.tasks.results import IdentifiedPlant
+from workflow.tasks.simulated_rig import beside, truth_beside
 from workflow.tasks.summary import RunSummary, model_numbers, uncertainty_numbers
 from workflow.text.formats import count
 from workflow.text.templates import rows_of, words
@@ -43,7 +43,7 @@ def identified(
     if export is not None and export.suffix.lower() not in MODEL_SUFFIXES:
         raise InputError(f"--export {export}: the ending must be {' or '.join(MODEL_SUFFIXES)}")
     progress.plan((("identify", 2.0), ("uncertainty", 1.0), *((("report", 4.0),) if report else ())))
-    true_modes = truth.truth_beside(files, measured[0].output_names[0])
+    true_modes = truth_beside(files, measured[0].output_names[0])
     for record in measured:
         refuse_constant_input(record)
     common = with_common_sampling_time([*measured, *fresh_logs])
@@ -57,7 +57,7 @@ def identified(
         with_plot=report is not None,
         progress=progress,
     )
-    result = replace(result, true_modes=truth.beside(result.about, true_modes), input_limit=input_limit)
+    result = replace(result, true_modes=beside(result.about, true_modes), input_limit=input_limit)
     written: dict[Path, bytes] = {}
     if report is not None:
         from workflow.report.identify_page import identify_page  # loads matplotlib: a second

@@ -46,7 +46,7 @@ def run_from_files(
     else:
         config, text = built_in_config()
     # Here: what computes takes seconds to load, and a configuration that is refused does not need it.
-    from workflow.report.stage import REPORT
+    from workflow.report.run_report import REPORT
     from workflow.tasks.pipeline import run_pipeline
 
     return run_pipeline(
@@ -69,7 +69,7 @@ def rebuild_report(
 
     also: kinds of file for its pictures beside SVG, pdf or png.
     """
-    from workflow.report.stage import REPORT, write_page
+    from workflow.report.run_report import REPORT, write_page
     from workflow.tasks.pipeline import rebuild_page
 
     return rebuild_page(run, dataclasses.replace(REPORT, run=partial(write_page, also=also)), progress)

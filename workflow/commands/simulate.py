@@ -23,8 +23,13 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
     out = Path(out)
     RunDirectory(out).refuse_unless_free()
     # Here: what simulates takes seconds to load, and a configuration that is refused does not need it.
-    from workflow.tasks import truth
-    from workflow.tasks.simulated_rig import INPUT_NAME, OUTPUT_NAMES, simulate_record
+    from workflow.tasks.simulated_rig import (
+        INPUT_NAME,
+        OUTPUT_NAMES,
+        TRUTH_FILE,
+        simulate_record,
+        truth_of,
+    )
 
     texts = {}
     for index, entry in enumerate(config.source.records):
@@ -33,5 +38,5 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
         signals = dict(zip((INPUT_NAME, *OUTPUT_NAMES), [*record.input.T, *record.output.T], strict=True))
         safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", entry.name)
         texts[f"{index + 1:02d}_{safe}.csv"] = storage.csv_text({"time_s": record.time_s, **signals})
-    texts[truth.FILE_NAME] = truth.truth_of(config.source).model_dump_json(indent=1) + "\n"
+    texts[TRUTH_FILE] = truth_of(config.source).model_dump_json(indent=1) + "\n"
     return storage.write_new_directory(out, texts)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 from workflow.config.run_config import RunConfig
 from workflow.engine import documents, storage
 from workflow.figures.subjects import RunView
 from workflow.report.rendering import render_page
-from workflow.tasks.results import RunResults
+from workflow.tasks.results import ReportResult, RunResults
+from workflow.tasks.stage import Stage, StageInput
+from workflow.tasks.stages import STAGES
 from workflow.tasks.summary import summarise
 
 
@@ -28,13 +31,12 @@ def write_report(
     run = results.run
     text = run.path / "config.toml"
     view = RunView(config, results, documents.read_text(text) if text.is_file() else "", run.manifest())
-    title = config.run.title or config.run.name
     study = (run.path.parent.parent / "study.html").is_file()  # of which this run is a point
     page = render_page(
         "report.html.j2",
         progress,
         also=also,
-        title=title,
+        title=config.run.title or config.run.name,
         run=view,
         study=study,
         summary=summarise(results, config),
@@ -50,3 +52,20 @@ def write_report(
         if stale.suffix in (".svg", ".png", ".pdf") and stale not in files:
             stale.unlink()
     return run.report_path
+
+
+def write_page(stage: StageInput, also: Iterable[str] = ()) -> ReportResult:
+    """The last stage of a run: report.html and the hash of its content; also: as of `write_report`."""
+    path = write_report(stage.results, stage.config, partial(stage.progress.update, "report"), also)
+    return ReportResult(storage.sha256_of_file(path))
+
+
+REPORT = Stage(
+    "report",
+    tuple(stage.name for stage in STAGES),
+    write_page,
+    expected_s=7.0,
+    # Words that appear on the page and nowhere before.
+    uses={"run": True, "notes": True, "specification": True},
+    also_writes=lambda run: (run.report_path,),
+)

@@ -17,8 +17,7 @@ from workflow.config.settings import check
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory, hash_of
-from workflow.study.keys import last_name, with_values
-from workflow.study.settings import Axis, StudyConfig
+from workflow.study.settings import Axis, StudyConfig, last_name, with_values
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.stage import Stage
 from workflow.tasks.stages import STAGES

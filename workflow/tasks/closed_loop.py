@@ -15,10 +15,10 @@ from control_design.convex.reference_filter import ReferenceFilter
 from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import SimulatedSource
 from workflow.engine.errors import naming
+from workflow.tasks.design import model_answer
 from workflow.tasks.friction_loop import check_friction
 from workflow.tasks.loop_conditions import ConditionBench
 from workflow.tasks.loop_sensitivity import rms_of, sensitivity_on_arm, settling_samples
-from workflow.tasks.reference_filter import model_answer
 from workflow.tasks.results import ClosedLoopResult, LoopCheck, LoopMetrics, LoopRuns
 from workflow.tasks.sampled_plant import simulate_draw
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, converter_steps, loop_of_arm, rig_of

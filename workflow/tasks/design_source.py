@@ -30,7 +30,7 @@ from workflow.config.run_config import RunConfig
 from workflow.engine import codec, documents, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.model_files import read_model
+from workflow.tasks.exports import read_model
 from workflow.tasks.pipeline import certified_for, config_of
 from workflow.tasks.results import IdentifiedPlant, RunResults
 from workflow.tasks.uncertainty import agreement_of

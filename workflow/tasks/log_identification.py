@@ -32,7 +32,7 @@ from workflow.engine.errors import naming
 from workflow.engine.progress import Progress
 from workflow.tasks.identification import clipped_as_measured, identified_channel
 from workflow.tasks.results import IdentifiedChannel, Tests, UncertainChannel
-from workflow.tasks.truth import TrueMode
+from workflow.tasks.simulated_rig import TrueMode
 from workflow.tasks.uncertainty import (
     N_BANDS,
     display_grid,

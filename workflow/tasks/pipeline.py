@@ -18,7 +18,7 @@ from workflow.engine.code_version import code_digest
 from workflow.engine.errors import CommandInterruptedError, InputError, naming, one_line
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import CONTROLLER_FILES, LAYOUT_VERSION, RunDirectory, hash_of
-from workflow.tasks.controller_files import write_controller
+from workflow.tasks.exports import write_controller
 from workflow.tasks.results import RecordsResult, RunResults
 from workflow.tasks.stage import Stage, StageInput
 from workflow.tasks.stages import STAGES

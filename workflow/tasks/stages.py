@@ -15,11 +15,10 @@ from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
 from workflow.engine.errors import naming
 from workflow.tasks.closed_loop import run_closed_loop
-from workflow.tasks.design import UNKNOWN_TO_BRACKET, certify_asked, find_bracket, find_design
+from workflow.tasks.design import UNKNOWN_TO_BRACKET, certify_asked, find_bracket, find_design, find_filter
 from workflow.tasks.friction_loop import friction_feedforward
 from workflow.tasks.identification import identify_channels
 from workflow.tasks.records import make_records
-from workflow.tasks.reference_filter import find_filter
 from workflow.tasks.results import (
     AchievablePerformance,
     AmplitudeCost,

@@ -1,4 +1,5 @@
-"""A controller as files, and its reference filter beside it; one that is not certified says so inside."""
+"""Models and controllers in files for other programs, reference filters beside them; a controller that is not
+certified says so inside."""
 
 from __future__ import annotations
 
@@ -10,7 +11,10 @@ import numpy as np
 from control_design.controllers.c_code import Dialect, c_header, c_source
 from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
-from workflow.engine import storage
+from ident.basis.model_files import ModelFile
+from ident.data.foreign_files import content_of
+from workflow.engine import documents, storage
+from workflow.engine.errors import naming
 from workflow.engine.run_directory import CONTROLLER_SUFFIXES
 from workflow.text.templates import render_text
 
@@ -82,3 +86,19 @@ def write_controller(
         {path: data for path, data in content.items() if not path.is_file() or path.read_bytes() != data}
     )
     return list(content)
+
+
+MODEL_SUFFIXES = (".json", ".mat")
+
+
+def model_bytes(path: Path, file: ModelFile) -> bytes:
+    """JSON or MAT by the ending (`MODEL_SUFFIXES`)."""
+    return file.to_mat() if path.suffix.lower() == ".mat" else file.to_json().encode("utf-8")
+
+
+def read_model(path: Path) -> ModelFile:
+    """The model in a file of `model_bytes`. Raises InputError: one line that names the file."""
+    with naming(str(path)):
+        if path.suffix.lower() == ".mat":
+            return ModelFile.from_mat(content_of(path), str(path))
+        return ModelFile.from_json(documents.read_text(path), str(path))
