@@ -363,9 +363,11 @@ def identify(
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
     need(*log, *(validation or []))
     from ident.basis.options import IdentOptions
-    from workflow.commands.identify import identify_logs
+    from workflow.commands.logs import read_logs
     from workflow.config.settings import check
+    from workflow.config.uncertainty_options import UncertaintyOptions
     from workflow.console import TerminalProgress
+    from workflow.engine.storage import refuse_in_the_way
 
     chosen: dict[str, Any] = {"n_pairs": pairs, "n_real": real, "integrators": integrators, "noise": noise}
     chosen |= {"omega_min_rad_s": omega_min, "omega_max_rad_s": omega_max}
@@ -377,10 +379,15 @@ def identify(
     }
     options = check(IdentOptions, chosen, source="options")
     with TerminalProgress(quiet=quiet) as progress:
-        summary = identify_logs(
+        promised = check(UncertaintyOptions, {"level": level, "promise": promise}, source="options")
+        written = [("--out", out), ("--report", report_page), ("--export", export)]
+        # A log given twice would count its noise twice as well known, or validate what it was fitted to.
+        refuse_in_the_way([*log, *(validation or [])], [(name, path) for name, path in written if path])
+        logs = read_logs(
             log,
             input_name,
             output_name,
+            validation=validation or [],
             time=time,
             dt_s=dt_s,
             time_unit=time_unit,
@@ -390,10 +397,14 @@ def identify(
             repair=repair,
             reference=reference,
             input_limit=input_limit,
-            validation=validation or [],
+        )
+        # A log that is refused does not wait for what identifies: that takes seconds to load.
+        from workflow.commands.identify import identify_logs
+
+        summary = identify_logs(
+            logs,
             options=options,
-            level=level,
-            promise=promise,
+            promised=promised,
             band_rad_s=band,
             noise_order=noise_order,
             out=out,
@@ -452,16 +463,14 @@ def design(
 
     with TerminalProgress(quiet=quiet) as progress:
         from control_design.controllers.c_code import Dialect
+        from workflow.config.design_file import read_design_file
+
+        dialect = Dialect(**_c_code(c_prefix, c_float))
+        # A design file that is refused does not wait for what designs: that takes seconds to load.
+        file = None if specification is None else read_design_file(specification)
         from workflow.commands.design import design_controller
 
-        summary = design_controller(
-            source,
-            specification,
-            out=out,
-            seed=seed,
-            dialect=Dialect(**_c_code(c_prefix, c_float)),
-            progress=progress,
-        )
+        summary = design_controller(source, file, out=out, seed=seed, dialect=dialect, progress=progress)
     _show(summary, as_json)
     _leave(summary)
 

@@ -307,15 +307,15 @@ def test_simulate_identify_design_hand_over_files(flexlink, tmp_path):
 
 def test_design_writes_what_the_ending_asks_for(flexlink, fast_run, tmp_path, monkeypatch):
     from control_design.controllers.controller import Controller
-    from workflow.commands import designed
+    from workflow.commands import design as command
 
-    found, design = [], designed._design
+    found, design = [], command._design
 
     def once(*given):
         found.append(found[0] if found else design(*given))
         return found[0]
 
-    monkeypatch.setattr(designed, "_design", once)  # it is about what is written of it
+    monkeypatch.setattr(command, "_design", once)  # it is about what is written of it
     for ending in (".mat", ".c"):
         assert flexlink("design", fast_run[0], "--out", tmp_path / f"controller{ending}").code == 0
     assert flexlink("design", fast_run[0], "--out", tmp_path / "controller.json").code == 0

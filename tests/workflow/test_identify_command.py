@@ -13,6 +13,7 @@ from ident.basis.model_files import ModelFile
 from tests.ident.benchmark_plants import P2_HZ, p2
 from tests.workflow.test_report import ATTACK, Page, is_one_file
 from workflow.commands.identify import identify_logs
+from workflow.commands.logs import read_logs
 from workflow.engine.errors import InputError
 from workflow.tasks.exports import read_model
 from workflow.text.formats import interval
@@ -50,7 +51,8 @@ def test_more_samples_than_memory_are_refused(logs, refused, monkeypatch):
 
 def identify_first(logs, **written):
     fresh = [logs / "fresh.csv"]
-    return identify_logs([logs / "first.csv"], "u_V", "tip_m", time="t_s", validation=fresh, **written)
+    read = read_logs([logs / "first.csv"], "u_V", "tip_m", time="t_s", validation=fresh)
+    return identify_logs(read, **written)
 
 
 @pytest.fixture(scope="module")
@@ -361,9 +363,8 @@ def test_hostile_names_are_escaped(undrawn, tmp_path):
     record = p2(3, 600).record
     hostile = f"{ATTACK}&$x_1$"
     log = write_log(tmp_path / "log.csv", record.input[:, 0], record.output[:, 0], ("t_s", "u_V", hostile))
-    summary = identify_logs(
-        [log], "u_V", hostile, time="t_s", report=tmp_path / "page.html", export=tmp_path / "m.json"
-    )
+    logs = read_logs([log], "u_V", hostile, time="t_s")
+    summary = identify_logs(logs, report=tmp_path / "page.html", export=tmp_path / "m.json")
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert ATTACK not in text
     assert hostile in Page(text).text

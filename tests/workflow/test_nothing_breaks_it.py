@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import workflow.commands.designed
+import workflow.commands.design
 import workflow.tasks.design_source
 import workflow.tasks.pipeline
 import workflow.tasks.simulated_rig
@@ -156,7 +156,7 @@ def cut_computations_off(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is computed: what was given has been taken once a command gets that far."""
     idle = [with_fields(stage, run=_computes) for stage in workflow.tasks.pipeline.STAGES]
     monkeypatch.setattr(workflow.tasks.pipeline, "STAGES", tuple(idle))
-    monkeypatch.setattr(workflow.commands.designed, "_design", _computes)
+    monkeypatch.setattr(workflow.commands.design, "_design", _computes)
     monkeypatch.setattr(workflow.tasks.design_source, "identify_frf", _computes)
     simulate = workflow.tasks.simulated_rig.simulate
     monkeypatch.setattr(

@@ -1,44 +1,34 @@
-"""`flexlink identify`: log files in; model files, a page and a table of numbers out."""
+"""`flexlink identify`: logs in; model files, a page and a table of numbers out."""
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
+from ident.basis.model_files import ModelFile
 from ident.basis.options import IdentOptions
 from ident.data.record import Record
-from ident.data.record_files import read_table
-from ident.data.roles import roles_of
-from workflow.config.settings import check
+from workflow.commands.logs import Logs
 from workflow.config.uncertainty_options import UncertaintyOptions
-from workflow.engine import storage
-from workflow.engine.errors import naming
+from workflow.engine import codec, interrupts, storage
+from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
-
-if TYPE_CHECKING:
-    from workflow.tasks.summary import RunSummary
+from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
+from workflow.tasks.log_identification import LogIdentification, identify_records
+from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
+from workflow.tasks.results import IdentifiedPlant
+from workflow.tasks.simulated_rig import beside, truth_beside
+from workflow.tasks.summary import RunSummary, model_numbers, uncertainty_numbers
+from workflow.text.formats import count
+from workflow.text.templates import rows_of, words
 
 
 def identify_logs(
-    logs: Sequence[Path],
-    input_name: str | None = None,
-    output_name: str | None = None,
+    logs: Logs,
     *,
-    time: str | None = None,
-    dt_s: float | None = None,
-    time_unit: str | None = None,
-    scale: Mapping[str, float] | None = None,
-    offset: Mapping[str, float] | None = None,
-    units: Mapping[str, str] | None = None,
-    repair: bool = False,
-    reference: str | None = None,
-    input_limit: float | None = None,
-    validation: Sequence[Path] = (),
     options: IdentOptions | None = None,
-    level: float = 0.95,
-    promise: str = "as recorded",
+    promised: UncertaintyOptions | None = None,
     band_rad_s: tuple[float, float] | None = None,
     noise_order: int | None = None,
     out: Path | None = None,
@@ -46,65 +36,77 @@ def identify_logs(
     export: Path | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
-    """Identify one channel from log files (tangent uncertainty) and write what is asked for.
+    """Identify one channel from logs (tangent uncertainty) and write what is asked for.
 
     out: npz with model and posterior, for `flexlink design`; report: HTML page; export: the model as .json
-    or .mat. Every file is written when everything is known, and whole. reference: column of the reference of
-    logs made in closed loop, for the two-stage method. input_limit: what the amplifier gives at most; larger
-    commands in the logs are taken as that. Input, output and time that are not named are found where names
-    and units leave no doubt. scale, offset, units, repair: as in `Record.from_file`.
-    time_unit: of the time column, where its name does not say it.
-    band_rad_s: fit inside this band only, friction and drift below it and noise above it left out. promise:
-    what the ellipses are about, as `uncertainty.promise` of a configuration; output_name is then the position
-    of the shaft that the friction acts on. noise_order: largest order of the noise model behind the ellipses;
-    none given: 8, or 32 where that leaves coloured residuals. Raises InputError: one line naming file, column
-    or line.
+    or .mat. Every file is written when everything is known, and whole. band_rad_s, promised: as of
+    `identify_records`; where friction is identified the output is the position of the shaft it acts on.
+    noise_order: largest order of the noise model behind the ellipses; none given: 8, or 32 where that leaves
+    coloured residuals. Raises InputError.
     """
-    promised = check(UncertaintyOptions, {"level": level, "promise": promise}, source="options")
-    # A log given twice would count its noise twice as well known, or validate what it was fitted to.
-    written = [("--out", out), ("--report", report), ("--export", export)]
-    storage.refuse_in_the_way([*logs, *validation], [(name, path) for name, path in written if path])
-    references = [] if reference is None else [reference]
-    if input_name is None or output_name is None or (time is None and dt_s is None):
-        with naming(str(logs[0])):
-            table, log = read_table(logs[0]), shlex.quote(str(logs[0]))
-            roles = roles_of(table, log, input=input_name, output=output_name, time=time, reference=reference)
-        input_name, output_name = roles.input, roles.output
-        time = roles.time if time is None and dt_s is None else time
-
-    def read(path: Path) -> Record:
-        with naming(str(path)):
-            record = Record.from_file(
-                path,
-                [input_name],
-                [output_name],
-                time=time,
-                dt_s=dt_s,
-                time_unit=time_unit,
-                scale=scale,
-                offset=offset,
-                units=units,
-                repair=repair,
-                references=references,
-            )
-            return record if input_limit is None else record.limited(input_limit)
-
-    measured = [read(Path(path)) for path in logs]
-    fresh_logs = [read(Path(path)) for path in validation]
-    # Here: what identifies takes seconds to load, and a log that is refused does not need it.
-    from workflow.commands.identified import identified
-
-    return identified(
-        measured,
-        fresh_logs,
-        files=[*logs, *validation],
-        options=options,
+    progress, promised = progress or Progress(), promised or UncertaintyOptions()
+    if export is not None and export.suffix.lower() not in MODEL_SUFFIXES:
+        raise InputError(f"--export {export}: the ending must be {' or '.join(MODEL_SUFFIXES)}")
+    progress.plan((("identify", 2.0), ("uncertainty", 1.0), *((("report", 4.0),) if report else ())))
+    true_modes = truth_beside(logs.files, logs.measured[0].output_names[0])
+    for record in logs.measured:
+        refuse_constant_input(record)
+    common = with_common_sampling_time([*logs.measured, *logs.fresh])
+    result = identify_records(
+        common[: len(logs.measured)],
+        common[len(logs.measured) :],
+        options,
         promised=promised,
         band_rad_s=band_rad_s,
         noise_order=noise_order,
-        input_limit=input_limit,
-        out=out,
-        report=report,
-        export=export,
-        progress=progress or Progress(),
+        with_plot=report is not None,
+        progress=progress,
     )
+    matched = beside(result.about, true_modes)
+    result = replace(result, true_modes=matched, input_limit=logs.input_limit)
+    written: dict[Path, bytes] = {}
+    if report is not None:
+        from workflow.report.identify_page import identify_page  # loads matplotlib: a second
+
+        with progress.stage("report") as update:
+            inputs = {str(path): storage.sha256_of_file(path) for path in logs.files}
+            written[report] = identify_page(result, inputs, update).encode()
+    if out is not None:
+        plant = IdentifiedPlant(result.spread.nominal, result.spread.posterior, promised.level)
+        written[out] = storage.npz_bytes(codec.to_arrays(plant))
+    if export is not None:
+        written[export] = model_bytes(export, ModelFile(result.about.model, result.spread.frequency))
+    interrupts.check()
+    storage.write_together(written)
+    return _summary(result, out, report, export)
+
+
+def _summary(
+    result: LogIdentification, out: Path | None, report: Path | None, export: Path | None
+) -> RunSummary:
+    about, spread = result.about, result.spread
+    return RunSummary(
+        title=f"{about.input} to {about.output}",
+        sections=rows_of("summary/identification.j2", result=result),
+        numbers={
+            **model_numbers(about),
+            "warnings": [words(item) for item in result.careful],
+            "logs": [_log_numbers(record) for record in (*result.measured, *result.fresh_records)],
+            "uncertainty": uncertainty_numbers(spread),
+            "file": None if out is None else str(out),
+            "model_file": None if export is None else str(export),
+        },
+        verdict=count(len(result.careful), "warning"),
+        report_path=None if report is None else str(report),
+    )
+
+
+def _log_numbers(record: Record) -> dict[str, Any]:
+    return {
+        "name": record.name,
+        "dt_s": record.dt_s,
+        "time_column": codec.plain(record.time_column),
+        "input_unit": "".join(record.input_units),
+        "output_unit": "".join(record.output_units),
+        "input_cut_samples": record.cut,
+    }

@@ -1,0 +1,79 @@
+"""The logs of one channel, read and refused before anything slow is loaded."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ident.data.record import Record
+from ident.data.record_files import read_table
+from ident.data.roles import roles_of
+from workflow.engine.errors import naming
+
+
+@dataclass(frozen=True, eq=False)
+class Logs:
+    """Records as read, of the fit and kept for validation, and all their files."""
+
+    measured: tuple[Record, ...]
+    fresh: tuple[Record, ...]
+    files: tuple[Path, ...]
+    input_limit: float | None
+
+
+def read_logs(
+    logs: Sequence[Path],
+    input_name: str | None = None,
+    output_name: str | None = None,
+    *,
+    validation: Sequence[Path] = (),
+    time: str | None = None,
+    dt_s: float | None = None,
+    time_unit: str | None = None,
+    scale: Mapping[str, float] | None = None,
+    offset: Mapping[str, float] | None = None,
+    units: Mapping[str, str] | None = None,
+    repair: bool = False,
+    reference: str | None = None,
+    input_limit: float | None = None,
+) -> Logs:
+    """One channel of log files; input, output and time that are not named are found where names and units
+    leave no doubt.
+
+    scale, offset, units, repair: as in `Record.from_file`. time_unit: of the time column, where its name does
+    not say it. reference: column of the reference of logs made in closed loop, for the two-stage method.
+    input_limit: what the amplifier gives at most; larger commands in the logs are taken as that. Raises
+    InputError: one line naming file, column or line.
+    """
+    if input_name is None or output_name is None or (time is None and dt_s is None):
+        with naming(str(logs[0])):
+            table, log = read_table(logs[0]), shlex.quote(str(logs[0]))
+            roles = roles_of(table, log, input=input_name, output=output_name, time=time, reference=reference)
+        input_name, output_name = roles.input, roles.output
+        time = roles.time if time is None and dt_s is None else time
+
+    def read(path: Path) -> Record:
+        with naming(str(path)):
+            record = Record.from_file(
+                path,
+                [input_name],
+                [output_name],
+                time=time,
+                dt_s=dt_s,
+                time_unit=time_unit,
+                scale=scale,
+                offset=offset,
+                units=units,
+                repair=repair,
+                references=[] if reference is None else [reference],
+            )
+            return record if input_limit is None else record.limited(input_limit)
+
+    return Logs(
+        tuple(read(path) for path in logs),
+        tuple(read(path) for path in validation),
+        (*logs, *validation),
+        input_limit,
+    )
