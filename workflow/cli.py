@@ -517,13 +517,18 @@ def study(
 ) -> None:
     """Controller tuning study: specification, ellipses, synthesis or payload varied over one plant."""
     need(config)
+    if jobs is not None and scheduler is not None:
+        raise InputError("--jobs and --scheduler contradict each other: the cluster's workers set the number")
     from workflow.console import TerminalProgress
 
     with TerminalProgress(quiet=quiet) as progress:
-        from workflow.study.run import run_study
+        from workflow.study.settings import load_study
+
+        file = load_study(config)  # one that is refused does not wait for what computes: seconds
+        from workflow.study.work import run_study
 
         summary = run_study(
-            config, out, jobs=jobs, scheduler=scheduler, resume=resume, replace=replace, progress=progress
+            file, out, jobs=jobs, scheduler=scheduler, resume=resume, replace=replace, progress=progress
         )
     _show(summary, as_json)
     _leave(summary)

@@ -21,7 +21,8 @@ from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.study.directory import StudyDirectory
-from workflow.study.run import run_study
+from workflow.study.settings import load_study
+from workflow.study.work import run_study
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.results import RunResults
 from workflow.tasks.summary import RunSummary
@@ -32,7 +33,7 @@ def small_study(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunSumm
     """Directory and summary of the small study, computed on two processes."""
     folder = tmp_path_factory.mktemp("study")
     out = folder / "out"
-    return out, run_study(write_study(folder), out, jobs=2)
+    return out, run_study(load_study(write_study(folder)), out, jobs=2)
 
 
 def rows_of(out: Path) -> list[dict[str, str]]:
@@ -115,7 +116,7 @@ def test_points_of_one_design_share_controller_and_plant(small_study):
 
 @pytest.mark.slow
 def test_numbers_do_not_depend_on_how_many_processes_there_are(small_study, tmp_path):
-    run_study(write_study(tmp_path), tmp_path / "out", jobs=1)
+    run_study(load_study(write_study(tmp_path)), tmp_path / "out", jobs=1)
     assert_same_study(small_study[0], tmp_path / "out")
 
 
@@ -128,7 +129,7 @@ def test_resuming_computes_only_what_is_missing(small_study, tmp_path):
     for name in ("table.csv", "table.json", "study.html"):
         (out / name).unlink()
     kept = {n: (out / "points" / n / "stages/design.npz").stat().st_mtime_ns for n in (names[0], names[3])}
-    run_study(write_study(tmp_path), out, resume=True, jobs=1)
+    run_study(load_study(write_study(tmp_path)), out, resume=True, jobs=1)
     assert_same_study(small_study[0], out)
     for name, before in kept.items():
         assert (out / "points" / name / "stages/design.npz").stat().st_mtime_ns == before
@@ -138,7 +139,8 @@ def test_a_finished_study_is_taken_up_and_can_be_extended(small_study, tmp_path)
     out = tmp_path / "out"
     shutil.copytree(small_study[0], out)
     before = point_bytes(out)
-    run_study(write_study(tmp_path, SMALL_STUDY.replace("1e5", "1e5, 2e5")), out, resume=True, jobs=1)
+    more = SMALL_STUDY.replace("1e5", "1e5, 2e5")
+    run_study(load_study(write_study(tmp_path, more)), out, resume=True, jobs=1)
     assert len(rows_of(out)) == 8
     after = point_bytes(out)
     assert {name: after[name] for name in before} == before
@@ -160,7 +162,7 @@ def test_a_run_directory_is_a_base(fast_run, tmp_path):
         "values = [1.0, 1.5, 1e5]", "values = [1.5]"
     )
     out = tmp_path / "out"
-    run_study(write_study(tmp_path, text), out, jobs=1)
+    run_study(load_study(write_study(tmp_path, text)), out, jobs=1)
     for row in rows_of(out):
         for name in ("identify.npz", "uncertainty.npz"):
             mine = (out / "points" / row["name"] / "stages" / name).read_bytes()
@@ -185,7 +187,7 @@ key = "closed_loop.draws"
 values = [1, 2]
 """
     out = tmp_path / "out"
-    run_study(write_study(tmp_path, text), out, jobs=2)
+    run_study(load_study(write_study(tmp_path, text)), out, jobs=2)
     rows = rows_of(out)
     assert len(list((out / "plants").iterdir())) == 2
     gammas = [float(row["worst_gamma"]) for row in rows]
@@ -216,7 +218,7 @@ values = ["biquads", "pi_d_notch"]
 """
     )
     out = tmp_path / "out"
-    summary = run_study(write_study(tmp_path, text), out, jobs=2)
+    summary = run_study(load_study(write_study(tmp_path, text)), out, jobs=2)
     states = [point["state"] for point in summary.numbers["points"]]
     # pi_d_notch of order 2 does not exist; a limit of nothing cannot be met.
     assert states[1] == states[3] == "impossible"
@@ -273,7 +275,7 @@ class Watch(Progress):
 def test_progress_counts_points(small_study, tmp_path):
     watch = Watch()
     shutil.copytree(small_study[0], tmp_path / "out")
-    run_study(write_study(tmp_path), tmp_path / "out", resume=True, progress=watch)
+    run_study(load_study(write_study(tmp_path)), tmp_path / "out", resume=True, progress=watch)
     assert watch.planned == ["plant", "points", "page"]
     assert watch.messages[-1].startswith("6 of 6, ")
 
@@ -306,7 +308,7 @@ def test_killed_study_resumes_with_identical_numbers_and_leaves_no_process(small
     while any(Path(f"/proc/{pid}/statm").exists() for pid in workers):
         assert time.monotonic() < deadline, "a worker outlived the study"
         time.sleep(0.05)
-    run_study(study, out, resume=True, jobs=2)
+    run_study(load_study(study), out, resume=True, jobs=2)
     assert_same_study(small_study[0], out)
 
 

@@ -21,7 +21,8 @@ from tests.workflow.command import ROOT, finish, start_flexlink, wait_until
 from tests.workflow.study_examples import SMALL_STUDY, TWO_POINTS, assert_same_study, write_study
 from workflow.engine.cluster import DaskCluster
 from workflow.engine.errors import StageError
-from workflow.study.run import run_study
+from workflow.study.settings import load_study
+from workflow.study.work import run_study
 
 # As many points as the small study, without what adds nothing to where they are computed.
 FAR = SMALL_STUDY.replace(
@@ -102,7 +103,7 @@ def test_worker_killed_midway_changes_no_number(cluster, tmp_path):
     os.kill(cluster.workers[0].pid, signal.SIGKILL)
     finish(process)
     assert cluster.workers[1].poll() is None
-    run_study(study, tmp_path / "near", jobs=2)
+    run_study(load_study(study), tmp_path / "near", jobs=2)
     assert_same_study(tmp_path / "near", tmp_path / "out")
 
 
@@ -122,7 +123,7 @@ def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, tmp
     ]
     done = finished_points(tmp_path / "out")
     assert 1 <= done < 6
-    run_study(study, tmp_path / "out", resume=True, jobs=2)
+    run_study(load_study(study), tmp_path / "out", resume=True, jobs=2)
     assert finished_points(tmp_path / "out") == 6
 
 
@@ -167,14 +168,14 @@ def test_a_stalled_study_goes_on_elsewhere(cluster, tmp_path):
     wait_until(lambda: finished_points(tmp_path / "out") >= 1, process)
     cluster.scheduler.send_signal(signal.SIGSTOP)
     began_s = time.monotonic()
-    run_study(study, tmp_path / "near", jobs=1)  # meanwhile
+    run_study(load_study(study), tmp_path / "near", jobs=1)  # meanwhile
     said = finish(process, 1, seconds=120)
     assert time.monotonic() - began_s < 60
     assert said == (
         f"flexlink: the Dask scheduler at {cluster.address} has not answered for 40 s; "
         "--resume continues the study\n"
     )
-    run_study(study, tmp_path / "out", resume=True, jobs=2)
+    run_study(load_study(study), tmp_path / "out", resume=True, jobs=2)
     assert_same_study(tmp_path / "near", tmp_path / "out")
 
 

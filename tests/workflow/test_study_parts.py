@@ -39,9 +39,9 @@ from workflow.study.page import StudyView
 from workflow.study.pareto import draw_pareto
 from workflow.study.points import Point, short
 from workflow.study.rows import PointRow, pareto_front
-from workflow.study.run import run_study
 from workflow.study.settings import Axis, ParetoPlot, last_name, load_study, parse_key, tidy, with_values
 from workflow.study.task import Task
+from workflow.study.work import run_study
 from workflow.tasks.results import (
     AchievablePerformance,
     CertifyResult,
@@ -107,7 +107,8 @@ def test_names_of_values():
 
 
 def test_example_is_a_valid_study():
-    config, _, base = load_study(ROOT / "examples" / "study.toml")
+    read = load_study(ROOT / "examples" / "study.toml")
+    config, base = read.config, read.base
     assert base is None
     assert {axis.name for axis in config.axes} == {"asked_rad_s", "order", "payload_kg"}
 
@@ -353,7 +354,7 @@ values = [0.4, 0.5]
 def test_search_gives_the_same_points_whatever_runs_them(tmp_path):
     pytest.importorskip("optuna", reason="the extra 'optuna' is not installed")
     study = write_study(tmp_path, SEARCH)
-    first = run_study(study, tmp_path / "one", jobs=2)
+    first = run_study(load_study(study), tmp_path / "one", jobs=2)
     points = first.numbers["points"]
     assert len(points) == 5
     assert len({point["name"] for point in points}) > 3
@@ -363,7 +364,7 @@ def test_search_gives_the_same_points_whatever_runs_them(tmp_path):
     # A resumed search asks the same questions: two points are gone, three are taken up.
     other = tmp_path / "other"
     keep_only(tmp_path / "one", other, [point["name"] for point in points[:3]])
-    run_study(study, other, jobs=1, resume=True)
+    run_study(load_study(study), other, jobs=1, resume=True)
     assert_same_study(tmp_path / "one", other)
 
 

@@ -8,6 +8,7 @@ import math
 import os
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -182,22 +183,29 @@ class StudyConfig(Section):
         return self
 
 
-def load_study(path: Path) -> tuple[StudyConfig, str, Path | None]:
-    """Study, its text, and the base (a file or a directory; None: the built-in arm).
+@dataclass(frozen=True)
+class StudyFile:
+    """A study as read; base: a file or a directory, None for the built-in arm."""
 
-    Raises InputError: one line naming file, key and what was expected.
-    """
+    path: Path
+    config: StudyConfig
+    text: str
+    base: Path | None
+
+
+def load_study(path: Path) -> StudyFile:
+    """Raises InputError: one line naming file, key and what was expected."""
     text, document = read_toml(path)
     config = check(StudyConfig, document, source=str(path))
     if config.study.base is None:
-        return config, text, None
+        return StudyFile(path, config, text, None)
     try:
         base = Path(os.path.normpath(path.absolute().parent / expand(config.study.base)))
     except ValueError as error:
         raise InputError(f"{path}: study.base: {error}") from error
     if not base.exists():
         raise InputError(f"{path}: study.base: no such file or run directory: {base}")
-    return config, text, base
+    return StudyFile(path, config, text, base)
 
 
 _NAME = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)((?:\[\d+\])*)")

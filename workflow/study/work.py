@@ -1,4 +1,4 @@
-"""The points of a study: computed, then table and page."""
+"""A whole study as one library call: its points computed, then table and page."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from workflow.study.points import (
 )
 from workflow.study.rows import PointRow, csv_text, row_of, row_without_run
 from workflow.study.search import ParzenSearch
-from workflow.study.settings import StudyConfig
+from workflow.study.settings import StudyFile
 from workflow.study.task import Done, Task
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.results import RunResults
@@ -39,21 +39,30 @@ from workflow.tasks.summary import RunSummary
 _PLANT_S, _POINT_S, _PAGE_S = 6.0, 12.0, 4.0  # expected: they shape the progress bar only
 
 
-def compute_study(
-    given: tuple[StudyConfig, str, Path | None],
-    config_path: Path,
+def run_study(
+    file: StudyFile,
     out: Path,
     *,
-    jobs: int | None,
-    scheduler: str | None,
-    resume: bool,
-    replace: bool,
-    progress: Progress,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    resume: bool = False,
+    replace: bool = False,
+    progress: Progress | None = None,
 ) -> RunSummary:
-    """`run_study` with the study that was read: settings, text, base."""
-    study, text, base_path = given
-    base = load_base(study, config_path, base_path)
-    maker = PointMaker(study, config_path, base)
+    """Compute every point of a study into `out`, then table and page; the table's numbers in the summary.
+
+    `resume` takes up the study that is there, `replace` deletes it first (when all that was given is right).
+
+    jobs: processes of this machine (default: one per processor). scheduler: address of a Dask scheduler whose
+    workers compute the points; what the points share is still computed here. A point that cannot be certified
+    is a result.
+
+    Raises InputError (one line) for anything wrong with what the user gave, StageError when points failed
+    (table and page are written all the same, and a resumed study tries them again) or the scheduler was lost.
+    """
+    study, progress = file.config, progress or Progress()
+    base = load_base(study, file.path, file.base)
+    maker = PointMaker(study, file.path, base)
     count, search = study.search.trials, None
     if study.search.method == "optuna":
         search = ParzenSearch(study, maker, base.config.run.seed)
@@ -68,7 +77,7 @@ def compute_study(
         if scheduler is not None:
             executor = stack.enter_context(closing(DaskCluster(scheduler)))
         with StudyDirectory(out).writing(resume=resume, replace=replace):
-            directory = StudyDirectory.begin(out, text=text, base=base, resume=resume, replace=replace)
+            directory = StudyDirectory.begin(out, text=file.text, base=base, resume=resume, replace=replace)
             share = _POINT_S * count / executor.width
             progress.plan([("plant", _PLANT_S), ("points", share), ("page", _PAGE_S)])
             work = _Work(directory, base, maker.base_point(), executor, here, progress, count)
@@ -80,7 +89,7 @@ def compute_study(
                 directory.discard_if_empty()
                 raise
             with progress.stage("page"):
-                summary = _write_up(directory, study, text, base, rows)
+                summary = _write_up(directory, file, base, rows)
     broken = [row for row in rows if row.state == "failed"]
     if broken:
         raise StageError(
@@ -196,17 +205,16 @@ def _done(
         yield list(zip(points, each, strict=True))
 
 
-def _write_up(
-    directory: StudyDirectory, study: StudyConfig, text: str, base: Base, rows: Sequence[PointRow]
-) -> RunSummary:
+def _write_up(directory: StudyDirectory, file: StudyFile, base: Base, rows: Sequence[PointRow]) -> RunSummary:
     """Table, picture and page: all of them or none."""
     # Imported here: only this step draws, and matplotlib takes a second to load.
     import workflow.study.pareto  # noqa: F401 (the page's drawing)
     from workflow.report.rendering import render_page
 
+    study = file.config
     title = study.study.title or base.config.run.title or base.config.run.name
     where = str(base.run.path) if base.run is not None else study.study.base or "the built-in arm"
-    view = StudyView(title, study, text, where, rows, _units(directory, rows))
+    view = StudyView(title, study, file.text, where, rows, _units(directory, rows))
     directory.link_numbers(rows)
     page = render_page("study.html.j2", title=title, study=view)
     files = {f"{name}.{picture.kind}": picture.content for name, picture in page.pictures.items()}
