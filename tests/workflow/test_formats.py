@@ -10,7 +10,7 @@ from jinja2 import ChoiceLoader, DictLoader
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-import workflow.study.pareto  # noqa: F401 (a drawing outside workflow.figures)
+import workflow.study.page  # noqa: F401 (a drawing outside workflow.figures)
 from workflow.figures.style import drawings
 from workflow.report import rendering
 from workflow.text.formats import (

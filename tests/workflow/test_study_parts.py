@@ -35,10 +35,8 @@ from workflow.engine.executor import LocalProcesses
 from workflow.figures.style import PREDICTED, render
 from workflow.report.rendering import render_page
 from workflow.study.columns import COLUMNS, numbers_of
-from workflow.study.page import StudyView
-from workflow.study.pareto import draw_pareto
+from workflow.study.page import PointRow, StudyView, draw_pareto, pareto_front
 from workflow.study.points import Point, short
-from workflow.study.rows import PointRow, pareto_front
 from workflow.study.settings import Axis, ParetoPlot, last_name, load_study, parse_key, tidy, with_values
 from workflow.study.task import Task
 from workflow.study.work import run_study

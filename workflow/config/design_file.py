@@ -102,8 +102,7 @@ class DesignFile(Section):
         return self._name
 
     def completed(self, run: RunConfig | None) -> DesignFile:
-        """What is left out is as in a run; but a file without [reference_filter] asks for none, it has no
-        other way to."""
+        """What is left out is as in a run, but for [reference_filter]: to leave it out is to ask for none."""
         if run is None:
             return self
         lacking = {"specification", "synthesis", "certificate", "achievable_performance"}

@@ -1,5 +1,4 @@
-"""What is asked about a design beyond its margins: any order's reach, sampled responses, a
-reference filter."""
+"""What is asked beyond margins: any order's reach, sampled responses, a reference filter."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""`RunConfig`: everything a run depends on, from one TOML file; every key has a default where one makes
-sense."""
+"""`RunConfig`: everything a run depends on, from one TOML file."""
 
 from __future__ import annotations
 
@@ -238,8 +237,7 @@ class Channel(Section):
         return self.name or self.output
 
     def over_amplitudes(self, low: float, high: float) -> Channel:
-        """The same, its ellipses over a range of amplitudes. Raises ValueError where it promises another
-        response."""
+        """The same over a range of amplitudes. Raises ValueError where it promises another response."""
         options = self.uncertainty
         if "promise" in options.model_fields_set and options.amplitudes != (low, high):
             raise ValueError(
@@ -478,8 +476,7 @@ def record_name(record: SimulatedRecord | FileRecord) -> str:
 
 
 def load_config(path: Path) -> tuple[RunConfig, str]:
-    """Configuration and its text. Raises InputError: one line naming file, dotted key and what was
-    expected."""
+    """Configuration and its text. Raises InputError: file, dotted key and what was expected in one line."""
     text, document = read_toml(path)
     return check(RunConfig, document, source=str(path), context={"base": path.absolute().parent}), text
 

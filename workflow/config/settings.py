@@ -42,8 +42,7 @@ def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
 def check(
     model: type[ModelT], document: Any, *, source: str, context: Mapping[str, Any] | None = None
 ) -> ModelT:
-    """`document` as a `model`. Raises InputError: one line with `source`, the dotted key and what was
-    expected."""
+    """`document` as a `model`. Raises InputError: `source`, dotted key and what was expected in one line."""
     try:
         # As JSON, whose strict reading takes `true` for no 1.0 and "2" for no 2, but a list for a tuple.
         text = to_json(document, inf_nan_mode="constants")

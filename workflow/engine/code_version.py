@@ -13,8 +13,7 @@ _ONLY_DRAWING = ("workflow/figures", "workflow/report", "workflow/text")
 
 @cache
 def code_digest(*more: str, drawing: bool = False) -> str:
-    """SHA-256 over the Python files of the rooms and of `more` rooms, paths and contents (with `drawing` also
-    what only draws)."""
+    """SHA-256 over the Python files of the rooms and of `more`; with `drawing` also over what only draws."""
     root = Path(__file__).resolve().parents[2]
     paths = [path for room in (*_ROOMS, *more) for path in sorted((root / room).rglob("*.py"))]
     if drawing:

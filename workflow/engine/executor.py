@@ -68,8 +68,7 @@ class Executor(Protocol):
         """How many tasks run at once."""
 
     def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R | Failure]]:
-        """Position and result of every task. watch: told position, share done and a word, where that is
-        known."""
+        """Position and result of every task. watch: told position, share done and a word, where known."""
 
 
 class LocalProcesses:

@@ -288,8 +288,7 @@ def _digest(content: Mapping[str, Any]) -> str:
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of what the numbers depend on; packages that are not installed as distributions are left
-    out."""
+    """Versions of what the numbers depend on, as far as it is installed."""
     versions = {}
     for name in _PACKAGES:
         try:

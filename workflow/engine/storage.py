@@ -153,8 +153,7 @@ def npz_bytes(arrays: Mapping[str, AnyArray]) -> bytes:
             if array.dtype.hasobject:
                 raise TypeError(f"array {name!r} has dtype {array.dtype}: objects would need pickle")
             entry = zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH)
-            # Level 1: signals and responses shrink about as far as they will, at a tenth of the time of
-            # level 6.
+            # Level 1: signals shrink about as far as they will, at a tenth of the time of level 6.
             entry.compress_type = zipfile.ZIP_DEFLATED
             content = io.BytesIO()
             np.lib.format.write_array(content, array, allow_pickle=False)
@@ -191,8 +190,7 @@ def sha256_of_file(path: Path) -> str:
 
 
 def remove_leftovers(directory: Path) -> None:
-    """Delete temporary files that a killed writer left in `directory` (call it while holding the run's
-    lock)."""
+    """Delete temporary files that a killed writer left in a directory (hold its lock)."""
     for leftover in directory.glob(f".*{TEMPORARY_SUFFIX}"):
         leftover.unlink(missing_ok=True)
 

@@ -90,15 +90,13 @@ def liveliest(signal: Real, length: int) -> slice:
 
 
 def envelope(time_s: Real, signals: Real, bins: int = 250) -> tuple[Real, Real, Real]:
-    """Time, smallest and largest value of several signals (R, T); over equal parts where T is much larger
-    than `bins`."""
+    """Time, smallest and largest value of signals (R, T); of `bins` equal parts where T is much larger."""
     low, high = signals.min(axis=0), signals.max(axis=0)
     length = time_s.size // bins
     if length < 2:
         return time_s, low, high
     at = np.arange(0, time_s.size, length)
-    # Each value holds for a part: drawn from its middle, and the ends kept, so that the band spans all of the
-    # time.
+    # Each value holds for a part: drawn from its middle, but for the ends: the band spans all of the time.
     middle = np.minimum(at + length // 2, time_s.size - 1)
     middle[0], middle[-1] = 0, time_s.size - 1
     return time_s[middle], np.minimum.reduceat(low, at), np.maximum.reduceat(high, at)

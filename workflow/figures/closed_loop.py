@@ -1,5 +1,4 @@
-"""The loop as computed from the identified model against as run on the machine: over time, measured |S|, dry
-friction."""
+"""The loop as computed from the model against as run on the machine: in time, |S| as measured, friction."""
 
 from __future__ import annotations
 

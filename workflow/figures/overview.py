@@ -1,5 +1,4 @@
-"""One picture of a run: what was identified and how surely, how far the loop stays from -1, what it does in
-time."""
+"""One picture of a run: what was identified, how far the loop stays from -1, what it does in time."""
 
 from __future__ import annotations
 

@@ -55,8 +55,7 @@ def draw_poles(
 
 
 def _near_corner(poles: Complex) -> float:
-    """Side of the close-up: holds the slowest lightly damped pair with room around it, else the slowest
-    poles."""
+    """Side of the close-up: room around the slowest lightly damped pair, else around the slowest poles."""
     upper = poles[(poles.imag > 1e-9) & (np.abs(poles) > 0.05)]
     log = np.log(upper)
     light = np.abs(upper[-log.real < 0.4 * np.abs(log)] - 1.0)

@@ -77,8 +77,7 @@ def _name_records(axes: Axes, shown: Sequence[RunRecord], starts: Real) -> None:
     for number, (item, start) in enumerate(zip(shown, starts, strict=False), 1):
         width = item.duration_s / starts[-1]
         name = style.plain(item.name, 40)
-        # About 0.0125 of the axis per letter at this size; the table beside the picture lists number and
-        # name.
+        # About 0.0125 of the axis per letter at this size; a table beside the picture has number and name.
         text = f"{number} {name}" if len(name) + 3 < width / 0.0125 else str(number)
         if len(text) > 2 or width > 0.012:
             axes.annotate(

@@ -218,8 +218,7 @@ def ratio_unit(output_unit: str, input_unit: str) -> str:
 
 
 def finish(figure: Figure) -> None:
-    """Last step of a figure: labels of log axes, and one legend below, where it hides nothing, every entry
-    once."""
+    """Last step of a figure: labels of log axes, and one legend below, every entry once."""
     plain_log_labels(figure)
     _raise_titles(figure)
     handles: dict[str, Any] = {}
@@ -228,8 +227,7 @@ def finish(figure: Figure) -> None:
             handles.setdefault(label, handle)
     if not handles:
         return
-    # Entries stand in columns of equal width: 0.08 in a letter at this size, and 0.75 in for the sample and
-    # the gap.
+    # Entries stand in columns of equal width: 0.08 in a letter at this size, 0.75 in for sample and gap.
     entry_in = 0.75 + 0.08 * max(len(label) for label in handles)
     fitting = max(1, int(figure.get_figwidth() / entry_in))
     figure.legend(

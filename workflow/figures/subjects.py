@@ -80,15 +80,13 @@ class ChannelView:
 
     @property
     def shown_fresh(self) -> int | None:
-        """Which free run is shown: the first validation record, else the first repeat, else a fitted record
-        (None)."""
+        """The free run that is shown: first validation record, else repeat, else a fitted record (None)."""
         roles = self.found.fresh_roles
         return next((roles.index(role) for role in ("validation", "repeat") if role in roles), None)
 
     @property
     def shown_pair(self) -> int | None:
-        """Index of the pole pair whose error surface is shown: the slowest lightly damped one, else the
-        slowest."""
+        """The pole pair whose error surface is shown: the slowest lightly damped one, else the slowest."""
         omega, zeta = self._omega_rad_s, self.found.model.poles.zeta()
         light = (zeta < LIGHT) & (zeta > 5e-4)
         slowest = np.argsort(np.where(light | ~light.any(), omega, np.inf))
@@ -239,8 +237,7 @@ class RunView:
 
     @property
     def certified_level(self) -> float:
-        """Level of the ellipses that were certified: calibrated to sampled responses where that was asked
-        for."""
+        """Level of the ellipses that were certified: calibrated to sampled responses where asked for."""
         joint = None if self.certificate is None else self.certificate.joint
         return self.level if joint is None else max(self.level, joint.level)
 

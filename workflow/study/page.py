@@ -1,20 +1,114 @@
-"""The study's page and what the terminal says of it; every sentence stands in the templates `study*.j2`."""
+"""Rows of a study's table, its page, its Pareto plots; every sentence stands in the templates `study*.j2`."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from workflow.engine import codec
-from workflow.study.columns import COLUMNS, Column
-from workflow.study.points import short
-from workflow.study.rows import PointRow, State, pareto_front
-from workflow.study.settings import StudyConfig
-from workflow.tasks.summary import RunSummary
-from workflow.text.templates import render_text, rows_of
+from workflow.engine.run_directory import RunDirectory
+from workflow.figures import style
+from workflow.study.columns import COLUMNS, Column, Number, numbers_of
+from workflow.study.points import Combination, Point, short
+from workflow.study.settings import Axis, ParetoPlot, StudyConfig
+from workflow.tasks.results import RunResults
+from workflow.tasks.summary import RunSummary, verdict_of
+from workflow.text.templates import render_text, rows_of, said
+
+State = Literal["certified", "does not come to rest", "not certified", "impossible", "failed"]
+
+
+@dataclass(frozen=True, eq=False)
+class PointRow(Combination):
+    """A point in the table. `numbers` has every column, None where there is no number."""
+
+    state: State
+    why: str
+    numbers: Mapping[str, Number]
+
+    @property
+    def good(self) -> bool:
+        """Certified, and every run in closed loop settles."""
+        return self.state == "certified"
+
+
+def row_of(point: Point, run: RunDirectory) -> PointRow:
+    """The row of a finished point."""
+    results, specification = RunResults(run), point.config.specification
+    design, certify, loop = results.design, results.certify, results.closed_loop
+    state: State
+    if design.synthesis is None:
+        state = "impossible"
+    elif not certify.certified:
+        state = "not certified"
+    elif loop.check is None or loop.check.settled_draws != loop.check.draws:
+        state = "does not come to rest"
+    else:
+        state = "certified"
+    numbers = numbers_of(results, specification.mode_band_rad_s)
+    # The certificate is the judge and names every item that is missed; the optimiser only what blocks it.
+    why = certify.reason
+    if design.gamma is not None and design.gamma > 1:
+        achievable, order = results.achievable_performance, specification.controller_order
+        advice = said("order_advice", achievable, design.gamma, order)
+        why = f"{why}; {advice}" if advice else why
+    if certify.certified:
+        why = verdict_of(replace(design, met=True), certify, loop)
+    return PointRow(point.number, point.name, point.values, state, why, numbers)
+
+
+def row_without_run(point: Combination, state: State, why: str) -> PointRow:
+    """The row of a combination that contradicts itself, or of a point that failed."""
+    return PointRow(point.number, point.name, point.values, state, why, dict.fromkeys(COLUMNS))
+
+
+def csv_text(axes: Sequence[Axis], rows: Sequence[PointRow], front: Sequence[Sequence[int]]) -> str:
+    """The table; numbers with every digit, nothing where there is none.
+
+    front: numbers of the points on each Pareto front; a column each.
+    """
+    records = [
+        {
+            "number": row.number,
+            "name": row.name,
+            **{
+                a.key: v if isinstance(v := row.values[a.key], (int, float)) else _cell(short(v))
+                for a in axes
+            },
+            "state": row.state,
+            **row.numbers,
+            **{f"front_{k}": "yes" if row.number in on else "no" for k, on in enumerate(front, 1)},
+            "why": _cell(row.why),
+        }
+        for row in rows
+    ]
+    # As objects: a whole number stays one beside a cell without a number.
+    return str(pd.DataFrame(records, dtype=object).to_csv(index=False, lineterminator="\n"))
+
+
+def _cell(text: str) -> str:
+    """Text that no spreadsheet takes for a formula."""
+    return f"'{text}" if text[:1] in ("=", "+", "-", "@") else text
+
+
+def pareto_front(rows: Sequence[PointRow], plot: ParetoPlot) -> list[int]:
+    """Numbers of the good points that no other good point beats in one column without losing in the other."""
+    names = (plot.x, plot.y)
+    placed = [row for row in rows if row.good and None not in [row.numbers[name] for name in names]]
+    a, b = ([COLUMNS[name].badness(row.numbers[name] or 0.0) for row in placed] for name in names)
+    beats = np.less_equal.outer(a, a) & np.less_equal.outer(b, b)
+    beats &= np.less.outer(a, a) | np.less.outer(b, b)  # [j, i]: j beats i
+    return [placed[i].number for i in np.flatnonzero(~np.any(beats, axis=0))]
+
 
 _BEST_BY = ("worst_gamma", "bandwidth_rad_s", "modulus_margin", "rise_time_s")
 
@@ -108,3 +202,64 @@ def study_summary(study: StudyView, path: str) -> RunSummary:
         verdict=render_text("study_verdict.j2", study=study).strip(),
         report_path=path,
     )
+
+
+_DOT: dict[str, Any] = {"ls": "none", "zorder": 3, "marker": "o", "ms": 6}
+_HOLLOW = _DOT | {"mfc": "none", "mec": style.LIMIT, "mew": 1.2}
+_DOMINATED = _DOT | {"color": "#a8adb4", "mew": 0}
+_FRONT = _DOT | {"color": style.PREDICTED, "marker": "D", "ms": 7, "mew": 0}
+
+
+@style.drawing("pareto")
+def draw_pareto(study: StudyView) -> Figure:
+    """Certified points filled (those on the front coloured and numbered), others hollow."""
+    plots = study.config.pareto
+    figure, places = style.small_multiples(len(plots), min(len(plots), 2), 4.3, 0.4)
+    for axes, plot, front in zip(places, plots, study.fronts, strict=True):
+        _draw(axes, study, plot, front)
+    return figure
+
+
+def _draw(axes: Axes, study: StudyView, plot: ParetoPlot, front: list[int]) -> None:
+    x_column, y_column = study.column(plot.x), study.column(plot.y)
+    x_label, y_label = study.heading(plot.x), study.heading(plot.y)
+    for say, label, column in ((axes.set_xlabel, x_label, x_column), (axes.set_ylabel, y_label, y_column)):
+        say(f"{style.plain(label, 40)} ({column.better} is better)")
+    axes.set_title(style.plain(f"{y_label} against {x_label}", 70))
+    at = np.array([(row.numbers[plot.x], row.numbers[plot.y]) for row in study.rows], dtype=np.float64)
+    there = ~np.isnan(at).any(axis=1)
+    if not there.all():
+        words = f"{np.count_nonzero(~there)} not drawn: no number here"
+        axes.annotate(words, (0.99, 0.01), xycoords="axes fraction", ha="right", fontsize=8, color="#666666")
+    number = np.array([row.number for row in study.rows])
+    good, on = np.array([row.good for row in study.rows]), np.isin(number, front)
+    for kind, label, look in (
+        (~good, "not certified", _HOLLOW),
+        (good & ~on, "certified, dominated", _DOMINATED),
+        (on, "certified, on the front", _FRONT),
+    ):
+        if (kind & there).any():
+            axes.plot(*at[kind & there].T, label=label, **look)
+    if on.sum() > 1:
+        axes.plot(*at[on][np.lexsort(at[on].T[::-1])].T, color=style.PREDICTED, lw=0.9, ls=":", zorder=2)
+    if there.any():
+        for limits, values in ((axes.set_xlim, at[there, 0]), (axes.set_ylim, at[there, 1])):
+            limits(*style.pad_limits(values.min(), values.max(), 0.1))
+        _number(axes, at[on], number[on])
+
+
+def _number(axes: Axes, at: npt.NDArray[np.float64], number: npt.NDArray[np.int64]) -> None:
+    """Numbers as in the table at places (P, 2), those of points in one place together."""
+    # A fiftieth of the axes: closer together, two labels would lie on one another.
+    shares = np.rint(50 * axes.transLimits.transform(at)) if number.size else at
+    for share in np.unique(shares, axis=0):
+        here = np.all(shares == share, axis=1)
+        axes.annotate(
+            style.plain(", ".join(map(str, sorted(number[here]))), 18),
+            at[here][0],
+            xytext=(6, 5),
+            textcoords="offset points",
+            fontsize=8.5,
+            color=style.REFERENCE,
+            zorder=4,
+        )

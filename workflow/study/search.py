@@ -10,8 +10,8 @@ from typing import Any
 
 from workflow.engine.errors import InputError
 from workflow.study.columns import COLUMNS
+from workflow.study.page import PointRow
 from workflow.study.points import Contradiction, Point, PointMaker
-from workflow.study.rows import PointRow
 from workflow.study.settings import Axis, StudyConfig, tidy
 
 # Points of a batch -> their rows, in the same order.

@@ -15,8 +15,9 @@ from workflow.engine.errors import InputError, StageError
 from workflow.engine.executor import Executor, Failure, LocalProcesses
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
+from workflow.report.rendering import render_page
 from workflow.study.directory import StudyDirectory
-from workflow.study.page import StudyView, study_summary
+from workflow.study.page import PointRow, StudyView, csv_text, row_of, row_without_run, study_summary
 from workflow.study.points import (
     PLANT_STAGES,
     POINT_STAGES,
@@ -27,7 +28,6 @@ from workflow.study.points import (
     load_base,
     shared_stages,
 )
-from workflow.study.rows import PointRow, csv_text, row_of, row_without_run
 from workflow.study.search import ParzenSearch
 from workflow.study.settings import StudyFile
 from workflow.study.task import Done, Task
@@ -207,10 +207,6 @@ def _done(
 
 def _write_up(directory: StudyDirectory, file: StudyFile, base: Base, rows: Sequence[PointRow]) -> RunSummary:
     """Table, picture and page: all of them or none."""
-    # Imported here: only this step draws, and matplotlib takes a second to load.
-    import workflow.study.pareto  # noqa: F401 (the page's drawing)
-    from workflow.report.rendering import render_page
-
     study = file.config
     title = study.study.title or base.config.run.title or base.config.run.name
     where = str(base.run.path) if base.run is not None else study.study.base or "the built-in arm"

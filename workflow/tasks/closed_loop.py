@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from control_design.analysis.closed_loop import ClosedLoopTrajectory, simulate, step_metrics
 from control_design.analysis.stability import closed_loop_poles
@@ -19,12 +18,10 @@ from workflow.tasks.design import model_answer
 from workflow.tasks.friction_loop import check_friction
 from workflow.tasks.loop_conditions import ConditionBench
 from workflow.tasks.loop_sensitivity import rms_of, sensitivity_on_arm, settling_samples
-from workflow.tasks.results import ClosedLoopResult, LoopCheck, LoopMetrics, LoopRuns
+from workflow.tasks.results import ClosedLoopResult, LoopCheck, LoopMetrics, LoopRuns, Real
 from workflow.tasks.sampled_plant import simulate_draw
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, converter_steps, loop_of_arm, rig_of
 from workflow.tasks.stage import StageInput
-
-Real = npt.NDArray[np.float64]
 
 _LEAD_IN = 0.05  # share of the record before the step, so that the picture shows rest
 # A run counts as settled when, at the end of either half, it moves by less than this share of the step and,
@@ -133,8 +130,7 @@ def _simulated(stage: StageInput) -> SimulatedSource:
 def make_trial(
     stage: StageInput, dt_s: float, pole_radius: float, reference_filter: ReferenceFilter | None = None
 ) -> Trial:
-    """Half the record for the step, half for the disturbance, each long enough for the slowest closed-loop
-    pole."""
+    """Half for the step, half for the disturbance, each long enough for the slowest closed-loop pole."""
     options, config = stage.config.closed_loop, stage.config
     used = stage.results.records.fitted(config.control_channel)
     samples = settling_samples(pole_radius, _SHORTEST, _LONGEST)

@@ -54,8 +54,7 @@ class DesignSource:
 
 
 def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource]:
-    """All plants, by different names and with one sampling time. Raises InputError: one line that names the
-    file."""
+    """All plants, by different names and with one sampling time. Raises InputError naming the file."""
     sources = [load_source(path, design) for path in paths]
     stated = [source for source in sources if isinstance(source.plant.uncertainty, StatedDiscs)]
     if design.uncertainty is not None and not stated:

@@ -1,5 +1,4 @@
-"""Models and controllers in files for other programs, reference filters beside them; a controller that is not
-certified says so inside."""
+"""Models and controllers in files for other programs; a controller that is not certified says so inside."""
 
 from __future__ import annotations
 

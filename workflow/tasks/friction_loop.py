@@ -12,7 +12,6 @@ from typing import Any
 
 import control
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import t as student
 
 from control_design.analysis.closed_loop import (
@@ -26,12 +25,9 @@ from control_design.controllers.feedforward import FrictionFeedforward
 from ident.friction import FrictionFit, FrictionLaw
 from ident.friction.loop import loop_through
 from workflow.tasks.loop_sensitivity import SMALL, measured_on_arm, sensitivity_plan, settling_samples
-from workflow.tasks.results import FrictionCheck, SensitivityCheck, SlowSine
+from workflow.tasks.results import FrictionCheck, Interval, Real, SensitivityCheck, SlowSine
 from workflow.tasks.simulated_rig import converter_steps, loop_of_arm
 from workflow.tasks.stage import StageInput
-
-Real = npt.NDArray[np.float64]
-Interval = tuple[float, float]
 
 # A step sought by bisection is right to this share of itself; how far around the guess it may lie.
 _SHARE, _APART = 0.01, 10.0

@@ -184,8 +184,7 @@ def identify_records(
 
 
 def _searched_around(band_rad_s: tuple[float, float], options: IdentOptions, dt_s: float) -> IdentOptions:
-    """No pair far outside the band, where nobody has stated bounds: it could only describe the filter's
-    skirts."""
+    """No pair far outside the band, unless bounds are stated: it could only fit the filter's skirts."""
     low, high = band_rad_s[0] / 2, min(2 * band_rad_s[1], 0.9 * np.pi / dt_s)
     bounds = {"omega_min_rad_s": options.omega_min_rad_s or low}
     return options.model_copy(update=bounds | {"omega_max_rad_s": options.omega_max_rad_s or high})

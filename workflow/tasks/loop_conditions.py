@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from control_design.analysis.closed_loop import ClosedLoopTrajectory, simulate
 from control_design.controllers.controller import Controller
@@ -24,11 +23,9 @@ from plant.machine import Machine
 from plant.rig import Rig
 from plant.simulation import simulate as simulate_arm
 from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
-from workflow.tasks.results import ConditionRun
+from workflow.tasks.results import ConditionRun, Real
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine, simulate_draw
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, UNITS, EncodedArm
-
-Real = npt.NDArray[np.float64]
 
 _SLEW_SHARE = 0.6  # of the voltage limit that the slew is predicted to use
 _OVERDRIVEN = 2.0  # times the voltage limit that the large step would need

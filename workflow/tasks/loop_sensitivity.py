@@ -7,16 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from control_design.analysis.closed_loop import MeasuredSensitivity, measure_sensitivity
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
-from workflow.tasks.results import MeasuredPeak, SensitivityCheck
+from workflow.tasks.results import MeasuredPeak, Real, SensitivityCheck
 from workflow.tasks.simulated_rig import loop_of_arm
 from workflow.tasks.stage import StageInput
-
-Real = npt.NDArray[np.float64]
 
 _DRAWS = 3
 _PERIODS_SMALL = 4  # sensor noise weighs ten times as much there, too
@@ -33,8 +30,7 @@ def rms_of(signals: Sequence[Real]) -> float:
 
 
 def settling_samples(pole_radius: float, shortest: int, longest: int) -> int:
-    """Of a trial in two halves, in either of which the slowest closed-loop pole dies out (to e^-7, a
-    thousandth)."""
+    """Of a trial in two halves, in either of which the slowest closed-loop pole dies out (to e^-7)."""
     wanted = round(2 * 7 / -np.log(min(max(pole_radius, 0.5), 1 - 1e-9)))
     return int(min(max(wanted, shortest), longest))
 

@@ -60,10 +60,8 @@ def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channe
     inputs = list(dict.fromkeys(channel.input for channel in channels))
     outputs = list(dict.fromkeys(channel.output for channel in channels))
     references = entry.references if entry.references is not None else source.references
-    # A record's own time base replaces the common one altogether: dt_s here must not meet a time column
-    # there.
+    # A record's own time base replaces the common one: dt_s here must not meet a time column there.
     own = entry.time is not None or entry.dt_s is not None
-
     units = {name: unit for name, unit in source.units.items() if name in (*inputs, *outputs)}
     with naming(str(entry.path)):
         record = Record.from_file(

@@ -387,8 +387,7 @@ class AmplitudeCost:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceFilterResult:
-    """filter: None where none was asked for, or where none is possible (reason); feedforward: of the
-    friction, where asked for."""
+    """filter: None where none was asked for or is possible (reason); feedforward: of the friction."""
 
     filter: ReferenceFilter | None = None
     reason: str | None = None
@@ -404,8 +403,7 @@ class ReferenceFilterResult:
 
 @dataclass(frozen=True, eq=False)
 class LoopRuns:
-    """Several closed-loop runs (R, T); limited: where a limit was active; performance: None without such a
-    channel."""
+    """Closed-loop runs (R, T); limited: where a limit was active; performance: None without a channel."""
 
     output: Real
     command: Real

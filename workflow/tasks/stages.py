@@ -63,8 +63,7 @@ def certify_controller(stage: StageInput) -> CertifyResult:
 
 
 def design_filter(stage: StageInput) -> ReferenceFilterResult:
-    """The filter with its worst-case errors, and the friction's feed-forward; nothing where none is asked for
-    or no controller is there."""
+    """Filter and friction feed-forward, where asked for; nothing where no controller is there."""
     settings, synthesis = stage.config.reference_filter, stage.results.design.synthesis
     if synthesis is None or stage.results.certify.certificate is None:
         return ReferenceFilterResult(

@@ -45,14 +45,13 @@ from workflow.tasks.results import (
     Intervals,
     ModeInterval,
     NominalAgreement,
+    Real,
     RunRecord,
     Tests,
     UncertainChannel,
     UncertaintyResult,
 )
 from workflow.tasks.stage import StageInput
-
-Real = npt.NDArray[np.float64]
 
 _FEWEST_FREQUENCIES = 100
 _SHARE_INSIDE = 0.9
@@ -223,8 +222,7 @@ def nominal_of(posterior: ResponsePosterior, poles: Poles, omega: Real) -> GobfM
 
 
 def display_grid(model: GobfModel, records: Sequence[Record]) -> Real:
-    """Frequencies (F,) for pictures: from one period per longest record to Nyquist, denser around the
-    modes."""
+    """Frequencies (F,) for pictures: from one period per longest record to Nyquist, denser at modes."""
     longest_s = max(record.n_samples for record in records) * model.dt_s
     poles = model.poles
     modes = [
@@ -285,8 +283,7 @@ def residual_tests(
 
 
 def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> Intervals | None:
-    """Intervals of modes (by frequency) and decay rates (slowest first), or None: only the tangent posterior
-    has them."""
+    """Of modes by frequency and decay rates, slowest first; None: only the tangent posterior has them."""
     try:
         found = pole_intervals(posterior, poles, level)
     except ValueError:
