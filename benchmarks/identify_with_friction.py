@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.harness import Print, main
 from ident import IdentOptions, Record
 from ident.checks.plausible_modes import PairKind, kind_of_pair
-from workflow.config.excitations import Multisine, Prbs
+from workflow.config.rig_settings import Multisine, Prbs
 from workflow.config.run_config import SimulatedRecord, SimulatedSource, built_in_config
 from workflow.tasks.log_identification import identify_records
 from workflow.tasks.simulated_rig import simulate_record, truth_of

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tests.workflow.command import FAST_ARM, ROOT
-from workflow.config.excitations import BangBang, Doublet, LogChirp, Multisine, Prbs
 from workflow.config.renamed_keys import RenamedKeyWarning
+from workflow.config.rig_settings import BangBang, Doublet, LogChirp, Multisine, Prbs
 from workflow.config.run_config import FileSource, RunConfig, SimulatedSource, built_in_config, load_config
 from workflow.config.settings import check
 from workflow.engine.errors import InputError

@@ -28,7 +28,7 @@ ARRAYS = {
 
 
 def test_npz_round_trip_is_exact(tmp_path):
-    storage.write_npz(tmp_path / "a.npz", ARRAYS)
+    storage.write_bytes(tmp_path / "a.npz", storage.npz_bytes(ARRAYS))
     back = storage.read_npz(tmp_path / "a.npz")
     assert back.keys() == ARRAYS.keys()
     for name, array in ARRAYS.items():
@@ -43,14 +43,14 @@ def test_equal_arrays_give_equal_bytes():
 
 
 def test_numpy_itself_reads_the_file(tmp_path):
-    storage.write_npz(tmp_path / "a.npz", ARRAYS)
+    storage.write_bytes(tmp_path / "a.npz", storage.npz_bytes(ARRAYS))
     with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
         np.testing.assert_array_equal(archive["response"], ARRAYS["response"])
 
 
 def test_objects_are_refused_on_writing(tmp_path):
     with pytest.raises(TypeError, match=r"'bad'.*pickle"):
-        storage.write_npz(tmp_path / "a.npz", {"bad": np.array([{"a": 1}], dtype=object)})
+        storage.npz_bytes({"bad": np.array([{"a": 1}], dtype=object)})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -128,7 +128,8 @@ def test_a_reader_never_sees_half_a_file_while_the_writer_is_killed(tmp_path):
         "k = 0\n"
         "while True:\n"
         "    k += 1\n"
-        "    storage.write_npz(Path(sys.argv[1]), {'a': np.full(40_000, k), 'b': np.array(k)})\n"
+        "    arrays = {'a': np.full(40_000, k), 'b': np.array(k)}\n"
+        "    storage.write_bytes(Path(sys.argv[1]), storage.npz_bytes(arrays))\n"
     )
     root = Path(__file__).resolve().parents[2]
     for pause in (0.0, 0.013, 0.027):

@@ -1,17 +1,22 @@
-"""How a configuration names the simulated machine: a preset or a rig file, and effects by their id."""
+"""How a configuration names the simulated machine: a preset or a rig file, effects by their id, excitations
+(the signals themselves are `plant.excitation`'s)."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, PlainSerializer, PlainValidator, ValidationInfo
+import numpy as np
+import numpy.typing as npt
+from pydantic import BeforeValidator, Field, PlainSerializer, PlainValidator, ValidationInfo
 
+from plant import excitation
 from plant.effects import parse_effect
 from plant.presets import paper_link
 from plant.rig import Rig
-from workflow.config.settings import resolve
+from workflow.config.settings import Section, resolve
 from workflow.engine import documents
 from workflow.engine.errors import naming, shortened
 
@@ -43,3 +48,94 @@ def _choose_rig(value: Any, info: ValidationInfo) -> str | Path:
 
 RigChoice = Annotated[str | Path, PlainValidator(_choose_rig), PlainSerializer(str, return_type=str)]
 EffectTable = Annotated[dict[str, Any], BeforeValidator(lambda value: parse_effect(value).to_dict())]
+Real = npt.NDArray[np.float64]
+
+
+class _Table(Section):
+    @abstractmethod
+    def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
+        """Voltage (T,). Raises ValueError where the numbers do not fit together."""
+
+
+class Prbs(_Table):
+    kind: Literal["prbs"] = Field(description="pseudo-random binary sequence")
+    amplitude_V: float = Field(gt=0, description="largest voltage")
+    samples: int = Field(ge=2, le=1_000_000, description="length of the record")
+    register_length: int = Field(11, ge=2, le=20, description="period: 2^register_length - 1 changes")
+    hold_samples: int = Field(1, ge=1, description="samples between possible changes of sign")
+
+    def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
+        return excitation.prbs(self.register_length, self.hold_samples, self.amplitude_V, self.samples, rng)
+
+
+class Multisine(_Table):
+    kind: Literal["multisine"] = Field(description="sum of sines of random phase")
+    rms_V: float = Field(gt=0, description="root mean square")
+    period_samples: int = Field(ge=2, le=1_000_000, description="length of a period")
+    periods: int = Field(1, ge=1, le=1000, description="whole periods of the record")
+    from_Hz: float = Field(gt=0, description="lowest frequency")
+    to_Hz: float = Field(gt=0, description="highest frequency")
+    grid: Literal["full", "odd", "odd_random"] = Field(
+        "full", description="excited lines: all, odd ones, odd ones of which one in four is left out"
+    )
+    phase_draws: int = Field(1, ge=1, le=1000, description="the draw with the lowest crest factor is kept")
+    lead_in_samples: int = Field(
+        0, ge=0, le=1_000_000, description="of the same signal before the whole periods"
+    )
+    lines_seed: int | None = Field(
+        None, ge=0, description="odd_random: draws the lines, for records that share them"
+    )
+
+    def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
+        lines = excitation.multisine_lines(
+            self.period_samples,
+            dt_s,
+            (self.from_Hz, self.to_Hz),
+            self.grid,
+            rng if self.lines_seed is None else np.random.default_rng(self.lines_seed),
+        )
+        return excitation.multisine(
+            lines,
+            self.period_samples,
+            self.rms_V,
+            rng,
+            periods=self.periods,
+            draws=self.phase_draws,
+            lead_in_samples=self.lead_in_samples,
+        )
+
+
+class LogChirp(_Table):
+    kind: Literal["log_chirp"] = Field(description="sweep, as long in each octave")
+    amplitude_V: float = Field(gt=0, description="largest voltage")
+    samples: int = Field(ge=2, le=1_000_000, description="length of the record")
+    from_Hz: float = Field(gt=0, description="lowest frequency")
+    to_Hz: float = Field(gt=0, description="highest frequency")
+
+    def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
+        return excitation.log_chirp(self.from_Hz, self.to_Hz, self.amplitude_V, self.samples, dt_s)
+
+
+class Doublet(_Table):
+    kind: Literal["doublet"] = Field(description="a pulse and its negative")
+    amplitude_V: float = Field(gt=0, description="largest voltage")
+    samples: int = Field(ge=2, le=1_000_000, description="length of the record")
+    start_s: float = Field(0.0, ge=0, description="rest before")
+    pulse_s: float = Field(gt=0, description="length of each of the two pulses")
+
+    def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
+        return excitation.doublet(self.amplitude_V, self.start_s, self.pulse_s, self.samples, dt_s)
+
+
+class BangBang(_Table):
+    kind: Literal["bang_bang"] = Field(description="full voltage one way, then the other")
+    amplitude_V: float = Field(gt=0, description="largest voltage")
+    samples: int = Field(ge=2, le=1_000_000, description="length of the record")
+    start_s: float = Field(0.0, ge=0, description="rest before")
+    slew_s: float = Field(gt=0, description="length of the move, half of it each way")
+
+    def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
+        return excitation.bang_bang(self.amplitude_V, self.start_s, self.slew_s, self.samples, dt_s)
+
+
+Excitation = Annotated[Prbs | Multisine | LogChirp | Doublet | BangBang, Field(discriminator="kind")]

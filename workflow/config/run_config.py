@@ -18,8 +18,7 @@ from control_design.synthesis.synthesis_options import SynthesisOptions
 from ident.basis.options import IdentOptions
 from plant.experiment_plan import ExperimentPlan
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
-from workflow.config.excitations import Excitation, Multisine
-from workflow.config.rig_settings import EffectTable, RigChoice
+from workflow.config.rig_settings import EffectTable, Excitation, Multisine, RigChoice
 from workflow.config.settings import InputPath, Section, check, read_toml, repeated
 from workflow.config.uncertainty_options import UncertaintyOptions
 

@@ -155,9 +155,8 @@ class DaskCluster:
     def _ask(self) -> None:
         """Note when the scheduler was heard of last, and when it had heard of a worker. A process that is
         stopped, or cut off, keeps its connections: only what it says tells that it is there."""
-        with suppress(
-            OSError, TimeoutError, RuntimeError, KeyError
-        ):  # KeyError: while a connection is broken
+        # KeyError: while a connection is broken.
+        with suppress(OSError, TimeoutError, RuntimeError, KeyError):
             identity = self._client.sync(self._client.scheduler.identity, callback_timeout=ANSWER_S)
             seen = {name: about["last_seen"] for name, about in identity["workers"].items()}
             self._heard_s = time.monotonic()

@@ -191,14 +191,9 @@ def _unpack_dataclass(kind: Any, document: Any, arrays: Mapping[str, AnyArray], 
     strange = sorted(set(document) - set(fields) - {_TYPE})
     missing = sorted(set(fields) - set(document))
     if strange or missing or document.get(_TYPE, kind.__name__) != kind.__name__:
-        what = (
-            f"unknown field '{shown(strange[0])}'"
-            if strange
-            else f"missing field {missing[0]!r}"
-            if missing
-            else "is"
-        )
-        raise CodecError(f"{at}: {what} ({shown(document.get(_TYPE))}, expected {kind.__name__})")
+        wrong = [f"unknown field '{shown(name)}'" for name in strange]
+        wrong += [f"missing field {name!r}" for name in missing] or ["is"]
+        raise CodecError(f"{at}: {wrong[0]} ({shown(document.get(_TYPE))}, expected {kind.__name__})")
     values = {name: _unpack(hint, document[name], arrays, f"{at}.{name}") for name, hint in fields.items()}
     try:
         return kind(**values)

@@ -161,11 +161,6 @@ def npz_bytes(arrays: Mapping[str, AnyArray]) -> bytes:
     return buffer.getvalue()
 
 
-def write_npz(path: Path, arrays: Mapping[str, AnyArray]) -> None:
-    """Atomic npz without pickle."""
-    write_bytes(path, npz_bytes(arrays))
-
-
 def read_npz(path: Path) -> dict[str, AnyArray]:
     """All arrays of an npz file, read without pickle.
 

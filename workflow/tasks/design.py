@@ -109,15 +109,8 @@ def certify_asked(
             coverage=options.joint_coverage,
             draws=options.joint_draws,
         )
-    unstable = [verdict.plant for verdict in certificate.plants if not verdict.stable]
-    missed = [said("requirement", item) for item in certificate.items if not item.met]
-    doubts = "; ".join([*(f"{name}: nominal closed loop unstable" for name in unstable), *missed])
-    return CertifyResult(
-        certificate,
-        certificate.certified,
-        doubts or ("every item is met" if certificate.certified else "an ellipse reaches -1"),
-        SampledResponses(joint, calibrated, reason),
-    )
+    sampled = SampledResponses(joint, calibrated, reason)
+    return CertifyResult(certificate, certificate.certified, said("certificate_reason", certificate), sampled)
 
 
 def undrawable(plants: Sequence[UncertainPlant]) -> str | None:
@@ -129,12 +122,7 @@ def undrawable(plants: Sequence[UncertainPlant]) -> str | None:
             if uncertainty is None:
                 continue
             if not isinstance(uncertainty, ResponsePosterior | ResponseDraws):
-                known = (
-                    "known at its own frequencies only"
-                    if plant.own_grid is not None
-                    else "a bound, not a distribution"
-                )
-                return f"responses of {plant.name} cannot be sampled: its uncertainty is {known}"
+                return said("undrawable", plant.name, plant.own_grid is not None)
             drawn = True
     return None if drawn else "no uncertainty is stated: there is nothing to draw from"
 

@@ -25,7 +25,7 @@ from ident.data.frf_records import FrfRepeats
 from ident.data.mat_files import mat_variables
 from ident.frequency_fit import identify_frf
 from ident.uncertainty import FrequencyUncertainty
-from workflow.config.design_file import DesignFile, PlantSection, StatedUncertainty
+from workflow.config.design_file import DesignFile, PlantSection
 from workflow.config.run_config import RunConfig
 from workflow.engine import codec, documents, storage
 from workflow.engine.errors import InputError, naming
@@ -34,7 +34,7 @@ from workflow.tasks.exports import read_model
 from workflow.tasks.pipeline import certified_for, config_of
 from workflow.tasks.results import IdentifiedPlant, RunResults
 from workflow.tasks.uncertainty import agreement_of
-from workflow.text.templates import words
+from workflow.text.templates import said, words
 
 _SAMPLING_TIME = ("dt_s", "dt", "Ts")
 # Of an entry of a state space in any units: products of some of them are still numbers.
@@ -100,25 +100,14 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
             return DesignSource(plant, "model and posterior of flexlink identify")
         if document.get("format") == FORMAT:
             exported = read_model(path)
-            name, nominal, ellipses = (
-                exported.model.output_name,
-                exported.model.to_control(),
-                exported.ellipses,
-            )
-            if ellipses is None:
+            name, nominal = exported.model.output_name, exported.model.to_control()
+            if (ellipses := exported.ellipses) is None:
                 return _stated(name, nominal, design, "exported model")
             plant = UncertainPlant(name, nominal, ellipses, level=ellipses.level)
             return DesignSource(plant, "exported model with ellipses", _grid_remarks(plant))
         nominal = read_state_space(path, document)
         _refuse_untold_integrators(path, nominal, design)
         return _stated(path.stem, nominal, design, "state space")
-
-
-def _discs_around(nominal: control.StateSpace, stated: StatedUncertainty) -> StatedDiscs:
-    if stated.multiplicative is not None:
-        return StatedDiscs(nominal, stated.multiplicative, "multiplicative")
-    assert stated.additive is not None
-    return StatedDiscs(nominal, stated.additive, "additive")
 
 
 def _read_document(path: Path) -> dict[str, Any]:
@@ -137,11 +126,12 @@ def _read_document(path: Path) -> dict[str, Any]:
 def _stated(name: str, nominal: control.StateSpace, design: DesignFile, origin: str) -> DesignSource:
     """A model that brings no ellipses: with the uncertainty of the design file, if it states one."""
     if design.uncertainty is None:
-        remark = "no uncertainty is stated ([uncertainty] in the design file): the design and its "
-        remark += "certificate hold for exactly this model"
-        return DesignSource(UncertainPlant(name, nominal), origin, (remark,))
+        return DesignSource(UncertainPlant(name, nominal), origin, (said("nothing_stated"),))
+    weight = design.uncertainty.multiplicative or design.uncertainty.additive
+    assert weight is not None
     with naming(f"{design.name} [uncertainty]"):
-        discs = _discs_around(nominal, design.uncertainty)
+        relative = design.uncertainty.multiplicative is not None
+        discs = StatedDiscs(nominal, weight, "multiplicative" if relative else "additive")
     return DesignSource(UncertainPlant(name, nominal, discs), origin)
 
 
@@ -279,7 +269,4 @@ def _grid_remarks(plant: UncertainPlant) -> tuple[str, ...]:
         own.omega_rad_s[inside], own.centre[inside], own.covariance[inside], own.dt_s, own.level, own.method
     )
     found = agreement_of(at, plant.channel.nominal_response)
-    return (
-        f"nominal model inside {found.share_inside_percent:.3g} % of the {own.omega_rad_s.size} "
-        f"ellipses, at most {found.largest_distance:.3g} of one from the centre ({found.at_rad_s:.4g} rad/s)",
-    )
+    return (said("nominal_inside", found, own.omega_rad_s.size),)

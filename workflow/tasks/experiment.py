@@ -114,9 +114,8 @@ def motion_of(limits: Limits) -> Callable[[Real], Real] | None:
     """Hub angle (T,) [rad] from rest under a voltage (T,): that of the linear rig, or of an integrator."""
     rig, gain = limits.rig, limits.gain_rad_per_Vs
     if rig is not None:
-        from plant.simulation import (
-            simulate,  # takes a second to load: limits that are refused do not need it
-        )
+        # Takes a second to load: limits that are refused do not need it.
+        from plant.simulation import simulate
 
         return lambda voltage: simulate(rig, voltage, dt_s=limits.dt_s).hub_angle_true_rad
     if gain is not None:
