@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-from workflow.engine import storage
+from workflow.engine import codec, storage
 from workflow.tasks.log_look import LogLook, look_at
 from workflow.tasks.summary import RunSummary
 from workflow.text.templates import rows_of
@@ -41,19 +41,11 @@ def _next(found: LogLook) -> str:
     roles = found.roles
     named = {"--input": roles.input, "--output": roles.output, "--time": roles.time}
     options = [f"{option} {shlex.quote(name)}" for option, name in named.items() if name]
-    return " ".join(
-        [
-            "flexlink identify",
-            shlex.quote(str(found.path)),
-            *options,
-            *(["--dt-s SECONDS"] * (not roles.time)),
-        ]
-    )
+    options += [] if roles.time else ["--dt-s SECONDS"]
+    return " ".join(["flexlink identify", shlex.quote(str(found.path)), *options])
 
 
 def _numbers(found: LogLook) -> dict[str, object]:
-    from workflow.engine import codec
-
     columns = {
         column.name: {
             "unit": column.unit,

@@ -69,8 +69,7 @@ def draw_waterfall(found: Diagnosis) -> Figure:
     # Beside a model error the repaired model may lie far below what does not interest.
     right.set(xscale="log", xlim=(0.8 * min(*every, floor), 1.3 * max(*every, 2 * floor)))
     right.set_yticks(range(len(rows)), [style.plain(name, 34) for name in rows])
-    right.set(ylim=(len(rows) - 0.5, -0.5), xlabel=words)
-    right.set_title("Every experiment alone")
+    right.set(ylim=(len(rows) - 0.5, -0.5), xlabel=words, title="Every experiment alone")
     return figure
 
 
@@ -96,8 +95,7 @@ def _bars(
     bars = axes.barh(np.arange(len(names)), percent, color=colours, height=0.62, tick_label=names)
     axes.bar_label(bars, labels, padding=4, fontsize=9)
     axes.invert_yaxis()
-    axes.set(xlim=(0, 112), xticks=[0, 20, 40, 60, 80, 100], xlabel=axis)
-    axes.set_title(title)
+    axes.set(xlim=(0, 112), xticks=[0, 20, 40, 60, 80, 100], xlabel=axis, title=title)
     axes.grid(visible=False, axis="y")
     return figure
 

@@ -93,8 +93,7 @@ def draw_residual_spectra(found: Diagnosis) -> Figure:
     dt_s = case.dt_s
     poles = linear_arm(case.rig).poles() if isinstance(case, Case) else np.zeros(0, complex)
     modes_Hz = sorted(float(abs(pole)) / (2 * np.pi) for pole in poles[poles.imag > 0])
-    figure = style.new_figure(3.7)
-    panels = figure.subplots(1, len(case.outputs), sharey=True, squeeze=False)[0]
+    figure, panels = style.small_multiples(len(case.outputs), len(case.outputs), 3.7, 0.0, sharey=True)
     for column, axes in enumerate(panels):
         for model in found.models:
             frequency, power = _spectrum([e[:, column] for e in found.residuals[model].values()], dt_s)

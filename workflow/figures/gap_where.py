@@ -90,8 +90,7 @@ def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure
             )
             right.plot(factor * np.array(part.interval), [row + offset] * 2, **_WHISKER)
     right.set_yticks(range(len(experiments)), [style.plain(e.experiment, 30) for e in experiments])
-    right.set(ylim=(len(experiments) - 0.5, -0.5), xlabel=words)
-    right.set_title("By experiment and sensor")
+    right.set(ylim=(len(experiments) - 0.5, -0.5), xlabel=words, title="By experiment and sensor")
     right.grid(visible=False, axis="y")
     left.plot([], [], **_WHISKER, label="95 % interval")
     return figure

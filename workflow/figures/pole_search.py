@@ -66,8 +66,7 @@ def draw_error_surface(channel: ChannelView) -> Figure | None:
     right.plot(omega, ratio.min(axis=0), **style.MODEL_LINE)
     right.axvline(surface.pole[0], color=style.HIGHLIGHT, lw=1.4)
     right.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]))
-    right.set(xlabel=_PAIR_AXIS, ylabel="residual RMS / smallest [1]")
-    right.set_title("Along frequency, best damping")
+    right.set(xlabel=_PAIR_AXIS, ylabel="residual RMS / smallest [1]", title="Along frequency, best damping")
     return figure
 
 

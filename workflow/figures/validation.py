@@ -65,8 +65,8 @@ def draw_residual_tests(channel: ChannelView) -> Figure | None:
     if not {"whiteness", "independence"} <= tests.keys():
         return None
     whiteness, independence = tests["whiteness"], tests["independence"]
-    figure = style.new_figure(3.5)
-    panels = left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.35])
+    figure, panels = style.panels(3.5, 1, 2, width_ratios=[1.0, 1.35])
+    left, right = panels
     dots = {"ls": "none", "ms": 4}
     for axes, test in zip(panels, (whiteness, independence), strict=True):
         lags, size = test.lags, test.correlation

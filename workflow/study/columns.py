@@ -70,11 +70,12 @@ def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None)
     that was identified, at the larger of two sizes.
     """
     # Here: a study that is refused needs the names of the columns only.
+    from workflow.engine.codec import plain
     from workflow.tasks.design import bracket_numbers
 
     found: dict[str, Number] = dict.fromkeys(COLUMNS)
     gamma, certify = results.design.gamma, results.certify
-    found["design_gamma"] = _finite(gamma)
+    found["design_gamma"] = plain(gamma)
     bracket = bracket_numbers(results.achievable_performance, gamma)
     found["any_order_gamma"] = bracket["reached"]
     found["above_any_order_percent"] = bracket["above_percent"]
@@ -90,7 +91,7 @@ def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None)
     if certificate is not None:
         verdict = certificate.plants[0]
         bound = certificate.gamma_bound
-        found["worst_gamma"] = _finite(certificate.gamma if bound is None else bound)
+        found["worst_gamma"] = plain(certificate.gamma if bound is None else bound)
         found["bandwidth_rad_s"] = verdict.bandwidth_rad_s
         found |= _margins("", verdict.worst_margins) | _margins("nominal_", verdict.nominal_margins)
         low, high = mode_band_rad_s or (0.0, math.inf)
@@ -128,7 +129,3 @@ def _margins(prefix: str, margins: Margins) -> dict[str, Number]:
         f"{prefix}phase_margin_deg": math.degrees(phase) if math.isfinite(phase) else None,
         f"{prefix}delay_margin_ms": 1e3 * delay if math.isfinite(delay) else None,
     }
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None

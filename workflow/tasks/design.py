@@ -169,7 +169,7 @@ def bracket_numbers(found: AchievablePerformance, gamma: float | None) -> dict[s
     bracket = found.bracket
     if bracket is None:
         return {"reached": None, "floor": None, "above_percent": None, "reason": found.reason}
-    reached, floor = _finite(bracket.ellipse), _finite(bracket.floor)
+    reached, floor = codec.plain(bracket.ellipse), codec.plain(bracket.floor)
     known = gamma is not None and math.isfinite(gamma) and reached is not None
     return {
         "reached": reached,
@@ -178,10 +178,6 @@ def bracket_numbers(found: AchievablePerformance, gamma: float | None) -> dict[s
         "reason": None,
         "bracket": codec.plain(bracket),
     }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def find_filter(

@@ -262,6 +262,11 @@ class UncertainChannel:
         report = self.posterior.report
         return 0 if report is None else len(report.ar_coefficients)
 
+    def in_plant(self, behind_friction: bool) -> PlantChannel:
+        behind = self.behind_friction if behind_friction else None
+        model = self.nominal if behind is None else behind.model
+        return PlantChannel(model.to_control(), (behind or self).posterior, self.level)
+
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyResult:
@@ -275,32 +280,19 @@ class UncertaintyResult:
         arm behind its friction, where the ellipses are about amplitudes."""
         key = config.control_index, config.performance_index, behind_friction
         if key not in self._plants:
-            self._plants[key] = self._plant(*key, config.control_channel.label)
+            control = self.channels[key[0]].in_plant(behind_friction)
+            self._plants[key] = UncertainPlant(
+                name=config.control_channel.label,
+                nominal=control.nominal,
+                uncertainty=control.uncertainty,
+                performance=None if key[1] is None else self.channels[key[1]].in_plant(behind_friction),
+                level=control.level,
+            )
         return self._plants[key]
 
     @cached_property
     def _plants(self) -> dict[tuple[int, int | None, bool], UncertainPlant]:
         return {}
-
-    def _plant(
-        self, control_index: int, performance: int | None, behind_friction: bool, name: str
-    ) -> UncertainPlant:
-        def channel(index: int) -> PlantChannel:
-            found = self.channels[index]
-            behind = found.behind_friction if behind_friction else None
-            model, posterior = (
-                (found.nominal, found.posterior) if behind is None else (behind.model, behind.posterior)
-            )
-            return PlantChannel(model.to_control(), posterior, found.level)
-
-        control = channel(control_index)
-        return UncertainPlant(
-            name=name,
-            nominal=control.nominal,
-            uncertainty=control.uncertainty,
-            performance=None if performance is None else channel(performance),
-            level=control.level,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -614,6 +606,3 @@ class RunResults:
     def __init__(self, run: RunDirectory) -> None:
         self.run = run
         self.read: dict[str, Any] = {}
-
-    def has(self, stage: str) -> bool:
-        return self.run.stage_file(stage) is not None

@@ -102,10 +102,7 @@ class EncodedArm(SampledArm):
         self._forces = iter(() if self._force is None else self._force.tolist())
 
     def measure(self) -> npt.NDArray[np.float64]:
-        output = super().measure()
-        if self._step:
-            output[0] = self._step * np.rint(output[0] / self._step)
-        return output
+        return quantised(super().measure(), self._step)
 
     def advance(self, voltage_V: float, hub_torque_Nm: float = 0.0, tip_force_N: float = 0.0) -> None:
         super().advance(voltage_V, hub_torque_Nm, tip_force_N + next(self._forces, 0.0))
