@@ -41,6 +41,7 @@ from workflow.engine.errors import (
 from workflow.engine.threads import one_thread
 
 if TYPE_CHECKING:
+    from workflow.console import TerminalProgress
     from workflow.tasks.summary import RunSummary
 
 _MANIFESTS = ("manifest.json", "study.json", "diagnose.json", "blind.json")  # of what can be continued
@@ -139,9 +140,7 @@ def run(
 ) -> None:
     """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
     need(config)
-    from workflow.console import TerminalProgress
-
-    with TerminalProgress(quiet=quiet) as progress:
+    with _watched(quiet) as progress:
         from workflow.commands.run import run_from_files  # a word comes first: it takes its time to load
 
         summary = run_from_files(
@@ -168,7 +167,7 @@ def simulate(
 ) -> None:
     """Simulate the experiments of a configuration and write them as CSV."""
     need(config)
-    from workflow.commands.simulate import simulate_to_csv
+    from workflow.commands.run import simulate_to_csv
 
     _show_files(simulate_to_csv(config, out), as_json)
 
@@ -366,7 +365,6 @@ def identify(
     from workflow.commands.logs import read_logs
     from workflow.config.settings import check
     from workflow.config.uncertainty_options import UncertaintyOptions
-    from workflow.console import TerminalProgress
     from workflow.engine.storage import refuse_in_the_way
 
     chosen: dict[str, Any] = {"n_pairs": pairs, "n_real": real, "integrators": integrators, "noise": noise}
@@ -378,7 +376,7 @@ def identify(
         "relative_degree": _degree(relative_degree),
     }
     options = check(IdentOptions, chosen, source="options")
-    with TerminalProgress(quiet=quiet) as progress:
+    with _watched(quiet) as progress:
         promised = check(UncertaintyOptions, {"level": level, "promise": promise}, source="options")
         written = [("--out", out), ("--report", report_page), ("--export", export)]
         # A log given twice would count its noise twice as well known, or validate what it was fitted to.
@@ -459,9 +457,7 @@ def design(
 ) -> None:
     """Design and certify one controller for one or several plants, identified here or brought along."""
     need(*source, specification)
-    from workflow.console import TerminalProgress
-
-    with TerminalProgress(quiet=quiet) as progress:
+    with _watched(quiet) as progress:
         from control_design.controllers.c_code import Dialect
         from workflow.config.design_file import read_design_file
 
@@ -487,9 +483,7 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Write report.html of a run directory anew and print its table."""
-    from workflow.console import TerminalProgress
-
-    with TerminalProgress(quiet=quiet) as progress:
+    with _watched(quiet) as progress:
         from workflow.commands.run import rebuild_report
         from workflow.engine.run_directory import RunDirectory
 
@@ -519,9 +513,7 @@ def study(
     need(config)
     if jobs is not None and scheduler is not None:
         raise InputError("--jobs and --scheduler contradict each other: the cluster's workers set the number")
-    from workflow.console import TerminalProgress
-
-    with TerminalProgress(quiet=quiet) as progress:
+    with _watched(quiet) as progress:
         from workflow.study.settings import load_study
 
         file = load_study(config)  # one that is refused does not wait for what computes: seconds
@@ -593,9 +585,7 @@ def diagnose(
         file, document = case_document(case[0])
         if not {"mjcf", "fmu", "python"} & set(document):
             check(CaseSettings, document, source=str(file))  # before what diagnoses is loaded: seconds
-    from workflow.console import TerminalProgress
-
-    with TerminalProgress(quiet=quiet) as progress:
+    with _watched(quiet) as progress:
         from workflow.diagnose.command import diagnose_cases
         from workflow.diagnose.simulator_case import settings_of
 
@@ -618,6 +608,12 @@ def diagnose(
         _complain(line, found.exit_code)
     if found.exit_code != EXIT_OK:
         raise typer.Exit(found.exit_code)
+
+
+def _watched(quiet: bool) -> TerminalProgress:
+    from workflow.console import TerminalProgress  # rich takes a moment to load
+
+    return TerminalProgress(quiet=quiet)
 
 
 def _c_code(prefix: str | None, single: bool | None) -> dict[str, Any]:

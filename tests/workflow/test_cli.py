@@ -346,7 +346,7 @@ def test_every_command_takes_a_time_limit(flexlink, monkeypatch, tmp_path):
     assert {"simulate", "excite", "look", "report", "blind", "paper"} <= commands.keys()
     assert [name for name, call in commands.items() if "time_limit" not in signature(call).parameters] == []
     monkeypatch.setattr(interrupts, "_came", None)
-    monkeypatch.setattr("workflow.commands.simulate.simulate_to_csv", lambda *_: time.sleep(30))
+    monkeypatch.setattr("workflow.commands.run.simulate_to_csv", lambda *_: time.sleep(30))
     answer = flexlink("simulate", "--out", tmp_path / "out", "--time-limit", "0.2")
     assert (answer.code, answer.err) == (142, "flexlink: the time limit is reached\n")
 
@@ -374,11 +374,11 @@ def swallowed():
     ],
     ids=["error", "memory", "interrupt", "swallowed"],
 )
-@pytest.mark.parametrize("command", ["run.run_from_files", "simulate.simulate_to_csv"])
+@pytest.mark.parametrize("command", ["run_from_files", "simulate_to_csv"])
 def test_what_nobody_expected_is_one_line(flexlink, monkeypatch, tmp_path, command, fails, code, line):
-    monkeypatch.setattr(f"workflow.commands.{command}", lambda *arguments, **options: fails())
+    monkeypatch.setattr(f"workflow.commands.run.{command}", lambda *arguments, **options: fails())
     monkeypatch.setattr(interrupts, "_came", None)
-    call = command.partition(".")[0], "--out", tmp_path / "run"
+    call = command.partition("_")[0], "--out", tmp_path / "run"
     answer = flexlink(*call)
     assert answer.code == code
     assert answer.err.startswith(f"flexlink: {line}")
