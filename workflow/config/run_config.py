@@ -382,10 +382,8 @@ class RunConfig(Section):
         if self.friction_identified:
             if self.closed_loop_data.method == "two_stage":
                 raise ValueError("identifying friction needs closed_loop_data.method = 'direct'")
-            if (
-                self.control_channel.identification.integrators > 1
-                or self.control_channel.identification.feedthrough
-            ):
+            control_options = self.control_channel.identification
+            if control_options.integrators > 1 or control_options.feedthrough:
                 raise ValueError(
                     "friction is identified from the control channel: its output is the position of the "
                     "shaft, so it has at most one integrator and no direct term"

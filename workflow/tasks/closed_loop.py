@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -176,24 +177,13 @@ def run_on_draws(
     drawn: tuple[ResponsePosterior, Real],
     shown: tuple[ResponsePosterior, Real] | None,
     trial: Trial,
-    measurement_step: float = 0.0,
-    command_step: float = 0.0,
+    **steps: float,
 ) -> LoopRuns:
     """One closed loop per draw of coefficients (R, P), of the performance channel (R, P') too where there is
-    one: its output follows from the command that acted."""
+    one: its output follows from the command that acted. steps: of the converters."""
     posterior, draws = drawn
-    runs = [
-        simulate_draw(
-            controller,
-            posterior,
-            one,
-            trial.given,
-            input_disturbance=trial.disturbance,
-            measurement_step=measurement_step,
-            command_step=command_step,
-        )
-        for one in draws
-    ]
+    how: dict[str, Any] = {"input_disturbance": trial.disturbance, **steps}
+    runs = [simulate_draw(controller, posterior, one, trial.given, **how) for one in draws]
     if shown is None:
         return _loop_runs(runs, None)
     tip, tip_draws = shown

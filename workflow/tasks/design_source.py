@@ -165,14 +165,8 @@ def read_state_space(path: Path, document: Mapping[str, Any]) -> control.StateSp
                 f"{wanted[name][0]}x{wanted[name][1]}: one input, one output, A square"
             )
         matrices[name] = matrix.reshape(wanted[name])
-    return control.ss(
-        matrices["A"],
-        matrices["B"],
-        matrices["C"],
-        matrices.get("D", np.zeros((1, 1))),
-        dt_s.item(),
-        remove_useless_states=False,
-    )
+    matrices.setdefault("D", np.zeros((1, 1)))
+    return control.ss(*(matrices[name] for name in "ABCD"), dt_s.item(), remove_useless_states=False)
 
 
 def _matrix(path: Path, name: str, value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -131,11 +131,8 @@ def _perform(
     run = results.run
     input_hash = stage_input_hash(stage, config, run, inputs)
     progress.start(stage.name)
-    if (
-        not always
-        and run.is_done(stage.name, input_hash)
-        and all(p.is_file() for p in stage.also_writes(run))
-    ):
+    there = run.is_done(stage.name, input_hash) and all(p.is_file() for p in stage.also_writes(run))
+    if there and not always:
         progress.finish(stage.name, 0.0, taken_up=True)
         return
     started = time.monotonic()

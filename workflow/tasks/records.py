@@ -39,20 +39,14 @@ def make_records(stage: StageInput) -> RecordsResult:
                 made.append(simulate_record(source, entry, stage.config.run.seed))
     else:
         made = [read_record(source, entry, stage.config.channels) for entry in source.records]
-    limit = source.input_limit or np.inf
-    result = RecordsResult(
-        tuple(
-            RunRecord(record.limited(limit), about.role, about.condition, about.remark, _kind(about))
-            for about, record in zip(entries, with_common_sampling_time(made), strict=True)
-        )
-    )
+    limit, records = source.input_limit or np.inf, list[RunRecord]()
+    for about, record in zip(entries, with_common_sampling_time(made), strict=True):
+        kind = about.excitation.kind if isinstance(about, SimulatedRecord) else "file"
+        records.append(RunRecord(record.limited(limit), about.role, about.condition, about.remark, kind))
+    result = RecordsResult(tuple(records))
     for item in result.of_role("estimation"):
         refuse_constant_input(item.record)
     return result
-
-
-def _kind(entry: SimulatedRecord | FileRecord) -> str:
-    return entry.excitation.kind if isinstance(entry, SimulatedRecord) else "file"
 
 
 def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channel]) -> Record:
