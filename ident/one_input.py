@@ -15,7 +15,6 @@ from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.checks.input_checks import advice, refuse_unusable
-from ident.checks.integrators_prior import integrators_test
 from ident.checks.nuisance_tests import NuisanceTest, clearly_left_out, nuisance_test
 from ident.checks.plausible_modes import implausible_pairs, pole_warnings
 from ident.checks.prior_tests import (
@@ -23,6 +22,7 @@ from ident.checks.prior_tests import (
     delay_test,
     direct_term_test,
     fixed_poles_test,
+    integrators_test,
     relative_degree_test,
     too_few_poles,
 )

@@ -93,7 +93,7 @@ class PriorTest:
 
     statistic stands against limit: the chi-square quantile at 99 % with that many degrees of freedom, and
     above it the prior is refused; a cancelled integrator is refused the other way round
-    (`ident.checks.integrators_prior`). imposed says whether the model keeps to the prior; details are what
+    (`ident.checks.prior_tests`). imposed says whether the model keeps to the prior; details are what
     the advice needs beside these.
     """
 
