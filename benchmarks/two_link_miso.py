@@ -31,7 +31,7 @@ from scipy.signal import dlsim
 from benchmarks.harness import Print, main, timed
 from examples.two_link_arm import AMPLITUDE_V, DT_S, ELBOW_ANGLE_RAD, NOISE_M
 from ident import IdentOptions, Record, identify
-from ident.several_inputs import identify_miso
+from ident.one_input import identify_miso
 from plant import prbs
 from validation.example_arms import two_link_operating_point
 

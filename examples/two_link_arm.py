@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from scipy.signal import dlsim
 
 from ident import IdentOptions, Record
-from ident.several_inputs import identify_miso
+from ident.one_input import identify_miso
 from ident.uncertainty.miso_uncertainty import response_uncertainty
 from plant import prbs
 from validation.example_arms import two_link_operating_point

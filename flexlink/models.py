@@ -23,8 +23,7 @@ from ident.data.signal_filter import band_limited
 from ident.data.table import Table
 from ident.frequency_fit import identify_frf
 from ident.identification import Identification as Identified
-from ident.one_input import identify as identify_records
-from ident.several_inputs import identify_miso
+from ident.one_input import identify as identify_records, identify_miso
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals

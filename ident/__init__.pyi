@@ -3,8 +3,7 @@ from .basis.functions import (
     basis_state_space as basis_state_space,
     regressor as regressor,
 )
-from .basis.miso_model import MisoModel as MisoModel
-from .basis.model import GobfModel as GobfModel
+from .basis.model import GobfModel as GobfModel, MisoModel as MisoModel
 from .basis.options import IdentOptions as IdentOptions
 from .basis.poles import Poles as Poles
 from .basis.structure import Structure as Structure
@@ -12,7 +11,6 @@ from .data.record import Record as Record
 from .data.signal_filter import band_limited as band_limited
 from .frequency_fit import FrfIdentification as FrfIdentification, identify_frf as identify_frf
 from .identification import Identification as Identification, MisoIdentification as MisoIdentification
-from .one_input import identify as identify
+from .one_input import identify as identify, identify_miso as identify_miso
 from .search.error_surface import ErrorSurface as ErrorSurface, error_surface as error_surface
-from .search.search_trace import SearchTrace as SearchTrace
-from .several_inputs import identify_miso as identify_miso
+from .search.pole_search import SearchTrace as SearchTrace

@@ -20,8 +20,7 @@ from ident.fit.frf_regression import FrfRegression, fit_response, prepare_respon
 from ident.fit.refinement import pole_system
 from ident.one_input import in_order
 from ident.search.order_selection import OrderSelection, OrderStep
-from ident.search.pole_search import PoleSearch
-from ident.search.search_trace import SearchTrace
+from ident.search.pole_search import PoleSearch, SearchTrace
 from ident.uncertainty.embedding import embed_response
 
 # The covariances explain the residual if chi-square is no less probable than this.

@@ -8,13 +8,12 @@ from functools import cached_property
 
 import numpy as np
 
-from ident.basis.miso_model import MisoModel
-from ident.basis.model import GobfModel
+from ident.basis.model import GobfModel, MisoModel
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray, lock, readonly_real
 from ident.data.finding import Finding, PriorTest, distinct
 from ident.search.order_selection import OrderStep
-from ident.search.search_trace import SearchTrace
+from ident.search.pole_search import SearchTrace
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -18,8 +18,8 @@ from ident.data.arrays import RealArray
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.fit.least_squares import Regression
+from ident.fit.problem import residual_colour
 from ident.fit.refinement import pole_system
-from ident.fit.residual_colour import residual_colour
 
 # An input is there at a frequency if it has this share of the density that it would have if its power were
 # spread evenly up to Nyquist ...

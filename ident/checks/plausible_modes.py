@@ -7,8 +7,7 @@ from enum import Enum
 import numpy as np
 
 from ident.basis.coordinates import ZETA_LIMIT
-from ident.basis.miso_model import MisoModel
-from ident.basis.model import GobfModel
+from ident.basis.model import GobfModel, MisoModel
 from ident.basis.poles import Poles
 from ident.data.finding import Finding, FindingKind, finding
 from ident.fit.refinement import Bounds

@@ -20,8 +20,7 @@ from ident.basis.structure import front_response
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.ellipses import standard_axes
 from ident.data.frequency_uncertainty import FrequencyUncertainty
-from ident.fit.problem import CandidateCost, Linearisation
-from ident.fit.residual_colour import ResidualColour, residual_colour
+from ident.fit.problem import CandidateCost, Linearisation, ResidualColour, residual_colour
 
 # A minor axis below this part of the major one would let one direction of one frequency overrule the rest.
 _THINNEST = 1e-4

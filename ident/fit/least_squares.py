@@ -21,8 +21,7 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.arrays import ComplexArray, RealArray
 from ident.fit.kernels import cost_of_point, driven_rows, linearise
-from ident.fit.problem import CandidateCost, Linearisation
-from ident.fit.residual_colour import ResidualColour, residual_colour
+from ident.fit.problem import CandidateCost, Linearisation, ResidualColour, residual_colour
 
 # Directions of the columns weaker than this fraction of the strongest are left at zero: the data do not
 # show them.

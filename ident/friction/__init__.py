@@ -2,9 +2,8 @@
 
 from ident.friction.amplitude import EquivalentFriction, at_amplitudes, equivalent_friction, refuse_unrecorded
 from ident.friction.arm import FrictionLaw
-from ident.friction.fit import fit_friction
+from ident.friction.fit import fit_friction, refuse_unseen_shaft
 from ident.friction.gauss_newton import FrictionFit
-from ident.friction.observable import refuse_unseen_shaft
 from ident.friction.posterior import BehindFriction, other_output_without_friction, without_friction
 
 __all__ = [

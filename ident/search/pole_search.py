@@ -14,15 +14,14 @@ import numpy as np
 from ident.basis.coordinates import SearchSpace, search_space
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.data.arrays import RealArray
+from ident.data.arrays import RealArray, lock
+from ident.data.finding import Finding
 from ident.data.record import Record
 from ident.fit.least_squares import Regression
-from ident.fit.problem import CandidateCost, PoleProblem
+from ident.fit.problem import CandidateCost, PoleProblem, ResidualColour
 from ident.fit.refinement import FAR, NEAR, Bounds, Refined, refine
 from ident.fit.regression import prepare
-from ident.fit.residual_colour import ResidualColour
 from ident.search.direct import best_apart, minimise
-from ident.search.search_trace import PolishedMinimum, SearchStage
 
 Problem = TypeVar("Problem", bound=PoleProblem, covariant=True)
 
@@ -328,3 +327,48 @@ def _real_grid(n_poles: int) -> RealArray:
     # The triangular map of the search space turns (low, 1) into equal poles at the top.
     couples = combinations_with_replacement(levels, 2)
     return np.array([[low, 0.0 if low == 1 else (high - low) / (1 - low)] for low, high in couples])
+
+
+@dataclass(frozen=True, eq=False)
+class SearchStage:
+    """One global search: coordinates (E, D) of the points in the order of evaluation and log J (E,)."""
+
+    title: str
+    coordinate_names: tuple[str, ...]
+    points: RealArray
+    log_cost: RealArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "coordinate_names", tuple(self.coordinate_names))
+        lock(self, "points", "log_cost")
+        if self.points.shape != (self.log_cost.size, len(self.coordinate_names)):
+            raise ValueError(
+                f"points must be ({self.log_cost.size}, {len(self.coordinate_names)}); got "
+                f"{self.points.shape}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class PolishedMinimum:
+    """End of one descent: where it was started from, the poles it reached and their residual sum of
+    squares."""
+
+    stage: str
+    poles: Poles
+    rss: float
+
+
+@dataclass(frozen=True, eq=False)
+class SearchTrace:
+    """All global searches and descents of one identification.
+
+    stages : tuple of SearchStage
+    minima : tuple of PolishedMinimum. In the order they were found.
+    warnings : tuple of Finding
+    evaluations : int. Cost evaluations in all, rescans and descents included.
+    """
+
+    stages: tuple[SearchStage, ...]
+    minima: tuple[PolishedMinimum, ...]
+    warnings: tuple[Finding, ...]
+    evaluations: int

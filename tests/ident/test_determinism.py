@@ -20,8 +20,7 @@ from threadpoolctl import threadpool_limits
 import ident
 from ident.basis.options import IdentOptions
 from ident.data.arrays import kernel_array
-from ident.one_input import identify
-from ident.several_inputs import identify_miso
+from ident.one_input import identify, identify_miso
 from ident.uncertainty.embedding import tangent
 from tests.ident.benchmark_plants import p1, p1_friction, p2, p3
 

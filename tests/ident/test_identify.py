@@ -10,7 +10,7 @@ import scipy.signal
 
 from ident.basis.options import IdentOptions
 from ident.data.finding import FindingKind
-from ident.fit.residual_colour import residual_colour
+from ident.fit.problem import residual_colour
 from ident.one_input import identify
 from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, max_length_sequence, p1, p2, run
 from tests.ident.findings import kinds

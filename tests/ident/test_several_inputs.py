@@ -7,15 +7,14 @@ import pytest
 from scipy import signal
 
 from ident.basis.functions import free_response
-from ident.basis.miso_model import MisoModel
+from ident.basis.model import MisoModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.data.finding import FindingKind
 from ident.data.record import Record
 from ident.fit.least_squares import fit, pole_sensitivities, project
 from ident.fit.regression import prepare_inputs
-from ident.one_input import identify
-from ident.several_inputs import identify_miso
+from ident.one_input import identify, identify_miso
 from ident.uncertainty.miso_uncertainty import response_uncertainty
 from tests.ident.benchmark_plants import p3
 from tests.ident.findings import kinds

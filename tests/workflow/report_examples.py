@@ -24,7 +24,7 @@ from ident.data.finding import FindingKind, finding
 from ident.data.record import Record
 from ident.one_input import Identification
 from ident.search.order_selection import OrderStep
-from ident.search.search_trace import PolishedMinimum, SearchStage, SearchTrace
+from ident.search.pole_search import PolishedMinimum, SearchStage, SearchTrace
 from ident.stabilisation import Stabilisation
 from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import RunConfig

@@ -16,7 +16,8 @@ from ident.basis.posterior import ResponsePosterior
 from ident.checks.residual_tests import whiteness_test
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
-from ident.one_input import Identification, identify
+from ident.identification import Identification
+from ident.one_input import identify
 from ident.uncertainty import FrequencyUncertainty
 from ident.uncertainty.embedding import classical, tangent
 from validation.paper.machines import LinkExperiment, PaperMachine, SimulationExample

@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from ident.search.error_surface import ErrorSurface, error_surface
 from ident.search.order_selection import OrderStep
-from ident.search.search_trace import SearchStage
+from ident.search.pole_search import SearchStage
 from ident.stabilisation import Stabilisation
 from ident.uncertainty import FrequencyUncertainty
 from workflow.figures import style

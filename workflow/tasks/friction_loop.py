@@ -23,7 +23,7 @@ from control_design.analysis.closed_loop import (
 from control_design.controllers.controller import Controller
 from control_design.controllers.feedforward import FrictionFeedforward
 from ident.friction import FrictionFit, FrictionLaw
-from ident.friction.loop import loop_through
+from ident.friction.kernel import loop_through
 from workflow.tasks.loop_sensitivity import SMALL, measured_on_arm, sensitivity_plan, settling_samples
 from workflow.tasks.results import FrictionCheck, Interval, Real, SensitivityCheck, SlowSine
 from workflow.tasks.simulated_rig import converter_steps, loop_of_arm
