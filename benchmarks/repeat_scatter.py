@@ -33,9 +33,9 @@ from ident.basis.options import EmbeddingOptions
 from ident.checks.distortion_findings import distortion_findings
 from ident.checks.validation import ScatterRow, repeat_scatter
 from ident.closed_loop import two_stage
+from ident.data.ellipses import hotelling_widening
 from ident.data.frf_records import FrfRepeats, inliers
 from ident.data.repeats import repeats_of
-from ident.data.widening import hotelling_widening
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.autoregression import whitened
 from ident.uncertainty.conditions import combine_posteriors, record_posteriors, repeat_posteriors

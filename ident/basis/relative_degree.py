@@ -50,7 +50,8 @@ def conditions(poles: Poles, integrators: int, relative_degree: int) -> RealArra
 
     Raises ValueError if a pole has no continuous-time counterpart, or there are fewer than r poles in all.
     """
-    return _functionals(poles, integrators, relative_degree, None, ())[0]
+    nothing = np.zeros(poles.order)
+    return conditions_with_sensitivities(poles, integrators, relative_degree, nothing, ())[0]
 
 
 def conditions_with_sensitivities(
@@ -62,16 +63,6 @@ def conditions_with_sensitivities(
     model with the given coefficients (B,); the columns are those functions, in order. They are the directions
     in which the model moves with that pole (`ident.fit.refinement`).
     """
-    return _functionals(poles, integrators, relative_degree, coefficients, blocks)
-
-
-def _functionals(
-    poles: Poles,
-    integrators: int,
-    relative_degree: int,
-    coefficients: RealArray | None,
-    blocks: tuple[Poles, ...],
-) -> tuple[RealArray, RealArray]:
     if not relative_degree >= 1:
         raise ValueError(f"relative_degree must be at least 1; got {relative_degree}")
     if relative_degree == 1:
@@ -98,19 +89,17 @@ def _functionals(
     matrix[first:size, first:size] = cascade.A
     matrix[first:size, k] = cascade.B[:, 0]
     pairs = [(first + rest.real.size + 2 * i, pole) for i, pole in enumerate(rest.pairs)]
-    scale = 1.0
-    if coefficients is not None:
-        drive = np.concatenate([coefficients[:k] @ expansion, coefficients[k:]])
-        scale = float(np.max(np.abs(drive), initial=0.0)) or 1.0
-        at = size
-        for part, block in zip(parts, blocks, strict=True):
-            if block.real.size + block.pairs.size != 1:
-                raise ValueError("a block is one real pole or one pair")
-            here = slice(at, at + block.order)
-            matrix[here, here] = part.A
-            matrix[here, 1:size] = part.B @ (drive / scale)[None, :]
-            pairs += [(at, complex(pole)) for pole in block.pairs]
-            at = here.stop
+    drive = np.concatenate([coefficients[:k] @ expansion, coefficients[k:]])
+    scale = float(np.max(np.abs(drive), initial=0.0)) or 1.0
+    at = size
+    for part, block in zip(parts, blocks, strict=True):
+        if block.real.size + block.pairs.size != 1:
+            raise ValueError("a block is one real pole or one pair")
+        here = slice(at, at + block.order)
+        matrix[here, here] = part.A
+        matrix[here, 1:size] = part.B @ (drive / scale)[None, :]
+        pairs += [(at, complex(pole)) for pole in block.pairs]
+        at = here.stop
     change = np.eye(total, dtype=np.complex128)
     for at, pole in pairs:
         change[at : at + 2, at : at + 2] = _schur_vectors(matrix[at : at + 2, at : at + 2], pole)

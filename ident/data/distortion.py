@@ -25,9 +25,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from ident.data.arrays import ComplexArray, RealArray
+from ident.data.ellipses import circular_widening
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record, in_groups
-from ident.data.widening import circular_widening
 
 # A period repeats the input to this share of its power (40 dB: an input as commanded, or well measured).
 _REPEATS = 1e-4

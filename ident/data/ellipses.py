@@ -1,10 +1,13 @@
-"""Confidence ellipses in the complex plane: axes of 2x2 covariances, distances."""
+"""Confidence ellipses in the complex plane: axes of 2x2 covariances, distances; and how much wider they
+have to be where the covariance is itself estimated, from little data."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
+from scipy.special import fdtri
 
 from ident.data.arrays import ComplexArray, RealArray
 
@@ -97,3 +100,16 @@ def ellipse_distance(offset: ComplexArray, ellipses: Ellipses, magnitude: RealAr
     floor = np.maximum(_ROUNDING * magnitude, np.finfo(np.float64).tiny)
     across = aligned.imag / np.maximum(ellipses.semi_minor, floor)
     return np.asarray(np.hypot(aligned.real / np.maximum(ellipses.semi_major, floor), across))
+
+
+def hotelling_widening(freedom: npt.ArrayLike, level: float) -> npt.NDArray[np.float64]:
+    """Factor on a 2x2 covariance estimated with so many degrees of freedom f > 1, so that its chi-square
+    ellipse at `level` is Hotelling's: 2 f / (f - 1) F(2, f - 1) / chi2(2)."""
+    f = np.asarray(freedom, dtype=np.float64)
+    return np.asarray(2 * f / (f - 1) * fdtri(2, f - 1, level) / chi2_radius(level) ** 2)
+
+
+def circular_widening(freedom: int, level: float) -> float:
+    """The same of a variance alike in all directions of the plane, estimated with so many complex degrees of
+    freedom f > 0: 2 F(2, 2 f) / chi2(2)."""
+    return float(2 * fdtri(2, 2 * freedom, level) / chi2_radius(level) ** 2)

@@ -1,7 +1,14 @@
-"""What holds for every file that somebody else wrote: how large it may be, and what is said of it."""
+"""Files that somebody else wrote: how large they may be, what is said of them; numpy archives of plain
+arrays; and files that only a compiled library reads, in a process of its own, whose end is a refusal and not
+ours."""
 
 from __future__ import annotations
 
+import io
+import os
+import subprocess
+import sys
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +17,11 @@ import numpy as np
 
 LARGEST_BYTES = 2**30
 """Of a file, and of what it unpacks to: some hundred channels at 1 kHz for twenty minutes as doubles."""
+
+_SCRIPT = Path(__file__).with_name("child_reader.py")
+_SECONDS = 150
+_REFUSED, _NO_LIBRARY = 2, 3
+_ENCRYPTED = 0x1
 
 
 @dataclass(frozen=True)
@@ -44,3 +56,73 @@ def as_numbers(values: Any) -> np.ndarray[Any, np.dtype[Any]]:
         what = "text" if array.dtype.kind in "USO" else f"{array.dtype}"
         raise ValueError(f"holds {shown(what)}; expected real numbers")
     return array
+
+
+def read_in_child(kind: str, library: str, content: bytes, extra: str = "logs") -> bytes:
+    """What `child_reader` makes of the bytes of a file of this kind (HDF5, parquet, xlsx, MCAP, bag, db3).
+
+    Raises ValueError, beginning with ':': damaged, too large, too slow, or the library is not installed.
+    """
+    # No plug-ins that the surroundings name: a filter of HDF5 is a library that gets loaded.
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("HDF5", "PYTHON"))}
+    command = [sys.executable, "-I", str(_SCRIPT), kind.lower()]
+    try:
+        done = subprocess.run(
+            command,
+            input=content,
+            capture_output=True,
+            timeout=_SECONDS,
+            env=kept | {"HDF5_PLUGIN_PRELOAD": "::"},
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise ValueError(f": not read in {_SECONDS} s; a smaller file, or CSV, is") from None
+    if done.returncode == 0:
+        return done.stdout
+    said = shown(done.stderr.decode("utf-8", "replace"))
+    if done.returncode == _NO_LIBRARY:
+        raise ValueError(
+            f": {kind} files need {library}: pip install 'flexlink[{extra}]' (or pip install {library})"
+        )
+    raise ValueError(
+        f": {said if done.returncode == _REFUSED and said else f'not a {kind} file, or a damaged one'}"
+    )
+
+
+def npz_arrays(content: bytes) -> dict[str, Any]:
+    """The arrays of an npz file by name; `Unread` in place of Python objects.
+
+    Raises ValueError with the reason, without the name of the file: no archive, encrypted, damaged, a name
+    twice, more than `LARGEST_BYTES`. Nothing is ever unpickled.
+    """
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(content))
+        entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+    except (zipfile.BadZipFile, NotImplementedError, UnicodeDecodeError):
+        raise ValueError("not a numpy .npz archive") from None
+    if len(entries) < len(archive.infolist()):
+        raise ValueError("damaged: a name is there twice")
+    if sum(entry.file_size for entry in entries.values()) > LARGEST_BYTES:
+        raise ValueError(f"unpacks to more than {LARGEST_BYTES >> 20} MiB: split the file")
+    return {name: _array(archive, name, entry) for name, entry in entries.items()}
+
+
+def _array(archive: zipfile.ZipFile, name: str, entry: zipfile.ZipInfo) -> Any:
+    if entry.flag_bits & _ENCRYPTED:
+        raise ValueError(f"'{shown(name)}' is encrypted; expected a plain archive (numpy.savez)")
+    try:
+        content = archive.read(entry)
+    except NotImplementedError:
+        method = f"method {entry.compress_type}"
+        raise ValueError(f"'{shown(name)}' is packed by {method}; expected numpy.savez_compressed") from None
+    except Exception:  # zipfile raises many kinds on damaged content
+        raise ValueError(f"'{shown(name)}' cannot be read, the archive is damaged") from None
+    try:
+        stream = io.BytesIO(content)
+        first = np.lib.format.read_magic(stream) == (1, 0)
+        header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+        if header(stream)[2].hasobject:
+            return Unread("Python objects; expected arrays of numbers")
+        return np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+    except (ValueError, OverflowError, MemoryError, TypeError, SyntaxError, RecursionError):
+        raise ValueError(f"'{shown(name)}' is no array of numbers, or damaged") from None

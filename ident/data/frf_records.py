@@ -9,9 +9,9 @@ from typing import Literal, Self
 import numpy as np
 
 from ident.data.arrays import ComplexArray, RealArray, factor_matrices, lock
+from ident.data.ellipses import hotelling_widening
 from ident.data.frequency_uncertainty import FrequencyUncertainty, frequencies
 from ident.data.record_files import read_table
-from ident.data.widening import hotelling_widening
 
 _PARTS = (("real", "imag"), ("gain", "phase_rad"))
 

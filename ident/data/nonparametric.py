@@ -9,9 +9,9 @@ import numpy as np
 from scipy.signal import detrend
 
 from ident.data.arrays import ComplexArray, RealArray
+from ident.data.ellipses import circular_widening
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
-from ident.data.widening import circular_widening
 
 
 def empirical_frf(

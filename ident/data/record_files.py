@@ -12,10 +12,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from ident.data.child_process import read_in_child
-from ident.data.foreign_files import LARGEST_BYTES, content_of, shown
+from ident.data.foreign_files import LARGEST_BYTES, content_of, npz_arrays, read_in_child, shown
 from ident.data.mat_files import mat_variables
-from ident.data.npz_files import npz_arrays
 from ident.data.table import Table
 from ident.data.text_tables import read_text, text_of
 

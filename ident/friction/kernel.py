@@ -1,5 +1,5 @@
-"""The compiled time stepper of a linear arm with dry friction at its shaft, alone and in a sampled control loop
-(compiled as a whole: an interval over draws and sizes takes a million samples).
+"""The compiled time stepper of a linear arm with dry friction at its shaft, alone and in a sampled
+control loop (compiled as a whole: an interval over draws and sizes takes a million samples).
 
 The arm is a sum of states: a state j with rate s_j (1/s) obeys x' = s_j x + e, or, where chain[j] is true,
 x' = s_j x + x_before with x_before the state before it (a pole taken twice); e = drive - friction, and the

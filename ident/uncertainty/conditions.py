@@ -21,8 +21,8 @@ from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray
+from ident.data.ellipses import hotelling_widening
 from ident.data.record import Record
-from ident.data.widening import hotelling_widening
 from ident.uncertainty.embedding import common_fir_length, tangent, tangent_rows
 from ident.uncertainty.embedding_algebra import nuisance_basis, triangle_of
 

@@ -38,8 +38,7 @@ from ident.uncertainty.embedding_algebra import (
     tc_factor,
     total_log_evidence,
 )
-from ident.uncertainty.embedding_rows import Beside, EmbeddingRows
-from ident.uncertainty.residual_noise import gls_residuals
+from ident.uncertainty.embedding_rows import Beside, EmbeddingRows, gls_residuals
 from ident.uncertainty.undetected_mode import (
     PairMixture,
     candidate_pairs,

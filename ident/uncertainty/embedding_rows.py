@@ -1,4 +1,5 @@
-"""Records as rows of the embedding's regression: nuisance, regressors, kernel, output, all whitened."""
+"""Records as rows of the embedding's regression: nuisance, regressors, kernel, output, all whitened; and what
+a fit of them leaves."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.signal import lfilter
 
 from ident.basis.functions import all_pass_signal, nuisance_columns, regressor
@@ -13,8 +15,17 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure, filter_input
 from ident.data.arrays import RealArray
 from ident.data.record import Record
-from ident.uncertainty.autoregression import first_rows, whitened
-from ident.uncertainty.embedding_algebra import Delays, RegressionBlock
+from ident.uncertainty.autoregression import Absorbed, first_rows, whitened
+from ident.uncertainty.embedding_algebra import (
+    Delays,
+    KernelPosterior,
+    ReducedRegression,
+    RegressionBlock,
+    joint_factor,
+)
+
+# Directions of the nuisance (columns of unit length) below this are left out, as in the fit.
+_NUISANCE_RANK = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,3 +147,40 @@ class EmbeddingRows:
     def _driven(self, u: RealArray) -> RealArray:
         columns = regressor(self.poles, u)
         return np.column_stack([columns, u]) if self.structure.feedthrough else columns
+
+
+def gls_residuals(
+    rows: EmbeddingRows, reduced: ReducedRegression, kernel: KernelPosterior
+) -> tuple[list[RealArray], Absorbed]:
+    """y minus posterior mean and nuisance, unwhitened, one array per record; and what the fit has absorbed.
+
+    rows are those of the fit, with its whitening. The kernel's mean is taken off, its share of the absorption
+    (which the prior keeps small) is neglected.
+    """
+    mean, _ = joint_factor(reduced, kernel)
+    p = reduced.n_columns
+    scale = np.linalg.norm(reduced.r11, axis=0)
+    residuals, absorbed = [], []
+    drops = rows.whitening.size > 1 and not np.any(first_rows(rows.whitening))
+    for block in rows.with_whitening(np.ones(1)).blocks():
+        rest = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
+        shared = block.regressors[:, reduced.kept] / scale
+        local = np.zeros((rest.size, 0))
+        length = np.linalg.norm(block.nuisance, axis=0)
+        nuisance = block.nuisance[:, length > 0] / length[length > 0]
+        if nuisance.shape[1]:
+            # Fitted where it was estimated, in the whitened rows, and taken off the plain ones.
+            u, d, vt = np.linalg.svd(whitened(nuisance, rows.whitening), full_matrices=False)
+            rank = int(np.count_nonzero(d > _NUISANCE_RANK * d[0]))
+            local = nuisance @ (vt[:rank].T / d[:rank])
+            targets = whitened(np.column_stack([rest, shared]), rows.whitening)
+            fitted = local @ (u[:, :rank].T @ targets)
+            rest = rest - fitted[:, 0]
+            shared = shared - fitted[:, 1:]
+        theirs = solve_triangular((reduced.r11 / scale).T, shared.T, lower=True, check_finite=False).T
+        residuals.append(rest)
+        columns = np.column_stack([local, theirs])
+        if drops:
+            columns = lfilter(np.ones(1), rows.whitening, whitened(columns, rows.whitening), axis=0)
+        absorbed.append(columns)
+    return residuals, Absorbed(tuple(absorbed))

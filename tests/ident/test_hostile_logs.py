@@ -10,7 +10,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from ident.data import child_process, foreign_files, record_files
+from ident.data import foreign_files, record_files
 from ident.data.record_files import read_table
 from tests.ident.mutations import Tally, mutated, tally
 from tests.ident.test_forty_logs import LOGS
@@ -88,8 +88,8 @@ def test_many_damaged_bytes_for_a_child(name, tmp_path):
 
 def test_a_child_that_dies_or_hangs_is_a_refusal(tmp_path, monkeypatch):
     script = tmp_path / "child.py"
-    monkeypatch.setattr(child_process, "_SCRIPT", script)
-    monkeypatch.setattr(child_process, "_SECONDS", 2)
+    monkeypatch.setattr(foreign_files, "_SCRIPT", script)
+    monkeypatch.setattr(foreign_files, "_SECONDS", 2)
     for code, words in (
         ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "not a HDF5 file, or a damaged one"),
         ("import time; time.sleep(60)", "not read in 2 s"),
@@ -97,7 +97,7 @@ def test_a_child_that_dies_or_hangs_is_a_refusal(tmp_path, monkeypatch):
     ):
         script.write_text(code)
         with pytest.raises(ValueError, match=words):
-            child_process.read_in_child("HDF5", "h5py", b"")
+            foreign_files.read_in_child("HDF5", "h5py", b"")
 
 
 def test_sizes_are_limited(tmp_path, monkeypatch):
@@ -146,8 +146,8 @@ def test_no_shell_and_no_surroundings(monkeypatch):
         seen.update(options, command=command)
         return subprocess.CompletedProcess(command, 0, b"", b"")
 
-    monkeypatch.setattr(child_process.subprocess, "run", run)
+    monkeypatch.setattr(foreign_files.subprocess, "run", run)
     monkeypatch.setenv("HDF5_PLUGIN_PATH", "/elsewhere")
-    child_process.read_in_child("HDF5", "h5py", b"")
+    foreign_files.read_in_child("HDF5", "h5py", b"")
     assert "HDF5_PLUGIN_PATH" not in seen["env"]
     assert seen["command"][1] == "-I"

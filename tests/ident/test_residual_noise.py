@@ -10,7 +10,13 @@ from ident.basis.options import EmbeddingOptions
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.record import Record
-from ident.uncertainty.autoregression import autocovariance, first_rows, fit_autoregression, whitened
+from ident.uncertainty.autoregression import (
+    Absorbed,
+    autocovariance,
+    first_rows,
+    fit_autoregression,
+    whitened,
+)
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.embedding_algebra import (
     conditional_posterior,
@@ -19,8 +25,7 @@ from ident.uncertainty.embedding_algebra import (
     reduce_regression,
     tc_factor,
 )
-from ident.uncertainty.embedding_rows import EmbeddingRows
-from ident.uncertainty.residual_noise import Absorbed, gls_residuals
+from ident.uncertainty.embedding_rows import EmbeddingRows, gls_residuals
 
 from .benchmark_plants import DT_S as DT
 from .three_mode_arm import random_arm

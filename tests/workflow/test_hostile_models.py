@@ -14,7 +14,7 @@ from ident.basis.model import GobfModel
 from ident.basis.model_files import ModelFile
 from ident.basis.poles import Poles
 from ident.basis.posterior import EmbeddingReport, ResponsePosterior
-from ident.data import npz_files
+from ident.data import foreign_files
 from tests.ident.mutations import Tally, mutated, tally
 from workflow.config.design_file import DesignFile
 from workflow.engine import codec, storage
@@ -185,7 +185,7 @@ def test_archives_of_another_kind(content, words, tmp_path):
 
 
 def test_an_archive_that_grows(tmp_path, monkeypatch):
-    monkeypatch.setattr(npz_files, "LARGEST_BYTES", 2**20)
+    monkeypatch.setattr(foreign_files, "LARGEST_BYTES", 2**20)
     np.savez_compressed(tmp_path / "hub.npz", zeros=np.zeros(2**18))
     assert "unpacks to more than 1 MiB" in complaint(tmp_path / "hub.npz")
 

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ident.data.foreign_files import Unread, content_of, shown
-from ident.data.npz_files import npz_arrays
+from ident.data.foreign_files import Unread, content_of, npz_arrays, shown
 from workflow.engine import codec, documents
 from workflow.engine.errors import InputError, cannot, naming
 
