@@ -17,7 +17,6 @@ class InputDelay(Effect):
 
     id = "input_delay"
     words = "a delay of the command"
-    group = "actuator"
     adds_to = "sampling.transport_delay_s"
     sought = Sought((2e-4, 100), (0.04, 30, 14), "dt_s")
 
@@ -33,7 +32,6 @@ class ActuatorGain(RatioEffect):
 
     id = "actuator_gain"
     words = "a wrong gain of the actuator"
-    group = "actuator"
     multiplies = "motor.torque_constant_Nm_A"
 
     ratio: Positive = Field(description="acting voltage over commanded voltage")
@@ -48,7 +46,6 @@ class ActuatorDeadZone(Effect):
 
     id = "actuator_dead_zone"
     words = "a dead zone of the actuator"
-    group = "actuator"
     dependence = "continuous"
     sought = Sought((1e-5, 1), (1e-3, 0.5, 12), "voltage_V", 1e-4)
 
@@ -64,7 +61,6 @@ class ActuatorSaturation(Effect):
 
     id = "actuator_saturation"
     words = "saturation of the actuator"
-    group = "actuator"
     neutral = MappingProxyType({"limit_V": 1e6})
     dependence = "continuous"
     sought = Sought((0.05, 1), (0.1, 0.99, 24), "voltage_V", 1e-4, grows=False)
@@ -81,7 +77,6 @@ class ActuatorLag(Effect):
 
     id = "actuator_lag"
     words = "a lag of the actuator"
-    group = "actuator"
     sought = Sought((2e-4, 200), (0.02, 40, 10), "dt_s")
 
     time_constant_s: NotNegative = Field(description="time constant T; 0 is none")

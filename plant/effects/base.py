@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, cast
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -43,7 +43,7 @@ class Effect(BaseModel, ABC):
 
     id : str. Name in the registry and in configuration files.
     words : str. Its name in a sentence.
-    group : str. Where it acts: actuator, joint, link or sensor.
+    group : str. Where it acts: actuator, joint, link or sensor, after the module that it is registered in.
     neutral : mapping or None. Parameter values at which the effect vanishes exactly, zero for those not
         named; None if there are none within the bounds.
     dependence : str
@@ -144,10 +144,13 @@ E = TypeVar("E", bound=Effect)
 def register(kind: type[E]) -> type[E]:
     """Class decorator: the effect can be configured and diagnosed by its id (look-alikes: only diagnosed).
 
+    Its group is the name of its module.
+
     Raises TypeError for a ratio without a stated value that it multiplies or a `modify` of its own.
     """
     if issubclass(kind, RatioEffect) and kind.multiplies is None and kind.modify is RatioEffect.modify:
         raise TypeError(f"{kind.id} multiplies no stated value: it needs its own modify")
+    kind.group = cast(Group, kind.__module__.rpartition(".")[2])
     (LOOK_ALIKES if kind.look_alike_of else EFFECTS)[kind.id] = kind
     return kind
 

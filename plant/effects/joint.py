@@ -39,7 +39,6 @@ class CoulombFriction(Effect):
 
     id = "coulomb_friction"
     words = "dry (Coulomb) friction"
-    group = "joint"
     friction = True
     dependence = "continuous"
     sought = Sought((1e-5, 1), (3e-4, 0.6, 14), "torque_Nm", 1e-3)
@@ -57,7 +56,6 @@ class StribeckFriction(Effect):
 
     id = "stribeck_friction"
     words = "dry friction that falls with speed (Stribeck)"
-    group = "joint"
     contains = "coulomb_friction"
     friction = True
     neutral = MappingProxyType({"stribeck_velocity_rad_s": 0.1})
@@ -112,7 +110,6 @@ class ViscousFriction(Effect):
 
     id = "viscous_friction"
     words = "additional viscous friction"
-    group = "joint"
     adds_to = "hub.viscous_friction_Nms"
     friction = True
 
@@ -139,7 +136,6 @@ class HubInertia(RatioEffect):
 
     id = "hub_inertia"
     words = "a wrong inertia of the hub"
-    group = "joint"
     multiplies = "hub.inertia_kg_m2"
 
     ratio: Positive = Field(description="true over nominal hub inertia")
@@ -151,7 +147,6 @@ class TorqueRipple(Effect):
 
     id = "torque_ripple"
     words = "torque ripple over the hub angle"
-    group = "joint"
     harmonic = "hub_angle"
 
     amplitude_Nm: NotNegative = Field(description="amplitude a")
@@ -176,7 +171,6 @@ class PeriodicDisturbance(Effect):
 
     id = "periodic_disturbance"
     words = "a periodic disturbance torque"
-    group = "joint"
     environment = True
     harmonic = "time"
 
@@ -202,7 +196,6 @@ class HardeningSpring(Effect):
 
     id = "hardening_spring"
     words = "a hardening spring (cable, hose)"
-    group = "joint"
     absolute_angle = True
 
     cubic_Nm_rad3: NotNegative = Field(description="coefficient k3")
@@ -227,7 +220,6 @@ class GroundSpring(Effect):
 
     id = "ground_spring"
     words = "a linear spring from hub to ground"
-    group = "joint"
     look_alike_of = "gravity"
 
     stiffness_Nm_rad: NotNegative = Field(description="stiffness k")
@@ -251,7 +243,6 @@ class JointCompliance(Effect):
 
     id = "joint_compliance"
     words = "a compliant joint between hub and link"
-    group = "joint"
     neutral = None  # the rigid joint is the limit of infinite stiffness
 
     stiffness_Nm_rad: Positive = Field(description="stiffness k")
@@ -279,7 +270,6 @@ class BaseCompliance(Effect):
 
     id = "base_compliance"
     words = "a compliant base under the motor"
-    group = "joint"
     neutral = None  # the fixed base is the limit of infinite stiffness
 
     stiffness_Nm_rad: Positive = Field(description="stiffness k to ground")
@@ -319,7 +309,6 @@ class Backlash(Effect):
 
     id = "backlash"
     words = "backlash in the gear"
-    group = "joint"
     neutral = None  # without a gap the contact is still elastic
     dependence = "non-smooth"
     sought = Sought((1e-5, 0.5), (3e-4, 0.2, 30), step=5e-3)

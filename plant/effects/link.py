@@ -17,7 +17,6 @@ class TipPayload(Effect):
 
     id = "tip_payload"
     words = "an additional mass at the tip"
-    group = "link"
     adds_to = "payload.mass_kg"
     sought = Sought((1e-6, 5), (1e-4, 1.5, 14), "link_mass_kg")
 
@@ -33,7 +32,6 @@ class LinkStiffness(RatioEffect):
 
     id = "link_stiffness"
     words = "a wrong bending stiffness of the link"
-    group = "link"
     multiplies = "link.youngs_modulus_Pa"
 
     ratio: Positive = Field(description="true over nominal bending stiffness")
@@ -45,7 +43,6 @@ class StructuralDamping(RatioEffect):
 
     id = "structural_damping"
     words = "wrong damping of the link"
-    group = "link"
     multiplies = "link.kelvin_voigt_s"
     largest_ratio = 50.0
 
@@ -62,7 +59,6 @@ class Gravity(Effect):
 
     id = "gravity"
     words = "gravity in a tilted plane"
-    group = "link"
     environment = True
     absolute_angle = True
     sought = Sought((1e-4, 20), (1e-3, 10, 12))

@@ -18,7 +18,6 @@ class SensorGain(RatioEffect):
 
     id = "sensor_gain"
     words = "a wrong gain of the tip sensor"
-    group = "sensor"
 
     ratio: Positive = Field(description="measured over true tip position")
 
@@ -32,7 +31,6 @@ class SensorDrift(Effect):
 
     id = "sensor_drift"
     words = "a drift of the tip sensor"
-    group = "sensor"
 
     rate_m_s: float = Field(description="drift of the tip sensor")
 
@@ -56,7 +54,6 @@ class Quantisation(Effect):
 
     id = "quantisation"
     words = "coarse quantisation of the tip sensor"
-    group = "sensor"
     dependence = "non-smooth"
 
     # Values on a grid are plain to see: the step is read off them (`diagnosis.machine.quantisation_grid`).
@@ -72,7 +69,6 @@ class SensorLag(Effect):
 
     id = "sensor_lag"
     words = "a lag of the tip sensor"
-    group = "sensor"
     sought = Sought((2e-4, 200), (0.02, 40, 10), "dt_s")
 
     time_constant_s: NotNegative = Field(description="time constant; 0 is none")
