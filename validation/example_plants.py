@@ -16,9 +16,8 @@ import control
 import numpy as np
 
 from control_design.plants.ellipses import Complex, Real
-from control_design.plants.first_order import FirstOrder, Intervals
+from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
 from control_design.plants.plant_set import UncertainPlant
-from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import stacked
 from control_design.plants.weights import RationalWeight
 from control_design.specification import Specification

@@ -31,10 +31,9 @@ from control_design.plants.ellipses import (
     quotient,
     secular_root,
 )
-from control_design.plants.first_order import FirstOrder, Intervals
+from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
 from control_design.plants.frequency_grid import starting_edges
 from control_design.plants.plant_set import Mode, UncertainPlant, frequency_response
-from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import Expand, SetExpansion, expandable
 from control_design.specification import Specification
 from control_design.specification.requirement import WeightedRequirement
@@ -273,11 +272,7 @@ def bound_all_frequencies(
         tuple(each for each in asked if each not in infinite),
     )
     bands = [edge for each in asked for edge in each.requirement.band or ()]
-    edges = starting_edges(
-        plant.nyquist_rad_s,
-        modes,
-        extra=(*(() if plant.own_grid is None else plant.own_grid), *bands),
-    )
+    edges = starting_edges(plant, modes, (*(() if plant.own_grid is None else plant.own_grid), *bands))
     difference = _model_error(loop, controller, edges[1:])
     if difference > _MODEL_ERROR:
         return AllFrequencies.ended_by(Obstacle.INEXACT, difference)

@@ -15,7 +15,7 @@ from control_design.analysis.stability import NyquistCount, closed_loop_poles, l
 from control_design.analysis.worst_case import worst_case
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Real
-from control_design.plants.frequency_grid import CHECKED_FROM_RAD_S, frequency_grid, with_own_grid
+from control_design.plants.frequency_grid import checked_grid, with_own_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification
 from control_design.specification.requirement import Findings, SpecificationItem
@@ -159,10 +159,7 @@ def _check_plant(
     own_modes = modes_of(controller.poles, plant.dt_s)
     near = [m for m in (*plant.modes, *loop_modes, *own_modes) if m.omega_rad_s < plant.nyquist_rad_s]
     light = [Mode(m.omega_rad_s, max(abs(m.zeta), 1e-5)) for m in near if abs(m.zeta) < 0.4]
-    wanted = frequency_grid(
-        plant.nyquist_rad_s, light, omega_min_rad_s=CHECKED_FROM_RAD_S, n_log=n_dense, n_mode=120 * len(light)
-    )
-    grid = with_own_grid(plant, wanted)
+    grid = with_own_grid(plant, checked_grid(plant, light, n_dense, 120))
 
     def response(omega: Real) -> Complex:
         return controller.response(omega, with_delay=False)

@@ -58,6 +58,12 @@ def frequency_grid(
     return np.asarray(grid[keep], dtype=np.float64)
 
 
+def checked_grid(plant: UncertainPlant, modes: Sequence[Mode], n_log: int, per_mode: int) -> Real:
+    """Grid that a design is checked on, whatever it was made on: from `CHECKED_FROM_RAD_S`."""
+    n_mode, low = per_mode * len(modes), CHECKED_FROM_RAD_S
+    return frequency_grid(plant.nyquist_rad_s, modes, omega_min_rad_s=low, n_log=n_log, n_mode=n_mode)
+
+
 def programme_grid(
     plant: UncertainPlant,
     modes: Sequence[Mode],
@@ -116,12 +122,10 @@ def with_violations(grid: Real, omega: Real, value: Real, limit: float, most: in
     return np.union1d(grid, omega[[i for i in local_maxima(value) if value[i] > limit][:most]])
 
 
-def starting_edges(nyquist_rad_s: float, modes: Sequence[Mode], *, extra: npt.ArrayLike = ()) -> Real:
+def starting_edges(plant: UncertainPlant, modes: Sequence[Mode], extra: npt.ArrayLike = ()) -> Real:
     """Edges of a first partition of [0, Nyquist] for bounds on intervals: logarithmic, finer around modes."""
-    count = max(60, int(40 * np.log10(nyquist_rad_s / CHECKED_FROM_RAD_S)))
-    inner = frequency_grid(
-        nyquist_rad_s, modes, omega_min_rad_s=CHECKED_FROM_RAD_S, n_log=count, n_mode=40 * len(modes)
-    )
+    count = max(60, int(40 * np.log10(plant.nyquist_rad_s / CHECKED_FROM_RAD_S)))
+    inner = checked_grid(plant, modes, count, 40)
     more = np.asarray(extra, dtype=np.float64)
-    more = more[(more > 0) & (more < nyquist_rad_s)]
+    more = more[(more > 0) & (more < plant.nyquist_rad_s)]
     return np.asarray(np.unique(np.concatenate([[0.0], inner, more])), dtype=np.float64)

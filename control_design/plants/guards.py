@@ -15,8 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from control_design.plants.ellipses import Complex, Ellipses, Real
-from control_design.plants.frequency_grid import CHECKED_FROM_RAD_S, frequency_grid
-from control_design.plants.plant_set import UncertainPlant
 from ident.data.arrays import lock
 
 GUARD_MODULUS = 0.1  # distance from -1 asked of a guard: stability with something to spare
@@ -51,17 +49,6 @@ class Guard:
         above = np.clip(np.searchsorted(own, wanted), 1, own.size - 1)
         index = np.unique(np.where(wanted - own[above - 1] < own[above] - wanted, above - 1, above))
         return Ellipses.of_no_size(self.omega_rad_s[index], self.response[index])
-
-
-def guard_grid(plant: UncertainPlant) -> Real:
-    """Frequencies fine enough to count the winding of a response whose modes have moved."""
-    return frequency_grid(
-        plant.nyquist_rad_s,
-        plant.modes,
-        omega_min_rad_s=CHECKED_FROM_RAD_S,
-        n_log=1200,
-        n_mode=400 * len(plant.modes),
-    )
 
 
 def different_responses(responses: Complex, most: int) -> npt.NDArray[np.int64]:

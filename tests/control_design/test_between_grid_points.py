@@ -9,9 +9,8 @@ import pytest
 from control_design import Channel, Controller, Specification, UncertainPlant, certify
 from control_design.analysis.between_grid_points import Obstacle
 from control_design.analysis.worst_case import worst_case
-from control_design.plants.first_order import FirstOrder, Intervals
+from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
 from control_design.plants.plant_set import frequency_response
-from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import stacked
 from ident import Poles
 from ident.uncertainty import ResponsePosterior

@@ -11,7 +11,7 @@ import scipy.linalg
 
 from control_design import Controller
 from control_design.controllers.c_code import c_header, c_source
-from control_design.controllers.feedforward import FrictionFeedforward
+from control_design.controllers.controller import FrictionFeedforward
 from tests.compiler import COMPILER, compiled, needs_compiler
 
 _DT = 0.005

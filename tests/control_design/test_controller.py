@@ -10,7 +10,7 @@ import pytest
 import scipy.io
 
 from control_design import Controller
-from control_design.controllers.feedforward import FrictionFeedforward
+from control_design.controllers.controller import FrictionFeedforward
 
 _DT = 0.01
 

@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given, strategies as st
 
 from control_design import Channel, LoopFunction, RationalWeight, Specification, UncertainPlant
-from control_design.plants.first_order import FirstOrder, Intervals
+from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
 from control_design.plants.plant_set import frequency_response
-from control_design.plants.rational_response import RationalResponse
 from control_design.plants.set_expansion import SetExpansion, own_grid_set, posterior_expansion
 from ident import Poles
 from ident.uncertainty import ResponsePosterior

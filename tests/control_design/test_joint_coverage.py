@@ -9,8 +9,7 @@ from scipy.stats import norm
 
 from control_design import Channel, Controller, Specification, UncertainPlant, certify
 from control_design.analysis.joint_coverage import SampledLoop, joint_coverage
-from control_design.plants.first_order import FirstOrder, Intervals
-from control_design.plants.rational_response import RationalResponse
+from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
 from control_design.plants.set_expansion import stacked
 from validation.example_plants import ResponseRecord, flexible_link, flexible_link_specification
 

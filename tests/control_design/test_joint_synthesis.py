@@ -17,7 +17,8 @@ from control_design import (
 )
 from control_design.analysis.joint_coverage import SampledLoop, unstable_draws
 from control_design.analysis.stability import winds
-from control_design.plants.guards import different_responses, guard_grid
+from control_design.plants.frequency_grid import checked_grid
+from control_design.plants.guards import different_responses
 from control_design.plants.plant_set import frequency_response
 from validation.example_plants import flexible_link, flexible_link_specification
 
@@ -46,7 +47,7 @@ def test_winding_of_random_loops_is_that_of_their_poles():
     seen = set()
     for _ in range(40):
         plant = UncertainPlant("random", random_stable(rng, 4, _DT) * 10 ** rng.uniform(-1.5, 0.5))
-        grid = guard_grid(plant)
+        grid = checked_grid(plant, plant.modes, 1200, 400)
         stable, _ = winds(frequency_response(plant.nominal, grid)[None], integrators=0, unstable_poles=0)
         poles = np.linalg.eigvals(control.feedback(plant.nominal, 1).A)
         assert stable[0] == (np.max(np.abs(poles)) < 1)
@@ -64,7 +65,7 @@ def test_a_guard_is_kept_stable_and_costs_no_weight():
         middle = np.sqrt(low * high)
         low, high = (middle, high) if _radius(free.controller, middle) < 1 else (low, middle)
     gain = 1.2 * high
-    grid = guard_grid(plant)
+    grid = checked_grid(plant, plant.modes, 1200, 400)
     guard = Guard(0, grid, gain * frequency_response(_lag(), grid))
     guarded = synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(1), guards=[guard])
     assert _radius(guarded.controller, gain) < 1

@@ -10,7 +10,7 @@ from control_design import Specification, SynthesisOptions, UncertainPlant
 from control_design.controllers.biquads import Cascade
 from control_design.plants.ellipses import Ellipses, scale_to_minus_one
 from control_design.synthesis.problem import Problem
-from control_design.synthesis.shortfall import DAMPING, DELAYED, NOMINAL, ROBUST, what_destabilises
+from control_design.synthesis.synthesis import DAMPING, DELAYED, NOMINAL, ROBUST, what_destabilises
 
 from .plants import RelativeDisc
 

@@ -9,7 +9,7 @@ import pytest
 
 from control_design import Controller, simulate
 from control_design.analysis.closed_loop import measure_sensitivity
-from control_design.controllers.feedforward import FrictionFeedforward
+from control_design.controllers.controller import FrictionFeedforward
 from ident import GobfModel, IdentOptions, Poles, Record, Structure
 from ident.friction import FrictionFit, FrictionLaw, fit_friction
 from ident.friction.arm import SteppedArm

@@ -20,8 +20,7 @@ from control_design.analysis.closed_loop import (
     sensitivity_of,
     simulate,
 )
-from control_design.controllers.controller import Controller
-from control_design.controllers.feedforward import FrictionFeedforward
+from control_design.controllers.controller import Controller, FrictionFeedforward
 from ident.friction import FrictionFit, FrictionLaw
 from ident.friction.kernel import loop_through
 from workflow.tasks.loop_sensitivity import SMALL, measured_on_arm, sensitivity_plan, settling_samples

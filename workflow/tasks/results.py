@@ -16,8 +16,7 @@ import numpy.typing as npt
 from control_design.analysis.certificate import Certificate
 from control_design.analysis.closed_loop import StepMetrics
 from control_design.analysis.joint_coverage import JointCoverage
-from control_design.controllers.controller import Controller
-from control_design.controllers.feedforward import FrictionFeedforward
+from control_design.controllers.controller import Controller, FrictionFeedforward
 from control_design.convex.reference_filter import ReferenceFilter
 from control_design.convex.youla import YoulaBracket
 from control_design.plants.plant_set import Channel as PlantChannel, UncertainPlant
