@@ -101,7 +101,8 @@ def long_arx_filter(records: Sequence[Record], options: IdentOptions) -> RealArr
         kept = np.concatenate([lags, longest + lags, 2 * longest + np.arange(len(part))])
         theta, *_ = np.linalg.lstsq(triangle[:, kept], triangle[:, -1], rcond=None)
         error = triangle[:, -1] - triangle[:, kept] @ theta
-        criterion = _bic(float(error @ error) / n, n, kept.size)
+        variance = max(float(error @ error) / n, np.finfo(np.float64).tiny)
+        criterion = float(n * np.log(variance) + kept.size * np.log(n))
         if criterion < least:
             best, least = np.concatenate([[1.0], theta[:order]]), criterion
     return best
@@ -155,7 +156,3 @@ def _innovations(found: Identification) -> float:
     n = whitening.size - 1
     errors = [lfilter(whitening, np.ones(1), part)[n:] for part in found.residuals]
     return float(np.mean(np.concatenate(errors) ** 2))
-
-
-def _bic(variance: float, n_samples: int, unknowns: int) -> float:
-    return float(n_samples * np.log(max(variance, np.finfo(np.float64).tiny)) + unknowns * np.log(n_samples))

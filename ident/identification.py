@@ -10,7 +10,7 @@ import numpy as np
 
 from ident.basis.model import GobfModel, MisoModel
 from ident.basis.structure import Structure
-from ident.data.arrays import RealArray, lock, readonly_real
+from ident.data.arrays import RealArray, lock, readonly
 from ident.data.finding import Finding, PriorTest, distinct
 from ident.search.order_selection import OrderStep
 from ident.search.pole_search import SearchTrace
@@ -59,7 +59,7 @@ class FittedRecords:
     advise: Callable[[], Sequence[Finding]] = field(default=tuple)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "residuals", tuple(readonly_real(item) for item in self.residuals))
+        object.__setattr__(self, "residuals", tuple(readonly(item) for item in self.residuals))
         lock(self, "fit_percent", "noise_filter")
         if not len(self.residuals) == len(self.record_names) == self.fit_percent.size:
             raise ValueError("residuals, record_names and fit_percent must have one entry per record")

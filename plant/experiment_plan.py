@@ -12,14 +12,10 @@ from collections.abc import Callable
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from plant.excitation import multisine, multisine_lines
+from plant.excitation import Integer, Real, multisine, multisine_lines
 from plant.rig import one_line
-
-Real = npt.NDArray[np.float64]
-Integer = npt.NDArray[np.int64]
 
 # Periods as multiples of that of the lower band edge: odd, so that the edge is an excited line.
 _MULTIPLES = range(15, 0, -2)

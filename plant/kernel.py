@@ -9,13 +9,10 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-from plant.machine import CUBIC, SINE, STRIBECK
+from plant.machine import CUBIC, SINE, STRIBECK, Integer, Real
 
-Real = npt.NDArray[np.float64]
-Integer = npt.NDArray[np.int64]
 _F = TypeVar("_F", bound=Callable[..., object])
 
 FRICTION, CONTACT = 0, 1  # elements that switch

@@ -18,7 +18,9 @@ from plant.rig import Rig
 
 SINE, CUBIC, STRIBECK, GRAVITY = 0, 1, 2, 3  # smooth forces of `plant.kernel`
 
-Signal = TypeVar("Signal", float, npt.NDArray[np.float64])
+Real = npt.NDArray[np.float64]
+Integer = npt.NDArray[np.int64]
+Signal = TypeVar("Signal", float, Real)
 
 
 @dataclass(frozen=True)

@@ -18,16 +18,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from plant.beam import BeamModes, clamped_free_modes
-from plant.machine import Machine
+from plant.machine import Machine, Real
 from plant.rig import Rig
 
 if TYPE_CHECKING:
     import control
-
-Real = npt.NDArray[np.float64]
 
 INPUT_NAMES = ("voltage_V", "hub_torque_Nm", "tip_force_N")
 OUTPUT_NAMES = ("hub_angle_rad", "tip_m")

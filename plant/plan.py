@@ -17,15 +17,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import eigh, expm
 
 from plant.kernel import CONTACT, FRICTION, run
-from plant.machine import GRAVITY, SINE, STRIBECK, Machine
+from plant.machine import GRAVITY, SINE, STRIBECK, Integer, Machine, Real
 from plant.modal import MOTOR_SIDE_SHARE, Equations, default_n_modes, equations_of_motion, static_moment_kg_m
-
-Real = npt.NDArray[np.float64]
-Integer = npt.NDArray[np.int64]
 
 # Basic step where something switches: 8 a sample at 5 ms. Twice that where forces are smooth.
 SUBSTEP_S = 6.25e-4

@@ -11,12 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from plant.effects import Effect, make_machine
-from plant.machine import Machine, SensorPath
+from plant.machine import Machine, Real, SensorPath
 from plant.modal import OUTPUT_NAMES
 from plant.plan import SUBSTEP_S, make_plan
 from plant.rig import Rig
 
-Real = npt.NDArray[np.float64]
 F = TypeVar("F", float, Real)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from control_design.plants.ellipses import Complex, Real
 
 if TYPE_CHECKING:
-    import control
+    pass
 
 SectionKind = Literal["integrator", "first_order", "second_order", "notch"]
 _NUMERATORS: dict[SectionKind, int] = {"integrator": 2, "first_order": 2, "second_order": 3, "notch": 1}
@@ -122,12 +122,6 @@ class Cascade:
             c = np.hstack([dj @ c, cj])
             d = dj @ d
         return a, b, c, d
-
-    def to_control(self, x: Sequence[float] | Real) -> control.StateSpace:
-        """The cascade as `control.StateSpace`."""
-        import control  # here, because it brings a plotting library with it
-
-        return control.ss(*self.state_space(x), self.dt_s)
 
 
 def tustin_frequency(omega_rad_s: Real, dt_s: float) -> Real:

@@ -96,24 +96,24 @@ def smallest_ratio(
     step = _Scaled(basis, rows)
     if start is not None and not np.min(rows.denominator(plane(basis @ start))) > 0:
         start = None
-    z = step.least_squares() if start is None else step.coordinates(start)
+    z = step.least_squares() if start is None else step.back @ start
     if start is None:
         for _ in range(30):
-            if np.min(rows.denominator(step.y(z))) > 0.05:
+            if np.min(rows.denominator(step.planar @ z)) > 0.05:
                 break
             z = 0.7 * z
     if not np.isfinite(step.ratio(z)):
         z = step.lower(z, 0.0, np.ones(rows.at.size), stop_below=-1e-3, feasibility=True)
     gamma = step.ratio(z)
     for _ in range(most_rounds if np.isfinite(gamma) else 0):
-        new = step.lower(z, gamma, rows.denominator(step.y(z)))
+        new = step.lower(z, gamma, rows.denominator(step.planar @ z))
         reached = step.ratio(new)
         if not reached < gamma:
             break
         gain, z, gamma = gamma - reached, new, reached
         if gain < _GAP * gamma or step.constant:
             break
-    return MinimaxPoint(step.original(z), gamma)
+    return MinimaxPoint(step.map @ z, gamma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +164,10 @@ def exchanged(
 
 
 class _Scaled:
-    """The rows in coordinates z of the basis that are orthonormal as seen by the rows."""
+    """The rows in coordinates z of the basis that are orthonormal as seen by the rows.
+
+    x = map z, z = back x, y = planar z.
+    """
 
     def __init__(self, basis: Complex, rows: PlaneRows) -> None:
         self.rows = rows
@@ -174,10 +177,10 @@ class _Scaled:
         )
         _, sizes, directions = np.linalg.svd(np.linalg.qr(seen, mode="r"))
         keep = sizes > _KEPT * sizes[0]
-        self._map = directions[keep].T / sizes[keep] * np.sqrt(rows.at.size)
-        self._back = (directions[keep] * sizes[keep][:, None]) / np.sqrt(rows.at.size)
-        self._planar = planar @ self._map  # (F, 2, m)
-        by_row = self._planar[rows.at]  # (R, 2, m)
+        self.map = directions[keep].T / sizes[keep] * np.sqrt(rows.at.size)
+        self.back = (directions[keep] * sizes[keep][:, None]) / np.sqrt(rows.at.size)
+        self.planar = planar @ self.map  # (F, 2, m)
+        by_row = self.planar[rows.at]  # (R, 2, m)
         self._numerators = np.matmul(rows.A, by_row)
         self._reaches = np.matmul(rows.C, by_row)
         self._levels = np.einsum("rj,rjm->rm", rows.E, by_row)
@@ -185,21 +188,12 @@ class _Scaled:
         self._reach_rounding = _ROUND_REACH
         self._fixed_reach = np.hypot(rows.c[:, 0], rows.c[:, 1])
 
-    def coordinates(self, x: Real) -> Real:
-        return np.asarray(self._back @ x)
-
-    def original(self, z: Real) -> Real:
-        return np.asarray(self._map @ z)
-
-    def y(self, z: Real) -> Real:
-        return np.asarray(self._planar @ z)
-
     def least_squares(self) -> Real:
         seen = self._numerators.reshape(-1, self._numerators.shape[2])
         return np.asarray(np.linalg.lstsq(seen, -self.rows.a.reshape(-1), rcond=None)[0])
 
     def ratio(self, z: Real) -> float:
-        return float(np.max(self.rows.ratio(self.y(z))))
+        return float(np.max(self.rows.ratio(self.planar @ z)))
 
     def lower(
         self, z: Real, gamma: float, scale: Real, *, stop_below: float = -np.inf, feasibility: bool = False

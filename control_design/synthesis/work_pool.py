@@ -151,7 +151,7 @@ class WorkPool:
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(jobs, context, initializer=_begin, initargs=parts)
         with interrupts_wait():
-            pool.submit(_ready)  # the first task starts all processes
+            pool.submit(int)  # the first task starts all processes
         self._pool = pool
 
     def do(self, tasks: Sequence[StartTask]) -> Iterator[Candidate]:
@@ -197,10 +197,6 @@ def _begin(
 
     threading.Thread(target=end_with_parent, daemon=True).start()
     _own = Workshop(Problem(plants, specification, options, guards))
-
-
-def _ready() -> None:
-    """Nothing: a task that starts the processes."""
 
 
 def _do(task: StartTask) -> Candidate:

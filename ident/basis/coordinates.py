@@ -63,17 +63,15 @@ class SearchSpace:
         pairs = [f"{name} {i + 1}" for i in range(self.n_pairs) for name in pair]
         return (*(f"{real} {i + 1}" for i in range(self.n_real)), *pairs)
 
-    def kernel_arguments(self, units: RealArray) -> tuple[RealArray, int, RealArray, RealArray]:
-        """Points and box as compiled code takes them (`ident.data.arrays.kernel_array`)."""
-        return kernel_array(units), self.n_real, self.low.copy(), self.high.copy()
-
     def _at(self, units: RealArray) -> RealArray:
         """Coordinates of one point (D,), or of as many as there are columns (D, E)."""
         return np.asarray(_coordinates_of_point(units, self.n_real, self.low, self.high))
 
     def blocks(self, unit: RealArray) -> RealArray:
         """Cascade blocks (R + P, 4) of a point of the unit cube."""
-        return np.asarray(blocks_of_point(*self.kernel_arguments(unit), self.raw))
+        return np.asarray(
+            blocks_of_point(kernel_array(unit), self.n_real, self.low.copy(), self.high.copy(), self.raw)
+        )
 
     def poles(self, unit: RealArray) -> Poles:
         """Poles of a point of the unit cube; a pair of the raw box that is not complex is put at zeta =

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ident.data.arrays import ComplexArray, RealArray, readonly_complex, readonly_real
+from ident.data.arrays import ComplexArray, RealArray, lock
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +29,8 @@ class Poles:
     pairs: ComplexArray = field(default_factory=lambda: np.zeros(0, dtype=np.complex128))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "real", readonly_real(self.real))
-        object.__setattr__(self, "pairs", readonly_complex(self.pairs))
+        lock(self, "real")
+        lock(self, "pairs", dtype=np.complex128)
         if self.real.ndim != 1 or self.pairs.ndim != 1:
             raise ValueError(f"poles must be 1-d arrays; got shapes {self.real.shape} and {self.pairs.shape}")
         # Number by number: a search makes tens of these, for a few poles each.

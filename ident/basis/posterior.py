@@ -144,8 +144,8 @@ class ResponsePosterior:
         """Per-frequency level whose ellipses hold the whole response on omega (F,) with probability `level`.
 
         The (level)-quantile of the largest normalised distance over the grid, from n_draws sampled responses,
-        as a per-frequency level; the sampling error of the joint probability is sqrt(level (1 - level) /
-        n_draws).
+        as a per-frequency level for `at` (squared radius 12 to 13 where that of one alone is 5.99); the sampling
+        error of the joint probability is sqrt(level (1 - level) / n_draws).
         """
         median = self.at(omega_rad_s, level=0.5)
         axes, rows = median.ellipse(), self.frequency_rows(omega_rad_s).T
@@ -159,12 +159,3 @@ class ResponsePosterior:
         # Ellipses at level 1/2 have squared radius 2 ln 2; a distance d on them is level 1 - 2^(-d^2).
         worst = float(np.quantile(largest, level))
         return float(min(-np.expm1(-(worst**2) * np.log(2)), 1 - 1e-15))
-
-    def simultaneous(
-        self, omega_rad_s: npt.ArrayLike, level: float, rng: np.random.Generator, n_draws: int = 2000
-    ) -> FrequencyUncertainty:
-        """Ellipses that hold the whole response on omega (F,) at once with probability `level`.
-
-        Those of `at` at the `joint_level`: their squared radius is 12 to 13 where that of one alone is 5.99.
-        """
-        return self.at(omega_rad_s, self.joint_level(omega_rad_s, level, rng, n_draws))

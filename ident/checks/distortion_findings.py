@@ -104,10 +104,14 @@ def _verdict(levels: Distortion, all_levels: Sequence[Distortion], unit: str) ->
     told: list[Finding] = []
     about: dict[str, Value] = {"rms": levels.rms, "unit": unit}
     if levels.realisations < 2:
-        told.append(finding(FindingKind.ONE_REALISATION, **about, lines=_n_detection(levels)))
+        detection = [lines.omega_rad_s.size for lines in (levels.odd, levels.even) if lines is not None]
+        told.append(finding(FindingKind.ONE_REALISATION, **about, lines=sum(detection)))
     if levels.noise_std is None:
         told.append(finding(FindingKind.ONE_PERIOD, **about))
-    bands = [band for band in _bands(levels) if band is not None]
+    # Distortion in every band: between realisations, or at the odd detection lines where there is one.
+    lines = levels.excited or levels.odd
+    found = [] if lines is None else [lines.within(*band) for band in levels.bands_rad_s]
+    bands = [band for band in found if band is not None]
     usable = [band for band in bands if band.significant or band.interval[1] <= _HIDDEN]
     if not bands or levels.noise_std is None:
         return told
@@ -122,16 +126,6 @@ def _verdict(levels: Distortion, all_levels: Sequence[Distortion], unit: str) ->
     percent = 100 * max(band.distortion for band in distorted)
     kind, trend = _kind(levels, distorted), _trend(levels, all_levels, distorted)
     return [*told, finding(FindingKind.DISTORTED, **about, percent=percent, parity=kind, trend=trend, **ends)]
-
-
-def _n_detection(levels: Distortion) -> int:
-    return sum(lines.omega_rad_s.size for lines in (levels.odd, levels.even) if lines is not None)
-
-
-def _bands(levels: Distortion) -> list[BandLevel | None]:
-    """Distortion in every band: between realisations, or at the odd detection lines where there is one."""
-    lines = levels.excited or levels.odd
-    return [] if lines is None else [lines.within(*band) for band in levels.bands_rad_s]
 
 
 def _kind(levels: Distortion, distorted: Sequence[BandLevel]) -> str:

@@ -100,10 +100,11 @@ def advice(
 
     `fixed` are the poles that were given (they come first among the model's).
     """
+    limit = excitation_limit_rad_s(records, model, residuals)
     return [
         *few_samples(data, model.order),
         *_unknown_rates(data, model, fixed),
-        *_weak_input(records, data, model, residuals),
+        *([finding(FindingKind.WEAK_INPUT, limit_rad_s=limit)] if limit < 0.6 * np.pi / data.dt_s else []),
         *clipped(records),
         *_drifting(records, data, model, residuals, fixed),
         *_far_from_zero(records, data),
@@ -163,15 +164,6 @@ def _is_known(residual: RealArray, data: Regression, omega_rad_s: float, deviati
     omega = np.linspace(0, np.pi / data.dt_s, density.size)
     there = float(np.interp(omega_rad_s, omega, _smooth(density, 3)))
     return bool(deviation * np.sqrt(there / max(float(density.mean()), 1e-300)) <= allowed)
-
-
-def _weak_input(
-    records: Sequence[Record], data: Regression, model: GobfModel, residuals: Sequence[RealArray]
-) -> list[Finding]:
-    limit = excitation_limit_rad_s(records, model, residuals)
-    if limit >= 0.6 * np.pi / data.dt_s:
-        return []
-    return [finding(FindingKind.WEAK_INPUT, limit_rad_s=limit)]
 
 
 def clipped(records: Sequence[Record]) -> list[Finding]:

@@ -64,7 +64,7 @@ def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = 25, level: 
     degrees of freedom. Records of at most 2 max_lag samples say next to nothing about such lags and are left
     out. Raises ValueError when none is longer, or the residuals are zero.
     """
-    centred = _centred(_long_enough(residuals, max_lag), max_lag)
+    centred = _centred(residuals, max_lag)
     n = sum(e.size for e in centred)
     correlation = _pooled_correlation(centred, centred, max_lag)[max_lag + 1 :]
     lags = np.arange(1, max_lag + 1)
@@ -89,8 +89,8 @@ def independence_test(
         u.size != e.size for u, e in zip(inputs, residuals, strict=False)
     ):
         raise ValueError("need one input of equal length for every residual")
-    e = _centred(_long_enough(residuals, max_lag), max_lag)
-    u = _centred(_long_enough(inputs, max_lag), max_lag)
+    e = _centred(residuals, max_lag)
+    u = _centred(inputs, max_lag)
     n = sum(part.size for part in e)
     correlation = _pooled_correlation(e, u, max_lag)
     longest = min(part.size for part in e) // 2
@@ -129,12 +129,9 @@ def residual_advice(
     return found
 
 
-def _long_enough(signals: Sequence[RealArray], max_lag: int) -> list[RealArray]:
-    """The signals longer than 2 max_lag, or all of them where none is (`_centred` then refuses them)."""
-    return [signal for signal in signals if signal.size > 2 * max_lag] or list(signals)
-
-
 def _centred(signals: Sequence[RealArray], max_lag: int) -> list[RealArray]:
+    """The signals longer than 2 max_lag without their means; ValueError where none is."""
+    signals = [signal for signal in signals if signal.size > 2 * max_lag] or signals
     if not signals:
         raise ValueError("need at least one record")
     if not max_lag >= 1:

@@ -39,20 +39,11 @@ def factor_matrices(factor: ComplexArray) -> RealArray:
 def lock(record: object, *names: str, dtype: npt.DTypeLike = np.float64) -> None:
     """Replace these fields of a frozen record by copies that cannot be written to."""
     for name in names:
-        array = np.array(getattr(record, name), dtype=dtype)
-        array.setflags(write=False)
-        object.__setattr__(record, name, array)
+        object.__setattr__(record, name, readonly(getattr(record, name), dtype))
 
 
-def readonly_real(values: Any) -> RealArray:
-    """A float64 copy that cannot be written to."""
-    array = np.array(values, dtype=np.float64)
-    array.setflags(write=False)
-    return array
-
-
-def readonly_complex(values: Any) -> ComplexArray:
-    """A complex128 copy that cannot be written to."""
-    array = np.array(values, dtype=np.complex128)
+def readonly(values: Any, dtype: npt.DTypeLike = np.float64) -> Any:
+    """A copy that cannot be written to."""
+    array = np.array(values, dtype=dtype)
     array.setflags(write=False)
     return array

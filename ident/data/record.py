@@ -9,7 +9,7 @@ from typing import Self, TypeVar
 
 import numpy as np
 
-from ident.data.arrays import RealArray, readonly_real
+from ident.data.arrays import RealArray, readonly
 from ident.data.finding import Finding
 from ident.data.record_files import read_table
 from ident.data.table import Table
@@ -77,7 +77,7 @@ class Record:
                 )
 
     def _check(self, key: str, names: tuple[str, ...]) -> None:
-        signal = readonly_real(getattr(self, key))
+        signal = readonly(getattr(self, key))
         object.__setattr__(self, key, signal)
         if signal.ndim != 2 or signal.shape[1] != len(names) or not names:
             raise ValueError(

@@ -107,7 +107,7 @@ def _linear_rows(
     """Columns (T, P) of the posterior's coefficients and the output (T,), whitened, without the nuisance."""
     assert posterior.report is not None
     rows = tangent_rows([record], model, options.model_copy(update={"fir_length": posterior.fir_length}))
-    (block,) = rows.with_whitening(np.array([1.0, *posterior.report.ar_coefficients])).blocks()
+    (block,) = replace(rows, whitening=np.array([1.0, *posterior.report.ar_coefficients])).blocks()
     both = np.column_stack([block.regressors, block.kernel[:], block.output])
     nuisance = nuisance_basis(block.nuisance)
     both = both - nuisance @ (nuisance.T @ both)

@@ -156,7 +156,7 @@ def _embed(
         for _ in range(_NOISE_ROUNDS):
             residuals, absorbed = gls_residuals(solved.rows, solved.reduced, solved.kernel)
             whitening = fit_autoregression(residuals, options.max_ar_order, solved.rows.whitening, absorbed)
-            behind = solved.rows.with_whitening(whitening)
+            behind = replace(solved.rows, whitening=whitening)
             solved = solve(replace(behind, known_std=_noise_std(behind)) if n_known else behind, options)
     poles = solved.rows.poles
     reduced, kernel, missed = solved.reduced, solved.kernel, solved.missed
@@ -306,7 +306,9 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
         missed = pair_mixture(candidates, statistics, reduced.degrees_of_freedom, log_rest, odds)
         if missed.visible is None or n_added == _MOST_ADDED:
             return _Solved(rows, reduced, kernel, missed)
-        rows = rows.with_pair(refined_pair(rows.pair_blocks, reduced, missed.visible))
+        # Twice: the pair's first-order movement is in the regressors too.
+        pair = refined_pair(rows.pair_blocks, reduced, missed.visible)
+        rows = replace(rows, poles=rows.poles.appended(Poles(pairs=np.array([pair, pair]))))
         n_added += 1
 
 

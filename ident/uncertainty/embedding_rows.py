@@ -80,15 +80,6 @@ class EmbeddingRows:
         """Columns beside the basis functions."""
         return self.beside[0].columns.shape[1] if self.beside else 0
 
-    def with_whitening(self, whitening: RealArray) -> EmbeddingRows:
-        """The same with another noise filter."""
-        return replace(self, whitening=whitening)
-
-    def with_pair(self, pair: complex) -> EmbeddingRows:
-        """The same with one more pair, twice: its first-order movement is in the regressors too."""
-        poles = Poles(self.poles.real, np.concatenate([self.poles.pairs, [pair, pair]]))
-        return replace(self, poles=poles)
-
     def __iter__(self) -> Iterator[Rows]:
         for k, record in enumerate(self.records):
             yield self._rows(record, self.beside[k] if self.beside else None)
@@ -162,7 +153,7 @@ def gls_residuals(
     scale = np.linalg.norm(reduced.r11, axis=0)
     residuals, absorbed = [], []
     drops = rows.whitening.size > 1 and not np.any(first_rows(rows.whitening))
-    for block in rows.with_whitening(np.ones(1)).blocks():
+    for block in replace(rows, whitening=np.ones(1)).blocks():
         rest = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
         shared = block.regressors[:, reduced.kept] / scale
         local = np.zeros((rest.size, 0))

@@ -26,7 +26,7 @@ from scipy.linalg import solve_triangular
 
 from ident.basis.functions import basis_response, block_parameters
 from ident.basis.poles import Poles
-from ident.data.arrays import ComplexArray, RealArray, kernel_array, readonly_complex, readonly_real
+from ident.data.arrays import ComplexArray, RealArray, kernel_array, readonly
 from ident.uncertainty.embedding_algebra import (
     KernelPosterior,
     ReducedRegression,
@@ -132,7 +132,7 @@ def candidate_pairs(n_samples: int) -> CandidatePairs:
             omega *= 1 + _SPACING * damping
         poles += group
         prior += [1 / len(group)] * len(group)
-    return CandidatePairs(readonly_complex(poles), readonly_real(np.array(prior) / np.sum(prior)))
+    return CandidatePairs(readonly(poles, np.complex128), readonly(np.array(prior) / np.sum(prior)))
 
 
 def pair_statistics(

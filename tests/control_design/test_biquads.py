@@ -35,7 +35,7 @@ def test_cascade_is_the_bilinear_transform_of_its_sections(sections):
         expected = expected * np.polyval(b, z) / np.polyval(a, z)
     omega = np.angle(z) / dt
     np.testing.assert_allclose(cascade.response(x, omega), expected, rtol=1e-8)
-    system = cascade.to_control(x)
+    system = control.ss(*cascade.state_space(x), cascade.dt_s)
     assert system.nstates == cascade.order
     np.testing.assert_allclose(control.evalfr(system, z[1]), expected[1], rtol=1e-8)
     radius = np.abs(system.poles())

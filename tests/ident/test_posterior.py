@@ -85,8 +85,7 @@ def test_joint_level_holds_whole_responses_together():
     p = posterior(5, integrators=0)
     level = p.joint_level(OMEGA, 0.9, np.random.default_rng(6), n_draws=4000)
     assert level > 0.9
-    ellipses = p.simultaneous(OMEGA, 0.9, np.random.default_rng(6), n_draws=4000)
-    assert ellipses.level == level
+    ellipses = p.at(OMEGA, level)
     fresh = p.response_of(p.sample(np.random.default_rng(7), 2000), OMEGA)
     inside = np.mean([np.all(ellipses.contains(response)) for response in fresh])
     # Binomial error of 2000 trials and of the 4000 draws behind the level: 0.008 together; 4 of those.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.signal import lfilter
 
-from ident.data.arrays import ComplexArray, RealArray, readonly_real
+from ident.data.arrays import ComplexArray, RealArray, readonly
 from ident.data.record import Record
 
 
@@ -30,7 +30,7 @@ class PolynomialModel:
 
     def __post_init__(self) -> None:
         for key in ("a", "b", "c", "f"):
-            object.__setattr__(self, key, readonly_real(getattr(self, key)))
+            object.__setattr__(self, key, readonly(getattr(self, key)))
 
     def of(self, record: Record, delay_samples: int) -> PolynomialModel:
         """The polynomials found between a record's delayed input and its output, as a model of the record."""
