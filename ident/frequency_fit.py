@@ -151,6 +151,13 @@ def identify_frf(
         input_delay_samples=options.input_delay_samples,
     )
     posterior = embed_response(data, model, fixed, embedding, shared_gain_std=shared_gain_std)
+    explained = finding(
+        FindingKind.CHI_SQUARE,
+        chi_square=fit.rss,
+        degrees_of_freedom=freedom,
+        expected_low=chi2.ppf(1 - _LEVEL, freedom),
+        expected_high=chi2.ppf(_LEVEL, freedom),
+    )
     band_rad_s = float(response.omega_rad_s[0]), float(response.omega_rad_s[-1])
     return FrfIdentification(
         model=model,
@@ -164,7 +171,7 @@ def identify_frf(
         omega_std_rad_s=omega,
         zeta_std=zeta,
         order_table=selection.table(best),
-        verdicts=(_chi_square(fit.rss, freedom),),
+        verdicts=(explained,),
         search=SearchTrace(
             tuple(search.stages),
             tuple(search.minima),
@@ -176,17 +183,6 @@ def identify_frf(
             ),
             search.evaluations,
         ),
-    )
-
-
-def _chi_square(rss: float, freedom: int) -> Finding:
-    low, high = chi2.ppf(1 - _LEVEL, freedom), chi2.ppf(_LEVEL, freedom)
-    return finding(
-        FindingKind.CHI_SQUARE,
-        chi_square=rss,
-        degrees_of_freedom=freedom,
-        expected_low=low,
-        expected_high=high,
     )
 
 

@@ -19,14 +19,16 @@ from ident.basis.model import GobfModel, MisoModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.checks.input_checks import advice, few_samples, least_independence, refuse_unusable
-from ident.checks.nuisance_tests import NuisanceTest, clearly_left_out, nuisance_test
 from ident.checks.plausible_modes import implausible_pairs, pole_warnings
 from ident.checks.prior_tests import (
+    NuisanceTest,
     best_under_relative_degree,
+    clearly_left_out,
     delay_test,
     direct_term_test,
     fixed_poles_test,
     integrators_test,
+    nuisance_test,
     relative_degree_test,
     too_few_poles,
 )

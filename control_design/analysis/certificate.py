@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -161,10 +162,7 @@ def _check_plant(
     light = [Mode(m.omega_rad_s, max(abs(m.zeta), 1e-5)) for m in near if abs(m.zeta) < 0.4]
     grid = with_own_grid(plant, checked_grid(plant, light, n_dense, 120))
 
-    def response(omega: Real) -> Complex:
-        return controller.response(omega, with_delay=False)
-
-    worst = worst_case(response, plant, specification, grid)
+    worst = worst_case(partial(controller.response, with_delay=False), plant, specification, grid)
     refinable = plant.own_grid is None
 
     def loop_gain(omega: Real) -> Complex:

@@ -10,14 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from control_design.plants.ellipses import Complex, Real
-
-if TYPE_CHECKING:
-    pass
 
 SectionKind = Literal["integrator", "first_order", "second_order", "notch"]
 _NUMERATORS: dict[SectionKind, int] = {"integrator": 2, "first_order": 2, "second_order": 3, "notch": 1}

@@ -79,19 +79,17 @@ class Ellipses:
             raise ValueError("ellipse semi-axes need semi_major >= semi_minor >= 0")
 
     @classmethod
-    def from_covariance(
-        cls, omega_rad_s: Real, centre: Complex, covariance: Real, level: float, *, what: str = "uncertainty"
-    ) -> Ellipses:
+    def from_covariance(cls, omega_rad_s: Real, centre: Complex, covariance: Real, level: float) -> Ellipses:
         """Ellipse e^T P^-1 e <= chi2_2(level) of covariance P (F, 2, 2); the quantile is -2 ln(1 - level).
 
         Raises ValueError if level is outside (0, 1) or a covariance is not symmetric positive semi-definite
         (names the frequency).
         """
         if not 0 < level < 1:
-            raise ValueError(f"{what}: level must lie in (0, 1); got {level}")
+            raise ValueError(f"uncertainty: level must lie in (0, 1); got {level}")
         covariance = np.asarray(covariance, dtype=np.float64)
         if covariance.shape != (np.size(omega_rad_s), 2, 2):
-            raise ValueError(f"{what}: covariance must be (F, 2, 2); got {covariance.shape}")
+            raise ValueError(f"uncertainty: covariance must be (F, 2, 2); got {covariance.shape}")
         a, b, d = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
         trace = a + d
         large = trace / 2 + np.hypot((a - d) / 2, b)
@@ -108,7 +106,7 @@ class Ellipses:
         if not np.all(good):
             worst = float(np.asarray(omega_rad_s)[np.argmin(good)])
             raise ValueError(
-                f"{what}: covariance at {worst:.4g} rad/s is not symmetric positive semi-definite"
+                f"uncertainty: covariance at {worst:.4g} rad/s is not symmetric positive semi-definite"
             )
         quantile, angle = chi2_radius(level) ** 2, 0.5 * np.arctan2(2 * b, a - d)
         semi_major = np.sqrt(quantile * large)
@@ -163,17 +161,20 @@ def secular_root(x: Real, y: Real, a: Real, b: Real) -> Real:
     return np.asarray(t, dtype=np.float64)
 
 
+def _to_scale(point: Complex, a: Real, b: Real) -> tuple[Real, Real, Real, Real, Real]:
+    """Coordinates of the point (absolute) and semi-axes in units of the largest of them, and that unit."""
+    x, y = np.abs(np.real(point)), np.abs(np.imag(point))
+    scale = np.maximum(np.maximum(x, y), np.maximum(a, 1e-300))
+    return x / scale, y / scale, a / scale, b / scale, scale
+
+
 def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real:
     """Distance from `point` to the filled axis-parallel ellipse at the origin; 0 inside. All (F,).
 
     The nearest point is (a^2 x/(a^2 + t), b^2 y/(b^2 + t)), t the `secular_root` (first-order condition; t is
     the multiplier). Degenerate axes (segments, points) are the limit b -> 0.
     """
-    x, y = np.abs(np.real(point)), np.abs(np.imag(point))
-    a = np.asarray(semi_major, dtype=np.float64)
-    b = np.asarray(semi_minor, dtype=np.float64)
-    scale = np.maximum(np.maximum(x, y), np.maximum(a, 1e-300))
-    x, y, a, b = x / scale, y / scale, a / scale, b / scale
+    x, y, a, b, scale = _to_scale(point, semi_major, semi_minor)
     t = secular_root(x, y, a, b)
     da, db = a * a + t, b * b + t
     # t = 0 on a degenerate axis: the point projects onto the segment itself.
@@ -192,11 +193,7 @@ def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Rea
     lies between max(a x, b y - a^2 + b^2) (one term alone) and a x + b y (the sum of the terms), where
     bisection finds it.
     """
-    x, y = np.abs(np.real(point)), np.abs(np.imag(point))
-    a = np.asarray(semi_major, dtype=np.float64)
-    b = np.asarray(semi_minor, dtype=np.float64)
-    scale = np.maximum(np.maximum(x, y), np.maximum(a, 1e-300))
-    x, y, a, b = x / scale, y / scale, a / scale, b / scale
+    x, y, a, b, scale = _to_scale(point, semi_major, semi_minor)
     ax, by = a * x, b * y
     gap = a * a - b * b
     # Unknown n = m - a^2 >= 0. Bisection on log-free bounds: lower = larger single-term root, upper = sum of

@@ -106,19 +106,11 @@ class Channel:
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         if self.uncertainty is None:
             return Ellipses.of_no_size(omega, self.nominal_response(omega))
-        if hasattr(self.uncertainty, "at"):
-            record: Any = self.uncertainty.at(omega, self.level)
-            return Ellipses.from_covariance(
-                omega,
-                np.asarray(record.centre),
-                np.asarray(record.covariance),
-                self.level,
-                what="uncertainty",
-            )
-        return self._from_own_grid(omega)
-
-    def _from_own_grid(self, omega: Real) -> Ellipses:
         record: Any = self.uncertainty
+        if hasattr(record, "at"):
+            record = record.at(omega, self.level)
+            centre, covariance = np.asarray(record.centre), np.asarray(record.covariance)
+            return Ellipses.from_covariance(omega, centre, covariance, self.level)
         own = np.asarray(record.omega_rad_s, dtype=np.float64)
         outside = (omega < own[0] * (1 - 1e-9)) | (omega > own[-1] * (1 + 1e-9))
         index = np.clip(np.searchsorted(own, omega), 0, own.size - 1)
@@ -135,7 +127,7 @@ class Channel:
         if np.any(outside):
             centre = np.where(outside, self.nominal_response(omega), centre)
             covariance = np.where(outside[:, None, None], 0.0, covariance)
-        return Ellipses.from_covariance(omega, centre, covariance, float(record.level), what="uncertainty")
+        return Ellipses.from_covariance(omega, centre, covariance, float(record.level))
 
 
 def frequency_response(system: control.StateSpace, omega_rad_s: Real) -> Complex:

@@ -18,6 +18,7 @@ import numpy as np
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
 from control_design.plants.plant_set import Channel
+from ident.basis.functions import block_parameters
 from ident.data.ellipses import chi2_radius
 from ident.uncertainty import ResponsePosterior
 
@@ -121,16 +122,13 @@ def _columns(posterior: ResponsePosterior, intervals: Intervals) -> tuple[Comple
     integrators and delay."""
     columns: list[FirstOrder] = []
     all_pass = intervals.constant(1.0)
-    for a in posterior.poles.real:
+    parameters = block_parameters(posterior.poles).tolist()
+    for a, (_, gain, _, _) in zip(posterior.poles.real, parameters, strict=False):
         driven = all_pass.times(intervals.pole(complex(a - 1.0)))
-        columns.append(driven.scaled(float(np.sqrt((1 - a) * (1 + a)))))
+        columns.append(driven.scaled(gain))
         all_pass = driven.times(_reflected_zero(complex(a), intervals))
-    for p in posterior.poles.pairs:
-        gamma = abs(p) ** 2
-        beta = 2 * p.real / (1 + gamma)
-        one_minus_gamma = (1 - abs(p.real)) * (1 + abs(p.real)) - p.imag**2
-        gain = float(np.sqrt(one_minus_gamma * (1 + gamma)))
-        other = float(np.sqrt(one_minus_gamma**2 + 4 * p.imag**2) / (1 + gamma))
+    pairs = parameters[posterior.poles.real.size :]
+    for p, (_, beta, gain, other) in zip(posterior.poles.pairs, pairs, strict=True):
         driven = all_pass.times(intervals.pole(p - 1.0))
         driven = driven.times(intervals.pole(p.conjugate() - 1.0))
         columns.append(driven.times(intervals.zero(complex(beta - 1.0))).scaled(gain))

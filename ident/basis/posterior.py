@@ -144,8 +144,8 @@ class ResponsePosterior:
         """Per-frequency level whose ellipses hold the whole response on omega (F,) with probability `level`.
 
         The (level)-quantile of the largest normalised distance over the grid, from n_draws sampled responses,
-        as a per-frequency level for `at` (squared radius 12 to 13 where that of one alone is 5.99); the sampling
-        error of the joint probability is sqrt(level (1 - level) / n_draws).
+        as a per-frequency level for `at` (squared radius 12 to 13 where that of one alone is 5.99); the
+        sampling error of the joint probability is sqrt(level (1 - level) / n_draws).
         """
         median = self.at(omega_rad_s, level=0.5)
         axes, rows = median.ellipse(), self.frequency_rows(omega_rad_s).T

@@ -1,4 +1,5 @@
-"""Tests of what the user says is known: integrators, fixed poles, input delay, relative degree (design 4.3).
+"""Tests of what the user says is known: integrators, fixed poles, input delay, relative degree (design 4.3);
+and whether the data ask for a nuisance: an unknown initial state, an offset.
 
 Each is a generalised likelihood ratio Ne ln(J with the prior / J without) against a chi-square quantile, Ne
 being the number of independent samples the residual is worth (`effective_samples`). A pole at z = 1 lies on
@@ -8,23 +9,29 @@ often than in 1 % of all records.
 A refused prior is kept all the same: who gives it may know the machine better than one record does, and a
 model whose structure was changed in silence is the worse surprise. The finding says so. What
 was left to the data (`relative_degree = "auto"`) is imposed only as far as the data agree.
+
+Of a nuisance, J with it takes a descent of the poles. Where the statistic is far from its limit the first
+step of that descent says enough (Rao's score test, which is the likelihood ratio to second order):
+J - g^T H^-1 g on the linearisation with the nuisance columns, at the poles found without them. Ne keeps slow
+disturbances from passing for initial states.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri
 from scipy.stats import chi2
 
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray
-from ident.data.finding import TEST_LEVEL, FindingKind, PriorTest, Value
+from ident.data.finding import TEST_LEVEL, Finding, FindingKind, PriorTest, Value, finding
 from ident.data.record import Record
 from ident.fit.least_squares import Regression
-from ident.fit.refinement import Refined
+from ident.fit.refinement import Refined, free_optimality
 from ident.fit.regression import prepare
 from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
 from ident.search.order_selection import OrderSelection
@@ -40,6 +47,10 @@ _SLOW_STARTS = {
 }
 # Two freed integrators may also have become a slow oscillation: turns over the whole record.
 _SLOW_TURNS = (0.3, 1.0, 3.0)
+# A nuisance left to the data stays if dropping it would be this improbable for records that do not need it.
+NUISANCE_LEVEL = 0.99
+# A score below this part of the limit, every sample counted as independent, leaves the descent out.
+_CLEARLY_BELOW = 0.6
 
 
 def statistic(rss_with_prior: float, without: Fitted) -> float:
@@ -303,3 +314,58 @@ def _other_pole_to_spare(given: Fitted, price: float) -> bool:
         statistic(given.search.descend(start, "one less").rss, given) <= limit_here
         for start, limit_here in fewer
     )
+
+
+@dataclass(frozen=True)
+class NuisanceTest:
+    """Verdict of the data on one nuisance of so many columns."""
+
+    name: str
+    columns: int
+    statistic: float
+
+    @property
+    def limit(self) -> float:
+        return float(chdtri(self.columns, 1 - NUISANCE_LEVEL))
+
+    @property
+    def needed(self) -> bool:
+        return self.statistic > self.limit
+
+    @property
+    def finding(self) -> Finding:
+        return finding(
+            FindingKind.NUISANCE,
+            name=self.name,
+            needed=self.needed,
+            columns=self.columns,
+            statistic=self.statistic,
+            limit=self.limit,
+            level=NUISANCE_LEVEL,
+        )
+
+
+def nuisance_test(name: str, without: Fitted, with_it: Fitted) -> NuisanceTest:
+    """Likelihood ratio of two optima."""
+    ratio = max(without.end.rss, 1e-300) / max(with_it.end.rss, 1e-300)
+    return NuisanceTest(name, _columns(without, with_it.data), float(with_it.worth() * np.log(ratio)))
+
+
+def clearly_left_out(name: str, without: Fitted, with_it: Regression) -> NuisanceTest | None:
+    """The score test if it leaves no doubt that the nuisance is not needed, else None: descend and compare.
+
+    No doubt: well below the limit even if each of the N samples counted. The statistic that is shown counts
+    what the residual without the nuisance is worth.
+    """
+    poles, search = without.poles, without.search
+    here = with_it.linearise(*poles.writable())
+    share = free_optimality(here, poles, search.bounds, search.fixed)
+    promised = here.rss * (1 - share**2)
+    gain = float(np.log(max(without.end.rss, 1e-300) / max(promised, 1e-300)))
+    test = NuisanceTest(name, _columns(without, with_it), without.worth() * gain)
+    return test if with_it.n_samples * gain < _CLEARLY_BELOW * test.limit else None
+
+
+def _columns(without: Fitted, with_it: Regression) -> int:
+    order = without.poles.order
+    return with_it.n_parameters(order) - without.data.n_parameters(order)

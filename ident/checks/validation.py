@@ -4,30 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from ident.basis.functions import nuisance_columns
-from ident.basis.poles import Poles
+from ident.basis.model import GobfModel
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray, lock, real_rows
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
-
-
-class SimulatedModel(Protocol):
-    """What a free run needs: GobfModel and ResponsePosterior both have it."""
-
-    @property
-    def poles(self) -> Poles: ...
-    @property
-    def integrators(self) -> int: ...
-    @property
-    def dt_s(self) -> float: ...
-    def simulate(self, u: RealArray) -> RealArray: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +34,7 @@ class FreshFit:
 
 
 def fit_on_fresh_data(
-    model: SimulatedModel,
+    model: GobfModel | ResponsePosterior,
     record: Record,
     *,
     estimate_initial_state: bool = True,

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import ComplexArray, RealArray, lock, readonly
 from ident.data.ellipses import Ellipses, chi2_radius, ellipse_distance, relative_deficit, standard_axes
 from ident.data.record_files import read_table
 from ident.data.table import Table
@@ -55,9 +55,9 @@ class FrequencyUncertainty:
     method: str = "given"
 
     def __post_init__(self) -> None:
-        omega = np.array(self.omega_rad_s, dtype=np.float64)
-        centre = np.array(self.centre, dtype=np.complex128)
-        covariance = np.array(self.covariance, dtype=np.float64)
+        lock(self, "omega_rad_s")
+        lock(self, "centre", dtype=np.complex128)
+        omega, centre, covariance = self.omega_rad_s, self.centre, np.array(self.covariance, dtype=np.float64)
         if (
             omega.ndim != 1
             or omega.size == 0
@@ -92,9 +92,7 @@ class FrequencyUncertainty:
         covariance[:, 0, 1] = covariance[:, 1, 0] = off_diagonal
         object.__setattr__(self, "dt_s", float(self.dt_s))
         object.__setattr__(self, "level", float(self.level))
-        for name, array in (("omega_rad_s", omega), ("centre", centre), ("covariance", covariance)):
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        object.__setattr__(self, "covariance", readonly(covariance))
 
     def ellipse(self, level: float | None = None) -> Ellipses:
         """Axes of the ellipses that hold the response with probability `level` (default: the record's)."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import minimum_filter
 
 from ident.basis.coordinates import SearchSpace
 from ident.basis.model import GobfModel
@@ -42,17 +43,12 @@ class ErrorSurface:
 
     def local_minima(self) -> list[tuple[int, int]]:
         """Grid points lower than all their (up to 8) neighbours, lowest first."""
-        padded = np.pad(self.mean_square, 1, constant_values=np.inf)
-        inner = padded[1:-1, 1:-1]
-        lowest = np.ones(inner.shape, dtype=np.bool_)
-        for i in (-1, 0, 1):
-            for j in (-1, 0, 1):
-                if (i, j) != (0, 0):
-                    neighbour = padded[1 + i : padded.shape[0] - 1 + i, 1 + j : padded.shape[1] - 1 + j]
-                    lowest &= inner < neighbour
-        found = np.argwhere(lowest)
-        order = np.argsort(inner[lowest], kind="stable")
-        return [(int(i), int(j)) for i, j in found[order]]
+        beside = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
+        lowest = self.mean_square < minimum_filter(
+            self.mean_square, footprint=beside, mode="constant", cval=np.inf
+        )
+        order = np.argsort(self.mean_square[lowest], kind="stable")
+        return [(int(i), int(j)) for i, j in np.argwhere(lowest)[order]]
 
 
 def error_surface(

@@ -18,7 +18,7 @@ from ident.basis.functions import basis_response
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
-from ident.checks.nuisance_tests import NuisanceTest
+from ident.checks.prior_tests import NuisanceTest
 from ident.checks.validation import ScatterRow, fit_on_fresh_data
 from ident.data.finding import FindingKind, finding
 from ident.data.record import Record
