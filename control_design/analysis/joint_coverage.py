@@ -20,14 +20,13 @@ import numpy.typing as npt
 from control_design.analysis.stability import closed_loop_poles, loop_integrators, winds
 from control_design.analysis.worst_case import PlantData, worst_of
 from control_design.controllers.controller import Controller
-from control_design.plants.ellipses import Complex, Real
+from control_design.plants.ellipses import Complex, Real, radius_of
 from control_design.plants.first_order import Intervals
 from control_design.plants.frequency_grid import checked_grid
 from control_design.plants.guards import Guard, different_responses
 from control_design.plants.plant_set import Channel, Mode, UncertainPlant, modes_of
 from control_design.plants.set_expansion import FirstOrderUncertainty
 from control_design.specification import Specification
-from ident.data.ellipses import chi2_radius
 from ident.uncertainty import ResponsePosterior
 
 _CHUNK = 250  # draws at a time: bounds the memory
@@ -100,7 +99,7 @@ def joint_coverage(
     outside = np.max([one.distance for one in found], axis=0)
     # The worst case at a radius is compared in standard deviations, common to all plants.
     wanted = float(np.quantile(gamma, coverage, method="higher"))
-    given = [chi2_radius(loop.plant.level) for loop in loops]
+    given = [radius_of(loop.plant.level) for loop in loops]
     at_given = max(loop.worst(radius) for loop, radius in zip(loops, given, strict=True))
     low, high = 1e-3, _LARGEST_RADIUS
     for _ in range(60):
@@ -161,7 +160,7 @@ class SampledLoop:
         ]
         grid = checked_grid(plant, light, 500, 80)
         self.omega_rad_s, self.data = grid, PlantData.build(plant, specification, grid)
-        self.unit = self.data.ellipses.scaled(1 / chi2_radius(plant.level))
+        self.unit = self.data.ellipses.scaled(1 / radius_of(plant.level))
         self.loop = controller.response(grid, with_delay=False)
         integrators, unstable = loop_integrators(controller, plant)
         self._required = {"integrators": integrators, "unstable_poles": unstable}

@@ -14,10 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ident.data.arrays import lock
-from ident.data.ellipses import chi2_radius
 
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
+
+
+def radius_of(level: float) -> float:
+    """Radius, in standard deviations, of the ellipse that holds a plane Gaussian with probability level."""
+    return float(np.sqrt(-2.0 * np.log1p(-level)))
 
 
 def quotient(above: Any, below: Real, otherwise: float = 0.0) -> Any:
@@ -108,7 +112,7 @@ class Ellipses:
             raise ValueError(
                 f"uncertainty: covariance at {worst:.4g} rad/s is not symmetric positive semi-definite"
             )
-        quantile, angle = chi2_radius(level) ** 2, 0.5 * np.arctan2(2 * b, a - d)
+        quantile, angle = radius_of(level) ** 2, 0.5 * np.arctan2(2 * b, a - d)
         semi_major = np.sqrt(quantile * large)
         semi_minor = np.minimum(np.sqrt(quantile * np.maximum(small, 0.0)), semi_major)
         return cls(np.asarray(omega_rad_s), centre, semi_major, semi_minor, np.exp(1j * angle))

@@ -15,11 +15,10 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from control_design.plants.ellipses import Complex, Real
+from control_design.plants.ellipses import Complex, Real, radius_of
 from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
 from control_design.plants.plant_set import Channel
 from ident.basis.functions import block_parameters
-from ident.data.ellipses import chi2_radius
 from ident.uncertainty import ResponsePosterior
 
 
@@ -95,7 +94,7 @@ def expandable(channel: Channel, integrators: int, between_own_points: str) -> E
 
     def expand(intervals: Intervals, cleared: int) -> SetExpansion:
         centre, generators = first_order(intervals, cleared)
-        return SetExpansion(centre, (generators.scaled(chi2_radius(channel.level)),))
+        return SetExpansion(centre, (generators.scaled(radius_of(channel.level)),))
 
     return expand
 

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from control_design.plants.ellipses import Real
+from control_design.plants.ellipses import Real, radius_of
 from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
 from control_design.plants.plant_set import count_integrators, frequency_response
 from control_design.plants.set_expansion import stacked
 from control_design.plants.weights import RationalWeight
-from ident.data.ellipses import chi2_radius
 from ident.uncertainty import FrequencyUncertainty
 
 if TYPE_CHECKING:
@@ -66,7 +65,7 @@ class StatedDiscs:
     def at(self, omega_rad_s: Real, level: float) -> FrequencyUncertainty:
         """Nominal response and circular covariances at omega (F,)."""
         omega = np.asarray(omega_rad_s, dtype=np.float64)
-        variance = (self.radius(omega) / chi2_radius(self.level)) ** 2
+        variance = (self.radius(omega) / radius_of(self.level)) ** 2
         return FrequencyUncertainty(
             omega,
             frequency_response(self.nominal, omega),
@@ -88,5 +87,5 @@ class StatedDiscs:
             disc = weight.expand(intervals).times(centre)
         else:
             disc = weight.expand(intervals, cleared)
-        disc = disc.scaled(1.0 / chi2_radius(self.level))
+        disc = disc.scaled(1.0 / radius_of(self.level))
         return centre, stacked([disc, disc.scaled(1j)])
