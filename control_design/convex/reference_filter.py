@@ -27,6 +27,7 @@ from control_design.plants.ellipses import Complex, Ellipses, Real, distance_to_
 from control_design.plants.frequency_grid import programme_grid
 from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.weights import RationalWeight
+from control_design.specification.requirement import constant_weight
 from ident.basis.functions import basis_state_space
 from ident.basis.poles import Poles
 from ident.data.arrays import factor_matrices
@@ -110,7 +111,7 @@ class _Matching:
         options: ReferenceFilterOptions,
     ) -> None:
         self.controller, self.plants, self.options = controller, plants, options
-        self.model, self.weight, self.dt_s = model, weight, controller.dt_s
+        self.model, self.weight, self.dt_s = model, weight or constant_weight(1.0), controller.dt_s
         self.grids: list[Real] = []
         self.dense: list[Ellipses] = []
         for plant in plants:
@@ -197,8 +198,6 @@ class _Matching:
         return self.model.at(imaginary_axis(omega, self.dt_s))
 
     def _weight_at(self, omega: Real) -> Complex:
-        if self.weight is None:
-            return np.ones(omega.size, complex)
         return self.weight.at(imaginary_axis(omega, self.dt_s))
 
     def _at_zero(self, poles: Poles) -> Real:

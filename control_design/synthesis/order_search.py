@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 
@@ -69,10 +69,10 @@ class OrderSearch:
         drawn = len(tasks) - len(self.given)
         least = len(self.given) + max((drawn + 1) // 2, min(drawn, 3))
         ends: list[Candidate] = []
-        for number, end in enumerate(self.pool.do(tasks)):
+        for number, end in enumerate(self._done(tasks)):
             self.tell(0.5 * (number + 1) / len(tasks), f"start {number + 1} of {len(tasks)}")
-            ends.append(self._taken(end))
-            found.append(ends[-1])
+            ends.append(end)
+            found.append(end)
             if self._enough(found):
                 best = min(found, key=lambda c: c.gamma)
                 return OrderResult(best, tuple(self.reports), (best.gamma,))
@@ -112,7 +112,7 @@ class OrderSearch:
                 self.problem.add_violated(self.cascade, c.parameters, c.gamma_grid)
             retreats = [self._retreat(c.parameters) for c in lost]
             tasks = [self._task(x) for x in retreats if x is not None]
-            lost = [self._taken(end) for end in self.pool.do(tasks)]
+            lost = list(self._done(tasks))
             kept += [c for c in lost if np.isfinite(c.gamma)]
             lost = [c for c in lost if np.isfinite(c.gamma_grid) and not np.isfinite(c.gamma)]
         return sorted(kept, key=lambda c: c.gamma)
@@ -137,9 +137,11 @@ class OrderSearch:
     def _task(self, parameters: Real, *, eased: bool = False) -> StartTask:
         return StartTask(self.cascade, parameters, tuple(self.problem.grids), eased)
 
-    def _taken(self, end: Candidate) -> Candidate:
-        self.reports += end.reports
-        return end
+    def _done(self, tasks: Sequence[StartTask]) -> Iterator[Candidate]:
+        """Where they ended, one after the other; what was run is noted."""
+        for end in self.pool.do(tasks):
+            self.reports += end.reports
+            yield end
 
     def _as_given(self, parameters: Real) -> Candidate:
         return Candidate(
@@ -195,8 +197,8 @@ class OrderSearch:
             hops = min(_HOPS if number == 0 else _LATER_HOPS, self.options.starts)
             starts += [self._hop(pool[0].parameters) for _ in range(hops)]
             fresh = []
-            for at, end in enumerate(self.pool.do([self._task(x) for x in starts])):
-                fresh.append(self._taken(end))
+            for at, end in enumerate(self._done([self._task(x) for x in starts])):
+                fresh.append(end)
                 if number == 0 and at >= len(pool) and self._agree(fresh):
                     break
             fresh = [c for c in self._retrieved([pool[0], *fresh]) if c is not pool[0]]
@@ -218,7 +220,8 @@ class OrderSearch:
             if agreed or self._enough([best]):
                 break
             self.problem.add_violated(self.cascade, current.parameters, current.gamma_grid)
-            current = self._taken(self.workshop.do(self._task(current.parameters)))
+            current = self.workshop.do(self._task(current.parameters))
+            self.reports += current.reports
             if not np.isfinite(current.gamma):
                 break
             best = min(best, current, key=lambda c: c.gamma)

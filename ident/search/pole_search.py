@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import cmath
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import combinations_with_replacement, cycle, islice, pairwise
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
@@ -174,9 +174,10 @@ class PoleSearch(Generic[Problem]):
         n_real, n_pairs = best.poles.counts
         # Up to two real poles are looked at together: one alone can be held by the other.
         couples = [slice(i, min(i + 2, n_real)) for i in range(n_fixed_real, n_real, 2)]
-        singles = [slice(i, i + 1) for i in range(n_fixed_pairs, n_pairs)]
-        scans = [partial(self._rescan_real, here=here) for here in couples]
-        scans += [partial(self._rescan_pair, here=here) for here in singles]
+        scans = [partial(self._rescan, part="real", here=here) for here in couples]
+        scans += [
+            partial(self._rescan, part="pairs", here=slice(i, i + 1)) for i in range(n_fixed_pairs, n_pairs)
+        ]
         quiet = 0
         for scan in islice(cycle(scans), _ROUNDS * len(scans)):
             found = scan(best)
@@ -186,55 +187,29 @@ class PoleSearch(Generic[Problem]):
                 break
         return best
 
-    def _rescan_real(self, best: Refined, here: slice) -> Refined:
-        count = here.stop - here.start
-        kept = best.poles.without_real(here)
-        space = self.space(count, 0)
+    def _rescan(self, best: Refined, part: Literal["real", "pairs"], here: slice) -> Refined:
+        """Descents from the best points of a grid over one block, the rest frozen; none from next to where the
+        block already is: it would come back."""
+        poles = best.poles
+        if part == "real":
+            kept, block = poles.without_real(here), Poles(poles.real[here])
+            grid, n_levels, n_starts = _real_grid(block.order), _REAL_GRID, 2
+        else:
+            kept, block = poles.without_pair(here), Poles(pairs=poles.pairs[here])
+            grid, n_levels, n_starts = _pair_grid(), _PAIR_GRID[0], 1
+        space = self.space(*block.counts)
         cost = self.data.candidate_cost(space, kept, kept)
-        here_now = np.sort(space.levels(Poles(best.poles.real[here])))
-
-        def looks(point: RealArray) -> tuple[Poles, bool]:
-            new = space.poles(point)
-            known = np.abs(np.sort(space.levels(new)) - here_now) <= 1 / (_REAL_GRID - 1)
-            real = best.poles.real.copy()
-            real[here] = new.real
-            return Poles(real, best.poles.pairs), bool(np.all(known))
-
-        return self._descend_from_grid(best, _real_grid(count), cost, looks, n_starts=2)
-
-    def _rescan_pair(self, best: Refined, here: slice) -> Refined:
-        kept = best.poles.without_pair(here)
-        space = self.space(0, 1)
-        cost = self.data.candidate_cost(space, kept, kept)
-        here_now = space.levels(Poles(pairs=best.poles.pairs[here]))
-
-        def looks(point: RealArray) -> tuple[Poles, bool]:
-            new = space.poles(point)
-            known = np.abs(space.levels(new) - here_now) <= 1 / (_PAIR_GRID[0] - 1)
-            pairs = best.poles.pairs.copy()
-            pairs[here] = new.pairs
-            return Poles(best.poles.real, pairs), bool(np.all(known))
-
-        return self._descend_from_grid(best, _pair_grid(), cost, looks, n_starts=1)
-
-    def _descend_from_grid(
-        self,
-        best: Refined,
-        grid: RealArray,
-        cost: CandidateCost,
-        looks: Callable[[RealArray], tuple[Poles, bool]],
-        n_starts: int,
-    ) -> Refined:
-        """Descents from the best points of the grid; `looks` gives the poles of a point, and whether it is
-        next to where the block already is: from there a descent would come back."""
+        here_now = np.sort(space.levels(block))
         costs = cost.rss(grid)
         self.evaluations += cost.evaluations
         found = best
         for point in best_apart(grid, costs, n_starts):
-            start, known = looks(point)
-            if known:
+            new = space.poles(point)
+            if np.all(np.abs(np.sort(space.levels(new)) - here_now) <= 1 / (n_levels - 1)):
                 continue
-            trial = self.descend(start, "rescan", ROUGH)
+            moved = getattr(poles, part).copy()
+            moved[here] = getattr(new, part)
+            trial = self.descend(replace(poles, **{part: moved}), "rescan", ROUGH)
             if trial.rss < found.rss * (1 - GAIN):
                 found = self.descend(trial.poles, "rescan")
         return found
