@@ -188,8 +188,8 @@ class PoleSearch(Generic[Problem]):
         return best
 
     def _rescan(self, best: Refined, part: Literal["real", "pairs"], here: slice) -> Refined:
-        """Descents from the best points of a grid over one block, the rest frozen; none from next to where the
-        block already is: it would come back."""
+        """Descents from the best points of a grid over one block, the rest frozen; none from next to where it
+        already is: such a one would come back."""
         poles = best.poles
         if part == "real":
             kept, block = poles.without_real(here), Poles(poles.real[here])
