@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from ident.basis.options import IdentOptions
 from ident.coloured_noise import prewhitened
-from ident.data.arrays import RealArray, lock
+from ident.data.arrays import BoolArray, IntArray, RealArray, lock
 from ident.data.record import Record
 from ident.fit.least_squares import EXPLAINED, Regression, fit
 from ident.fit.refinement import Refined
@@ -38,9 +38,6 @@ _BEYOND_CHOSEN = 3
 _MOST_SAMPLES = 10_000
 _MOST_PAIRS = 12
 _FEWEST_ORDERS = 2
-
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 
 class StableMode(NamedTuple):

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from control_design.controllers.controller import Controller
-from control_design.plants.ellipses import Complex, Real
+from control_design.plants.ellipses import Boolean, Complex, Real
 from ident.data.arrays import lock
 
 
@@ -83,7 +83,7 @@ class ClosedLoopTrajectory:
     reference: Real
     output: Real
     command: Real
-    limited: npt.NDArray[np.bool_]
+    limited: Boolean
     dt_s: float
     measured_index: int = 0
 

@@ -15,12 +15,11 @@ from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-import numpy.typing as npt
 
 from control_design.analysis.stability import closed_loop_poles, loop_integrators, winds
 from control_design.analysis.worst_case import PlantData, worst_of
 from control_design.controllers.controller import Controller
-from control_design.plants.ellipses import Complex, Real, radius_of
+from control_design.plants.ellipses import Boolean, Complex, Real, radius_of
 from control_design.plants.first_order import Intervals
 from control_design.plants.frequency_grid import checked_grid
 from control_design.plants.guards import Guard, different_responses
@@ -140,7 +139,7 @@ class SampledGamma:
     normalised distance of the measured response from the centre, in standard deviations."""
 
     gamma: Real
-    stable: npt.NDArray[np.bool_]
+    stable: Boolean
     distance: Real
 
 
@@ -198,7 +197,7 @@ class SampledLoop:
         second = np.where(thin, 0.0, turned.imag / minor)
         return np.asarray(np.max(np.hypot(turned.real / major, second), axis=1), dtype=np.float64)
 
-    def stable_of(self, responses: Responses, members: Complex) -> npt.NDArray[np.bool_]:
+    def stable_of(self, responses: Responses, members: Complex) -> Boolean:
         """Whether 1 + K G winds as it must, (D,); on a ten times finer grid where a step is wide."""
         omega = self.omega_rad_s
         stable, wide = winds(members * (self.loop * self.data.delay), **self._required)

@@ -7,10 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from control_design.controllers.controller import Controller
-from control_design.plants.ellipses import Complex, Real
+from control_design.plants.ellipses import Boolean, Complex, Real
 from control_design.plants.plant_set import UncertainPlant, count_integrators, delayed
 
 
@@ -91,9 +90,7 @@ def half_turns(value: Complex, integrators: int) -> Real:
     return np.asarray(closed, dtype=np.float64)
 
 
-def winds(
-    loop_gain: Complex, *, integrators: int, unstable_poles: int
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+def winds(loop_gain: Complex, *, integrators: int, unstable_poles: int) -> tuple[Boolean, Boolean]:
     """(1 + L turns as a stable loop's, some phase step is wider than pi/3), each (D,), for L (D, F) from
     near zero frequency to Nyquist; see `nyquist_count`."""
     turns = half_turns(1.0 + loop_gain, integrators)

@@ -15,10 +15,9 @@ from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg
 
-from control_design.plants.ellipses import Complex, Real, quotient
+from control_design.plants.ellipses import Complex, Integer, Real, quotient
 from control_design.plants.frequency_grid import with_violations
 
 # Radii of the rounding of |.| at its kink. An active numerator is as large as gamma m, of which the rounding
@@ -37,7 +36,7 @@ class PlaneRows:
     """R rows on F plane vectors: at (R,) position k of each row; A (R, 2, 2), a (R, 2) numerator; e (R,),
     E (R, 2), C (R, 2, 2), c (R, 2) denominator."""
 
-    at: npt.NDArray[np.int64]
+    at: Integer
     A: Real
     a: Real
     e: Real

@@ -17,6 +17,8 @@ from ident.data.arrays import lock
 
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
+Integer = npt.NDArray[np.int64]
+Boolean = npt.NDArray[np.bool_]
 
 
 def radius_of(level: float) -> float:
@@ -127,7 +129,7 @@ class Ellipses:
         """Axes times a factor."""
         return replace(self, semi_major=factor * self.semi_major, semi_minor=factor * self.semi_minor)
 
-    def subset(self, index: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> Ellipses:
+    def subset(self, index: Integer | Boolean) -> Ellipses:
         """The ellipses at the given positions."""
         return Ellipses(*(getattr(self, field.name)[index] for field in fields(self)))
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg
 
-from control_design.plants.ellipses import Complex, Real
+from control_design.plants.ellipses import Boolean, Complex, Real
 from control_design.plants.weights import RationalWeight
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class Intervals:
         beyond = np.maximum(np.abs(offset) - self.half_width * self.dt_s, 0.0)
         return np.asarray(np.hypot(inward, 2.0 * np.sqrt(size) * np.sin(beyond / 2)), dtype=np.float64)
 
-    def part(self, index: npt.NDArray[np.bool_]) -> Intervals:
+    def part(self, index: Boolean) -> Intervals:
         """Some of them."""
         return replace(self, centre=self.centre[index], half_width=self.half_width[index])
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from control_design.plants.ellipses import Real
+from control_design.plants.ellipses import Integer, Real
 from control_design.plants.plant_set import Mode, UncertainPlant
 
 CHECKED_FROM_RAD_S = 1e-4
@@ -109,7 +109,7 @@ def plant_grid(plant: UncertainPlant, wanted: Real) -> Real:
     return np.union1d(own[index], _outside(own, wanted))
 
 
-def local_maxima(value: Real) -> npt.NDArray[np.int64]:
+def local_maxima(value: Real) -> Integer:
     """Positions of local maxima of (F,), ends included, largest value first."""
     padded = np.concatenate([[-np.inf], value, [-np.inf]])
     peak = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:])

@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from control_design.plants.ellipses import Complex, Ellipses, Real
+from control_design.plants.ellipses import Complex, Ellipses, Integer, Real
 from ident.data.arrays import lock
 
 GUARD_MODULUS = 0.1  # distance from -1 asked of a guard: stability with something to spare
@@ -51,7 +50,7 @@ class Guard:
         return Ellipses.of_no_size(self.omega_rad_s[index], self.response[index])
 
 
-def different_responses(responses: Complex, most: int) -> npt.NDArray[np.int64]:
+def different_responses(responses: Complex, most: int) -> Integer:
     """Positions of up to `most` of the responses (D, F), each as far as can be from those before it: largest
     mean of |difference|/(sum of sizes), from the first one on."""
     chosen = [0]

@@ -18,11 +18,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import block_diag
 
 from control_design.controllers.biquads import Cascade, tustin_frequency
-from control_design.plants.ellipses import Complex, Real, quotient
+from control_design.plants.ellipses import Complex, Integer, Real, quotient
 from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.angle_program import Rows, parameter_bounds
 from control_design.synthesis.minimax_step import MinimaxStep, minimax_step
@@ -175,7 +174,7 @@ class _Boundary:
         self._powers = 1j * tustin_frequency(self._omega, cascade.dt_s) / cascade.scale_rad_s
         self._powers = np.where(np.abs(self._powers) > 1e6, 1e6j, self._powers)
         # Of one closed-loop function each: positions of its frequencies and weights there, (D,).
-        self._blocks: list[tuple[LoopFunction, npt.NDArray[np.int64], Real]] = []
+        self._blocks: list[tuple[LoopFunction, Integer, Real]] = []
         for function in LoopFunction:
             sizes = [size for of, size in rows.weights if of is function]
             weight = np.max(sizes, axis=0) if sizes else np.zeros(0)
@@ -261,9 +260,7 @@ class _Boundary:
         total = total + (mixed[use] * (share[use] / -bend[use])[:, None]).T @ mixed[use]
         return total, np.asarray(-share * w, dtype=np.complex128)
 
-    def _worst(
-        self, k: Complex, index: npt.NDArray[np.int64], open_loop: float
-    ) -> tuple[Complex, Complex, Complex]:
+    def _worst(self, k: Complex, index: Integer, open_loop: float) -> tuple[Complex, Complex, Complex]:
         """Members (D,) with the largest |g^open_loop/(1 + g K)| at some of the frequencies, and their first
         and second derivative along the boundary; k (D,).
 

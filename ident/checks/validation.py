@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from ident.basis.functions import nuisance_columns
 from ident.basis.model import GobfModel
 from ident.basis.posterior import ResponsePosterior
-from ident.data.arrays import RealArray, lock, real_rows
+from ident.data.arrays import BoolArray, RealArray, lock, real_rows
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 
@@ -153,7 +153,7 @@ def repeat_scatter(
 def _relative_spread(
     estimate: FrequencyUncertainty,
     posterior: ResponsePosterior | None,
-    inside: np.ndarray[tuple[int], np.dtype[np.bool_]],
+    inside: BoolArray,
     size: RealArray,
 ) -> RealArray:
     """Factor M (2 F, K) of the covariance M M^T of the relative errors (Re, Im) of a band."""

@@ -9,6 +9,8 @@ import numpy.typing as npt
 
 RealArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 # Options of a numba function that compiled code alone calls: the ways in for Python and C are not compiled.
 INSIDE: Any = {"cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}

@@ -24,7 +24,7 @@ from functools import cached_property
 import numpy as np
 from scipy.stats import chi2
 
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import BoolArray, ComplexArray, IntArray, RealArray
 from ident.data.ellipses import circular_widening
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record, in_groups
@@ -230,8 +230,8 @@ class _Steady:
     period: int
     input: ComplexArray
     output: ComplexArray
-    excited: np.ndarray[tuple[int], np.dtype[np.bool_]]
-    silent: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    excited: BoolArray
+    silent: BoolArray
     drift: float
 
     @classmethod
@@ -299,7 +299,7 @@ def _levels(group: Sequence[_Steady]) -> Distortion:
     gain = g.mean(axis=0)
     drive = np.mean(np.abs(inputs[:, at]) ** 2, axis=0)
 
-    def levels(lines: np.ndarray[tuple[int], np.dtype[np.int64]]) -> LineLevels | None:
+    def levels(lines: IntArray) -> LineLevels | None:
         """At lines without excitation, as if they had that of their neighbours."""
         if not lines.size:
             return None

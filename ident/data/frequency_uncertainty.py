@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from ident.data.arrays import ComplexArray, RealArray, lock, readonly
+from ident.data.arrays import BoolArray, ComplexArray, RealArray, lock, readonly
 from ident.data.ellipses import Ellipses, chi2_radius, ellipse_distance, relative_deficit, standard_axes
 from ident.data.record_files import read_table
 from ident.data.table import Table
@@ -106,7 +106,7 @@ class FrequencyUncertainty:
         magnitude = np.abs(self.centre) + np.abs(response)
         return ellipse_distance(response - self.centre, self.ellipse(), magnitude)
 
-    def contains(self, response: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def contains(self, response: npt.ArrayLike) -> BoolArray:
         """(F,) whether a response (F,) lies in the ellipse of its frequency."""
         return np.asarray(self.normalised_distance(response) <= 1.0)
 
@@ -162,7 +162,7 @@ class FrequencyUncertainty:
         return response
 
 
-def _refuse_first(bad: npt.NDArray[np.bool_], omega: RealArray, complaint: str) -> None:
+def _refuse_first(bad: BoolArray, omega: RealArray, complaint: str) -> None:
     if np.any(bad):
         index = int(np.argmax(bad))
         raise ValueError(f"{complaint} (first at omega = {omega[index]:.6g} rad/s)")

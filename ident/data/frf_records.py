@@ -8,7 +8,7 @@ from typing import Literal, Self
 
 import numpy as np
 
-from ident.data.arrays import ComplexArray, RealArray, factor_matrices, lock
+from ident.data.arrays import BoolArray, ComplexArray, IntArray, RealArray, factor_matrices, lock
 from ident.data.ellipses import hotelling_widening
 from ident.data.frequency_uncertainty import FrequencyUncertainty, frequencies
 from ident.data.record_files import read_table
@@ -141,7 +141,7 @@ class FrfRepeats:
         method = "repeated measurements" if of == "mean" else "one more run"
         return FrequencyUncertainty(grid, centre, covariance, dt_s, level, method)
 
-    def _chosen(self, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> FrfRepeats:
+    def _chosen(self, keep: BoolArray) -> FrfRepeats:
         if not np.any(keep):
             raise ValueError("no measured point is left")
         return FrfRepeats(
@@ -163,8 +163,8 @@ def inliers(points: ComplexArray, threshold: float) -> ComplexArray:
 
 
 def _pooled(
-    scatter: RealArray, freedom: np.ndarray[tuple[int], np.dtype[np.int64]], centre: ComplexArray, m: int
-) -> tuple[RealArray, np.ndarray[tuple[int], np.dtype[np.int64]]]:
+    scatter: RealArray, freedom: IntArray, centre: ComplexArray, m: int
+) -> tuple[RealArray, IntArray]:
     """Sums over m neighbours on either side of scatter relative to the centre, turned back to each centre."""
     if np.any(centre == 0):
         raise ValueError("pooling uses relative scatter, but a mean response is exactly zero")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import detrend
 
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import ComplexArray, IntArray, RealArray
 from ident.data.ellipses import circular_widening
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
@@ -127,9 +127,7 @@ def _half_width(half_width_lines: int | None, n_records: int) -> int:
     return half
 
 
-def _groups(
-    spectra: Spectra, width: int, omega_min: float | None, omega_max: float | None
-) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
+def _groups(spectra: Spectra, width: int, omega_min: float | None, omega_max: float | None) -> IntArray:
     """(F, width) line indices of non-overlapping averaging widths inside the band."""
     low = 0.0 if omega_min is None else omega_min
     high = np.inf if omega_max is None else omega_max
@@ -140,9 +138,7 @@ def _groups(
     return inside[: count * width].reshape(count, width)
 
 
-def _local_ratio(
-    spectra: Spectra, groups: np.ndarray[tuple[int, int], np.dtype[np.int64]], level: float
-) -> tuple[ComplexArray, RealArray]:
+def _local_ratio(spectra: Spectra, groups: IntArray, level: float) -> tuple[ComplexArray, RealArray]:
     """Centre (F,) and widened variance E|G_hat - G|^2 (F,)."""
     u, y, w = spectra.input[:, groups], spectra.output[:, groups], spectra.instrument[:, groups]
     denominator = np.sum(u * w.conj(), axis=(0, 2))

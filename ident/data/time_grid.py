@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident.data.arrays import RealArray
+from ident.data.arrays import IntArray, RealArray
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.table import Table
 
@@ -61,7 +61,7 @@ class TimeGrid:
     """
 
     dt_s: float
-    rows: np.ndarray[tuple[int], np.dtype[np.int64]]
+    rows: IntArray
     late: RealArray
 
     @classmethod

@@ -13,13 +13,12 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
 from ident.basis.coordinates import SearchSpace
 from ident.basis.functions import _blocks, block_parameters, free_response
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import ComplexArray, IntArray, RealArray
 from ident.fit.kernels import cost_of_point, driven_rows, linearise
 from ident.fit.problem import CandidateCost, Linearisation, ResidualColour, residual_colour
 
@@ -46,7 +45,7 @@ class Regression:
 
     u: RealArray
     y: RealArray
-    starts: npt.NDArray[np.int64]
+    starts: IntArray
     polynomials: RealArray
     structure: Structure
     dt_s: float

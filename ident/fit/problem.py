@@ -14,13 +14,12 @@ from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.fft import next_fast_len
 from scipy.special import chdtri
 
 from ident.basis.coordinates import SearchSpace
 from ident.basis.poles import Poles
-from ident.data.arrays import ComplexArray, RealArray, kernel_array
+from ident.data.arrays import ComplexArray, IntArray, RealArray, kernel_array
 
 # Below this fraction of |y|^2 the products of the candidates' columns know nothing; a refinement sees the
 # true residual.
@@ -137,7 +136,7 @@ class ResidualColour:
     white: bool
 
 
-def residual_colour(residual: RealArray, starts: npt.NDArray[np.int64]) -> ResidualColour:
+def residual_colour(residual: RealArray, starts: IntArray) -> ResidualColour:
     """Colour of a residual (N,) of records that begin at `starts` (K + 1,)."""
     n = residual.size
     lags = min(200, int(np.min(np.diff(starts))) // 10)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from ident.basis.functions import basis_response
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure, filter_input, front_response
-from ident.data.arrays import ComplexArray, RealArray, kernel_array, real_rows
+from ident.data.arrays import BoolArray, ComplexArray, RealArray, kernel_array, real_rows
 from ident.data.record import Record
 from ident.friction.kernel import step_through
 
@@ -63,7 +62,7 @@ class SteppedArm:
     structure: Structure
     dt_s: float
     rates: ComplexArray
-    chain: npt.NDArray[np.bool_]
+    chain: BoolArray
     weights: ComplexArray
 
     @classmethod
@@ -127,9 +126,7 @@ def less_friction(record: Record, friction: RealArray, delay_samples: int) -> Re
     return replace(record, input=record.input - shifted[:, None])
 
 
-def _state_responses(
-    z: ComplexArray, rates: ComplexArray, chain: npt.NDArray[np.bool_], dt_s: float
-) -> ComplexArray:
+def _state_responses(z: ComplexArray, rates: ComplexArray, chain: BoolArray, dt_s: float) -> ComplexArray:
     """(F, N) responses of the sampled states to a held input."""
     out = np.empty((z.size, rates.size), dtype=np.complex128)
     for j, s in enumerate(rates):

@@ -26,7 +26,7 @@ from scipy.linalg import solve_triangular
 
 from ident.basis.functions import basis_response, block_parameters
 from ident.basis.poles import Poles
-from ident.data.arrays import ComplexArray, RealArray, kernel_array, readonly
+from ident.data.arrays import BoolArray, ComplexArray, RealArray, kernel_array, readonly
 from ident.uncertainty.embedding_algebra import (
     KernelPosterior,
     ReducedRegression,
@@ -91,7 +91,7 @@ class PairStatistics:
         floor = _ROUNDING * self.size[:, None]
         return np.maximum(values, floor), vectors, np.where(values > floor, along, 0.0)
 
-    def distinguishable(self) -> npt.NDArray[np.bool_]:
+    def distinguishable(self) -> BoolArray:
         """(J,) whether these records can tell the pair from the poles and the nuisance at all."""
         return np.asarray(self.gram[:, 0, 0] + self.gram[:, 1, 1] > _DISTINGUISHABLE * self.size)
 
