@@ -26,7 +26,7 @@ class SynthesisError(Exception):
 class BlockingPoint:
     """A frequency at which a requirement keeps gamma from getting smaller.
 
-    weight: name of a weighted requirement; without a stable design, one of the words of `shortfall`. value:
+    weight: name of a weighted requirement; without a stable design, one of the words of `synthesis`. value:
     weighted worst case there, inf where the loop or a member of the ellipse is unstable.
     """
 
