@@ -1,5 +1,5 @@
-"""The controller as it runs: discrete state space with saturation, rate limit, anti-windup and one sample of
-delay."""
+"""The controller as it runs: discrete state space with saturation, rate limit, anti-windup, one sample of
+delay, and what dry friction takes off the command given back from the reference."""
 
 from __future__ import annotations
 

@@ -2,7 +2,8 @@
 
 On |x| <= half_width around omega_k: f(omega_k + x) = value + slope x + r with |r| <= remainder. Sums and
 products of such expansions are such expansions, so a bound that holds for z - p and 1/(z - p) on an arc of
-the circle carries over to every rational response. Rounding of double precision is neglected.
+the circle carries over to every rational response (`RationalResponse`). Rounding of double precision is
+neglected.
 """
 
 from __future__ import annotations

@@ -135,20 +135,21 @@ def _response_and_all_pass(poles: Poles, z: ComplexArray) -> tuple[ComplexArray,
 
 def regressor(poles: Poles, u: RealArray) -> RealArray:
     """Basis functions driven by u from rest: Phi (T, B) with Phi[k, i] = [L_i(q) u](k); Phi[0] = 0."""
+    return _through(poles, u)[0].T
+
+
+def all_pass_signal(poles: Poles, u: RealArray) -> RealArray:
+    """u (T,) sent through the all-pass of the poles, from rest, (T,)."""
+    return _through(poles, u)[1]
+
+
+def _through(poles: Poles, u: RealArray) -> tuple[RealArray, RealArray]:
     signal = np.array(u, dtype=np.float64)
     if signal.ndim != 1:
         raise ValueError(f"u must be (T,); got shape {signal.shape}")
     rows = np.empty((poles.order, signal.size))
     run_cascade(block_parameters(poles), poles.real.size, signal, rows, 0, 0, signal.size)
-    return rows.T
-
-
-def all_pass_signal(poles: Poles, u: RealArray) -> RealArray:
-    """u (T,) sent through the all-pass of the poles, from rest, (T,)."""
-    signal = np.array(u, dtype=np.float64)
-    rows = np.empty((poles.order, signal.size))
-    run_cascade(block_parameters(poles), poles.real.size, signal, rows, 0, 0, signal.size)
-    return signal
+    return rows, signal
 
 
 def free_response(poles: Poles, n_samples: int) -> RealArray:

@@ -173,7 +173,8 @@ def loop_through(
     command: Any,
     limited: Any,
 ) -> None:
-    """Fill measured (T,), command (T,) and limited (T,) of a loop from rest.
+    """Fill measured (T,), command (T,) and limited (T,) of a loop from rest: that of
+    `control_design.analysis.closed_loop.simulate` on this arm.
 
     reference, noise (T,): set point, and what is added to the position before it is measured in steps[0].
     added (T,): joins the law's command before it is limited. law (n + 1, n + 2): rows of the state and the
