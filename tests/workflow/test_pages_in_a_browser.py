@@ -18,8 +18,8 @@ from tests.workflow import report_examples as example
 from workflow.figures.bode import draw_bode
 from workflow.figures.poles import draw_poles
 from workflow.report import rendering
+from workflow.report.pages import write_report
 from workflow.report.rendering import render_page
-from workflow.report.run_report import write_report
 from workflow.tasks.experiment import Limits, plan_experiment
 from workflow.tasks.results import RunResults
 from workflow.text.templates import environment

@@ -15,7 +15,7 @@ from tests.workflow import report_examples as example
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import drawings
-from workflow.report.run_report import write_report
+from workflow.report.pages import write_report
 from workflow.tasks.results import ClosedLoopResult, ReferenceFilterResult, RunResults
 from workflow.text.templates import environment, words
 

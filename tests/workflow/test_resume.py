@@ -25,8 +25,8 @@ from workflow.engine.errors import CommandInterruptedError, InputError
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import render
-from workflow.report import run_report
-from workflow.report.run_report import REPORT
+from workflow.report import pages
+from workflow.report.pages import REPORT
 from workflow.tasks.exports import write_controller
 from workflow.tasks.results import ClosedLoopResult, RunResults
 from workflow.tasks.stages import STAGES
@@ -168,7 +168,7 @@ def test_an_interrupt_that_a_library_makes_something_else_of_is_one(fast_run, tm
     out = tmp_path / "run"
     shutil.copytree(fast_run[0], out)
     (out / "report.html").unlink()
-    monkeypatch.setattr(run_report, "write_report", swallowed)
+    monkeypatch.setattr(pages, "write_report", swallowed)
     with pytest.raises(CommandInterruptedError):
         run_from_files(FAST_ARM, out, resume=True)
     assert RunDirectory.open(out).manifest()["status"] == "interrupted"
@@ -202,7 +202,7 @@ def plain_page(monkeypatch):
         storage.write_text(results.run.report_path, "<html></html>\n")
         return results.run.report_path
 
-    monkeypatch.setattr(run_report, "write_report", write)
+    monkeypatch.setattr(pages, "write_report", write)
 
 
 def test_resume_from_every_stage_boundary(fast_run, tmp_path, plain_page):

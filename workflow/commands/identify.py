@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Mapping
 from dataclasses import replace
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +17,7 @@ from workflow.engine.progress import Progress
 from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
 from workflow.tasks.log_identification import LogIdentification, identify_records
 from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
-from workflow.tasks.results import IdentifiedPlant, RunRecord
+from workflow.tasks.results import IdentifiedPlant
 from workflow.tasks.simulated_rig import beside, truth_beside
 from workflow.tasks.summary import RunSummary, model_numbers, uncertainty_numbers
 from workflow.text.formats import count
@@ -69,9 +66,11 @@ def identify_logs(
     result = replace(result, true_modes=matched, input_limit=logs.input_limit)
     written: dict[Path, bytes] = {}
     if report is not None:
+        from workflow.report.pages import identify_page  # only a page needs what draws
+
         with progress.stage("report") as update:
             inputs = {str(path): storage.sha256_of_file(path) for path in logs.files}
-            written[report] = _page(result, inputs, update).encode()
+            written[report] = identify_page(result, inputs, update).encode()
     if out is not None:
         plant = IdentifiedPlant(result.spread.nominal, result.spread.posterior, promised.level)
         written[out] = storage.npz_bytes(codec.to_arrays(plant))
@@ -80,37 +79,6 @@ def identify_logs(
     interrupts.check()
     storage.write_together(written)
     return _summary(result, out, report, export)
-
-
-def _page(
-    result: LogIdentification, inputs: Mapping[str, str], progress: Callable[[float, str], None] | None = None
-) -> str:
-    """One self-contained HTML page; inputs are the files with their SHA-256. Same results, same page."""
-    # Here: only a page needs what draws.
-    from workflow.figures.subjects import log_channel
-    from workflow.report.rendering import render_page
-
-    options, channel = result.options, log_channel(result)
-    versions = [(name, metadata.version(name)) for name in ("flexlink", "numpy", "scipy", "nlopt")]
-    page = render_page(
-        "identification.html.j2",
-        progress,
-        title=f"{channel.found.input} to {channel.found.output}",
-        result=result,
-        channel=channel,
-        records=[
-            *(RunRecord(record, "estimation", None, "") for record in result.measured),
-            *(RunRecord(record, "validation", None, "") for record in result.fresh_records),
-        ],
-        changed=[
-            (name, value)
-            for name, field in type(options).model_fields.items()
-            if (value := getattr(options, name)) != field.default
-        ],
-        versions=[*versions, ("python", sys.version.split()[0])],
-        inputs=inputs,
-    )
-    return page.html
 
 
 def _summary(

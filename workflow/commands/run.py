@@ -48,7 +48,7 @@ def run_from_files(
     else:
         config, text = built_in_config()
     # Here: what computes takes seconds to load, and a configuration that is refused does not need it.
-    from workflow.report.run_report import REPORT
+    from workflow.report.pages import REPORT
     from workflow.tasks.pipeline import run_pipeline
 
     return run_pipeline(
@@ -71,7 +71,7 @@ def rebuild_report(
 
     also: kinds of file for its pictures beside SVG, pdf or png.
     """
-    from workflow.report.run_report import REPORT, write_page
+    from workflow.report.pages import REPORT, write_page
     from workflow.tasks.pipeline import rebuild_page
 
     return rebuild_page(run, dataclasses.replace(REPORT, run=partial(write_page, also=also)), progress)

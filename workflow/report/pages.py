@@ -1,16 +1,19 @@
-"""The report of a run: one self-contained page and its pictures, from what the stages left."""
+"""The self-contained pages of a run, from what its stages left, and of `flexlink identify`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import sys
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+from importlib import metadata
 from pathlib import Path
 
 from workflow.config.run_config import RunConfig
 from workflow.engine import documents, storage
-from workflow.figures.subjects import RunView
+from workflow.figures.subjects import RunView, log_channel
 from workflow.report.rendering import render_page
-from workflow.tasks.results import ReportResult, RunResults
+from workflow.tasks.log_identification import LogIdentification
+from workflow.tasks.results import ReportResult, RunRecord, RunResults
 from workflow.tasks.stage import Stage, StageInput
 from workflow.tasks.stages import STAGES
 from workflow.tasks.summary import summarise
@@ -69,3 +72,30 @@ REPORT = Stage(
     uses={"run": True, "notes": True, "specification": True},
     also_writes=lambda run: (run.report_path,),
 )
+
+
+def identify_page(
+    result: LogIdentification, inputs: Mapping[str, str], progress: Callable[[float, str], None] | None = None
+) -> str:
+    """One self-contained HTML page; inputs are the files with their SHA-256. Same results, same page."""
+    options, channel = result.options, log_channel(result)
+    versions = [(name, metadata.version(name)) for name in ("flexlink", "numpy", "scipy", "nlopt")]
+    page = render_page(
+        "identification.html.j2",
+        progress,
+        title=f"{channel.found.input} to {channel.found.output}",
+        result=result,
+        channel=channel,
+        records=[
+            *(RunRecord(record, "estimation", None, "") for record in result.measured),
+            *(RunRecord(record, "validation", None, "") for record in result.fresh_records),
+        ],
+        changed=[
+            (name, value)
+            for name, field in type(options).model_fields.items()
+            if (value := getattr(options, name)) != field.default
+        ],
+        versions=[*versions, ("python", sys.version.split()[0])],
+        inputs=inputs,
+    )
+    return page.html
