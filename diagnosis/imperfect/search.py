@@ -144,10 +144,14 @@ class Search:
                 continue
             self.points.append((candidate, points))
             ends.append(self._descended(around, candidate, points, around.jacobian))
-        for k, end in enumerate(sorted(ends, key=lambda end: end.loss)):
+        by_loss = sorted(range(len(ends)), key=lambda j: ends[j].loss)
+        for k, j in enumerate(by_loss):
+            end = ends[j]
             if k < _FINISHED and not end.converged:
                 end = descend(self.records, end.candidates, end.deviations, end.coordinates, end.start)
-            self.add(refined(self.records, end) if k < _FINISHED else end)
+            found = self.add(refined(self.records, end) if k < _FINISHED else end)
+            # Where it ended alone may be far from every start, and right beside another effect.
+            self.points[j][1].insert(0, _point(found.end))
 
     def _descended(
         self, around: Descent, candidate: Candidate, points: Sequence[Point], nominal: Real
@@ -221,12 +225,10 @@ class Search:
         for candidate, points in self.points:
             if candidate.effect in held or candidate.kind.contains in held:
                 continue
-            near = (
-                points_of(self.records, parent, candidate)[:1]
-                if candidate.kind.harmonic
-                else beside(self.records, parent, candidate, _spread(points))
-            )
-            trials += [(candidate, near[0])] if near else []
+            harmonic = candidate.kind.harmonic is not None
+            near = beside(self.records, parent, candidate, points[:1] if harmonic else _spread(points))
+            near += points_of(self.records, parent, candidate)[:1] if harmonic else []
+            trials += [(candidate, point) for point in sorted(near, key=lambda point: point.loss)[:1]]
         trials.sort(key=lambda trial: trial[1].loss)
         chosen: dict[tuple[str, float], tuple[Candidate, Point]] = {}
         for candidate, point in trials:

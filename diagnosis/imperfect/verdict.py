@@ -19,6 +19,7 @@ from diagnosis.evidence.hypotheses import Probabilities
 from diagnosis.imperfect.search import Explanation, Search, best_of_sets
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.rounding import Rounding, rounding_effect
+from plant.effects import EFFECTS, LOOK_ALIKES
 
 # Log likelihoods count this much less than independent coefficients would (calibrated on generated cases:
 # `flexlink blind --workshop`); prior densities of stated values count whole.
@@ -40,8 +41,9 @@ _IMPERFECTIONS, _IMPERFECTIONS_WIDTH = 0.6, 0.65
 _UNKNOWN, _UNKNOWN_WIDTH, _PRIOR_UNKNOWN = 2.2, 0.6, 0.15
 # A set is out that leaves so much more of the held-out records, in model errors too, than a part of it.
 _WORSE, _WORSE_BY = 1.15, 0.2
-# Logarithm of how much less probable a cause beyond the list is that looks like an effect.
-_UNLISTED = 0.55
+# How probable a cause beyond the list is that looks like an effect, beside the effect.
+_UNLISTED = 1 / 3
+_LISTED_AS = {name: str(kind.look_alike_of) for name, kind in LOOK_ALIKES.items()}
 # Sets this far behind in score take no part.
 _BEHIND, _MOST_SETS, _PASSES = 8.0, 8, 3
 
@@ -110,7 +112,7 @@ def _gain(explanation: Explanation, listed: Sequence[str]) -> float:
         + _VOLUME * explanation.log_volume
         + float(np.log(_PRIOR_COUNT[len(candidates)] / comb(len(listed), len(candidates))))
         - further
-        - _UNLISTED * sum(name not in listed for name in explanation.names)
+        + float(np.log(_UNLISTED)) * sum(name not in listed for name in explanation.names)
     )
 
 
@@ -180,9 +182,14 @@ def _weighed(search: Search, listed: Sequence[str]) -> tuple[Judged, ...]:
 def _contradicted(explanation: Explanation, others: Iterable[Explanation], model_error: float) -> bool:
     """Whether held-out records are left notably more by a set than by a part of it: what it adds is fitted to
     the other records and true of none."""
-    left = float(np.max(explanation.shares[1]))
-    parts = [float(np.max(e.shares[1])) for e in others if set(e.key) < set(explanation.key)]
+    left, listed = float(np.max(explanation.shares[1])), _as_listed(explanation)
+    parts = [float(np.max(e.shares[1])) for e in others if _as_listed(e) < listed]
     return bool(parts) and left > max(_WORSE * min(parts), min(parts) + _WORSE_BY * model_error)
+
+
+def _as_listed(explanation: Explanation) -> set[str]:
+    """Its effects, each look-alike under the name of what it looks like."""
+    return {_LISTED_AS.get(name, name) for name in explanation.names}
 
 
 def _judged(
@@ -219,9 +226,16 @@ def _judged(
     )
     explains = complete = 0.0 if at_edge else _enough(_left(explanation), model_error)
     for part in parts.values():
-        complete *= 1.0 if part.name in listed else 1 - part.matters
+        complete *= 1 - part.matters * (_hidden(part.name) if part.name in listed else 1.0)
     named = tuple(parts[name] for name in explanation.names if name in listed)
     return Judged(explanation, named, score_of(explanation, listed, model_error), explains, complete)
+
+
+def _hidden(name: str) -> float:
+    """Probability that what is beyond the list acts in place of an effect, where no look-alike is fitted."""
+    kind = EFFECTS.get(name)
+    alone = kind is not None and kind.beside is not None and name not in _LISTED_AS.values()
+    return _UNLISTED / (1 + _UNLISTED) if alone else 0.0
 
 
 def best_without(
@@ -253,8 +267,7 @@ def _part(
     off = _tolerances_off(search, explanation, explanation.names.index(name))
     if off is not None:
         # A stated value in itself: what it changes may be imitated by the others within their tolerances.
-        preferred = float(expit(_gain(explanation, listed) - _gain(rest, listed)))
-        matters = max(matters, preferred * _soft(off / _FAR_OFF, _FAR_OFF_WIDTH))
+        matters = max(matters, _soft(off / _FAR_OFF, _FAR_OFF_WIDTH))
     return Part(name, share, matters)
 
 
@@ -314,34 +327,33 @@ def _soft(ratio: float, width: float) -> float:
 
 
 def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: float) -> Probabilities:
-    """Every set shared out: unknown where it is not complete, else those of its effects that matter; none of
-    them only as far as the nominal alone leaves no more than imperfections, which do not interest
-    (none_enough)."""
+    """Every set shared out: unknown where it is not complete, else those of its effects that matter. None of
+    them only as far as the nominal alone leaves no more than imperfections (none_enough): where it leaves
+    more and the set does not, the largest of its effects interests, however little it carries."""
     weights = softmax([s.score for s in sets])
-    shared: dict[tuple[str, ...], float] = {}
+    shared: dict[tuple[str, ...], float] = {("unknown",): 0.0}
     cause = {"none": 0.0, **dict.fromkeys(listed, 0.0), "unknown": 0.0}
     presence = dict.fromkeys(listed, 0.0)
+
+    def give(names: Sequence[str], share: float) -> None:
+        key = tuple(sorted(names))
+        shared[key] = shared.get(key, 0.0) + share
+        cause[names[0] if names else "none"] += share
+        for name in presence.keys() & set(names):
+            presence[name] += share
+
     for weight, one in zip(weights, sets, strict=True):
-        shared[("unknown",)] = shared.get(("unknown",), 0.0) + weight * (1 - one.complete)
-        cause["unknown"] += weight * (1 - one.complete)
-        if one.complete == 0.0:
-            continue
-        for count in range(len(one.parts) + 1):
-            for chosen in combinations(one.parts, count):
-                share = weight * one.complete
-                for part in one.parts:
-                    share *= part.matters if part in chosen else 1 - part.matters
-                if not chosen:
-                    enough = none_enough / (1.0 if one.parts else one.complete)
-                    shared[("unknown",)] += share * (1 - enough)
-                    cause["unknown"] += share * (1 - enough)
-                    share *= enough
-                names = tuple(sorted(part.name for part in chosen))
-                shared[names] = shared.get(names, 0.0) + share
-                lead = max(chosen, key=lambda part: part.share).name if chosen else "none"
-                cause[lead] += share
-                for name in names:
-                    presence[name] += share
+        give(["unknown"], weight * (1 - one.complete))
+        parts = sorted(one.parts, key=lambda part: -part.share)
+        for chosen in (some for count in range(len(parts) + 1) for some in combinations(parts, count)):
+            share = weight * one.complete
+            for part in parts:
+                share *= part.matters if part in chosen else 1 - part.matters
+            if not chosen and one.complete > 0:
+                enough = none_enough / (1.0 if parts else one.complete)
+                give([parts[0].name if parts else "unknown"], share * (1 - enough))
+                share *= enough
+            give([part.name for part in chosen], share)
     return Probabilities(
         {name: float(p) for name, p in cause.items()},
         {names: float(p) for names, p in shared.items()},

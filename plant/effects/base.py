@@ -57,6 +57,8 @@ class Effect(BaseModel, ABC):
         The torque is a sine of the hub angle or of time: amplitude and phase follow by linear least squares.
     look_alike_of : str or None
         Not an answer of a diagnosis, but what the effect of this id may be mistaken for.
+    beside : str or None
+        What looks like it, is not on the list, and what would tell them apart: the end of a sentence.
     adds_to : str or None. Key of the stated value that it adds to.
     contains : str or None. Simpler effect that it is with its further parameters at an end of their ranges.
     absolute_angle : bool. It depends on the true hub angle: where an encoder has its zero matters.
@@ -75,6 +77,7 @@ class Effect(BaseModel, ABC):
     multiplies: ClassVar[str | None] = None
     harmonic: ClassVar[Harmonic | None] = None
     look_alike_of: ClassVar[str | None] = None
+    beside: ClassVar[str | None] = None
     adds_to: ClassVar[str | None] = None
     contains: ClassVar[str | None] = None
     absolute_angle: ClassVar[bool] = False

@@ -136,6 +136,7 @@ class HubInertia(RatioEffect):
 
     id = "hub_inertia"
     words = "a wrong inertia of the hub"
+    beside = "a body that something compliant holds to the hub, below its resonance; faster motions"
     multiplies = "hub.inertia_kg_m2"
 
     ratio: Positive = Field(description="true over nominal hub inertia")

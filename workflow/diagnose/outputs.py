@@ -17,7 +17,7 @@ from diagnosis.machine.case import Case
 from diagnosis.machine.own_plant import PlantCase
 from diagnosis.where.findings import Where
 from diagnosis.where.where import where
-from plant.effects import LOOK_ALIKES, Effect
+from plant.effects import EFFECTS, Effect
 from plant.rig import Rig
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.controller_check import ControllerCheck, NoControllerError, check_controller
@@ -178,7 +178,7 @@ def case_page(page: CasePage, progress: Callable[[float, str], None] | None = No
         moved=moved(page.found, page.found.deviations),
         moved_refit=moved(page.found, page.found.deviations_refit),
         partial=partial_answers(page.found),
-        look_alikes=LOOK_ALIKES,
+        effects=EFFECTS,
         versions=[*versions, ("python", sys.version.split()[0])],
     ).html
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from diagnosis.answer import Diagnosis
 from diagnosis.where.findings import Where
 from diagnosis.where.where import where_in_records
-from plant.effects import LOOK_ALIKES
+from plant.effects import EFFECTS
 from workflow.diagnose.following import Following, following
 from workflow.diagnose.per_cent import moved, partial_answers, shown
 from workflow.diagnose.words import FILTERS
@@ -56,7 +56,7 @@ def plant_page(found: Diagnosis) -> str:
         moved=moved(found, found.deviations),
         moved_refit=moved(found, found.deviations_refit),
         partial=partial_answers(found),
-        look_alikes=LOOK_ALIKES,
+        effects=EFFECTS,
     ).html
 
 
