@@ -194,7 +194,7 @@ class MujocoArm:
                 Quantity(
                     f"gravity.{axis}",
                     float(self.spec.option.gravity[k]),
-                    _gravity(k),
+                    partial(_put_gravity, k),
                     "acceleration_m_s2",
                     _STANDARD_GRAVITY,
                     signed=True,
@@ -220,11 +220,10 @@ class MujocoArm:
         )
         for key, parameter, unit, most, dependence in parts:
             value = float(np.ravel(getattr(joint, key))[0])
-            put = _first_of(joint.name, key)
             yield Quantity(
                 f"{joint.name}.{key}",
                 value,
-                put,
+                partial(_put_first, joint.name, key),
                 parameter,
                 unit,
                 (1e-4, most),
@@ -235,7 +234,7 @@ class MujocoArm:
             yield Quantity(
                 f"{joint.name}.backlash",
                 0.0,
-                _backlash(joint.name),
+                partial(_put_backlash, joint.name),
                 f"gap_{x}",
                 travel,
                 (1e-3, 0.5),
@@ -249,9 +248,9 @@ class MujocoArm:
         late = partial(
             Quantity, unit=self.dt_s, span=(0.02, longest), starts=(0.2, min(20.0, longest)), group="actuator"
         )
-        yield Quantity(f"{one.name}.gain", 1.0, _gain(one.name))
-        yield late(f"{one.name}.lag", lag, _lag(one.name), "time_constant_s")
-        put = _delay("actuator", one.name, self.spec.option.timestep)
+        yield Quantity(f"{one.name}.gain", 1.0, partial(_put_gain, one.name))
+        yield late(f"{one.name}.lag", lag, partial(_put_lag, one.name), "time_constant_s")
+        put = partial(_put_delay, "actuator", one.name, self.spec.option.timestep)
         yield late(f"{one.name}.delay", float(one.delay), put, "delay_s")
 
     def _of_link(self, body: Any) -> Iterator[Quantity]:
@@ -259,22 +258,23 @@ class MujocoArm:
         k = model.body(body.name).id
         if not (body.mass > 0 and model.body_weldid[k]):
             return
-        yield Quantity(f"{body.name}.mass", float(body.mass), _mass(body.name))
+        yield Quantity(f"{body.name}.mass", float(body.mass), partial(_put_mass, body.name))
         # Of a link on one hinge in the world, inertia is what armature is.
         if model.body_weldid[model.body_parentid[model.body_weldid[k]]]:
-            yield Quantity(f"{body.name}.inertia", 1.0, _inertia(body.name))
+            yield Quantity(f"{body.name}.inertia", 1.0, partial(_put_inertia, body.name))
         if body.sites and k not in model.body_parentid[1:]:
-            put = _payload(body.name, tuple(body.sites[0].pos))
+            put = partial(_put_payload, body.name, tuple(body.sites[0].pos))
             yield Quantity(
                 f"{body.name}.payload", 0.0, put, "mass_kg", float(body.mass), (1e-3, 10.0), group="link"
             )
 
     def _of_sensor(self, name: str, swing: float) -> Iterator[Quantity]:
         sensor = self.spec.sensor(name)
-        yield Quantity(f"{name}.sensor_gain", self.number(f"{name}.gain", 1.0), _number(f"{name}.gain"))
-        offset, put = self.number(f"{name}.offset", 0.0), _number(f"{name}.offset")
+        gain, offset = self.number(f"{name}.gain", 1.0), self.number(f"{name}.offset", 0.0)
+        yield Quantity(f"{name}.sensor_gain", gain, partial(_put_number, f"{name}.gain"))
+        put = partial(_put_number, f"{name}.offset")
         yield Quantity(f"{name}.sensor_offset", offset, put, "offset", swing, signed=True, group="sensor")
-        put = _delay("sensor", name, self.spec.option.timestep)
+        put = partial(_put_delay, "sensor", name, self.spec.option.timestep)
         late = ((0.02, 100.0), (0.2, 10.0))
         yield Quantity(
             f"{name}.sensor_delay", float(sensor.delay), put, "delay_s", self.dt_s, *late, group="sensor"
@@ -489,108 +489,80 @@ def _usual_tolerance(name: str) -> float:
     return TOLERANCES.get(name.rpartition(".")[2], _ELSE)
 
 
-def _first_of(joint: str, key: str) -> Put:
+# Each writes a value into an MjSpec once the arguments before it are bound.
+
+
+def _put_first(joint: str, key: str, spec: Any, value: float) -> None:
     """A number of a joint, or the first of several (of a polynomial of the speed)."""
-
-    def put(spec: Any, value: float) -> None:
-        one = spec.joint(joint)
-        if np.ndim(getattr(one, key)):
-            _set_component(one, key, 0, value)
-        else:
-            setattr(one, key, value)
-
-    return put
+    one = spec.joint(joint)
+    if np.ndim(getattr(one, key)):
+        _put_component(one, key, 0, value)
+    else:
+        setattr(one, key, value)
 
 
-def _gravity(k: int) -> Put:
-    return lambda spec, value: _set_component(spec.option, "gravity", k, value)
+def _put_gravity(k: int, spec: Any, value: float) -> None:
+    _put_component(spec.option, "gravity", k, value)
 
 
-def _set_component(one: Any, key: str, k: int, value: float) -> None:
+def _put_component(one: Any, key: str, k: int, value: float) -> None:
     whole = np.array(getattr(one, key), dtype=np.float64)
     whole[k] = value
     setattr(one, key, whole)
 
 
-def _gain(name: str) -> Put:
+def _put_gain(name: str, spec: Any, factor: float) -> None:
     """Force of an actuator, its feedback included."""
-
-    def put(spec: Any, factor: float) -> None:
-        one = spec.actuator(name)
-        one.gainprm = np.array(one.gainprm) * np.r_[[factor] * 3, np.ones(7)]
-        one.biasprm = np.array(one.biasprm) * np.r_[[factor] * 3, np.ones(7)]
-
-    return put
+    one = spec.actuator(name)
+    one.gainprm = np.array(one.gainprm) * np.r_[[factor] * 3, np.ones(7)]
+    one.biasprm = np.array(one.biasprm) * np.r_[[factor] * 3, np.ones(7)]
 
 
-def _lag(name: str) -> Put:
-    def put(spec: Any, value: float) -> None:
-        one = spec.actuator(name)
-        if one.dyntype == mujoco.mjtDyn.mjDYN_NONE:
-            one.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
-            one.actearly = True
-        _set_component(one, "dynprm", 0, value)
-
-    return put
+def _put_lag(name: str, spec: Any, value: float) -> None:
+    one = spec.actuator(name)
+    if one.dyntype == mujoco.mjtDyn.mjDYN_NONE:
+        one.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
+        one.actearly = True
+    _put_component(one, "dynprm", 0, value)
 
 
-def _delay(kind: str, name: str, step_s: float) -> Put:
-    def put(spec: Any, value: float) -> None:
-        one = getattr(spec, kind)(name)
-        one.delay, one.nsample, one.interp = value, int(np.ceil(value / step_s)) + 2, 1
-
-    return put
+def _put_delay(kind: str, name: str, step_s: float, spec: Any, value: float) -> None:
+    one = getattr(spec, kind)(name)
+    one.delay, one.nsample, one.interp = value, int(np.ceil(value / step_s)) + 2, 1
 
 
-def _mass(name: str) -> Put:
+def _put_mass(name: str, spec: Any, value: float) -> None:
     """At the same density and shape: inertia in proportion."""
-
-    def put(spec: Any, value: float) -> None:
-        body = spec.body(name)
-        body.inertia = np.array(body.inertia) * (value / body.mass)
-        body.mass = value
-
-    return put
+    body = spec.body(name)
+    body.inertia = np.array(body.inertia) * (value / body.mass)
+    body.mass = value
 
 
-def _inertia(name: str) -> Put:
-    def put(spec: Any, factor: float) -> None:
-        body = spec.body(name)
-        body.inertia = np.array(body.inertia) * factor
-
-    return put
+def _put_inertia(name: str, spec: Any, factor: float) -> None:
+    body = spec.body(name)
+    body.inertia = np.array(body.inertia) * factor
 
 
-def _payload(name: str, at: tuple[float, float, float]) -> Put:
-    def put(spec: Any, mass: float) -> None:
-        load = spec.body(name).add_body(name=f"{name} payload", pos=at)
-        load.explicitinertial, load.mass, load.ipos = True, mass, np.zeros(3)
-        load.inertia = np.full(3, 1e-9 * mass)
-
-    return put
+def _put_payload(name: str, at: tuple[float, float, float], spec: Any, mass: float) -> None:
+    load = spec.body(name).add_body(name=f"{name} payload", pos=at)
+    load.explicitinertial, load.mass, load.ipos = True, mass, np.zeros(3)
+    load.inertia = np.full(3, 1e-9 * mass)
 
 
-def _backlash(name: str) -> Put:
+def _put_backlash(name: str, spec: Any, gap: float) -> None:
     """A second joint on the same axis that is free within the gap; armature stays at the first, the motor."""
-
-    def put(spec: Any, gap: float) -> None:
-        joint = spec.joint(name)
-        joint.parent.add_joint(
-            name=f"{name} backlash",
-            type=joint.type,
-            axis=joint.axis,
-            pos=joint.pos,
-            limited=mujoco.mjtLimited.mjLIMITED_TRUE,
-            range=np.array([-0.5, 0.5]) * gap,
-            solref_limit=np.array([2 * spec.option.timestep, 1.0]),
-        )
-
-    return put
+    joint = spec.joint(name)
+    joint.parent.add_joint(
+        name=f"{name} backlash",
+        type=joint.type,
+        axis=joint.axis,
+        pos=joint.pos,
+        limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        range=np.array([-0.5, 0.5]) * gap,
+        solref_limit=np.array([2 * spec.option.timestep, 1.0]),
+    )
 
 
-def _number(name: str) -> Put:
-    def put(spec: Any, value: float) -> None:
-        one = spec.numeric(name) or spec.add_numeric(name=name, size=1)
-        one.data = np.array([value])
-
-    return put
+def _put_number(name: str, spec: Any, value: float) -> None:
+    one = spec.numeric(name) or spec.add_numeric(name=name, size=1)
+    one.data = np.array([value])
