@@ -7,7 +7,7 @@ the templates.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -331,7 +331,8 @@ class Where:
     """Where the gap lies.
 
     gap : PartGap. All records together.
-    sensors, experiments, bands, regimes, drift, common, curves : See their records.
+    sensors, experiments, bands, regimes, drift, common, curves : See their records. From regimes on only of a
+        flexible link.
     periodic, amplitude, linear : None where the records do not allow it.
     subsystem : dict
         Probability of none, actuator, joint, link, sensor, environment, unknown; empty without probabilities.
@@ -342,15 +343,15 @@ class Where:
     sensors: tuple[SensorGap, ...]
     experiments: tuple[ExperimentGap, ...]
     bands: tuple[BandGap, ...]
-    regimes: tuple[RegimeFinding, ...]
-    drift: tuple[DriftFinding, ...]
-    common: tuple[CommonFinding, ...]
-    curves: tuple[EquivalentCurve, ...]
-    periodic: tuple[PeriodicFinding, ...]
-    amplitude: AmplitudeFinding | None
-    linear: LinearCorrection | None
-    subsystem: dict[str, float]
-    level: float
+    regimes: tuple[RegimeFinding, ...] = ()
+    drift: tuple[DriftFinding, ...] = ()
+    common: tuple[CommonFinding, ...] = ()
+    curves: tuple[EquivalentCurve, ...] = ()
+    periodic: tuple[PeriodicFinding, ...] = ()
+    amplitude: AmplitudeFinding | None = None
+    linear: LinearCorrection | None = None
+    subsystem: dict[str, float] = field(default_factory=dict)
+    level: float = field(kw_only=True)
 
     @property
     def is_gap(self) -> bool:

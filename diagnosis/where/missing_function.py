@@ -24,6 +24,7 @@ from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.findings import EquivalentCurve, sensors_of
 from diagnosis.where.regimes import Motion
+from diagnosis.where.where_energy import Energy
 
 _SHIFTS = 39
 # Axes that explain less than this are not worth the shifts.
@@ -66,8 +67,7 @@ def missing_functions(
     Found also asks for a share of 30 % and that no shift in time of the function's variable explains as much
     (39 shifts), which guards against slow residuals that any slow function would fit.
     """
-    squares = sum(float(np.sum(e**2)) for e in residuals.values())
-    gap = squares - sum(e.size for e in residuals.values())
+    gap = Energy.of(residuals.values()).gap
     # In noise deviations, (T, Y): of the nominal machine, wherever a record starts.
     response, _ = case.machine.torque_response(max(e.voltage_V.size for e in case.experiments))
     torque, sensors = response / case.noise, sensors_of(case)

@@ -7,7 +7,7 @@ of the motion stands in the place of the noise.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -18,11 +18,10 @@ from diagnosis.machine.flexible_arm import NOISE
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.where.distortion import periodic_findings
 from diagnosis.where.findings import Where, sensors_of
-from diagnosis.where.linear_correction import linear_correction
 from diagnosis.where.missing_function import missing_functions
 from diagnosis.where.regimes import motions, regime_axes, regime_findings
 from diagnosis.where.where_energy import Energy, band_gaps, experiment_gaps, part_gap, sensor_gaps
-from diagnosis.where.where_trends import amplitude_finding, common_findings, drift_findings
+from diagnosis.where.where_trends import amplitude_finding, common_findings, drift_findings, linear_correction
 from plant.effects import EFFECTS
 
 LEVEL = 0.01
@@ -55,16 +54,14 @@ def where(
         case, residuals = over_levels(case, residuals, case.model_error * motion_of(case))
     moved, sensors = motions(case, residuals), sensors_of(case)
     e = {name: np.asarray(residuals[name], dtype=np.float64) for name in moved}
-    squares = Energy(sum(float(np.sum(v**2)) for v in e.values()), sum(v.size for v in e.values()))
-    by_sensor, bands = sensor_gaps(e, sensors, level), band_gaps(e, sensors, case.rig.sampling.dt_s, level)
+    found = _by_parts(e, sensors, case.rig.sampling.dt_s, level)
+    bands = found.bands
     if case.model_error > 0:
         # What a model may miss is stated for all frequencies together, not for each of them.
-        quiet = [s.sensor for s in by_sensor if not s.gap.found]
+        quiet = [s.sensor for s in found.sensors if not s.gap.found]
         bands = tuple(replace(b, gap=replace(b.gap, found=False)) if b.sensor in quiet else b for b in bands)
-    return Where(
-        gap=part_gap(squares, squares, level),
-        sensors=by_sensor,
-        experiments=experiment_gaps(e, level),
+    return replace(
+        found,
         bands=bands,
         regimes=regime_findings(e, sensors, regime_axes(moved), level, rng),
         drift=drift_findings(case, e, level),
@@ -74,7 +71,6 @@ def where(
         amplitude=amplitude_finding(case, e, level, rng),
         linear=linear_correction(case, e),
         subsystem=subsystem_mass(probabilities) if probabilities else {},
-        level=level,
     )
 
 
@@ -83,24 +79,17 @@ def where_in_records(case: CaseOfMachine, residuals: Mapping[str, Real], dt_s: f
     model_error = case.machine.weighing.model_error
     if model_error > 0:
         _, residuals = over_levels(case, residuals, model_error * motion_of(case))
-    squares = Energy(
-        sum(float(np.sum(e**2)) for e in residuals.values()), sum(e.size for e in residuals.values())
-    )
-    sensors = case.machine.output_names
+    return _by_parts(residuals, case.machine.output_names, dt_s, LEVEL)
+
+
+def _by_parts(residuals: Mapping[str, Real], sensors: Sequence[str], dt_s: float, level: float) -> Where:
+    whole = Energy.of(residuals.values())
     return Where(
-        gap=part_gap(squares, squares, LEVEL),
-        sensors=sensor_gaps(residuals, sensors, LEVEL),
-        experiments=experiment_gaps(residuals, LEVEL),
-        bands=band_gaps(residuals, sensors, dt_s, LEVEL),
-        regimes=(),
-        drift=(),
-        common=(),
-        curves=(),
-        periodic=(),
-        amplitude=None,
-        linear=None,
-        subsystem={},
-        level=LEVEL,
+        gap=part_gap(whole, whole, level),
+        sensors=sensor_gaps(residuals, sensors, level),
+        experiments=experiment_gaps(residuals, level),
+        bands=band_gaps(residuals, sensors, dt_s, level),
+        level=level,
     )
 
 

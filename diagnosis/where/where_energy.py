@@ -8,7 +8,7 @@ noncentrality; so p-values are exact and intervals need no resampling. Bands use
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +30,11 @@ class Energy:
 
     squares: float
     count: int
+
+    @classmethod
+    def of(cls, signals: Iterable[Real]) -> Energy:
+        parts = [(float(np.sum(signal**2)), signal.size) for signal in signals]
+        return cls(sum(squares for squares, _ in parts), sum(size for _, size in parts))
 
     @property
     def gap(self) -> float:
@@ -68,10 +73,7 @@ def part_gap(part: Energy, whole: Energy, level: float) -> PartGap:
 
 
 def sensor_gaps(residuals: Mapping[str, Real], sensors: Sequence[str], level: float) -> tuple[SensorGap, ...]:
-    energies = [
-        total([Energy(float(np.sum(e[:, s] ** 2)), e.shape[0]) for e in residuals.values()])
-        for s in range(len(sensors))
-    ]
+    energies = [Energy.of(e[:, s] for e in residuals.values()) for s in range(len(sensors))]
     whole = total(energies)
     return tuple(
         SensorGap(sensor, part_gap(energy, whole, level / len(sensors)))
@@ -81,10 +83,7 @@ def sensor_gaps(residuals: Mapping[str, Real], sensors: Sequence[str], level: fl
 
 def experiment_gaps(residuals: Mapping[str, Real], level: float) -> tuple[ExperimentGap, ...]:
     """Every experiment: all sensors together and each; one level for all these tests."""
-    energies = {
-        name: [Energy(float(np.sum(column**2)), column.size) for column in e.T]
-        for name, e in residuals.items()
-    }
+    energies = {name: [Energy.of([column]) for column in e.T] for name, e in residuals.items()}
     whole = total([energy for parts in energies.values() for energy in parts])
     each = level / sum(1 + len(parts) for parts in energies.values())
     return tuple(
