@@ -11,7 +11,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 import diagnosis
-from workflow.diagnose.plant_page import write_plant_page
+from workflow.diagnose.pages import write_plant_page
 
 GUIDE = Path(__file__).resolve().parents[2] / "docs" / "own_plant.md"
 DT_S, SAMPLES = 0.01, 500

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import metadata
 from typing import Any
 
 import tomlkit
@@ -15,23 +13,19 @@ from diagnosis.answer import Diagnosis
 from diagnosis.diagnosis import diagnose
 from diagnosis.machine.case import Case
 from diagnosis.machine.own_plant import PlantCase
-from diagnosis.where.findings import Where
 from diagnosis.where.where import where
-from plant.effects import EFFECTS, Effect
+from plant.effects import Effect
 from plant.rig import Rig
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.controller_check import ControllerCheck, NoControllerError, check_controller
 from workflow.diagnose.directory import answer_text
 from workflow.diagnose.document import document_of
-from workflow.diagnose.following import Following, following
-from workflow.diagnose.per_cent import moved, partial_answers, shown
-from workflow.diagnose.plant_page import plant_page
+from workflow.diagnose.following import following
+from workflow.diagnose.pages import CasePage, case_page, moved, plant_page
 from workflow.diagnose.simulator_case import SimulatorCase
-from workflow.diagnose.words import FILTERS
 from workflow.engine import codec, storage
 from workflow.engine.errors import naming
 from workflow.engine.executor import Report
-from workflow.report.rendering import render_page
 
 # Shares of a case's time, for the progress bar only.
 _ENGINE, _WHERE, _NEXT, _CONTROLLER = 0.75, 0.8, 0.85, 0.9
@@ -114,10 +108,10 @@ class Work:
         name = loaded.case.name
         with naming(f"case {name}"):
             found = self.engine(loaded.case, progress=lambda f, m: report(_CONTROLLER * f, m))
-            files = {f"{name}.html": plant_page(found).encode()}
+            coming = following(found)
+            files = {f"{name}.html": plant_page(found, coming).encode()}
             if loaded.repaired is not None:
                 files[f"{name}.xml"] = loaded.repaired(found).encode()
-        coming = following(found)
         beside = {"next_experiment": {"advice": coming.advice, **codec.plain(coming.repeat or {})}}
         return self._with_document(loaded, found, beside, files), time.process_time()
 
@@ -144,43 +138,6 @@ def _control(found: Diagnosis) -> tuple[ControllerCheck | None, str]:
         return check_controller(found.case, found.rig, found.repair), ""
     except NoControllerError as error:
         return None, str(error)
-
-
-@dataclass(frozen=True, eq=False)
-class CasePage:
-    """Everything the page is made of.
-
-    where: of the gap that is left when the nominal parameters are re-estimated within their tolerances;
-    remains: of what the effects leave. check is None where there was nothing to compare, no_check says why.
-    """
-
-    loaded: LoadedCase
-    found: Diagnosis
-    where: Where
-    remains: Where
-    next_experiment: Following
-    check: ControllerCheck | None
-    no_check: str
-    rig_text: str
-    effects_text: str
-
-
-def case_page(page: CasePage, progress: Callable[[float, str], None] | None = None) -> str:
-    """One self-contained HTML page; equal content gives equal bytes."""
-    versions = [(name, metadata.version(name)) for name in ("flexlink", "numpy", "scipy", "numba")]
-    return render_page(
-        "diagnosis/case.html.j2",
-        progress,
-        filters=FILTERS.items(),
-        title=page.loaded.case.name,
-        page=page,
-        shown=shown(page.found),
-        moved=moved(page.found, page.found.deviations),
-        moved_refit=moved(page.found, page.found.deviations_refit),
-        partial=partial_answers(page.found),
-        effects=EFFECTS,
-        versions=[*versions, ("python", sys.version.split()[0])],
-    ).html
 
 
 def rig_text(

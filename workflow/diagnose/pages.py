@@ -1,0 +1,136 @@
+"""The pages of a diagnosis, of a rig and of an own plant; beside a model error in per cent of the motion."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from importlib import metadata
+from math import copysign
+from pathlib import Path
+from typing import Any
+
+from diagnosis.answer import Diagnosis, held_out_gap
+from diagnosis.where.findings import Where
+from diagnosis.where.where import motion_of, over_levels, where_in_records
+from plant.effects import EFFECTS
+from workflow.diagnose.case_files import LoadedCase
+from workflow.diagnose.controller_check import ControllerCheck
+from workflow.diagnose.following import Following, following
+from workflow.diagnose.words import FILTERS
+from workflow.engine import storage
+from workflow.report.rendering import render_page
+
+
+@dataclass(frozen=True, eq=False)
+class CasePage:
+    """Everything the page is made of.
+
+    where: of the gap that is left when the nominal parameters are re-estimated within their tolerances;
+    remains: of what the effects leave. check is None where there was nothing to compare, no_check says why.
+    """
+
+    loaded: LoadedCase
+    found: Diagnosis
+    where: Where
+    remains: Where
+    next_experiment: Following
+    check: ControllerCheck | None
+    no_check: str
+    rig_text: str
+    effects_text: str
+
+
+def case_page(page: CasePage, progress: Callable[[float, str], None] | None = None) -> str:
+    """One self-contained HTML page; equal content gives equal bytes."""
+    versions = [(name, metadata.version(name)) for name in ("flexlink", "numpy", "scipy", "numba")]
+    versions.append(("python", sys.version.split()[0]))
+    return _rendered("diagnosis/case.html.j2", page.found, progress, page=page, versions=versions)
+
+
+def plant_page(found: Diagnosis, coming: Following) -> str:
+    """One self-contained HTML page about a `PlantCase`; equal content gives equal bytes.
+
+    Raises ValueError if the plant does not state its sampling period.
+    """
+    dt_s = found.case.dt_s
+    if not dt_s > 0:
+        raise ValueError(f"case {found.case.name}: state the plant's sampling period (dt_s) for a page")
+    numbers = {
+        "parameters": dict(found.rig.parameters),
+        "effects": [change.to_dict() for change in found.repair],
+    }
+    page = {
+        "found": found,
+        "where": where_in_records(found.case, found.residuals_refit, dt_s),
+        "remains": where_in_records(found.case, found.residuals_after, dt_s),
+        "next_experiment": coming,
+        "numbers": json.dumps(numbers, indent=1),
+    }
+    return _rendered("diagnosis/plant.html.j2", found, page=page)
+
+
+def write_plant_page(found: Diagnosis, path: Path) -> None:
+    """`plant_page` as a file."""
+    storage.write_bytes(path, plant_page(found, following(found)).encode())
+
+
+def _rendered(
+    template: str,
+    found: Diagnosis,
+    progress: Callable[[float, str], None] | None = None,
+    **values: Any,
+) -> str:
+    return render_page(
+        template,
+        progress,
+        filters=FILTERS.items(),
+        title=found.case.name,
+        shown=shown(found),
+        moved=moved(found, found.deviations),
+        moved_refit=moved(found, found.deviations_refit),
+        partial=partial_answers(found),
+        effects=EFFECTS,
+        **values,
+    ).html
+
+
+def shown(found: Diagnosis) -> Diagnosis:
+    """Residuals and gaps over a hundredth of each output's motion (RMS about its mean, held-out records).
+
+    The floor is then the stated model error in per cent. As it is where the simulation is exact.
+    """
+    if not found.case.model_error > 0:
+        return found
+    level = 0.01 * motion_of(found.case)
+    (case, before), (_, refit), (_, after) = (
+        over_levels(found.case, residuals, level)
+        for residuals in (found.residuals_before, found.residuals_refit, found.residuals_after)
+    )
+    return replace(
+        found,
+        case=case,
+        residuals_before=before,
+        residuals_refit=refit,
+        residuals_after=after,
+        gap_before=held_out_gap(case, before),
+        gap_refit=held_out_gap(case, refit),
+        gap_after=held_out_gap(case, after),
+        noise_floor=100 * found.case.model_error,
+    )
+
+
+def moved(found: Diagnosis, deviations: Mapping[str, float]) -> Mapping[str, float]:
+    """Stated values that were re-estimated -> by how many tolerances, positive where the value grew.
+
+    A deviation multiplies: a value below zero falls where its deviation is above.
+    """
+    stated = found.case.machine.description
+    return {key: d * copysign(1.0, stated.value(key)) for key, d in deviations.items()}
+
+
+def partial_answers(found: Diagnosis, most: int = 5) -> tuple[tuple[tuple[str, ...], float], ...]:
+    """Effects that close a part of the held-out gap by themselves, with that share, most first."""
+    closes = () if found.shares is None else found.shares.closes
+    return tuple(one for one in closes if one[1] > 0)[:most]
