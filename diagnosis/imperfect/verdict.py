@@ -266,8 +266,10 @@ def _part(
     matters = _soft(share / limit / search.case.machine.weighing.model_error, _INTERESTS_WIDTH)
     off = _tolerances_off(search, explanation, explanation.names.index(name))
     if off is not None:
-        # A stated value in itself: what it changes may be imitated by the others within their tolerances.
-        matters = max(matters, _soft(off / _FAR_OFF, _FAR_OFF_WIDTH))
+        # A stated value in itself: what it changes may be imitated by the others within their tolerances. Far
+        # off is not enough: of a value that nobody stated anything is.
+        preferred = float(expit(_gain(explanation, listed) - _gain(rest, listed)))
+        matters = max(matters, preferred * _soft(off / _FAR_OFF, _FAR_OFF_WIDTH))
     return Part(name, share, matters)
 
 

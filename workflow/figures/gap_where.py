@@ -76,7 +76,8 @@ def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure
             left.plot([middle, middle], np.maximum(interval, factor * _SMALLEST), **_WHISKER)
         left.plot([], [], color=colour, lw=4.0, label=name)
     left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel=words)
-    left.set_ylim(bottom=factor * _SMALLEST)
+    # Up to what does not interest at least, so that a frame in which nothing is large is not empty.
+    left.set_ylim(factor * _SMALLEST, max(left.get_ylim()[1], factor))
     left.set_title("By frequency")
     for row, entry in enumerate(experiments):
         for sensor, part, offset in zip(sensors, entry.sensors, 0.15 * apart, strict=True):
