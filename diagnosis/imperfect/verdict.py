@@ -331,7 +331,8 @@ def _soft(ratio: float, width: float) -> float:
 def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: float) -> Probabilities:
     """Every set shared out: unknown where it is not complete, else those of its effects that matter. None of
     them only as far as the nominal alone leaves no more than imperfections (none_enough): where it leaves
-    more and the set does not, the largest of its effects interests, however little it carries."""
+    more and the set does not, the largest of its effects interests, however little it carries. With
+    none_enough zero nobody has stated what does not interest: then that is unknown."""
     weights = softmax([s.score for s in sets])
     shared: dict[tuple[str, ...], float] = {("unknown",): 0.0}
     cause = {"none": 0.0, **dict.fromkeys(listed, 0.0), "unknown": 0.0}
@@ -353,7 +354,7 @@ def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: f
                 share *= part.matters if part in chosen else 1 - part.matters
             if not chosen and one.complete > 0:
                 enough = none_enough / (1.0 if parts else one.complete)
-                give([parts[0].name if parts else "unknown"], share * (1 - enough))
+                give([parts[0].name if parts and none_enough > 0 else "unknown"], share * (1 - enough))
                 share *= enough
             give([part.name for part in chosen], share)
     return Probabilities(

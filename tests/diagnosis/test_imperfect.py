@@ -26,6 +26,8 @@ from diagnosis.imperfect.levels import Levels, coefficients
 from diagnosis.imperfect.records import Records, Start, StartColumns
 from diagnosis.imperfect.search import Explanation, Search
 from diagnosis.imperfect.verdict import judged
+from diagnosis.machine.flexible_arm import FlexibleArm
+from diagnosis.machine.machine_protocol import Weighing
 from plant.effects import LOOK_ALIKES, parse_effect
 from plant.presets import paper_link
 from validation.blind.generate import generate
@@ -337,11 +339,23 @@ def test_small_effects_are_nothing_together_where_each_is_nothing():
     assert found.probabilities.cause["unknown"] < 0.5
 
 
-def test_what_explains_the_records_where_the_nominal_does_not_is_named_though_small():
+def test_a_value_that_nobody_stated_is_not_named_for_being_far_off():
+    # No tolerance: any delay is far off, and this one explains next to nothing.
+    found = _judged({(): (0.0, 0.02, 0.02), ("input_delay",): (12.0, 0.0199, 0.0199)})
+    assert found.judged[0].explanation.names == ("input_delay",)
+    assert found.probabilities.cause["input_delay"] < 0.5
+
+
+def test_what_explains_the_records_where_the_nominal_does_not_is_named_though_small(monkeypatch):
     # The estimation record drifts off with ripple that carries less than interests of the held-out one.
-    found = _judged({(): (0.0, 0.3, 0.05), ("torque_ripple",): (200.0, 0.04, 0.005)})
+    sets = {(): (0.0, 0.3, 0.05), ("torque_ripple",): (200.0, 0.04, 0.005)}
+    found = _judged(sets)
     assert found.accepted == ("torque_ripple",)
     assert found.probabilities.cause["unknown"] < 0.1
+    # What interests is a user's word: where nobody has given it, small is not said to be enough for a name.
+    usual = property(lambda arm: Weighing(model_error=arm.model_error, stated=False))
+    monkeypatch.setattr(FlexibleArm, "weighing", usual)
+    assert _judged(sets).answer == "unknown"
 
 
 def test_a_look_alike_leaves_no_more_of_held_out_records_than_what_it_looks_like():
