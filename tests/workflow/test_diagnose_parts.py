@@ -9,8 +9,7 @@ from diagnosis.machine.case import Case, Experiment
 from plant import EFFECTS, parse_effects, simulate
 from plant.effects import in_words
 from tests.workflow.diagnosis_examples import small_rig
-from workflow.diagnose.controller_check import check_controller
-from workflow.diagnose.linear_machine import sampled_linear_machine
+from workflow.diagnose.controller_check import check_controller, sampled_linear_machine
 from workflow.diagnose.words import FILTERS, key_words, parameter_words, probability_words, unit_of
 from workflow.text import formats
 
