@@ -24,8 +24,7 @@ from diagnosis.evidence.confirmation import confronted
 from diagnosis.evidence.hypotheses import DISAGREEMENT, Hypothesis, Probabilities, probabilities
 from diagnosis.evidence.look_alikes import look_alikes
 from diagnosis.evidence.search import Progress, search
-from diagnosis.fit.fit import Fit, fit
-from diagnosis.fit.intervals import parameter_intervals
+from diagnosis.fit.fit import Fit, fit, parameter_intervals
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.imperfect.answered import beside_imperfections, looked_at_again, reaches_noise, searched
 from diagnosis.machine.case import Case

@@ -13,11 +13,8 @@ from scipy.signal import czt
 from diagnosis.fit.fit import Fit
 from diagnosis.fit.nominal import prior_cost, prior_curvature, prior_slope
 from diagnosis.fit.residual import ResidualModel
-from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Real
 from plant.effects.search_space import Candidate
-from plant.rig import Rig
-from plant.simulation import simulate
 
 # Ripple and disturbance frequencies are looked at this densely: periods over the record for the one, a tenth
 # of the inverse of the largest angle for the other.
@@ -55,10 +52,8 @@ class Screening:
 
     def starts(self, candidate: Candidate) -> list[Start]:
         """Every start of the candidate, best first."""
-        machine = self.model.nominal.at(self.around.deviations)
-        if candidate.kind.harmonic and isinstance(machine, FlexibleArm):
-            found = self._harmonic(candidate, machine.rig)
-        else:
+        found = self._harmonic(candidate) if candidate.kind.harmonic else None
+        if found is None:
             found = [
                 start for x in candidate.starts if (start := self._at(candidate, np.array(x))) is not None
             ]
@@ -122,15 +117,16 @@ class Screening:
         parts, outputs = np.split(change, self._parts), self.model.case.noise.size
         return float(max(np.max(np.sqrt(np.mean(p.reshape(-1, outputs) ** 2, axis=0))) for p in parts))
 
-    def _harmonic(self, candidate: Candidate, rig: Rig) -> list[Start]:
-        """Amplitude and phase by linear least squares at each frequency: the torque acts on a linear arm."""
+    def _harmonic(self, candidate: Candidate) -> list[Start] | None:
+        """Amplitude and phase by linear least squares at each frequency: the torque acts on a linear arm;
+        None of a machine without a hub."""
         model, around = self.model, self.around
         P = around.deviations.size
-        dt, noise = rig.sampling.dt_s, model.case.noise
         longest = max(len(e.input) for e in model.case.estimation)
-        pulse = np.zeros(longest)
-        pulse[0] = 1.0
-        response = simulate(rig, np.zeros(longest), hub_torque_Nm=pulse).output / noise
+        known = model.nominal.at(around.deviations).torque_response(longest)
+        if known is None:
+            return None
+        response, dt = known[0] / model.case.noise, known[1]
         model.simulations += 1
         periodic = candidate.kind.harmonic == "time"
         if periodic:

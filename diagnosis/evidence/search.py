@@ -11,8 +11,7 @@ import numpy as np
 from diagnosis.evidence.hypotheses import BESIDE_NON_SMOOTH, DISAGREEMENT, Hypothesis
 from diagnosis.evidence.screening import Screening, Start, smallest_size
 from diagnosis.fit.discrepancy import discrepancy
-from diagnosis.fit.fit import Fit, cost_at, fit, non_smooth
-from diagnosis.fit.non_smooth import refined
+from diagnosis.fit.fit import Fit, cost_at, fit, non_smooth, refined
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real

@@ -2,7 +2,8 @@
 
 Minimises |e|^2 + |d|^2 over the deviations d of the nominal parameters (more beyond two tolerances) and
 the coordinates x of the candidates (inside their boxes), e being the whitened residuals:
-Levenberg-Marquardt with difference quotients, inside the boxes.
+Levenberg-Marquardt with difference quotients, inside the boxes; sizes on which the cost does not depend
+smoothly (backlash, rounding) on grids, all else following.
 """
 
 from __future__ import annotations
@@ -32,6 +33,9 @@ _UNIT = 1e3
 _PROBE, _BEND = 0.1, 0.75
 # Decrease that the quadratic model may still promise where a fit ends.
 _LEFT = 0.5
+# Grids of a non-smooth size: how far they reach to either side, one after the other, and their points.
+_REACHES = (0.12, 0.04, 0.012)
+_POINTS = 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +158,50 @@ def fit(
     J = _jacobian(model, candidates, d, x, e, nominal_jacobian)
     parts = tuple(np.split(x, splits[:-1])) if candidates else ()
     return Fit(tuple(candidates), d, parts, e, J, cost, converged, model.case.machine.weighing)
+
+
+def refined(model: ResidualModel, end: Fit) -> Fit:
+    """The fit with the sizes of its non-smooth effects sought on grids around where a descent has left them.
+
+    Difference quotients along a non-smooth size say little, and a descent ends in the nearest jump. Each grid
+    is evaluated with everything else moved along the Jacobian of the present point; the best point is refined
+    without moving the size.
+    """
+    best = end
+    for k, candidate in enumerate(end.candidates):
+        if candidate.dependence != "non-smooth":
+            continue
+        for reach in _REACHES:
+            best = _round(model, best, k, reach)
+    return best
+
+
+def _round(model: ResidualModel, best: Fit, k: int, reach: float) -> Fit:
+    P = best.deviations.size
+    sizes = [len(c.axes) for c in best.candidates]
+    at = P + sum(sizes[:k])
+    others = np.delete(np.arange(best.jacobian.shape[1]), at)
+    J = best.jacobian[:, others]
+    H = J.T @ J
+    H[range(P), range(P)] += prior_curvature(best.deviations)
+    scale = np.sqrt(np.maximum(np.diag(H), 1e-12))
+    low, high = best.candidates[k].box
+    trials = []
+    for shift in np.linspace(-reach, reach, _POINTS):
+        x = [part.copy() for part in best.coordinates]
+        x[k][0] = np.clip(x[k][0] + shift, low[0], high[0])
+        effects = tuple(c.effect_at(part) for c, part in zip(best.candidates, x, strict=True))
+        e = model.of(best.deviations, effects)
+        gradient = J.T @ e
+        gradient[:P] += prior_slope(best.deviations)
+        step = -np.linalg.solve(H + 1e-6 * np.diag(scale**2), gradient)
+        cost = float(e @ e + gradient @ step) + prior_cost(best.deviations)
+        trials.append((cost, x, best.deviations + np.clip(step[:P], -1.5, 1.5)))
+    cost, x, d = min(trials, key=lambda trial: trial[0])
+    if not cost < best.cost:
+        return best
+    found = fit(model, best.candidates, x, model.nominal.within(d), iterations=5, tolerance=0.5)
+    return found if found.cost < best.cost else best
 
 
 def cost_at(
@@ -292,3 +340,21 @@ def _inside(x: float, slope: float, spread: float, low: float, high: float) -> f
         a, b = -b, -a
     upper, lower = log_ndtr(b), log_ndtr(a)
     return float(shift + upper + np.log1p(-np.exp(min(lower - upper, -1e-300))))
+
+
+def parameter_intervals(
+    candidate: Candidate, coordinates: Real, covariance: Real, rng: np.random.Generator, draws: int
+) -> dict[str, tuple[float, float]]:
+    """95 % intervals by Gaussian draws of the coordinates (A,), kept inside their box; covariance (A, A)."""
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    moved = coordinates + rng.standard_normal((draws, coordinates.size)) @ root.T
+    sampled = [candidate.parameters(draw) for draw in np.clip(moved, *candidate.box)]
+    found = {}
+    for key, value in candidate.parameters(coordinates).items():
+        spread = np.array([p[key] for p in sampled]) - value
+        if key == "phase_rad":
+            spread = np.mod(spread + np.pi, 2 * np.pi) - np.pi
+        below, above = np.quantile(spread, [0.025, 0.975])
+        found[key] = (float(value + below), float(value + above))
+    return found

@@ -19,7 +19,7 @@ from diagnosis.answer import (
     held_out_gap,
     share_closed,
 )
-from diagnosis.fit.intervals import parameter_intervals
+from diagnosis.fit.fit import parameter_intervals
 from diagnosis.imperfect import verdict as judging
 from diagnosis.imperfect.carried import shares_of
 from diagnosis.imperfect.descent import Descent
