@@ -105,8 +105,6 @@ class Screening:
     def _follow(self, e: Real) -> tuple[float, Real]:
         """Least cost and step of the deviations on the linearisation."""
         d = self.around.deviations
-        if not d.size:
-            return float(e @ e), np.zeros(0)
         gradient = self._Jn.T @ e + prior_slope(d)
         step = -np.linalg.solve(self._A, gradient)
         # Never trust the linearisation beyond a tolerance or so.

@@ -88,9 +88,8 @@ class Plant:
         lock(self, "noise")
         object.__setattr__(self, "effects", tuple(self.effects))
         object.__setattr__(self, "output_names", tuple(self.output_names))
-        object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
-        object.__setattr__(self, "tolerances", MappingProxyType(dict(self.tolerances)))
-        object.__setattr__(self, "start", MappingProxyType(dict(self.start)))
+        for key in ("parameters", "tolerances", "start"):
+            object.__setattr__(self, key, MappingProxyType(dict(getattr(self, key))))
         for name, spread in self.start.items():
             if not 0 < spread < np.inf:
                 raise ValueError(f"plant: spread of {name} at the start must be positive; got {spread}")
@@ -138,16 +137,14 @@ class Plant:
     @property
     def unknown_start(self) -> UnknownStart:
         """Of the states that are named as such, beside a model error."""
-        known = replace(KNOWN_START, zero_outputs=np.zeros((0, self.noise.size)))
-        if not (self.start and self.weighing.model_error > 0):
-            return known
-        states = len(self.start)
+        spread = np.array([*self.start.values()] if self.weighing.model_error > 0 else [])
         return replace(
-            known,
-            state_spread=np.array(list(self.start.values())),
-            state_per_zero=np.zeros((states, 0)),
-            guess=lambda record: np.zeros(states),
-            responses=None,
+            KNOWN_START,
+            state_spread=spread,
+            zero_outputs=np.zeros((0, self.noise.size)),
+            state_per_zero=np.zeros((spread.size, 0)),
+            guess=lambda record: np.zeros(spread.size),
+            responses=None if spread.size else KNOWN_START.responses,
         )
 
     def torque_response(self, samples: int) -> None:
