@@ -184,7 +184,7 @@ def _turning(parameters, effects, inputs):
 
 
 def test_what_is_wrong_is_named_beside_a_bias_that_drifts():
-    """A bias of less than a hundredth of the largest voltage leaves most of the gap of an angle nobody holds."""
+    """A bias of a hundredth of the voltage leaves most of the gap of an angle that nobody holds."""
     rng = np.random.default_rng(5)
     experiments = []
     for amplitude, role in ((0.75, "estimation"), (1.5, "estimation"), (1.1, "held_out")):
