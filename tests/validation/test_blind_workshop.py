@@ -14,7 +14,7 @@ from plant.rig import Rig
 from plant.simulation import Simulator, Start
 from validation.blind.generate import generate
 from validation.blind.truth import LISTED, WORKSHOP_UNLISTED, Background, Before, Feedback, Truth
-from validation.blind.workshop.generate import SHARES, workshop_schedule
+from validation.blind.workshop.cases import SHARES, workshop_schedule
 from validation.blind.workshop.machine import draw_workshop
 from validation.blind.workshop.nominal import Log, Nominal
 from validation.blind.workshop.score import FAMILIES, score_folders

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from validation.blind.inputs import Planned, plan_experiments
-from validation.blind.rigs import Rig, draw_rig, draw_tolerances, rounded, stated
+from validation.blind.rigs import Rig, draw_rig, draw_tolerances, log_uniform, rounded, stated
 from validation.blind.sizes import NOT_TOGETHER, PARAMETRIC, Sizable, Table, sizable
 from validation.blind.truth import LISTED, UNLISTED, Clean, Real, Truth
 
@@ -137,7 +137,7 @@ def _effects(
     low, high = RANGES[sort]
     found = []
     for one in names:
-        wanted = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+        wanted = log_uniform(rng, low, high)
         open_size = sizable(one, rig, plans, rng)
         if tolerances and one in PARAMETRIC:
             entry = _many_tolerances(one, open_size, rig, plans, tolerances, (low, high), rng)

@@ -21,11 +21,17 @@ import typer
 
 from validation.blind.cases import BlindCase, make_case, schedule
 from validation.blind.rigs import rig_toml
-from validation.blind.workshop import generate as workshop_cases
+from validation.blind.workshop.cases import (
+    WorkshopCase,
+    WorkshopPlan,
+    make_case as make_workshop_case,
+    workshop_schedule,
+)
+from validation.blind.workshop.files import write_workshop_case
 from workflow.engine.storage import write_text
 
 Answer = dict[str, Any]
-Plan = tuple[Any, bool, str] | workshop_cases.WorkshopPlan
+Plan = tuple[Any, bool, str] | WorkshopPlan
 
 
 def case_name(index: int) -> str:
@@ -77,12 +83,15 @@ def answer_toml(answer: Mapping[str, Any]) -> str:
 def _one(seed: int, out: Path, open_cases: bool, job: tuple[int, Plan]) -> Answer:
     index, plan = job
     folder = out / case_name(index)
-    if isinstance(plan, workshop_cases.WorkshopPlan):
-        answer = {"case": folder.name, **workshop_cases.write_case(seed, index, plan, folder)}
+    rng = np.random.default_rng([seed, 1, index])
+    case: BlindCase | WorkshopCase
+    if isinstance(plan, WorkshopPlan):
+        case = make_workshop_case(plan, rng)
+        write_workshop_case(case, folder, rng)
     else:
-        case = make_case(*plan, np.random.default_rng([seed, 1, index]))
+        case = make_case(*plan, rng)
         write_case(case, folder)
-        answer = {"case": folder.name, **case.answer}
+    answer = {"case": folder.name, **case.answer}
     if open_cases:
         write_text(folder / "rig_exact.toml", rig_toml(answer["true_rig"]))
         write_text(folder / "answer.toml", answer_toml(answer))
@@ -111,7 +120,7 @@ def generate(
     answers = dict(finished or {})
     work = partial(_one, seed, out, open_cases)
     drawn = np.random.default_rng([seed, 0, n_cases])
-    plans: list[Plan] = [*(workshop_cases.workshop_schedule if workshop else schedule)(n_cases, drawn, only)]
+    plans: list[Plan] = [*(workshop_schedule if workshop else schedule)(n_cases, drawn, only)]
     tasks = [(k, plan) for k, plan in enumerate(plans) if case_name(k) not in answers]
 
     def take(done: Iterable[Answer]) -> None:

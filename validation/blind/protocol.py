@@ -30,7 +30,7 @@ from validation.blind.seal import (
     write_private,
 )
 from validation.blind.worker import BlindCase, diagnose_folder, failed
-from validation.blind.workshop.generate import SHARES
+from validation.blind.workshop.cases import SHARES
 from validation.blind.workshop.score import FAMILIES
 from workflow.engine.codec import plain_text
 from workflow.engine.errors import InputError

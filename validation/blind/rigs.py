@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from validation.blind.truth import RigTable
@@ -32,12 +34,23 @@ def rounded(value: float, digits: int = 4) -> float:
     return float(f"{value:.{digits}g}")
 
 
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """Drawn evenly in the logarithm."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def off(table: Rig, key: str, tolerance: float, most: float, digits: int, rng: np.random.Generator) -> None:
+    """Move a value by its tolerance times a standard normal number, redrawn beyond `most`."""
+    d = rng.standard_normal()
+    while abs(d) > most:
+        d = rng.standard_normal()
+    section, name = key.split(".")
+    table[section][name] = rounded(table[section][name] * (1 + tolerance * d), digits)
+
+
 def draw_rig(rng: np.random.Generator) -> Rig:
     """An arm of 0.4 to 1.2 m whose first flexible mode lies between 2 and 20 Hz."""
-
-    def log(low: float, high: float) -> float:
-        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
+    log = partial(log_uniform, rng)
     density, modulus = _MATERIALS[int(rng.choice(len(_MATERIALS), p=_SHARES))]
     density, modulus = density * rng.uniform(0.93, 1.07), modulus * rng.uniform(0.93, 1.07)
     while True:
@@ -101,11 +114,7 @@ def stated(rig: RigTable, tolerances: dict[str, float], rng: np.random.Generator
     """The rig as its makers know it: true (1 + t d) with d standard normal, redrawn beyond two tolerances."""
     table: Rig = {section: dict(values) for section, values in rig.items()}
     for key, tolerance in tolerances.items():
-        d = rng.standard_normal()
-        while abs(d) > _LARGEST_DRAW:
-            d = rng.standard_normal()
-        section, name = key.split(".")
-        table[section][name] = rounded(table[section][name] * (1 + tolerance * d), 5)
+        off(table, key, tolerance, _LARGEST_DRAW, 5, rng)
     return table
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from math import pi
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from validation.blind.inputs import Planned
-from validation.blind.rigs import rounded
+from validation.blind.rigs import log_uniform, rounded
 from validation.blind.truth import LISTED, UNLISTED, RigTable
 
 Table = dict[str, Any]
@@ -54,12 +55,10 @@ def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random
     s = _scales(rig, plans)
     sign = float(rng.choice([-1.0, 1.0]))
     phase = rng.uniform(0, 2 * pi)
+    log = partial(log_uniform, rng)
 
     def ratio(size: float) -> Table:
         return {"ratio": 1 + size if sign > 0 else 1 / (1 + size)}
-
-    def log(low: float, high: float) -> float:
-        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
     def growing(first: float, largest: float, fixed: Table, **units: float) -> Sizable:
         """Parameters in proportion to the size, beside fixed ones."""

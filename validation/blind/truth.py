@@ -381,17 +381,18 @@ class Truth:
     def _substeps(self) -> int:
         """Substeps per sample from the fastest eigenvalue of the machine at rest."""
         p = self._physics
-        M, K, C = self.linear()
-        size = M.shape[0]
-        A = np.zeros((2 * size, 2 * size))
-        A[:size, size:] = np.eye(size)
-        A[size:, :size] = -np.linalg.solve(M, K)
-        A[size:, size:] = -np.linalg.solve(M, C)
-        fastest = float(np.max(np.abs(np.linalg.eigvals(A))))
+        fastest = float(np.max(np.abs(np.linalg.eigvals(state_matrix(*self.linear())))))
         if p.inductance > 0:
             fastest = max(fastest, p.resistance / p.inductance)
         fewest = _FEWEST_CONTACT if p.backlash >= 0 else self._fewest
         return int(np.clip(np.ceil(self.dt_s * fastest / 0.9), fewest, _MOST))
+
+
+def state_matrix(M: Real, K: Real, C: Real) -> Real:
+    """Of positions, then speeds."""
+    size = M.shape[0]
+    below = [-np.linalg.solve(M, K), -np.linalg.solve(M, C)]
+    return np.block([[np.zeros((size, size)), np.eye(size)], below])
 
 
 def amplified(voltage_V: Real, static: Real) -> Real:

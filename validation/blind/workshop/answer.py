@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any, Literal
 
 from validation.blind.rigs import Rig, rounded
@@ -27,7 +28,9 @@ def answer_of(
 ) -> dict[str, Any]:
     """As the answer files of the labelled cases."""
     hidden = sort == "unlisted"
-    b, noise = machine.background, machine.noise
+    noise, background = machine.noise, asdict(machine.background)
+    hub_offset_rad = background.pop("hub_offset_rad")
+    del background["encoder_step_rad"]  # which is stated as counts
     entries = []
     for effect in effects if not hidden else ():
         entry: dict[str, Any] = {
@@ -55,18 +58,11 @@ def answer_of(
         answer["major_over_background_realised"] = sizes["major_over_background_realised"]
         answer["major_over_background"] = {"unlisted": next(iter(designed.values()))} if hidden else designed
     answer["background"] = {
-        "dry_friction_Nm": b.dry_friction_Nm,
-        "presliding_rad": b.presliding_rad,
-        "cogging_Nm": b.cogging_Nm,
-        "cogging_per_rev": b.cogging_per_rev,
-        "cogging_phase_rad": b.cogging_phase_rad,
-        "amplifier_lag_s": b.amplifier_lag_s,
-        "tilt_m_s2": b.tilt_m_s2,
-        "tilt_angle_rad": b.tilt_angle_rad,
+        **background,
         "transport_delay_s": machine.true["sampling"]["transport_delay_s"],
         "encoder_counts_per_turn": machine.counts,
         "hub_noise_true_over_stated": rounded(noise.hub / machine.stated["sensors"]["hub_angle_noise_rad"]),
-        "hub_offset_rad": b.hub_offset_rad,
+        "hub_offset_rad": hub_offset_rad,
         "time_stamp_jitter": noise.jitter,
     }
     if machine.sensor != "none":

@@ -95,10 +95,6 @@ def rms(parts: list[Real]) -> Real:
     return np.asarray(np.sqrt(np.mean(np.concatenate(parts) ** 2, axis=0)))
 
 
-def outputs_of(machine: Workshop) -> list[str]:
-    return ["hub_angle_rad"] + ([machine.sensor_key] if machine.sensor_key else [])
-
-
 def measured_sizes(
     bench: Bench,
     clean: list[Log],
@@ -110,7 +106,6 @@ def measured_sizes(
     machine = bench.machine
     stated = np.array(list(machine.stated["sensors"].values()))
     none = np.zeros(len(machine.tolerances))
-    outputs = outputs_of(machine)
 
     def held(parts: list[Real]) -> list[Real]:
         return [part for part, log in zip(parts, clean, strict=True) if log.held_out]
@@ -143,7 +138,7 @@ def measured_sizes(
         rms([log.output - log.output.mean(axis=0) for log in clean if log.held_out]),
     )
     table = {}
-    for k, key in enumerate(outputs):
+    for k, key in enumerate(machine.outputs):
 
         def major(parts: list[Real], k: int = k) -> float:
             return (

@@ -12,8 +12,8 @@ from validation.blind.rigs import rounded
 from validation.blind.sizes import Table
 from validation.blind.truth import Background, Real, Truth
 from validation.blind.workshop.answer import Sort, answer_of
-from validation.blind.workshop.bench import Bench, measured_sizes, outputs_of
-from validation.blind.workshop.machine import Sensor, Workshop, draw_workshop
+from validation.blind.workshop.bench import Bench, measured_sizes
+from validation.blind.workshop.machine import SENSORS, Sensor, Workshop, draw_workshop
 from validation.blind.workshop.nominal import Log
 from validation.blind.workshop.plans import Controller, Run, plan_workshop
 from validation.blind.workshop.sizes import (
@@ -25,6 +25,7 @@ from validation.blind.workshop.sizes import (
     unlisted,
 )
 
+SHARES: dict[Sort, float] = {"none": 0.25, "single": 0.4, "pair": 0.2, "unlisted": 0.15}
 _BACKGROUND = (0.02, 0.035)  # of the motion, root mean square, held out, after a refit
 _MAJOR = (3.5, 8.0)  # over the background
 _REALISED = (2.0, 16.0)
@@ -52,18 +53,63 @@ class WorkshopCase:
     answer: dict[str, Any]
 
 
-def make_case(sort: Sort, sensor: Sensor, closed: bool, first: str, rng: np.random.Generator) -> WorkshopCase:
-    """Draw machines and sizes until background and major effects are as wanted; first: an effect to try.
+@dataclass(frozen=True)
+class WorkshopPlan:
+    """closed_loop: wholly. first_effect: tried before others, empty without one."""
+
+    sort: Sort
+    sensor: Sensor
+    closed_loop: bool
+    first_effect: str
+
+
+def workshop_schedule(n_cases: int, rng: np.random.Generator, only: Sort | None = None) -> list[WorkshopPlan]:
+    """Plans with the shares of the sorts; sensors and loops in turn, every effect before one comes twice."""
+    if n_cases < 1:
+        raise ValueError(f"the number of cases must be at least 1; got {n_cases}")
+    mix = SHARES if only is None else {only: 1.0}
+    wanted = {sort: share * n_cases for sort, share in mix.items()}
+    sorts = [sort for sort, number in wanted.items() for _ in range(int(number + 1e-9))]
+    sorts += sorted(wanted, key=lambda sort: -((wanted[sort] + 1e-9) % 1))[: n_cases - len(sorts)]
+    places: list[tuple[Sensor, bool]] = [(sensor, loop) for sensor in SENSORS for loop in (False, True)]
+    begin = int(rng.integers(len(places)))
+    decks: dict[Sort, list[str]] = {}
+    plans = []
+    for k, sort in enumerate(sorts):
+        sensor, closed = places[(begin + k) % len(places)]
+        plans.append(
+            WorkshopPlan(sort, sensor, closed, _dealt(decks.setdefault(sort, []), sort, sensor, rng))
+        )
+    return [plans[i] for i in rng.permutation(n_cases)]
+
+
+def _dealt(deck: list[str], sort: Sort, sensor: Sensor, rng: np.random.Generator) -> str:
+    """Next effect of a deck that these sensors can show; a deck without one is filled up."""
+    if sort == "none":
+        return ""
+    pool, every = (
+        (unlisted(sensor), unlisted("tip")) if sort == "unlisted" else (listed(sensor), listed("tip"))
+    )
+    if not set(deck) & set(pool):
+        deck += rng.permutation(every).tolist()
+    name = next(name for name in deck if name in pool)
+    deck.remove(name)
+    return name
+
+
+def make_case(plan: WorkshopPlan, rng: np.random.Generator) -> WorkshopCase:
+    """Draw machines and sizes until background and major effects are as wanted.
 
     Raises ValueError if forty draws do not suffice.
     """
+    sort, sensor, first = plan.sort, plan.sensor, plan.first_effect
     for attempt in range(_TRIES):
         pool = unlisted(sensor) if sort == "unlisted" else listed(sensor)
         names = [] if sort == "none" else [first if attempt < 3 and first in pool else str(rng.choice(pool))]
         if sort == "pair":
             names.append(str(rng.choice(partners(names[0], sensor))))
         try:
-            case = _attempt(sort, sensor, closed, names, rng)
+            case = _attempt(sort, sensor, plan.closed_loop, names, rng)
         except ValueError as error:
             if "every bound" not in str(error):
                 raise
@@ -212,7 +258,7 @@ def _recorded(
         samples.append(Sample(run, quantities, lost))
         held = run.plan.role == "held_out"
         clean_logs.append(Log(clean.voltage_V, bench.output(clean, before), held))
-        measured = np.column_stack([quantities[k] for k in outputs_of(machine)])
+        measured = np.column_stack([quantities[k] for k in machine.outputs])
         noisy_logs.append(Log(clean.voltage_V, measured, held))
         # The true machine but for its imperfections, driven by the voltage as logged.
         same = oracle.record(clean.voltage_V, None, None, run.before)

@@ -56,11 +56,10 @@ def write_workshop_case(case: WorkshopCase, folder: Path, rng: np.random.Generat
     write_text(
         folder / "rig.toml", shown_rig.replace("\n\n[sampling]", '\nnoise_is = "data sheet"\n\n[sampling]')
     )
-    outputs = ["hub_angle_rad"] + ([machine.sensor_key] if machine.sensor_key else [])
     document: dict[str, Any] = {
         "case": folder.name,
         "model_error": MODEL_ERROR,
-        "outputs": outputs,
+        "outputs": machine.outputs,
         "columns": {
             name: {"column": column, "scale": scale, "offset": offset}
             for name, (column, scale, offset) in columns.items()

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from validation.blind.rigs import Rig, draw_rig, rounded
+from validation.blind.rigs import Rig, draw_rig, log_uniform, off, rounded
 from validation.blind.truth import Background, Real
 
 Sensor = Literal["none", "tip", "acc"]
@@ -72,9 +72,10 @@ class Workshop:
     rows: tuple[int, int]
 
     @property
-    def sensor_key(self) -> str | None:
-        """Name of the tip's quantity in the files."""
-        return {"none": None, "tip": "tip_m", "acc": "tip_acceleration_m_s2"}[self.sensor]
+    def outputs(self) -> list[str]:
+        """Names of the measured quantities in the files."""
+        tip = {"none": [], "tip": ["tip_m"], "acc": ["tip_acceleration_m_s2"]}
+        return ["hub_angle_rad", *tip[self.sensor]]
 
     def scaled(self, factor: float) -> Background:
         """Friction, cogging and tilt times this; lag and encoder as they are."""
@@ -91,7 +92,7 @@ def draw_workshop(sensor: Sensor, rng: np.random.Generator) -> Workshop:
     """A machine; friction, cogging and tilt are relative to each other only (see `Workshop.scaled`)."""
 
     def log(low: float, high: float) -> float:
-        return rounded(float(np.exp(rng.uniform(np.log(low), np.log(high)))))
+        return rounded(log_uniform(rng, low, high))
 
     nominal = draw_rig(rng)
     dt = float(rng.choice(list(_ROWS)))
@@ -108,11 +109,7 @@ def draw_workshop(sensor: Sensor, rng: np.random.Generator) -> Workshop:
     true: Rig = {section: dict(values) for section, values in nominal.items()}
     for key, tolerance in tolerances.items():
         most = _FARTHEST if rng.random() < _FAR else 2.0
-        d = rng.standard_normal()
-        while abs(d) > most:
-            d = rng.standard_normal()
-        section, name = key.split(".")
-        true[section][name] = rounded(true[section][name] * (1 + tolerance * d), 6)
+        off(true, key, tolerance, most, 6, rng)
     counts = round(log(2200, 18500))
     drag = nominal["hub"]["viscous_friction_Nms"]
     # Of a scale that the caller sets: torques of some tenths of the viscous one at a radian per second.

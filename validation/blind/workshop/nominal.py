@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from validation.blind.rigs import Rig
-from validation.blind.truth import Background, Real, Truth
+from validation.blind.truth import Background, Real, Truth, state_matrix
 
 # Weight of a sample: its noise and this share of the motion. What a model misses is no noise, and 25 samples
 # of it tell no more than one, so that tolerances still count; beyond four of them no value is believed.
@@ -40,9 +40,7 @@ class Linear:
         M, K, C = truth.linear()
         size = M.shape[0]
         motor = rig["motor"]
-        A = np.zeros((2 * size, 2 * size))
-        A[:size, size:] = np.eye(size)
-        A[size:, :size], A[size:, size:] = -np.linalg.solve(M, K), -np.linalg.solve(M, C)
+        A = state_matrix(M, K, C)
         b = np.zeros(2 * size)
         b[size:] = np.linalg.solve(M, np.eye(size)[0]) * (
             motor["gear_ratio"] * motor["torque_constant_Nm_A"] / motor["resistance_ohm"]
