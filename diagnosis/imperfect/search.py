@@ -134,7 +134,7 @@ class Search:
     def _alone(self) -> None:
         around = self.base.end
         spaces = self.case.machine.candidates(self.case.experiments)
-        ends: list[Descent] = []
+        ends: list[tuple[Descent, list[Point]]] = []
         for k, candidate in enumerate(spaces):
             self.progress(0.05 + 0.4 * k / len(spaces), f"fitting {candidate.effect}")
             if candidate.kind.contains is not None or self._late(candidate.effect):
@@ -143,15 +143,13 @@ class Search:
             if not points:
                 continue
             self.points.append((candidate, points))
-            ends.append(self._descended(around, candidate, points, around.jacobian))
-        by_loss = sorted(range(len(ends)), key=lambda j: ends[j].loss)
-        for k, j in enumerate(by_loss):
-            end = ends[j]
+            ends.append((self._descended(around, candidate, points, around.jacobian), points))
+        for k, (end, points) in enumerate(sorted(ends, key=lambda one: one[0].loss)):
             if k < _FINISHED and not end.converged:
                 end = descend(self.records, end.candidates, end.deviations, end.coordinates, end.start)
             found = self.add(refined(self.records, end) if k < _FINISHED else end)
             # Where it ended alone may be far from every start, and right beside another effect.
-            self.points[j][1].insert(0, _point(found.end))
+            points.insert(0, _point(found.end))
 
     def _descended(
         self, around: Descent, candidate: Candidate, points: Sequence[Point], nominal: Real

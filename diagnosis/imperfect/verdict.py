@@ -31,18 +31,6 @@ _PRIOR_COUNT = (0.2, 0.35, 0.3, 0.1, 0.035, 0.015)
 # Every machine rubs, cogs, stands a little out of level and has an amplifier that lags: that is among what
 # the model error allows, and the limit of these is higher. Nor is it a measure what a drift makes of them in
 # the records they were fitted to: they must carry as much of held-out ones.
-# (Of a machine of several joints they are called "elbow.frictionloss", "motor2.lag", "gravity.x".)
-_EVERYWHERE = frozenset(
-    {
-        "coulomb_friction",
-        "stribeck_friction",
-        "frictionloss",
-        "torque_ripple",
-        "gravity",
-        "actuator_lag",
-        "lag",
-    }
-)
 _INTERESTS, _INTERESTS_EVERYWHERE, _INTERESTS_WIDTH = 0.75, 1.12, 0.06
 # A wrong stated value interests from this many tolerances on.
 _FAR_OFF, _FAR_OFF_WIDTH = 4.4, 0.06
@@ -271,7 +259,7 @@ def _part(
     """What an effect carries within a set, or within the larger one in which it was seen before; rest: the
     set without it."""
     share, limit = share_beside(rest, explanation), _INTERESTS
-    if not _EVERYWHERE.isdisjoint(name.split(".")):
+    if explanation.end.candidates[explanation.names.index(name)].kind.everywhere:
         share, limit = min(share, float(_carried(rest, explanation)[1])), _INTERESTS_EVERYWHERE
     share = max(share, seen.share if seen else 0.0)
     matters = _soft(share / limit / search.case.machine.weighing.model_error, _INTERESTS_WIDTH)
@@ -359,11 +347,12 @@ def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: f
     for weight, one in zip(weights, sets, strict=True):
         give(["unknown"], weight * (1 - one.complete))
         parts = sorted(one.parts, key=lambda part: -part.share)
-        for chosen in (some for count in range(len(parts) + 1) for some in combinations(parts, count)):
+        some = (chosen for count in range(len(parts) + 1) for chosen in combinations(parts, count))
+        for chosen in some if one.complete > 0 else ():
             share = weight * one.complete
             for part in parts:
                 share *= part.matters if part in chosen else 1 - part.matters
-            if not chosen and one.complete > 0:
+            if not chosen:
                 enough = none_enough / (1.0 if parts else one.complete)
                 give([parts[0].name if parts and none_enough > 0 else "unknown"], share * (1 - enough))
                 share *= enough

@@ -92,13 +92,21 @@ class Quantity:
     signed: bool = False
     dependence: Dependence = "smooth"
     group: str = ""
+    everywhere: bool = False
 
     @property
     def effect(self) -> PlantEffect:
         low, high = (self.unit * share for share in self.span)
         first, last = (self.unit * min(share, 0.6 * self.span[1]) for share in self.starts)
         size = EffectParameter(self.parameter, low, high, tuple(geometric(first, last, 6)))
-        return PlantEffect(self.name, (size,), self.signed, dependence=self.dependence, group=self.group)
+        return PlantEffect(
+            self.name,
+            (size,),
+            self.signed,
+            dependence=self.dependence,
+            group=self.group,
+            everywhere=self.everywhere,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +207,7 @@ class MujocoArm:
                     _STANDARD_GRAVITY,
                     signed=True,
                     group="link",
+                    everywhere=True,
                 )
                 for k, axis in enumerate("xyz")
             ),
@@ -229,6 +238,7 @@ class MujocoArm:
                 (1e-4, most),
                 dependence=dependence,
                 group="joint",
+                everywhere=key == "frictionloss",
             )
         if joint.armature > 0:
             yield Quantity(
@@ -249,7 +259,7 @@ class MujocoArm:
             Quantity, unit=self.dt_s, span=(0.02, longest), starts=(0.2, min(20.0, longest)), group="actuator"
         )
         yield Quantity(f"{one.name}.gain", 1.0, partial(_put_gain, one.name))
-        yield late(f"{one.name}.lag", lag, partial(_put_lag, one.name), "time_constant_s")
+        yield late(f"{one.name}.lag", lag, partial(_put_lag, one.name), "time_constant_s", everywhere=True)
         put = partial(_put_delay, "actuator", one.name, self.spec.option.timestep)
         yield late(f"{one.name}.delay", float(one.delay), put, "delay_s")
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from diagnosis.machine.around import Acts
-from plant.effects.base import ratio_candidates
+from plant.effects.base import EFFECTS, ratio_candidates
 from plant.effects.search_space import Axis, Candidate, Dependence, Harmonic
 
 _STEPS = {"smooth": 1e-5, "continuous": 1e-3, "non-smooth": 5e-3}
@@ -84,6 +84,8 @@ class PlantEffect:
         continuous (dry friction); neither (backlash, rounding), which takes grids in place of slopes.
     group : str. Where it acts (actuator, joint, sensor, ...); only shown.
     contains : str or None. Simpler effect that it is with its further parameters at an end of their ranges.
+    everywhere : bool or None
+        Every machine has some of it (dry friction, a lag); None: as the listed effect of that name has it.
     acts : Acts or None
         What it does to a simulation that does not know it (`with_effects`); None: the simulation is told.
     """
@@ -96,6 +98,7 @@ class PlantEffect:
     group: str = ""
     contains: str | None = None
     acts: Acts | None = None
+    everywhere: bool | None = None
     # Which of its own parameters an effect multiplies nobody said.
     multiplies: ClassVar[str | None] = None
     harmonic: ClassVar[Harmonic | None] = None
@@ -104,6 +107,9 @@ class PlantEffect:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", tuple(self.parameters))
+        if self.everywhere is None:
+            listed = EFFECTS.get(self.name.rpartition(".")[2])
+            object.__setattr__(self, "everywhere", listed is not None and listed.everywhere)
         if not self.parameters:
             raise ValueError(f"effect {self.name}: needs at least one parameter")
         if self.name in ("none", "unknown"):
@@ -143,6 +149,7 @@ class WrongValue:
     multiplies: str
     tolerance: float
     dependence: ClassVar[Dependence] = "smooth"
+    everywhere: ClassVar[bool] = False
     harmonic: ClassVar[Harmonic | None] = None
     adds_to: ClassVar[str | None] = None
     contains: ClassVar[str | None] = None

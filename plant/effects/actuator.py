@@ -77,6 +77,7 @@ class ActuatorLag(Effect):
 
     id = "actuator_lag"
     words = "a lag of the actuator"
+    everywhere = True
     sought = Sought((2e-4, 200), (0.02, 40, 10), "dt_s")
 
     time_constant_s: NotNegative = Field(description="time constant T; 0 is none")

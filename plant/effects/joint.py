@@ -39,6 +39,7 @@ class CoulombFriction(Effect):
 
     id = "coulomb_friction"
     words = "dry (Coulomb) friction"
+    everywhere = True
     friction = True
     dependence = "continuous"
     sought = Sought((1e-5, 1), (3e-4, 0.6, 14), "torque_Nm", 1e-3)
@@ -56,6 +57,7 @@ class StribeckFriction(Effect):
 
     id = "stribeck_friction"
     words = "dry friction that falls with speed (Stribeck)"
+    everywhere = True
     contains = "coulomb_friction"
     friction = True
     neutral = MappingProxyType({"stribeck_velocity_rad_s": 0.1})
@@ -148,6 +150,7 @@ class TorqueRipple(Effect):
 
     id = "torque_ripple"
     words = "torque ripple over the hub angle"
+    everywhere = True
     harmonic = "hub_angle"
 
     amplitude_Nm: NotNegative = Field(description="amplitude a")

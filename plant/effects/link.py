@@ -61,6 +61,7 @@ class Gravity(Effect):
     words = "gravity in a tilted plane"
     beside = "a linear spring from hub to ground, while motions are small; larger ones"
     environment = True
+    everywhere = True
     absolute_angle = True
     sought = Sought((1e-4, 20), (1e-3, 10, 12))
 

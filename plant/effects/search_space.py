@@ -99,6 +99,9 @@ class EffectKind(Protocol):
     def dependence(self) -> Dependence: ...
 
     @property
+    def everywhere(self) -> bool | None: ...
+
+    @property
     def multiplies(self) -> str | None: ...
 
     @property
