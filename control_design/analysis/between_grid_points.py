@@ -48,13 +48,13 @@ _MODEL_ERROR = 1e-6  # largest relative disagreement of zeros and poles with the
 class Obstacle(Enum):
     """Why nothing was proved for all frequencies; `AllFrequencies.obstacle_at` is the number in brackets."""
 
-    OWN_FREQUENCIES = "the uncertainty is known on its own frequencies only"
-    OWN_PERFORMANCE_FREQUENCIES = "the performance channel is known on its own frequencies only"
-    NO_DERIVATIVES = "the uncertainty does not say how it changes between frequencies"
-    INEXACT = "zeros, poles and generators miss responses and ellipses (relative difference)"
-    NOT_STABLE = "the loop is not robustly stable on the dense grid"
-    NO_DISTANCE = "no positive distance from -1 could be shown at one frequency (rad/s)"
-    WINDING = "1 + K c does not wind as a stable loop's"
+    OWN_FREQUENCIES = "uncertainty without model"
+    OWN_PERFORMANCE_FREQUENCIES = "performance channel without model"
+    NO_DERIVATIVES = "uncertainty without derivatives"
+    INEXACT = "inexact zeros and poles"  # relative difference
+    NOT_STABLE = "not robustly stable"
+    NO_DISTANCE = "distance not positive"  # rad/s
+    WINDING = "wrong winding"
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from string import Template
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 if TYPE_CHECKING:
     from control_design.controllers.controller import Controller
@@ -37,12 +37,15 @@ class Dialect:
 def c_header(controller: Controller, prefix: str = "controller", number: Number = "double") -> str:
     """Declarations to include: the state, `<prefix>_reset` and `<prefix>_step`. Raises ValueError."""
     Dialect(prefix, number)
-    return _template("controller.h.in").substitute(
+    return _filled(
+        "controller.h.in",
+        controller,
         about=re.sub(r"[^ -~]|\*/", "?", controller.name),
         delay=controller.computational_delay_samples,
         dt_s=repr(controller.dt_s),
         guard=f"{prefix.upper()}_H",
-        **_names(controller, prefix, number),
+        name=prefix,
+        number=number,
     )
 
 
@@ -86,76 +89,56 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
     def vector(values: Real) -> str:
         return "{" + ", ".join(literal(value) for value in (values if values.size else [0.0])) + "}"
 
-    constants, limits, kept, strength, given = "", "", "", "LEVEL", controller.feedforward
-    if given is not None:
-        named = {
-            "LEVEL": given.level,
-            "TURN": given.turn(controller.dt_s),
-            "SHARE": given.share(controller.dt_s),
+    values = {"f": suffix}
+    if (given := controller.feedforward) is not None:
+        values |= {
+            "level": literal(given.level),
+            "turn": literal(given.turn(controller.dt_s)),
+            "share": literal(given.share(controller.dt_s)),
+            "excess": literal(given.excess),
+            "fall": literal(given.fall * controller.dt_s),
         }
-        if given.excess > 0:
-            named |= {"EXCESS": given.excess, "FALL": given.fall * controller.dt_s}
-            strength = f"(LEVEL + EXCESS * exp{suffix}(-fabs{suffix}(moved) / FALL))"
-            constants = "#include <math.h>\n"
-        constants += "".join(
-            f"static const {number} {name} = {literal(value)};\n" for name, value in named.items()
-        )
     if controller.input_limit is not None:
-        constants += f"static const {number} INPUT_LIMIT = {literal(controller.input_limit)};\n"
-        limits = _template("input_limit.c.in").template
+        values["input_limit"] = literal(controller.input_limit)
     if controller.rate_limit is not None:
-        change = literal(controller.rate_limit * controller.dt_s)
-        constants += f"static const {number} LARGEST_CHANGE = {change};  /* rate_limit * dt_s */\n"
-        limits, kept = _template("rate_limit.c.in").template + limits, "    state->last = command;\n"
-    limited = _limited(controller)
-    if limited:
-        constants += f"static const {number} M[{max(controller.order, 1)}] = "
-        constants += f"{vector(controller.anti_windup_gain[:, 0])};\n"
-        limits += "    state->limited = command != wanted;\n"
-    at_rest = ["limited"] * limited + ["last"] * bool(kept) + ["reference", "smoothed"] * (given is not None)
-    return _template("controller.c.in").substitute(
+        values["largest_change"] = literal(controller.rate_limit * controller.dt_s)
+    return _filled(
+        "controller.c.in",
+        controller,
         header=c_header(controller, prefix, number),
         A=",\n    ".join(vector(row) for row in controller.A) or vector(controller.C[0]),
         B=vector(controller.B[:, 0]),
         C=vector(controller.C[0]),
         D=literal(float(controller.D[0, 0])),
-        constants=constants,
-        limits=limits,
-        feedforward=""
-        if given is None
-        else _template("feedforward.c.in").substitute(number=number, strength=strength),
-        at_rest="".join(f"    state->{name} = 0;\n" for name in at_rest),
-        back=" + M[i] * (command - wanted)" if limited else "",
-        kept=kept,
-        **_names(controller, prefix, number),
+        M=vector(controller.anti_windup_gain[:, 0]),
+        name=prefix,
+        number=number,
+        **values,
     )
 
 
-def _limited(controller: Controller) -> bool:
-    return controller.input_limit is not None or controller.rate_limit is not None
-
-
-def _names(controller: Controller, prefix: str, number: Number) -> dict[str, Any]:
-    given, limited = controller.feedforward is not None, _limited(controller)
-    more = f"    {number} last;  /* previous command */\n" * (controller.rate_limit is not None)
-    more += f"    {number} reference, smoothed;  /* previous one, friction at its speed */\n" * given
-    more += "    int limited;  /* 1 while a limit was active in the last call */\n" * limited
-    command = "u = C x + D e" + " + friction feed-forward" * given
-    law = f"{command}; x+ = A x + B e"
-    if limited:
-        law = f"{command} limited; x+ = A x + B e + M (u_limited - u)"
-    return {
-        "name": prefix,
-        "number": number,
-        "order": controller.order,
-        # C has no arrays of length zero.
-        "size": max(controller.order, 1),
-        "reference": f", {number} reference" if given else "",
-        "law": law,
-        "more": more,
+def _filled(template: str, controller: Controller, **values: object) -> str:
+    """A template with its values. A line that begins with `@what:` is for controllers that have it (`!what`:
+    that have it not; several with commas: all of them)."""
+    given = controller.feedforward
+    has = {
+        "input_limit": controller.input_limit is not None,
+        "rate_limit": controller.rate_limit is not None,
+        "limits": controller.input_limit is not None or controller.rate_limit is not None,
+        "friction": given is not None,
+        "breakaway": given is not None and given.excess > 0,
     }
+    lines = []
+    for line in _template(template):
+        tags, _, text = line[1:].partition(":") if line.startswith("@") else ("", "", line)
+        if all(has[tag.lstrip("!")] is not tag.startswith("!") for tag in tags.split(",") if tag):
+            lines.append(text)
+    # C has no arrays of length zero.
+    shape = {"order": controller.order, "size": max(controller.order, 1)}
+    return Template("".join(lines)).substitute(values, **shape)
 
 
 @cache
-def _template(name: str) -> Template:
-    return Template((files("control_design.controllers") / name).read_text("ascii"))
+def _template(name: str) -> tuple[str, ...]:
+    text = (files("control_design.controllers") / name).read_text("ascii")
+    return tuple(text.splitlines(keepends=True))

@@ -9,16 +9,22 @@ from control_design.controllers.controller import Controller
 
 
 class Outcome(Enum):
-    MET_ON_GRID = "every requirement is met at every frequency of the dense grid for every plant"
-    NOT_MET = "the solver converged to a stable loop, but some requirement is exceeded"
-    NOT_CONVERGED = "no start led to a stable loop; the controller means nothing"
+    """In words: `outcome` of the pages' sentences."""
+
+    MET_ON_GRID = "met on the grid"  # every requirement at every frequency of the dense grid
+    NOT_MET = "not met"  # a stable loop, but some requirement is exceeded
+    NOT_CONVERGED = "not converged"  # no start led to a stable loop; the controller means nothing
 
 
 class SynthesisError(Exception):
-    """The synthesis did not meet the specification; `result` holds the best point found."""
+    """The synthesis did not meet the specification; `result` holds the best point found, which the message
+    tells: gamma, and what blocks it where."""
 
     def __init__(self, message: str, result: SynthesisResult) -> None:
-        super().__init__(message)
+        worst = "".join(
+            f"; {b.weight} of {b.plant!r} at {b.omega_rad_s:.4g} rad/s blocks" for b in result.blocking[:1]
+        )
+        super().__init__(f"{message} (gamma {result.gamma:.4g}){worst}")
         self.result = result
 
 
@@ -82,8 +88,10 @@ class SynthesisResult:
         Raises SynthesisError otherwise, with this result attached.
         """
         if self.outcome is not Outcome.MET_ON_GRID:
-            blocks = (
-                f"; {b.weight} of {b.plant!r} at {b.omega_rad_s:.4g} rad/s blocks" for b in self.blocking
+            raise SynthesisError(
+                "no start led to a stable loop; the controller means nothing"
+                if self.outcome is Outcome.NOT_CONVERGED
+                else "the solver converged to a stable loop, but some requirement is exceeded",
+                self,
             )
-            raise SynthesisError(f"{self.outcome.value} (gamma {self.gamma:.4g}){next(blocks, '')}", self)
         return self.controller

@@ -60,13 +60,17 @@ def _first_complaint(model: type[BaseModel], error: ValidationError) -> str:
     return _complaint(model, details[0]) + rest
 
 
+def meant(word: str, known: Sequence[str], what: str) -> str:
+    """What to write in place of a word that nobody knows: the known one that looks like it, else all."""
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    return f"did you mean {close[0]}?" if close else f"known {what}: {', '.join(known)}"
+
+
 def _complaint(model: type[BaseModel], detail: ErrorDetails) -> str:
     kind, message = detail["type"], detail["msg"]
     key, known = _walk(model, detail["loc"])
     if kind == "extra_forbidden":
-        close = difflib.get_close_matches(str(detail["loc"][-1]), known, n=1, cutoff=0.5)
-        hint = f"did you mean {close[0]}?" if close else "known keys: " + ", ".join(sorted(known))
-        return f"unknown key {key} ({hint})"
+        return f"unknown key {key} ({meant(str(detail['loc'][-1]), sorted(known), 'keys')})"
     if kind == "missing":
         return f"missing key {key}"
     if kind == "union_tag_not_found":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -11,7 +10,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from ident.data.arrays import RealArray
 from plant.effects import EFFECTS
 from plant.rig import Output
-from workflow.config.settings import Section, check, read_toml, repeated
+from workflow.config.settings import Section, check, meant, read_toml, repeated
 from workflow.engine.errors import InputError
 
 CASE_FILE, RIG_FILE = "case.toml", "rig.toml"
@@ -78,9 +77,7 @@ class ExperimentEntry(Section):
 
 def _known_effect(name: str) -> str:
     if name not in EFFECTS:
-        close = get_close_matches(name, EFFECTS, n=1, cutoff=0.5)
-        hint = f"did you mean {close[0]}?" if close else f"known effects: {', '.join(EFFECTS)}"
-        raise ValueError(f"no such effect {name!r} ({hint})")
+        raise ValueError(f"no such effect {name!r} ({meant(name, tuple(EFFECTS), 'effects')})")
     return name
 
 

@@ -172,7 +172,7 @@ def _designed(plant: _Plant, specification: Specification) -> Controller:
     except SpecificationError as error:
         raise NoControllerError(str(error)) from error
     if found.outcome is Outcome.NOT_CONVERGED:
-        raise NoControllerError(f"{plant.uncertain.name}: {found.outcome.value}")
+        raise NoControllerError(f"{plant.uncertain.name}: no start led to a stable loop")
     return found.controller
 
 

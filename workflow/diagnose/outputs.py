@@ -26,6 +26,7 @@ from workflow.diagnose.simulator_case import SimulatorCase
 from workflow.engine import codec, storage
 from workflow.engine.errors import naming
 from workflow.engine.executor import Report
+from workflow.text.templates import render_text
 
 # Shares of a case's time, for the progress bar only.
 _ENGINE, _WHERE, _NEXT, _CONTROLLER = 0.75, 0.8, 0.85, 0.9
@@ -147,19 +148,16 @@ def rig_text(
 
     The head names every moved value with how far it moved; effects_file is empty where there are no effects.
     """
-    head = [f"# {case}: rig as repaired by flexlink diagnose"]
-    for key, d in deviations.items():
+    moved = []
+    for key, tolerances in deviations.items():
         old, new = stated.value(key), repaired.value(key)
         if old != new:
-            percent = 100 * (new / old - 1) if old else 0.0
-            head.append(f"#   {key}: {old:.6g} stated, {new:.6g} now ({percent:+.2f} %, {d:+.2f} tolerances)")
-    if effects_file:
-        head.append(f"# The effects to add stand in {effects_file}.")
-    return "\n".join(head) + "\n" + repaired.to_toml()
+            moved.append((key, old, new, 100 * (new / old - 1) if old else 0.0, tolerances))
+    toml = repaired.to_toml()
+    return render_text("diagnosis/rig.toml.j2", case=case, moved=moved, effects_file=effects_file, toml=toml)
 
 
 def effects_text(case: str, effects: Sequence[Effect]) -> str:
     """The effects as [[effects]] tables, in the spelling of [[source.effects]] in a run configuration."""
     tables = tomlkit.dumps({"effects": [effect.to_dict() for effect in effects]})
-    place = "in a run configuration they go under [[source.effects]]"
-    return f"# {case}: effects found by flexlink diagnose; {place}\n\n{tables}"
+    return render_text("diagnosis/effects.toml.j2", case=case, toml=tables)

@@ -193,7 +193,7 @@ def _stabilisation(axes: Axes, plot: Stabilisation, response: FrequencyUncertain
     if response is None and omega.size:
         axes.set_xlim(omega.min() / 1.5, omega.max() * 1.5)
     axes.set_title("Stabilisation: which modes stay")
-    axes.set(xlabel="frequency of the pair [rad/s]", ylabel="pole pairs in the fit [1]")
+    axes.set(xlabel=_PAIR_AXIS, ylabel="pole pairs in the fit [1]")
 
 
 def _faint(axes: Axes, response: FrequencyUncertainty) -> None:

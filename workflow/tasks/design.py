@@ -88,7 +88,7 @@ def certify_asked(
     with it the ellipses are of the calibrated level where that is higher, and the share of stable draws is an
     item of the certificate.
     """
-    reason = undrawable(plants) if options.joint_draws else "no responses were drawn (joint_draws = 0)"
+    reason = undrawable(plants) if options.joint_draws else said("not_drawn")
     calibrated = reason is None and options.calibrate
     certificate = certify(
         controller,
@@ -124,7 +124,7 @@ def undrawable(plants: Sequence[UncertainPlant]) -> str | None:
             if not isinstance(uncertainty, ResponsePosterior | ResponseDraws):
                 return said("undrawable", plant.name, plant.own_grid is not None)
             drawn = True
-    return None if drawn else "no uncertainty is stated: there is nothing to draw from"
+    return None if drawn else said("nothing_to_draw")
 
 
 def joint_numbers(found: SampledResponses) -> dict[str, Any]:
@@ -154,13 +154,13 @@ def find_bracket(
 ) -> AchievablePerformance:
     """The bracket, or why there is none."""
     if not options.compute:
-        return AchievablePerformance(reason="not asked for (compute = false)")
+        return AchievablePerformance(reason=said("bracket_not_asked"))
     try:
         bracket = youla_bracket(plants, specification, options, progress=progress)
     except SpecificationError as impossible:
         return AchievablePerformance(reason=str(impossible))
     except (ValueError, ArithmeticError) as unfit:
-        return AchievablePerformance(reason=f"the parametrisation does not take this plant: {unfit}")
+        return AchievablePerformance(reason=said("bracket_unfit", str(unfit)))
     return AchievablePerformance(bracket)
 
 
@@ -196,7 +196,7 @@ def find_filter(
             controller, plants, settings.reference_model, settings, weight=settings.error_weight
         )
     except ValueError as unfit:
-        return ReferenceFilterResult(reason=f"no reference filter: {unfit}")
+        return ReferenceFilterResult(reason=said("no_filter", str(unfit)))
     return ReferenceFilterResult(found)
 
 

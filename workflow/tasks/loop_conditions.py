@@ -26,6 +26,7 @@ from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
 from workflow.tasks.results import ConditionRun, Real
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine, simulate_draw
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, UNITS, EncodedArm
+from workflow.text.templates import said
 
 _SLEW_SHARE = 0.6  # of the voltage limit that the slew is predicted to use
 _OVERDRIVEN = 2.0  # times the voltage limit that the large step would need
@@ -132,7 +133,7 @@ class ConditionBench:
             peak = float(np.max(np.abs(self.predict(shape, law=self._unlimited).command)))
             size = min(_SLEW_SHARE * self.controller.input_limit / peak, 20 * self.step)
         seconds = length * self.controller.dt_s
-        return self._run("slew", f"smooth move in {seconds:.3g} s", np.asarray(size * shape))
+        return self._run("slew", said("smooth_move", seconds), np.asarray(size * shape))
 
     def push(self) -> ConditionRun:
         """A half-sine force at the tip, set point zero."""
@@ -149,7 +150,7 @@ class ConditionBench:
         scale = self.step / float(np.max(np.abs(answer)))
         return self._run(
             "push at the tip",
-            f"{scale:.3g} N, half sine of {1e3 * length * dt:.3g} ms",
+            said("half_sine", scale, 1e3 * length * dt),
             np.zeros(n),
             output_disturbance=scale * answer,
             tip_force_N=scale * force,
@@ -165,7 +166,7 @@ class ConditionBench:
         return [
             self._run(
                 f"payload {percent} %",
-                f"{1e3 * rated * percent / 100:.3g} g at the tip",
+                said("payload", 1e3 * rated * percent / 100),
                 effects=without,
                 rig=self.rig.perturbed({"payload.mass_kg": rated * percent / 100}),
             )
@@ -176,7 +177,7 @@ class ConditionBench:
         """One sample of delay more."""
         own = float(self.effects.get("input_delay", {}).get("delay_s", 0.0))
         late = {"input_delay": {"name": "input_delay", "delay_s": own + self.controller.dt_s}}
-        return self._run("late", f"{1e3 * self.controller.dt_s:.3g} ms more delay", effects=late)
+        return self._run("late", said("more_delay", 1e3 * self.controller.dt_s), effects=late)
 
     def frictions(self) -> list[ConditionRun]:
         """None of the arm's joint friction effects, and twice as much of each."""
@@ -191,10 +192,9 @@ class ConditionBench:
                 for name, effect in own.items()
             }
 
-        listed = " and ".join(name.replace("_", " ") for name in own)
         return [
-            self._run("no friction", f"without {listed}", effects=scaled(0.0)),
-            self._run("double friction", f"twice the {listed}", effects=scaled(2.0)),
+            self._run("no friction", said("other_friction", list(own), 0), effects=scaled(0.0)),
+            self._run("double friction", said("other_friction", list(own), 2), effects=scaled(2.0)),
         ]
 
     def coarse(self) -> ConditionRun:
@@ -205,7 +205,7 @@ class ConditionBench:
             4 * max(self.source.encoder_step_rad, self.options.measurement_step) or 0.004 * self.step
         )
         unit = UNITS[OUTPUT_NAMES[self.measured]]
-        words = f"command in steps of {command:.3g} V, measurement of {measurement:.3g} {unit}"
+        words = said("coarse_steps", command, measurement, unit)
         return self._run("coarse", words, steps=(measurement, command))
 
     def overdriven(self) -> list[ConditionRun]:
@@ -216,16 +216,10 @@ class ConditionBench:
         free = self._unlimited
         peak = float(np.max(np.abs(self.predict(self.reference, law=free).command)))
         reference = self.reference * (_OVERDRIVEN * limit / peak)
-        words = f"a step that asks for {_OVERDRIVEN:g} times the limit"
+        kept, ignored = (said("overdriven", _OVERDRIVEN, known) for known in (True, False))
         return [
-            self._run("voltage limit", f"{words}, with anti-windup", reference),
-            self._run(
-                "no anti-windup",
-                f"{words}, the controller does not know of it",
-                reference,
-                law=free,
-                clip=limit,
-            ),
+            self._run("voltage limit", kept, reference),
+            self._run("no anti-windup", ignored, reference, law=free, clip=limit),
         ]
 
     @property

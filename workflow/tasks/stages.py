@@ -28,6 +28,7 @@ from workflow.tasks.results import (
 )
 from workflow.tasks.stage import Stage, StageInput
 from workflow.tasks.uncertainty import find_uncertainty
+from workflow.text.templates import said
 
 
 def design_controller(stage: StageInput) -> DesignResult:
@@ -66,9 +67,7 @@ def design_filter(stage: StageInput) -> ReferenceFilterResult:
     """Filter and friction feed-forward, where asked for; nothing where no controller is there."""
     settings, synthesis = stage.config.reference_filter, stage.results.design.synthesis
     if synthesis is None or stage.results.certify.certificate is None:
-        return ReferenceFilterResult(
-            reason=None if settings is None else "no reference filter: there is no controller"
-        )
+        return ReferenceFilterResult(reason=None if settings is None else said("no_filter"))
     with naming("reference filter"):
         found = find_filter(synthesis.controller, [stage.plant], settings)
     friction = stage.results.identify.friction
