@@ -40,6 +40,7 @@ from tests.workflow.test_design_sources import (
 )
 from workflow.cli import main
 from workflow.engine.executor import LocalProcesses
+from workflow.report import rendering
 
 TINY_SIMULATION = """
 [run]
@@ -269,8 +270,27 @@ def outputs_replayed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str,
     }
 
 
+def _drawn_from(folder: Path) -> dict[Path, bytes]:
+    """What the pictures of a run are made of: its numbers and its configuration."""
+    made_of = [path for path in folder.rglob("*") if path.is_file()]
+    made_of = [path for path in made_of if path.parent.name == "stages" or path.stem == "config"]
+    return {path.relative_to(folder): path.read_bytes() for path in made_of}
+
+
+class _DrawnBefore(dict[str, Callable[..., object]]):
+    """In place of all drawings."""
+
+    def __missing__(self, name: str) -> Callable[..., object]:
+        return lambda *_: name
+
+
 def tampered(one: Output, folder: Path, count: int, number: int) -> Tally:
-    """Its calls on the directory tampered with: refused, or the first ends with the same files."""
+    """Its calls on the directory tampered with: refused, or the first ends with the same files.
+
+    Pictures are not rendered. Those of untouched numbers are the same every time: they are drawn where files
+    of the directory are compared, and wherever a number or the configuration was touched.
+    """
+    whole = _drawn_from(one.whole)
 
     def attempt(rng: np.random.Generator) -> str | None:
         place = folder / "place"
@@ -278,7 +298,10 @@ def tampered(one: Output, folder: Path, count: int, number: int) -> Tally:
         try:
             tamper(rng, place)
             call = int(rng.integers(len(one.calls)))
-            line = refusal(one.calls[call](place), place)
+            with pytest.MonkeyPatch.context() as patch:
+                if (call > 0 or not one.same) and _drawn_from(place) == whole:
+                    patch.setattr(rendering, "drawings", _DrawnBefore)
+                line = refusal(one.calls[call](place), place)
             if line is None and call == 0:
                 for name in one.same:
                     assert (place / name).read_bytes() == (one.whole / name).read_bytes(), f"{name} differs"
