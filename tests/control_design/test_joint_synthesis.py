@@ -127,7 +127,8 @@ def test_bad_input_is_refused():
 def test_link_b_is_stable_for_999_of_1000_parameter_draws():
     """Mode frequency three standard deviations high leaves every ellipse; plain designs lose 0.15 %."""
     plant, specification = flexible_link("B"), flexible_link_specification(5)
-    design = synthesise_jointly([plant], specification, rng=np.random.default_rng(1))
+    few = SynthesisOptions(starts=2)  # as good as the default here
+    design = synthesise_jointly([plant], specification, few, rng=np.random.default_rng(1))
     assert design.reached
     assert design.result.gamma < 1.13  # plain 1.085: the price of the guards
     fresh = SampledLoop(design.result.controller, plant, specification).gamma(

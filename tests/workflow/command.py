@@ -40,11 +40,16 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def start_flexlink(
-    *arguments: object, stdout: IO[bytes] | int = subprocess.PIPE, threads: int = 1
+    *arguments: object, stdout: IO[bytes] | int = subprocess.PIPE, threads: int = 1, first: str = ""
 ) -> subprocess.Popen[bytes]:
-    """`flexlink` in a process of its own."""
+    """`flexlink` in a process of its own; first: statements that it begins with."""
+    begin = ["-c", f"{first}\nimport sys\nfrom workflow.__main__ import main\nsys.exit(main())"]
     return subprocess.Popen(
-        [sys.executable, "-m", "workflow", *(str(argument) for argument in arguments)],
+        [
+            sys.executable,
+            *(begin if first else ["-m", "workflow"]),
+            *(str(argument) for argument in arguments),
+        ],
         cwd=ROOT,
         env={**os.environ, "OMP_NUM_THREADS": str(threads)},
         stdout=stdout,
