@@ -148,7 +148,7 @@ def test_a_schedule_has_the_shares_and_no_effect_its_sensors_cannot_show():
 
 @pytest.mark.slow
 def test_generated_cases_load_and_hold_what_their_answers_say(tmp_path):
-    answers = generate(5, 3, tmp_path, open_cases=True, workshop=True)
+    answers = generate(5, 1, tmp_path, open_cases=True, workshop=True)
     assert {a["verdict"] for a in answers} == {"none", "effect", "unknown"}
     for answer in answers:
         case = load_case(tmp_path / answer["case"]).case
