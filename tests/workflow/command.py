@@ -88,6 +88,20 @@ def draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rendering, "render", lambda figure, also: empty)
 
 
+class _Built(dict[str, Callable[..., object]]):
+    """In place of all drawings: something is there to be rendered."""
+
+    def __missing__(self, name: str) -> Callable[..., object]:
+        return lambda *_: name
+
+
+def build_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside `draw_nothing`, where the same numbers have been drawn before: figures are not even built."""
+    from workflow.report import rendering
+
+    monkeypatch.setattr(rendering, "drawings", _Built)
+
+
 def kill(process: subprocess.Popen[bytes]) -> None:
     """SIGKILL, and wait for the end."""
     process.kill()

@@ -24,7 +24,7 @@ import workflow.tasks.pipeline
 import workflow.tasks.simulated_rig
 from control_design.controllers.controller import Controller
 from tests.ident.mutations import Tally, tally
-from tests.workflow.command import FAST_ARM, ROOT, draw_nothing
+from tests.workflow.command import FAST_ARM, ROOT, build_nothing, draw_nothing
 from tests.workflow.diagnosis_examples import FRICTION, write_case
 from tests.workflow.mutations import spoilt, tamper
 from tests.workflow.study_examples import SMALL_STUDY, TWO_POINTS, write_study
@@ -40,7 +40,6 @@ from tests.workflow.test_design_sources import (
 )
 from workflow.cli import main
 from workflow.engine.executor import LocalProcesses
-from workflow.report import rendering
 
 TINY_SIMULATION = """
 [run]
@@ -277,13 +276,6 @@ def _drawn_from(folder: Path) -> dict[Path, bytes]:
     return {path.relative_to(folder): path.read_bytes() for path in made_of}
 
 
-class _DrawnBefore(dict[str, Callable[..., object]]):
-    """In place of all drawings."""
-
-    def __missing__(self, name: str) -> Callable[..., object]:
-        return lambda *_: name
-
-
 def tampered(one: Output, folder: Path, count: int, number: int) -> Tally:
     """Its calls on the directory tampered with: refused, or the first ends with the same files.
 
@@ -300,7 +292,7 @@ def tampered(one: Output, folder: Path, count: int, number: int) -> Tally:
             call = int(rng.integers(len(one.calls)))
             with pytest.MonkeyPatch.context() as patch:
                 if (call > 0 or not one.same) and _drawn_from(place) == whole:
-                    patch.setattr(rendering, "drawings", _DrawnBefore)
+                    build_nothing(patch)
                 line = refusal(one.calls[call](place), place)
             if line is None and call == 0:
                 for name in one.same:
