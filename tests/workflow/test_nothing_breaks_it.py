@@ -217,11 +217,13 @@ Call = Callable[[Path], list[str]]
 
 @dataclass(frozen=True)
 class Output:
-    """A directory that a command left, what reads it again, and those files of it that come out the same."""
+    """A directory that a command left, what reads it again, and those files of it that come out the same;
+    drawn: the run in it that a call draws which compares no files."""
 
     whole: Path
     calls: tuple[Call, ...]
     same: tuple[str, ...] = ()
+    drawn: str = ""
 
 
 def run_output(run: Path) -> Output:
@@ -264,7 +266,9 @@ def outputs_replayed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str,
     others = {"diagnose.json", "timings.json", "lock"}
     answers = sorted({path.name for path in (folder / "diagnose").iterdir()} - others)
     return {
-        "study": Output(folder / "study", (again(study), point), ("table.csv", "table.json", "study.html")),
+        "study": Output(
+            folder / "study", (again(study), point), ("table.csv", "table.json", "study.html"), "points/1"
+        ),
         "diagnose": Output(folder / "diagnose", (again(diagnosis),), tuple(answers)),
     }
 
@@ -282,7 +286,7 @@ def tampered(one: Output, folder: Path, count: int, number: int) -> Tally:
     Pictures are not rendered. Those of untouched numbers are the same every time: they are drawn where files
     of the directory are compared, and wherever a number or the configuration was touched.
     """
-    whole = _drawn_from(one.whole)
+    whole = _drawn_from(one.whole / one.drawn)
 
     def attempt(rng: np.random.Generator) -> str | None:
         place = folder / "place"
@@ -291,7 +295,7 @@ def tampered(one: Output, folder: Path, count: int, number: int) -> Tally:
             tamper(rng, place)
             call = int(rng.integers(len(one.calls)))
             with pytest.MonkeyPatch.context() as patch:
-                if (call > 0 or not one.same) and _drawn_from(place) == whole:
+                if (call > 0 or not one.same) and _drawn_from(place / one.drawn) == whole:
                     build_nothing(patch)
                 line = refusal(one.calls[call](place), place)
             if line is None and call == 0:
