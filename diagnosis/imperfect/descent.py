@@ -28,6 +28,9 @@ _COARSE_STEP = {"log": 0.1, "angle": 0.1, "linear": 0.0125}
 _LARGEST_STEP, _LARGEST_MOVE = 2.0, 1.5
 # Grids around a size on which the loss does not depend smoothly: how far, points of each.
 _REACHES, _POINTS = (0.1, 0.03), 9
+_FAR = np.array([-3.0, -2.0, -1.2, -0.6, -0.25, -0.08, 0.08, 0.25, 0.6, 1.2, 2.0, 3.0])
+# Above the loss of an end, that of a start which leads to no better one.
+_HOPELESS = 5.0
 _AGAIN = (2, 5, 8, 11)
 _STATE_ITERATIONS = 30
 
@@ -208,30 +211,46 @@ def descend(
 def refined(records: Records, end: Descent) -> Descent:
     """The end with the sizes on which the loss does not depend smoothly sought on grids around it, all else
     following, and descended from the best of each."""
-    low, high = box(end.candidates)
     first = 0
     for candidate in end.candidates:
         for reach in _REACHES if candidate.dependence == "non-smooth" else ():
-            trials = []
-            for shift in np.linspace(-reach, reach, _POINTS):
-                x = end.coordinates.copy()
-                x[first] = np.clip(x[first] + shift, low[first], high[first])
-                e = records.coefficients(end.deviations, effects_at(end.candidates, x), end.start)
-                trials.append((*follow(records, end, e, end.start), x))
-            _, d, x = min(trials, key=lambda trial: trial[0])
-            again = descend(
-                records,
-                end.candidates,
-                d,
-                x,
-                end.start,
-                nominal_jacobian=end.jacobian[:, : d.size],
-                columns=end.columns,
-                iterations=5,
-            )
-            end = min(end, again, key=lambda one: one.loss)
+            end = _sought(records, end, first, np.linspace(-reach, reach, _POINTS))
         first += len(candidate.axes)
     return end
+
+
+def scanned(records: Records, end: Descent) -> Descent:
+    """The same over far values of all parameters on logarithmic scales: where contacts switch, the loss
+    along any of them is jagged, and slopes lead no further than the next tooth."""
+    for k, axis in enumerate(axis for c in end.candidates for axis in c.axes):
+        if axis.scale == "log":
+            end = _sought(records, end, k, _FAR)
+    return end
+
+
+def _sought(records: Records, end: Descent, k: int, shifts: Real) -> Descent:
+    """The best of the end and what is descended to from the best of some shifts of its k-th coordinate."""
+    low, high = box(end.candidates)
+    trials = []
+    for shift in shifts:
+        x = end.coordinates.copy()
+        x[k] = np.clip(x[k] + shift, low[k], high[k])
+        e = records.coefficients(end.deviations, effects_at(end.candidates, x), end.start)
+        trials.append((*follow(records, end, e, end.start), x))
+    loss, d, x = min(trials, key=lambda trial: trial[0])
+    if loss > end.loss + _HOPELESS:
+        return end
+    again = descend(
+        records,
+        end.candidates,
+        d,
+        x,
+        end.start,
+        nominal_jacobian=end.jacobian[:, : d.size],
+        columns=end.columns,
+        iterations=5,
+    )
+    return min(end, again, key=lambda one: one.loss)
 
 
 def best_move(records: Records, part: slice, columns: Real, e: Real, state: Real) -> Real:

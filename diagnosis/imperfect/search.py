@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from diagnosis.evidence.look_alikes import look_alike
-from diagnosis.imperfect.descent import Descent, best_move, descend, loss_at, occam, refined
+from diagnosis.imperfect.descent import Descent, best_move, descend, loss_at, occam, refined, scanned
 from diagnosis.imperfect.records import Records, Start
 from diagnosis.imperfect.starts import Point, beside, points_of
+from diagnosis.imperfect.windows import in_windows
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from plant.effects import LOOK_ALIKES
@@ -28,6 +29,12 @@ _FINISHED, _REFINED = 6, 2
 _CONTINUED = 3
 # Beside values pulled this far (tolerances), effects that multiply one are tried as well.
 _PULLED = 1.8
+# Fits in windows: effects extended, others tried beside each, and sets of one and two continued in free runs.
+_IN_WINDOWS, _BESIDE_IN_WINDOWS, _FREED = 1, 4, (2, 3)
+# Loss that the best of them gains in windows, or none is continued.
+_GAINED = 15.0
+# Scans of sets with contacts, each of the likeliest that is left or has gained this since its last.
+_SCANS, _GAINED_BY_SCAN = 2, 2.0
 _HELD_OUT_STEPS = 5
 # Of octaves, what is felt where disturbances of the inputs are amplified.
 _AMPLIFIED = 0.5
@@ -116,13 +123,22 @@ class Search:
         self._alone()
         self._containing(self.found)
         for count in range(2, weighing.most_effects + 1):
-            likeliest = max(self.found, key=lambda e: e.evidence)
-            if count > 3 and np.max(likeliest.shares) <= weighing.model_error:
+            if count > 3 and not self._unexplained:
                 break
             self._together(count)
+        if self._unexplained:
+            self._from_windows()
         several = best_of_sets(e for e in self.found if len(e.names) > 1)
         self._containing(list(several.values())[:_CONTINUED])
+        if self._unexplained:
+            self._scanned()
         self._look_alikes()
+
+    @property
+    def _unexplained(self) -> bool:
+        """Whether the likeliest leaves more of the motion than is stated not to interest."""
+        likeliest = max(self.found, key=lambda e: e.evidence)
+        return bool(np.max(likeliest.shares) > self.case.machine.weighing.model_error)
 
     def _late(self, what: str) -> bool:
         if time.monotonic() < self.deadline_s:
@@ -155,14 +171,19 @@ class Search:
         self, around: Descent, candidate: Candidate, points: Sequence[Point], nominal: Real
     ) -> Descent:
         chosen = [points[0]]
-        turned = candidate.kind.absolute_angle and not self.case.machine.unknown_start.zero_seen
         for point in points[1:]:
-            if len(chosen) == (2 * _ALONE if turned else _ALONE) or point.loss > self.base.end.loss + 5:
+            if (
+                len(chosen) == (2 * _ALONE if self._turned(candidate) else _ALONE)
+                or point.loss > self.base.end.loss + 5
+            ):
                 break
             if all(point.far_from(other) for other in chosen):
                 chosen.append(point)
         ends = [self._from(around, candidate, point, nominal) for point in chosen]
         return min(ends, key=lambda end: end.loss)
+
+    def _turned(self, candidate: Candidate) -> bool:
+        return candidate.kind.absolute_angle and not self.case.machine.unknown_start.zero_seen
 
     def _from(self, around: Descent, candidate: Candidate, point: Point, nominal: Real) -> Descent:
         return descend(
@@ -223,9 +244,10 @@ class Search:
         for candidate, points in self.points:
             if candidate.effect in held or candidate.kind.contains in held:
                 continue
-            harmonic = candidate.kind.harmonic is not None
-            near = beside(self.records, parent, candidate, points[:1] if harmonic else _spread(points))
-            near += points_of(self.records, parent, candidate)[:1] if harmonic else []
+            # A frequency, and a zero that no other output tells, may be any other beside another effect.
+            anew = candidate.kind.harmonic is not None or self._turned(candidate)
+            near = beside(self.records, parent, candidate, points[:1] if anew else _spread(points))
+            near += points_of(self.records, parent, candidate, every=2)[:1] if anew else []
             trials += [(candidate, point) for point in sorted(near, key=lambda point: point.loss)[:1]]
         trials.sort(key=lambda trial: trial[1].loss)
         chosen: dict[tuple[str, float], tuple[Candidate, Point]] = {}
@@ -239,6 +261,49 @@ class Search:
         ends = [self._from(parent, candidate, point, nominal) for candidate, point in chosen.values()]
         for k, end in enumerate(sorted(ends, key=lambda end: end.loss)):
             self.add(refined(self.records, end) if k < _REFINED else end)
+
+    def _from_windows(self) -> None:
+        """Torques over the angle and what stands beside them, from where fits in windows ended."""
+        acting = [c for c, _ in self.points if c.kind.absolute_angle or c.kind.harmonic == "hub_angle"]
+        if not acting or not isinstance(self.case, Case) or self._late("fits in windows"):
+            return
+        self.progress(0.95, "fitting in windows")
+        base, states = self.base.end, self.records.state_spread.size
+        windows = Search(in_windows(self.case), self.progress, self.deadline_s, self.at_inputs)
+        start, _ = windows._started(windows.records, base.deviations, (), windows.records.at_rest())
+        windows.add(descend(windows.records, (), base.deviations, base.coordinates, start))
+        around = windows.base.end
+        for candidate in acting:
+            points = points_of(windows.records, around, candidate)
+            windows.add(windows._descended(around, candidate, points, around.jacobian))
+        windows.points = [(c, points) for c, points in self.points if c.kind.harmonic != "time"]
+        likely = sorted((e.end for e in windows.found[1:]), key=lambda end: end.loss)[:_IN_WINDOWS]
+        if likely[0].loss > around.loss - _GAINED:
+            return
+        for end in likely:
+            windows._beside(end, _BESIDE_IN_WINDOWS)
+        for count, most in enumerate(_FREED, start=1):
+            of_count = [e.end for e in windows.found if len(e.names) == count]
+            for end in sorted(of_count, key=lambda end: end.loss)[:most]:
+                start = Start(end.start.states[:, :states], end.start.zeros)
+                freed = descend(self.records, end.candidates, end.deviations, end.coordinates, start)
+                self.add(refined(self.records, freed))
+
+    def _scanned(self) -> None:
+        """The likeliest sets with contacts once more from far values of all their parameters."""
+        done: dict[tuple[str, ...], float] = {}
+        for _ in range(_SCANS):
+            likeliest = (
+                e
+                for key, e in best_of_sets(self.found).items()
+                if e.end.non_smooth and e.end.loss < done.get(key, np.inf) - _GAINED_BY_SCAN
+            )
+            this = next(likeliest, None)
+            if this is None or self._late("scans of sets with contacts"):
+                return
+            self.progress(0.97, f"scanning {' and '.join(this.names)}")
+            done[this.key] = this.end.loss
+            self.add(refined(self.records, scanned(self.records, this.end)))
 
     def _look_alikes(self) -> None:
         """Causes beyond the list in place of what they look like, wherever that may be the answer."""

@@ -37,13 +37,13 @@ class Point:
         return bool(moved > _APART or turned > _APART)
 
 
-def points_of(records: Records, around: Descent, candidate: Candidate) -> list[Point]:
-    """Every start of a candidate beside a fit, best first."""
+def points_of(records: Records, around: Descent, candidate: Candidate, every: int = 1) -> list[Point]:
+    """Every start of a candidate beside a fit, or one in several of its grid, best first."""
     found = _harmonic(records, around, candidate) if candidate.kind.harmonic else []
     if not found:
         found = [
             point
-            for x in candidate.starts
+            for x in candidate.starts[::every]
             for start in _turned(records, around.start, candidate)
             if (point := point_at(records, around, candidate, np.array(x), start)) is not None
         ]
