@@ -29,8 +29,8 @@ _FINISHED, _REFINED = 6, 2
 _CONTINUED = 3
 # Beside values pulled this far (tolerances), effects that multiply one are tried as well.
 _PULLED = 1.8
-# Fits in windows: effects extended, others tried beside each, and sets of one and two continued in free runs.
-_IN_WINDOWS, _BESIDE_IN_WINDOWS, _FREED = 1, 4, (2, 3)
+# Fits in windows: effects tried beside the best, and sets of one and of two continued in free runs.
+_BESIDE_IN_WINDOWS, _FREED = 4, (2, 3)
 # Loss that the best of them gains in windows, or none is continued.
 _GAINED = 15.0
 # Scans of sets with contacts, each of the likeliest that is left or has gained this since its last.
@@ -275,13 +275,14 @@ class Search:
         around = windows.base.end
         for candidate in acting:
             points = points_of(windows.records, around, candidate)
-            windows.add(windows._descended(around, candidate, points, around.jacobian))
+            if points and not self._late("fits in windows"):
+                windows.add(windows._descended(around, candidate, points, around.jacobian))
         windows.points = [(c, points) for c, points in self.points if c.kind.harmonic != "time"]
-        likely = sorted((e.end for e in windows.found[1:]), key=lambda end: end.loss)[:_IN_WINDOWS]
-        if likely[0].loss > around.loss - _GAINED:
+        best = min((e.end for e in windows.found), key=lambda end: end.loss)
+        if best.loss > around.loss - _GAINED:
             return
-        for end in likely:
-            windows._beside(end, _BESIDE_IN_WINDOWS)
+        if not self._late("fits in windows"):
+            windows._beside(best, _BESIDE_IN_WINDOWS)
         for count, most in enumerate(_FREED, start=1):
             of_count = [e.end for e in windows.found if len(e.names) == count]
             for end in sorted(of_count, key=lambda end: end.loss)[:most]:
