@@ -16,7 +16,6 @@ from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from plant import EFFECTS, Rig, parse_effects, simulate
 from plant.effects import Effect
 from plant.presets import paper_link
-from workflow.diagnose.outputs import Engine
 
 FRICTION = {"name": "coulomb_friction", "torque_Nm": 0.05}
 _SAMPLES = 240
@@ -58,7 +57,7 @@ def write_case(
 
 
 @dataclass(frozen=True)
-class KnownAnswer(Engine):
+class KnownAnswer:
     """Says what it was told, with the residuals that follow.
 
     verdict, detail, unlisted: as in a Diagnosis. fails: cases it raises an error for; dies: cases that kill

@@ -39,7 +39,7 @@ QUESTIONS = (
 
 def made(folder, engine, *, rig=None, controller=False):
     """Files of one case, computed here."""
-    files, _ = Work(load_case(folder, rig), controller, "code", engine).run(lambda f, m: None)
+    files, _ = Work(load_case(folder, rig), {"controller": controller}, "code", engine).run(lambda f, m: None)
     return files
 
 
@@ -368,7 +368,7 @@ def test_a_directory_of_something_else_is_left_alone(cases, tmp_path, here):
 
 
 def test_json_is_all_there_is_on_standard_output(cases, tmp_path, here, flexlink, monkeypatch):
-    monkeypatch.setattr(command, "Engine", lambda: KnownAnswer((FRICTION,)))
+    monkeypatch.setattr(command, "diagnose", KnownAnswer((FRICTION,)))
     answer = flexlink("diagnose", *cases, "--out", tmp_path / "out", "--no-controller", "--json")
     printed = answer.document()
     assert [case["verdict"] for case in printed["cases"]] == ["effect", "effect"]

@@ -105,7 +105,7 @@ def test_a_study_goes_on(tmp_path, monkeypatch, continued, flexlink):
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_a_diagnosis_goes_on(tmp_path, monkeypatch, continued):
-    monkeypatch.setattr(workflow.diagnose.command, "Engine", lambda **_: KnownAnswer((FRICTION,)))
+    monkeypatch.setattr(workflow.diagnose.command, "diagnose", KnownAnswer((FRICTION,)))
     case = write_case(tmp_path / "c", FRICTION)
     disk = FullDisk(monkeypatch)
     call = ("diagnose", case, "--out", tmp_path / "out", "--no-controller")

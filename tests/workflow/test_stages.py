@@ -73,7 +73,7 @@ def test_commands_beyond_what_the_amplifier_gives_are_taken_as_that(run):
         {"name": "actuator_saturation", "limit_V": 0.7 * entry.excitation.amplitude_V},
     )
     loud = config_of(run.run).model_copy(update={"source": source.model_copy(update={"effects": effects})})
-    first = make_records(StageInput(loud, None, Progress())).records[0]
+    first = make_records(StageInput(loud, run, Progress())).records[0]
     commanded = run.records.records[0].record
     assert first.record.cut == commanded.n_samples
     np.testing.assert_allclose(first.record.input, 0.7 * commanded.input, rtol=1e-12)

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from diagnosis.answer import Diagnosis
+from diagnosis.diagnosis import diagnose
 from workflow.config.settings import repeated
 from workflow.diagnose.case_files import LoadedCase, load_case
 from workflow.diagnose.case_settings import CASE_FILE, case_document
 from workflow.diagnose.directory import DiagnosisDirectory
-from workflow.diagnose.outputs import Engine, Work
+from workflow.diagnose.outputs import Work
 from workflow.diagnose.simulator_case import (
     SimulatorCase,
     SimulatorSettings,
@@ -88,28 +91,29 @@ def diagnose_cases(
     replace: bool = False,
     controller: bool = True,
     time_limit_s: float | None = None,
-    engine: Engine | None = None,
+    engine: Callable[..., Diagnosis] | None = None,
     progress: Progress | None = None,
 ) -> DiagnosisRun:
     """Diagnose every case into `out`.
 
     places: case folders or files, or what a simulator's case file says, with files in the current folder.
     rig: file in each case folder that is read in place of the one its case file names. jobs: processes
-    (default: one per processor). time_limit_s: see `diagnosis.diagnose`. A case that
-    fails does not lose the others; one that fails alone raises
-    InputError or StageError. Raises InputError (one line, nothing written) if no case can be read, two have
-    one name, or `out` cannot be used.
+    (default: one per processor). time_limit_s: see `diagnosis.diagnose`, in whose place tests put a quick
+    `engine`. A case that fails does not lose the others; one that fails alone raises InputError or
+    StageError. Raises InputError (one line, nothing written) if no case can be read, two have one name, or
+    `out` cannot be used.
     """
     progress = progress or Progress()
     loaded, unreadable = _load(places, rig)
     code = code_digest("diagnosis", drawing=True)
-    engine = engine or (Engine() if time_limit_s is None else Engine(time_limit_s=time_limit_s))
-    work = [Work(one, controller, code, engine) for one in loaded]
+    limits = {} if time_limit_s is None else {"time_limit_s": time_limit_s}
+    options, engine = {"controller": controller, **limits}, partial(engine or diagnose, **limits)
+    work = [Work(one, options, code, engine) for one in loaded]
     with DiagnosisDirectory(out).writing(resume=resume, replace=replace):
         directory = DiagnosisDirectory.begin(
             out,
             inputs={one.case.name: one.input_sha256 for one in loaded},
-            options={"controller": controller, **engine.options},
+            options=options,
             resume=resume,
             replace=replace,
         )
@@ -182,7 +186,7 @@ def _compute(
         words = f"{done} of {len(work)} done, {names[index]}: {message}" if several else message
         progress.update("cases", sum(shares) / len(todo), words)
 
-    processes = LocalProcesses(width, preload=["workflow.diagnose.outputs"])
+    processes = LocalProcesses(width, preload=["diagnosis.diagnosis", "workflow.diagnose.outputs"])
     with progress.stage("cases", taken_up=not todo):
         for index, found in processes.run(list(todo.values()), watch):
             name = names[index]

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import tomlkit
 
 from diagnosis.answer import Diagnosis
-from diagnosis.diagnosis import diagnose
-from diagnosis.machine.case import Case
-from diagnosis.machine.own_plant import PlantCase
 from diagnosis.where.where import where
 from plant.effects import Effect
 from plant.rig import Rig
@@ -29,32 +26,18 @@ from workflow.engine.executor import Report
 from workflow.text.templates import render_text
 
 # Shares of a case's time, for the progress bar only.
-_ENGINE, _WHERE, _NEXT, _CONTROLLER = 0.75, 0.8, 0.85, 0.9
-
-
-@dataclass(frozen=True)
-class Engine:
-    """What computes a diagnosis; tests put a quick one in its place."""
-
-    time_limit_s: float = field(default=float("inf"), kw_only=True)
-
-    @property
-    def options(self) -> dict[str, float]:
-        """What of it an answer depends on."""
-        return {} if self.time_limit_s == float("inf") else {"time_limit_s": self.time_limit_s}
-
-    def __call__(self, case: Case | PlantCase, *, progress: Report | None = None) -> Diagnosis:
-        return diagnose(case, progress=progress, time_limit_s=self.time_limit_s)
+_DIAGNOSED, _WHERE, _NEXT, _CONTROLLER = 0.75, 0.8, 0.85, 0.9
 
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """One case to do, here or in a process of its own. controller: whether the controllers are compared."""
+    """One case to do, here or in a process of its own. options: what else the answer depends on, of which
+    `controller` says whether the controllers are compared; diagnose: `diagnosis.diagnose` with the others."""
 
     loaded: LoadedCase | SimulatorCase
-    controller: bool
+    options: Mapping[str, float]
     code_sha256: str
-    engine: Engine
+    diagnose: Callable[..., Diagnosis]
 
     @property
     def made_from(self) -> dict[str, Any]:
@@ -62,7 +45,7 @@ class Work:
         return {
             "input_sha256": self.loaded.input_sha256,
             "code_sha256": self.code_sha256,
-            "options": {"controller": self.controller, **self.engine.options},
+            "options": dict(self.options),
         }
 
     def run(self, report: Report) -> tuple[dict[str, bytes], float]:
@@ -75,14 +58,14 @@ class Work:
             return self._of_simulator(self.loaded, report)
         loaded, case = self.loaded, self.loaded.case
         with naming(f"case {case.name}"):
-            found = self.engine(case, progress=lambda f, m: report(_ENGINE * f, m))
-            report(_ENGINE, "where")
+            found = self.diagnose(case, progress=lambda f, m: report(_DIAGNOSED * f, m))
+            report(_DIAGNOSED, "where")
             place = where(case, found.residuals_refit, found.probabilities)
             remains = where(case, found.residuals_after)
             report(_WHERE, "next experiment")
             coming = following(found)
             report(_NEXT, "controller")
-            check, no_check = _control(found) if self.controller else (None, "not_asked")
+            check, no_check = _control(found) if self.options["controller"] else (None, "not_asked")
         rig_name, effects_name = f"{case.name}.rig.toml", f"{case.name}.effects.toml"
         effects = effects_text(case.name, found.repair) if found.repair else ""
         rig = rig_text(
@@ -108,7 +91,7 @@ class Work:
     def _of_simulator(self, loaded: SimulatorCase, report: Report) -> tuple[dict[str, bytes], float]:
         name = loaded.case.name
         with naming(f"case {name}"):
-            found = self.engine(loaded.case, progress=lambda f, m: report(_CONTROLLER * f, m))
+            found = self.diagnose(loaded.case, progress=lambda f, m: report(_CONTROLLER * f, m))
             coming = following(found)
             files = {f"{name}.html": plant_page(found, coming).encode()}
             if loaded.repaired is not None:

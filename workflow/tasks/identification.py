@@ -77,7 +77,8 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
             as_measured = records.fitted(channel)
             if known is not None:
                 found = clipped_as_measured(found, as_measured)
-            found = with_warnings(found, amplitude_effects(as_measured))
+            warnings = found.identification.search.warnings
+            found = with_warnings(found, (*warnings, *amplitude_effects(as_measured)))
             channels.append(
                 replace(
                     found,
@@ -90,20 +91,17 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
     return IdentifyResult(tuple(channels), friction)
 
 
-def with_warnings(found: IdentifiedChannel, more: Sequence[Finding]) -> IdentifiedChannel:
-    """The channel with what else is doubtful of its model."""
-    search = found.identification.search
-    search = replace(search, warnings=(*search.warnings, *more))
+def with_warnings(found: IdentifiedChannel, warnings: Sequence[Finding]) -> IdentifiedChannel:
+    """The channel with this as what is doubtful of its model."""
+    search = replace(found.identification.search, warnings=tuple(warnings))
     return replace(found, identification=replace(found.identification, search=search))
 
 
 def clipped_as_measured(found: IdentifiedChannel, measured: Sequence[Record]) -> IdentifiedChannel:
     """What stands at its limit is seen in what was measured, not in what taking the friction off has left."""
-    search = found.identification.search
-    others = tuple(warning for warning in search.warnings if warning.kind is not FindingKind.CLIPPED)
-    search = replace(search, warnings=others)
-    found = replace(found, identification=replace(found.identification, search=search))
-    return with_warnings(found, clipped(measured))
+    warnings = found.identification.search.warnings
+    others = [warning for warning in warnings if warning.kind is not FindingKind.CLIPPED]
+    return with_warnings(found, [*others, *clipped(measured)])
 
 
 def friction_of(stage: StageInput) -> FrictionFit:

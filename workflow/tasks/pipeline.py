@@ -50,22 +50,22 @@ def run_pipeline(
     then, unless identification had already been paid for. Raises StageError when a computation fails.
     """
     progress = progress or Progress()
-    out = Path(out)
-    RunDirectory(out).refuse_unless_free(resume=resume, replace=replace)
+    run = RunDirectory(Path(out))
+    existed, results = run.path.exists(), RunResults(run)
+    run.refuse_unless_free(resume=resume, replace=replace)
     inputs = {str(path): storage.sha256_of_file(path) for path in config.input_files}
     # Records are read before anything is written: a bad log leaves no directory behind.
     first = STAGES[0]
     started = time.monotonic()
     ready: RecordsResult | None = None
-    if not (resume and out.exists()):
+    if not (resume and existed):
         with threadpool_limits(1):
-            ready = first.run(StageInput(config, None, progress, called))
+            ready = first.run(StageInput(config, results, progress, called))
     ready_s = time.monotonic() - started
-    existed, run = out.exists(), RunDirectory(out)
     # More threads round otherwise.
     with run.writing(resume=resume, replace=replace), threadpool_limits(1):
         RunDirectory.begin(
-            out,
+            run.path,
             config_text=config_text,
             config=config.to_document(),
             seed=config.run.seed,
@@ -78,7 +78,6 @@ def run_pipeline(
         stages = STAGES if page is None else (*STAGES, page)
         progress.plan([(stage.name, stage.expected_s) for stage in stages])
         try:
-            results = RunResults(run)
             for stage in stages:
                 before = (ready, ready_s) if stage is first else None
                 _perform(stage, config, results, progress, inputs, before)
@@ -88,7 +87,7 @@ def run_pipeline(
             if isinstance(error, KeyboardInterrupt) or interrupts.came():  # a library may make anything of it
                 with suppress(InputError):  # a full disk, a directory that is gone
                     run.record_status("interrupted")
-                raise CommandInterruptedError(out) from None
+                raise CommandInterruptedError(run.path) from None
             _fail(run, error, created=not existed)
             raise
         run.record_status("complete" if summary.certified else "complete, not certified")

@@ -19,20 +19,12 @@ from workflow.tasks.results import RunResults
 
 @dataclass(frozen=True)
 class StageInput:
-    """What a stage may look at. `earlier` is None for the first stage only, which reads no earlier result.
-    `called`: what to call the configuration in a complaint."""
+    """What a stage may look at. results: of those before it; called: the configuration, in a complaint."""
 
     config: RunConfig
-    earlier: RunResults | None
+    results: RunResults
     progress: Progress
     called: str = "the configuration"
-
-    @property
-    def results(self) -> RunResults:
-        """What the stages before it found."""
-        if self.earlier is None:
-            raise RuntimeError("the first stage has no earlier results")
-        return self.earlier
 
     @property
     def plant(self) -> UncertainPlant:
