@@ -106,7 +106,7 @@ def diagnose_cases(
     progress = progress or Progress()
     loaded, unreadable = _load(places, rig)
     code = code_digest("diagnosis", drawing=True)
-    limits = {} if time_limit_s is None else {"time_limit_s": time_limit_s}
+    limits: dict[str, Any] = {} if time_limit_s is None else {"time_limit_s": time_limit_s}
     options, engine = {"controller": controller, **limits}, partial(engine or diagnose, **limits)
     work = [Work(one, options, code, engine) for one in loaded]
     with DiagnosisDirectory(out).writing(resume=resume, replace=replace):
