@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from scipy.signal import butter, filtfilt
 
-from benchmarks.own_plant import SHARE, Real, given, lagged, late_value
+from benchmarks.own_plant import SHARE, Real, constants, lagged, late_value
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
 from diagnosis.machine.machine_protocol import Role
 
@@ -66,58 +66,26 @@ def effects(loop: bool, refined: bool) -> tuple[PlantEffect, ...]:
     return tuple(found)
 
 
+_EVERY = effects(loop=True, refined=True)
+
+
 def simulate(
     parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]], inputs: Real
 ) -> Real:
     """Reference position (T, 1) -> motor force (T, 1), after a run-in at the reference's first speed."""
-    value = given(effects)
-    # Dry friction adds up when two laws of it are tried together.
-    coulomb = value("coulomb_friction", "force_N")
-    stribeck = value("stribeck_friction", "static_N")
     reference = inputs[:, 0]
     before = reference[0] - (reference[1] - reference[0]) * np.arange(_RUN_IN, 0, -1)
-    force = _run(
-        np.concatenate([before, reference]),
-        parameters["mass_kg"],
-        parameters["viscous_Ns_m"],
-        coulomb + value("stribeck_friction", "coulomb_share") * stribeck,
-        coulomb + stribeck,
-        value("stribeck_friction", "velocity_m_s", 1.0),
-        value("constant_offset", "force_N"),
-        value("viscous_asymmetry", "coefficient_Ns_m"),
-        value("quadratic_friction", "coefficient_Ns2_m2"),
-        value("cable_spring", "stiffness_N_m"),
-        value("hardening_spring", "cubic_N_m3"),
-        1 + value("actuator_gain", "relative_error"),
-        value("input_delay", "delay_s"),
-        value("actuator_lag", "time_constant_s"),
-        value("actuator_dead_zone", "width_V"),
-        value("actuator_saturation", "limit_V", LIMIT_V),
-        value("encoder_quantisation", "step_m"),
-    )
+    force = _run(np.concatenate([before, reference]), _constants(parameters, effects))
     return np.asarray(force[_RUN_IN:, None])
 
 
+def _constants(parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]]) -> np.record:
+    limit = {"actuator_saturation_limit_V": LIMIT_V, "stribeck_friction_velocity_m_s": 1.0}
+    return constants(_EVERY, effects, parameters, **limit)
+
+
 @njit
-def _run(
-    reference: Real,
-    mass: float,
-    viscous: float,
-    coulomb: float,
-    static: float,
-    stribeck_velocity: float,
-    offset: float,
-    asymmetry: float,
-    quadratic: float,
-    spring: float,
-    cubic: float,
-    gain: float,
-    delay: float,
-    lag: float,
-    dead_zone: float,
-    limit: float,
-    encoder: float,
-) -> Real:
+def _run(reference: Real, p: np.record) -> Real:
     """Friction by its implicit step, so that the axis truly sticks; force of the record, (T,)."""
     T = reference.size
     h = DT_S / _SUBSTEPS
@@ -127,20 +95,31 @@ def _run(
     seen1 = q - v * DT_S
     seen2 = q - 2 * v * DT_S
     pull = 0.0
+    limit, encoder = p.actuator_saturation_limit_V, p.encoder_quantisation_step_m
+    dead_zone = p.actuator_dead_zone_width_V * FORCE_PER_VOLT_N
+    # Dry friction adds up when two laws of it are tried together.
+    coulomb = p.coulomb_friction_force_N + p.stribeck_friction_coulomb_share * p.stribeck_friction_static_N
+    static = p.coulomb_friction_force_N + p.stribeck_friction_static_N
+    asymmetry, quadratic = p.viscous_asymmetry_coefficient_Ns_m, p.quadratic_friction_coefficient_Ns2_m2
     for k in range(T):
         seen = q if encoder <= 0.0 else encoder * np.round(q / encoder)
         volts = VELOCITY_GAIN * (POSITION_GAIN * (reference[k] - seen) - (seen - seen2) / (2 * DT_S))
         seen2, seen1 = seen1, seen
         volts = min(max(volts, -limit), limit)
         force[k] = FORCE_PER_VOLT_N * volts
-        late = gain * late_value(force, k, delay / DT_S, dead_zone * FORCE_PER_VOLT_N)
+        late = (1 + p.actuator_gain_relative_error) * late_value(
+            force, k, p.input_delay_delay_s / DT_S, dead_zone
+        )
         for _ in range(_SUBSTEPS):
-            pull = lagged(pull, late, h, lag)
-            level = coulomb + (static - coulomb) * np.exp(-abs(v) / stribeck_velocity)
-            side = viscous + (asymmetry if v > 0 else -asymmetry)
-            free = v + h / mass * (pull - offset - spring * q - cubic * q**3 - quadratic * v * abs(v))
-            held = h / mass * level
-            new = 0.0 if abs(free) <= held else (free - np.sign(free) * held) / (1 + h / mass * side)
+            pull = lagged(pull, late, h, p.actuator_lag_time_constant_s)
+            level = coulomb + (static - coulomb) * np.exp(-abs(v) / p.stribeck_friction_velocity_m_s)
+            side = p.viscous_Ns_m + (asymmetry if v > 0 else -asymmetry)
+            spring = p.cable_spring_stiffness_N_m * q
+            cubic = p.hardening_spring_cubic_N_m3 * q**3
+            free = pull - p.constant_offset_force_N - spring - cubic - quadratic * v * abs(v)
+            free = v + h / p.mass_kg * free
+            held = h / p.mass_kg * level
+            new = 0.0 if abs(free) <= held else (free - np.sign(free) * held) / (1 + h / p.mass_kg * side)
             q += 0.5 * h * (v + new)
             v = new
     return force
@@ -152,27 +131,25 @@ def forces(parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, f
     Effects of the actuator are inverted: the force of the record is the one commanded.
     """
     q, v, a = inputs.T
-    value = given(effects)
-    share, speed = (
-        value("stribeck_friction", "coulomb_share"),
-        value("stribeck_friction", "velocity_m_s", 1.0),
-    )
-    stribeck = value("stribeck_friction", "static_N") * (share + (1 - share) * np.exp(-np.abs(v) / speed))
+    p = _constants(parameters, effects)
+    share = p.stribeck_friction_coulomb_share
+    fall = np.exp(-np.abs(v) / p.stribeck_friction_velocity_m_s)
+    stribeck = p.stribeck_friction_static_N * (share + (1 - share) * fall)
     force = (
-        parameters["mass_kg"] * a
-        + parameters["viscous_Ns_m"] * v
-        + (value("coulomb_friction", "force_N") + stribeck) * np.sign(v)
-        + value("constant_offset", "force_N")
-        + value("viscous_asymmetry", "coefficient_Ns_m") * np.abs(v)
-        + value("quadratic_friction", "coefficient_Ns2_m2") * v * np.abs(v)
-        + value("cable_spring", "stiffness_N_m") * q
-        + value("hardening_spring", "cubic_N_m3") * q**3
+        p.mass_kg * a
+        + p.viscous_Ns_m * v
+        + (p.coulomb_friction_force_N + stribeck) * np.sign(v)
+        + p.constant_offset_force_N
+        + p.viscous_asymmetry_coefficient_Ns_m * np.abs(v)
+        + p.quadratic_friction_coefficient_Ns2_m2 * v * np.abs(v)
+        + p.cable_spring_stiffness_N_m * q
+        + p.hardening_spring_cubic_N_m3 * q**3
     )
     t = np.arange(q.size) * DT_S
-    force = np.interp(t + value("input_delay", "delay_s"), t, force)
-    force = force + value("actuator_lag", "time_constant_s") * np.gradient(force, DT_S)
-    force = force + value("actuator_dead_zone", "width_V") * FORCE_PER_VOLT_N * np.sign(force)
-    return np.asarray(force[:, None] / (1 + value("actuator_gain", "relative_error")))
+    force = np.interp(t + p.input_delay_delay_s, t, force)
+    force = force + p.actuator_lag_time_constant_s * np.gradient(force, DT_S)
+    force = force + p.actuator_dead_zone_width_V * FORCE_PER_VOLT_N * np.sign(force)
+    return np.asarray(force[:, None] / (1 + p.actuator_gain_relative_error))
 
 
 def record(folder: Path) -> Real:

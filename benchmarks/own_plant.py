@@ -1,15 +1,15 @@
-"""What the simulations of the real machines share: effects by name, a delayed command."""
+"""What the simulations of the real machines share: their constants for compiled code, a delayed command."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 from scipy.linalg import expm
 
-from diagnosis import EffectParameter
+from diagnosis import EffectParameter, PlantEffect
 
 Real = npt.NDArray[np.float64]
 
@@ -17,13 +17,20 @@ Real = npt.NDArray[np.float64]
 SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.3, 0.7), "linear")
 
 
-def given(effects: Mapping[str, Mapping[str, float]]) -> Callable[..., float]:
-    """value(effect, parameter, without=0.0): `without` where the effect is not there."""
+def constants(
+    listed: Sequence[PlantEffect],
+    effects: Mapping[str, Mapping[str, float]],
+    parameters: Mapping[str, float] | None = None,
+    **absent: float,
+) -> np.record:
+    """The parameters, and EFFECT_PARAMETER of every listed effect: zero, or as in `absent`, without it.
 
-    def value(effect: str, parameter: str, without: float = 0.0) -> float:
-        return float(effects[effect][parameter]) if effect in effects else without
-
-    return value
+    A record with named fields, which compiled code reads as well.
+    """
+    values = {f"{effect.name}_{p.name}": 0.0 for effect in listed for p in effect.parameters} | absent
+    values |= {f"{name}_{key}": value for name, given in effects.items() for key, value in given.items()}
+    values |= parameters or {}
+    return np.rec.array([tuple(values.values())], dtype=[(name, np.float64) for name in values])[0]
 
 
 @njit

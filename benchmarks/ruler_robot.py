@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from scipy.optimize import least_squares
 
-from benchmarks.own_plant import SHARE, Real, given, held_input, lagged, late_value
+from benchmarks.own_plant import SHARE, Real, constants, held_input, lagged, late_value
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
 from diagnosis.machine.machine_protocol import Role
 
@@ -38,51 +38,35 @@ GUESS = {
 }
 
 
-def effects() -> tuple[PlantEffect, ...]:
-    P = EffectParameter
-    dry = SHARE, P("velocity_counts_s", 1.0, 1000.0)
-    return (
-        PlantEffect("coulomb_friction", (P("drive_counts", 0.01, 40.0),), dependence="continuous"),
-        PlantEffect("stribeck_friction", (P("static_counts", 0.01, 60.0), *dry), dependence="continuous"),
-        PlantEffect("drive_offset", (P("drive_counts", 0.01, 40.0),), signed=True, dependence="continuous"),
-        PlantEffect("angle_offset", (P("counts", 0.01, 40.0),), signed=True),
-        PlantEffect("input_delay", (P("delay_s", 1e-4, 0.03),)),
-        PlantEffect("actuator_lag", (P("time_constant_s", 1e-4, 0.1),)),
-        PlantEffect("actuator_dead_zone", (P("width_counts", 0.01, 40.0),), dependence="continuous"),
-        PlantEffect(
-            "actuator_saturation", (P("limit_counts", 10.0, 200.0),), grows=False, dependence="continuous"
-        ),
-        PlantEffect("quadratic_friction", (P("counts_at_10_counts_s", 1e-6, 0.1),), signed=True),
-        PlantEffect("hardening_spring", (P("counts_at_10_counts", 1e-6, 1.0),), signed=True),
-    )
+_P = EffectParameter
+EFFECTS = (
+    PlantEffect("coulomb_friction", (_P("drive_counts", 0.01, 40.0),), dependence="continuous"),
+    PlantEffect(
+        "stribeck_friction",
+        (_P("static_counts", 0.01, 60.0), SHARE, _P("velocity_counts_s", 1.0, 1000.0)),
+        dependence="continuous",
+    ),
+    PlantEffect("drive_offset", (_P("drive_counts", 0.01, 40.0),), signed=True, dependence="continuous"),
+    PlantEffect("angle_offset", (_P("counts", 0.01, 40.0),), signed=True),
+    PlantEffect("input_delay", (_P("delay_s", 1e-4, 0.03),)),
+    PlantEffect("actuator_lag", (_P("time_constant_s", 1e-4, 0.1),)),
+    PlantEffect("actuator_dead_zone", (_P("width_counts", 0.01, 40.0),), dependence="continuous"),
+    PlantEffect(
+        "actuator_saturation", (_P("limit_counts", 10.0, 200.0),), grows=False, dependence="continuous"
+    ),
+    PlantEffect("quadratic_friction", (_P("counts_at_10_counts_s", 1e-6, 0.1),), signed=True),
+    PlantEffect("hardening_spring", (_P("counts_at_10_counts", 1e-6, 1.0),), signed=True),
+)
 
 
 def simulate(
     parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]], inputs: Real
 ) -> Real:
     """Reference (T, 1) -> theta (T, 1), both in counts, from rest."""
-
-    value = given(effects)
-    static = value("stribeck_friction", "static_counts")
-    coulomb = value("coulomb_friction", "drive_counts")
+    absent = {"actuator_saturation_limit_counts": np.inf, "stribeck_friction_velocity_counts_s": 1.0}
     A, B = held_input(*state_space(parameters), DT_S / SUBSTEPS)
-    theta = _run(
-        np.ascontiguousarray(inputs[:, 0]),
-        A,
-        B[:, 0].copy(),
-        coulomb + static * value("stribeck_friction", "coulomb_share"),
-        coulomb + static,
-        value("stribeck_friction", "velocity_counts_s", 1.0),
-        value("drive_offset", "drive_counts"),
-        value("angle_offset", "counts"),
-        value("input_delay", "delay_s"),
-        value("actuator_lag", "time_constant_s"),
-        value("actuator_dead_zone", "width_counts"),
-        value("actuator_saturation", "limit_counts", np.inf),
-        value("quadratic_friction", "counts_at_10_counts_s"),
-        value("hardening_spring", "counts_at_10_counts"),
-    )
-    return np.asarray(theta[:, None])
+    p = constants(EFFECTS, effects, **absent)
+    return np.asarray(_run(np.ascontiguousarray(inputs[:, 0]), A, B[:, 0].copy(), p)[:, None])
 
 
 def state_space(p: Mapping[str, float]) -> tuple[Real, Real]:
@@ -100,39 +84,28 @@ def state_space(p: Mapping[str, float]) -> tuple[Real, Real]:
 
 
 @njit
-def _run(
-    reference: Real,
-    A: Real,
-    B: Real,
-    coulomb: float,
-    static: float,
-    stribeck_velocity: float,
-    offset: float,
-    angle_offset: float,
-    delay: float,
-    lag: float,
-    dead_zone: float,
-    limit: float,
-    quadratic: float,
-    cubic: float,
-) -> Real:
+def _run(reference: Real, A: Real, B: Real, p: np.record) -> Real:
     """Dry friction as the drive that it takes off, so that the hub truly sticks."""
     T = reference.size
     h = DT_S / SUBSTEPS
     theta, command = np.zeros(T), np.zeros(T)
     x, y = np.zeros(6), np.zeros(6)
-    pull = 0.0
+    pull, limit = 0.0, p.actuator_saturation_limit_counts
+    dry, static = p.coulomb_friction_drive_counts, p.stribeck_friction_static_counts
+    coulomb, static = dry + static * p.stribeck_friction_coulomb_share, dry + static
+    quadratic, cubic = p.quadratic_friction_counts_at_10_counts_s, p.hardening_spring_counts_at_10_counts
     for k in range(T):
-        theta[k] = x[0] + angle_offset
+        theta[k] = x[0] + p.angle_offset_counts
         command[k] = min(max(reference[k] - theta[k], -limit), limit)
-        late = late_value(command, k, delay / DT_S, dead_zone)
+        late = late_value(command, k, p.input_delay_delay_s / DT_S, p.actuator_dead_zone_width_counts)
         for _ in range(SUBSTEPS):
-            pull = lagged(pull, late, h, lag)
-            drive = pull + offset - quadratic * x[3] * abs(x[3]) / 100 - cubic * (x[0] / 10) ** 3
+            pull = lagged(pull, late, h, p.actuator_lag_time_constant_s)
+            drive = pull + p.drive_offset_drive_counts
+            drive = drive - quadratic * x[3] * abs(x[3]) / 100 - cubic * (x[0] / 10) ** 3
             free = B[3] * drive
             for c in range(6):
                 free += A[3, c] * x[c]
-            level = coulomb + (static - coulomb) * np.exp(-abs(x[3]) / stribeck_velocity)
+            level = coulomb + (static - coulomb) * np.exp(-abs(x[3]) / p.stribeck_friction_velocity_counts_s)
             drive -= min(max(free / B[3], -level), level)
             for r in range(6):
                 y[r] = B[r] * drive
@@ -179,7 +152,7 @@ def case(folder: Path, fitted: tuple[int, ...] = (50, 75), judged: tuple[int, ..
         dict.fromkeys(stated, 0.1),
         ("theta_counts",),
         np.array([noise]),
-        effects(),
+        EFFECTS,
     )
     roles: tuple[tuple[Role, int, tuple[int, ...]], ...] = (
         ("estimation", 1, fitted),

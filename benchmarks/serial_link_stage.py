@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from scipy.signal import lfilter
 
-from benchmarks.own_plant import SHARE, Real, given, held_input, lagged, late_value
+from benchmarks.own_plant import SHARE, Real, constants, held_input, lagged, late_value
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
 
 DT_S, PERIOD, SUBSTEPS = 0.002, 5000, 2
@@ -49,24 +49,26 @@ TOLERANCES = {
 }
 
 
-def effects() -> tuple[PlantEffect, ...]:
-    P = EffectParameter
-    dry = SHARE, P("velocity_rad_s", 1e-3, 1.0)
-    return (
-        PlantEffect("coulomb_friction", (P("current_A", 1e-4, 0.5),), dependence="continuous"),
-        PlantEffect("stribeck_friction", (P("static_A", 1e-4, 0.8), *dry), dependence="continuous"),
-        PlantEffect("current_offset", (P("current_A", 1e-4, 0.5),), signed=True, dependence="continuous"),
-        PlantEffect("strain_offset", (P("angle_rad", 1e-6, 0.02),), signed=True),
-        PlantEffect("strain_gain", (P("relative_error", 1e-3, 0.8),), signed=True),
-        PlantEffect("input_delay", (P("delay_s", 1e-4, 0.03),)),
-        PlantEffect("actuator_lag", (P("time_constant_s", 1e-4, 0.1),)),
-        PlantEffect("actuator_dead_zone", (P("width_A", 1e-4, 0.5),), dependence="continuous"),
-        # Beyond what the tolerances of the stated values explain.
-        PlantEffect("load_inertia", (P("relative_increase", 0.3, 9.0),)),
-        PlantEffect("link_softness", (P("relative_increase", 0.3, 9.0),)),
-        PlantEffect("other_stage", (P("share", 1e-3, 10.0),), signed=True),
-        PlantEffect("hardening_spring", (P("cubic_A_rad3", 1e-3, 100.0),), signed=True),
-    )
+_P = EffectParameter
+EFFECTS = (
+    PlantEffect("coulomb_friction", (_P("current_A", 1e-4, 0.5),), dependence="continuous"),
+    PlantEffect(
+        "stribeck_friction",
+        (_P("static_A", 1e-4, 0.8), SHARE, _P("velocity_rad_s", 1e-3, 1.0)),
+        dependence="continuous",
+    ),
+    PlantEffect("current_offset", (_P("current_A", 1e-4, 0.5),), signed=True, dependence="continuous"),
+    PlantEffect("strain_offset", (_P("angle_rad", 1e-6, 0.02),), signed=True),
+    PlantEffect("strain_gain", (_P("relative_error", 1e-3, 0.8),), signed=True),
+    PlantEffect("input_delay", (_P("delay_s", 1e-4, 0.03),)),
+    PlantEffect("actuator_lag", (_P("time_constant_s", 1e-4, 0.1),)),
+    PlantEffect("actuator_dead_zone", (_P("width_A", 1e-4, 0.5),), dependence="continuous"),
+    # Beyond what the tolerances of the stated values explain.
+    PlantEffect("load_inertia", (_P("relative_increase", 0.3, 9.0),)),
+    PlantEffect("link_softness", (_P("relative_increase", 0.3, 9.0),)),
+    PlantEffect("other_stage", (_P("share", 1e-3, 10.0),), signed=True),
+    PlantEffect("hardening_spring", (_P("cubic_A_rad3", 1e-3, 100.0),), signed=True),
+)
 
 
 def simulation(gains: Real):
@@ -75,33 +77,12 @@ def simulation(gains: Real):
     def simulate(
         parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]], inputs: Real
     ) -> Real:
-        value = given(effects)
-        coulomb = value("coulomb_friction", "current_A")
-        static = value("stribeck_friction", "static_A")
-        steady = coulomb + static * value("stribeck_friction", "coulomb_share")
+        p = constants(EFFECTS, effects, stribeck_friction_velocity_rad_s=1.0)
         moved = dict(parameters)
-        moved["load_inertia_kg_m2"] *= 1 + value("load_inertia", "relative_increase")
-        moved["spring_Nm_rad"] /= 1 + value("link_softness", "relative_increase")
+        moved["load_inertia_kg_m2"] *= 1 + p.load_inertia_relative_increase
+        moved["spring_Nm_rad"] /= 1 + p.link_softness_relative_increase
         A, B = held_input(*state_space(moved), DT_S / SUBSTEPS)
-        out = _run(
-            np.ascontiguousarray(inputs[:, 0]),
-            value("other_stage", "share") * inputs[:, 1],
-            inputs[0, 2],
-            A,
-            B,
-            gains,
-            steady,
-            max(coulomb + static, steady),
-            value("stribeck_friction", "velocity_rad_s", 1.0),
-            value("current_offset", "current_A"),
-            value("input_delay", "delay_s"),
-            value("actuator_lag", "time_constant_s"),
-            value("actuator_dead_zone", "width_A"),
-            value("hardening_spring", "cubic_A_rad3"),
-            value("strain_offset", "angle_rad"),
-            1 + value("strain_gain", "relative_error"),
-        )
-        return np.asarray(out)
+        return np.asarray(_run(np.ascontiguousarray(inputs), A, B, gains, p))
 
     return simulate
 
@@ -124,52 +105,39 @@ def state_space(p: Mapping[str, float]) -> tuple[Real, Real]:
 
 
 @njit
-def _run(
-    reference: Real,
-    outside: Real,
-    start: float,
-    A: Real,
-    B: Real,
-    gains: Real,
-    coulomb: float,
-    static: float,
-    stribeck_velocity: float,
-    offset: float,
-    delay: float,
-    lag: float,
-    dead_zone: float,
-    cubic: float,
-    strain_offset: float,
-    strain_gain: float,
-) -> Real:
+def _run(inputs: Real, A: Real, B: Real, gains: Real, p: np.record) -> Real:
     """Dry friction as the current that it takes off, so that the joint truly sticks; (T, 2)."""
-    T = reference.size
+    T = len(inputs)
     h = DT_S / SUBSTEPS
     out = np.zeros((T, 2))
     command = np.zeros(T)
     x, y = np.zeros(4), np.zeros(4)
-    x[0] = start
+    x[0] = inputs[0, 2]
     keep = np.exp(-FILTER_RAD_S * DT_S)
-    last0, last1, speed0, speed1 = start, strain_offset, 0.0, 0.0
-    pull = gains[0] * (reference[0] - start)
+    last0, last1, speed0, speed1 = x[0], p.strain_offset_angle_rad, 0.0, 0.0
+    pull = gains[0] * (inputs[0, 0] - x[0])
+    dry, static = p.coulomb_friction_current_A, p.stribeck_friction_static_A
+    coulomb, static = dry + static * p.stribeck_friction_coulomb_share, dry + static
     for k in range(T):
-        theta, alpha = x[0], strain_gain * x[1] + strain_offset
+        reference, outside = inputs[k, 0], p.other_stage_share * inputs[k, 1]
+        theta = x[0]
+        alpha = (1 + p.strain_gain_relative_error) * x[1] + p.strain_offset_angle_rad
         out[k, 0], out[k, 1] = theta, alpha
         speed0 = keep * speed0 + (1 - keep) * (theta - last0) / DT_S
         speed1 = keep * speed1 + (1 - keep) * (alpha - last1) / DT_S
         last0, last1 = theta, alpha
-        i = gains[0] * (reference[k] - theta) - gains[1] * alpha - gains[2] * speed0 - gains[3] * speed1
+        i = gains[0] * (reference - theta) - gains[1] * alpha - gains[2] * speed0 - gains[3] * speed1
         command[k] = min(max(i, -LIMIT_A), LIMIT_A)
-        late = late_value(command, k, delay / DT_S, dead_zone)
+        late = late_value(command, k, p.input_delay_delay_s / DT_S, p.actuator_dead_zone_width_A)
         for _ in range(SUBSTEPS):
-            pull = lagged(pull, late, h, lag)
-            drive = pull + offset - cubic * x[0] ** 3
+            pull = lagged(pull, late, h, p.actuator_lag_time_constant_s)
+            drive = pull + p.current_offset_current_A - p.hardening_spring_cubic_A_rad3 * x[0] ** 3
             free = A[2, 0] * x[0] + A[2, 1] * x[1] + A[2, 2] * x[2] + A[2, 3] * x[3] + B[2, 0] * drive
-            free += B[2, 1] * outside[k]
-            level = coulomb + (static - coulomb) * np.exp(-abs(x[2]) / stribeck_velocity)
+            free += B[2, 1] * outside
+            level = coulomb + (static - coulomb) * np.exp(-abs(x[2]) / p.stribeck_friction_velocity_rad_s)
             taken = min(max(free / B[2, 0], -level), level)
             for r in range(4):
-                y[r] = B[r, 0] * (drive - taken) + B[r, 1] * outside[k]
+                y[r] = B[r, 0] * (drive - taken) + B[r, 1] * outside
                 for c in range(4):
                     y[r] += A[r, c] * x[c]
             x[:] = y
@@ -225,7 +193,7 @@ def case(folder: Path, stage: int) -> PlantCase:
         TOLERANCES,
         ("theta_rad", "alpha_rad"),
         noise,
-        effects(),
+        EFFECTS,
     )
     return PlantCase(
         f"Quanser serial flexible link, stage {stage}",
