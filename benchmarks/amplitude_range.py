@@ -1,7 +1,5 @@
 """Ellipses that promise the response at an amplitude, and over a range of them: do they hold it?
 
-    OMP_NUM_THREADS=1 python -m benchmarks.amplitude_range [--seeds 40] [--counts 16384] [--realisations 2000]
-
 The default arm's hub and tip with dry friction of several levels. Records: random-phase multisines of odd
 lines without a random quarter, 0.2 to 95 Hz, a period of 5 s recorded twice from rest, two realisations at
 2 V rms and two at 6 V. Truth: best linear approximation, the mean over fresh realisations of the same lines
@@ -15,24 +13,19 @@ Bands of half a decade from 0.63 rad/s, at the excited lines; error, radius and 
 
 from __future__ import annotations
 
-import itertools
 import time
+from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 
 from benchmarks.harness import Print, main
-from benchmarks.without_friction import EDGES_RAD_S, with_friction
-from ident import Record, identify
+from benchmarks.without_friction import behind_friction, judged, tell_bands, with_friction
+from ident import Record
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import ComplexArray, RealArray
-from ident.friction import (
-    at_amplitudes,
-    equivalent_friction,
-    fit_friction,
-    other_output_without_friction,
-    without_friction,
-)
+from ident.friction import at_amplitudes, equivalent_friction
 from plant import parse_effects, simulate
 from plant.excitation import multisine, multisine_lines
 from workflow.config.run_config import SimulatedSource, built_in_config
@@ -44,7 +37,6 @@ POOLED_V = float(np.sqrt(np.mean(np.square(RECORDED_V))))
 RANGE_V = tuple(np.geomspace(RECORDED_V[0], RECORDED_V[-1], 5).tolist())
 LINES = multisine_lines(PERIOD, DT_S, (0.2, 95.0), "odd_random", np.random.default_rng(99))
 OMEGA_RAD_S = 2 * np.pi * LINES / (PERIOD * DT_S)
-BANDS = [(low <= OMEGA_RAD_S) & (high > OMEGA_RAD_S) for low, high in itertools.pairwise(EDGES_RAD_S)]
 
 
 def voltage(rms_V: float, rng: np.random.Generator) -> RealArray:
@@ -74,41 +66,12 @@ def recorded(source: SimulatedSource, seed: int) -> list[Record]:
     return records
 
 
-class Counted:
-    """What ellipses did at truths, one row for each."""
-
-    def __init__(self) -> None:
-        self._rows: list[RealArray] = []
-
-    def add(self, posterior: ResponsePosterior, true: ComplexArray, error: RealArray) -> None:
-        ellipses, size = posterior.at(OMEGA_RAD_S), np.abs(true)
-        widened = replace(
-            ellipses, covariance=ellipses.covariance + 0.5 * error[:, None, None] ** 2 * np.eye(2)
-        )
-        self._rows.append(
-            np.array(
-                [
-                    widened.contains(true),
-                    ellipses.contains(true),
-                    np.abs(ellipses.centre - true) / size,
-                    ellipses.ellipse().semi_major / size,
-                    error / size,
-                ]
-            )
-        )
-
-    def tell(self, out: Print, name: str) -> None:
-        inside, alone, error, radius, left = np.stack(self._rows, axis=1)
-        rows = {
-            "inside %": [100 * float(np.mean(inside[:, band])) for band in BANDS],
-            "alone %": [100 * float(np.mean(alone[:, band])) for band in BANDS],
-            "error %": [100 * float(np.median(error[:, band])) for band in BANDS],
-            "radius %": [100 * float(np.median(radius[:, band])) for band in BANDS],
-            "truth %": [100 * float(np.median(left[:, band])) for band in BANDS],
-        }
-        rows["ratio"] = [r / e for r, e in zip(rows["radius %"], rows["error %"], strict=True)]
-        for row, values in rows.items():
-            out(f"  {name}  {row:<9}" + " ".join(f"{value:8.3g}" for value in values))
+def judged_beside(posterior: ResponsePosterior, true: ComplexArray, error: RealArray) -> pd.DataFrame:
+    """As `judged`, with the standard error (F,) of the truth in the ellipses; alone: inside without it."""
+    ellipses = posterior.at(OMEGA_RAD_S)
+    covariance = ellipses.covariance + 0.5 * error[:, None, None] ** 2 * np.eye(2)
+    found = judged(ellipses, true).assign(alone=ellipses.contains(true), truth=error / np.abs(true))
+    return found.assign(inside=replace(ellipses, covariance=covariance).contains(true))
 
 
 def run(
@@ -125,33 +88,26 @@ def run(
         assert isinstance(config.source, SimulatedSource)
         source = with_friction(config.source, torque_Nm, counts)
         truths = {rms_V: truth(source, rms_V, realisations) for rms_V in (POOLED_V, *RANGE_V)}
-        counted = {(what, k): Counted() for what in ("one", "range") for k in range(2)}
+        found: dict[tuple[str, str], list[pd.DataFrame]] = defaultdict(list)
         cpu = []
         for seed in range(seeds):
             records = recorded(source, seed)
             begin = time.process_time()
-            at_hub, at_tip = ([r.siso(c.input, c.output) for r in records] for c in config.channels)
-            friction = fit_friction(at_hub, config.control_channel.identification)
-            hub, tip = (
-                identify([friction.taken_off(record) for record in at], channel.identification).model
-                for at, channel in zip((at_hub, at_tip), config.channels, strict=True)
-            )
-            behind = (
-                without_friction(at_hub, friction, hub, config.channels[0].embedding),
-                other_output_without_friction(at_tip, friction, tip, config.channels[1].embedding),
-            )
+            at_hub = [record.siso(config.channels[0].input, config.channels[0].output) for record in records]
+            friction, arms = behind_friction(records, config.channels)
             rng = np.random.default_rng(seed)
             for what, amplitudes in (("one", None), ("range", (RANGE_V[0], RANGE_V[-1]))):
                 equivalent = equivalent_friction(friction, at_hub, rng, amplitudes)
-                for k, arm in enumerate(behind):
+                for k, arm in enumerate(arms):
                     posterior, _ = at_amplitudes(arm, equivalent, rng)
                     for rms_V in RANGE_V if amplitudes else (POOLED_V,):
                         centre, error = truths[rms_V]
-                        counted[what, k].add(posterior, centre[k], error[k])
+                        rows = judged_beside(posterior, centre[k], error[k])
+                        found[what, ("hub", "tip")[k]].append(rows)
             cpu.append(time.process_time() - begin)
         out(f"\nfriction {torque_Nm:g} N m; CPU {np.median(cpu):.1f} s, at most {max(cpu):.1f} s")
-        for (what, k), rows in counted.items():
-            rows.tell(out, f"{what:<5}  {('hub', 'tip')[k]}")
+        for (what, arm), rows in found.items():
+            tell_bands(out, f"{what:<5}  {arm}", rows, ("inside", "alone", "error", "radius", "truth"))
 
 
 if __name__ == "__main__":

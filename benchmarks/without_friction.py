@@ -1,7 +1,5 @@
 """Ellipses that promise the response without dry friction, on the default arm: do they hold it?
 
-    OMP_NUM_THREADS=1 python -m benchmarks.without_friction [--seeds 40] [--counts 16384] [--first 0]
-
 Records, sensor noise, encoder and settings of `workflow/data/default_arm.toml` with dry friction of several
 levels. Truth: the linear arm (stated viscous friction added), voltage held between samples, delayed by one.
 Inside: share of (seed, frequency) with the true response inside its 95 % ellipse, frequencies 30 a decade.
@@ -12,23 +10,25 @@ whose 95 % interval holds the true level. CPU: friction and both channels' poles
 
 from __future__ import annotations
 
-import itertools
-import time
+from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
+import pandas as pd
 
-from benchmarks.harness import Print, main
+from benchmarks.harness import Print, main, timed
 from ident import Record, identify
 from ident.data.arrays import ComplexArray, RealArray
-from ident.friction import fit_friction, other_output_without_friction, without_friction
+from ident.friction import FrictionFit, fit_friction, other_output_without_friction, without_friction
+from ident.friction.posterior import BehindFriction
+from ident.uncertainty import FrequencyUncertainty
 from plant.modal import linear_arm
-from workflow.config.run_config import SimulatedSource, built_in_config
+from workflow.config.run_config import Channel, SimulatedSource, built_in_config
 from workflow.tasks.simulated_rig import rig_of, simulate_record
 
 FRICTIONS_NM = (0.0, 0.005, 0.02, 0.1)
 EDGES_RAD_S = 0.63 * 10 ** (0.5 * np.arange(7))
 OMEGA_RAD_S = np.geomspace(0.63, 627.0, 91)
-BANDS = [(low <= OMEGA_RAD_S) & (high > OMEGA_RAD_S) for low, high in itertools.pairwise(EDGES_RAD_S)]
 
 
 def with_friction(source: SimulatedSource, torque_Nm: float, counts: int) -> SimulatedSource:
@@ -59,44 +59,64 @@ def true_responses(source: SimulatedSource, omega_rad_s: RealArray) -> ComplexAr
     return np.asarray((held / (z[:, None] - np.exp(s * dt_s))) @ shares.T / z[:, None])
 
 
-def per_band(values: RealArray) -> list[float]:
-    """Median over the bands of half a decade of values (seeds, F)."""
-    return [float(np.median(values[:, band])) for band in BANDS]
+def behind_friction(
+    records: Sequence[Record], channels: Sequence[Channel]
+) -> tuple[FrictionFit, tuple[BehindFriction, BehindFriction]]:
+    """The friction found at the hub, and hub and tip without it; channels: of hub and tip."""
+    hub, tip = channels
+    at_hub, at_tip = ([r.siso(c.input, c.output) for r in records] for c in channels)
+    friction = fit_friction(at_hub, hub.identification)
+    models = [
+        identify([friction.taken_off(record) for record in at], channel.identification).model
+        for at, channel in ((at_hub, hub), (at_tip, tip))
+    ]
+    return friction, (
+        without_friction(at_hub, friction, models[0], hub.embedding),
+        other_output_without_friction(at_tip, friction, models[1], tip.embedding),
+    )
+
+
+def judged(ellipses: FrequencyUncertainty, true: ComplexArray) -> pd.DataFrame:
+    """Row by row of frequencies: band, truth (F,) inside, error and larger semi-axis over |truth|."""
+    size = np.abs(true)
+    return pd.DataFrame(
+        {
+            "band": np.digitize(ellipses.omega_rad_s, EDGES_RAD_S),
+            "inside": ellipses.contains(true),
+            "error": np.abs(ellipses.centre - true) / size,
+            "radius": ellipses.ellipse().semi_major / size,
+        }
+    )
+
+
+def tell_bands(
+    out: Print, name: str, found: Sequence[pd.DataFrame], rows: Sequence[str] = ("inside", "error", "radius")
+) -> None:
+    """Per cent in every band: shares of what is true or false, medians of what is a size; then the ratio."""
+    bands = pd.concat(found).groupby("band")
+    table = {row: bands[row].mean() if found[0][row].dtype == bool else bands[row].median() for row in rows}
+    cells = {f"{row} %": 100 * values for row, values in table.items()}
+    for row, values in (cells | {"ratio": table["radius"] / table["error"]}).items():
+        out(f"  {name}  {row:<9}" + " ".join(f"{value:8.3g}" for value in values))
 
 
 def run(out: Print, *, seeds: int = 40, counts: int = 16384, first: int = 0) -> None:
     config, _ = built_in_config()
-    hub, tip = config.channels
     assert isinstance(config.source, SimulatedSource)
     out(f"encoder {counts} counts a turn; bands from 0.63 rad/s, half a decade each")
     for torque_Nm in FRICTIONS_NM:
         source = with_friction(config.source, torque_Nm, counts)
-        motor = rig_of(source).motor
+        to_Nm = rig_of(source).motor.torque_per_volt_Nm_V
         truth = true_responses(source, OMEGA_RAD_S).T
-        found = np.zeros((3, seeds, 2, OMEGA_RAD_S.size))
+        found: dict[str, list[pd.DataFrame]] = {"hub": [], "tip": []}
         levels, cpu = [], []
-        for k in range(seeds):
-            records = estimation_records(source, first + k)
-            begin = time.process_time()
-            at_hub, at_tip = ([r.siso(c.input, c.output) for r in records] for c in (hub, tip))
-            friction = fit_friction(at_hub, hub.identification)
-            models = [
-                identify([friction.taken_off(record) for record in at], channel.identification).model
-                for at, channel in ((at_hub, hub), (at_tip, tip))
-            ]
-            posteriors = (
-                without_friction(at_hub, friction, models[0], hub.embedding).response,
-                other_output_without_friction(at_tip, friction, models[1], tip.embedding).response,
-            )
-            cpu.append(time.process_time() - begin)
-            to_Nm = motor.torque_per_volt_Nm_V
+        for seed in range(first, first + seeds):
+            records = estimation_records(source, seed)
+            (friction, arms), spent = timed(partial(behind_friction, records, config.channels))
+            cpu.append(spent)
             levels.append((friction.level * to_Nm, friction.level_std * to_Nm))
-            for j, posterior in enumerate(posteriors):
-                ellipses = posterior.at(OMEGA_RAD_S)
-                size = np.abs(truth[j])
-                found[0, k, j] = ellipses.contains(truth[j])
-                found[1, k, j] = np.abs(ellipses.centre - truth[j]) / size
-                found[2, k, j] = ellipses.ellipse().semi_major / size
+            for rows, arm, true in zip(found.values(), arms, truth, strict=True):
+                rows.append(judged(arm.response.at(OMEGA_RAD_S), true))
         level, std = np.array(levels).T
         held = np.mean(np.abs(level - torque_Nm) <= 1.96 * std)
         off = f"error {100 * np.median(np.abs(level / torque_Nm - 1)):.2f} %, " if torque_Nm else ""
@@ -104,16 +124,8 @@ def run(out: Print, *, seeds: int = 40, counts: int = 16384, first: int = 0) -> 
             f"\nfriction {torque_Nm:g} N m: level {off}inside its 95 % interval {100 * held:.0f} %; "
             f"CPU {np.median(cpu):.1f} s, at most {max(cpu):.1f} s"
         )
-        for j, name in enumerate(("hub", "tip")):
-            inside, error, radius = found[:, :, j]
-            rows = {
-                "inside %": [100 * float(np.mean(inside[:, band])) for band in BANDS],
-                "error %": [100 * value for value in per_band(error)],
-                "radius %": [100 * value for value in per_band(radius)],
-                "ratio": [r / e for r, e in zip(per_band(radius), per_band(error), strict=True)],
-            }
-            for row, values in rows.items():
-                out(f"  {name}  {row:<9}" + " ".join(f"{value:8.3g}" for value in values))
+        for name, rows in found.items():
+            tell_bands(out, name, rows)
 
 
 if __name__ == "__main__":
