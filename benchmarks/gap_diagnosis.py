@@ -14,14 +14,13 @@ import os
 import subprocess
 import sys
 import tempfile
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from benchmarks.harness import Print, main
 from validation.blind.report import text
-from validation.blind.scores import scores
+from validation.blind.scores import GROUPS
+from validation.blind.workshop.score import score_folders
 from workflow.engine.errors import EXIT_NOT_CERTIFIED, EXIT_OK
 from workflow.engine.storage import read_json
 
@@ -52,23 +51,7 @@ def tell(out: Print, diagnosis: Path, cases: Path) -> None:
             f"CPU {timings.get(path.stem, {}).get('cpu_s', float('nan')):5.1f} s"
         )
     out()
-    out(text(score(diagnosis, cases)).rstrip("\n"))
-
-
-def score(diagnosis: Path, cases: Path) -> dict[str, Any]:
-    """Scores over all open cases; a nominal is exact if the rig file that was read has no tolerances.
-
-    Raises InputError naming the diagnosis that is missing.
-    """
-    timings = read_json(diagnosis / "timings.json")
-    said, true = [], []
-    for path in sorted(cases.glob("*/answer.toml")):
-        name = path.parent.name
-        said.append({**read_json(diagnosis / f"{name}.json"), **timings.get(name, {})})
-        rig = tomllib.loads((path.parent / said[-1].get("rig_file", "rig.toml")).read_text("utf-8"))
-        nominal = "uncertain" if rig.get("tolerances") else "exact"
-        true.append({**tomllib.loads(path.read_text("utf-8")), "case": name, "nominal": nominal})
-    return scores(said, true)
+    out(text(score_folders(cases, diagnosis, GROUPS)).rstrip("\n"))
 
 
 def run(out: Print, *, cases: Path = LABELLED, jobs: int = 2, keep: str = "") -> None:

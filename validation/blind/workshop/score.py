@@ -42,13 +42,16 @@ FAMILIES: Mapping[str, str] = MappingProxyType(
 )
 
 
-def score_folders(labelled: Path, found: Path, *, partial: bool = False) -> dict[str, Any]:
+def score_folders(
+    labelled: Path, found: Path, groups: Mapping[str, str] = FAMILIES, *, partial: bool = False
+) -> dict[str, Any]:
     """As `validation.blind.scores.scores`; a case without a diagnosis is wrong, or left out if partial.
 
-    Raises InputError if there is no labelled case, or a diagnosis that belongs to none.
+    A nominal is exact if the rig file that was read has no tolerances. Raises InputError if there is no
+    labelled case, or a diagnosis that belongs to none.
     """
     answers = {
-        path.parent.name: tomllib.loads(path.read_text("utf-8"))
+        path.parent.name: {**tomllib.loads(path.read_text("utf-8")), "case": path.parent.name}
         for path in sorted(labelled.glob("*/answer.toml"))
     }
     if not answers:
@@ -67,7 +70,12 @@ def score_folders(labelled: Path, found: Path, *, partial: bool = False) -> dict
         raise InputError(f"{found}: no diagnosis is there; expected the --out of flexlink diagnose")
     names = [name for name in answers if name in documents or not partial]
     said = [(documents.get(name) or failed(name, "no diagnosis")) | timings.get(name, {}) for name in names]
-    return scores(said, [answers[name] for name in names], FAMILIES)
+    for name, document in zip(names, said, strict=True):
+        rig = labelled / name / document.get("rig_file", "rig.toml")
+        if rig.is_file():
+            stated = tomllib.loads(rig.read_text("utf-8"))
+            answers[name]["nominal"] = "uncertain" if stated.get("tolerances") else "exact"
+    return scores(said, [answers[name] for name in names], groups)
 
 
 def main(
