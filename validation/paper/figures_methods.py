@@ -84,61 +84,55 @@ def _methods(shown: Comparison, names: tuple[str, ...]) -> list[Curve]:
     ]
 
 
+@style.finished
 def _bode(shown: Comparison, curves: list[Curve], title: str) -> Figure:
     omega, reference = shown.omega_rad_s, curves[0].response
-    with style.house_style():
-        figure = style.new_figure(6.0)
-        gain, phase = figure.subplots(2, 1, sharex=True, height_ratios=[1.25, 1.0])
-        for curve in curves:
-            gain.plot(omega, decibels(np.abs(curve.response)), **curve.line, label=curve.label)
-            phase.plot(omega, _phase(omega, curve.response, reference), **curve.line)
-        _frequency_axes(gain, phase, omega)
-        gain.set_title(title)
-        gain.set_ylabel(f"gain [dB re 1 {shown.machine.gain_unit}]")
-        phase.set_ylabel("phase [deg]")
-        phase.yaxis.set_major_locator(MultipleLocator(180))
-        style.finish(figure)
+    figure, (gain, phase) = style.panels(6.0, 2, 1, sharex=True, height_ratios=[1.25, 1.0])
+    for curve in curves:
+        gain.plot(omega, decibels(np.abs(curve.response)), **curve.line, label=curve.label)
+        phase.plot(omega, _phase(omega, curve.response, reference), **curve.line)
+    _frequency_axes(gain, phase, omega)
+    gain.set_title(title)
+    gain.set_ylabel(f"gain [dB re 1 {shown.machine.gain_unit}]")
+    phase.set_ylabel("phase [deg]")
+    phase.yaxis.set_major_locator(MultipleLocator(180))
     return figure
 
 
+@style.finished
 def draw_gobf_run(shown: Comparison) -> Figure:
     """Fig. 5: measured tip and GOBF's free run, and what is left."""
     record = shown.trial.fresh
     time, measured = record.time_s, record.output[:, 0]
-    with style.house_style():
-        figure = style.new_figure(4.9)
-        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.7, 1.0])
-        _overlay(upper, shown, "GOBF")
-        upper.set_title(f"Fresh data, GOBF: fit {shown.scores['GOBF'].fit_percent:.1f} %")
-        residual = {**style.MEASURED_LINE, "lw": 0.7}
-        lower.plot(time, measured - shown.simulated["GOBF"], **residual, label="measured - simulated")
-        sensor = "±2 standard deviations of the sensor noise"
-        lower.axhspan(-2 * NOISE_STD, 2 * NOISE_STD, **style.BAND, zorder=0, label=sensor)
-        lower.set_ylabel("residual [m]")
-        lower.set_xlabel("time [s]")
-        upper.set_xlim(time[0], time[-1])
-        style.finish(figure)
+    figure, (upper, lower) = style.panels(4.9, 2, 1, sharex=True, height_ratios=[1.7, 1.0])
+    _overlay(upper, shown, "GOBF")
+    upper.set_title(f"Fresh data, GOBF: fit {shown.scores['GOBF'].fit_percent:.1f} %")
+    residual = {**style.MEASURED_LINE, "lw": 0.7}
+    lower.plot(time, measured - shown.simulated["GOBF"], **residual, label="measured - simulated")
+    sensor = "±2 standard deviations of the sensor noise"
+    lower.axhspan(-2 * NOISE_STD, 2 * NOISE_STD, **style.BAND, zorder=0, label=sensor)
+    lower.set_ylabel("residual [m]")
+    lower.set_xlabel("time [s]")
+    upper.set_xlim(time[0], time[-1])
     return figure
 
 
+@style.finished
 def draw_peer_runs(shown: Comparison) -> Figure:
     """Fig. 6: the same for ARX, ARMAX and OE, one panel each on the same axes."""
     measured = shown.trial.fresh.output[:, 0]
     names = METHODS[1:]
-    with style.house_style():
-        figure = style.new_figure(7.0)
-        panels = figure.subplots(len(names), 1, sharex=True, sharey=True)
-        for axes, name in zip(panels, names, strict=True):
-            _overlay(axes, shown, name)
-            fit = shown.scores[name].fit_percent
-            words = f"fit {fit:.1f} %" if np.isfinite(fit) else "runs away"
-            axes.set_title(f"Fresh data, {name}: {words}")
-        span = float(np.ptp(measured))
-        # A run that leaves the measured range by far is not worth making the others unreadable for.
-        panels[0].set_ylim(measured.min() - 0.6 * span, measured.max() + 0.6 * span)
-        panels[0].set_xlim(0, shown.trial.fresh.time_s[-1])
-        panels[-1].set_xlabel("time [s]")
-        style.finish(figure)
+    figure, panels = style.panels(7.0, len(names), 1, sharex=True, sharey=True)
+    for axes, name in zip(panels, names, strict=True):
+        _overlay(axes, shown, name)
+        fit = shown.scores[name].fit_percent
+        words = f"fit {fit:.1f} %" if np.isfinite(fit) else "runs away"
+        axes.set_title(f"Fresh data, {name}: {words}")
+    span = float(np.ptp(measured))
+    # A run that leaves the measured range by far is not worth making the others unreadable for.
+    panels[0].set_ylim(measured.min() - 0.6 * span, measured.max() + 0.6 * span)
+    panels[0].set_xlim(0, shown.trial.fresh.time_s[-1])
+    panels[-1].set_xlabel("time [s]")
     return figure
 
 
@@ -150,39 +144,37 @@ def _overlay(axes: Axes, shown: Comparison, name: str) -> None:
     axes.set_ylabel("tip [m]")
 
 
+@style.finished
 def draw_bounds(study: BoundsStudy, gain_unit: str) -> Figure:
     """Fig. 7: two-sigma bounds of both recipes on one record, the truth, and its distance from the centre."""
     colours = {"classical": PAPER_WAY, "tangent": OUR_WAY}
-    with style.house_style():
-        figure = style.new_figure(7.4)
-        grid = figure.subplots(3, 2, sharex=True, sharey="row", height_ratios=[1.5, 1.1, 0.9])
-        floor = decibels(np.abs(study.truth).min()) - 20
-        for column, (name, bound) in enumerate(study.bounds.items()):
-            gain, phase, distance = grid[:, column]
-            _band(gain, phase, bound, study.truth, colours[name], name, float(floor))
-            distance.axhspan(1e-3, 1.0, color=colours[name], alpha=0.15, lw=0)
-            for values, words, line in (
-                (study.distance[name], "distance, this record", {"ls": "-"}),
-                (study.distance_frictionless[name], "distance, same arm without friction", {"ls": ":"}),
-            ):
-                shown = np.maximum(values, 1e-3)
-                distance.plot(study.omega_rad_s, shown, color=style.REFERENCE, lw=1.2, **line, label=words)
-            distance.set_yscale("log")
-            distance.set_xlabel("frequency [rad/s]")
-            _frequency_axes(gain, distance, study.omega_rad_s)
-            share = study.inside_percent[name][0]
-            low, high = JUDGED_BAND_RAD_S
-            gain.set_title(f"{name}: truth inside at {share:.0f} % of {low:.0f} to {high:.0f} rad/s")
-        grid[0, 0].set_ylabel(f"gain [dB re 1 {gain_unit}]")
-        grid[1, 0].set_ylabel("phase [deg]")
-        grid[1, 0].yaxis.set_major_locator(MultipleLocator(180))
-        grid[2, 0].set_ylabel("distance of\ntruth [2 sigma]")
-        largest = max(float(values.max()) for values in study.distance.values())
-        grid[2, 0].set_ylim(0.05, max(100.0, 1.5 * largest))
-        grid[0, 0].set_ylim(floor, decibels(np.abs(study.truth).max()) + 10)
-        span = unwrapped_degrees(study.truth)
-        grid[1, 0].set_ylim(span.min() - 200, span.max() + 100)
-        style.finish(figure)
+    figure, grid = style.panels(7.4, 3, 2, sharex=True, sharey="row", height_ratios=[1.5, 1.1, 0.9])
+    floor = decibels(np.abs(study.truth).min()) - 20
+    for column, (name, bound) in enumerate(study.bounds.items()):
+        gain, phase, distance = grid[:, column]
+        _band(gain, phase, bound, study.truth, colours[name], name, float(floor))
+        distance.axhspan(1e-3, 1.0, color=colours[name], alpha=0.15, lw=0)
+        for values, words, line in (
+            (study.distance[name], "distance, this record", {"ls": "-"}),
+            (study.distance_frictionless[name], "distance, same arm without friction", {"ls": ":"}),
+        ):
+            shown = np.maximum(values, 1e-3)
+            distance.plot(study.omega_rad_s, shown, color=style.REFERENCE, lw=1.2, **line, label=words)
+        distance.set_yscale("log")
+        distance.set_xlabel("frequency [rad/s]")
+        _frequency_axes(gain, distance, study.omega_rad_s)
+        share = study.inside_percent[name][0]
+        low, high = JUDGED_BAND_RAD_S
+        gain.set_title(f"{name}: truth inside at {share:.0f} % of {low:.0f} to {high:.0f} rad/s")
+    grid[0, 0].set_ylabel(f"gain [dB re 1 {gain_unit}]")
+    grid[1, 0].set_ylabel("phase [deg]")
+    grid[1, 0].yaxis.set_major_locator(MultipleLocator(180))
+    grid[2, 0].set_ylabel("distance of\ntruth [2 sigma]")
+    largest = max(float(values.max()) for values in study.distance.values())
+    grid[2, 0].set_ylim(0.05, max(100.0, 1.5 * largest))
+    grid[0, 0].set_ylim(floor, decibels(np.abs(study.truth).max()) + 10)
+    span = unwrapped_degrees(study.truth)
+    grid[1, 0].set_ylim(span.min() - 200, span.max() + 100)
     return figure
 
 

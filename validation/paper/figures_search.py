@@ -22,19 +22,18 @@ _CUT_LINES: tuple[dict[str, Any], ...] = (
 )
 
 
+@style.finished
 def draw_surface(study: SurfaceStudy) -> Figure:
     """Above: surface and cuts. Below: minima against the grid, and shares of DIRECT's searches at order 4."""
-    with style.house_style():
-        figure = style.new_figure(8.6)
-        grid = figure.add_gridspec(4, 2, height_ratios=[0.5, 0.7, 0.6, 0.6], width_ratios=[1.15, 1.0])
-        left = figure.add_subplot(grid[:2, 0])
-        close, whole = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
-        counts, shares = figure.add_subplot(grid[2:, 0]), figure.add_subplot(grid[2:, 1])
-        _surface(figure, left, study)
-        _cuts(close, whole, study)
-        _counts(counts, study.counts)
-        _shares(shares, study.shares)
-        style.finish(figure)
+    figure = style.new_figure(8.6)
+    grid = figure.add_gridspec(4, 2, height_ratios=[0.5, 0.7, 0.6, 0.6], width_ratios=[1.15, 1.0])
+    left = figure.add_subplot(grid[:2, 0])
+    close, whole = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
+    counts, shares = figure.add_subplot(grid[2:, 0]), figure.add_subplot(grid[2:, 1])
+    _surface(figure, left, study)
+    _cuts(close, whole, study)
+    _counts(counts, study.counts)
+    _shares(shares, study.shares)
     return figure
 
 
