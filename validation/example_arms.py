@@ -7,78 +7,35 @@ import numpy as np
 import numpy.typing as npt
 
 from plant.beam import clamped_free_modes
-from plant.machine import Machine
-from plant.modal import equations_of_motion
 from plant.presets import paper_link
-from plant.rig import Hub, Link, Motor, Rig
+from plant.rig import Hub, Link, Motor
 
 Real = npt.NDArray[np.float64]
 
 _EXAMPLE_ZEROS_RAD_S = (10.8, -10.5)  # the paper, below its eq. (32)
 # The example's flexible pole is not printed; this is where the identification benchmark puts it.
 _EXAMPLE_POLE_RAD_S = 15.0
-
-
-def paper_example_rig() -> Rig:
-    """The physical arm behind `paper_example`: a slender link on a light hub, clamped at the axis.
-
-    One assumed mode (clamped root, unit modal mass, frequency w, tip value p, coupling b) under a hub torque
-    has
-
-        tip / torque = ((L - b p) s^2 + L kappa w^2 s + L w^2) / (s^2 ((I - b^2) s^2 + I kappa w^2 s + I
-        w^2)),
-
-    I the inertia of hub and link. b p = 1.138 L for every uniform link, so there is one zero on either side,
-    and their sum and product give kappa and w: w = 3.95 rad/s. I then puts the flexible pole at 15 rad/s. The
-    paper's own link, 6.35 mm thick, has w = 32.6 rad/s and its zeros at +-88 rad/s; so the example needs a
-    link of 0.77 mm, or of the paper's section and 2.9 m length. We keep 1 m and the width, and take the
-    thinner one.
-    """
-    link = paper_link().link
-    length, density, modulus = link.length_m, link.density_kg_m3, 69e9
-    unit = clamped_free_modes(1.0, 1.0, length, 1)
-    excess = float(unit.tip[0] * unit.coupling[0]) - length  # b p - L, the same for every uniform link
-    right, left = _EXAMPLE_ZEROS_RAD_S
-    omega_squared = -right * left * excess / length
-    shape = float(unit.omega_rad_s[0])  # omega of a link with EI = m = 1
-    thickness = float(np.sqrt(12.0 * density * omega_squared / modulus)) / shape
-    mass_per_length = density * link.width_m * thickness
-    coupling_squared = mass_per_length * float(unit.coupling[0]) ** 2
-    inertia = coupling_squared / (1 - omega_squared / _EXAMPLE_POLE_RAD_S**2)
-    return paper_link().perturbed(
-        {
-            "link.thickness_m": thickness,
-            "link.youngs_modulus_Pa": modulus,
-            "link.kelvin_voigt_s": (right + left) * excess / (length * omega_squared),
-            "hub.inertia_kg_m2": inertia - mass_per_length * length**3 / 3,
-            "hub.radius_m": 0.0,
-            "hub.viscous_friction_Nms": 0.0,
-            "motor.torque_constant_Nm_A": 1.0,
-            "motor.back_emf_Vs_rad": 0.0,
-            "motor.resistance_ohm": 1.0,
-            "motor.gear_ratio": 1.0,
-            "sensors.hub_angle_noise_rad": 0.0,
-            "sensors.tip_noise_m": 0.004,
-        }
-    )
+# Length over inertia of an arm with such zeros: 1 m long and as wide as the paper's, but 0.77 mm thick.
+_EXAMPLE_GAIN = 217.863
 
 
 def paper_example() -> control.TransferFunction:
     """The paper's simulation example, eq. (32) with n = 1: hub torque [N m] to tip position [m], continuous
     time.
 
-    Two poles at the origin, a lightly damped pair at 15 rad/s (damping ratio 0.02) and real zeros at +10.8
-    and -10.5 rad/s. The asymmetry of the zeros is the structural damping. See `paper_example_rig` for the
-    physics.
+    Two poles at the origin, a lightly damped pair at 15 rad/s and real zeros at +10.8 and -10.5 rad/s. With
+    one assumed mode (clamped root, unit modal mass, frequency w, tip value p, coupling b)
+
+        tip / torque = ((L - b p) s^2 + L kappa w^2 s + L w^2) / (s^2 ((I - b^2) s^2 + I kappa w^2 s + I
+        w^2)),
+
+    so the asymmetry of the zeros is the structural damping kappa, and gives the pair a damping ratio of 0.02.
     """
-    rig = paper_example_rig()
-    equations = equations_of_motion(Machine(rig), n_modes=1)
-    rigid, length = float(equations.mass[0, 0]), rig.link.length_m
-    coupling, tip = float(equations.mass[0, 1]), float(equations.tip[1])
-    omega_squared, damping = float(equations.stiffness[1, 1]), float(equations.damping[1, 1])
+    right, left = _EXAMPLE_ZEROS_RAD_S
+    square, kappa, one = np.polymul([-1 / right, 1.0], [-1 / left, 1.0])
     return control.tf(
-        [length - coupling * tip, length * damping, length * omega_squared],
-        [rigid - coupling**2, rigid * damping, rigid * omega_squared, 0.0, 0.0],
+        _EXAMPLE_GAIN * np.array([square, kappa, one]),
+        [1 / _EXAMPLE_POLE_RAD_S**2, kappa, one, 0.0, 0.0],
         inputs=["hub_torque_Nm"],
         outputs=["tip_m"],
         name="paper_example",
