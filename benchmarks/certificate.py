@@ -1,7 +1,5 @@
 """The certificate on the flexible link (order-5 designs, scenarios A, B, C): all frequencies, joint coverage.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.certificate [--draws 3000] [--scenarios A B C]
-
 First table: largest weighted worst case on the dense grid, its proved upper bound for all frequencies, the
 largest value on 400,000 log-spaced frequencies (never above the bound), CPU seconds of the bound alone and of
 the whole certificate (median of five).

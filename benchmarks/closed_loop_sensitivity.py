@@ -1,7 +1,5 @@
 """Peak of the sensitivity on the nonlinear default arm against what was predicted and certified.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.closed_loop_sensitivity [--seeds 5]
-
 The default arm end to end: records with friction, encoder steps, noise, delay and voltage limit; model and
 ellipses from them; controller and certificate. Then S is measured on the arm in closed loop: random-phase
 multisines as reference (0.5 to 120 rad/s, lines 0.31 rad/s apart, four phase draws of two periods each

@@ -1,7 +1,5 @@
 """P2 (three modes): do 95 % ellipses hold the truth 95 % of the time, poles and order from the same data?
 
-    OMP_NUM_THREADS=1 python -m benchmarks.coverage_p2 [--cases main random] [--seeds 200] [--name NAME]
-
 Plants, inputs and noise: `benchmarks.p2_plants`; every run has its own input and noise, and its own plant
 where the case says so. Poles and order by identify([record]) with default options.
 """

@@ -1,7 +1,5 @@
 """DaISy robot arm (96-009): fitted on the first half, run freely on the second, and honest splits beside it.
 
-    FLEXLINK_DATA=/path/to/data OMP_NUM_THREADS=1 python -m benchmarks.daisy_arm
-
 Fit: 100 (1 - |y - yhat| / |y - mean y|) of a free run, no output fed back. "own state": second half alone,
 its initial state (one number per pole, no offset) estimated from it. "carried": the initial state of the
 first half is estimated there and the run goes on through the second, where it is judged. "through": from rest

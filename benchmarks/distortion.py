@@ -1,7 +1,5 @@
 """Noise and nonlinear distortion told from records of a plan: do they have the right size?
 
-    OMP_NUM_THREADS=1 python -m benchmarks.distortion [--seeds 40] [--truth 200] [--first 0] [--rms 3 6]
-
 The default arm with dry friction of several levels, its encoder and its sensor noise, under a plan of 4
 realisations x 2 periods of 50 s at each amplitude (seed k: other phases, lines and noise). 3 and 6 V rms stay
 within the amplifier's 24 V; 8 V rms is cut off now and then, and such rare events differ more between few

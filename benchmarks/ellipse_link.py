@@ -1,9 +1,6 @@
 """The flexible link with ellipses: certified worst case of our designs and what any controller can reach,
 scenarios A, B, C at orders 3 to 6, with times.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.ellipse_link [--orders 5 6 4 3] [--scenarios A B C] [--seed 1]
-                                                        [--jobs 1 2] [--repeat 3] [--no-fine]
-
 The worst case is max(|W1 S|, |W3 K S|) over all ellipses from the certificate (its own refined grid, not the
 optimiser's). Reach beside it: the same orders by a prototype, and the exact-ellipse Youla value.
 

@@ -1,7 +1,5 @@
 """CPU time of an order-4 fit and of its hot loop, the cost of candidate poles, beside those of others.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.fit_time [--seeds 50]
-
 Plant P1 (one mode, double integrator, 30 dB). Fits: two real poles and a pair sought without prior
 knowledge, N = 1000, on noise seeds 0 .. SEEDS - 1, ours and an output-error fit (Steiglitz-McBride start,
 NumPy and SciPy) taking turns. Warnings are worked out when they are asked for: the row that names them asks.

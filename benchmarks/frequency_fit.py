@@ -1,7 +1,5 @@
 """GOBF models from measured frequency responses: coverage on a known plant, order and fit on the Kyoto arm.
 
-    FLEXLINK_DATA=/path/to/data OMP_NUM_THREADS=1 python -m benchmarks.frequency_fit [--seeds 100]
-
 Known plant: P2 (three modes, two real poles) at 120 frequencies from 0.5 to 300 rad/s, circular errors of 5 %
 of |G| and 0.03 % of its largest value, covariances given. Ellipses at 95 % on 200 other frequencies, order
 from data; estimated poles over their stated standard deviations.

@@ -1,7 +1,5 @@
 """The loop with dry friction on the nonlinear default arm, against what records and controller predict.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.friction_in_the_loop [--seeds 14] [--first 0]
-
 One controller (the default arm's); arms with dry friction of several levels and records, noise and phases of
 several seeds. From the records of an arm come its linear part and its friction; from these:
 1. Peak of |S| as measured with random-phase multisines of several sizes (rms): predicted 95 % interval, the

@@ -1,9 +1,12 @@
 """What every benchmark shares: options, repetition, times taken in turns, and the results file.
 
 A benchmark is a module with a function `run(out, *, option=default, ...)` that tells its numbers line by line
-with `out(line)`, and ends with `main(run)`. Its options on the command line are the keywords of `run`. A run
-with all options as they are writes benchmarks/results/MODULE.txt; with --name NAME any run writes NAME.txt;
-everything else is only printed.
+with `out(line)`, and ends with `main(run)`:
+
+    OMP_NUM_THREADS=1 FLEXLINK_DATA=/path/to/data python -m benchmarks.MODULE --help
+
+Its options on the command line are the keywords of `run`. A run with all options as they are writes
+benchmarks/results/MODULE.txt; with --name NAME any run writes NAME.txt; everything else is only printed.
 """
 
 from __future__ import annotations

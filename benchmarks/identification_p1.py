@@ -1,8 +1,6 @@
 """P1 (one mode at 15 rad/s, double integrator, 30 dB, N = 1000), our fits beside their peers: with
 nothing known, with the structure known (relative degree 2, integrators), and what the data say to that.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.identification_p1 [--seeds 50]
-
 Peers are OE, ARMAX, ARX and subspace of order 4 (OE and ARMAX with more starts than is usual, too), and the
 one that can be told of the integrators (output error on the summed input). Then the variant with friction,
 s (s + 0.3) in place of s^2 and the input held 4 samples, where a wrong second integrator loses the mode.

@@ -1,8 +1,6 @@
 """`flexlink identify` on weak records of the default arm (dry friction 0.02 N m, encoder): are both modes
 found?
 
-    OMP_NUM_THREADS=1 python -m benchmarks.identify_with_friction [--seeds 50]
-
 Sensor noise and friction as in `workflow/data/default_arm.toml`; a binary voltage and a multisine up to 60
 Hz, 10 s each; one integrator and one sample of delay stated. True modes: those of the linear arm with both
 viscous frictions. Found: a pair within 2 % (5 %) of the true frequency. Limit: share of seeds that an

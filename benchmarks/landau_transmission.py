@@ -1,7 +1,5 @@
 """Landau's flexible transmission, three loads: the published score.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.landau_transmission [--seed 1]
-
 Six free parameters. First our synthesis for the three loads at once from the frequency-domain items (order 3
 with integrator: six parameters), then a direct search from its controller, because four items are read off
 step responses: R = (1 - q^-1)(1 + r_1 q^-1 + ...), S of the given length, T = S(1), many laws at once, the

@@ -1,7 +1,5 @@
 """What damping of the flexible mode costs: the published link at order 6 with W4, a weight on G S.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.mode_damping [--parts exact A B A-damped B-damped] [--ratios ...]
-
 W1 and W3 as published, W4 = 1/(r max|G|) on G S within a factor 1.5 of the mode; r runs. Cost: largest
 max(|W1 S|, |W3 K S|), without ellipses and as the worst case over the ellipses of scenarios A and B (from the
 certificate's refined grid). Damping: of the nominal closed loop's pole nearest 15 rad/s, and, stricter, the

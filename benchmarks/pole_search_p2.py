@@ -1,8 +1,6 @@
 """P2 (three modes, two slow real poles, N = 2000, 35 dB): how often the search for four poles ends in the
 best minimum.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.pole_search_p2 [--seeds 50]
-
 The search fits two real poles and one pair to a plant of three modes, in a box that comes from the data
 alone. Success: residual sum of squares within 0.2 % of the best known, which is the lowest that any row here
 found, or a search of 3000 evaluations with 20 starts. Evaluations count the global search, rescans and

@@ -1,11 +1,9 @@
 """Random plants and specifications: is every returned design stable, and what does an impossible one say?
 
-    OMP_NUM_THREADS=1 python -m benchmarks.random_designs [--first-seed 0] [--seeds 200]
-
-A case draws one to three
-flexible modes, up to two integrators, up to two samples of delay, a first-order lag, and a posterior over
-coefficients from spreads of gain, lag, mode frequencies and dampings plus a short impulse response; a
-specification; designs with low effort (with the default options where that finds nothing stable); certifies.
+A case draws one to three flexible modes, up to two integrators, up to two samples of delay, a first-order
+lag, and a posterior over coefficients from spreads of gain, lag, mode frequencies and dampings plus a short
+impulse response; a specification; designs with low effort (with the default options where that finds nothing
+stable); certifies.
 Stability is then checked without any frequency response: plants drawn from inside the ellipses (a point of
 the generators' ball lies in the ellipse of every frequency) and the closed-loop poles by python-control.
 """

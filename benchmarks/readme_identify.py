@@ -1,7 +1,5 @@
 """`flexlink identify` as the README has it, on the default logs with other seeds of noise and phases.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.readme_identify [--seeds 50]
-
 Eight records of the default arm (4 and 8 V rms), one integrator, one sample of delay, one real pole and two
 pairs stated. Right: both modes within 3 % of those of the linear arm, and no further pair called a mode. The
 share within 1 % of both, and how often each 95 % interval holds its mode, beside it: of the response as

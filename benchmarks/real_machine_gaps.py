@@ -1,7 +1,5 @@
 """What real machines have that their models lack, by the diagnosis of `diagnosis.machine.own_plant`.
 
-    FLEXLINK_DATA=/path/to/data OMP_NUM_THREADS=1 python -m benchmarks.real_machine_gaps
-
 Per machine: noise from repeats of one motion, and nothing else set (no model error is stated). Gaps are the
 pooled RMS of (measured - model)/noise on held-out records. "closed" is relative to the model as
 stated with its values moved.

@@ -1,8 +1,6 @@
 """Two degrees of freedom on the flexible link, scenario B: worst-case model-matching error with and without a
 reference filter.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.reference_filter [--seed 1]
-
 Feedback: our order-5 design. Model T_ref = 1/(s/2 + 1)^2, W = 1. 'members' evaluates the error once more by
 python-control on 720 members of the boundary of every ellipse at 1500 frequencies of its own.
 """

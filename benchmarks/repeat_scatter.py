@@ -1,7 +1,5 @@
 """Predicted against measured scatter on three real arms that were measured again and again.
 
-    FLEXLINK_DATA=/path/to/data python -m benchmarks.repeat_scatter [--only slfr|daisy|kyoto]
-
 Reach everywhere: measured over predicted, standard deviations, RMS over half a decade, within 0.7 to 1.4.
 
 SLFR (slfr_krauss_2009): six closed-loop sweeps, two amplitudes three times each (two-stage input; settings of

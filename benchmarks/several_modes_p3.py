@@ -1,7 +1,5 @@
 """P3 (three and five modes beside 1/(s^2 + 0.3 s), N = 2000): global optima, and the time of a whole fit.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.several_modes_p3 [--seeds 8]
-
 Global optimum: mean square residual within 2 % of the variance of the noise. Once with the numbers of poles
 given, once chosen from the data; then also the numbers of pairs that were chosen (at 30 dB the highest modes
 are below the noise). Validation: |y - yhat|/|y - mean y| on a fresh noise-free sequence (seed 77) from rest.

@@ -1,7 +1,5 @@
 """How large the house is: lines, boxes and arrows of every package, and the sentences left in Python.
 
-    python -m benchmarks.size
-
 Lines: all lines of `*.py`. Boxes: files or folders seen from the top of the package; arrows: imports between
 two of them, the package's own `__init__` left out. Sentences: lines of string literals of four words or more
 that are no docstring, no error (`raise`, a call of an exception) and no help text of an option.

@@ -1,7 +1,5 @@
 """Two-link arm, both motors to the tip: shared poles against poles of each channel by itself.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.two_link_miso [--seeds 20]
-
 The arm of `examples/two_link_arm.py` (1 V binary sequences, 0.02 mm of noise), 8000 samples in all:
 
     both, shared       both motors at once, one set of poles (`identify_miso`)

@@ -1,8 +1,6 @@
 """Two masses and a spring (Wie and Bernstein): peaks of S and T over the stiffness range at published gains,
 and an exact robust stability margin.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.two_mass [--seeds 1 2 3]
-
 Peaks: P = k/(s^2 (s^2 + 2 k)), m1 = m2 = 1, k in [0.5, 2]; DC gain of K at least 0.032, high-frequency
 |s K| at most 0.08, as for Chait's QFT design 0.032 (10 s + 1)/(4 s^2 + 2 s + 1). Direct search of the
 continuous-time controller on 13 stiffnesses, then the peaks over 100 log-spaced ones and 8000 frequencies.
