@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from validation.blind.inputs import Planned, plan_experiments
 from validation.blind.rigs import Rig, draw_rig, draw_tolerances, log_uniform, rounded, stated
 from validation.blind.sizes import NOT_TOGETHER, PARAMETRIC, Sizable, Table, sizable
-from validation.blind.truth import LISTED, UNLISTED, Clean, Real, Truth
+from validation.blind.truth import LISTED, UNLISTED, Clean, OutOfBoundsError, Real, Truth
 
+S = TypeVar("S", bound=str)
 Sort = Literal["none", "faint", "clear", "pair", "unlisted"]
 SORTS: tuple[Sort, ...] = ("none", "faint", "clear", "pair", "unlisted")
 # Shares of a set of cases. The sets this resembles say nothing about the next one's mix; nor does this.
@@ -54,6 +55,19 @@ class BlindCase:
     answer: dict[str, Any]
 
 
+def sorts_of(shares: Mapping[S, float], n_cases: int, only: S | None, slack: float = 0.0) -> list[S]:
+    """As many of each sort as its share, by largest remainders, so that it holds for few cases too.
+
+    slack: what a number may lack of a whole one by rounding.
+    """
+    if n_cases < 1:
+        raise ValueError(f"the number of cases must be at least 1; got {n_cases}")
+    mix = shares if only is None else {only: 1.0}
+    wanted = {sort: share * n_cases + slack for sort, share in mix.items()}
+    sorts = [sort for sort, number in wanted.items() for _ in range(int(number))]
+    return sorts + sorted(wanted, key=lambda sort: -(wanted[sort] % 1))[: n_cases - len(sorts)]
+
+
 def schedule(
     n_cases: int, rng: np.random.Generator, only: Sort | None = None
 ) -> list[tuple[Sort, bool, str]]:
@@ -61,19 +75,9 @@ def schedule(
 
     only: nothing but cases of this sort.
     """
-    if n_cases < 1:
-        raise ValueError(f"the number of cases must be at least 1; got {n_cases}")
-    sorts: list[Sort] = []
-    # Largest remainders, so that the shares hold for small numbers too.
-    mix = SHARES if only is None else {only: 1.0}
-    shares = {sort: share * n_cases for sort, share in mix.items()}
-    for sort, share in shares.items():
-        sorts += [sort] * int(share)
-    by_remainder = sorted(shares, key=lambda sort: -(shares[sort] % 1))
-    sorts += by_remainder[: n_cases - len(sorts)]
     decks: dict[str, list[str]] = {}
     plan = []
-    for k, sort in enumerate(sorts):
+    for k, sort in enumerate(sorts_of(SHARES, n_cases, only)):
         names = UNLISTED if sort == "unlisted" else LISTED
         deck = decks.setdefault(sort, [])
         if not deck:
@@ -101,9 +105,7 @@ def make_case(sort: Sort, exact: bool, first_effect: str, rng: np.random.Generat
             records = _run(rig, effects, plans, rng)
             if not _seen_where_fitted(records):
                 continue
-        except ValueError as error:
-            if "every bound" not in str(error):
-                raise
+        except OutOfBoundsError:
             continue
         shown = stated(rig, tolerances, rng) if tolerances else rig
         return BlindCase(shown, tolerances, records, _answer(sort, rig, tolerances, effects, records))

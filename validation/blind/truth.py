@@ -74,6 +74,10 @@ _FEWEST, _FEWEST_CONTACT, _MOST = 16, 128, 2000
 _MODES_WORKSHOP, _FEWEST_WORKSHOP = 4, 4
 
 
+class OutOfBoundsError(ValueError):
+    """A machine, or its motion, beyond what these simulations are made for: another one is drawn."""
+
+
 @dataclass(frozen=True, eq=False)
 class Feedback:
     """PD control of the noisy hub angle, one sample ahead; reference (T,)."""
@@ -127,10 +131,12 @@ class Clean:
     def measured(self, noise: Real) -> Real:
         """(T, 2) with noise (T, 2) added and the tip quantised or clipped where its sensor does so."""
         hub, tip = self.hub_angle_rad + noise[:, 0], self.tip_m + noise[:, 1]
-        tip = np.clip(tip, -self.clip_m, self.clip_m)
-        if self.step_m > 0:
-            tip = self.step_m * np.rint(tip / self.step_m)
-        return np.column_stack([hub, tip])
+        return np.column_stack([hub, self.sensed_tip(tip)])
+
+    def sensed_tip(self, tip_m: Real) -> Real:
+        """A tip reading behind the limit and the step of its sensor, where it has them."""
+        tip = np.clip(tip_m, -self.clip_m, self.clip_m)
+        return self.step_m * np.rint(tip / self.step_m) if self.step_m > 0 else tip
 
 
 class Truth:
@@ -256,7 +262,7 @@ class Truth:
 
         The rows before the first one are returned too; time counts from the first.
 
-        Raises ValueError where the motion leaves every bound (an unstable loop).
+        Raises OutOfBoundsError where the motion leaves every bound (an unstable loop).
         """
         get, p = self.get, self._physics
         commanded = np.array(voltage_V, dtype=np.float64)
@@ -287,7 +293,9 @@ class Truth:
             reference, whole, start, encoder, outputs,
         )  # fmt: skip
         if not fine or not np.all(np.isfinite(outputs)):
-            raise ValueError("the motion leaves every bound: the loop is unstable or the voltage too high")
+            raise OutOfBoundsError(
+                "the motion leaves every bound: the loop is unstable or the voltage too high"
+            )
         return self.sensed(commanded, outputs, start[1])
 
     @property

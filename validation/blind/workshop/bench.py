@@ -10,7 +10,7 @@ import numpy as np
 from validation.blind.inputs import Planned
 from validation.blind.rigs import rounded
 from validation.blind.sizes import Table
-from validation.blind.truth import Background, Clean, Real, Truth
+from validation.blind.truth import Background, Clean, OutOfBoundsError, Real, Truth
 from validation.blind.workshop.machine import Workshop
 from validation.blind.workshop.nominal import Log, Nominal
 from validation.blind.workshop.plans import Run
@@ -39,25 +39,24 @@ class Bench:
         )
 
     def record(self, truth: Truth, run: Run, hub_noise: Real | None = None) -> Clean:
-        """Raises ValueError where the hub turns farther than any workshop would let it."""
+        """Raises OutOfBoundsError where the hub turns farther than any workshop would let it."""
         clean = truth.record(run.plan.voltage_V, run.plan.feedback, hub_noise, run.before)
         if np.max(np.abs(clean.hub_angle_rad - run.before.start_angle_rad)) > _WIDEST_RAD:
-            raise ValueError("the hub turns too far: it leaves every bound")
+            raise OutOfBoundsError("the hub turns too far: it leaves every bound")
         return clean
 
     def output(self, clean: Clean, rows_before: int) -> Real:
         """(T, n) as sensors without noise, encoder zero or resolution see it."""
         columns = [clean.hub_angle_rad]
         if self.machine.sensor == "tip":
-            tip = np.clip(clean.tip_m, -clean.clip_m, clean.clip_m)
-            columns.append(clean.step_m * np.rint(tip / clean.step_m) if clean.step_m > 0 else tip)
+            columns.append(clean.sensed_tip(clean.tip_m))
         elif self.machine.sensor == "acc":
             columns.append(clean.tip_acceleration_m_s2)
         return np.column_stack(columns)[rows_before:]
 
     def logs(self, truth: Truth) -> list[Log]:
         if truth.substeps > _MOST_SUBSTEPS:
-            raise ValueError("a machine this stiff is beyond every bound")
+            raise OutOfBoundsError("a machine this stiff is beyond every bound")
         found = []
         for run in self.runs:
             clean = self.record(truth, run)
@@ -133,26 +132,24 @@ def measured_sizes(
         for name, parts in gaps.items():
             mine = [p for p, log in zip(parts, clean, strict=True) if log.held_out == (role == "held_out")]
             pooled[f"{role}_gap_{name}"] = rounded(float(np.sqrt(np.mean((rms(mine) / stated) ** 2))))
-    left, motion = (
-        rms(held(background)),
-        rms([log.output - log.output.mean(axis=0) for log in clean if log.held_out]),
-    )
-    table = {}
-    for k, key in enumerate(machine.outputs):
+    left = rms(held(background))
+    motion = rms([log.output - log.output.mean(axis=0) for log in clean if log.held_out])
 
-        def major(parts: list[Real], k: int = k) -> float:
-            return (
-                rounded(float(np.sqrt(max(rms(held(parts))[k] ** 2 - left[k] ** 2, 0.0)))) if effects else 0.0
-            )
+    def beyond(parts: list[Real]) -> Real:
+        return np.sqrt(np.maximum(rms(held(parts)) ** 2 - left**2, 0.0)) * bool(effects)
 
-        table[key] = {
-            "motion_rms": rounded(float(motion[k])),
-            "noise_stated": float(stated[k]),
-            "background_rms": rounded(float(left[k])),
-            "background_share_of_motion": rounded(float(left[k] / motion[k])),
-            "major_rms_after_refit": major(refit),
-            "major_rms_true_values": major(true_values),
-        }
+    sizes = {
+        "motion_rms": motion,
+        "noise_stated": stated,
+        "background_rms": left,
+        "background_share_of_motion": left / motion,
+        "major_rms_after_refit": beyond(refit),
+        "major_rms_true_values": beyond(true_values),
+    }
+    table = {
+        key: {name: rounded(float(values[k])) for name, values in sizes.items()}
+        for k, key in enumerate(machine.outputs)
+    }
     named = "major_rms_true_values" if before is true_values else "major_rms_after_refit"
     realised = max(v[named] / v["background_rms"] for v in table.values())
     return {

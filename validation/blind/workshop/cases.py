@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from validation.blind.cases import sorts_of
 from validation.blind.rigs import rounded
 from validation.blind.sizes import Table
-from validation.blind.truth import Background, Real, Truth
+from validation.blind.truth import Background, OutOfBoundsError, Real, Truth
 from validation.blind.workshop.answer import Sort, answer_of
 from validation.blind.workshop.bench import Bench, measured_sizes
 from validation.blind.workshop.machine import SENSORS, Sensor, Workshop, draw_workshop
@@ -65,12 +66,7 @@ class WorkshopPlan:
 
 def workshop_schedule(n_cases: int, rng: np.random.Generator, only: Sort | None = None) -> list[WorkshopPlan]:
     """Plans with the shares of the sorts; sensors and loops in turn, every effect before one comes twice."""
-    if n_cases < 1:
-        raise ValueError(f"the number of cases must be at least 1; got {n_cases}")
-    mix = SHARES if only is None else {only: 1.0}
-    wanted = {sort: share * n_cases for sort, share in mix.items()}
-    sorts = [sort for sort, number in wanted.items() for _ in range(int(number + 1e-9))]
-    sorts += sorted(wanted, key=lambda sort: -((wanted[sort] + 1e-9) % 1))[: n_cases - len(sorts)]
+    sorts = sorts_of(SHARES, n_cases, only, slack=1e-9)
     places: list[tuple[Sensor, bool]] = [(sensor, loop) for sensor in SENSORS for loop in (False, True)]
     begin = int(rng.integers(len(places)))
     decks: dict[Sort, list[str]] = {}
@@ -110,9 +106,7 @@ def make_case(plan: WorkshopPlan, rng: np.random.Generator) -> WorkshopCase:
             names.append(str(rng.choice(partners(names[0], sensor))))
         try:
             case = _attempt(sort, sensor, plan.closed_loop, names, rng)
-        except ValueError as error:
-            if "every bound" not in str(error):
-                raise
+        except OutOfBoundsError:
             continue
         if case is not None:
             return case
@@ -245,10 +239,7 @@ def _recorded(
             "hub_angle_rad": hub[before:],
         }
         if machine.sensor == "tip":
-            tip = np.clip(sampled(clean.tip_m) + tip_noise, -clean.clip_m, clean.clip_m)
-            if clean.step_m > 0:
-                tip = clean.step_m * np.rint(tip / clean.step_m)
-            quantities["tip_m"] = tip[before:]
+            quantities["tip_m"] = clean.sensed_tip(sampled(clean.tip_m) + tip_noise)[before:]
         elif machine.sensor == "acc":
             felt = sampled(clean.tip_acceleration_m_s2) + tip_noise
             quantities["tip_acceleration_m_s2"] = felt[before:]

@@ -10,7 +10,7 @@ import numpy as np
 
 from validation.blind.inputs import Planned
 from validation.blind.rigs import rounded
-from validation.blind.truth import Before, Feedback, Real, Truth
+from validation.blind.truth import Before, Feedback, OutOfBoundsError, Real, Truth
 
 Controller = Literal["none", "P", "PD"]
 # Effects that pull towards a hub angle of zero: an arm in open loop is started near it.
@@ -35,7 +35,7 @@ def plan_workshop(
     pulled = any(name in _TURNING_BACK for name in effects)
     controller: Controller = str(rng.choice(["P", "P", "PD"]))  # type: ignore[assignment]
     loop = makers.loop(controller)
-    runs: list[tuple[str, str, str, Real | None]] = []
+    runs: list[tuple[str, str, str, Real]]
     u = rng.uniform
     if closed:
         small, large, fresh = u(0.25, 0.5), u(0.5, 1.2), u(0.4, 1.2)
@@ -78,7 +78,6 @@ def plan_workshop(
             runs.append(("mixed", "smoothed random voltage", "held_out", makers.wandering(u(0.3, 0.5))))
     made = []
     for k, (kind, words, role, shape) in enumerate(runs):
-        assert shape is not None
         in_loop = closed or words.startswith("multisine on")
         farthest = (1.2 if in_loop else 0.25) if pulled else 3.1
         start = rounded(u(-farthest, farthest))
@@ -153,7 +152,7 @@ class _Makers:
             if np.std(late) < 0.015 and np.max(angle) < 0.3 * 1.7:
                 return found
             bandwidth *= 0.8
-        raise ValueError("no loop found: at every bound")
+        raise OutOfBoundsError("no loop found: at every bound")
 
     # ---- references
 
