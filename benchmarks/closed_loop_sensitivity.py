@@ -106,7 +106,7 @@ def measured(
     )
 
 
-def same_plant(out: Print, config: RunConfig, seeds: int, folder: Path) -> list[float]:
+def same_plant(out: Print, config: RunConfig, seeds: int, folder: Path) -> None:
     """The arm that was identified: several seeds of records, noise and phases, two sizes of excitation."""
     out("1. The arm that was identified, dry friction 0.02 N m; one design per seed of records and noise")
     out("   off: measured against the nominal prediction, %")
@@ -127,10 +127,9 @@ def same_plant(out: Print, config: RunConfig, seeds: int, folder: Path) -> list[
     worst = max(deviations, key=abs)
     out(f"   measured against nominal at 0.2 rad rms: worst {worst:+.2f} % (reach: {REACH_PERCENT:g} %)")
     out()
-    return deviations
 
 
-def several_payloads(out: Print, config: RunConfig, folder: Path) -> float:
+def several_payloads(out: Print, config: RunConfig, folder: Path) -> None:
     """One controller for three identified payloads, measured on these and between."""
     plants = []
     for mass in PAYLOADS_KG:
@@ -159,7 +158,6 @@ def several_payloads(out: Print, config: RunConfig, folder: Path) -> float:
     off = 100 * (worst / largest - 1)
     out(f"   worst case: certified {largest:.4f}, achieved {worst:.4f}: {off:+.2f} % (reach: within 5 %)")
     out()
-    return off
 
 
 def words(found: MeasuredSensitivity) -> str:

@@ -16,6 +16,7 @@ others for the judgement, so that the model has to know the response where it wa
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from scipy.signal import lfilter
@@ -108,16 +109,8 @@ def whitened(record: Record, order: int) -> GobfModel:
     for _ in range(2):
         residual = fit_on_fresh_data(model, record, estimate_offset=False).residual
         a = fit_autoregression([residual], 8)
-        kept = a.size - 1
-        filtered = Record(
-            record.name,
-            lfilter(a, [1.0], record.input, axis=0)[kept:],
-            lfilter(a, [1.0], record.output, axis=0)[kept:],
-            record.dt_s,
-            record.input_names,
-            record.output_names,
-        )
-        model = identify([filtered], structure(order)).model
+        u, y = (lfilter(a, [1.0], signal, axis=0)[a.size - 1 :] for signal in (record.input, record.output))
+        model = identify([replace(record, input=u, output=y)], structure(order)).model
     return model
 
 

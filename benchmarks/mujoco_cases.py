@@ -172,9 +172,9 @@ class ByEquations:
     """The machine as two equations of motion (absolute angles of rods, downwards positive), Runge-Kutta."""
 
     def __init__(self, truth: Truth) -> None:
-        self.truth = truth
-        self.state = np.concatenate([at_rest(truth), np.zeros(truth.n)])
-        n = truth.n
+        self.n = n = truth.n
+        self.state = np.zeros(4)
+        self.state[:n] = at_rest(truth)
 
         def two(values: Any, without: float) -> Any:
             return np.array([*values, *[without] * (2 - n)], dtype=np.float64)
@@ -196,15 +196,10 @@ class ByEquations:
 
     @property
     def angle(self) -> Any:
-        return self.state[: self.truth.n].copy()
+        return self.state[: self.n].copy()
 
     def step(self, torque: Any) -> None:
-        full = np.zeros(2)
-        full[: self.truth.n] = torque
-        y = np.zeros(4)
-        y[: self.truth.n], y[2 : 2 + self.truth.n] = self.state[: self.truth.n], self.state[self.truth.n :]
-        y = _integrated(y, full, *self.constants)
-        self.state = np.concatenate([y[: self.truth.n], y[2 : 2 + self.truth.n]])
+        self.state = _integrated(self.state, np.append(torque, [0.0] * (2 - self.n)), *self.constants)
 
 
 @njit(cache=True)
