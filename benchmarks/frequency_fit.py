@@ -10,13 +10,13 @@ covariances; every structure fitted to one date and judged on the other.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from benchmarks.harness import Print, data_folder, main
+from benchmarks.harness import Print, data_folder, main, timed
 from ident import IdentOptions
 from ident.data.frf_records import FrfRepeats
 from ident.frequency_fit import identify_frf
@@ -52,9 +52,9 @@ def known_plant(seeds: int, say: Print) -> None:
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
         noise = rng.standard_normal(OMEGA.size) + 1j * rng.standard_normal(OMEGA.size)
-        begin = time.process_time()
-        found = identify_frf(FrequencyUncertainty(OMEGA, response + size * noise, covariance, DT_S))
-        seconds.append(time.process_time() - begin)
+        measured = FrequencyUncertainty(OMEGA, response + size * noise, covariance, DT_S)
+        found, spent = timed(partial(identify_frf, measured))
+        seconds.append(spent)
         ellipses = found.posterior.at(GRID)
         hits.append(ellipses.contains(truth))
         radii.append(ellipses.enclosing_radius() / np.maximum(np.abs(ellipses.centre - truth), 1e-300))

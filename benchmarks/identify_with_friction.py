@@ -12,13 +12,12 @@ little). CPU per identification, uncertainty included.
 
 from __future__ import annotations
 
-import time
+from functools import partial
 
 import numpy as np
 
-from benchmarks.harness import Print, main
+from benchmarks.harness import Print, main, timed
 from ident import IdentOptions, Record
-from ident.checks.plausible_modes import PairKind, kind_of_pair
 from workflow.config.rig_settings import Multisine, Prbs
 from workflow.config.run_config import SimulatedRecord, SimulatedSource, built_in_config
 from workflow.tasks.log_identification import identify_records
@@ -42,7 +41,7 @@ EXPERIMENTS = (
     ),
 )
 BANDS = (None, (30.0, 190.0), (10.0, 600.0))
-EXCITED_HZ = 50.0
+EXCITED_HZ = 50.0  # the third mode, at 91 Hz, is not asked for
 
 
 def weak_records(source: SimulatedSource, seed: int) -> list[Record]:
@@ -56,7 +55,6 @@ def run(out: Print, *, seeds: int = 50) -> None:
     modes = truth_of(source).modes["hub_angle_rad"]
     first, second = (mode.frequency_Hz for mode in modes if mode.frequency_Hz < EXCITED_HZ)
     experiments = [weak_records(source, seed) for seed in range(seeds)]
-    longest_s = max(record.n_samples * record.dt_s for record in experiments[0])
     out(f"true modes {first:.2f} and {second:.2f} Hz; limit for the upper one within 2 %: about 0.85")
     out(f"{'':<32}  {first:.2f} Hz   {second:.2f} Hz               spurious    95 % interval     CPU s")
     out(f"{'':<32}  in 2 %    in 2 %  in 5 %  RMS error  modes      of the upper one  median   most")
@@ -69,18 +67,18 @@ def run(out: Print, *, seeds: int = 50) -> None:
         for band in BANDS:
             errors, cpu, spurious, covered = [], [], 0, 0
             for records in experiments:
-                begin = time.process_time()
-                result = identify_records(records, (), options, band_rad_s=band, with_plot=False)
-                cpu.append(time.process_time() - begin)
-                modes = result.about.modes
-                hertz = np.array([mode.frequency_Hz for mode in modes])
+                result, spent = timed(
+                    partial(identify_records, records, (), options, band_rad_s=band, with_plot=False)
+                )
+                cpu.append(spent)
+                hertz = np.array([mode.frequency_Hz for mode in result.about.modes])
                 near = int(np.argmin(np.abs(hertz - second)))
                 errors.append([float(np.min(np.abs(hertz / true - 1))) for true in (first, second)])
                 spurious += sum(
-                    kind_of_pair(mode.omega_rad_s, mode.damping, longest_s) is PairKind.MODE
+                    result.about.is_mode(mode)
                     and min(abs(mode.frequency_Hz / true - 1) for true in (first, second)) > 0.1
                     and mode.frequency_Hz < EXCITED_HZ
-                    for mode in modes
+                    for mode in result.about.modes
                 )
                 if result.spread.intervals is not None:
                     low, high = result.spread.intervals.modes[near].frequency_Hz

@@ -12,10 +12,10 @@ size of an added effect) against the truth.
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from typing import Any
 
@@ -24,7 +24,7 @@ import numpy as np
 from numba import njit
 from scipy.signal import butter, sosfilt
 
-from benchmarks.harness import Print, main
+from benchmarks.harness import Print, main, timed
 from diagnosis import PlantCase, PlantExperiment, diagnose
 from diagnosis.machine.mujoco_plant import MujocoArm
 
@@ -327,9 +327,7 @@ class Answer:
 
 def answer(number: int, seed: int) -> Answer:
     truth, case = case_of(number, seed)
-    begun = time.process_time()
-    found = diagnose(case)
-    cpu_s = time.process_time() - begun
+    found, cpu_s = timed(partial(diagnose, case))
     values = dict(found.rig.parameters)
     for change in found.repair:
         size = next(iter(change.values.values()))

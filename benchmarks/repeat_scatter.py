@@ -38,19 +38,15 @@ from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.autoregression import whitened
 from ident.uncertainty.conditions import combine_posteriors, record_posteriors, repeat_posteriors
 from ident.uncertainty.embedding import tangent
+from workflow.config.run_config import Channel, FileSource, load_config
+from workflow.tasks.records import read_record
 from workflow.text.templates import words
 
 HZ = 2 * np.pi
 REACH = 0.7, 1.4
 
+SLFR = Path(__file__).parents[1] / "examples" / "slfr_krauss_2009.toml"
 SLFR_BANDS_HZ = ((1.0, 3.16), (3.16, 10.0), (10.0, 25.0))
-SLFR_AMPLITUDES, SLFR_REPEATS = (50, 75), (1, 2, 3)
-_COMMON = {"estimate_initial_state": False, "omega_min_rad_s": 6.0, "omega_max_rad_s": 260.0, "n_pairs": 2}
-SLFR_CHANNELS = {
-    "hub": ("theta_rad", (31.4, 188.5), IdentOptions(integrators=1, n_real=1, **_COMMON)),
-    "tip": ("accel_counts", (12.6, 188.5), IdentOptions(feedthrough=True, n_real=2, **_COMMON)),
-}
-SLFR_BOUNDS = EmbeddingOptions(coloured_noise=True, max_ar_order=20, fir_length=60)
 POINTS_PER_BAND = 40
 
 DAISY_BANDS = ((0.0316, 0.1), (0.1, 0.316), (0.316, 1.0), (1.0, 3.15))
@@ -65,24 +61,15 @@ def verdict(ratio: float) -> str:
     return f"{ratio:>5.2f} {'met ' if REACH[0] <= ratio <= REACH[1] else 'FAIL'}"
 
 
-def slfr(folder: Path, channel: str, say: Print) -> None:
+def slfr(source: FileSource, channel: Channel, say: Print) -> None:
     """One channel of the Krauss arm: table over bands."""
-    output, band, options = SLFR_CHANNELS[channel]
-    measured = [
-        Record.from_file(
-            folder / f"swept_sine_amp{amplitude}_rep{repeat}.csv",
-            ["v_drive_counts"],
-            [output],
-            time="t_s",
-            references=["u_ref_rad"],
-        )
-        for amplitude in SLFR_AMPLITUDES
-        for repeat in SLFR_REPEATS
-    ]
-    stage = two_stage([band_limited(record, 5.03, 188.5) for record in measured], options, SLFR_BOUNDS)
+    band, options, bounds = channel.band_rad_s, channel.identification, channel.uncertainty
+    sweeps = [entry for entry in source.records if entry.role == "estimation"]
+    measured = [read_record(source, entry, (channel,)) for entry in sweeps]
+    stage = two_stage([band_limited(one, *channel.bounds_band_rad_s) for one in measured], options, bounds)
     model = identify([band_limited(record, *band) for record in stage.records], options).model
-    posteriors = record_posteriors(stage.records, model, SLFR_BOUNDS)
-    by_others = repeat_posteriors([stage.records[:3], stage.records[3:]], model, SLFR_BOUNDS)
+    posteriors = record_posteriors(stage.records, model, bounds)
+    by_others = repeat_posteriors([stage.records[:3], stage.records[3:]], model, bounds)
     omega = HZ * np.concatenate([np.geomspace(a, b * (1 - 1e-6), POINTS_PER_BAND) for a, b in SLFR_BANDS_HZ])
 
     def rows(groups: list[list[ResponsePosterior]]) -> list[ScatterRow]:
@@ -102,7 +89,7 @@ def slfr(folder: Path, channel: str, say: Print) -> None:
             for i, posterior in enumerate(posteriors)
         ]
     )
-    say(f"\nSLFR {channel} ({output} from v_drive_counts); {words(stage.finding)}")
+    say(f"\nSLFR {channel.name} ({channel.output} from {channel.input}); {words(stage.finding)}")
     say("Scatter of a sweep over the response, measured and predicted; ratios measured over predicted")
     say(f"{'':<39}own residuals      the other repeats    at 50       at 75       left-out sweep")
     say(
@@ -246,8 +233,9 @@ def together(one: FrequencyUncertainty, other: FrequencyUncertainty) -> np.ndarr
 def run(say: Print, *, only: str = "") -> None:
     folder = data_folder("slfr_krauss_2009", "daisy_robot_arm", "quanser_rfl_frf")
     if only in ("", "slfr"):
-        for channel in SLFR_CHANNELS:
-            slfr(folder / "slfr_krauss_2009", channel, say)
+        config, _ = load_config(SLFR)
+        for channel in config.channels:
+            slfr(config.source, channel, say)
         say("\n" + reading("repeat_scatter_slfr"))
     if only in ("", "daisy"):
         daisy(folder / "daisy_robot_arm" / "robot_arm.csv", say)

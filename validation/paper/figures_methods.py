@@ -92,8 +92,7 @@ def _bode(shown: Comparison, curves: list[Curve], title: str) -> Figure:
         gain.plot(omega, decibels(np.abs(curve.response)), **curve.line, label=curve.label)
         phase.plot(omega, _phase(omega, curve.response, reference), **curve.line)
     _frequency_axes(gain, phase, omega)
-    gain.set_title(title)
-    gain.set_ylabel(f"gain [dB re 1 {shown.machine.gain_unit}]")
+    gain.set(title=title, ylabel=f"gain [dB re 1 {shown.machine.gain_unit}]")
     phase.set_ylabel("phase [deg]")
     phase.yaxis.set_major_locator(MultipleLocator(180))
     return figure
@@ -106,14 +105,13 @@ def draw_gobf_run(shown: Comparison) -> Figure:
     time, measured = record.time_s, record.output[:, 0]
     figure, (upper, lower) = style.panels(4.9, 2, 1, sharex=True, height_ratios=[1.7, 1.0])
     _overlay(upper, shown, "GOBF")
-    upper.set_title(f"Fresh data, GOBF: fit {shown.scores['GOBF'].fit_percent:.1f} %")
     residual = {**style.MEASURED_LINE, "lw": 0.7}
     lower.plot(time, measured - shown.simulated["GOBF"], **residual, label="measured - simulated")
     sensor = "±2 standard deviations of the sensor noise"
     lower.axhspan(-2 * NOISE_STD, 2 * NOISE_STD, **style.BAND, zorder=0, label=sensor)
-    lower.set_ylabel("residual [m]")
-    lower.set_xlabel("time [s]")
-    upper.set_xlim(time[0], time[-1])
+    lower.set(xlabel="time [s]", ylabel="residual [m]")
+    fit = shown.scores["GOBF"].fit_percent
+    upper.set(title=f"Fresh data, GOBF: fit {fit:.1f} %", xlim=(time[0], time[-1]))
     return figure
 
 
@@ -161,20 +159,17 @@ def draw_bounds(study: BoundsStudy, gain_unit: str) -> Figure:
             shown = np.maximum(values, 1e-3)
             distance.plot(study.omega_rad_s, shown, color=style.REFERENCE, lw=1.2, **line, label=words)
         distance.set_yscale("log")
-        distance.set_xlabel("frequency [rad/s]")
         _frequency_axes(gain, distance, study.omega_rad_s)
         share = study.inside_percent[name][0]
         low, high = JUDGED_BAND_RAD_S
         gain.set_title(f"{name}: truth inside at {share:.0f} % of {low:.0f} to {high:.0f} rad/s")
-    grid[0, 0].set_ylabel(f"gain [dB re 1 {gain_unit}]")
-    grid[1, 0].set_ylabel("phase [deg]")
-    grid[1, 0].yaxis.set_major_locator(MultipleLocator(180))
-    grid[2, 0].set_ylabel("distance of\ntruth [2 sigma]")
+    gain, phase, distance = grid[:, 0]
+    highest, span = decibels(np.abs(study.truth).max()), unwrapped_degrees(study.truth)
+    gain.set(ylabel=f"gain [dB re 1 {gain_unit}]", ylim=(floor, highest + 10))
+    phase.set(ylabel="phase [deg]", ylim=(span.min() - 200, span.max() + 100))
+    phase.yaxis.set_major_locator(MultipleLocator(180))
     largest = max(float(values.max()) for values in study.distance.values())
-    grid[2, 0].set_ylim(0.05, max(100.0, 1.5 * largest))
-    grid[0, 0].set_ylim(floor, decibels(np.abs(study.truth).max()) + 10)
-    span = unwrapped_degrees(study.truth)
-    grid[1, 0].set_ylim(span.min() - 200, span.max() + 100)
+    distance.set(ylabel="distance of\ntruth [2 sigma]", ylim=(0.05, max(100.0, 1.5 * largest)))
     return figure
 
 
@@ -201,8 +196,7 @@ def _band(
 
 
 def _frequency_axes(top: Axes, bottom: Axes, omega: RealArray) -> None:
-    top.set_xscale("log")
-    top.set_xlim(omega[0], omega[-1])
+    top.set(xscale="log", xlim=(omega[0], omega[-1]))
     style.hertz_axis(top)
     bottom.set_xlabel("frequency [rad/s]")
 

@@ -63,12 +63,10 @@ def _surface(figure: Figure, axes: Axes, study: SurfaceStudy) -> None:
             i, j = np.array(points).T
             words = f"{label}: {len(points)}"
             axes.plot(surface.first[i], surface.second[j], ls="none", clip_on=False, **marker, label=words)
-    axes.set_xlabel("beta [1]")
-    axes.set_ylabel("gamma [1]")
+    axes.set(xlabel="beta [1]", ylabel="gamma [1]", title="Error surface J, colours of equal area")
     axes.xaxis.set_major_locator(MultipleLocator(0.005))
     axes.xaxis.set_major_formatter(FormatStrFormatter("%.3f"))
     axes.yaxis.set_major_formatter(FormatStrFormatter("%.4f"))
-    axes.set_title("Error surface J, colours of equal area")
     axes.grid(visible=False)
     bar = figure.colorbar(mesh, ax=axes, pad=0.02, aspect=30, ticks=levels[:: max(levels.size // 6, 1)])
     bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%.5f"))
@@ -81,15 +79,12 @@ def _cuts(close: Axes, whole: Axes, study: SurfaceStudy) -> None:
         for axes in (close, whole):
             axes.plot(study.surface.first, values, **line, label=f"cut at gamma = {gamma:.4f}")
     for axes in (close, whole):
-        axes.set_xlim(study.surface.first[0], study.surface.first[-1])
+        axes.set(xlim=(study.surface.first[0], study.surface.first[-1]), ylabel="J [output²]")
         axes.xaxis.set_major_locator(MultipleLocator(0.005))
         axes.xaxis.set_major_formatter(FormatStrFormatter("%.3f"))
-        axes.set_ylabel("J [output²]")
-    close.set_ylim(0.92 * top, 1.01 * top)
+    close.set(ylim=(0.92 * top, 1.01 * top), title="Cuts along beta: top, and whole")
     close.tick_params(labelbottom=False)
-    whole.set_ylim(0, 1.05 * top)
-    whole.set_xlabel("beta [1]")
-    close.set_title("Cuts along beta: top, and whole")
+    whole.set(ylim=(0, 1.05 * top), xlabel="beta [1]")
 
 
 def _counts(axes: Axes, counts: tuple[MinimaCount, ...]) -> None:
@@ -102,10 +97,8 @@ def _counts(axes: Axes, counts: tuple[MinimaCount, ...]) -> None:
         for x, value in zip(place + offset, values, strict=True):
             axes.text(x, value + 0.3, f"{value}", ha="center", fontsize=8, color="#333333")
     axes.set_xticks(place, [f"{count.n_points}" for count in counts])
-    axes.set_xlabel("grid points per axis [1]")
-    axes.set_ylabel("number [1]")
+    axes.set(xlabel="grid points per axis [1]", ylabel="number [1]", title="Minima counted, by grid")
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_title("Minima counted, by grid")
     axes.grid(visible=False, axis="x")
 
 
@@ -121,8 +114,6 @@ def _shares(axes: Axes, shares: SearchShares) -> None:
         for y, value in zip(place + offset, percent, strict=True):
             axes.text(value + 1.5, y, f"{value:.0f}", va="center", fontsize=7.5, color="#333333")
     axes.set_yticks(place, [name.removeprefix("GN_") for name in VARIANTS], fontsize=7.5)
-    axes.set_xlim(0, 112)
-    axes.set_xticks([0, 20, 40, 60, 80, 100])
+    axes.set(xlim=(0, 112), xticks=[0, 20, 40, 60, 80, 100], title="DIRECT at order 4 (plant of Fig. 2)")
     axes.set_xlabel("searches ending in the global minimum [%]")
-    axes.set_title("DIRECT at order 4 (plant of Fig. 2)")
     axes.grid(visible=False, axis="y")
