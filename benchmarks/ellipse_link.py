@@ -9,8 +9,8 @@ repeats. On a shared machine the wall time is that of the machine as it was, so 
 run, mean of a minute) is printed beside it, and what a machine with that many cores to spare would take: CPU
 seconds of this process and those of its workers over their number.
 
-Third table: the bracket. --fine adds a row with a larger basis and grid, how far the default ones are from
-their limits, and the ellipse problem, which is not convex, from five starts.
+Third table: the bracket. Row fine: a larger basis and grid, how far the default ones are from their limits.
+Then the ellipse problem, which is not convex, from five starts.
 """
 
 from __future__ import annotations
@@ -78,14 +78,10 @@ def times(out: Print, scenario: Scenario, jobs: int, repeat: int, seed: int) -> 
     out(f"{scenario:>8} {jobs:>4}  {wall_s:>6.1f} {reach:>5}  {load:>14.1f}  {free:>12.1f}")
 
 
-def bracketed(out: Print, scenario: Scenario, gamma: dict[int, float], fine: bool) -> None:
+def bracketed(out: Print, scenario: Scenario, gamma: dict[int, float]) -> None:
     """Bracket of one scenario by several settings; gamma: certified worst case by order."""
     plant, specification = flexible_link(scenario), flexible_link_specification(TIMED_ORDER)
-    settings = {
-        "default": YoulaOptions(),
-        "hull": YoulaOptions(hull=True),
-        **({"fine": FINE} if fine else {}),
-    }
+    settings = {"default": YoulaOptions(), "hull": YoulaOptions(hull=True), "fine": FINE}
     for name, options in settings.items():
         bracket, spent = timed(partial(youla_bracket, plant, specification, options))
         one = bracket.plants[0]
@@ -104,7 +100,6 @@ def run(
     seed: int = 1,
     jobs: tuple[int, ...] = (1, 2),
     repeat: int = 3,
-    fine: bool = True,
 ) -> None:
     out("scenario order  certified  (reach)  over youla %  stable  CPU s  certify s")
     gamma = {s: {order: certified(out, s, order, seed) for order in orders} for s in scenarios}
@@ -123,16 +118,15 @@ def run(
         "  hull bound  excess 5 / 6 %  CPU s"
     )
     for scenario in scenarios:
-        bracketed(out, scenario, gamma[scenario], fine)
-    if fine:
-        out()
-        out("The ellipse problem is not convex: its value from five starts between the discs' answers.")
-        for scenario in scenarios:
-            problem = BracketProblem(flexible_link(scenario), flexible_link_specification(5), YoulaOptions())
-            outer, inner = (problem.exchanged(region, None)[2] for region in ("enclosing", "inscribed"))
-            starts = ((1 - f) * outer + f * inner for f in (0.0, 0.25, 0.5, 0.75, 1.0))
-            values = [problem.exchanged("ellipse", start)[0] for start in starts]
-            out(f"{scenario:>8}  " + "  ".join(f"{value:.4f}" for value in values))
+        bracketed(out, scenario, gamma[scenario])
+    out()
+    out("The ellipse problem is not convex: its value from five starts between the discs' answers.")
+    for scenario in scenarios:
+        problem = BracketProblem(flexible_link(scenario), flexible_link_specification(5), YoulaOptions())
+        outer, inner = (problem.exchanged(region, None)[2] for region in ("enclosing", "inscribed"))
+        starts = ((1 - f) * outer + f * inner for f in (0.0, 0.25, 0.5, 0.75, 1.0))
+        values = [problem.exchanged("ellipse", start)[0] for start in starts]
+        out(f"{scenario:>8}  " + "  ".join(f"{value:.4f}" for value in values))
 
 
 if __name__ == "__main__":

@@ -144,26 +144,33 @@ def _run(inputs: Real, A: Real, B: Real, gains: Real, p: np.record) -> Real:
     return out
 
 
+def logged(folder: Path, stage: int) -> Real:
+    """(5, T): commanded current, (not used), reference, theta and alpha of a stage."""
+    data = np.loadtxt(folder / "quanser_2dsfl" / "lqr_run.csv", delimiter=",", skiprows=1)
+    return data[:, 5 * stage - 4 : 5 * stage + 1].T
+
+
+def manufacturers_gains(folder: Path, stage: int) -> Real:
+    """(4,) of the feedback that the record was made with."""
+    path = folder / "quanser_2dsfl" / f"nominal_stage{stage}_K.csv"
+    return np.loadtxt(path, delimiter=",", skiprows=1)
+
+
 def law_error(folder: Path, stage: int, filter_rad_s: float) -> float:
     """RMS [A] of the logged command minus the law with the manufacturer's gains, after the first second."""
-    quanser = folder / "quanser_2dsfl"
-    data = np.loadtxt(quanser / "lqr_run.csv", delimiter=",", skiprows=1)
-    gains = np.loadtxt(quanser / f"nominal_stage{stage}_K.csv", delimiter=",", skiprows=1)
-    command, _, reference, theta, alpha = data[:, 5 * stage - 4 : 5 * stage + 1].T
+    command, _, reference, theta, alpha = logged(folder, stage)
     keep = np.exp(-filter_rad_s * DT_S)
     speeds = [lfilter([1 - keep, keep - 1], [DT_S, -keep * DT_S], x - x[0]) for x in (theta, alpha)]
-    law = gains @ np.array([reference - theta, -alpha, -speeds[0], -speeds[1]])
+    law = manufacturers_gains(folder, stage) @ np.array([reference - theta, -alpha, -speeds[0], -speeds[1]])
     return float(np.sqrt(np.mean((command - law)[500:] ** 2)))
 
 
 def standing(folder: Path, stage: int) -> Real:
     """Mean commanded current [A] of every 0.3 s in which the joint stands within 0.1 mrad, (W,)."""
-    data = np.loadtxt(folder / "quanser_2dsfl" / "lqr_run.csv", delimiter=",", skiprows=1)
-    at, n = 1 if stage == 1 else 6, 150
-    theta = np.lib.stride_tricks.sliding_window_view(data[:, at + 3], n)[::n]
-    current = np.lib.stride_tricks.sliding_window_view(data[:, at], n)[::n].mean(axis=1)
+    command, _, _, theta, _ = logged(folder, stage)
+    command, theta = (np.lib.stride_tricks.sliding_window_view(x, 150)[::150] for x in (command, theta))
     still = np.ptp(theta, axis=1) < 1e-4
-    return np.asarray(current[still])
+    return np.asarray(command.mean(axis=1)[still])
 
 
 def case(folder: Path, stage: int) -> PlantCase:
@@ -172,23 +179,21 @@ def case(folder: Path, stage: int) -> PlantCase:
     "other_stage" acts on the load: for stage 1 the spring torque of stage 2, for stage 2 the angular
     acceleration of what it stands on (second differences of 30 ms of the measured tip angle).
     """
-    quanser = folder / "quanser_2dsfl"
-    data = np.loadtxt(quanser / "lqr_run.csv", delimiter=",", skiprows=1)
-    gains = np.loadtxt(quanser / f"nominal_stage{stage}_K.csv", delimiter=",", skiprows=1)
-    at, other = (3, 8) if stage == 1 else (8, 3)
+    _, _, reference, theta, alpha = logged(folder, stage)
+    _, _, _, other_theta, other_alpha = logged(folder, 3 - stage)
     if stage == 1:
         spring = MANUFACTURER[2]["spring_Nm_rad"] / MANUFACTURER[1]["load_inertia_kg_m2"]
-        outside = spring * data[:, other + 2]
+        outside = spring * other_alpha
     else:
-        tip, n = data[:, other + 1] + data[:, other + 2], 15
+        tip, n = other_theta + other_alpha, 15
         padded = np.pad(tip, n, mode="edge")
         outside = -(padded[2 * n :] - 2 * tip + padded[: -2 * n]) / (n * DT_S) ** 2
-    inputs = np.column_stack([data[:, at], outside, data[:, at + 1]])
-    output = data[:, at + 1 : at + 3]
+    inputs = np.column_stack([reference, outside, theta])
+    output = np.column_stack([theta, alpha])
     first, second = slice(0, PERIOD), slice(PERIOD, 2 * PERIOD)
     noise = np.sqrt(np.mean((output[first] - output[second]) ** 2, axis=0) / 2)
     plant = Plant(
-        simulation(gains),
+        simulation(manufacturers_gains(folder, stage)),
         MANUFACTURER[stage],
         TOLERANCES,
         ("theta_rad", "alpha_rad"),

@@ -119,7 +119,7 @@ def test_the_nominal_machine_is_the_truth_in_small_motion_and_finds_its_values(s
     exact = nominal.residuals(machine.true, np.zeros(len(machine.tolerances)))[1]
     # Measured 1e-6: rotations are exact, deflections small.
     assert np.all(np.std(exact, axis=0) < 1e-5 * motion)
-    refit = nominal.refit(machine.stated).residuals[1]
+    refit = nominal.refit(machine.stated)[1]
     stated = nominal.residuals(machine.stated, np.zeros(len(machine.tolerances)))[1]
     # Measured 0.064: the tolerances hold back a little.
     assert np.all(np.std(refit, axis=0) < 0.1 * np.std(stated, axis=0))

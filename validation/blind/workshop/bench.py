@@ -74,7 +74,7 @@ class Bench:
         logs = self.logs(Truth(self.machine.true, effects, background or self.quiet))
         nominal = self.nominal(logs)
         if refit:
-            residuals = nominal.refit(self.machine.true).residuals
+            residuals = nominal.refit(self.machine.true)
         else:
             residuals = nominal.residuals(self.machine.true, np.zeros(len(self.machine.tolerances)))
         return rms([r for r, log in zip(residuals, logs, strict=True) if log.held_out])
@@ -82,7 +82,7 @@ class Bench:
     def share(self, background: Background) -> float:
         """What a refit leaves over the motion on the held-out records, over all outputs."""
         logs = self.logs(Truth(self.machine.true, (), background))
-        residuals = self.nominal(logs).refit(self.machine.true).residuals
+        residuals = self.nominal(logs).refit(self.machine.true)
         held = [k for k, log in enumerate(logs) if log.held_out]
         left = rms([residuals[k] for k in held])
         motion = rms([logs[k].output - logs[k].output.mean(axis=0) for k in held])
@@ -113,7 +113,7 @@ def measured_sizes(
     background = pure.linear_refit(
         machine.true, [log.output - same for log, same in zip(clean, oracle, strict=True)]
     )
-    refit = pure.refit(machine.true).residuals
+    refit = pure.refit(machine.true)
     true_values = pure.residuals(machine.true, none)
     parametric = [tolerances_away(e, machine.true, machine.tolerances) is not None for e in effects]
     before = true_values if any(parametric) else refit
@@ -121,7 +121,7 @@ def measured_sizes(
     gaps = {
         "nominal": noise.residuals(machine.stated, none),
         "true_values": noise.residuals(machine.true, none),
-        "refit": noise.refit(machine.true).residuals,
+        "refit": noise.refit(machine.true),
         "after_oracle": noise.linear_refit(
             machine.true, [log.output - same for log, same in zip(noisy, oracle, strict=True)]
         ),

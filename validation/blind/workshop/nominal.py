@@ -95,14 +95,6 @@ def _held(A: Real, b: Real, over_s: float) -> Real:
     return np.asarray(expm(block * over_s)[:size, size])
 
 
-@dataclass(frozen=True, eq=False)
-class Refit:
-    """Residuals (T, n) per record, and log deviations of the stated values."""
-
-    residuals: list[Real]
-    deviations: Real
-
-
 class Nominal:
     """Fits rigs to logs; weights (n,) per output are one over what a sample is worth."""
 
@@ -141,8 +133,9 @@ class Nominal:
         found = np.linalg.lstsq(columns / scale, target, rcond=1e-9)[0]
         return np.asarray((target - (columns / scale) @ found).reshape(gap.shape) / w)
 
-    def refit(self, rig: Rig) -> Refit:
-        """Stated values fitted to the estimation records, within what their tolerances make of them."""
+    def refit(self, rig: Rig) -> list[Real]:
+        """Residuals (T, n) per record with the stated values fitted to the estimation records, within what
+        their tolerances make of them."""
         zero = np.zeros(len(self.keys))
 
         def stacked(at: Real) -> Real:
@@ -157,7 +150,7 @@ class Nominal:
         p = least_squares(
             stacked, zero, slopes, bounds=(-most, most), x_scale=self.spread, ftol=_ENOUGH, max_nfev=_MOST
         ).x
-        return Refit(self.residuals(rig, p), p)
+        return self.residuals(rig, p)
 
     def linear_refit(self, rig: Rig, gaps: Sequence[Real]) -> list[Real]:
         """Gaps (T, n) to another model near the rig, with what small changes of its values explain taken out.
