@@ -10,7 +10,7 @@ Measures and Cramer-Rao bounds: `benchmarks.p1_measures`. Process CPU time per f
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from benchmarks.harness import Print, main
 from benchmarks.p1_measures import FRICTION, HEADER, PLAIN, Score, Variant, bounds, row, score
 from ident import IdentOptions, Record, identify
 from ident.basis.structure import filter_input
-from tests.ident.benchmark_plants import DT_S, Truth
+from tests.ident.benchmark_plants import Truth
 from validation.comparators.comparators import armax, arx, oe
 from validation.comparators.subspace import moesp
 from validation.paper.methods import LinearModel
@@ -45,32 +45,13 @@ PEERS: dict[str, Fit] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Summed:
-    """A model of the summed input, as a model of the input."""
-
-    model: Any
-    integrators: int
-
-    def frequency_response(self, omega_rad_s: np.ndarray) -> np.ndarray:
-        sums = 1 / (1 - np.exp(-1j * omega_rad_s * DT_S)) ** self.integrators
-        return np.asarray(self.model.frequency_response(omega_rad_s) * sums)
-
-    @property
-    def poles(self) -> np.ndarray:
-        """Without those of the integrators."""
-        return np.asarray(self.model.poles)
-
-    def simulate(self, u: np.ndarray) -> np.ndarray:
-        return np.asarray(self.model.simulate(filter_input(u, self.integrators, 0)))
-
-
 def summed_oe(integrators: int) -> Fit:
     """Output error with the integrators taken out: four coefficients in B, four less the integrators in F."""
 
-    def fit(record: Record) -> Summed:
+    def fit(record: Record) -> LinearModel:
         summed = replace(record, input=filter_input(record.input[:, 0], integrators, 0)[:, None])
-        return Summed(oe(summed, 4, 4 - integrators, arx_start=False), integrators)
+        found = oe(summed, 4, 4 - integrators, arx_start=False)
+        return replace(found, f=np.convolve(found.f, np.poly(np.ones(integrators))))
 
     return fit
 

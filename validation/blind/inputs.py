@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from validation.blind.rigs import magnitudes
 from validation.blind.truth import Feedback, Real, Truth
 
 _PERIOD = 700
@@ -88,17 +89,11 @@ def _doublet(dt_s: float, rng: np.random.Generator) -> Real:
 
 def _slew(truth: Truth, T: int, rng: np.random.Generator) -> Feedback:
     """Out and part of the way back along smooth references; bandwidth well below the first mode."""
-    rig = truth.rig
-    link, hub, motor = rig["link"], rig["hub"], rig["motor"]
-    mass = link["density_kg_m3"] * link["width_m"] * link["thickness_m"] * link["length_m"]
-    r, L = hub["radius_m"], link["length_m"]
-    inertia = hub["inertia_kg_m2"] + mass * (L**2 / 3 + r * L + r**2)
-    inertia += rig["payload"]["mass_kg"] * (r + L) ** 2
-    per_volt = motor["gear_ratio"] * motor["torque_constant_Nm_A"] / motor["resistance_ohm"]
-    braking = per_volt * motor["gear_ratio"] * motor["back_emf_Vs_rad"] + hub["viscous_friction_Nms"]
+    known = magnitudes(truth.rig)
+    braking = known.braking + known.viscous
     bandwidth = rng.uniform(2.5, 4.0)
-    proportional = inertia * bandwidth**2 / per_volt
-    derivative = max(2 * 0.8 * bandwidth * inertia - braking, 0.02 * braking) / per_volt
+    proportional = known.inertia * bandwidth**2 / known.per_volt
+    derivative = max(2 * 0.8 * bandwidth * known.inertia - braking, 0.02 * braking) / known.per_volt
     target = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, 0.42)
     back = target * rng.uniform(-0.5, 0.5)
     reference = np.zeros(T)

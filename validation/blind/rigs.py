@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -98,6 +99,22 @@ def draw_rig(rng: np.random.Generator) -> Rig:
         section: {key: rounded(float(value)) for key, value in values.items()}
         for section, values in table.items()
     }
+
+
+def magnitudes(rig: RigTable) -> SimpleNamespace:
+    """Mass of the link, inertia at the hub when all is stiff, torque per volt and braking of the motor."""
+    link, hub, motor = rig["link"], rig["hub"], rig["motor"]
+    L, r = link["length_m"], hub["radius_m"]
+    mass = link["density_kg_m3"] * link["width_m"] * link["thickness_m"] * L
+    inertia = hub["inertia_kg_m2"] + mass * (L**2 / 3 + r * L + r**2)
+    per_volt = motor["gear_ratio"] * motor["torque_constant_Nm_A"] / motor["resistance_ohm"]
+    return SimpleNamespace(
+        link_mass=mass,
+        inertia=inertia + rig["payload"]["mass_kg"] * (r + L) ** 2,
+        per_volt=per_volt,
+        braking=per_volt * motor["gear_ratio"] * motor["back_emf_Vs_rad"],
+        viscous=hub["viscous_friction_Nms"],
+    )
 
 
 def draw_tolerances(rng: np.random.Generator) -> dict[str, float]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from validation.blind.inputs import Planned
-from validation.blind.rigs import log_uniform, rounded
+from validation.blind.rigs import log_uniform, magnitudes, rounded
 from validation.blind.truth import LISTED, UNLISTED, RigTable
 
 Table = dict[str, Any]
@@ -161,25 +161,19 @@ def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random
 
 def _scales(rig: RigTable, plans: tuple[Planned, ...]) -> SimpleNamespace:
     """Magnitudes of a rig and its planned voltages, SI units."""
-    link, hub, motor = rig["link"], rig["hub"], rig["motor"]
-    L, r = link["length_m"], hub["radius_m"]
-    mass = link["density_kg_m3"] * link["width_m"] * link["thickness_m"] * L
+    link = rig["link"]
     bending = link["youngs_modulus_Pa"] * link["width_m"] * link["thickness_m"] ** 3 / 12
     rms = float(np.median([np.sqrt(np.mean(p.voltage_V**2)) for p in plans if p.feedback is None]))
-    per_volt = motor["gear_ratio"] * motor["torque_constant_Nm_A"] / motor["resistance_ohm"]
-    inertia = hub["inertia_kg_m2"] + mass * (L**2 / 3 + r * L + r**2)
+    known = magnitudes(rig)
     return SimpleNamespace(
+        **vars(known),
         voltage=rms,
         peak=max(float(np.max(np.abs(p.voltage_V))) for p in plans),
-        torque=per_volt * rms,
-        viscous=hub["viscous_friction_Nms"],
-        braking=per_volt * motor["gear_ratio"] * motor["back_emf_Vs_rad"],
-        inertia=inertia + rig["payload"]["mass_kg"] * (r + L) ** 2,
-        link_mass=mass,
-        link_spring=3 * bending / L,
-        length=L,
-        resistance=motor["resistance_ohm"],
+        torque=known.per_volt * rms,
+        link_spring=3 * bending / link["length_m"],
+        length=link["length_m"],
+        resistance=rig["motor"]["resistance_ohm"],
         dt=rig["sampling"]["dt_s"],
         tip_noise=rig["sensors"]["tip_noise_m"],
-        tip_peak=(r + L) * 0.35,
+        tip_peak=(rig["hub"]["radius_m"] + link["length_m"]) * 0.35,
     )

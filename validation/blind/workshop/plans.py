@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from validation.blind.inputs import Planned
-from validation.blind.rigs import rounded
+from validation.blind.rigs import magnitudes, rounded
 from validation.blind.truth import Before, Feedback, OutOfBoundsError, Real, Truth
 
 Controller = Literal["none", "P", "PD"]
@@ -115,15 +115,12 @@ class _Makers:
         self.truth, self.samples, self.rng = truth, samples, rng
         self.dt = truth.dt_s
         self.rows_before = int(_BEFORE_S / self.dt)
-        rig = truth.rig
         M, K, _ = truth.linear()
         squares = np.linalg.eigvals(np.linalg.solve(M, K)).real
         self.first_rad_s = float(np.sqrt(np.sort(squares)[1]))
         self.inertia = float(M[0, 0])
-        motor = rig["motor"]
-        self.per_volt = motor["gear_ratio"] * motor["torque_constant_Nm_A"] / motor["resistance_ohm"]
-        self.braking = self.per_volt * motor["gear_ratio"] * motor["back_emf_Vs_rad"]
-        self.braking += rig["hub"]["viscous_friction_Nms"]
+        known = magnitudes(truth.rig)
+        self.per_volt, self.braking = known.per_volt, known.braking + known.viscous
 
     def length(self) -> int:
         return int(self.rng.integers(self.samples[0], self.samples[1] + 1)) + self.rows_before
