@@ -9,7 +9,6 @@ library reads take a process each.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -49,17 +48,13 @@ def run(
 
     with tempfile.TemporaryDirectory(prefix="flexlink-") as name:
         folder = Path(name)
-        told_each: list[tuple[str, Callable[[], Tally]]] = [
-            *((f"log: {log}", lambda log=log: logs.damaged(log, folder, binary)) for log in logs.IN_PROCESS),
-            *(
-                (f"model: {file}", lambda file=file: models.damaged(file, folder, binary))
-                for file in models.WHOLE
-            ),
-            ("controller .json", lambda: texts.spoilt_controllers(controllers)),
-            *((f"log: {log}", lambda log=log: logs.damaged(log, folder, child)) for log in logs.IN_A_CHILD),
-        ]
-        for kind, found in told_each:
-            told(kind, found())
+        for log in logs.IN_PROCESS:
+            told(f"log: {log}", logs.damaged(log, folder, binary))
+        for file in models.WHOLE:
+            told(f"model: {file}", models.damaged(file, folder, binary))
+        told("controller .json", texts.spoilt_controllers(controllers))
+        for log in logs.IN_A_CHILD:
+            told(f"log: {log}", logs.damaged(log, folder, child))
         with pytest.MonkeyPatch.context() as patch:
             draw_nothing(patch)
             run_from_files(FAST_ARM, folder / "run")

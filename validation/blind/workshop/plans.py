@@ -35,49 +35,34 @@ def plan_workshop(
     pulled = any(name in _TURNING_BACK for name in effects)
     controller: Controller = str(rng.choice(["P", "P", "PD"]))  # type: ignore[assignment]
     loop = makers.loop(controller)
-    runs: list[tuple[str, str, str, Real]]
     u = rng.uniform
     if closed:
         small, large, fresh = u(0.25, 0.5), u(0.5, 1.2), u(0.4, 1.2)
         runs = [
-            ("steps_low", "random steps of the reference, small", "estimation", makers.steps(small)),
-            ("steps_high", "random steps of the reference, large", "estimation", makers.steps(large)),
-            ("multisine", "random-phase multisine reference", "estimation", makers.tones(u(0.15, 0.5))),
-            ("slews", "smooth slews of the reference", "estimation", makers.slews(u(0.7, 1.3))),
-            (
-                "steps_fresh",
-                "random steps of the reference, another sequence",
-                "held_out",
-                makers.steps(fresh),
-            ),
-            ("mixed", "multisine on slews of the reference", "held_out", makers.mixed()),
+            ("steps_low", "random steps of the reference, small", makers.steps(small)),
+            ("steps_high", "random steps of the reference, large", makers.steps(large)),
+            ("multisine", "random-phase multisine reference", makers.tones(u(0.15, 0.5))),
+            ("slews", "smooth slews of the reference", makers.slews(u(0.7, 1.3))),
+            ("steps_fresh", "random steps of the reference, another sequence", makers.steps(fresh)),
+            ("mixed", "multisine on slews of the reference", makers.mixed()),
         ]
     else:
         low, high, fresh = u(0.1, 0.2), u(0.3, 0.6), u(0.2, 0.4)
         runs = [
-            ("prbs_low", "random binary voltage, low amplitude", "estimation", makers.binary(low)),
-            ("prbs_high", "random binary voltage, high amplitude", "estimation", makers.binary(high)),
-            (
-                "multisine",
-                "random-phase multisine voltage, periodic",
-                "estimation",
-                makers.sines(u(0.12, 0.3)),
-            ),
-            (
-                "doublet_decay",
-                "voltage doublets with pauses at zero volts",
-                "estimation",
-                makers.doublets(u(0.12, 0.35)),
-            ),
-            ("prbs_fresh", "random binary voltage, another sequence", "held_out", makers.binary(fresh)),
+            ("prbs_low", "random binary voltage, low amplitude", makers.binary(low)),
+            ("prbs_high", "random binary voltage, high amplitude", makers.binary(high)),
+            ("multisine", "random-phase multisine voltage, periodic", makers.sines(u(0.12, 0.3))),
+            ("doublet_decay", "voltage doublets with pauses at zero volts", makers.doublets(u(0.12, 0.35))),
+            ("prbs_fresh", "random binary voltage, another sequence", makers.binary(fresh)),
         ]
         if rng.random() < 0.6:
-            runs.append(("mixed", "multisine on slews of the reference", "held_out", makers.mixed()))
+            runs.append(("mixed", "multisine on slews of the reference", makers.mixed()))
         else:
             controller = "none"
-            runs.append(("mixed", "smoothed random voltage", "held_out", makers.wandering(u(0.3, 0.5))))
+            runs.append(("mixed", "smoothed random voltage", makers.wandering(u(0.3, 0.5))))
     made = []
-    for k, (kind, words, role, shape) in enumerate(runs):
+    for k, (kind, words, shape) in enumerate(runs):
+        role = "estimation" if k < 4 else "held_out"
         in_loop = closed or words.startswith("multisine on")
         farthest = (1.2 if in_loop else 0.25) if pulled else 3.1
         start = rounded(u(-farthest, farthest))
