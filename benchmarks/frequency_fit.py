@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -25,18 +26,7 @@ from tests.ident.benchmark_plants import DT_S, P2_HZ, P2_ZETA, p2
 
 OMEGA = np.geomspace(0.5, 300, 120)
 GRID = np.geomspace(0.5, 300, 200)
-BANDS = (
-    (0.5, 3),
-    (3, 13),
-    (13, 19),
-    (19, 55),
-    (55, 66),
-    (66, 72),
-    (72, 120),
-    (120, 160),
-    (160, 190),
-    (190, 300),
-)
+BANDS = tuple(pairwise((0.5, 3, 13, 19, 55, 66, 72, 120, 160, 190, 300)))
 KYOTO_DT_S = 0.002
 OUTLIER = 6.0
 

@@ -20,34 +20,18 @@ from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExper
 
 DT_S, PERIOD, SUBSTEPS = 0.002, 5000, 2
 LIMIT_A, FILTER_RAD_S = 0.94, 150.0
-MANUFACTURER = {
-    1: {
-        "hub_inertia_kg_m2": 0.0635,
-        "load_inertia_kg_m2": 0.1704,
-        "spring_Nm_rad": 39.96,
-        "hub_damping_Nms": 4.0,
-        "link_damping_Nms": 1e-3,
-        "torque_constant_Nm_A": 8.925,
-    },
-    2: {
-        "hub_inertia_kg_m2": 0.00302,
-        "load_inertia_kg_m2": 0.00644,
-        "spring_Nm_rad": 6.858,
-        "hub_damping_Nms": 1.5,
-        "link_damping_Nms": 0.0856,
-        "torque_constant_Nm_A": 0.8701,
-    },
+# First stage, second stage, and relative tolerance: the manufacturer states none, so what a data sheet is
+# usually good for.
+_STATED = {
+    "hub_inertia_kg_m2": (0.0635, 0.00302, 0.1),
+    "load_inertia_kg_m2": (0.1704, 0.00644, 0.1),
+    "spring_Nm_rad": (39.96, 6.858, 0.1),
+    "hub_damping_Nms": (4.0, 1.5, 0.3),
+    "link_damping_Nms": (1e-3, 0.0856, 0.3),
+    "torque_constant_Nm_A": (8.925, 0.8701, 0.05),
 }
-# Stated by the manufacturer without any uncertainty: what a data sheet is usually good for.
-TOLERANCES = {
-    "hub_inertia_kg_m2": 0.1,
-    "load_inertia_kg_m2": 0.1,
-    "spring_Nm_rad": 0.1,
-    "hub_damping_Nms": 0.3,
-    "link_damping_Nms": 0.3,
-    "torque_constant_Nm_A": 0.05,
-}
-
+MANUFACTURER = {stage: {name: row[stage - 1] for name, row in _STATED.items()} for stage in (1, 2)}
+TOLERANCES = {name: tolerance for name, (_, _, tolerance) in _STATED.items()}
 
 _P = EffectParameter
 EFFECTS = (

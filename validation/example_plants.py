@@ -25,24 +25,18 @@ from control_design.specification import Specification
 Scenario = Literal["A", "B", "C"]
 
 _DT_S = 0.005
-_NOMINAL = {
-    "gain": 1.0,
-    "slow_pole": 0.02,
-    "pole": 4.0,
-    "mode": 15.0,
-    "zeta": 0.015,
-    "zero_right": 10.8,
-    "zero_left": 11.5,
+# Nominal value, and relative standard deviation in scenario A.
+_PARAMETERS = {
+    "gain": (1.0, 0.03),
+    "slow_pole": (0.02, 0.15),
+    "pole": (4.0, 0.05),
+    "mode": (15.0, 0.006),
+    "zeta": (0.015, 0.10),
+    "zero_right": (10.8, 0.04),
+    "zero_left": (11.5, 0.05),
 }
-_SPREAD_A = {
-    "gain": 0.03,
-    "slow_pole": 0.15,
-    "pole": 0.05,
-    "mode": 0.006,
-    "zeta": 0.10,
-    "zero_right": 0.04,
-    "zero_left": 0.05,
-}
+_NOMINAL = {name: nominal for name, (nominal, _) in _PARAMETERS.items()}
+_SPREAD_A = {name: spread for name, (_, spread) in _PARAMETERS.items()}
 _SPREAD: dict[Scenario, dict[str, float]] = {
     "A": _SPREAD_A,
     "B": _SPREAD_A | {"gain": 0.15, "mode": 0.015},
