@@ -7,8 +7,6 @@ too (ARX thin, ARMAX thick, OE dash-dotted, as in the paper), so that a grey pri
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -42,55 +40,49 @@ _MEASURED = style.MEASURED_LINE | {"lw": 2.4, "alpha": 0.6}
 _COMMON_TURN_RAD_S = (0.5, 5.0)
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """One response (F,) with its line and its entry in the legend."""
-
-    label: str
-    response: ComplexArray
-    line: Mapping[str, Any]
+# Entry in the legend -> response (F,) and its line.
+Curves = dict[str, tuple[ComplexArray, dict[str, Any]]]
 
 
 def draw_simulation(results: PaperResults) -> Figure:
     """Fig. 2: the simulated plant, GOBF as we search, and GOBF as the paper searched."""
     shown = results.simulation
     omega = shown.omega_rad_s
-    curves = [
-        Curve("simulated plant", shown.truth, TRUTH_LINE),
-        Curve("GOBF, DIRECT alone in the raw box", results.recipe.frequency_response(omega), RECIPE_LINE),
-        Curve("GOBF, this project", shown.models["GOBF"].frequency_response(omega), METHOD_LINES["GOBF"]),
-    ]
+    ours = shown.models["GOBF"].frequency_response(omega)
+    curves: Curves = {
+        "simulated plant": (shown.truth, TRUTH_LINE),
+        "GOBF, DIRECT alone in the raw box": (results.recipe.frequency_response(omega), RECIPE_LINE),
+        "GOBF, this project": (ours, METHOD_LINES["GOBF"]),
+    }
     return _bode(shown, curves, "Simulation: plant and GOBF model of order 4")
 
 
 def draw_simulation_peers(results: PaperResults) -> Figure:
     """Fig. 3: the same plant with ARX, ARMAX and OE from the usual starts."""
     shown = results.simulation
-    curves = [Curve("simulated plant", shown.truth, TRUTH_LINE), *_methods(shown, METHODS[1:])]
+    curves = {"simulated plant": (shown.truth, TRUTH_LINE)} | _methods(shown, METHODS[1:])
     return _bode(shown, curves, "Simulation: plant and ARX, ARMAX, OE of order 4, usual starts")
 
 
 def draw_experiment(results: PaperResults) -> Figure:
     """Fig. 4: the nonlinear arm's models, and the linear arm for truth."""
     shown = results.experiment
-    curves = [Curve("true linear arm", shown.truth, TRUTH_LINE), *_methods(shown, METHODS)]
+    curves = {"true linear arm": (shown.truth, TRUTH_LINE)} | _methods(shown, METHODS)
     return _bode(shown, curves, "Experiment (nonlinear arm): models of order 4")
 
 
-def _methods(shown: Comparison, names: tuple[str, ...]) -> list[Curve]:
-    return [
-        Curve(name, shown.models[name].frequency_response(shown.omega_rad_s), METHOD_LINES[name])
-        for name in names
-    ]
+def _methods(shown: Comparison, names: tuple[str, ...]) -> Curves:
+    omega = shown.omega_rad_s
+    return {name: (shown.models[name].frequency_response(omega), METHOD_LINES[name]) for name in names}
 
 
 @style.finished
-def _bode(shown: Comparison, curves: list[Curve], title: str) -> Figure:
-    omega, reference = shown.omega_rad_s, curves[0].response
+def _bode(shown: Comparison, curves: Curves, title: str) -> Figure:
+    omega, (reference, _) = shown.omega_rad_s, next(iter(curves.values()))
     figure, (gain, phase) = style.panels(6.0, 2, 1, sharex=True, height_ratios=[1.25, 1.0])
-    for curve in curves:
-        gain.plot(omega, decibels(np.abs(curve.response)), **curve.line, label=curve.label)
-        phase.plot(omega, _phase(omega, curve.response, reference), **curve.line)
+    for label, (response, line) in curves.items():
+        gain.plot(omega, decibels(np.abs(response)), **line, label=label)
+        phase.plot(omega, _phase(omega, response, reference), **line)
     _frequency_axes(gain, phase, omega)
     gain.set(title=title, ylabel=f"gain [dB re 1 {shown.machine.gain_unit}]")
     phase.set_ylabel("phase [deg]")
