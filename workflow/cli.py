@@ -204,7 +204,8 @@ def excite(
 ) -> None:
     """Plan random-phase multisines that tell response, noise and nonlinear distortion apart."""
     from workflow.commands.excite import write_experiment
-    from workflow.tasks.experiment import Limits, rig_called
+    from workflow.config.rig_settings import rig_called
+    from workflow.tasks.experiment import Limits
 
     limits = Limits(
         band_Hz=band,

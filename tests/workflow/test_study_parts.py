@@ -191,8 +191,9 @@ def test_numbers_beyond_the_margins():
     peaks = SimpleNamespace(
         nominal_peak=1.4, measured=(SimpleNamespace(peak=1.42), SimpleNamespace(peak=1.1))
     )
-    row = SimpleNamespace(**_METRICS)
-    check = SimpleNamespace(settled_draws=1, draws=1, sensitivity=peaks, achieved=(row,))
+    check = SimpleNamespace(
+        settled_draws=1, draws=1, sensitivity=peaks, spread_of=lambda name: (0.0, 0.0, _METRICS[name])
+    )
     results = SimpleNamespace(
         design=design_of(0.88),
         achievable_performance=achievable(0.8),

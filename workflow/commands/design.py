@@ -55,9 +55,8 @@ def _design(
         if design.synthesis is None:
             return _Designed(replace(design, reason=f"specification not met: {design.reason}"), nothing)
         achievable = find_bracket(plants, specification, asked.achievable_performance)
-        if not design.has_controller:
+        if (controller := design.controller) is None:
             return _Designed(design, nothing, achievable)
-        controller = design.synthesis.controller
         certified = certify_asked(
             controller,
             plants,
@@ -108,14 +107,12 @@ def design_controller(
     with progress.stage("design") as update:
         done = _design(plants, specification, asked, seed, update)
     certificate, certified = done.certify.certificate, done.certify.certified
-    synthesis, order = done.design.synthesis, specification.controller_order
+    controller, order = done.design.controller, specification.controller_order
     files: list[Path] = []
-    if out is not None and synthesis is not None and certificate is not None:
+    if out is not None and controller is not None:
         found = done.reference_filter.filter
         known = "; ".join(dict.fromkeys(source.certified_for for source in sources_found))
-        files = write_controller(
-            out, synthesis.controller, found, certified=certified, about=known, dialect=dialect
-        )
+        files = write_controller(out, controller, found, certified=certified, about=known, dialect=dialect)
     gamma, advice = done.design.gamma, None
     if gamma is not None and gamma > 1:
         advice = said("order_advice", done.achievable, gamma, order) or None

@@ -13,13 +13,15 @@ from workflow.tasks.experiment import Limits, PlannedExperiment, plan_experiment
 PLAN_FILE, PAGE_FILE = "plan.json", "plan.html"
 
 
-def write_experiment(limits: Limits, out: Path, *, seed: int, **settings: object) -> list[Path]:
+def write_experiment(
+    limits: Limits, out: Path, *, seed: int, lead_in_s: float, **settings: object
+) -> list[Path]:
     """Plan an experiment within limits; one CSV (time_s, voltage_V) per record, the plan and its page.
 
-    settings: fields of `plant.ExperimentPlan` by name, and lead_in_s. Raises InputError.
+    settings: fields of `plant.ExperimentPlan` by name. Raises InputError.
     """
     RunDirectory(out).refuse_unless_free()
-    found = plan_experiment(limits, seed=seed, **settings)
+    found = plan_experiment(limits, seed=seed, lead_in_s=lead_in_s, **settings)
     # Here: these take seconds to load, and limits that are refused do not need them.
     from workflow.report.rendering import render_page
     from workflow.tasks.simulated_rig import INPUT_NAME

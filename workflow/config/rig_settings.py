@@ -30,6 +30,11 @@ def read_rig(path: Path) -> Rig:
         return Rig.from_document(content, str(path))
 
 
+def rig_called(name: str | Path) -> Rig:
+    """A preset by its name, or a rig file. Raises InputError."""
+    return PRESETS[str(name)]() if str(name) in PRESETS else read_rig(Path(name))
+
+
 def _choose_rig(value: Any, info: ValidationInfo) -> str | Path:
     """A preset's name, or a rig file that is there and can be read."""
     if not isinstance(value, (str, Path)):

@@ -166,7 +166,7 @@ class RunView:
         by_name = {item.name: item.record for item in self.results.records.records}
         friction = self.results.identify.friction if channel.uncertainty.friction_identified else None
         slug = re.sub(r"[^A-Za-z0-9]+", "-", found.name).strip("-").lower()[:24]
-        with_loop = index == self.config.control_index and self.results.design.has_controller
+        with_loop = index == self.config.control_index and self.results.design.controller is not None
         return ChannelView(
             found,
             self.results.uncertainty.channels[index],
@@ -285,14 +285,6 @@ class RunView:
         if loop is None or not loop.tracking:
             return 0.0
         return abs(loop.predicted.disturbance_left) / loop.reference_step
-
-    def spread_of(self, metric: str) -> tuple[float | None, float | None, float | None]:
-        """First, smallest and largest of a closed-loop metric over the runs; one that a run never reached
-        (None) is larger than every other."""
-        assert self.loop is not None
-        values = [getattr(row, metric) for row in self.loop.achieved]
-        known = [value for value in values if value is not None]
-        return values[0], min(known, default=None), max(known) if len(known) == len(values) else None
 
     @cached_property
     def loop_grid(self) -> Real:

@@ -102,16 +102,9 @@ def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None)
     check = results.closed_loop.check
     if check is not None:
         found["settled_draws"], found["draws"] = check.settled_draws, check.draws
-        for name in (
-            "settling_time_s",
-            "rise_time_s",
-            "overshoot_percent",
-            "peak_command",
-            "disturbance_peak",
-        ):
-            values = [getattr(row, name) for row in check.achieved]
-            # A run that never gets there has no time: neither has the point.
-            found[name] = None if None in values else max(values)
+        # A run that never gets there has no time: neither has the point.
+        worst = "settling_time_s", "rise_time_s", "overshoot_percent", "peak_command", "disturbance_peak"
+        found |= {name: check.spread_of(name)[-1] for name in worst}
         if check.sensitivity is not None:
             found["predicted_peak_sensitivity"] = check.sensitivity.nominal_peak
             found["measured_peak_sensitivity"] = check.sensitivity.measured[0].peak

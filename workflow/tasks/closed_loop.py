@@ -48,10 +48,9 @@ class Trial:
 def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
     """Prediction and machine on the same trial; Monte Carlo over noise and rig, or over drawn plants."""
     config, results = stage.config, stage.results
-    synthesis = results.design.synthesis
-    if synthesis is None or results.certify.certificate is None:
+    controller, options = results.design.controller, config.closed_loop
+    if controller is None:
         return ClosedLoopResult(skipped=results.certify.reason)
-    controller, options = synthesis.controller, config.closed_loop
     law = results.reference_filter.law(controller)
     with naming("closed loop"):
         radius = float(np.max(np.abs(closed_loop_poles(controller, stage.plant))))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +13,6 @@ from plant.excitation import crest_factor
 from plant.experiment_plan import ExperimentPlan
 from plant.modal import linear_arm
 from plant.rig import Rig
-from workflow.config.rig_settings import PRESETS, read_rig
 from workflow.engine.errors import InputError
 
 Real = npt.NDArray[np.float64]
@@ -105,11 +103,6 @@ class PlannedExperiment:
         return tuple(self.plan.radius(rms, self.limits.dt_s, noise) for rms in self.plan.rms_V)
 
 
-def rig_called(name: str) -> Rig:
-    """A preset by its name, or a rig file. Raises InputError."""
-    return PRESETS[name]() if name in PRESETS else read_rig(Path(name))
-
-
 def motion_of(limits: Limits) -> Callable[[Real], Real] | None:
     """Hub angle (T,) [rad] from rest under a voltage (T,): that of the linear rig, or of an integrator."""
     rig, gain = limits.rig, limits.gain_rad_per_Vs
@@ -123,7 +116,9 @@ def motion_of(limits: Limits) -> Callable[[Real], Real] | None:
     return None
 
 
-def plan_experiment(limits: Limits, *, seed: int, **settings: object) -> PlannedExperiment:
+def plan_experiment(
+    limits: Limits, *, seed: int, lead_in_s: float = 1.0, **settings: object
+) -> PlannedExperiment:
     """The longest periods and largest voltages that the limits allow; settings: fields of the plan by name.
 
     Raises InputError (one line) where no experiment stays within them.
@@ -134,7 +129,6 @@ def plan_experiment(limits: Limits, *, seed: int, **settings: object) -> Planned
     motion = motion_of(limits)
     if limits.angle_deg is not None and motion is None:
         raise InputError("angle_deg is a limit of the motion: give a rig or gain_rad_per_Vs to predict it")
-    lead_in_s = settings.pop("lead_in_s", 1.0)
     if limits.rms_V:
         settings["rms_V"] = limits.rms_V
     try:
@@ -142,7 +136,7 @@ def plan_experiment(limits: Limits, *, seed: int, **settings: object) -> Planned
             band_Hz=limits.band_Hz,
             dt_s=limits.dt_s,
             duration_s=limits.duration_s,
-            lead_in_s=float(str(lead_in_s)),
+            lead_in_s=lead_in_s,
             lines_seed=seed,
             **settings,
         )

@@ -172,14 +172,12 @@ def _dialect(run: RunDirectory, stated: Mapping[str, Any]) -> Dialect:
 
 def _keep_controller(results: RunResults, config: RunConfig, dialect: Dialect) -> None:
     """controller.json, .c and .h in the run directory; none of an earlier design stay."""
-    design, certify = results.design, results.certify
     written: list[Path] = []
-    if design.synthesis is not None and certify.certificate is not None:
-        second = results.reference_filter
-        law = second.law(design.synthesis.controller)
-        about = certified_for(results, config)
+    if (controller := results.design.controller) is not None:
+        second, certified = results.reference_filter, results.certify.certified
+        law, about = second.law(controller), certified_for(results, config)
         written = write_controller(
-            results.run.path, law, second.filter, certified=certify.certified, about=about, dialect=dialect
+            results.run.path, law, second.filter, certified=certified, about=about, dialect=dialect
         )
     for name in CONTROLLER_FILES:
         if results.run.path / name not in written:

@@ -329,9 +329,10 @@ class DesignResult:
         return None if self.synthesis is None else self.synthesis.gamma
 
     @property
-    def has_controller(self) -> bool:
-        """Whether there is a controller that means something."""
-        return self.synthesis is not None and self.synthesis.outcome is not Outcome.NOT_CONVERGED
+    def controller(self) -> Controller | None:
+        """Where there is one that means something."""
+        found = self.synthesis
+        return None if found is None or found.outcome is Outcome.NOT_CONVERGED else found.controller
 
 
 @dataclass(frozen=True, eq=False)
@@ -558,6 +559,12 @@ class LoopCheck:
     @property
     def settled_draws(self) -> int:
         return sum(row.settled for row in self.achieved)
+
+    def spread_of(self, metric: str) -> tuple[float | None, float | None, float | None]:
+        """First, smallest and largest of a metric over the runs; None (never reached) is larger than all."""
+        values = [getattr(row, metric) for row in self.achieved]
+        known = [value for value in values if value is not None]
+        return values[0], min(known, default=None), max(known) if len(known) == len(values) else None
 
 
 @dataclass(frozen=True, eq=False)

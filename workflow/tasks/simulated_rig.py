@@ -18,7 +18,7 @@ from plant.effects import make_machine, parse_effects
 from plant.modal import default_n_modes, equations_of_motion
 from plant.rig import Rig
 from plant.simulation import SampledArm, simulate
-from workflow.config.rig_settings import PRESETS, read_rig
+from workflow.config.rig_settings import rig_called
 from workflow.config.run_config import ClosedLoopOptions, RunConfig, SimulatedRecord, SimulatedSource
 from workflow.config.settings import Section, check
 from workflow.engine import documents
@@ -32,10 +32,8 @@ UNITS = {"voltage_V": "V", "hub_angle_rad": "rad", "tip_m": "m"}
 
 
 def rig_of(source: SimulatedSource) -> Rig:
-    """The nominal rig. Raises ValueError (one line) or OSError for a rig file that cannot be read."""
-    if isinstance(source.rig, str) and source.rig in PRESETS:
-        return PRESETS[source.rig]()
-    return read_rig(Path(source.rig))
+    """The nominal rig. Raises InputError for a rig file that cannot be read."""
+    return rig_called(source.rig)
 
 
 def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) -> Record:

@@ -56,42 +56,42 @@ def find_achievable(stage: StageInput) -> AchievablePerformance:
 def certify_controller(stage: StageInput) -> CertifyResult:
     """The controller checked independently of the optimiser that made it, or why there is none."""
     design, config = stage.results.design, stage.config
-    if design.synthesis is None or not design.has_controller:
+    law, rng = design.controller, stage.rng("certify")
+    if law is None:
         return CertifyResult(None, certified=False, reason=design.reason)
-    law, rng = design.synthesis.controller, stage.rng("certify")
     with naming("certify"):
         return certify_asked(law, [stage.plant], config.specification, config.certificate, rng)
 
 
 def design_filter(stage: StageInput) -> ReferenceFilterResult:
     """Filter and friction feed-forward, where asked for; nothing where no controller is there."""
-    settings, synthesis = stage.config.reference_filter, stage.results.design.synthesis
-    if synthesis is None or stage.results.certify.certificate is None:
+    settings, law = stage.config.reference_filter, stage.results.design.controller
+    if law is None:
         return ReferenceFilterResult(reason=None if settings is None else said("no_filter"))
     with naming("reference filter"):
-        found = find_filter(synthesis.controller, [stage.plant], settings)
+        found = find_filter(law, [stage.plant], settings)
     friction = stage.results.identify.friction
     if stage.config.closed_loop.friction_feedforward and friction is not None:
-        found = replace(found, feedforward=friction_feedforward(synthesis.controller, friction))
+        found = replace(found, feedforward=friction_feedforward(law, friction))
     return found
 
 
 def find_amplitude_cost(stage: StageInput) -> AmplitudeCost:
     """A design for the arm behind its friction, certified there and over the amplitudes; empty where none are
     promised, or the run itself has no controller."""
-    config, own = stage.config, stage.results.design
-    if not config.control_channel.uncertainty.about_amplitudes or not own.has_controller:
+    config, own = stage.config, stage.results.design.controller
+    if not config.control_channel.uncertainty.about_amplitudes or own is None:
         return AmplitudeCost()
     asked, tell = config.specification, partial(stage.progress.update, "amplitude_cost")
     linear = stage.results.uncertainty.plant(config, behind_friction=True)
     with naming("amplitude cost"):
         # From the starts of the run's own design: what differs is the plant.
         design = find_design([linear], asked, config.synthesis, config.certificate, stage.rng("design"), tell)
-        if own.synthesis is None or design.synthesis is None or not design.has_controller:
+        law = design.controller
+        if law is None:
             return AmplitudeCost(design)
-        law = design.synthesis.controller
         behind, carried_over = (certify(law, [plant], asked) for plant in (linear, stage.plant))
-    left = _left_by_unit(own.synthesis.controller, stage.plant), _left_by_unit(law, linear)
+    left = _left_by_unit(own, stage.plant), _left_by_unit(law, linear)
     return AmplitudeCost(design, behind, carried_over, left)
 
 

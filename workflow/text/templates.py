@@ -6,10 +6,8 @@ import contextlib
 import hashlib
 import importlib.util
 import marshal
-import os
 import re
 import sys
-import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path
@@ -142,15 +140,7 @@ class CompiledTemplates(BytecodeCache):
         path, code = _file(bucket), marshal.dumps(bucket.code)
         with contextlib.suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
-            # Several processes may write at once: each its own file, and the last one stays.
-            handle, part = tempfile.mkstemp(dir=path.parent, suffix=".part")
-            try:
-                with os.fdopen(handle, "wb") as file:
-                    file.write(self._digest(bucket, code) + code)
-                os.replace(part, path)
-            except BaseException:
-                Path(part).unlink(missing_ok=True)
-                raise
+            path.write_bytes(self._digest(bucket, code) + code)  # half of it would not count
 
     def _digest(self, bucket: Bucket, code: bytes) -> bytes:
         return hashlib.sha256(f"{self._made_by} {bucket.checksum}".encode() + code).digest()
