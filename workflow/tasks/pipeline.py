@@ -19,7 +19,7 @@ from workflow.engine.errors import CommandInterruptedError, InputError, naming, 
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import CONTROLLER_FILES, LAYOUT_VERSION, RunDirectory, hash_of
 from workflow.tasks.exports import write_controller
-from workflow.tasks.results import RecordsResult, RunResults
+from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage, StageInput
 from workflow.tasks.stages import STAGES
 from workflow.tasks.summary import RunSummary, summarise
@@ -51,17 +51,15 @@ def run_pipeline(
     """
     progress = progress or Progress()
     run = RunDirectory(Path(out))
-    existed, results = run.path.exists(), RunResults(run)
+    existed, given = run.path.exists(), StageInput(config, RunResults(run), progress, called)
     run.refuse_unless_free(resume=resume, replace=replace)
     inputs = {str(path): storage.sha256_of_file(path) for path in config.input_files}
     # Records are read before anything is written: a bad log leaves no directory behind.
-    first = STAGES[0]
-    started = time.monotonic()
-    ready: RecordsResult | None = None
+    ready: tuple[Any, float] | None = None
     if not (resume and existed):
+        started = time.monotonic()
         with threadpool_limits(1):
-            ready = first.run(StageInput(config, results, progress, called))
-    ready_s = time.monotonic() - started
+            ready = STAGES[0].run(given), time.monotonic() - started
     # More threads round otherwise.
     with run.writing(resume=resume, replace=replace), threadpool_limits(1):
         RunDirectory.begin(
@@ -79,10 +77,9 @@ def run_pipeline(
         progress.plan([(stage.name, stage.expected_s) for stage in stages])
         try:
             for stage in stages:
-                before = (ready, ready_s) if stage is first else None
-                _perform(stage, config, results, progress, inputs, before)
-            _keep_controller(results, config, dialect)
-            summary = summarise(results, config)
+                _perform(stage, given, inputs, ready if stage is STAGES[0] else None)
+            _keep_controller(given.results, config, dialect)
+            summary = summarise(given.results, config)
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt) or interrupts.came():  # a library may make anything of it
                 with suppress(InputError):  # a full disk, a directory that is gone
@@ -96,13 +93,11 @@ def run_pipeline(
 
 def rebuild_page(run: RunDirectory, page: Stage, progress: Progress | None = None) -> RunSummary:
     """Perform the last stage anew on a finished run. Raises InputError when a stage is missing."""
-    config = config_of(run)
-    results = RunResults(run)
-    progress = progress or Progress()
-    progress.plan([(page.name, page.expected_s)])
+    given = StageInput(config_of(run), RunResults(run), progress or Progress())
+    given.progress.plan([(page.name, page.expected_s)])
     with run.locked():
-        _perform(page, config, results, progress, {}, None, always=True)
-    return summarise(results, config)
+        _perform(page, given, {}, always=True)
+    return summarise(given.results, given.config)
 
 
 def certified_for(results: RunResults, config: RunConfig) -> str:
@@ -119,29 +114,26 @@ def config_of(run: RunDirectory) -> RunConfig:
 
 def _perform(
     stage: Stage,
-    config: RunConfig,
-    results: RunResults,
-    progress: Progress,
+    given: StageInput,
     inputs: Mapping[str, str],
-    ready: tuple[RecordsResult | None, float] | None,
+    ready: tuple[Any, float] | None = None,
     *,
     always: bool = False,
 ) -> None:
-    run = results.run
-    input_hash = stage_input_hash(stage, config, run, inputs)
+    """ready: its result where that is known already, and the seconds it took."""
+    run, progress = given.results.run, given.progress
+    input_hash = stage_input_hash(stage, given.config, run, inputs)
     progress.start(stage.name)
     there = run.is_done(stage.name, input_hash) and all(p.is_file() for p in stage.also_writes(run))
     if there and not always:
         progress.finish(stage.name, 0.0, taken_up=True)
         return
     started = time.monotonic()
-    result, before_s = ready if ready is not None else (None, 0.0)
-    if result is None:
-        result = stage.run(StageInput(config, results, progress))
+    result, before_s = ready or (stage.run(given), 0.0)
     interrupts.check()
     run.save_stage(stage.name, result, input_hash)
     # The stages after it see what is on the disk, as they would in a resumed run: to the last digit.
-    results.read.pop(stage.name, None)
+    given.results.read.pop(stage.name, None)
     seconds = time.monotonic() - started + before_s
     run.record_stage(stage.name, seconds, input_hash)
     progress.finish(stage.name, seconds, taken_up=False)
