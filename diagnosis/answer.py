@@ -59,6 +59,7 @@ class Shares:
     small : effects in the repaired model that carry less than what interests.
     closes : (effects, share of the gap closed by them alone), most first; also where the answer is unknown.
     not_tried : what a time limit left out.
+    silent : effects of the answer that do nothing in the held-out records.
     at_inputs : the share that interests is one of the inputs, whatever the machine makes of it; shares are of
         the motion without what a bias of that size lets drift.
     horizon_samples : length of windows, each from the state that fits it best (`imperfect.horizon`), and
@@ -74,6 +75,7 @@ class Shares:
     small: tuple[str, ...]
     closes: tuple[tuple[tuple[str, ...], float], ...]
     not_tried: tuple[str, ...]
+    silent: tuple[str, ...] = ()
     at_inputs: bool = False
     horizon_samples: int = 0
     horizon_before: tuple[float, ...] = ()

@@ -12,7 +12,7 @@ import numpy as np
 from diagnosis.answer import Shares
 from diagnosis.imperfect.horizon import horizon_samples, shares_over_horizon
 from diagnosis.imperfect.search import Explanation, Search
-from diagnosis.imperfect.verdict import Verdict
+from diagnosis.imperfect.verdict import Verdict, is_silent
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.rounding import rounding_effect
 
@@ -60,6 +60,7 @@ def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.ran
         small=tuple(name for name in names if name not in found.accepted),
         closes=tuple((key, c) for c, key in told),
         not_tried=tuple(search.left_out),
+        silent=tuple(name for name in fitted if is_silent(search, accepted, name)),
         at_inputs=search.at_inputs,
         **_over_horizon(search, accepted),
     )

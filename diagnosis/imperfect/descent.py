@@ -304,16 +304,20 @@ def follow(records: Records, around: Descent, e: Real, start: Start) -> tuple[fl
 
 
 def occam(records: Records, end: Descent) -> float:
-    """log of the prior density of the effects' coordinates times the volume that the records leave them."""
-    equations = end.equations(records)
+    """log of the prior density of the effects' coordinates times the volume that the records leave them and
+    the deviations, whatever the starts and zeros are.
+
+    Those have no volume here: their spread only says that a record may begin anywhere, and a model is not
+    less likely because its motion feels more of how it began.
+    """
     # What the records say nothing about keeps the width of its range.
     low, high = box(end.candidates)
     width = np.where(np.isfinite(high - low), high - low, 2 * np.pi)
-    hessian, P = equations.hessian.copy(), end.deviations.size
+    precision, P = end.precision(records), end.deviations.size
     rows = range(P, P + width.size)
-    hessian[rows, rows] += 12 / width**2
-    scale = np.sqrt(np.diag(hessian) + 1e-12)
-    scaled = hessian / np.outer(scale, scale) + 1e-10 * np.eye(scale.size)
+    precision[rows, rows] += 12 / width**2
+    scale = np.sqrt(np.diag(precision) + 1e-12)
+    scaled = precision / np.outer(scale, scale) + 1e-10 * np.eye(scale.size)
     logdet = np.linalg.slogdet(scaled)[1] + 2 * float(np.sum(np.log(scale)))
     density = sum(c.log_density(end.coordinates_of(k)) for k, c in enumerate(end.candidates))
     return float(density - 0.5 * logdet + 0.5 * end.coordinates.size * np.log(2 * np.pi))

@@ -359,6 +359,21 @@ class Search:
             within = self.without(within, k)
         return max((e for e in self.found if e.key == key), key=lambda e: e.evidence)
 
+    def acts_on_held_out(self, explanation: Explanation, k: int) -> float:
+        """Share of the motion that the k-th effect changes of held-out records, all else as it is; of the
+        output that shows most of it."""
+        end, held = explanation.end, self.held_out
+        rest = [effect for j, effect in enumerate(end.effects) if j != k]
+        start = self._beginning(held, end.start)
+        pairs = zip(
+            held.residuals(end.deviations, end.effects, start),
+            held.residuals(end.deviations, rest, start),
+            strict=True,
+        )
+        motion = held.levels.motion.reshape(-1, self.case.noise.size).sum(axis=0)
+        changed = sum(np.sum((with_it - without) ** 2, axis=0) for with_it, without in pairs)
+        return float(np.sqrt(np.max(changed / motion)))
+
     def finished(self, explanation: Explanation) -> Explanation:
         """Descended to its end."""
         end = explanation.end
@@ -404,12 +419,16 @@ class Search:
             np.array([records.shares(left), held.shares(left_held_out)]),
         )
 
+    def _beginning(self, held: Records, fitted: Start) -> Start:
+        """Starts of records as their first samples say, sensors at the zeros that others have."""
+        start = held.at_rest()
+        if not start.zeros.size:
+            return start
+        return start.with_zeros(fitted.zeros, self.case.machine.unknown_start.state_per_zero)
+
     def _started(self, held: Records, d: Real, effects: Sequence[Any], fitted: Start) -> tuple[Start, Real]:
         """Records from states that fit them best, everything else as fitted: start, coefficients."""
-        start = held.at_rest()
-        if start.zeros.size:
-            per_zero = self.case.machine.unknown_start.state_per_zero
-            start = start.with_zeros(fitted.zeros, per_zero)
+        start = self._beginning(held, fitted)
         e = held.coefficients(d, effects, start)
         if not start.states.shape[1]:
             return start, e

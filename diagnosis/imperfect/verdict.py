@@ -32,6 +32,8 @@ _PRIOR_COUNT = (0.2, 0.35, 0.3, 0.1, 0.035, 0.015)
 # the model error allows, and the limit of these is higher. Nor is it a measure what a drift makes of them in
 # the records they were fitted to: they must carry as much of held-out ones.
 _INTERESTS, _INTERESTS_EVERYWHERE, _INTERESTS_WIDTH = 0.75, 1.12, 0.06
+# Held-out records of which an effect changes less than this (model errors) say nothing about it.
+_SILENT = 0.25
 # A wrong stated value interests from this many tolerances on.
 _FAR_OFF, _FAR_OFF_WIDTH = 4.4, 0.06
 # What a complete answer leaves, and what an unknown cause does: medians in model errors, widths (logarithms
@@ -52,7 +54,8 @@ class Part:
     """What one effect of a set carries: share of the motion, probability that it matters.
 
     share : geometric mean of what it carries on estimation and on held-out records. An effect that is real
-        carries something of both. Of effects that every machine has some of, no more than on the latter.
+        carries something of both, but where it does nothing in the latter. Of effects that every machine has
+        some of, no more than on the latter.
     """
 
     name: str
@@ -126,8 +129,10 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
         if len(search.found) == known:
             break
     weighing = search.case.machine.weighing
-    # What effects too small to interest carry together is measured as each of them is.
-    alike = float(np.sqrt(np.prod(np.max(search.base.shares, axis=1))))
+    # What effects too small to interest carry together is measured as each of them is; held-out records have
+    # a veto.
+    most = np.max(search.base.shares, axis=1)
+    alike = max(float(np.sqrt(np.prod(most))), float(most[1]))
     none_enough = _enough(alike, weighing.model_error) if weighing.stated else 0.0
     probabilities = _probabilities(sets, listed, none_enough)
     rounding, beside = rounding_effect(search.case), dict[str, float]()
@@ -258,18 +263,28 @@ def _part(
 ) -> Part:
     """What an effect carries within a set, or within the larger one in which it was seen before; rest: the
     set without it."""
+    k, model_error = explanation.names.index(name), search.case.machine.weighing.model_error
     share, limit = share_beside(rest, explanation), _INTERESTS
-    if explanation.end.candidates[explanation.names.index(name)].kind.everywhere:
-        share, limit = min(share, float(_carried(rest, explanation)[1])), _INTERESTS_EVERYWHERE
+    estimated, held_out = map(float, _carried(rest, explanation))
+    if explanation.end.candidates[k].kind.everywhere:
+        share, limit = min(share, held_out), _INTERESTS_EVERYWHERE
+    elif share < limit * model_error < estimated and is_silent(search, explanation, name):
+        share = estimated
     share = max(share, seen.share if seen else 0.0)
-    matters = _soft(share / limit / search.case.machine.weighing.model_error, _INTERESTS_WIDTH)
-    off = _tolerances_off(search, explanation, explanation.names.index(name))
+    matters = _soft(share / limit / model_error, _INTERESTS_WIDTH)
+    off = _tolerances_off(search, explanation, k)
     if off is not None:
         # A stated value in itself: what it changes may be imitated by the others within their tolerances. Far
         # off is not enough: of a value that nobody stated anything is.
         preferred = float(expit(_gain(explanation, listed) - _gain(rest, listed)))
         matters = max(matters, preferred * _soft(off / _FAR_OFF, _FAR_OFF_WIDTH))
     return Part(name, share, matters)
+
+
+def is_silent(search: Search, explanation: Explanation, name: str) -> bool:
+    """Whether held-out records say nothing about an effect: it does nothing there."""
+    acts = search.acts_on_held_out(explanation, explanation.names.index(name))
+    return acts < _SILENT * search.case.machine.weighing.model_error
 
 
 def share_beside(rest: Explanation, explanation: Explanation) -> float:

@@ -21,7 +21,7 @@ from diagnosis import (
 )
 from diagnosis.evidence.look_alikes import look_alike
 from diagnosis.imperfect.carried import shares_of
-from diagnosis.imperfect.descent import Descent, best_move, descend, refined, scanned
+from diagnosis.imperfect.descent import Descent, best_move, descend, occam, refined, scanned
 from diagnosis.imperfect.levels import Levels, coefficients
 from diagnosis.imperfect.records import Records, Start, StartColumns
 from diagnosis.imperfect.search import Explanation, Search
@@ -341,6 +341,41 @@ def test_small_effects_are_nothing_together_where_each_is_nothing():
     assert found.probabilities.cause["unknown"] < 0.5
 
 
+def test_held_out_records_veto_that_nothing_is_missing():
+    left_over = _judged({(): (0.0, 0.02, 0.12)})
+    assert left_over.answer == "unknown"
+    assert _judged({(): (0.0, 0.03, 0.03)}).answer == "none"
+
+
+@pytest.mark.parametrize(("acts", "answer"), [(0.0, "actuator_saturation"), (0.3, "none")])
+def test_held_out_records_that_an_effect_does_nothing_in_say_nothing_about_it(acts, answer):
+    # Commands of the held-out record stay below the limit: it explains and contradicts nothing there.
+    sets = {(): (0.0, 0.2, 0.03), ("actuator_saturation",): (400.0, 0.03, 0.03)}
+    found = _judged(sets, acts=acts)
+    assert found.answer == answer
+
+
+def test_what_an_effect_does_in_held_out_records():
+    rng = np.random.default_rng(16)
+    arm, weak, strong = _case(rng).machine, rng.choice([-1.0, 1.0], 40).repeat(15), 3.0
+    cut = parse_effect({"name": "actuator_saturation", "limit_V": 1.5})
+    acts = []
+    for size in (1.0, strong):
+        records = tuple(
+            _experiment(name, role, arm.simulator((cut,))(volts[:, None]), volts)
+            for name, role, volts in (("a", "estimation", strong * weak), ("b", "held_out", size * weak))
+        )
+        search = Search(Case("cut off", RIG, records, 0.05), lambda share, words: None)
+        (candidate,) = [
+            c for c in search.case.machine.candidates(records) if c.effect == "actuator_saturation"
+        ]
+        x, nothing = np.array([candidate.axes[0].coordinate(1.5)]), np.zeros(0)
+        end = descend(search.records, (candidate,), nothing, x, search.records.at_rest())
+        acts.append(search.acts_on_held_out(search.add(end), 0))
+    assert acts[0] == 0.0
+    assert acts[1] > 0.5
+
+
 def test_a_value_that_nobody_stated_is_not_named_for_being_far_off():
     # No tolerance: any delay is far off, and this one explains next to nothing.
     found = _judged({(): (0.0, 0.02, 0.02), ("input_delay",): (12.0, 0.0199, 0.0199)})
@@ -448,9 +483,10 @@ def test_far_values_are_scanned_where_contacts_switch():
     assert (stiffness, gap) == pytest.approx((40.0, 0.1), rel=0.03)
 
 
-def _judged(sets, step_m=0.0):
+def _judged(sets, step_m=0.0, acts=1.0):
     """The verdict on sets of effects by what they gain and leave: (log likelihood, shares of the motion left
-    of estimation and of held-out records); step_m: of the tip's values."""
+    of estimation and of held-out records); step_m: of the tip's values; acts: share of the motion that each
+    effect changes of held-out records."""
     rng = np.random.default_rng(9)
     records = []
     for name, role in {"a": "estimation", "b": "held_out"}.items():
@@ -482,6 +518,7 @@ def _judged(sets, step_m=0.0):
         held_out=Records(case, case.held_out),
         without=lambda whole, k: found[frozenset(whole.names) - {whole.names[k]}],
         simpler=lambda explanation: None,
+        acts_on_held_out=lambda whole, k: acts,
     )
     return judged(search, case.machine.weighing.listed)
 
@@ -554,3 +591,14 @@ def test_precision_of_parameters_whatever_the_starts_are():
     shared = replace(end, jacobian=np.column_stack([end.columns.zeros, end.left]))
     whole = np.linalg.inv(shared.equations(records).hessian)
     np.testing.assert_allclose(np.linalg.inv(shared.precision(records)), whole[:2, :2], rtol=1e-5)
+
+
+def test_how_much_is_felt_of_the_start_says_nothing_about_a_set():
+    driven = [replace(e, voltage_V=np.ones(400)) for e in _case(np.random.default_rng(17)).experiments]
+    case = Case("walk", RIG, tuple(driven), 0.05)
+    records = Records(case, case.estimation)
+    (friction,) = [c for c in case.machine.candidates(case.experiments) if c.effect == "coulomb_friction"]
+    end = descend(records, (friction,), np.zeros(0), np.log([0.05]), records.at_rest(), iterations=2)
+    felt = StartColumns(end.columns.zeros, tuple(3 * own for own in end.columns.states), end.columns.per_zero)
+    # The volume of twelve further unknowns would be twelve times log 3.
+    assert occam(records, replace(end, columns=felt)) == pytest.approx(occam(records, end), abs=0.5)
