@@ -1,10 +1,10 @@
-"""Words of a figure stand where nothing else is."""
+"""Panels and words stand where matplotlib's own constrained layout has them."""
 
 import numpy as np
 import pytest
 
 from workflow.figures import style
-from workflow.figures.style import lay_out, titles
+from workflow.figures.layout import lay_out, titles
 
 
 def panels_with_everything(scale=1.0):
@@ -23,6 +23,19 @@ def panels_with_everything(scale=1.0):
         style.hertz_axis(grid[0, 0])
         style.finish(figure)
     return figure
+
+
+def positions(figure):
+    return np.array([axes.get_position(original=True).extents for axes in figure.axes])
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-7, 3e6])
+def test_panels_stand_where_the_constrained_layout_has_them(scale):
+    ours, theirs = panels_with_everything(scale), panels_with_everything(scale)
+    with style.house_style():
+        lay_out(ours)
+        theirs.get_layout_engine().execute(theirs)
+    np.testing.assert_allclose(positions(ours), positions(theirs), atol=2e-3)
 
 
 def test_labels_of_a_column_stand_under_each_other_and_beside_their_numbers():

@@ -11,7 +11,7 @@ import importlib
 import io
 import pkgutil
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, wraps
 from typing import Any, Literal, TypeVar, cast
@@ -24,11 +24,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
-from matplotlib.text import Text
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
-from matplotlib.transforms import Bbox, ScaledTranslation
+from matplotlib.transforms import ScaledTranslation
 
 from workflow.engine import interrupts
+from workflow.figures.layout import lay_out, titles
 from workflow.figures.reading import POINT, draw_minor_ticks, marked, take_minor_ticks
 
 MEASURED = "#6b6b6b"  # what sensors said
@@ -174,26 +174,6 @@ def render(figure: Figure, also: Iterable[str] = ()) -> Picture:
         return Picture("svg", svg, plot, files) if small else Picture("png", png, plot, files)
 
 
-def lay_out(figure: Figure) -> list[tuple[float, float]]:
-    """Place the panels of a figure once and for all, labels of a column under each other.
-
-    Returned: from where to where each panel reaches with its words, in pixels. Positions are on a grid of
-    1e-5 of the figure: the solver's last bits depend on where its objects lie in memory, and clip paths are
-    named after them.
-    """
-    engine = figure.get_layout_engine()
-    figure.set_layout_engine("none")
-    figure.align_ylabels()
-    if engine is not None:
-        # Drawing everything, as draw_without_rendering does, would take as long again.
-        engine.execute(figure)
-        for axes in figure.axes:
-            axes.set_position(Bbox(np.round(axes.get_position(original=True).get_points(), 5)))
-    shown = [axes for axes in figure.axes if axes.get_visible()]
-    boxes = [axes.get_tightbbox() or axes.bbox for axes in shown]
-    return [(box.x0, box.x1) for box in boxes]
-
-
 def _saved(figure: Figure, kind: str) -> bytes:
     buffer = io.BytesIO()
     dated = ("Software",) if kind == "png" else ("Creator", "Producer", "CreationDate")
@@ -298,12 +278,6 @@ def drawings() -> Mapping[str, Drawing]:
     for module in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f"workflow.figures.{module.name}")
     return _DRAWINGS
-
-
-def titles(axes: Axes) -> Iterator[Text]:
-    """Its title, wherever it stands."""
-    words = (it for it in axes.get_children() if isinstance(it, Text) and it not in axes.texts)
-    return (it for it in words if it.get_text())
 
 
 _SECOND_AXIS_PT, _POWER_PT = 27.4, 12.0  # from the panel's edge to above ticks, numbers and words
