@@ -339,24 +339,26 @@ def test_a_strong_line_meets_more_friction_in_the_response_too(
     assert 1.7 < values[strong] / np.mean(values[[strong - 1, strong + 1]]) < 1.95
 
 
-def test_what_no_poles_follow_of_strong_lines_is_small_beside_the_ellipses(
-    rubbing: tuple[float, list[Record], FrictionFit],
-) -> None:
+def test_what_no_poles_follow_of_strong_lines_is_small_beside_the_ellipses() -> None:
     """N that falls with frequency and has no phase: the formula of the best linear approximation itself, on
-    the centre of the arm."""
-    _, records, found = rubbing
-    behind = without_friction(records, found)
+    the centre of the arm. Of several records: what modes may be missed is drawn and differs with rounding."""
     omega, n = np.geomspace(1.0, 100.0, 80), 0.04
     stronger = 0.03 / (1 + (omega / 10) ** 2)
     mean = np.array([[n, 0.0, 0.0, 0.0, 0.0]])
-    equivalent = EquivalentFriction(
-        found, np.ones(1), omega, stronger[None], mean, np.zeros((1, 5)), np.zeros((1, 5, 5))
-    )
-    posterior, _ = at_amplitudes(behind, equivalent, np.random.default_rng(1))
-    met = n * (1 + stronger) * 1j * omega * behind.shaft.centre(omega)
-    off = np.abs(posterior.centre(omega) - behind.response.centre(omega) / (1 + met))
-    # Errors weighed half relative to the response itself leave 0.2.
-    assert np.max(off / posterior.at(omega).enclosing_radius()) < 1 / 6
+    largest = []
+    for seed in (2, 3, 4):
+        records = recorded(0.1, seed)
+        found = fit_friction(records, OPTIONS)
+        behind = without_friction(records, found)
+        equivalent = EquivalentFriction(
+            found, np.ones(1), omega, stronger[None], mean, np.zeros((1, 5)), np.zeros((1, 5, 5))
+        )
+        posterior, _ = at_amplitudes(behind, equivalent, np.random.default_rng(1))
+        met = n * (1 + stronger) * 1j * omega * behind.shaft.centre(omega)
+        off = np.abs(posterior.centre(omega) - behind.response.centre(omega) / (1 + met))
+        largest.append(np.max(off / posterior.at(omega).enclosing_radius()))
+    # 0.14; errors weighed half relative to the response itself leave 0.19.
+    assert np.median(largest) < 1 / 6
 
 
 def test_modes_narrower_than_the_grid_stay_what_they_are(
