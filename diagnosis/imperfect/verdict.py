@@ -266,7 +266,9 @@ def _part(
     k, model_error = explanation.names.index(name), search.case.machine.weighing.model_error
     share, limit = share_beside(rest, explanation), _INTERESTS
     estimated, held_out = map(float, _carried(rest, explanation))
-    if explanation.end.candidates[k].kind.everywhere:
+    # What looks like a tilt is judged as a tilt: some of either is everywhere.
+    alike = _LISTED_AS.get(name)
+    if (EFFECTS[alike] if alike else explanation.end.candidates[k].kind).everywhere:
         share, limit = min(share, held_out), _INTERESTS_EVERYWHERE
     elif share < limit * model_error < estimated and is_silent(search, explanation, name):
         share = estimated
@@ -368,7 +370,7 @@ def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: f
             for part in parts:
                 share *= part.matters if part in chosen else 1 - part.matters
             if not chosen:
-                enough = none_enough / (1.0 if parts else one.complete)
+                enough = none_enough / (1.0 if one.explanation.names else one.complete)
                 give([parts[0].name if parts and none_enough > 0 else "unknown"], share * (1 - enough))
                 share *= enough
             give([part.name for part in chosen], share)

@@ -402,6 +402,12 @@ def test_a_look_alike_leaves_no_more_of_held_out_records_than_what_it_looks_like
     assert [one.explanation.names for one in found.judged] == [("gravity",)]
 
 
+def test_a_look_alike_of_what_every_machine_has_must_carry_as_much():
+    # A tilt of the background: a spring to ground explains it, and is no cause beyond the list for that.
+    assert _judged({(): (0.0, 0.105, 0.05), ("ground_spring",): (400.0, 0.01, 0.01)}).answer == "none"
+    assert _judged({(): (0.0, 0.105, 0.08), ("ground_spring",): (400.0, 0.01, 0.01)}).answer == "unknown"
+
+
 @pytest.mark.parametrize(("cause", "sure"), [("hub_inertia", 0.75), ("link_stiffness", 1.0)])
 def test_what_an_unlisted_cause_acts_like_is_less_sure(cause, sure):
     # A body that a spring holds to the hub is the hub's inertia below its resonance, and not on the list.
