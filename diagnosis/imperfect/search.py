@@ -254,8 +254,9 @@ class Search:
         for candidate, point in trials:
             pulled = candidate.kind.multiplies is not None and np.any(np.abs(parent.deviations) > _PULLED)
             if len(chosen) < most or pulled:
-                # Beside contacts that switch the one side may look better and the other be so.
-                side = candidate.axes[0].low if parent.non_smooth else 0.0
+                # Beside contacts that switch, and values pulled far, the one side may look better and the
+                # other be so.
+                side = candidate.axes[0].low if parent.non_smooth or pulled else 0.0
                 chosen.setdefault((candidate.effect, side), (candidate, point))
         nominal = parent.jacobian[:, : parent.deviations.size]
         ends = [self._from(parent, candidate, point, nominal) for candidate, point in chosen.values()]
