@@ -264,8 +264,8 @@ def _part(
     """What an effect carries within a set, or within the larger one in which it was seen before; rest: the
     set without it."""
     k, model_error = explanation.names.index(name), search.case.machine.weighing.model_error
-    share, limit = share_beside(rest, explanation), _INTERESTS
     estimated, held_out = map(float, _carried(rest, explanation))
+    share, limit = float(np.sqrt(estimated * held_out)), _INTERESTS
     # What looks like a tilt is judged as a tilt: some of either is everywhere.
     alike = _LISTED_AS.get(name)
     if (EFFECTS[alike] if alike else explanation.end.candidates[k].kind).everywhere:

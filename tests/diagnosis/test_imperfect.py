@@ -26,7 +26,7 @@ from diagnosis.imperfect.levels import Levels, coefficients
 from diagnosis.imperfect.records import Records, Start, StartColumns
 from diagnosis.imperfect.search import Explanation, Search
 from diagnosis.imperfect.starts import points_of
-from diagnosis.imperfect.verdict import judged
+from diagnosis.imperfect.verdict import is_silent, judged
 from diagnosis.imperfect.windows import in_windows
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Weighing
@@ -371,7 +371,9 @@ def test_what_an_effect_does_in_held_out_records():
         ]
         x, nothing = np.array([candidate.axes[0].coordinate(1.5)]), np.zeros(0)
         end = descend(search.records, (candidate,), nothing, x, search.records.at_rest())
-        acts.append(search.acts_on_held_out(search.add(end), 0))
+        found = search.add(end)
+        acts.append(search.acts_on_held_out(found, 0))
+        assert is_silent(search, found, "actuator_saturation") == (size == 1.0)
     assert acts[0] == 0.0
     assert acts[1] > 0.5
 
