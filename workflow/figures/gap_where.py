@@ -137,7 +137,8 @@ def draw_curves(where: Where) -> Figure | None:
         axes.axhline(0, color="#555555", lw=0.8)
         axes.set_xlabel(_with_unit(curve.axis.replace("_", " "), curve.unit))
         axes.set_ylabel(_with_unit(_ROUTES[curve.route], curve.value_unit))
-        axes.set_title(f"{100 * curve.share:.0f} % of the gap energy", fontsize=9.5, fontweight="normal")
+        share = min(curve.share, 1.0)
+        axes.set_title(f"{100 * share:.0f} % of the gap energy", fontsize=9.5, fontweight="normal")
     return figure
 
 
