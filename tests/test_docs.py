@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks import workshop_series
 from tests.workflow.command import Answer
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -94,6 +95,26 @@ def test_no_snippet_is_left_out():
         assert ("```console" in text) == (name in CONSOLE), name
         assert (">>> " in text) == (name in ELSEWHERE), name
     assert {page.stem for page in (DOCS / "tutorials").iterdir()} == set(NOTEBOOKS)
+
+
+def test_readme_counts_every_sealed_series():
+    lines: list[str] = []
+    workshop_series.run(lines.append)
+    count = {
+        what: counts for what, *counts in re.findall(r"^(.+?)\s+(\d+)/(\d+) ", "\n".join(lines), re.MULTILINE)
+    }
+    right, cases = count["verdict and set right, every case"]
+    single, singles = count["top-1, every single effect"]
+    exact, pairs = count["two effects, exact set"]
+    unlisted, unknown = count["unknown: precision"]
+    sure, _ = count["confident and wrong (p > 0.8)"]
+    text = re.sub(r"\s+", " ", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert f"On {cases} sealed cases" in text
+    assert f"{right} verdicts and sets were right: {single} of {singles} single effects" in text
+    assert f"of {pairs} pairs {exact};" in text
+    assert (
+        f'of {unknown} "unknown" {unlisted} had a cause beyond the list; {sure} of {cases} were wrong' in text
+    )
 
 
 def test_every_key_of_a_configuration_has_a_meaning():

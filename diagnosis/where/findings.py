@@ -420,10 +420,11 @@ class Where:
         ]
         if not runs or min(runs)[0] == len(shares):
             return None
-        _, share, low, high = min(runs)
+        _, less, low, high = min(runs)
         halves = [np.ptp(b.gap.share_interval) / scale / 2 for b in bands if low <= b.low_Hz < high]
         half = float(np.sqrt(np.sum(np.square(halves))))
-        return Concentration(low, high, -share, half) if min(-share, 1.0) - half >= 0.5 else None
+        share = min(-less, 1.0)
+        return Concentration(low, high, share, half) if share - half >= 0.5 else None
 
     def even(self, sensor: str) -> bool:
         """Whether a sensor's gap is spread evenly over all frequencies, as more sensor noise would be."""

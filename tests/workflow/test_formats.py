@@ -22,6 +22,7 @@ from workflow.text.formats import (
     listing,
     number,
     percent,
+    portion,
     sentence,
     setting,
     share,
@@ -75,6 +76,7 @@ def test_numbers_with_units_and_ranges():
     assert percent(4.5678, 2) == "4.6 %"
     assert share(0.95) == "95 %"
     assert share(None) == "–"
+    assert [portion(value) for value in (-0.2, 0.004, 0.567, 1.01)] == ["0 %", "0 %", "57 %", "100 %"]
     assert signed(-0.125, "%") == "-0.12 %"
     assert extent([2.0, 1.0, 3.0]) == "1 to 3"
     assert extent([1.00001, 1.0]) == "1"

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from diagnosis.where.findings import SENSORS, BandGap, RegimeBin, Where
 from workflow.figures import gap_style, style
 from workflow.figures.bands import Real
+from workflow.text.formats import portion
 
 _LOOKS = {SENSORS[output][0]: (words, colour) for output, (words, _, colour) in gap_style.OUTPUTS.items()}
 _MOST_REGIMES = 6
@@ -137,8 +138,7 @@ def draw_curves(where: Where) -> Figure | None:
         axes.axhline(0, color="#555555", lw=0.8)
         axes.set_xlabel(_with_unit(curve.axis.replace("_", " "), curve.unit))
         axes.set_ylabel(_with_unit(_ROUTES[curve.route], curve.value_unit))
-        share = min(curve.share, 1.0)
-        axes.set_title(f"{100 * share:.0f} % of the gap energy", fontsize=9.5, fontweight="normal")
+        axes.set_title(f"{portion(curve.share)} of the gap energy", fontsize=9.5, fontweight="normal")
     return figure
 
 

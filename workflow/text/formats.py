@@ -47,6 +47,11 @@ def share(value: float | None, digits: int = 4) -> str:
     return percent(None if value is None else 100 * value, digits)
 
 
+def portion(value: float) -> str:
+    """A share of a whole in full percent; estimates by subtraction that lie outside are none or all of it."""
+    return percent(float(f"{100 * min(max(value, 0.0), 1.0):.0f}"))
+
+
 def signed(value: float | None, unit: str = "", decimals: int = 2) -> str:
     """With its sign and a fixed number of decimals."""
     return MISSING if value is None else f"{value:+.{decimals}f} {unit}".rstrip()
@@ -163,8 +168,8 @@ def _finite(value: float | None) -> bool:
 
 TESTS: Mapping[str, Callable[..., bool]] = {"finite": _finite, "nan": math.isnan}
 _NAMED: tuple[Callable[..., Any], ...] = (
-    number, si, percent, share, signed, fixed, interval, extent, frequency, hertz, decibels, in_decibels,
-    unit, listing, sparkline, count, sentence, yes_no, setting,
+    number, si, percent, share, portion, signed, fixed, interval, extent, frequency, hertz, decibels,
+    in_decibels, unit, listing, sparkline, count, sentence, yes_no, setting,
 )  # fmt: skip
 FILTERS: Mapping[str, Callable[..., Any]] = {
     **{function.__name__: function for function in _NAMED},
