@@ -22,21 +22,22 @@ _SLACK_RAD = 1e-13
 _AT_START: Any = np.int64(0)
 _IN_THE_MIDDLE: Any = np.int64(1)
 _AT_END: Any = np.int64(2)
+_COMPILED: Any = {"cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
 
 
 def _called(function: _F) -> _F:
     # By compiled code alone: the ways in for Python and C are not compiled.
-    options: Any = {"cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    return cast(_F, njit(**options, error_model="numpy")(function))
+    return cast(_F, njit(**_COMPILED)(function))
 
 
 def _inlined(function: _F) -> _F:
     # Pieces of `run`, kept apart for the reader. As calls they would cost a factor of two: the compiler no
-    # longer sees that the work arrays do not overlap.
-    return cast(_F, njit(inline="always", error_model="numpy")(function))
+    # longer sees that the work arrays do not overlap. Put together in the source (inline="always") they count
+    # references to every array, and so does a loop that is left by `break`.
+    return cast(_F, njit(**_COMPILED, forceinline=True)(function))
 
 
-@_called
+@_inlined
 def _smooth_forces(
     first: int,
     last: int,
@@ -48,19 +49,20 @@ def _smooth_forces(
     static_moment: Real,
     geometric_stiffness: Real,
 ) -> None:
-    """Fill force (3, J) at the nodes first..last from position (3, J)."""
+    """Fill force (3J,) at the nodes first..last from position (3J,), node by node."""
     for node in range(first, last + 1):
+        k = node * channel_kind.size
         j = 0
         while j < channel_kind.size:
             kind = channel_kind[j]
-            y = position[node, j]
+            y = position[k + j]
             if kind == SINE:
-                force[node, j] = channel[j, 0] * np.sin(channel[j, 1] * y + channel[j, 2])
+                force[k + j] = channel[j, 0] * np.sin(channel[j, 1] * y + channel[j, 2])
             elif kind == CUBIC:
-                force[node, j] = -channel[j, 0] * y**3
+                force[k + j] = -channel[j, 0] * y**3
             elif kind == STRIBECK:
                 slip = mode[int(channel[j, 2])]
-                force[node, j] = 0.0 if slip == 0 else -slip * channel[j, 0] * np.exp(-abs(y) / channel[j, 1])
+                force[k + j] = 0.0 if slip == 0 else -slip * channel[j, 0] * np.exp(-abs(y) / channel[j, 1])
             else:
                 # Root angle first, then every modal deflection:
                 # V = g [S (1 - cos) + s.q sin + 1/2 cos q.K.q].
@@ -69,14 +71,14 @@ def _smooth_forces(
                 moment, shortening = 0.0, 0.0
                 n = static_moment.size
                 for i in range(n):
-                    q = position[node, j + 1 + i]
+                    q = position[k + j + 1 + i]
                     moment += static_moment[i] * q
                     row = 0.0
                     for m in range(n):
-                        row += geometric_stiffness[i, m] * position[node, j + 1 + m]
+                        row += geometric_stiffness[i, m] * position[k + j + 1 + m]
                     shortening += row * q
-                    force[node, j + 1 + i] = -g * (sine * static_moment[i] + cosine * row)
-                force[node, j] = -g * (channel[j, 1] * sine + cosine * moment - 0.5 * sine * shortening)
+                    force[k + j + 1 + i] = -g * (sine * static_moment[i] + cosine * row)
+                force[k + j] = -g * (channel[j, 1] * sine + cosine * moment - 0.5 * sine * shortening)
                 j += n
             j += 1
 
@@ -101,30 +103,25 @@ def _hold(held: Real, mode: Integer, reference: Real, element: Real) -> int:
 
 
 @_inlined
-def _linear_step(w: Real, x: Real, held: Real, new: Real) -> None:
-    """Fill new with the step of the state under held inputs alone."""
-    n = x.size
-    for i in range(n):
-        new[i] = 0.0
-    for m in range(n):
-        value = x[m]
-        for i in range(n):
-            new[i] += w[m, i] * value
-    for m in range(held.size):
-        value = held[m]
+def _add_rows(table: Real, first: int, values: Real, total: Real) -> None:
+    """Add the values times the table's rows from the first on: whole rows, which lie in one piece."""
+    for m in range(values.size):
+        value, row = values[m], first + m
         if value != 0.0:
-            for i in range(n):
-                new[i] += w[n + m, i] * value
+            for i in range(total.size):
+                total[i] += table[row, i] * value
 
 
 @_inlined
 def _add_smooth_forces(
-    w: Real,
-    g: Real,
+    step: Real,
+    reach: Real,
+    base: int,
     x: Real,
     held: Real,
     new: Real,
     free: Real,
+    later: Real,
     position: Real,
     force: Real,
     mode: Integer,
@@ -137,74 +134,55 @@ def _add_smooth_forces(
     """Add to new what the smooth forces do in the step, by collocation at its start, middle and end (order
     4).
 
-    free (2J,), position (3, J) and force (3, J) are work space; the last force is that at the end of the
-    step.
+    base: row of these tables where the step's begin. free, later (2J,), position (3J,) and force (3J,) are
+    work space; the last force is that at the end of the step.
     """
     n, n_channels = x.size, channel_kind.size
-    first = n + held.size
+    first = base + n + held.size
     for j in range(n_channels):
-        total = 0.0
-        for i in range(n):
-            total += channel_rows[i, j] * x[i]
-        position[0, j] = total
-    for column in range(2 * n_channels):
-        total = 0.0
-        for m in range(n):
-            total += g[m, column] * x[m]
-        for m in range(held.size):
-            total += g[n + m, column] * held[m]
-        free[column] = total
+        position[j], free[j], free[n_channels + j] = 0.0, 0.0, 0.0
+    for i in range(n):
+        for j in range(n_channels):
+            position[j] += channel_rows[i, j] * x[i]
+    _add_rows(reach, base, x, free)
+    _add_rows(reach, base + n, held, free)
     _smooth_forces(
-        _AT_START,
-        _AT_START,
-        position,
-        force,
-        mode,
-        channel_kind,
-        channel,
-        static_moment,
-        geometric_stiffness,
+        _AT_START, _AT_START, position, force, mode, channel_kind, channel, static_moment, geometric_stiffness
     )
     for j in range(n_channels):
-        force[1, j], force[2, j] = force[0, j], force[0, j]
+        force[n_channels + j] = force[2 * n_channels + j] = force[j]
     # The sweeps contract by h |df/dv| / J, which `plant.plan` keeps below 0.3.
-    for sweep in range(12):
+    sweep, change, size = 0, 1.0, 0.0
+    while sweep < 12 and (sweep < 2 or change > 1e-9 * size):
+        if sweep > 0:
+            _smooth_forces(
+                _IN_THE_MIDDLE,
+                _AT_END,
+                position,
+                force,
+                mode,
+                channel_kind,
+                channel,
+                static_moment,
+                geometric_stiffness,
+            )
+        for i in range(2 * n_channels):
+            later[i] = free[i]
+        _add_rows(reach, first, force, later)
         change, size = 0.0, 1e-3
-        for later in range(2):
-            for j in range(n_channels):
-                column = later * n_channels + j
-                total = free[column]
-                for node in range(3):
-                    for c in range(n_channels):
-                        total += g[first + node * n_channels + c, column] * force[node, c]
-                change = max(change, abs(total - position[1 + later, j]))
-                size = max(size, abs(total))
-                position[1 + later, j] = total
-        if sweep > 0 and change <= 1e-9 * size:
-            break
-        _smooth_forces(
-            _IN_THE_MIDDLE,
-            _AT_END,
-            position,
-            force,
-            mode,
-            channel_kind,
-            channel,
-            static_moment,
-            geometric_stiffness,
-        )
-    for node in range(3):
-        for c in range(n_channels):
-            value, row = force[node, c], first + node * n_channels + c
-            for i in range(n):
-                new[i] += w[row, i] * value
+        for i in range(2 * n_channels):
+            change = max(change, abs(later[i] - position[n_channels + i]))
+            size = max(size, abs(later[i]))
+            position[n_channels + i] = later[i]
+        sweep += 1
+    _add_rows(step, first, force, new)
 
 
 @_inlined
-def _along(row: Real, x: Real) -> float:
+def _along(rows: Real, row: int, x: Real) -> float:
     total = 0.0
-    for i in range(x.size):
-        total += row[i] * x[i]
+    for i in range(rows.shape[1]):
+        total += rows[row, i] * x[i]
     return total
 
 
@@ -228,12 +206,13 @@ def _modes_still_hold(
     element: Real,
     element_rows: Real,
     element_rate: Real,
+    q: int,
 ) -> bool:
     """Fill wanted with the mode every element has in the state new; whether all are as assumed."""
     n, n_held = new.size, held.size
     same = True
     for e in range(mode.size):
-        angle, speed = _along(element_rows[e, 0], new), _along(element_rows[e, 1], new)
+        angle, speed = _along(element_rows, 2 * e, new), _along(element_rows, 2 * e + 1, new)
         wanted[e] = mode[e]
         if element[e, 0] == CONTACT:
             side = 1 if angle > 0 else -1
@@ -250,13 +229,14 @@ def _modes_still_hold(
             # The slider follows only while its own speed, shaft minus rate of stretch, keeps the sign.
             slider = speed
             if element[e, 3] != 0.0:
-                rate = 0.0
+                rate, row = 0.0, q * mode.size + e
                 for i in range(n):
-                    rate += element_rate[e, i] * new[i]
+                    rate += element_rate[row, i] * new[i]
                 for m in range(n_held):
-                    rate += element_rate[e, n + m] * held[m]
-                for j in range(force.shape[1]):
-                    rate += element_rate[e, n + n_held + j] * force[2, j]
+                    rate += element_rate[row, n + m] * held[m]
+                n_channels = force.size // 3
+                for j in range(n_channels):
+                    rate += element_rate[row, n + n_held + j] * force[2 * n_channels + j]
                 softening = element[e, 3] / element[e, 4] * np.exp(-abs(speed) / element[e, 4])
                 slider += mode[e] * np.sign(speed) * softening * rate / element[e, 1]
             if mode[e] * slider <= 0.0 or mode[e] * speed <= 0.0:
@@ -272,7 +252,7 @@ def _switch(
     """Take over the wanted modes; a friction element that sticks keeps the stretch it has."""
     for e in range(mode.size):
         if wanted[e] != mode[e] and element[e, 0] == FRICTION and wanted[e] == 0:
-            angle, speed = _along(element_rows[e, 0], x), _along(element_rows[e, 1], x)
+            angle, speed = _along(element_rows, 2 * e, x), _along(element_rows, 2 * e + 1, x)
             reference[e] = angle - mode[e] * _largest_stretch(element, e, speed)
         mode[e] = wanted[e]
 
@@ -304,24 +284,25 @@ def run(
     x (N,), reference (E,), mode (E,): state, friction slider positions, slip and contact signs; changed in
         place.
     substeps (G,): steps per part of the sample (G = 1, or 2 with a fractional delay).
-    step (G, Q, L, N + 3 + E + 3J, N): transition of (x, held inputs, node forces) per matrix set and step
-        size 2^l.
-    reach (G, Q, L, N + 3 + E + 3J, 2J): the same to the channel positions at the middle and the end of the
-        step.
+    step (G Q L R, N): transition of the R = N + 3 + E + 3J values (x, held inputs, node forces) per part of
+        the sample, matrix set and step size 2^l, one below the other: views of them cost up to a fourth.
+    reach (G Q L R, 2J): the same to the channel positions at the middle and the end of the step.
     element (E, 6): kind, then friction (k, Tc, Ts - Tc, vs, 0) or contact (gap/2, kc, cc, 0, 0).
-    element_rows (E, 2, N): relative angle and speed.
-    element_rate (Q, E, N + 3 + E + J): relative acceleration.
+    element_rows (2E, N): relative angle and speed.
+    element_rate (Q E, N + 3 + E + J): relative acceleration.
     channel_kind (J,), channel (J, 3), channel_rows (N, J): smooth forces and the position each depends on.
     static_moment (M,), geometric_stiffness (M, M): of the modes under gravity; empty without it.
     """
     n, n_elements, n_channels = x.size, mode.size, channel_kind.size
-    top = step.shape[2] - 1
+    n_rows, n_sets = n + 3 + n_elements + 3 * n_channels, 1 << n_elements
+    n_levels = step.shape[0] // (n_rows * n_sets * substeps.size)
     held, new = np.zeros(3 + n_elements), np.empty(n)
-    free, position, force = np.empty(2 * n_channels), np.zeros((3, n_channels)), np.zeros((3, n_channels))
+    free, later = np.empty(2 * n_channels), np.empty(2 * n_channels)
+    position, force = np.zeros(3 * n_channels), np.zeros(3 * n_channels)
     wanted = np.zeros(n_elements, dtype=np.int64)
     for k in range(inputs.shape[0]):
         for o in range(observed.shape[1]):
-            observed[k, o] = _along(output_rows[o], x)
+            observed[k, o] = _along(output_rows, o, x)
         # What has died away is zero: numbers near the smallest there is take a hundred times as long.
         for i in range(n):
             if abs(x[i]) < _NOTHING:
@@ -331,19 +312,25 @@ def run(
             for _ in range(substeps[part]):
                 # Time left in this step in units of the smallest one; a step of size 2^level starts on a
                 # multiple of it.
-                remaining, level = 1 << top, top
+                level = n_levels - 1
+                remaining = 1 << level
                 while remaining > 0:
                     q = _hold(held, mode, reference, element)
-                    w = step[part, q, level]
-                    _linear_step(w, x, held, new)
+                    base = ((part * n_sets + q) * n_levels + level) * n_rows
+                    for i in range(n):
+                        new[i] = 0.0
+                    _add_rows(step, base, x, new)
+                    _add_rows(step, base + n, held, new)
                     if n_channels > 0:
                         _add_smooth_forces(
-                            w,
-                            reach[part, q, level],
+                            step,
+                            reach,
+                            base,
                             x,
                             held,
                             new,
                             free,
+                            later,
                             position,
                             force,
                             mode,
@@ -355,7 +342,7 @@ def run(
                         )
                     if n_elements > 0:
                         same = _modes_still_hold(
-                            new, held, force, mode, wanted, reference, element, element_rows, element_rate[q]
+                            new, held, force, mode, wanted, reference, element, element_rows, element_rate, q
                         )
                         if not same and level > 0:
                             level -= 1

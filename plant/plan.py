@@ -123,12 +123,12 @@ def make_plan(
     output_rows = builder.outputs()
     arguments = (
         np.array(substeps, dtype=np.int64),
-        step,
-        reach,
+        step.reshape(-1, n),
+        reach.reshape(step.size // n, 2 * n_channels),
         output_rows,
         element,
-        element_rows,
-        rate,
+        element_rows.reshape(-1, n),
+        rate.reshape(-1, rate.shape[2]),
         kinds,
         channel,
         np.ascontiguousarray(channel_rows.T),
