@@ -14,6 +14,7 @@ switching or smooth forces there is one exact step a sample.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,6 +41,8 @@ _SMALLEST_PART = 1e-9
 
 # Corner and damping ratio of the accelerometer: far above any mode, and its delay of 0.1 ms is none here.
 _ACCELEROMETER_RAD_S, _ACCELEROMETER_DAMPING = 2 * np.pi * 2000.0, float(np.sqrt(0.5))
+# A search makes thousands of plans, always with the same nodes.
+_gauss_legendre = lru_cache(maxsize=16)(np.polynomial.legendre.leggauss)
 
 
 class PlanState(NamedTuple):
@@ -306,7 +309,7 @@ class _Builder:
         if self.machine.gravity_m_s2 == 0:
             return np.zeros(0), np.zeros((0, 0))
         rig, modes = self.machine.rig, self.equations.modes
-        nodes, weights = np.polynomial.legendre.leggauss(8 * modes.tip.size + 16)
+        nodes, weights = _gauss_legendre(8 * modes.tip.size + 16)
         x = 0.5 * rig.link.length_m * (nodes + 1)
         outboard = rig.link.mass_per_length_kg_m * (rig.link.length_m - x) + rig.payload.mass_kg
         slope = modes.slope(x)
@@ -417,23 +420,26 @@ def _transitions(
             step[level] = transition[:n].T
             transition = transition @ transition
         return
-    transition = expm(block * (shortest / 2))
-    for level in range(levels):
-        h = shortest * 2**level
-        middle, transition = transition, transition @ transition
-        step[level] = _by_nodes(transition[:n], first, n_force, h).T
-        reach[level, :, :n_force] = (rows @ _by_nodes(middle[:n], first, n_force, h)).T
-        reach[level, :, n_force:] = step[level] @ rows.T
+    powers = [expm(block * (shortest / 2))]
+    for _ in range(levels):
+        powers.append(powers[-1] @ powers[-1])
+    halves = np.array(powers)[:, :n]
+    h = shortest * 2.0 ** np.arange(levels)[:, None, None]
+    end = _by_nodes(halves[1:], first, n_force, h)
+    step[:] = end.swapaxes(1, 2)
+    reach[:, :, :n_force] = (rows @ _by_nodes(halves[:-1], first, n_force, h)).swapaxes(1, 2)
+    reach[:, :, n_force:] = (rows @ end).swapaxes(1, 2)
 
 
-def _by_nodes(transition: Real, first: int, n_force: int, h: float) -> Real:
+def _by_nodes(transition: Real, first: int, n_force: int, h: Real) -> Real:
     """Columns for the forces at start, middle and end, from force, slope and curvature at the start."""
-    value, slope, curve = (transition[:, first + i * n_force : first + (i + 1) * n_force] for i in range(3))
-    return np.hstack(
+    value, slope, curve = (transition[..., first + i * n_force : first + (i + 1) * n_force] for i in range(3))
+    return np.concatenate(
         [
-            transition[:, :first],
+            transition[..., :first],
             value - 3 / h * slope + 4 / h**2 * curve,
             4 / h * slope - 8 / h**2 * curve,
             -slope / h + 4 / h**2 * curve,
-        ]
+        ],
+        axis=-1,
     )

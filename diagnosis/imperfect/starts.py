@@ -109,15 +109,24 @@ def _harmonic(records: Records, around: Descent, candidate: Candidate) -> list[P
         else _CYCLES
     )
     zero = around.start.zeros[0] if around.start.zeros.size else 0.0
+
+    def moved(angle: Real) -> Real:
+        torque = np.stack([np.sin(angle), np.cos(angle)])
+        return np.fft.irfft(np.fft.rfft(torque, size)[:, :, None] * transfer, size, axis=1)
+
+    def column_pair(moved: Real) -> Real:
+        return np.column_stack([-coefficients(m) for m in moved])
+
     found = []
     for line in lines[(lines >= low) & (lines <= high)]:
-        pairs = []
-        for e in records.experiments:
-            T = len(e.output)
-            angle = 2 * np.pi * line * time_s[:T] if periodic else line * (e.output[:, 0] - zero)
-            torque = np.stack([np.sin(angle), np.cos(angle)])
-            moved = np.fft.irfft(np.fft.rfft(torque, size)[:, :, None] * transfer, size, axis=1)[:, :T]
-            pairs.append(np.column_stack([-coefficients(m) for m in moved]))
+        if periodic:
+            # The same in all records, as far as each goes.
+            whole = moved(2 * np.pi * line * time_s)
+            of_length = {T: column_pair(whole[:, :T]) for T in {len(e.output) for e in records.experiments}}
+            pairs = [of_length[len(e.output)] for e in records.experiments]
+        else:
+            angles = [line * (e.output[:, 0] - zero) for e in records.experiments]
+            pairs = [column_pair(moved(angle)[:, : angle.size]) for angle in angles]
         columns = np.concatenate(pairs)
         weighted = columns * weights[:, None]
         cross = np.empty((g.size, 2))
