@@ -73,6 +73,8 @@ class Records:
         self.simulations = 0
         ends = np.cumsum([e.output.size for e in experiments])
         self.parts = [slice(int(b - e.output.size), int(b)) for b, e in zip(ends, experiments, strict=True)]
+        # What no machine does counts so much and no more.
+        self._far = [1e6 * np.std(e.output, axis=0) for e in experiments]
         unknown = case.machine.unknown_start
         self.state_spread, self.zero_spread = unknown.state_spread, unknown.zero_spread
 
@@ -98,15 +100,15 @@ class Records:
         simulate = self.nominal.at(deviations).simulator(effects)
         self.simulations += len(self.experiments)
         found = []
-        for experiment, state in zip(self.experiments, start.states, strict=True):
+        for experiment, state, far in zip(self.experiments, start.states, self._far, strict=True):
             e = experiment.output - simulate(experiment.input, state, start.zeros)
             missing = list(getattr(experiment, "missing", ()))
             if missing:
                 kept = np.setdiff1d(np.arange(len(e)), missing)
                 for column in e.T:
                     column[missing] = np.interp(missing, kept, column[kept])
-            far = 1e6 * np.std(experiment.output, axis=0)
-            found.append(np.clip(np.where(np.isnan(e), far, e), -far, far))
+            # Written so that nan is far, too.
+            found.append(e if np.all(np.abs(e) <= far) else np.clip(np.where(np.isnan(e), far, e), -far, far))
         return found
 
     def coefficients(self, deviations: Real, effects: Sequence[Any], start: Start) -> Real:
