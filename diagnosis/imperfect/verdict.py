@@ -302,17 +302,14 @@ def _carried(rest: Explanation, explanation: Explanation) -> Real:
 
 
 def _tolerances_off(search: Search, explanation: Explanation, k: int) -> float | None:
-    """How far the k-th effect and the deviations together move the value it changes; None for others."""
+    """How far the k-th effect and the deviations together move the value it changes; None for others, and for
+    values without a tolerance: none of theirs is there to imitate what the effect does."""
     end, machine = explanation.end, search.case.machine
     kind = end.candidates[k].kind
     key = kind.multiplies or kind.adds_to
-    if key is None:
+    if key is None or key not in machine.tolerances or not machine.description.value(key) > 0:
         return None
-    if key not in machine.tolerances:
-        return np.inf
     tolerance, stated = machine.tolerances[key], machine.description.value(key)
-    if not stated > 0:
-        return np.inf
     deviation = float(end.deviations[search.records.nominal.keys.index(key)])
     moved = stated * np.exp(tolerance * deviation)
     size = next(iter(end.effects[k].parameters().values()))

@@ -379,7 +379,7 @@ def test_what_an_effect_does_in_held_out_records():
 
 
 def test_a_value_that_nobody_stated_is_not_named_for_being_far_off():
-    # No tolerance: any delay is far off, and this one explains next to nothing.
+    # No tolerance: however far off a delay is, what it does counts, and that is next to nothing.
     found = _judged({(): (0.0, 0.02, 0.02), ("input_delay",): (12.0, 0.0199, 0.0199)})
     assert found.judged[0].explanation.names == ("input_delay",)
     assert found.probabilities.cause["input_delay"] < 0.5
