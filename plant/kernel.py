@@ -11,7 +11,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numba import njit
 
-from plant.machine import CUBIC, SINE, STRIBECK, Integer, Real
+from plant.machine import CUBIC, QUADRATIC, SINE, STRIBECK, Integer, Real
 
 _F = TypeVar("_F", bound=Callable[..., object])
 
@@ -60,6 +60,8 @@ def _smooth_forces(
                 force[k + j] = channel[j, 0] * np.sin(channel[j, 1] * y + channel[j, 2])
             elif kind == CUBIC:
                 force[k + j] = -channel[j, 0] * y**3
+            elif kind == QUADRATIC:
+                force[k + j] = -channel[j, 0] * y * abs(y)
             elif kind == STRIBECK:
                 slip = mode[int(channel[j, 2])]
                 force[k + j] = 0.0 if slip == 0 else -slip * channel[j, 0] * np.exp(-abs(y) / channel[j, 1])

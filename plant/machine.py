@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from plant.rig import Rig
 
-SINE, CUBIC, STRIBECK, GRAVITY = 0, 1, 2, 3  # smooth forces of `plant.kernel`
+SINE, CUBIC, STRIBECK, GRAVITY, QUADRATIC = 0, 1, 2, 3, 4  # smooth forces of `plant.kernel`
 
 Real = npt.NDArray[np.float64]
 Integer = npt.NDArray[np.int64]

@@ -22,7 +22,16 @@ from plant.effects.base import (
     with_torque,
 )
 from plant.effects.search_space import PHASE, Axis, Candidate, Scales, Sought, geometric, log_axis
-from plant.machine import CUBIC, SINE, Disturbance, DryFriction, Machine, SmoothTorque, TorsionSpring
+from plant.machine import (
+    CUBIC,
+    QUADRATIC,
+    SINE,
+    Disturbance,
+    DryFriction,
+    Machine,
+    SmoothTorque,
+    TorsionSpring,
+)
 from plant.modal import static_moment_kg_m
 from plant.rig import Rig
 
@@ -130,6 +139,25 @@ class ViscousFriction(Effect):
         usual = (least, USUAL_TOLERANCES * spread) if least > 0 else None
         axis = log_axis("coefficient_Nms", max(1e-5 * damping, least), 30 * damping, usual=usual)
         return (cls._size(axis, geometric(max(1e-4 * damping, 1.2 * least), 3 * damping, 8)),)
+
+
+@register
+class QuadraticDrag(Effect):
+    """Torque -c omega |omega| on the hub (motor side, with backlash), as of air or churned oil.
+
+    At one speed that is viscous friction: no answer of a diagnosis, which needs it to tell that from what
+    looks like it.
+    """
+
+    id = "quadratic_drag"
+    words = "a drag that grows with the square of the speed"
+    look_alike_of = "viscous_friction"
+
+    coefficient_Nms2: NotNegative = Field(description="coefficient c")
+
+    def modify(self, machine: Machine) -> Machine:
+        torque = SmoothTorque(QUADRATIC, (self.coefficient_Nms2,), at="motor", of="speed")
+        return with_torque(machine, torque)
 
 
 @register

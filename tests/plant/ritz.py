@@ -26,6 +26,7 @@ class RitzArm:
         backlash=False,
         ripple=None,
         cubic=0.0,
+        drag=0.0,
         gravity=0.0,
         disturbance=None,
         voltage_lag=0.0,
@@ -89,6 +90,7 @@ class RitzArm:
         # Gravity: X = (r + x) cos b - w sin b - cos b s(x), shortening s = 1/2 int_0^x w'^2, by nested
         # quadrature.
         self.g, self.ripple, self.cubic, self.disturbance = gravity, ripple, cubic, disturbance
+        self.drag = drag
         self.moment = m * w @ (r + x) + mp * (r + length)
         moments = np.zeros(pick.shape[0])
         moments[4:] = [m * w @ s(x) + mp * s(length) for s in shapes]
@@ -113,6 +115,8 @@ class RitzArm:
             force = force + self.hub * amplitude * np.sin(2 * np.pi * frequency * t + phase)
         if self.cubic:
             force = force - self.hub * self.cubic * (self.hub @ c) ** 3
+        if self.drag:
+            force = force - self.hub * self.drag * (self.hub @ v) * abs(self.hub @ v)
         if self.g:
             sine, cosine = np.sin(self.root @ c), np.cos(self.root @ c)
             push = -self.moment * sine - cosine * self.moments @ c + sine * c @ self.shortening @ c

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from plant import Rig, paper_link, parse_effect, parse_effects, simulate
+from plant.effects import LOOK_ALIKES
 from tests.plant.ritz import RitzArm
 
 
@@ -58,6 +59,11 @@ def _compare(options, effects, delay=0.0, **inputs):
 def test_smooth_effects_agree_with_an_independent_arm_to_a_millionth(name):
     options, effects = SMOOTH[name]
     assert _compare(options, parse_effects(effects)) < 1e-6
+
+
+def test_a_drag_that_no_configuration_has_agrees_with_an_independent_arm():
+    drag = LOOK_ALIKES["quadratic_drag"](coefficient_Nms2=0.2)
+    assert _compare({"drag": 0.2}, (drag,)) < 1e-6
 
 
 def test_effects_together_agree_with_an_independent_arm():
