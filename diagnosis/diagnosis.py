@@ -94,7 +94,9 @@ def _without_error(case: CaseOfMachine, progress: Progress, rng: np.random.Gener
     every = (*found.hypotheses, *look_alikes(model, found.hypotheses, found.base))
     weighed = probabilities(every)
     accepted = _accepted(every, weighed.answer)
-    seen = confronted(model, every, accepted) if weighed.answer != "unknown" else None
+    likeliest = max(every, key=lambda h: h.unknown_weight)
+    leading = likeliest if weighed.answer == "unknown" else accepted
+    seen = confronted(model, every, leading) if weighed.answer != "unknown" or not leading.is_answer else None
     if seen is not None:
         every = seen
         weighed = probabilities(every)

@@ -28,7 +28,7 @@ _CONTRADICTED = 2.0
 def confronted(
     model: ResidualModel, hypotheses: Sequence[Hypothesis], accepted: Hypothesis
 ) -> list[Hypothesis] | None:
-    """The hypotheses as held-out records leave them; None if these confirm the accepted one.
+    """The hypotheses as held-out records leave them; None if these confirm the accepted one, an answer.
 
     The log density with which each possible answer predicts them is added to its weights, and to those of an
     unknown rest besides what such a rest gains by them.
@@ -37,7 +37,8 @@ def confronted(
     if not case.held_out:
         return None
     first = _prediction(model, accepted.fit)
-    if first.unknown_gain < _CONFIRMED and not _contradicted(model, hypotheses, accepted, first):
+    confirmed = accepted.is_answer and first.unknown_gain < _CONFIRMED
+    if confirmed and not _contradicted(model, hypotheses, accepted, first):
         return None
     best = max(h.largest_weight for h in hypotheses)
     seen = {
