@@ -12,12 +12,19 @@ from benchmarks.harness import RESULTS, Print, main
 WHOLE = "verdict and set right, every case"
 ROW = re.compile(r"^(\S.*?)\s{2,}\d+ % \[\d+, \d+\] \((\d+)/(\d+)\)", re.MULTILINE)
 END = "baseline:"
+# What machines without an effect were called, name and count each.
+NONE, CALLED = re.compile(r"^  none: (.+)$", re.MULTILINE), re.compile(r"(\w+) (\d+)")
+NAMED = "no effect, but one named"
 
 
 def run(out: Print) -> None:
     right, asked, series = Counter[str](), Counter[str](), []
     for path in sorted(RESULTS.glob("blind_workshop_*.txt")):
-        for what, some, of in ROW.findall(path.read_text(encoding="utf-8").split(END)[0]):
+        text = path.read_text(encoding="utf-8").split(END)[0]
+        for name, count in CALLED.findall("".join(NONE.findall(text))):
+            right[NAMED] += int(count) if name not in ("none", "unknown") else 0
+            asked[NAMED] += int(count)
+        for what, some, of in ROW.findall(text):
             right[what] += int(some)
             asked[what] += int(of)
             if what == WHOLE:

@@ -94,9 +94,9 @@ def _without_error(case: CaseOfMachine, progress: Progress, rng: np.random.Gener
     every = (*found.hypotheses, *look_alikes(model, found.hypotheses, found.base))
     weighed = probabilities(every)
     accepted = _accepted(every, weighed.answer)
-    likeliest = max(every, key=lambda h: h.unknown_weight)
-    leading = likeliest if weighed.answer == "unknown" else accepted
-    seen = confronted(model, every, leading) if weighed.answer != "unknown" or not leading.is_answer else None
+    unknown = weighed.answer == "unknown"
+    leading = max(every, key=lambda h: h.unknown_weight) if unknown else accepted
+    seen = None if unknown and leading.is_answer else confronted(model, every, leading)
     if seen is not None:
         every = seen
         weighed = probabilities(every)

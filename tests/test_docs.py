@@ -107,11 +107,15 @@ def test_readme_counts_every_sealed_series():
     single, singles = count["top-1, every single effect"]
     exact, pairs = count["two effects, exact set"]
     unlisted, unknown = count["unknown: precision"]
+    named, without = count["no effect, but one named"]
     sure, _ = count["confident and wrong (p > 0.8)"]
     text = re.sub(r"\s+", " ", (ROOT / "README.md").read_text(encoding="utf-8"))
     assert f"On {cases} sealed cases" in text
     assert f"{right} verdicts and sets were right: {single} of {singles} single effects" in text
-    assert f"of {pairs} pairs {exact};" in text
+    assert f"of {pairs} pairs {exact}; {named} of {without} machines without an effect got one" in text
+    last = re.findall(r"\d+/\d+", lines[0])[-4:]
+    said = "the last four had {} of {}, {} of {}, {} of {} and {} of {} verdicts right"
+    assert said.format(*re.findall(r"\d+", " ".join(last))) in text
     assert (
         f'of {unknown} "unknown" {unlisted} had a cause beyond the list; {sure} of {cases} were wrong' in text
     )

@@ -26,9 +26,10 @@ _CONTRADICTED = 2.0
 
 
 def confronted(
-    model: ResidualModel, hypotheses: Sequence[Hypothesis], accepted: Hypothesis
+    model: ResidualModel, hypotheses: Sequence[Hypothesis], leading: Hypothesis
 ) -> list[Hypothesis] | None:
-    """The hypotheses as held-out records leave them; None if these confirm the accepted one, an answer.
+    """The hypotheses as held-out records leave them; None if these confirm the leading one and it
+    is an answer, no look-alike.
 
     The log density with which each possible answer predicts them is added to its weights, and to those of an
     unknown rest besides what such a rest gains by them.
@@ -36,13 +37,13 @@ def confronted(
     case = model.case
     if not case.held_out:
         return None
-    first = _prediction(model, accepted.fit)
-    confirmed = accepted.is_answer and first.unknown_gain < _CONFIRMED
-    if confirmed and not _contradicted(model, hypotheses, accepted, first):
+    first = _prediction(model, leading.fit)
+    confirmed = leading.is_answer and first.unknown_gain < _CONFIRMED
+    if confirmed and not _contradicted(model, hypotheses, leading, first):
         return None
     best = max(h.largest_weight for h in hypotheses)
     seen = {
-        k: first if h is accepted else _prediction(model, h.fit)
+        k: first if h is leading else _prediction(model, h.fit)
         for k, h in enumerate(hypotheses)
         if h.largest_weight > best - STILL_POSSIBLE
     }
@@ -52,18 +53,18 @@ def confronted(
 
 
 def _contradicted(
-    model: ResidualModel, hypotheses: Sequence[Hypothesis], accepted: Hypothesis, first: _Prediction
+    model: ResidualModel, hypotheses: Sequence[Hypothesis], leading: Hypothesis, first: _Prediction
 ) -> bool:
-    """Whether another one with no more effects is well ahead of the accepted one once both have predicted."""
-    ahead = accepted.log_weight + first.gain + _CONTRADICTED
+    """Whether another one with no more effects is well ahead of the leading one once both have predicted."""
+    ahead = leading.log_weight + first.gain + _CONTRADICTED
     close: dict[tuple[frozenset[str], bool], Hypothesis] = {}
     for h in sorted(hypotheses, key=lambda h: -h.weight):
-        if len(h.names) <= len(accepted.names) or not accepted.names:
+        if len(h.names) <= len(leading.names) or not leading.names:
             close.setdefault((frozenset(h.names), h.is_answer), h)
     return any(
         h.weight + _prediction(model, h.fit).gain > ahead
         for h in close.values()
-        if h is not accepted and h.weight > accepted.log_weight - STILL_POSSIBLE
+        if h is not leading and h.weight > leading.log_weight - STILL_POSSIBLE
     )
 
 
