@@ -32,7 +32,6 @@ _FAR = np.array([-3.0, -2.0, -1.2, -0.6, -0.25, -0.08, 0.08, 0.25, 0.6, 1.2, 2.0
 # Above the loss of an end, that of a start which leads to no better one.
 _HOPELESS = 5.0
 _AGAIN = (2, 5, 8, 11)
-_STATE_ITERATIONS = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +145,10 @@ def descend(
     columns: StartColumns | None = None,
     iterations: int = 10,
     tolerance: float = 0.5,
+    touching: bool = False,
 ) -> Descent:
     """Descend from a point; the Jacobian by the deviations and the start columns may be those of a point
-    nearby, and are renewed on the way."""
+    nearby, and are renewed on the way. touching: the latter feel contacts (`settled`)."""
     P, A = deviations.size, coordinates.size
     low, high = box(candidates)
     d, x = deviations.copy(), np.clip(coordinates, low, high)
@@ -169,7 +169,7 @@ def descend(
             step = np.full(P, coarse.get("log", _DEVIATION_STEP))
             nominal_jacobian = quotients(lambda d: left(d, x, start), d, e, step)  # noqa: B023
         if columns is None or iteration == _AGAIN[0]:
-            columns = records.start_columns(d, effects_at(candidates, x), start)
+            columns = records.start_columns(d, effects_at(candidates, x), start, touching=touching)
         if columns.zeros.shape[1] and any(c.kind.absolute_angle for c in candidates):
             columns = records.with_true_angles(columns, d, effects_at(candidates, x), start, e)
         by_effects = quotients(lambda x: left(d, x, start), x, e, steps, high)  # noqa: B023
@@ -251,38 +251,6 @@ def _sought(records: Records, end: Descent, k: int, shifts: Real) -> Descent:
         iterations=5,
     )
     return min(end, again, key=lambda one: one.loss)
-
-
-def best_move(records: Records, part: slice, columns: Real, e: Real, state: Real) -> Real:
-    """(S,) from the state at the start of a record to the one that leaves least of its coefficients e (T Y,),
-    these being linear in it; columns (T Y, S), part: where they stand among those of all records.
-
-    Far from it the loss is flat, and weights of what is left there lead to it in many small steps: they are
-    taken on the energies of the bands, and once more from where all bands weigh as their floors do.
-    """
-    levels, spread = records.levels, records.state_spread
-    band = levels.band[part]
-    bands = slice(int(band.min()), int(band.max()) + 1)
-    rows = np.column_stack([columns, e])
-    energies = np.array([own.T @ own for b in range(bands.start, bands.stop) for own in [rows[band == b]]])
-    counted, floor = levels.counted[bands], levels.floor[bands]
-
-    def left(move: Real) -> Real:
-        whole = np.append(move, 1.0)
-        return np.asarray(np.maximum(energies @ whole @ whole, 0.0))
-
-    def loss(move: Real) -> float:
-        return levels.loss_of(left(move), bands) + 0.5 * float(np.sum(((state + move) / spread) ** 2))
-
-    found: list[Real] = []
-    for weights in (counted / (left(np.zeros(state.size)) + floor), 1 / floor):
-        for _ in range(_STATE_ITERATIONS):
-            weighted = np.tensordot(weights, energies, 1)
-            H, g = weighted[:-1, :-1] + np.diag(1 / spread**2), weighted[:-1, -1] + state / spread**2
-            move = np.asarray(-np.linalg.solve(H, g))
-            weights = counted / (left(move) + floor)
-        found.append(move)
-    return min(found, key=loss)
 
 
 def follow(records: Records, around: Descent, e: Real, start: Start) -> tuple[float, Real]:

@@ -127,9 +127,23 @@ class Levels:
     def energy(self, e: Real) -> Real:
         return np.asarray(np.bincount(self.band, e * e, minlength=self.floor.size), dtype=np.float64)
 
-    def loss_of(self, energy: Real, bands: slice = slice(None)) -> float:
-        """-log likelihood of the energies (.,) of these bands."""
-        return 0.5 * float(self.counted[bands] @ np.log1p(energy / self.floor[bands]))
+    def within(self, part: slice) -> Levels:
+        """Of the record that has this part of the coefficients."""
+        band = self.band[part]
+        own = slice(int(band.min()), int(band.max()) + 1)
+        return Levels(
+            band - own.start,
+            self.counted[own],
+            self.floor[own],
+            self.noise[own],
+            self.felt[own],
+            self.belongs[own],
+            self.motion,
+        )
+
+    def loss_of(self, energy: Real) -> float:
+        """-log likelihood of energies (B,)."""
+        return 0.5 * float(self.counted @ np.log1p(energy / self.floor))
 
     def loss(self, e: Real) -> float:
         """-log likelihood of coefficients (N,), up to a constant of the records."""

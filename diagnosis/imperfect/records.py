@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -98,28 +99,38 @@ class Records:
     def residuals(self, deviations: Real, effects: Sequence[Any], start: Start) -> list[Real]:
         """measured - model (T, Y) of every record, in the outputs' units."""
         simulate = self.nominal.at(deviations).simulator(effects)
-        self.simulations += len(self.experiments)
-        found = []
-        for experiment, state, far in zip(self.experiments, start.states, self._far, strict=True):
-            e = experiment.output - simulate(experiment.input, state, start.zeros)
-            missing = list(getattr(experiment, "missing", ()))
-            if missing:
-                kept = np.setdiff1d(np.arange(len(e)), missing)
-                for column in e.T:
-                    column[missing] = np.interp(missing, kept, column[kept])
-            # Written so that nan is far, too.
-            found.append(e if np.all(np.abs(e) <= far) else np.clip(np.where(np.isnan(e), far, e), -far, far))
-        return found
+        return [self._left(simulate, r, state, start.zeros) for r, state in enumerate(start.states)]
+
+    def _left(self, simulate: Callable[..., Real], r: int, state: Real, zeros: Real) -> Real:
+        """measured - model (T, Y) of the r-th record."""
+        experiment, far = self.experiments[r], self._far[r]
+        self.simulations += 1
+        e = experiment.output - simulate(experiment.input, state, zeros)
+        missing = list(getattr(experiment, "missing", ()))
+        if missing:
+            kept = np.setdiff1d(np.arange(len(e)), missing)
+            for column in e.T:
+                column[missing] = np.interp(missing, kept, column[kept])
+        # Written so that nan is far, too.
+        return e if np.all(np.abs(e) <= far) else np.clip(np.where(np.isnan(e), far, e), -far, far)
+
+    def of_each(self, deviations: Real, effects: Sequence[Any], zeros: Real) -> Callable[[int, Real], Real]:
+        """Coefficients (T Y,) of the r-th record by r and the state at its start."""
+        simulate = self.nominal.at(deviations).simulator(effects)
+        return lambda r, state: coefficients(self._left(simulate, r, state, zeros))
 
     def coefficients(self, deviations: Real, effects: Sequence[Any], start: Start) -> Real:
         return np.concatenate([coefficients(e) for e in self.residuals(deviations, effects, start)])
 
-    def start_columns(self, deviations: Real, effects: Sequence[Any], start: Start) -> StartColumns:
-        """Of the linear part of the machine; of one whose linear part nobody knows, difference quotients."""
+    def start_columns(
+        self, deviations: Real, effects: Sequence[Any], start: Start, *, touching: bool = False
+    ) -> StartColumns:
+        """Of the linear part of the machine; where nobody knows that, and where contacts are to be felt
+        (touching), difference quotients."""
         longest = max(len(e.output) for e in self.experiments)
         outputs = self.case.noise.size
         responses = self.nominal.at(deviations).unknown_start.responses
-        if responses is None:
+        if responses is None or touching:
             states = self._differences(deviations, effects, start)
         else:
             whole = responses(effects, longest)
@@ -138,14 +149,19 @@ class Records:
         return StartColumns.of(np.concatenate(zeros), states, self.case.machine.unknown_start.state_per_zero)
 
     def _differences(self, deviations: Real, effects: Sequence[Any], start: Start) -> list[Real]:
-        here = self.coefficients(deviations, effects, start)
-        steps = _STATE_STEP * self.state_spread
-        columns = [
-            (self.coefficients(deviations, effects, Start(start.states + step, start.zeros)) - here) / size
-            for step, size in zip(np.diag(steps), steps, strict=True)
+        of_each = self.of_each(deviations, effects, start.zeros)
+        lefts = [partial(of_each, r) for r in range(len(self.experiments))]
+        return [
+            self.quotients_by_state(left, state, left(state))
+            for left, state in zip(lefts, start.states, strict=True)
         ]
-        whole = np.column_stack(columns)
-        return [whole[part] for part in self.parts]
+
+    def quotients_by_state(self, left: Callable[[Real], Real], state: Real, e: Real) -> Real:
+        """(T Y, S) difference quotients of the coefficients of a record (`of_each`); e: there."""
+        steps = np.where(np.isfinite(self.state_spread), _STATE_STEP * self.state_spread, _ANGLE_STEP_RAD)
+        return np.column_stack(
+            [(left(state + step) - e) / size for step, size in zip(np.diag(steps), steps, strict=True)]
+        )
 
     def with_true_angles(
         self, columns: StartColumns, deviations: Real, effects: Sequence[Any], start: Start, e: Real

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
 from diagnosis.evidence.look_alikes import look_alike
-from diagnosis.imperfect.descent import Descent, best_move, descend, loss_at, occam, refined, scanned
+from diagnosis.imperfect.descent import Descent, descend, loss_at, occam, refined, scanned
 from diagnosis.imperfect.records import Records, Start
+from diagnosis.imperfect.settled import settled
 from diagnosis.imperfect.starts import Point, beside, points_of
 from diagnosis.imperfect.windows import in_windows
 from diagnosis.machine.case import Case
@@ -35,7 +35,8 @@ _BESIDE_IN_WINDOWS, _FREED = 4, (2, 3)
 _GAINED = 15.0
 # Scans of sets with contacts, each of the likeliest that is left or has gained this since its last.
 _SCANS, _GAINED_BY_SCAN = 2, 2.0
-_HELD_OUT_STEPS = 5
+# Sets of each size with contacts whose starts feel them, and how far behind in evidence they may be.
+_TOUCHING, _TOUCHING_ITERATIONS, _UNLIKELY = 2, 5, 150.0
 # Of octaves, what is felt where disturbances of the inputs are amplified.
 _AMPLIFIED = 0.5
 _LAST_ITERATIONS, _LAST_TOLERANCE = 20, 0.02
@@ -96,6 +97,8 @@ class Search:
         self.points: list[tuple[Candidate, list[Point]]] = []
         # Sets already fitted without one of their effects, or with a simpler one.
         self._reduced: set[tuple[object, ...]] = set()
+        # Whether starts of held-out records feel contacts.
+        self._touching = False
 
     @property
     def base(self) -> Explanation:
@@ -117,7 +120,7 @@ class Search:
         """
         weighing = self.case.machine.weighing
         P = self.records.nominal.count
-        start, _ = self._started(self.records, np.zeros(P), (), self.records.at_rest())
+        start, _ = settled(self.records, np.zeros(P), (), self.records.at_rest())
         nominal = descend(self.records, (), np.zeros(P), np.zeros(0), start, iterations=12)
         self.add(nominal)
         self._alone()
@@ -132,6 +135,7 @@ class Search:
         self._containing(list(several.values())[:_CONTINUED])
         if self._unexplained:
             self._scanned()
+            self._from_contacts()
         self._look_alikes()
 
     @property
@@ -271,7 +275,7 @@ class Search:
         self.progress(0.95, "fitting in windows")
         base, states = self.base.end, self.records.state_spread.size
         windows = Search(in_windows(self.case), self.progress, self.deadline_s, self.at_inputs)
-        start, _ = windows._started(windows.records, base.deviations, (), windows.records.at_rest())
+        start, _ = settled(windows.records, base.deviations, (), windows.records.at_rest())
         windows.add(descend(windows.records, (), base.deviations, base.coordinates, start))
         around = windows.base.end
         for candidate in acting:
@@ -306,6 +310,31 @@ class Search:
             self.progress(0.97, f"scanning {' and '.join(this.names)}")
             done[this.key] = this.end.loss
             self.add(refined(self.records, scanned(self.records, this.end)))
+
+    def _from_contacts(self) -> None:
+        """The likeliest sets of each size with contacts once more from starts that feel them."""
+        self._touching = True
+        sets = [e for e in best_of_sets(self.found).values() if e.end.non_smooth]
+        for count in range(1, self.case.machine.weighing.most_effects + 1):
+            for e in [e for e in sets if len(e.names) == count][:_TOUCHING]:
+                if e.evidence < max(e.evidence for e in self.found) - _UNLIKELY:
+                    continue
+                if self._late("starts of records in free play"):
+                    return
+                self.progress(0.97, f"starts in free play, {' and '.join(e.names)}")
+                end = e.end
+                start, _ = settled(self.records, end.deviations, end.effects, end.start, touching=True)
+                again = descend(
+                    self.records,
+                    end.candidates,
+                    end.deviations,
+                    end.coordinates,
+                    start,
+                    nominal_jacobian=end.jacobian[:, : end.deviations.size],
+                    touching=True,
+                    iterations=_TOUCHING_ITERATIONS,
+                )
+                self.add(min(end, again, key=lambda one: one.loss))
 
     def _look_alikes(self) -> None:
         """Causes beyond the list in place of what they look like, wherever that may be the answer."""
@@ -394,19 +423,21 @@ class Search:
         """The nominal as stated: only the starts are fitted."""
         end = self.base.end
         stated = np.zeros(end.deviations.size)
-        start, e = self._started(self.records, stated, (), end.start)
+        start, e = settled(self.records, stated, (), self._beginning(self.records, end.start))
         loss, prior = loss_at(self.records, e, stated, start)
         return self._explanation(replace(end, deviations=stated, start=start, left=e, loss=loss, prior=prior))
 
     def add(self, end: Descent) -> Explanation:
-        """The explanation with what it predicts of the held-out records, their starts fitted."""
+        """The explanation with what it predicts of the held-out records, their starts fitted (`settled`)."""
         explanation = self._explanation(end)
         self.found.append(explanation)
         return explanation
 
     def _explanation(self, end: Descent) -> Explanation:
         records, held = self.records, self.held_out
-        start, e = self._started(held, end.deviations, end.effects, end.start)
+        beginning = self._beginning(held, end.start)
+        touching = self._touching and end.non_smooth
+        start, e = settled(held, end.deviations, end.effects, beginning, touching=touching)
         left = tuple(records.residuals(end.deviations, end.effects, end.start))
         left_held_out = tuple(held.residuals(end.deviations, end.effects, start))
         held_out_loss = held.levels.loss(e) + 0.5 * float(np.sum((start.states / held.state_spread) ** 2))
@@ -426,27 +457,6 @@ class Search:
         if not start.zeros.size:
             return start
         return start.with_zeros(fitted.zeros, self.case.machine.unknown_start.state_per_zero)
-
-    def _started(self, held: Records, d: Real, effects: Sequence[Any], fitted: Start) -> tuple[Start, Real]:
-        """Records from states that fit them best, everything else as fitted: start, coefficients."""
-        start = self._beginning(held, fitted)
-        e = held.coefficients(d, effects, start)
-        if not start.states.shape[1]:
-            return start, e
-        loss, _ = loss_at(held, e, d, start)
-        columns = held.start_columns(d, effects, start)
-        for _ in range(_HELD_OUT_STEPS):
-            moves = [
-                best_move(held, part, own, e[part], states)
-                for part, own, states in zip(held.parts, columns.states, start.states, strict=True)
-            ]
-            moved = Start(start.states + moves, start.zeros)
-            e2 = held.coefficients(d, effects, moved)
-            loss2, _ = loss_at(held, e2, d, moved)
-            if not loss2 < loss - 0.2:
-                break
-            start, e, loss = moved, e2, loss2
-        return start, e
 
 
 def best_of_sets(found: Iterable[Explanation]) -> dict[tuple[str, ...], Explanation]:

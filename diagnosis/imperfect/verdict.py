@@ -40,6 +40,8 @@ _FAR_OFF, _FAR_OFF_WIDTH = 4.4, 0.06
 # of shares of the motion, normal; any size above its median for an unknown cause), prior of the latter.
 _IMPERFECTIONS, _IMPERFECTIONS_WIDTH = 0.6, 0.65
 _UNKNOWN, _UNKNOWN_WIDTH, _PRIOR_UNKNOWN = 2.2, 0.6, 0.15
+# After a contact that comes a little early all goes another way: what imperfections leave is more.
+_AFTER_CONTACTS = 2.0
 # A set is out that leaves so much more of the held-out records, in model errors too, than a part of it.
 _WORSE, _WORSE_BY = 1.15, 0.2
 # How probable a cause beyond the list is that looks like an effect, beside the effect.
@@ -101,7 +103,7 @@ class Verdict:
 
 def score_of(explanation: Explanation, listed: Sequence[str], model_error: float) -> float:
     """Log weight of a set of effects, out of those that are listed."""
-    return _gain(explanation, listed) + float(np.log(sum(_remaining(_left(explanation), model_error))))
+    return _gain(explanation, listed) + float(np.log(sum(_remaining(_beyond(explanation), model_error))))
 
 
 def _gain(explanation: Explanation, listed: Sequence[str]) -> float:
@@ -228,7 +230,7 @@ def _judged(
         c.at_edge(explanation.end.coordinates_of(k)) and parts[c.effect].matters > 0.5
         for k, c in enumerate(explanation.end.candidates)
     )
-    explains = complete = 0.0 if at_edge else _enough(_left(explanation), model_error)
+    explains = complete = 0.0 if at_edge else _enough(_beyond(explanation), model_error)
     for part in parts.values():
         complete *= 1 - part.matters * (_hidden(part.name) if part.name in listed else 1.0)
     named = tuple(parts[name] for name in explanation.names if name in listed)
@@ -320,6 +322,11 @@ def _tolerances_off(search: Search, explanation: Explanation, k: int) -> float |
 def _left(explanation: Explanation) -> float:
     """Share of the motion that is left of estimation and held-out records."""
     return float(np.sqrt(np.mean(np.max(explanation.shares, axis=1) ** 2)))
+
+
+def _beyond(explanation: Explanation) -> float:
+    """The same as it would be without contacts."""
+    return _left(explanation) / (_AFTER_CONTACTS if explanation.end.non_smooth else 1.0)
 
 
 def _enough(left: float, model_error: float) -> float:

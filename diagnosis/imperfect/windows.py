@@ -63,6 +63,7 @@ class ArmInWindows(FlexibleArm):
             state_per_zero=np.tile(once.state_per_zero, (self.windows, 1)),
             guess=guess,
             responses=responses,
+            tried=np.zeros((0, 0)),
         )
 
     def simulator(self, effects: Sequence[Effect]) -> Callable[..., Real]:

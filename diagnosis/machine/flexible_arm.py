@@ -34,6 +34,8 @@ _ACCELERATION: Output = "tip_acceleration_m_s2"
 # Unknown starts: modes of the link that may still swing, and how far anything may be from rest.
 _MODES = 2
 _SPEED_RAD_S, _DEFLECTION, _RATE = 5.0, 1.0, 20.0
+# In free play the hub drifts until it touches, however slowly it did at first.
+_DRIFTS_RAD_S = np.outer([-1.0, 1.0], np.geomspace(3e-3, 0.1, 7)).ravel()
 # Beside a model error of per cents: within a thousandth of the motion in a third of the time. Accelerations
 # feel modes that angles do not: on a light link three miss 2.6 % of one, four 1.3 %.
 _COARSE_MODES, _COARSE_ACCELERATION_MODES, _COARSE_S = 3, 4, 4 * SUBSTEP_S
@@ -90,6 +92,7 @@ class FlexibleArm:
             self._responses,
             zero_seen=_TIP in self.outputs,
             slowest_period_samples=float(2 * np.pi / slowest_rad_s / self.rig.sampling.dt_s),
+            tried=np.outer(_DRIFTS_RAD_S, np.eye(len(spread))[1]),
         )
 
     def _first_sample(self, record: RecordOfMachine) -> Real:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Generic, Literal, Protocol, TypeVar, get_args
 
 import numpy as np
@@ -54,6 +54,7 @@ class UnknownStart:
         where nobody knows that, and spreads are finite.
     zero_seen : bool. Another output tells the zero; else it matters only to what depends on the true angle.
     slowest_period_samples : float. Period of the slowest mode; 0 where it is not known.
+    tried : (., S) moves of a start that are tried beside contacts that switch.
     """
 
     state_spread: Real
@@ -64,6 +65,7 @@ class UnknownStart:
     responses: Callable[[Sequence[Any], int], list[Real]] | None
     zero_seen: bool = True
     slowest_period_samples: float = 0.0
+    tried: Real = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 KNOWN_START = UnknownStart(

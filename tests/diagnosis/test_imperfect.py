@@ -21,10 +21,11 @@ from diagnosis import (
 )
 from diagnosis.evidence.look_alikes import look_alike
 from diagnosis.imperfect.carried import shares_of
-from diagnosis.imperfect.descent import Descent, best_move, descend, occam, refined, scanned
+from diagnosis.imperfect.descent import Descent, descend, occam, refined, scanned
 from diagnosis.imperfect.levels import Levels, coefficients
 from diagnosis.imperfect.records import Records, Start, StartColumns
 from diagnosis.imperfect.search import Explanation, Search
+from diagnosis.imperfect.settled import best_move, settled
 from diagnosis.imperfect.starts import points_of
 from diagnosis.imperfect.verdict import is_silent, judged
 from diagnosis.imperfect.windows import in_windows
@@ -82,12 +83,12 @@ def test_a_state_far_from_the_guess_is_found_in_one_move():
     """Where the loss is flat: beside what it leaves there, the present residuals are large in every band."""
     rng = np.random.default_rng(5)
     case = _case(rng)
-    records, part = Records(case, case.estimation), slice(0, 800)
+    records = Records(case, case.estimation)
     shapes = [np.ones(400), np.arange(400) / 400, *np.cos(np.outer([0.3, 0.7, 0.31, 0.71], np.arange(400)))]
     columns = np.column_stack([coefficients(np.column_stack([s, 2 * s])) for s in shapes])
     true = np.array([0.3, -2.0, 0.4, -0.2, 3.0, -2.0])
     e = columns @ true + coefficients(1e-3 * rng.standard_normal((400, 2)))
-    move = best_move(records, part, columns, e, np.zeros(6))
+    move = best_move(records.levels, records.state_spread, columns, e, np.zeros(6))
     at_the_end = records.levels.loss(e + columns @ move)
     assert at_the_end < records.levels.loss(e - columns @ true) + 1
     near = minimize(
@@ -348,6 +349,11 @@ def test_held_out_records_veto_that_nothing_is_missing():
     assert _judged({(): (0.0, 0.03, 0.03)}).answer == "none"
 
 
+@pytest.mark.parametrize(("effect", "answer"), [("backlash", "backlash"), ("actuator_dead_zone", "unknown")])
+def test_more_may_be_left_after_contacts_than_beside_anything_else(effect, answer):
+    assert _judged({(): (0.0, 0.4, 0.4), (effect,): (600.0, 0.12, 0.12)}).answer == answer
+
+
 @pytest.mark.parametrize(("acts", "answer"), [(0.0, "actuator_saturation"), (0.3, "none")])
 def test_held_out_records_that_an_effect_does_nothing_in_say_nothing_about_it(acts, answer):
     # Commands of the held-out record stay below the limit: it explains and contradicts nothing there.
@@ -443,6 +449,28 @@ def _hub_only(seed, *effects):
         records.append(Experiment(name, role, voltage, read, outputs=("hub_angle_rad",)))
     search = Search(Case("hub", RIG, tuple(records), 0.05), lambda share, words: None)
     return search, {c.effect: c for c in search.case.machine.candidates(search.case.experiments)}
+
+
+@pytest.mark.parametrize("seed", [3, 5, 7])
+def test_a_record_that_begins_in_free_play_is_followed_from_there(seed):
+    # Cut out of a run: until the hub touches, it goes on as it went, which no linear arm does.
+    rng = np.random.default_rng(seed)
+    play = {"name": "backlash", "gap_rad": 0.1}
+    truth, records = Truth(RIG.model_dump(exclude={"tolerances"}), (play,), Background()), []
+    for name, role in (("a", "estimation"), ("b", "estimation"), ("c", "held_out")):
+        voltage = 1.5 * rng.choice([-1.0, 1.0], 30).repeat(40)
+        angle = truth.record(voltage, None, None, Before(0.4)).hub_angle_rad[:, None]
+        first = int(rng.integers(250, 450))
+        read = angle[first:] + 3e-4 * rng.standard_normal(angle[first:].shape)
+        records.append(Experiment(name, role, voltage[first:], read, outputs=("hub_angle_rad",)))
+    of = Search(Case("play", RIG, tuple(records), 0.05), lambda share, words: None).records
+    nothing, effects = np.zeros(of.nominal.count), (parse_effect(play),)
+    losses = {}
+    for touching in (False, True):
+        _, e = settled(of, nothing, effects, of.at_rest(), touching=touching)
+        losses[touching] = [of.levels.within(part).loss(e[part]) for part in of.parts]
+    assert max(losses[False]) > 8
+    assert max(losses[True]) < 1
 
 
 def test_accelerations_are_those_of_enough_modes():

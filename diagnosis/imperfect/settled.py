@@ -1,0 +1,111 @@
+"""States at the start of records that fit them best, everything else as it is.
+
+Each record depends on its own start alone. What a start does is what the linear part of the machine makes of
+it, until contacts switch: in free play a hub goes on as it went until it touches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from diagnosis.imperfect.levels import Levels
+from diagnosis.imperfect.records import Records, Start
+from diagnosis.machine.machine_protocol import Real
+
+_ITERATIONS = 30
+# Steps of a start, and what a further one must gain; beside contacts parts of a step are tried as well.
+_STEPS, _GAIN = 5, 0.2
+_PARTS = (1.0, 0.3, 0.1, 0.03)
+
+
+def settled(
+    records: Records, d: Real, effects: Sequence[Any], start: Start, *, touching: bool = False
+) -> tuple[Start, Real]:
+    """The start from which the records fit best, and their coefficients (N,) there.
+
+    touching : from where the steps of the linear arm end and from the guess, states some way off are tried
+        (`UnknownStart.tried`), and columns are difference quotients at every further step.
+    """
+    if not start.states.size:
+        return start, records.coefficients(d, effects, start)
+    columns, unknown = records.start_columns(d, effects, start).states, records.case.machine.unknown_start
+    rest = records.at_rest().with_zeros(start.zeros, unknown.state_per_zero)
+    left = records.of_each(d, effects, start.zeros)
+    found = []
+    for r, state in enumerate(start.states):
+        best = _RecordStart(records, r, left, state)
+        best.descend(columns[r])
+        for near in (best.state, rest.states[r]) if touching and unknown.tried.size else ():
+            one = _RecordStart(records, r, left, near)
+            for moved in near + unknown.tried:
+                one.better(moved)
+            one.descend()
+            best = min(best, one, key=lambda one: one.loss)
+        found.append(best)
+    e = np.concatenate([one.e for one in found])
+    return Start(np.array([one.state for one in found]), start.zeros), e
+
+
+class _RecordStart:
+    """The best so far of the states (S,) at the start of the r-th record, e (T Y,) its coefficients there."""
+
+    def __init__(self, records: Records, r: int, left: Callable[[int, Real], Real], state: Real) -> None:
+        self.records, self.levels = records, records.levels.within(records.parts[r])
+        self.left = partial(left, r)
+        self.state, self.e = state, self.left(state)
+        self.loss = self._loss(state, self.e)
+
+    def _loss(self, state: Real, e: Real) -> float:
+        return self.levels.loss(e) + 0.5 * float(np.sum((state / self.records.state_spread) ** 2))
+
+    def better(self, state: Real) -> bool:
+        """Whether a state is, which then is taken."""
+        e = self.left(state)
+        if (loss := self._loss(state, e)) < self.loss:
+            self.state, self.e, self.loss = state, e, loss
+            return True
+        return False
+
+    def descend(self, columns: Real | None = None) -> None:
+        """By steps that are linear in the columns (T Y, S); without, in difference quotients at each state,
+        and by parts of such steps."""
+        parts, spread = _PARTS if columns is None else (1.0,), self.records.state_spread
+        for _ in range(_STEPS):
+            own = columns
+            if own is None:
+                own = self.records.quotients_by_state(self.left, self.state, self.e)
+            before, move = self.loss, best_move(self.levels, spread, own, self.e, self.state)
+            if not any(self.better(self.state + part * move) for part in parts) or self.loss > before - _GAIN:
+                return
+
+
+def best_move(levels: Levels, spread: Real, columns: Real, e: Real, state: Real) -> Real:
+    """(S,) from the state at the start of a record to the one that leaves least of its coefficients e (T Y,),
+    these being linear in it; columns (T Y, S), levels: of this record.
+
+    Far from it the loss is flat, and weights of what is left there lead to it in many small steps: they are
+    taken on the energies of the bands, and once more from where all bands weigh as their floors do.
+    """
+    rows = np.column_stack([columns, e])
+    energies = np.array([own.T @ own for b in range(levels.floor.size) for own in [rows[levels.band == b]]])
+
+    def left(move: Real) -> Real:
+        whole = np.append(move, 1.0)
+        return np.asarray(np.maximum(energies @ whole @ whole, 0.0))
+
+    def loss(move: Real) -> float:
+        return levels.loss_of(left(move)) + 0.5 * float(np.sum(((state + move) / spread) ** 2))
+
+    found: list[Real] = []
+    for weights in (levels.counted / (left(np.zeros(state.size)) + levels.floor), 1 / levels.floor):
+        for _ in range(_ITERATIONS):
+            weighted = np.tensordot(weights, energies, 1)
+            H, g = weighted[:-1, :-1] + np.diag(1 / spread**2), weighted[:-1, -1] + state / spread**2
+            move = np.asarray(-np.linalg.solve(H, g))
+            weights = levels.counted / (left(move) + levels.floor)
+        found.append(move)
+    return min(found, key=loss)
