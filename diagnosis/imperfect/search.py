@@ -313,6 +313,8 @@ class Search:
 
     def _from_contacts(self) -> None:
         """The likeliest sets of each size with contacts once more from starts that feel them."""
+        if not self.case.machine.unknown_start.tried.size:
+            return
         self._touching = True
         sets = [e for e in best_of_sets(self.found).values() if e.end.non_smooth]
         for count in range(1, self.case.machine.weighing.most_effects + 1):

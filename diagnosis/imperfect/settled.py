@@ -39,7 +39,7 @@ def settled(
     for r, state in enumerate(start.states):
         best = _RecordStart(records, r, left, state)
         best.descend(columns[r])
-        for near in (best.state, rest.states[r]) if touching and unknown.tried.size else ():
+        for near in (best.state, rest.states[r]) if touching else ():
             one = _RecordStart(records, r, left, near)
             for moved in near + unknown.tried:
                 one.better(moved)
