@@ -237,9 +237,7 @@ def _intervals(
     candidate, coordinates = end.candidates[k], end.coordinates_of(k)
     first = end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])
     rows = slice(first, first + len(candidate.axes))
-    inverse = np.asarray(
-        np.linalg.pinv(end.equations(search.records).hessian, hermitian=True), dtype=np.float64
-    )
+    inverse = np.asarray(np.linalg.pinv(end.normal(search.records).hessian, hermitian=True), dtype=np.float64)
     rest = judging.best_without(best_of_sets(search.found), explanation, explanation.names[k])
     alike = _ALIKE * search.case.machine.weighing.model_error
     share = max(judging.share_beside(rest, explanation), alike)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -70,62 +71,68 @@ class Descent:
         first = sum(len(c.axes) for c in self.candidates[:k])
         return self.coordinates[first : first + len(self.candidates[k].axes)]
 
-    def equations(self, records: Records, start: Start | None = None, e: Real | None = None) -> Normal:
-        """Normal equations at the end, or of other coefficients e (N,) and start in its linearisation."""
-        return normal_equations(
-            records,
-            records.levels.weights(self.left),
-            self.jacobian,
-            self.columns,
-            self.deviations,
-            self.start if start is None else start,
-            self.left if e is None else e,
-        )
+    def normal(self, records: Records) -> NormalEquations:
+        """Of its linearisation."""
+        return _normal_at(self, records)
 
     def precision(self, records: Records) -> Real:
         """(P + A, P + A) of deviations and coordinates, whatever the starts and zeros are."""
-        H, n = self.equations(records).hessian, self.jacobian.shape[1]
+        H, n = self.normal(records).hessian, self.jacobian.shape[1]
         rest = np.linalg.pinv(H[n:, n:], hermitian=True)
         return np.asarray(H[:n, :n] - H[:n, n:] @ rest @ H[n:, :n])
 
 
 @dataclass(frozen=True, eq=False)
-class Normal:
-    """Weighted, in (d, x, zeros, states of record 1, 2, ...): hessian (M, M), gradient (M,)."""
+class NormalEquations:
+    """Weighted, in (d, x, zeros, states of record 1, 2, ...): hessian (M, M).
 
+    weighted : (N, P + A + Z) and (T Y, S) of every record, columns times the weights.
+    """
+
+    records: Records
+    deviations: Real
+    weighted: tuple[Real, tuple[Real, ...]]
     hessian: Real
-    gradient: Real
+
+    @classmethod
+    def of(
+        cls, records: Records, weights: Real, jacobian: Real, columns: StartColumns, deviations: Real
+    ) -> NormalEquations:
+        shared = np.column_stack([jacobian, columns.zeros])
+        P, k, S = deviations.size, shared.shape[1], records.state_spread.size
+        M = k + len(records.parts) * S
+        weighted, of_states = shared * weights[:, None], []
+        H = np.zeros((M, M))
+        H[:k, :k] = shared.T @ weighted
+        for r, (part, own) in enumerate(zip(records.parts, columns.states, strict=True)):
+            at = slice(k + r * S, k + (r + 1) * S)
+            of_states.append(own * weights[part, None])
+            H[at, at] = own.T @ of_states[r] + np.diag(1 / records.state_spread**2)
+            H[:k, at] = weighted[part].T @ own
+            H[at, :k] = H[:k, at].T
+        H[range(P), range(P)] += prior_curvature(deviations)
+        zeros = range(jacobian.shape[1], k)
+        H[zeros, zeros] += 1 / records.zero_spread**2
+        return cls(records, deviations, (weighted, tuple(of_states)), H)
+
+    def gradient(self, start: Start, e: Real) -> Real:
+        """(M,) where coefficients e (N,) are left from a start."""
+        weighted, of_states = self.weighted
+        shared, Z = weighted.T @ e, start.zeros.size
+        shared[: self.deviations.size] += prior_slope(self.deviations)
+        shared[shared.size - Z :] += start.zeros / self.records.zero_spread**2
+        own = [
+            columns.T @ e[part] + states / self.records.state_spread**2
+            for part, columns, states in zip(self.records.parts, of_states, start.states, strict=True)
+        ]
+        return np.concatenate([shared, *own])
 
 
-def normal_equations(
-    records: Records,
-    weights: Real,
-    jacobian: Real,
-    columns: StartColumns,
-    deviations: Real,
-    start: Start,
-    e: Real,
-) -> Normal:
-    shared = np.column_stack([jacobian, columns.zeros])
-    P, k = deviations.size, shared.shape[1]
-    R, S = start.states.shape
-    weighted = shared * weights[:, None]
-    H, g = np.zeros((k + R * S, k + R * S)), np.zeros(k + R * S)
-    H[:k, :k], g[:k] = shared.T @ weighted, weighted.T @ e
-    free = 1 / records.state_spread**2
-    for r, (part, own) in enumerate(zip(records.parts, columns.states, strict=True)):
-        at = slice(k + r * S, k + (r + 1) * S)
-        own_weighted = own * weights[part, None]
-        H[at, at] = own.T @ own_weighted + np.diag(free)
-        H[:k, at] = weighted[part].T @ own
-        H[at, :k] = H[:k, at].T
-        g[at] = own_weighted.T @ e[part] + free * start.states[r]
-    H[range(P), range(P)] += prior_curvature(deviations)
-    g[:P] += prior_slope(deviations)
-    zeros = range(jacobian.shape[1], k)
-    H[zeros, zeros] += 1 / records.zero_spread**2
-    g[jacobian.shape[1] : k] += start.zeros / records.zero_spread**2
-    return Normal(H, g)
+@lru_cache(maxsize=2)
+def _normal_at(end: Descent, records: Records) -> NormalEquations:
+    """Once for all that is tried beside a fit."""
+    weights = records.levels.weights(end.left)
+    return NormalEquations.of(records, weights, end.jacobian, end.columns, end.deviations)
 
 
 def loss_at(records: Records, e: Real, deviations: Real, start: Start) -> tuple[float, float]:
@@ -174,8 +181,8 @@ def descend(
             columns = records.with_true_angles(columns, d, effects_at(candidates, x), start, e)
         by_effects = quotients(lambda x: left(d, x, start), x, e, steps, high)  # noqa: B023
         jacobian = np.column_stack([nominal_jacobian, by_effects])
-        equations = normal_equations(records, records.levels.weights(e), jacobian, columns, d, start, e)
-        H, g = equations.hessian, equations.gradient
+        normal = NormalEquations.of(records, records.levels.weights(e), jacobian, columns, d)
+        H, g = normal.hessian, normal.gradient(start, e)
         held = ((x <= low) & (g[P : P + A] > 0)) | ((x >= high) & (g[P : P + A] < 0))
         free = np.setdiff1d(np.arange(g.size), P + np.flatnonzero(held))
         reached = None
@@ -257,9 +264,9 @@ def follow(records: Records, around: Descent, e: Real, start: Start) -> tuple[fl
     """What the loss of coefficients e (N,) becomes, and where the deviations go, once everything that
     `around` holds has followed linearly."""
     P = around.deviations.size
-    equations = around.equations(records, start, e)
-    H = equations.hessian + np.diag(1e-9 * np.diag(equations.hessian) + 1e-12)
-    step = np.asarray(-np.linalg.solve(H, equations.gradient), dtype=np.float64)
+    normal = around.normal(records)
+    H = normal.hessian + np.diag(1e-9 * np.diag(normal.hessian) + 1e-12)
+    step = np.asarray(-np.linalg.solve(H, normal.gradient(start, e)), dtype=np.float64)
     step[:P] = np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP)
     moved = e + np.column_stack([around.jacobian, around.columns.zeros]) @ step[: -start.states.size or None]
     d, start2 = around.deviations + step[:P], around.columns.moved(start, step[around.jacobian.shape[1] :])

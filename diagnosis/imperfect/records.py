@@ -74,6 +74,11 @@ class Records:
         self.simulations = 0
         ends = np.cumsum([e.output.size for e in experiments])
         self.parts = [slice(int(b - e.output.size), int(b)) for b, e in zip(ends, experiments, strict=True)]
+        lacking = [list(getattr(e, "missing", ())) for e in experiments]
+        self._missing = [
+            (rows, np.setdiff1d(np.arange(len(e.output)), rows))
+            for e, rows in zip(experiments, lacking, strict=True)
+        ]
         # What no machine does counts so much and no more.
         self._far = [1e6 * np.std(e.output, axis=0) for e in experiments]
         unknown = case.machine.unknown_start
@@ -106,9 +111,8 @@ class Records:
         experiment, far = self.experiments[r], self._far[r]
         self.simulations += 1
         e = experiment.output - simulate(experiment.input, state, zeros)
-        missing = list(getattr(experiment, "missing", ()))
+        missing, kept = self._missing[r]
         if missing:
-            kept = np.setdiff1d(np.arange(len(e)), missing)
             for column in e.T:
                 column[missing] = np.interp(missing, kept, column[kept])
         # Written so that nan is far, too.

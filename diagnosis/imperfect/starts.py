@@ -96,8 +96,8 @@ def _harmonic(records: Records, around: Descent, candidate: Candidate) -> list[P
     size = next_fast_len(2 * longest, real=True)
     transfer = np.fft.rfft(response, size, axis=0)
     weights = records.levels.weights(around.left)
-    equations = around.equations(records)
-    H, g = equations.hessian, equations.gradient
+    normal = around.normal(records)
+    H, g = normal.hessian, normal.gradient(around.start, around.left)
     factor = cho_factor(H + np.diag(1e-9 * np.diag(H) + 1e-12))
     shared = np.column_stack([around.jacobian, around.columns.zeros])
     k, S = shared.shape[1], around.start.states.shape[1]

@@ -659,7 +659,7 @@ def test_precision_of_parameters_whatever_the_starts_are():
     records = Records(case, case.estimation)
     end = descend(records, (), np.zeros(0), np.zeros(0), records.at_rest(), iterations=2)
     shared = replace(end, jacobian=np.column_stack([end.columns.zeros, end.left]))
-    whole = np.linalg.inv(shared.equations(records).hessian)
+    whole = np.linalg.inv(shared.normal(records).hessian)
     np.testing.assert_allclose(np.linalg.inv(shared.precision(records)), whole[:2, :2], rtol=1e-5)
 
 
