@@ -131,14 +131,16 @@ class Levels:
         """Of the record that has this part of the coefficients."""
         band = self.band[part]
         own = slice(int(band.min()), int(band.max()) + 1)
+        belongs = self.belongs[own]
+        first = int(belongs.min())
         return Levels(
             band - own.start,
             self.counted[own],
             self.floor[own],
             self.noise[own],
             self.felt[own],
-            self.belongs[own],
-            self.motion,
+            belongs - first,
+            self.motion[first : int(belongs.max()) + 1],
         )
 
     def loss_of(self, energy: Real) -> float:

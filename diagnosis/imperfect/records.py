@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from diagnosis.fit.fit import quotients
 from diagnosis.fit.nominal import LogNormalParameters
 from diagnosis.imperfect.levels import Levels, coefficients, disturbance, octave_energies
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
@@ -83,6 +84,8 @@ class Records:
         self._far = [1e6 * np.std(e.output, axis=0) for e in experiments]
         unknown = case.machine.unknown_start
         self.state_spread, self.zero_spread = unknown.state_spread, unknown.zero_spread
+        known = np.isfinite(self.state_spread)
+        self.state_steps = np.where(known, _STATE_STEP * self.state_spread, _ANGLE_STEP_RAD)
 
     def _amplified(self, experiment: RecordOfMachine) -> Real:
         """(octaves, Y) energies of what disturbances as large as its inputs do to the outputs, of the stated
@@ -154,18 +157,10 @@ class Records:
 
     def _differences(self, deviations: Real, effects: Sequence[Any], start: Start) -> list[Real]:
         of_each = self.of_each(deviations, effects, start.zeros)
-        lefts = [partial(of_each, r) for r in range(len(self.experiments))]
         return [
-            self.quotients_by_state(left, state, left(state))
-            for left, state in zip(lefts, start.states, strict=True)
+            quotients(partial(of_each, r), state, of_each(r, state), self.state_steps)
+            for r, state in enumerate(start.states)
         ]
-
-    def quotients_by_state(self, left: Callable[[Real], Real], state: Real, e: Real) -> Real:
-        """(T Y, S) difference quotients of the coefficients of a record (`of_each`); e: there."""
-        steps = np.where(np.isfinite(self.state_spread), _STATE_STEP * self.state_spread, _ANGLE_STEP_RAD)
-        return np.column_stack(
-            [(left(state + step) - e) / size for step, size in zip(np.diag(steps), steps, strict=True)]
-        )
 
     def with_true_angles(
         self, columns: StartColumns, deviations: Real, effects: Sequence[Any], start: Start, e: Real

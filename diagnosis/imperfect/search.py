@@ -319,7 +319,7 @@ class Search:
         sets = [e for e in best_of_sets(self.found).values() if e.end.non_smooth]
         for count in range(1, self.case.machine.weighing.most_effects + 1):
             for e in [e for e in sets if len(e.names) == count][:_TOUCHING]:
-                if e.evidence < max(e.evidence for e in self.found) - _UNLIKELY:
+                if e.evidence < max(other.evidence for other in self.found) - _UNLIKELY:
                     continue
                 if self._late("starts of records in free play"):
                     return

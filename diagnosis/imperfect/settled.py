@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from diagnosis.fit.fit import quotients
 from diagnosis.imperfect.levels import Levels
 from diagnosis.imperfect.records import Records, Start
 from diagnosis.machine.machine_protocol import Real
@@ -73,12 +74,12 @@ class _RecordStart:
     def descend(self, columns: Real | None = None) -> None:
         """By steps that are linear in the columns (T Y, S); without, in difference quotients at each state,
         and by parts of such steps."""
-        parts, spread = _PARTS if columns is None else (1.0,), self.records.state_spread
+        records, parts = self.records, _PARTS if columns is None else (1.0,)
         for _ in range(_STEPS):
             own = columns
             if own is None:
-                own = self.records.quotients_by_state(self.left, self.state, self.e)
-            before, move = self.loss, best_move(self.levels, spread, own, self.e, self.state)
+                own = quotients(self.left, self.state, self.e, records.state_steps)
+            before, move = self.loss, best_move(self.levels, records.state_spread, own, self.e, self.state)
             if not any(self.better(self.state + part * move) for part in parts) or self.loss > before - _GAIN:
                 return
 

@@ -325,7 +325,7 @@ def _left(explanation: Explanation) -> float:
 
 
 def _beyond(explanation: Explanation) -> float:
-    """The same as it would be without contacts."""
+    """What is left, as it would be without contacts."""
     return _left(explanation) / (_AFTER_CONTACTS if explanation.end.non_smooth else 1.0)
 
 

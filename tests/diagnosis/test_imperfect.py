@@ -467,8 +467,10 @@ def test_a_record_that_begins_in_free_play_is_followed_from_there(seed):
     nothing, effects = np.zeros(of.nominal.count), (parse_effect(play),)
     losses = {}
     for touching in (False, True):
-        _, e = settled(of, nothing, effects, of.at_rest(), touching=touching)
+        start, e = settled(of, nothing, effects, of.at_rest(), touching=touching)
+        np.testing.assert_array_equal(e, of.coefficients(nothing, effects, start))
         losses[touching] = [of.levels.within(part).loss(e[part]) for part in of.parts]
+        assert sum(losses[touching]) == pytest.approx(of.levels.loss(e))
     assert max(losses[False]) > 8
     assert max(losses[True]) < 1
 
