@@ -101,6 +101,7 @@ class JointPath:
     ground_spring_Nm_rad: float = 0.0
     compliance: TorsionSpring | None = None
     base: TorsionSpring | None = None
+    attached: TorsionSpring | None = None
     backlash_gap_rad: float | None = None
 
 

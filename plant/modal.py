@@ -113,7 +113,8 @@ def link_modes(rig: Rig, n_modes: int) -> BeamModes:
 
 
 def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
-    """Linear equations of the machine: rig, springs at joint, base and hub, the two sides of a backlash.
+    """Linear equations of the machine: rig, springs at joint, base and hub, a body held to the
+    hub, the two sides of a backlash.
 
     Torques that are not linear in the state (friction, contact, ripple, cubic spring, gravity) are not in it.
     """
@@ -124,6 +125,8 @@ def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
         names.append("base")
     if joint.backlash_gap_rad is not None:
         names.append("motor")
+    if joint.attached is not None:
+        names.append("attached")
     if joint.compliance is not None:
         names.append("root")
     first = len(names)
@@ -133,6 +136,7 @@ def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
     hub = unit["hub"]
     base = unit.get("base", zero)
     motor = unit.get("motor", hub)
+    attached = unit.get("attached", hub)
     root = unit.get("root", hub)
     shaft = motor - base
 
@@ -150,13 +154,17 @@ def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
     stiffness += elastic
     damping += rig.link.kelvin_voigt_s * elastic
     damping += (rig.hub.viscous_friction_Nms + rig.motor.back_emf_damping_Nms) * np.outer(shaft, shaft)
-    for spring, twist in ((joint.compliance, root - hub), (joint.base, base)):
+    sprung = (
+        (joint.compliance, root, root - hub),
+        (joint.base, base, base),
+        (joint.attached, attached, attached - hub),
+    )
+    for spring, carried, twist in sprung:
         if spring is not None:
             stiffness += spring.stiffness_Nm_rad * np.outer(twist, twist)
             damping += spring.damping_Nms * np.outer(twist, twist)
+            mass += spring.inertia_kg_m2 * np.outer(carried, carried)
     stiffness += joint.ground_spring_Nm_rad * np.outer(motor, motor)
-    if joint.base is not None:
-        mass += joint.base.inertia_kg_m2 * np.outer(base, base)
     bending = modes.tip @ deflection
     return Equations(
         mass=mass,

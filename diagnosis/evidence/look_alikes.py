@@ -16,8 +16,6 @@ from diagnosis.fit.fit import Fit, fit
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.machine.case import Case
 from plant.effects import LOOK_ALIKES, Effect
-from plant.effects.search_space import Candidate, log_axis
-from plant.rig import Rig
 
 # Of unknown causes this share is a look-alike of an effect: a third as probable as the effect itself.
 _SHARE = 0.06
@@ -40,22 +38,27 @@ def look_alikes(model: ResidualModel, hypotheses: Sequence[Hypothesis], base: Fi
         unlisted = float(np.log(PRIOR_UNKNOWN) + np.log(_SHARE)) - log_prior((name,))
         for h in hypotheses:
             if name in h.names and h.largest_weight > best - STILL_POSSIBLE:
-                other = weighed(model, _with(model, h.fit, name, kind), base)
-                found.append(Hypothesis(other.fit, -np.inf, other.log_weight + unlisted))
+                others = [weighed(model, end, base) for end in _with(model, h.fit, name, kind)]
+                other = max(others, key=lambda other: other.log_weight, default=None)
+                if other is not None:
+                    found.append(Hypothesis(other.fit, -np.inf, other.log_weight + unlisted))
     return tuple(found)
 
 
-def look_alike(kind: type[Effect], of: Candidate, rig: Rig) -> tuple[Candidate, float]:
-    """Search of a look-alike, and its size's coordinate less that of what it looks like."""
-    scale, axis = kind.look_alike_scale(rig), of.axes[0]
-    size = log_axis(next(iter(kind.model_fields)), axis.low * scale, axis.high * scale, axis.step)
-    return Candidate(kind, (size,), ()), float(np.log(scale))
-
-
-def _with(model: ResidualModel, end: Fit, name: str, kind: type[Effect]) -> Fit:
-    """The fit with the look-alike in place of the effect of this name; first parameters are sizes."""
+def _with(model: ResidualModel, end: Fit, name: str, kind: type[Effect]) -> list[Fit]:
+    """Fits with the look-alike in place of the effect of this name."""
     k = end.names.index(name)
-    other, shift = look_alike(kind, end.candidates[k], model.nominal.at(end.deviations).description)
+    other = kind.in_place_of(
+        end.candidates[k], end.coordinates[k], model.nominal.at(end.deviations).description
+    )
     candidates = (*end.candidates[:k], other, *end.candidates[k + 1 :])
-    x = (*end.coordinates[:k], end.coordinates[k] + shift, *end.coordinates[k + 1 :])
-    return fit(model, candidates, x, end.deviations, iterations=_ITERATIONS)
+    return [
+        fit(
+            model,
+            candidates,
+            (*end.coordinates[:k], np.array(start), *end.coordinates[k + 1 :]),
+            end.deviations,
+            iterations=_ITERATIONS,
+        )
+        for start in other.starts
+    ]

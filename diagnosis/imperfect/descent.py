@@ -242,9 +242,8 @@ def _sought(records: Records, end: Descent, k: int, shifts: Real) -> Descent:
     for shift in shifts:
         x = end.coordinates.copy()
         x[k] = np.clip(x[k] + shift, low[k], high[k])
-        e = records.coefficients(end.deviations, effects_at(end.candidates, x), end.start)
-        trials.append((*follow(records, end, e, end.start), x))
-    loss, d, x = min(trials, key=lambda trial: trial[0])
+        trials.append(x)
+    loss, d, x = best_following(records, end, end.candidates, trials)
     if loss > end.loss + _HOPELESS:
         return end
     again = descend(
@@ -258,6 +257,18 @@ def _sought(records: Records, end: Descent, k: int, shifts: Real) -> Descent:
         iterations=5,
     )
     return min(end, again, key=lambda one: one.loss)
+
+
+def best_following(
+    records: Records, around: Descent, candidates: Sequence[Candidate], trials: Sequence[Real]
+) -> tuple[float, Real, Real]:
+    """The best of some coordinates of the candidates once all else has followed (`follow`): loss,
+    deviations, coordinates."""
+    followed = []
+    for x in trials:
+        e = records.coefficients(around.deviations, effects_at(candidates, x), around.start)
+        followed.append((*follow(records, around, e, around.start), x))
+    return min(followed, key=lambda trial: trial[0])
 
 
 def follow(records: Records, around: Descent, e: Real, start: Start) -> tuple[float, Real]:

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from diagnosis.evidence.look_alikes import look_alike
-from diagnosis.imperfect.descent import Descent, descend, loss_at, occam, refined, scanned
+from diagnosis.imperfect.descent import Descent, best_following, descend, loss_at, occam, refined, scanned
 from diagnosis.imperfect.records import Records, Start
 from diagnosis.imperfect.settled import settled
 from diagnosis.imperfect.starts import Point, beside, points_of
@@ -348,11 +347,14 @@ class Search:
                 end = explanation.end
                 k = end.names.index(str(kind.look_alike_of))
                 rig = self.records.nominal.at(end.deviations).description
-                other, shift = look_alike(kind, end.candidates[k], rig)
-                x = end.coordinates.copy()
-                x[sum(len(c.axes) for c in end.candidates[:k])] += shift
+                other = kind.in_place_of(end.candidates[k], end.coordinates_of(k), rig)
                 candidates = (*end.candidates[:k], other, *end.candidates[k + 1 :])
-                self.add(descend(self.records, candidates, end.deviations, x, end.start))
+                first = sum(len(c.axes) for c in end.candidates[:k])
+                rest = end.coordinates[:first], end.coordinates[first + len(end.candidates[k].axes) :]
+                trials = [np.concatenate([rest[0], start, rest[1]]) for start in other.starts]
+                if trials:
+                    _, d, x = best_following(self.records, end, candidates, trials)
+                    self.add(descend(self.records, candidates, d, x, end.start))
 
     def simpler(self, explanation: Explanation) -> None:
         """The same with effects in place of those that contain them, from where these ended: further values

@@ -232,16 +232,9 @@ def _judged(
     )
     explains = complete = 0.0 if at_edge else _enough(_beyond(explanation), model_error)
     for part in parts.values():
-        complete *= 1 - part.matters * (_hidden(part.name) if part.name in listed else 1.0)
+        complete *= 1.0 if part.name in listed else 1 - part.matters
     named = tuple(parts[name] for name in explanation.names if name in listed)
     return Judged(explanation, named, score_of(explanation, listed, model_error), explains, complete)
-
-
-def _hidden(name: str) -> float:
-    """Probability that what is beyond the list acts in place of an effect, where no look-alike is fitted."""
-    kind = EFFECTS.get(name)
-    alone = kind is not None and kind.beside is not None and name not in _LISTED_AS.values()
-    return _UNLISTED / (1 + _UNLISTED) if alone else 0.0
 
 
 def best_without(

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, cast
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from plant.effects.search_space import (
@@ -110,6 +111,13 @@ class Effect(BaseModel, ABC):
     def look_alike_scale(cls, rig: Rig) -> float:
         """Size of this effect per size of the one it looks like (`look_alike_of`)."""
         return 1.0
+
+    @classmethod
+    def in_place_of(cls, other: Candidate, x: npt.NDArray[np.float64], rig: Rig) -> Candidate:
+        """Search of this effect from where the one that it looks like ended, at the coordinates x (A,)."""
+        scale, axis = cls.look_alike_scale(rig), other.axes[0]
+        size = log_axis(next(iter(cls.model_fields)), axis.low * scale, axis.high * scale, axis.step)
+        return Candidate(cls, (size,), ((float(x[0] + np.log(scale)),),))
 
     def parameters(self) -> dict[str, float]:
         """Parameter values by name."""

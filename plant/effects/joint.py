@@ -29,6 +29,7 @@ from plant.machine import (
     Disturbance,
     DryFriction,
     Machine,
+    Real,
     SmoothTorque,
     TorsionSpring,
 )
@@ -170,6 +171,47 @@ class HubInertia(RatioEffect):
     multiplies = "hub.inertia_kg_m2"
 
     ratio: Positive = Field(description="true over nominal hub inertia")
+
+
+@register
+class AttachedBody(Effect):
+    """A body about the hub axis that a torsion spring and damper hold to the hub: a coupling, a drum.
+
+    Below its resonance that is inertia of the hub: no answer of a diagnosis, which needs it to tell that from
+    what looks like it.
+    """
+
+    id = "attached_body"
+    words = "a body that something compliant holds to the hub"
+    look_alike_of = "hub_inertia"
+
+    inertia_kg_m2: Positive = Field(description="inertia Ja of the body")
+    stiffness_Nm_rad: Positive = Field(description="stiffness k")
+    damping_Nms: NotNegative = Field(description="damping c")
+
+    def modify(self, machine: Machine) -> Machine:
+        return with_joint(
+            machine, attached=TorsionSpring(self.stiffness_Nm_rad, self.damping_Nms, self.inertia_kg_m2)
+        )
+
+    @classmethod
+    def in_place_of(cls, other: Candidate, x: Real, rig: Rig) -> Candidate:
+        hub, ratio = rig.hub.inertia_kg_m2, other.axes[0]
+        if ratio.value(x[0]) <= 1:
+            return Candidate(cls, (), ())
+        inertia = (ratio.value(x[0]) - 1) * hub
+        # Held more stiffly than that it is inertia of the hub.
+        slowest, fastest = 2 * np.pi * 0.5, 2 * np.pi * 0.125 / rig.sampling.dt_s
+        axes = [
+            log_axis("inertia_kg_m2", (ratio.low - 1) * hub, (ratio.high - 1) * hub),
+            log_axis("stiffness_Nm_rad", inertia * slowest**2, inertia * fastest**2),
+            log_axis("damping_Nms", 0.01 * inertia * slowest, 2 * inertia * fastest),
+        ]
+        starts = [
+            (inertia, inertia * omega**2, 0.2 * inertia * omega)
+            for omega in geometric(3 * slowest, 0.6 * fastest, 6)
+        ]
+        return cls._candidate(axes, starts)
 
 
 @register

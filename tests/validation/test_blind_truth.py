@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from plant.effects import EFFECTS, parse_effects
-from plant.effects.joint import GroundSpring
+from plant.effects.joint import AttachedBody, GroundSpring
 from plant.rig import Rig
 from plant.simulation import simulate
 from validation.blind.beam import link_basis
@@ -96,13 +96,20 @@ def test_every_effect_agrees_with_the_plants_to_a_small_part_of_the_noise(name):
     assert np.all(_noise_deviations(Truth(RIG, effects), effects, _voltage()) < 0.05)
 
 
-def test_a_spring_to_ground_agrees_with_the_plants():
-    # Beyond the list, but the diagnosis has to know it: gravity looks like it.
+# Beyond the list, but the diagnosis has to know them: gravity and hub inertia look like them.
+@pytest.mark.parametrize(
+    ("name", "effect"),
+    [
+        ("ground_spring", GroundSpring(stiffness_Nm_rad=0.5)),
+        ("attachment", AttachedBody(inertia_kg_m2=0.01, stiffness_Nm_rad=6.0, damping_Nms=0.05)),
+    ],
+)
+def test_what_looks_like_an_effect_agrees_with_the_plants(name, effect):
     voltage = _voltage()
-    ours = Truth(RIG, [{"name": "ground_spring", "stiffness_Nm_rad": 0.5}])
+    ours = Truth(RIG, [{"name": name, **effect.parameters()}])
     record = ours.record(voltage).measured(np.zeros((voltage.size, 2)))
     rig = Rig.model_validate(RIG)
-    plant = simulate(rig, voltage, [GroundSpring(stiffness_Nm_rad=0.5)]).output
+    plant = simulate(rig, voltage, [effect]).output
     nothing = simulate(rig, voltage).output
     assert np.all(np.std(record - nothing, axis=0) > 5 * ours.noise)
     assert np.all(np.sqrt(np.mean((record - plant) ** 2, axis=0)) < 0.05 * ours.noise)
