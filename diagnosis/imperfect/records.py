@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.fft import idct
 
 from diagnosis.fit.fit import quotients
 from diagnosis.fit.nominal import LogNormalParameters
@@ -128,6 +129,14 @@ class Records:
 
     def coefficients(self, deviations: Real, effects: Sequence[Any], start: Start) -> Real:
         return np.concatenate([coefficients(e) for e in self.residuals(deviations, effects, start)])
+
+    def residuals_of(self, e: Real) -> tuple[Real, ...]:
+        """measured - model (T, Y) of every record from their coefficients (N,)."""
+        shapes = [experiment.output.shape for experiment in self.experiments]
+        return tuple(
+            np.asarray(idct(e[part].reshape(shape), axis=0, norm="ortho"))
+            for part, shape in zip(self.parts, shapes, strict=True)
+        )
 
     def start_columns(
         self, deviations: Real, effects: Sequence[Any], start: Start, *, touching: bool = False

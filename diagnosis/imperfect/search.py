@@ -442,8 +442,7 @@ class Search:
         beginning = self._beginning(held, end.start)
         touching = self._touching and end.non_smooth
         start, e = settled(held, end.deviations, end.effects, beginning, touching=touching)
-        left = tuple(records.residuals(end.deviations, end.effects, end.start))
-        left_held_out = tuple(held.residuals(end.deviations, end.effects, start))
+        left, left_held_out = records.residuals_of(end.left), held.residuals_of(e)
         held_out_loss = held.levels.loss(e) + 0.5 * float(np.sum((start.states / held.state_spread) ** 2))
         return Explanation(
             end,

@@ -17,7 +17,7 @@ from diagnosis.imperfect.levels import Levels
 from diagnosis.imperfect.records import Records, Start
 from diagnosis.machine.machine_protocol import Real
 
-_ITERATIONS = 30
+_ITERATIONS, _STILL = 30, 1e-7
 # Steps of a start, and what a further one must gain; beside contacts parts of a step are tried as well.
 _STEPS, _GAIN = 5, 0.2
 _PARTS = (1.0, 0.3, 0.1, 0.03)
@@ -103,10 +103,13 @@ def best_move(levels: Levels, spread: Real, columns: Real, e: Real, state: Real)
 
     found: list[Real] = []
     for weights in (levels.counted / (left(np.zeros(state.size)) + levels.floor), 1 / levels.floor):
+        move = np.zeros(state.size)
         for _ in range(_ITERATIONS):
-            weighted = np.tensordot(weights, energies, 1)
+            weighted, before = np.tensordot(weights, energies, 1), move
             H, g = weighted[:-1, :-1] + np.diag(1 / spread**2), weighted[:-1, -1] + state / spread**2
             move = np.asarray(-np.linalg.solve(H, g))
+            if np.all(np.abs(move - before) < _STILL * spread):
+                break
             weights = levels.counted / (left(move) + levels.floor)
         found.append(move)
     return min(found, key=loss)

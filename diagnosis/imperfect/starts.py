@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import next_fast_len
+from scipy.fft import dct, next_fast_len
 from scipy.linalg import cho_factor, cho_solve
 
 from diagnosis.imperfect.descent import Descent, follow
-from diagnosis.imperfect.levels import coefficients
 from diagnosis.imperfect.records import Records, Start
 from diagnosis.machine.machine_protocol import Real
 from plant.effects.search_space import Candidate
@@ -115,7 +114,7 @@ def _harmonic(records: Records, around: Descent, candidate: Candidate) -> list[P
         return np.fft.irfft(np.fft.rfft(torque, size)[:, :, None] * transfer, size, axis=1)
 
     def column_pair(moved: Real) -> Real:
-        return np.column_stack([-coefficients(m) for m in moved])
+        return -dct(moved, axis=1, norm="ortho").reshape(2, -1).T
 
     found = []
     for line in lines[(lines >= low) & (lines <= high)]:
