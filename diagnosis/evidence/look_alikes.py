@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from diagnosis.evidence.hypotheses import PRIOR_UNKNOWN, STILL_POSSIBLE, Hypothesis, log_prior
+from diagnosis.evidence.screening import Screening
 from diagnosis.evidence.search import weighed
 from diagnosis.fit.fit import Fit, fit
 from diagnosis.fit.residual import ResidualModel
@@ -38,27 +39,24 @@ def look_alikes(model: ResidualModel, hypotheses: Sequence[Hypothesis], base: Fi
         unlisted = float(np.log(PRIOR_UNKNOWN) + np.log(_SHARE)) - log_prior((name,))
         for h in hypotheses:
             if name in h.names and h.largest_weight > best - STILL_POSSIBLE:
-                others = [weighed(model, end, base) for end in _with(model, h.fit, name, kind)]
-                other = max(others, key=lambda other: other.log_weight, default=None)
-                if other is not None:
-                    found.append(Hypothesis(other.fit, -np.inf, other.log_weight + unlisted))
+                other = weighed(model, _with(model, h.fit, name, kind), base)
+                found.append(Hypothesis(other.fit, -np.inf, other.log_weight + unlisted))
     return tuple(found)
 
 
-def _with(model: ResidualModel, end: Fit, name: str, kind: type[Effect]) -> list[Fit]:
-    """Fits with the look-alike in place of the effect of this name."""
+def _with(model: ResidualModel, end: Fit, name: str, kind: type[Effect]) -> Fit:
+    """The fit with the look-alike in place of the effect of this name, from the best of its starts."""
     k = end.names.index(name)
     other = kind.in_place_of(
         end.candidates[k], end.coordinates[k], model.nominal.at(end.deviations).description
     )
+    screening, trials = Screening(model, end), []
+    for start in other.starts:
+        x = (*end.coordinates[:k], np.array(start), *end.coordinates[k + 1 :])
+        effects = list(end.effects)
+        effects[k] = other.effect_at(x[k])
+        cost, step = screening.follow(model.of(end.deviations, effects))
+        trials.append((cost, end.deviations + step, x))
+    _, deviations, x = min(trials, key=lambda trial: trial[0])
     candidates = (*end.candidates[:k], other, *end.candidates[k + 1 :])
-    return [
-        fit(
-            model,
-            candidates,
-            (*end.coordinates[:k], np.array(start), *end.coordinates[k + 1 :]),
-            end.deviations,
-            iterations=_ITERATIONS,
-        )
-        for start in other.starts
-    ]
+    return fit(model, candidates, x, model.nominal.within(deviations), iterations=_ITERATIONS)

@@ -98,11 +98,11 @@ class Screening:
         e = self.model.of(self.around.deviations, effects)
         if not np.all(np.isfinite(e)):
             return None
-        cost, step = self._follow(e)
+        cost, step = self.follow(e)
         change = e - self.around.residuals
         return Start(cost, x, self.around.deviations + step, self._size(change), change.astype(np.float32))
 
-    def _follow(self, e: Real) -> tuple[float, Real]:
+    def follow(self, e: Real) -> tuple[float, Real]:
         """Least cost and step of the deviations on the linearisation."""
         d = self.around.deviations
         gradient = self._Jn.T @ e + prior_slope(d)

@@ -24,6 +24,8 @@ Progress = Callable[[float, str], None]
 _ALONE, _BESIDE_POINTS = 2, 4
 _PARENTS, _TRIED = (3, 1), (6, 4)
 _FINISHED, _REFINED = 6, 2
+# Sets of an effect in which what looks like it takes its place.
+_ALIKE = 3
 # Sets of several whose simple effects are also continued as those that contain them.
 _CONTINUED = 3
 # Beside values pulled this far (tolerances), effects that multiply one are tried as well.
@@ -338,12 +340,15 @@ class Search:
                 self.add(min(end, again, key=lambda one: one.loss))
 
     def _look_alikes(self) -> None:
-        """Causes beyond the list in place of what they look like, wherever that may be the answer."""
+        """Causes beyond the list in place of what they look like, wherever that may be the answer, at least
+        alone: what one effect looks like may look like two others as well."""
         if not isinstance(self.case, Case):
             return
         ranked = sorted(self.found, key=lambda e: -e.evidence)[:_FINISHED]
         for kind in LOOK_ALIKES.values():
-            for explanation in [e for e in ranked if kind.look_alike_of in e.names]:
+            alone = [e for e in self.found if e.names == (kind.look_alike_of,)]
+            sets = [e for e in ranked if kind.look_alike_of in e.names]
+            for explanation in sets[:_ALIKE] or alone:
                 end = explanation.end
                 k = end.names.index(str(kind.look_alike_of))
                 rig = self.records.nominal.at(end.deviations).description
@@ -352,9 +357,8 @@ class Search:
                 first = sum(len(c.axes) for c in end.candidates[:k])
                 rest = end.coordinates[:first], end.coordinates[first + len(end.candidates[k].axes) :]
                 trials = [np.concatenate([rest[0], start, rest[1]]) for start in other.starts]
-                if trials:
-                    _, d, x = best_following(self.records, end, candidates, trials)
-                    self.add(descend(self.records, candidates, d, x, end.start))
+                _, d, x = best_following(self.records, end, candidates, trials)
+                self.add(descend(self.records, candidates, d, x, end.start))
 
     def simpler(self, explanation: Explanation) -> None:
         """The same with effects in place of those that contain them, from where these ended: further values

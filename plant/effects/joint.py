@@ -196,20 +196,19 @@ class AttachedBody(Effect):
 
     @classmethod
     def in_place_of(cls, other: Candidate, x: Real, rig: Rig) -> Candidate:
-        hub, ratio = rig.hub.inertia_kg_m2, other.axes[0]
-        if ratio.value(x[0]) <= 1:
-            return Candidate(cls, (), ())
-        inertia = (ratio.value(x[0]) - 1) * hub
+        hub, ratio = rig.hub.inertia_kg_m2, other.axes[0].value(x[0])
+        # A hub that moves above the resonance of what it carries seems lighter, by no telling how much.
+        sizes = [(ratio - 1) * hub] if ratio > 1 else [0.3 * hub, hub, 3 * hub]
         # Held more stiffly than that it is inertia of the hub.
         slowest, fastest = 2 * np.pi * 0.5, 2 * np.pi * 0.125 / rig.sampling.dt_s
         axes = [
-            log_axis("inertia_kg_m2", (ratio.low - 1) * hub, (ratio.high - 1) * hub),
-            log_axis("stiffness_Nm_rad", inertia * slowest**2, inertia * fastest**2),
-            log_axis("damping_Nms", 0.01 * inertia * slowest, 2 * inertia * fastest),
+            log_axis("inertia_kg_m2", 0.02 * hub, 10 * hub),
+            log_axis("stiffness_Nm_rad", sizes[0] * slowest**2, sizes[-1] * fastest**2),
+            log_axis("damping_Nms", 0.01 * sizes[0] * slowest, 2 * sizes[-1] * fastest),
         ]
         starts = [
-            (inertia, inertia * omega**2, 0.2 * inertia * omega)
-            for omega in geometric(3 * slowest, 0.6 * fastest, 6)
+            (size, size * omega**2, 0.2 * size * omega)
+            for size, omega in product(sizes, geometric(3 * slowest, 0.6 * fastest, 6))
         ]
         return cls._candidate(axes, starts)
 
