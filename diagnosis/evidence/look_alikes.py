@@ -1,7 +1,8 @@
 """Causes beyond the list that look like an effect of it, so that nobody is too sure of the effect.
 
 At small angles the torque of gravity on a hanging link is that of a linear spring to ground, a cable or a
-hose. The list has no such spring; what it explains as well as gravity does is unknown with some probability.
+hose; at one speed a drag is viscous friction; below its resonance a body that a spring holds to the hub is
+inertia of the hub. The list has none of these; what they explain as well is unknown with some probability.
 """
 
 from __future__ import annotations

@@ -9,7 +9,6 @@ from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, cast
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from plant.effects.search_space import (
@@ -22,7 +21,7 @@ from plant.effects.search_space import (
     Sought,
     log_axis,
 )
-from plant.machine import Machine, SmoothTorque
+from plant.machine import Machine, Real, SmoothTorque
 from plant.rig import Rig
 
 Group = Literal["actuator", "joint", "link", "sensor"]
@@ -113,7 +112,7 @@ class Effect(BaseModel, ABC):
         return 1.0
 
     @classmethod
-    def in_place_of(cls, other: Candidate, x: npt.NDArray[np.float64], rig: Rig) -> Candidate:
+    def in_place_of(cls, other: Candidate, x: Real, rig: Rig) -> Candidate:
         """Search of this effect from where the one that it looks like ended, at the coordinates x (A,)."""
         scale, axis = cls.look_alike_scale(rig), other.axes[0]
         size = log_axis(next(iter(cls.model_fields)), axis.low * scale, axis.high * scale, axis.step)
