@@ -5,6 +5,7 @@
 
 Every name here is imported when it is first used, so that `import flexlink` itself costs nothing. Results
 show in a line or a few what was found; `plot()` draws them, `to_control()` hands them to python-control.
+What takes long runs on one thread, as the commands do: matrices here are small.
 
 Data        `Record`, `FrfRepeats`, `FrequencyUncertainty`, `band_limited`, `empirical_frf`
 Models      `identify`, `identify_frf`, `identify_miso`, `uncertainty`, `GobfModel`, `Poles`, `IdentOptions`,

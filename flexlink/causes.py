@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from threadpoolctl import threadpool_limits
+
 from diagnosis import answer, diagnosis as chain
 from diagnosis.machine.case import Case, Experiment
 from flexlink.shown import Shown, dressed
@@ -36,4 +38,5 @@ def diagnose(case: Any, **more: Any) -> Diagnosis:
     >>> found.verdict, found.effects[0].name
     ('effect', 'coulomb_friction')
     """
-    return dressed(Diagnosis, chain.diagnose(case, **more))
+    with threadpool_limits(1):
+        return dressed(Diagnosis, chain.diagnose(case, **more))

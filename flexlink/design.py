@@ -9,6 +9,7 @@ from typing import Any
 import control
 import numpy as np
 import numpy.typing as npt
+from threadpoolctl import threadpool_limits
 
 from control_design.analysis import certificate, closed_loop
 from control_design.analysis.closed_loop import LinearMachine, SampledMachine, step_metrics
@@ -122,7 +123,8 @@ def synthesise(
     """
     chosen = _several(plants)
     generator = np.random.default_rng(rng)
-    result = synthesis.synthesise(chosen, specification, options, rng=generator, **more)
+    with threadpool_limits(1):
+        result = synthesis.synthesise(chosen, specification, options, rng=generator, **more)
     return dressed(SynthesisResult, result, plants=chosen, specification=specification)
 
 
@@ -149,7 +151,8 @@ def certify(
     if plants is None or specification is None:
         raise ValueError("certify needs plants and a specification beside a controller")
     chosen = _several(plants)
-    found = certificate.certify(controller, chosen, specification, **more)
+    with threadpool_limits(1):
+        found = certificate.certify(controller, chosen, specification, **more)
     return dressed(
         Certificate, found, controller=controller, uncertain_plants=chosen, specification=specification
     )

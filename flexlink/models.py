@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ValidationError
+from threadpoolctl import threadpool_limits
 
 from flexlink.shown import Shown, dressed
 from ident.basis import model, posterior
@@ -262,7 +263,8 @@ def identify(
     """
     chosen = _options(IdentOptions, options, settings)
     used = (records,) if isinstance(records, PlainRecord) else tuple(records)
-    found = identify_records(used, chosen)
+    with threadpool_limits(1):
+        found = identify_records(used, chosen)
     return dressed(Identification, found, model=dressed(GobfModel, found.model), records=used)
 
 
@@ -291,7 +293,8 @@ def uncertainty(
     used = records if records is not None else getattr(identification, "records", ())
     if not used:
         raise ValueError("give the records of the identification")
-    found = tangent(used, identification.model, chosen)
+    with threadpool_limits(1):
+        found = tangent(used, identification.model, chosen)
     return dressed(Uncertainty, found, nominal_poles=identification.model.poles)
 
 

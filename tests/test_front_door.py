@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from scipy.signal import lfilter
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import flexlink
 
@@ -96,6 +97,36 @@ def test_importing_it_imports_nothing_else():
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
     with pytest.raises(AttributeError, match="nothing_of_ours"):
         _ = flexlink.nothing_of_ours
+
+
+@pytest.mark.parametrize(
+    ("inner", "call"),
+    [
+        ("flexlink.causes.chain.diagnose", lambda: flexlink.diagnose(None)),
+        ("flexlink.models.identify_records", lambda: flexlink.identify(example_record())),
+        (
+            "flexlink.models.tangent",
+            lambda: flexlink.uncertainty(flexlink.identify(example_record(), n_pairs=1), [example_record()]),
+        ),
+        (
+            "flexlink.design.synthesis.synthesise",
+            lambda: flexlink.synthesise(example_plant(), example_specification()),
+        ),
+        (
+            "flexlink.design.certificate.certify",
+            lambda: flexlink.certify(None, example_plant(), example_specification()),
+        ),
+    ],
+)
+def test_long_calls_run_on_one_thread(inner, call, monkeypatch):
+    def threads(*_args, **_more):
+        raise RuntimeError(max(library["num_threads"] for library in threadpool_info()))
+
+    monkeypatch.setattr(inner, threads)
+    with threadpool_limits(2):
+        with pytest.raises(RuntimeError, match=r"^1$"):
+            call()
+        assert max(library["num_threads"] for library in threadpool_info()) == 2
 
 
 def test_results_show_draw_and_convert():
