@@ -231,8 +231,9 @@ class TorqueRipple(Effect):
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        # Less than a quarter of a period looks like a spring or a constant torque.
-        fewest = float(np.clip(0.5 * np.pi / scales.swing_rad, 1.0, 20.0))
+        # Less than a quarter of a period looks like a spring or a constant torque; once per revolution is a
+        # weight, whatever its direction.
+        fewest = float(np.clip(0.5 * np.pi / scales.swing_rad, 2.0, 20.0))
         amplitude = log_axis("amplitude_Nm", 1e-6 * scales.torque_Nm, scales.torque_Nm)
         cycles = Axis("cycles_per_rev", "linear", fewest, 80.0, 1e-4, edge=True)
         return (cls._candidate([amplitude, cycles, PHASE]),)

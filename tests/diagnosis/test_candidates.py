@@ -20,9 +20,13 @@ TOLERANCE = 0.05
 
 @pytest.fixture
 def listed():
-    """Of a rig whose hub inertia is known to five per cent, in records that swing by 1 rad."""
+    return _listed()
+
+
+def _listed(swing_rad=0.5):
+    """Of a rig whose hub inertia is known to five per cent."""
     rig = paper_link().model_copy(update={"tolerances": {"hub.inertia_kg_m2": TOLERANCE}})
-    output = np.column_stack([np.linspace(-0.5, 0.5, 50)] * 2)
+    output = np.column_stack([np.linspace(-0.5, 0.5, 50) * swing_rad] * 2)
     record = Experiment("only", "estimation", np.ones(50), output)
     case = Case("arm", rig, (record, replace(record, name="other", role="held_out")))
     return case.machine.candidates(case.experiments)
@@ -82,8 +86,13 @@ def _ripple(listed, cycles_per_rev):
 def test_a_period_that_no_record_completes_is_rather_something_unknown(listed):
     (ripple,) = [c for c in listed if c.effect == "torque_ripple"]
     least = ripple.axes[1].low
-    # A swing of 1 rad is a quarter of a period there.
-    assert least == pytest.approx(0.5 * np.pi)
+    # A swing of 0.5 rad is a quarter of a period there.
+    assert least == pytest.approx(np.pi)
     inside, at_edge = _ripple(listed, 3 * least), _ripple(listed, least)
     assert inside.log_weight > inside.unknown_weight
     assert at_edge.log_weight < at_edge.unknown_weight
+
+
+def test_what_comes_once_per_revolution_is_a_weight_and_no_ripple():
+    (ripple,) = [c for c in _listed(swing_rad=6.0) if c.effect == "torque_ripple"]
+    assert ripple.axes[1].low == 2.0
