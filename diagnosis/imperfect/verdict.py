@@ -56,8 +56,9 @@ class Part:
     """What one effect of a set carries: share of the motion, probability that it matters.
 
     share : geometric mean of what it carries on estimation and on held-out records. An effect that is real
-        carries something of both, but where it does nothing in the latter. Of effects that every machine has
-        some of, no more than on the latter.
+        carries something of both, but where it does nothing in the latter, or where the records speak for it
+        and what it does on the former can be had otherwise. Of effects that every machine has some of, no
+        more than on the latter.
     """
 
     name: str
@@ -267,6 +268,11 @@ def _part(
         share, limit = min(share, held_out), _INTERESTS_EVERYWHERE
     elif share < limit * model_error < estimated and is_silent(search, explanation, name):
         share = estimated
+    elif estimated < held_out and score_of(explanation, listed, model_error) > _BEHIND + score_of(
+        rest, listed, model_error
+    ):
+        # Without it the others fit the records they were fitted to as well, with values that others refute.
+        share = held_out
     share = max(share, seen.share if seen else 0.0)
     matters = _soft(share / limit / model_error, _INTERESTS_WIDTH)
     off = _tolerances_off(search, explanation, k)

@@ -296,6 +296,24 @@ def test_of_two_effects_that_can_replace_each_other_one_is_named(friction, zone,
     assert found.accepted == (named,)
 
 
+def test_what_others_imitate_only_in_the_records_they_are_fitted_to_is_named():
+    # Friction and tilt fit the estimation record without the dead zone, with values that the other refutes.
+    friction, zone, tilt = "coulomb_friction", "actuator_dead_zone", "gravity"
+    found = _judged(
+        {
+            (): (0.0, 0.25, 0.95),
+            (friction,): (129.0, 0.19, 0.47),
+            (friction, tilt): (155.0, 0.044, 0.44),
+            (zone,): (374.0, 0.09, 0.13),
+            (zone, tilt): (399.0, 0.105, 0.1),
+            (friction, zone): (422.0, 0.1, 0.1),
+            (friction, zone, tilt): (449.0, 0.05, 0.057),
+        }
+    )
+    assert found.answer == zone
+    assert found.probabilities.presence[zone] > 0.8
+
+
 @pytest.mark.parametrize(
     ("second", "without", "accepted"),
     [
