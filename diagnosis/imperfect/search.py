@@ -340,15 +340,16 @@ class Search:
                 self.add(min(end, again, key=lambda one: one.loss))
 
     def _look_alikes(self) -> None:
-        """Causes beyond the list in place of what they look like, wherever that may be the answer, at least
-        alone: what one effect looks like may look like two others as well."""
+        """Causes beyond the list in place of what they look like, wherever that may be the answer, and alone:
+        what one effect looks like may look like two others as well."""
         if not isinstance(self.case, Case):
             return
-        ranked = sorted(self.found, key=lambda e: -e.evidence)[:_FINISHED]
+        best = best_of_sets(self.found)
+        likeliest = list(best.values())[:_FINISHED]
         for kind in LOOK_ALIKES.values():
-            alone = [e for e in self.found if e.names == (kind.look_alike_of,)]
-            sets = [e for e in ranked if kind.look_alike_of in e.names]
-            for explanation in sets[:_ALIKE] or alone:
+            sets = [e for e in likeliest if kind.look_alike_of in e.names][:_ALIKE]
+            alone = [e for e in best.values() if e.names == (kind.look_alike_of,) and e not in sets]
+            for explanation in (*sets, *alone):
                 end = explanation.end
                 k = end.names.index(str(kind.look_alike_of))
                 rig = self.records.nominal.at(end.deviations).description

@@ -478,6 +478,22 @@ def _hub_only(seed, *effects):
     return search, {c.effect: c for c in search.case.machine.candidates(search.case.experiments)}
 
 
+def test_every_likely_set_of_an_effect_and_the_effect_alone_are_also_fitted_with_its_look_alike():
+    search, kinds = _hub_only(2, {"name": "gravity", "acceleration_m_s2": 0.3})
+    nothing, start = np.zeros(search.records.nominal.count), search.records.at_rest()
+    search.add(descend(search.records, (), nothing, np.zeros(0), start))
+    alone, several = ("gravity",), (("gravity", "coulomb_friction"), ("gravity", "viscous_friction"))
+    # Sets that were fitted several times count once.
+    for names in (alone, *several, *several, *several):
+        candidates = [kinds[name] for name in names]
+        x = np.log([0.3, *[2e-3] * (len(names) - 1)])
+        search.add(descend(search.records, candidates, nothing, x, start, iterations=2))
+    search._look_alikes()
+    fitted = {e.key for e in search.found}
+    for names in (alone, *several):
+        assert tuple(sorted({"ground_spring", *names} - {"gravity"})) in fitted
+
+
 @pytest.mark.parametrize("seed", [3, 5, 7])
 def test_a_record_that_begins_in_free_play_is_followed_from_there(seed):
     # Cut out of a run: until the hub touches, it goes on as it went, which no linear arm does.
