@@ -69,7 +69,7 @@ def _smooth_forces(
                 # Root angle first, then every modal deflection:
                 # V = g [S (1 - cos) + s.q sin + 1/2 cos q.K.q].
                 g = channel[j, 0]
-                sine, cosine = np.sin(y), np.cos(y)
+                sine, cosine = np.sin(y - channel[j, 2]), np.cos(y - channel[j, 2])
                 moment, shortening = 0.0, 0.0
                 n = static_moment.size
                 for i in range(n):

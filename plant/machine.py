@@ -124,6 +124,7 @@ class Machine:
     joint: JointPath = field(default_factory=JointPath)
     sensor: SensorPath = field(default_factory=SensorPath)
     gravity_m_s2: float = 0.0
+    gravity_direction_rad: float = 0.0
 
     @property
     def linear(self) -> bool:

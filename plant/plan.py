@@ -290,7 +290,7 @@ class _Builder:
                 row = self._position(place) if torque.of == "angle" else self._speed(place)
                 add(torque.law, torque.values, row, self._column(place))
         if machine.gravity_m_s2 != 0:
-            values = machine.gravity_m_s2, static_moment_kg_m(machine.rig)
+            values = machine.gravity_m_s2, static_moment_kg_m(machine.rig), machine.gravity_direction_rad
             add(GRAVITY, values, self._position(eq.root), self._column(eq.root))
             for direction in np.eye(eq.mass.shape[0])[eq.first_mode :]:
                 add(GRAVITY, values, self._position(direction), self._column(direction))

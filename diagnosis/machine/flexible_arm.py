@@ -135,6 +135,7 @@ class FlexibleArm:
         """Every effect of the registry that a fit can find; signed ones twice. Of a sensor of the link that
         is not tip_m only its gain is one."""
         scales = scales_of(self.rig, experiments)
+        scales = replace(scales, any_direction=self.model_error > 0 and _TIP in self.outputs)
         gain = ("sensor_gain",) if set(self.outputs) - {"hub_angle_rad", "hub_speed_rad_s"} else ()
         seen = [
             effect

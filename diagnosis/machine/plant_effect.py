@@ -60,6 +60,8 @@ class EffectParameter:
 class Change:
     """An effect with values, as a fit hands it to the simulation."""
 
+    as_listed: ClassVar[bool] = True
+
     id: str
     values: Mapping[str, float]
 

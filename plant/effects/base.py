@@ -102,6 +102,11 @@ class Effect(BaseModel, ABC):
         """The effect at the values of the search's axes; sign: which side of a signed size."""
         return cls(**values)
 
+    @property
+    def as_listed(self) -> bool:
+        """Whether it is what is listed by its name, at these parameters."""
+        return True
+
     def simpler(self) -> Effect | None:
         """The effect that this one becomes without its further parameters."""
         return None

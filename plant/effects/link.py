@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 from pydantic import Field
 
 from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, register, with_parameters
-from plant.effects.search_space import Sought
+from plant.effects.search_space import Axis, Candidate, Scales, Sought
 from plant.machine import Machine
+
+# A tilt is the listed one up to so far from along the link; directions of others that a search starts from.
+_ALONG_RAD = 0.6
+_DIRECTION, _DIRECTIONS = Axis("direction_rad", "angle", -np.pi, np.pi, 1e-4), 6
 
 
 @register
@@ -53,8 +58,9 @@ class StructuralDamping(RatioEffect):
 class Gravity(Effect):
     """The plane is tilted: in-plane gravity g along the link axis at theta = 0, pointing away from the hub.
 
-    Acts on link and tip mass with the full angle of the link root; the deflection enters to second order,
-    so the hanging link is also stiffened by its own weight.
+    Another direction is no answer of a diagnosis: every machine stands a little out of level somehow. Acts on
+    link and tip mass with the full angle of the link root; the deflection enters to second order, so the
+    hanging link is also stiffened by its own weight.
     """
 
     id = "gravity"
@@ -66,6 +72,24 @@ class Gravity(Effect):
     sought = Sought((1e-4, 20), (1e-3, 10, 12))
 
     acceleration_m_s2: NotNegative = Field(description="in-plane component of gravity")
+    direction_rad: float = Field(default=0.0, description="hub angle at which the link hangs")
+
+    @classmethod
+    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        """With its direction where an output tells the zero of the angle; else that stands in for it."""
+        size, values = cls.sought.at("acceleration_m_s2", scales)
+        if not scales.any_direction:
+            return (cls._size(size, values),)
+        around = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS
+        return (cls._candidate([size, _DIRECTION], [(v, a) for v in values for a in around]),)
+
+    @property
+    def as_listed(self) -> bool:
+        return abs(self.direction_rad) <= _ALONG_RAD
+
+    def parameters(self) -> dict[str, float]:
+        """Its direction where that is not along the link."""
+        return {name: v for name, v in super().parameters().items() if v or name == "acceleration_m_s2"}
 
     def modify(self, machine: Machine) -> Machine:
-        return replace(machine, gravity_m_s2=machine.gravity_m_s2 + self.acceleration_m_s2)
+        return replace(machine, gravity_m_s2=self.acceleration_m_s2, gravity_direction_rad=self.direction_rad)

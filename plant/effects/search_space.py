@@ -51,7 +51,7 @@ class Axis:
 
     def value(self, coordinate: float) -> float:
         if self.scale == "angle":
-            return float(np.mod(coordinate, 2 * np.pi))
+            return float(self.low + np.mod(coordinate - self.low, 2 * np.pi))
         return float(np.exp(coordinate)) if self.scale == "log" else float(coordinate)
 
     @property
@@ -190,6 +190,8 @@ class Scales:
     swing_rad: float
     speed_rad_s: float
     duration_s: float
+    # Of gravity, where an output tells where the hub angle is zero.
+    any_direction: bool = False
 
     @property
     def dt_s(self) -> float:

@@ -11,6 +11,7 @@ from plant import EFFECTS, Effect, paper_link, parse_effect, parse_effects, prbs
 from plant.effects.base import RatioEffect, register
 from plant.effects.joint import CoulombFriction
 from plant.machine import Machine
+from plant.simulation import Simulator, Start
 
 RIG = paper_link()
 VOLTAGE = prbs(7, 6, 3.0, 300, np.random.default_rng(4))
@@ -266,3 +267,13 @@ def test_backlash_at_rest_costs_no_more_than_backlash_in_motion():
         return min(times)
 
     assert seconds(pushed_once) < 5 * seconds(moving)
+
+
+def test_gravity_in_another_direction_is_the_same_from_another_angle():
+    along = {"name": "gravity", "acceleration_m_s2": 2.0}
+    turned = Simulator(RIG, [parse_effect({**along, "direction_rad": 0.7})]).run(VOLTAGE, start=Start(0.3))
+    straight = Simulator(RIG, [parse_effect(along)]).run(VOLTAGE, start=Start(0.3 - 0.7))
+    np.testing.assert_allclose(turned.hub_angle_rad, straight.hub_angle_rad + 0.7, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(turned.tip_deflection_m, straight.tip_deflection_m, rtol=0, atol=1e-9)
+    still = Simulator(RIG, ()).run(VOLTAGE, start=Start(0.3))
+    assert np.max(np.abs(turned.hub_angle_rad - still.hub_angle_rad)) > 0.03
