@@ -1,7 +1,9 @@
 """States at the start of records that fit them best, everything else as it is.
 
 Each record depends on its own start alone. What a start does is what the linear part of the machine makes of
-it, until contacts switch: in free play a hub goes on as it went until it touches.
+it, until contacts switch: in free play a hub goes on as it went until it touches. Where nobody knows a linear
+part, a whole record says little far from its start (a pendulum that dry friction holds at rest does not feel
+its angle): the start is then sought on its first samples, and more of them.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from diagnosis.fit.fit import quotients
 from diagnosis.imperfect.levels import Levels
@@ -21,6 +24,9 @@ _ITERATIONS, _STILL = 30, 1e-7
 # Steps of a start, and what a further one must gain; beside contacts parts of a step are tried as well.
 _STEPS, _GAIN = 5, 0.2
 _PARTS = (1.0, 0.3, 0.1, 0.03)
+# Beginnings of a record that its start is sought on, the fewest samples, steps in spreads of a state and
+# least squares of each; and what a spread weighs beside the motion.
+_BEGINNINGS, _FEWEST, _STEP, _CALLS, _LITTLE = (16, 4), 20, 0.02, 15, 1e-3
 
 
 def settled(
@@ -40,6 +46,10 @@ def settled(
     for r, state in enumerate(start.states):
         best = _RecordStart(records, r, left, state)
         best.descend(columns[r])
+        if unknown.responses is None and best.better(
+            _begun(records, r, d, effects, Start(state, start.zeros))
+        ):
+            best.descend()
         for near in (best.state, rest.states[r]) if touching else ():
             one = _RecordStart(records, r, left, near)
             for moved in near + unknown.tried:
@@ -49,6 +59,25 @@ def settled(
         found.append(best)
     e = np.concatenate([one.e for one in found])
     return Start(np.array([one.state for one in found]), start.zeros), e
+
+
+def _begun(records: Records, r: int, d: Real, effects: Sequence[Any], start: Start) -> Real:
+    """States (S,) that fit the beginnings of the r-th record best, from states (S,)."""
+    record, spread = records.experiments[r], records.state_spread
+    simulate, scale = records.nominal.at(d).simulator(effects), np.std(record.output, axis=0)
+    z = start.states / spread
+    for part in _BEGINNINGS:
+        T = max(len(record.output) // part, _FEWEST)
+
+        def left(z: Real, T: int = T) -> Real:
+            e = (record.output[:T] - simulate(record.input[:T], z * spread, start.zeros)) / scale
+            return np.append(np.clip(e, -1 / _LITTLE, 1 / _LITTLE), _LITTLE * z)
+
+        def slopes(z: Real, left: Callable[[Real], Real] = left) -> Real:
+            return quotients(left, z, left(z), np.full(z.size, _STEP))
+
+        z = least_squares(left, z, slopes, max_nfev=_CALLS).x
+    return np.asarray(z * spread)
 
 
 class _RecordStart:

@@ -7,6 +7,8 @@ from numba import njit
 from scipy.integrate import solve_ivp
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose
+from diagnosis.imperfect.records import Records
+from diagnosis.imperfect.settled import settled
 
 DT_S, SAMPLES, NOISE_RAD = 0.02, 500, 1e-3
 
@@ -70,3 +72,41 @@ def test_starts_of_records_are_fitted_and_the_spring_is_found():
     assert low < 0.4 < high
     assert abs(spring.parameters["cubic_Nm_rad3"] / 0.4 - 1) < 0.15
     assert found.gap_closed > 0.95
+
+
+@njit
+def _rubbing(dry, angle, speed):
+    """The pendulum without a motor; dry friction takes off what it can, so that it truly sticks."""
+    found, h = np.zeros((SAMPLES, 1)), DT_S / 20
+    for k in range(SAMPLES):
+        found[k] = angle
+        for _ in range(20):
+            free = speed - h * (np.sin(angle) + 0.05 * speed) / 0.1
+            speed = np.sign(free) * max(abs(free) - h * dry / 0.1, 0.0)
+            angle += h * speed
+    return found
+
+
+def test_a_start_is_found_where_friction_holds_the_first_guess():
+    """At rest the pendulum sticks: no difference quotient there says how it began."""
+    plant = Plant(
+        lambda p, effects, inputs, start: _rubbing(0.03, *start.values())[: len(inputs)],
+        {"weight_Nm": 1.0},
+        {},
+        ("angle_rad",),
+        np.array([NOISE_RAD]),
+        (PlantEffect("drag", (EffectParameter("coefficient_Nms2", 1e-3, 1.0),)),),
+        model_error=0.05,
+        start={"angle_rad": 1.0, "speed_rad_s": 5.0},
+    )
+    begun = np.array([[1.1, 0.3], [-0.6, -4.0]])
+    still = np.zeros((SAMPLES, 1))
+    records = tuple(
+        PlantExperiment(role, role, still, _rubbing(0.03, *state))
+        for role, state in zip(("estimation", "held_out"), begun, strict=True)
+    )
+    case = PlantCase("rubs", plant, records)
+    fitted = Records(case, case.experiments)
+    start, left = settled(fitted, np.zeros(0), (), fitted.at_rest())
+    np.testing.assert_allclose(start.states, begun, atol=0.01)
+    assert np.all(fitted.shares(fitted.residuals_of(left)) < 0.01)
