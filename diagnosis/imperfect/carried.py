@@ -36,7 +36,12 @@ def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.ran
         for count in range(len(names) + 1)
         for chosen in combinations(names, count)
     }
-    blocks = {chosen: _blocks(search, explanation) for chosen, explanation in subsets.items()}
+    # Alone a part may run away, far beyond what the nominal leaves: it carries nothing.
+    nothing = _blocks(search, subsets[()])
+    blocks = {
+        chosen: min(_blocks(search, explanation), nothing, key=np.sum)
+        for chosen, explanation in subsets.items()
+    }
     drawn = rng.integers(0, blocks[()].size, (_DRAWS, blocks[()].size))
     carried = {}
     for name in names:
