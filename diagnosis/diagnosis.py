@@ -83,7 +83,7 @@ def diagnose(
         exact = _without_error(case.without_model_error(), again, rng)
         if exact.verdict != "unknown":
             return exact
-    return looked_at_again(beside_imperfections(found, rng), again, deadline_s, rng)
+    return looked_at_again(found, beside_imperfections(found, rng), again, deadline_s, rng)
 
 
 def _without_error(case: CaseOfMachine, progress: Progress, rng: np.random.Generator) -> Diagnosis:

@@ -52,21 +52,29 @@ def searched(case: CaseOfMachine, progress: Progress, deadline_s: float = np.inf
 
 
 def looked_at_again(
-    answer: Diagnosis, progress: Progress, deadline_s: float, rng: np.random.Generator
+    first: Search, answer: Diagnosis, progress: Progress, deadline_s: float, rng: np.random.Generator
 ) -> Diagnosis:
     """The answer of a machine that integrates, where what a bias makes of a free run does not interest.
 
-    That drifts as far as it likes, and beside it nothing else seems to matter. Not taken where the records
-    leave no gap that interests, nor where it only adds to what was named.
+    That drifts as far as it likes, and beside it nothing else seems to matter. Not sought where the records
+    leave no gap that interests, nor where the answer of the first search leaves none then either; not taken
+    where it only adds to what was named.
     """
     if answer.verdict == "none":
         return answer
     search = Search(answer.case, progress, deadline_s, at_inputs=True)
     if not search.amplifies:
         return answer
+    named = set(answer.combination)
+    holding = [e for e in first.found if named and named <= set(e.names)]
+    if holding:
+        named_alone = first.by_these(answer.combination, max(holding, key=lambda e: e.evidence))
+        left = search.left_by(named_alone)
+        if np.max(left) < answer.case.machine.weighing.model_error:
+            return answer
     search.run()
     again = beside_imperfections(search, rng)
-    return again if again.combination and not set(again.combination) & set(answer.combination) else answer
+    return again if again.combination and not set(again.combination) & named else answer
 
 
 def reaches_noise(search: Search) -> bool:

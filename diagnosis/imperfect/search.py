@@ -23,6 +23,9 @@ Progress = Callable[[float, str], None]
 # Starts descended from alone; parents extended and effects fitted beside each: pairs, larger sets.
 _ALONE, _BESIDE_POINTS = 2, 4
 _PARENTS, _TRIED = (3, 1), (6, 4)
+# Further parents beside which only what every machine has some of is fitted, how many of these beside each,
+# and how far behind in evidence they may be.
+_FURTHER, _TRIED_BESIDE_FURTHER, _FAR_BEHIND = 2, 2, 100.0
 _FINISHED, _REFINED = 6, 2
 # Sets of an effect in which what looks like it takes its place.
 _ALIKE = 3
@@ -234,20 +237,32 @@ class Search:
                 self.add(best)
 
     def _together(self, count: int) -> None:
-        pool = best_of_sets(e for e in self.found if len(e.names) == count - 1)
-        parents = list(pool.values())[: _PARENTS[count > 2]]
+        pool = list(best_of_sets(e for e in self.found if len(e.names) == count - 1).values())
+        parents = pool[: _PARENTS[count > 2]]
         for k, parent in enumerate(parents):
             words = f"fitting more beside {' and '.join(parent.names)}"
             self.progress(min(0.45 + 0.25 * (count - 2) + 0.25 * k / len(parents), 0.95), words)
             if self._late(f"further effects beside {' and '.join(parent.names)}"):
                 return
             self._beside(parent.end, _TRIED[count > 2])
+        # Friction and tilt, which may be more than what is sought, take the first places; what else is likely
+        # shows what it explains once they are beside it.
+        tried, further = {_unusual(parent) for parent in parents} | {frozenset[str]()}, 0
+        for parent in pool[len(parents) :]:
+            if further == _FURTHER or parent.evidence < pool[0].evidence - _FAR_BEHIND:
+                break
+            if _unusual(parent) not in tried and not self._late("friction and tilt beside further sets"):
+                tried, further = tried | {_unusual(parent)}, further + 1
+                self._beside(parent.end, _TRIED_BESIDE_FURTHER, everywhere=True)
 
-    def _beside(self, parent: Descent, most: int) -> None:
+    def _beside(self, parent: Descent, most: int, *, everywhere: bool = False) -> None:
+        """everywhere : only what every machine has some of."""
         trials: list[tuple[Candidate, Point]] = []
         held = {name for c in parent.candidates for name in (c.effect, c.kind.contains)} - {None}
         for candidate, points in self.points:
             if candidate.effect in held or candidate.kind.contains in held:
+                continue
+            if everywhere and not candidate.kind.everywhere:
                 continue
             # A frequency, and a zero that no other output tells, may be any other beside another effect.
             anew = candidate.kind.harmonic is not None or self._turned(candidate)
@@ -436,6 +451,12 @@ class Search:
         loss, prior = loss_at(self.records, e, stated, start)
         return self._explanation(replace(end, deviations=stated, start=start, left=e, loss=loss, prior=prior))
 
+    def left_by(self, other: Explanation) -> Real:
+        """(2, Y) shares that the same effects leave here, descended on from where another search ended."""
+        end = other.end
+        here = descend(self.records, end.candidates, end.deviations, end.coordinates, end.start)
+        return self._explanation(here).shares
+
     def add(self, end: Descent) -> Explanation:
         """The explanation with what it predicts of the held-out records, their starts fitted (`settled`)."""
         explanation = self._explanation(end)
@@ -473,6 +494,11 @@ def best_of_sets(found: Iterable[Explanation]) -> dict[tuple[str, ...], Explanat
     for explanation in sorted(found, key=lambda e: -e.evidence):
         best.setdefault(explanation.key, explanation)
     return best
+
+
+def _unusual(explanation: Explanation) -> frozenset[str]:
+    """Its effects but those that every machine has some of."""
+    return frozenset(c.effect for c in explanation.end.candidates if not c.kind.everywhere)
 
 
 def _spread(points: Sequence[Point]) -> Sequence[Point]:

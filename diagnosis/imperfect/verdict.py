@@ -36,6 +36,8 @@ _INTERESTS, _INTERESTS_EVERYWHERE, _INTERESTS_WIDTH = 0.75, 1.12, 0.06
 _SILENT = 0.25
 # A wrong stated value interests from this many tolerances on.
 _FAR_OFF, _FAR_OFF_WIDTH = 4.4, 0.06
+# And is none within this many.
+_WITHIN = 2.0
 # What a complete answer leaves, and what an unknown cause does: medians in model errors, widths (logarithms
 # of shares of the motion, normal; any size above its median for an unknown cause), prior of the latter.
 _IMPERFECTIONS, _IMPERFECTIONS_WIDTH = 0.6, 0.65
@@ -170,15 +172,17 @@ def _rounded(search: Search, rounding: Rounding) -> float:
 
 
 def _weighed(search: Search, listed: Sequence[str]) -> tuple[Judged, ...]:
-    """The sets that take part, best first: none that leaves more of the held-out records than the nominal."""
+    """The sets that take part, best first: none that leaves more of the held-out records than the nominal, as
+    stated or re-estimated."""
     model_error = search.case.machine.weighing.model_error
     best = best_of_sets(search.found)
-    farthest = search.base.pooled_held_out(search.case.noise)
+    noise = search.case.noise
+    farthest = min(e.pooled_held_out(noise) for e in (search.base, search.stated()))
     score = {
         key: score_of(explanation, listed, model_error)
         for key, explanation in best.items()
         if not _contradicted(explanation, best.values(), model_error)
-        and explanation.pooled_held_out(search.case.noise) <= farthest
+        and (not key or explanation.pooled_held_out(noise) <= farthest)
     }
     ranked = sorted((best[key] for key in score), key=lambda e: -score[e.key])
     top = score[ranked[0].key]
@@ -232,9 +236,14 @@ def _judged(
         for k, c in enumerate(explanation.end.candidates)
     )
     explains = complete = 0.0 if at_edge else _enough(_beyond(explanation), model_error)
+    answers = {
+        name
+        for name, effect in zip(explanation.names, explanation.end.effects, strict=True)
+        if name in listed and effect.as_listed
+    }
     for part in parts.values():
-        complete *= 1.0 if part.name in listed else 1 - part.matters
-    named = tuple(parts[name] for name in explanation.names if name in listed)
+        complete *= 1.0 if part.name in answers else 1 - part.matters
+    named = tuple(parts[name] for name in explanation.names if name in answers)
     return Judged(explanation, named, score_of(explanation, listed, model_error), explains, complete)
 
 
@@ -281,6 +290,8 @@ def _part(
         # off is not enough: of a value that nobody stated anything is.
         preferred = float(expit(_gain(explanation, listed) - _gain(rest, listed)))
         matters = max(matters, preferred * _soft(off / _FAR_OFF, _FAR_OFF_WIDTH))
+        # An effect and a deviation that cancel each other are no finding, whatever a fit without it left.
+        matters *= _soft(off / _WITHIN, _FAR_OFF_WIDTH)
     return Part(name, share, matters)
 
 

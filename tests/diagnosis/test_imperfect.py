@@ -453,6 +453,70 @@ def test_a_look_alike_that_fits_better_makes_an_effect_unknown():
     assert _judged(sets | {("attached_body",): (440.0, 0.005, 0.005)}).answer == "unknown"
 
 
+@pytest.mark.parametrize(("turned_rad", "answer"), [(0.3, "gravity"), (1.5, "unknown"), (3.0, "unknown")])
+def test_a_tilt_across_the_link_is_not_the_listed_one(turned_rad, answer):
+    sets = {(): (0.0, 0.3, 0.3), ("gravity",): (400.0, 0.01, 0.01)}
+    assert _judged(sets, turned_rad=turned_rad).answer == answer
+
+
+def test_a_tilt_in_any_direction_is_found_where_the_tip_tells_the_zero():
+    # Records of an independent simulator that turns far, on a plane that falls off across the link.
+    rng = np.random.default_rng(4)
+    truth = Truth(RIG.model_dump(exclude={"tolerances"}), (), Background(tilt_m_s2=0.3, tilt_angle_rad=-1.9))
+    records = []
+    for name, role in (("a", "estimation"), ("b", "held_out")):
+        voltage = 2.0 * rng.choice([-1.0, 1.0], 20).repeat(40)
+        clean = truth.record(voltage, None, None, Before(0.4))
+        read = np.column_stack([clean.hub_angle_rad + 0.2, clean.tip_m])
+        records.append(_experiment(name, role, read, voltage))
+    case = Case("tilted", RIG, tuple(records), 0.05)
+    search = Search(case, lambda share, words: None)
+    nothing, start = np.zeros(search.records.nominal.count), search.records.at_rest()
+    nominal = descend(search.records, (), nothing, np.zeros(0), start)
+    (tilt,) = [c for c in case.machine.candidates(case.experiments) if c.effect == "gravity"]
+    best = points_of(search.records, nominal, tilt)[0]
+    search.add(nominal)
+    found = search.add(descend(search.records, (tilt,), best.deviations, best.coordinates, best.start))
+    assert np.all(found.shares < 0.005)
+    assert found.end.effects[0].acceleration_m_s2 == pytest.approx(0.3, rel=0.01)
+    # The truth's angle is that of the link's axis from where it hangs.
+    assert abs(found.end.effects[0].direction_rad) == pytest.approx(1.9, abs=0.01)
+
+
+def test_an_answer_leaves_no_more_of_held_out_records_than_the_stated_values():
+    sets = {(): (0.0, 0.3, 0.3), ("actuator_dead_zone",): (400.0, 0.01, 0.01)}
+    assert _judged(sets).answer == "actuator_dead_zone"
+    less = SimpleNamespace(pooled_held_out=lambda noise: -1.0)
+    assert _judged(sets, stated=less).answer != "actuator_dead_zone"
+
+
+def test_friction_and_tilt_are_fitted_beside_what_they_come_before(monkeypatch):
+    # The likeliest three are all of what every machine has some of; what is sought stands behind them.
+    search, kinds = _hub_only(2)
+    nothing, start = np.zeros(search.records.nominal.count), search.records.at_rest()
+    names = ("coulomb_friction", "gravity", "actuator_lag", "input_delay", "viscous_friction", "backlash")
+    for k, name in enumerate(names):
+        x = np.array([np.mean(axis.box) for axis in kinds[name].axes])
+        end = descend(search.records, (kinds[name],), nothing, x, start, iterations=1)
+        search.found.append(Explanation(end, -float(k), 0.0, 0.0, (), (), np.zeros((2, 1))))
+    asked = []
+    monkeypatch.setattr(
+        search, "_beside", lambda end, most, everywhere=False: asked.append((*end.names, everywhere))
+    )
+    search._together(2)
+    usual = [(name, False) for name in names[:3]]
+    assert asked == [*usual, ("input_delay", True), ("viscous_friction", True)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("cases", "seed", "k"), [(40, 6089, 26), (40, 6067, 16)])
+def test_a_spring_behind_friction_and_tilt_is_found(tmp_path, cases, seed, k):
+    # One needs friction beside it, the other a tilt across the link.
+    others = {f"case_{i:04d}": {"case": f"case_{i:04d}"} for i in range(1, cases + 1) if i != k}
+    generate(cases, seed, tmp_path, jobs=1, workshop=True, finished=others)
+    assert diagnose(load_case(tmp_path / f"case_{k:04d}").case).combination == ("hardening_spring",)
+
+
 @pytest.mark.slow
 def test_beside_another_effect_a_fit_also_starts_where_it_ended_alone(tmp_path):
     # Beside the heavy hub no size of the grid is near enough to the spring's, which its own fit has found.
@@ -598,10 +662,11 @@ def test_far_values_are_scanned_where_contacts_switch():
     assert (stiffness, gap) == pytest.approx((40.0, 0.1), rel=0.03)
 
 
-def _judged(sets, step_m=0.0, acts=1.0):
+def _judged(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
     """The verdict on sets of effects by what they gain and leave: (log likelihood, shares of the motion left
     of estimation and of held-out records); step_m: of the tip's values; acts: share of the motion that each
-    effect changes of held-out records."""
+    effect changes of held-out records; stated: what stated values leave, as an explanation; turned_rad: of
+    every coordinate that is an angle."""
     rng = np.random.default_rng(9)
     records = []
     for name, role in {"a": "estimation", "b": "held_out"}.items():
@@ -618,7 +683,10 @@ def _judged(sets, step_m=0.0, acts=1.0):
 
     def fitted(names, gain, left, held_out):
         chosen = tuple(candidates[name] for name in names)
-        x = np.array([np.mean(np.nan_to_num(axis.box)) for c in chosen for axis in c.axes])
+        middle = {"angle": lambda axis: turned_rad}
+        x = np.array(
+            [middle.get(axis.scale, lambda axis: np.mean(axis.box))(axis) for c in chosen for axis in c.axes]
+        )
         start, columns = (
             Start(np.zeros((1, 0)), nothing),
             StartColumns(np.zeros((0, 0)), (), np.zeros((0, 0))),
@@ -630,6 +698,7 @@ def _judged(sets, step_m=0.0, acts=1.0):
     search = SimpleNamespace(
         found=list(found.values()),
         base=found[frozenset()],
+        stated=lambda: stated or found[frozenset()],
         case=case,
         records=Records(case, case.estimation),
         held_out=Records(case, case.held_out),
