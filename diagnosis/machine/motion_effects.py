@@ -28,6 +28,10 @@ _AT_ONCE = 0.02
 _FORGOTTEN = 1e-7
 
 
+class NotFollowedError(ValueError, ArithmeticError):
+    """A simulation that no force on a body can be put around: wrong as stated, a trial that ran away in a fit."""
+
+
 @dataclass(frozen=True)
 class BodyForces:
     """Forces on a body against its motion, SI or whatever units force and motion have.
@@ -70,7 +74,7 @@ class PulseResponse:
     def of(cls, motion: Real, dt_s: float, *, of_speed: bool) -> PulseResponse:
         """motion (T,): change of the motion per force, the pulse in its second sample.
 
-        Raises ValueError if the force does not move the body at once.
+        Raises NotFollowedError if the force does not move the body at once, or the motion is no number.
         """
         h = motion[1:]
         at_once = abs(h[0]) > _AT_ONCE * abs(h[1])
@@ -86,8 +90,8 @@ class PulseResponse:
                 corrections = np.array([0.5 * h[1] / dt_s, 0.5 * h[2] / dt_s - speed[1]])
         ahead = 0 if at_once else 1
         largest = np.max(np.abs(speed[:20]))
-        if not abs(speed[ahead]) > 0.1 * largest:
-            raise ValueError(
+        if not (np.all(np.isfinite(motion)) and abs(speed[ahead]) > 0.1 * largest):
+            raise NotFollowedError(
                 "friction and springs need a force that moves the body at once; the simulated motion follows "
                 "the stated input later, or its steps are too coarse for a pulse of one sample"
             )

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 
-from diagnosis import Plant, PlantExperiment, with_effects
+from diagnosis import EffectParameter, Plant, PlantEffect, PlantExperiment, with_effects
 from diagnosis.machine.listed_effects import KINDS
 from diagnosis.machine.plant_effect import Change
 from tests.diagnosis.machines import rubbing
@@ -226,3 +228,30 @@ def test_two_friction_laws_add_up_and_an_unmeasured_motion_will_do():
     alone = plant.simulated([Change("coulomb_friction", {"force": 0.8})])(force[:, None])
     assert together.shape == (force.size, 1)
     np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-12)
+
+
+def test_a_trial_that_friction_cannot_be_put_around_ran_away():
+    """A gap between force and body that swallows the pulse; a motion that becomes no number later on."""
+    force, noise = _force(DT_S), 1e-4
+    broken = {
+        "gap": lambda x: np.sign(x) * np.maximum(np.abs(x) - 0.5, 0),
+        "overflow": lambda x: np.where(np.arange(len(x))[:, None] < 100, x, np.nan),
+    }
+
+    def simulation(parameters, effects, inputs):
+        found = _moved(inputs[:, 0].copy(), *BODIES["on a spring"], DT_S)
+        for name in effects:
+            found = broken[name](found)
+        return found
+
+    record = PlantExperiment("a", "estimation", force[:, None], simulation({}, {}, force[:, None]))
+    own = tuple(PlantEffect(name, (EffectParameter("size", 0.1, 1.0),)) for name in broken)
+    plant = Plant(simulation, {}, {}, ("x", "v"), np.full(2, noise), own)
+    equipped = with_effects(plant, ["coulomb_friction"], [record], dt_s=DT_S, motion="x")
+    friction = Change("coulomb_friction", {"force": 0.8})
+    for name in broken:
+        found = equipped.simulator([Change(name, {"size": 0.5}), friction])(force[:, None])
+        np.testing.assert_array_equal(found, 1e12 * noise)
+        stated = replace(plant, simulation=lambda p, e, u, name=name: simulation(p, {name: {}}, u))
+        with pytest.raises(ValueError, match="friction and springs need a force that moves the body"):
+            with_effects(stated, ["coulomb_friction"], [record], dt_s=DT_S, motion="x")
