@@ -16,6 +16,8 @@ Values = Mapping[str, float]
 
 # A force that the simulation does not follow to this share of what it changes was not found.
 _MISSED = 0.05
+# Share of the largest early motion after a pulse that is one.
+_SHOWS = 0.05
 # Simulations without the forces that are kept: those of one set of parameters.
 _KEPT = 16
 
@@ -63,7 +65,9 @@ class Body:
         pushed = still.copy()
         pushed[1, self.force] = self.pulse
         moved = (run(pushed) - run(still))[:, self.motion] / self.pulse
-        sign = float(np.sign(moved[np.argmax(np.abs(moved[:5]))]))
+        first = np.abs(moved[:5])
+        # The first that shows: at few samples per period the largest is on the way back.
+        sign = float(np.sign(moved[np.argmax(first > _SHOWS * np.max(first))]))
         return PulseResponse.of(sign * moved, self.dt_s, of_speed=self.of_speed), sign
 
     def _remembered(self, key: Hashable, compute: Callable[[], Any]) -> Any:
