@@ -23,6 +23,16 @@ _KEPT = 16
 
 
 @dataclass(frozen=True, eq=False)
+class Started:
+    """A simulation from a start, the same from rest; what it depends on besides its inputs, and its start."""
+
+    run: Run
+    at_rest: Run
+    key: Hashable
+    start: Hashable
+
+
+@dataclass(frozen=True, eq=False)
 class Body:
     """A body in the simulation: column of its force, column of its motion, force of a pulse to try it with.
 
@@ -36,14 +46,13 @@ class Body:
     pulse: float
     _kept: dict[Hashable, Any] = field(default_factory=dict, repr=False)
 
-    def under(self, run: Run, key: Hashable, forces: BodyForces) -> Run:
-        """The simulation with forces on the body; not a number where none were found that it follows.
-
-        key : what the simulation depends on besides its inputs.
-        """
+    def under(self, started: Started, forces: BodyForces) -> Run:
+        """The simulation with forces on the body; not a number where none were found that it follows."""
+        run = started.run
 
         def simulated(inputs: Real) -> Real:
-            response, sign = self._remembered((key, inputs.shape), lambda: self._response(run, inputs))
+            asked = (started.key, inputs.shape)
+            response, sign = self._remembered(asked, lambda: self._response(started.at_rest, inputs))
 
             def under(force: Real) -> tuple[Real, Real]:
                 moved = inputs.copy()
@@ -52,7 +61,7 @@ class Body:
                 return found, sign * found[:, self.motion]
 
             command = inputs[:, self.force]
-            free = self._remembered((key, inputs.tobytes()), lambda: under(command))
+            free = self._remembered((started.key, started.start, inputs.tobytes()), lambda: under(command))
             outputs, missed = with_forces(under, free, command, response, forces)
             return outputs if missed < _MISSED else np.full_like(outputs, np.nan)
 
@@ -86,9 +95,9 @@ class MeasuredBody:
     speed: int
     force: int
 
-    def under(self, run: Run, key: Hashable, forces: BodyForces) -> Run:
+    def under(self, started: Started, forces: BodyForces) -> Run:
         def simulated(inputs: Real) -> Real:
-            found = np.array(run(inputs))
+            found = np.array(started.run(inputs))
             found[:, self.force] += forces.overcome(inputs[:, self.position], inputs[:, self.speed])
             return found
 
@@ -115,11 +124,8 @@ class Acts:
     at_rest_before: bool = True
 
 
-def around(run: Run, acting: Sequence[tuple[Acts, Values]], key: Hashable) -> Run:
-    """A simulation with effects around it, on each column in the order given.
-
-    key : what the simulation depends on besides its inputs.
-    """
+def around(started: Started, acting: Sequence[tuple[Acts, Values]]) -> Run:
+    """A simulation with effects around it, on each column in the order given."""
     bodies: dict[int, tuple[AnyBody, dict[str, float]]] = {}
     for acts, values in acting:
         if not isinstance(acts.on, int):
@@ -127,13 +133,14 @@ def around(run: Run, acting: Sequence[tuple[Acts, Values]], key: Hashable) -> Ru
             for name, value in acts.change(values).items():
                 # Laws of dry friction that are tried together add up, but for the speed over which one falls.
                 sizes[name] = value + (sizes.get(name, 0.0) if name != "stribeck_velocity" else 0.0)
-    inner, known = run, key
+    inner = started
     for body, sizes in bodies.values():
-        inner = body.under(inner, known, replace(BodyForces(), **sizes))
-        known = (known, tuple(sizes.items()))
+        forces, known = replace(BodyForces(), **sizes), (inner.key, tuple(sizes.items()))
+        at_rest = body.under(replace(inner, run=inner.at_rest, start=None), forces)
+        inner = Started(body.under(inner, forces), at_rest, known, inner.start)
 
     def simulated(inputs: Real) -> Real:
-        return _changed(inner(_changed(inputs, acting, "input")), acting, "output")
+        return _changed(inner.run(_changed(inputs, acting, "input")), acting, "output")
 
     return simulated
 

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from types import MappingProxyType
 
 import numpy as np
 
-from diagnosis.machine.around import around
+from diagnosis.machine.around import Started, around
 from diagnosis.machine.machine_protocol import (
     KNOWN_START,
     Real,
@@ -174,8 +174,7 @@ class Plant:
         ratios = {wrong[e.id]: e.values["ratio"] for e in effects if e.id in wrong}
         if ratios:
             return self.scaled(ratios).simulated([e for e in effects if e.id not in wrong], states)
-        begun = np.zeros(len(self.start)) if states is None else states
-        start = ({name: float(v) for name, v in zip(self.start, begun, strict=True)},) if self.start else ()
+        begun = (0.0,) * len(self.start) if states is None else tuple(float(v) for v in states)
         listed = {effect.name: effect.acts for effect in self.effects if effect.acts is not None}
         told = {effect.id: effect.values for effect in effects if effect.id not in listed}
         acting = [
@@ -186,7 +185,8 @@ class Plant:
         ]
         known = (tuple(self.parameters.items()), tuple((k, tuple(v.items())) for k, v in told.items()))
 
-        def told_simulation(inputs: Real) -> Real:
+        def told_simulation(begun: tuple[float, ...], inputs: Real) -> Real:
+            start = (dict(zip(self.start, begun, strict=True)),) if self.start else ()
             try:
                 found = np.asarray(self.simulation(self.parameters, told, inputs, *start), dtype=np.float64)
             except _NUMERICAL:
@@ -201,7 +201,8 @@ class Plant:
                 )
             return found
 
-        run = around(told_simulation, acting, known)
+        run, at_rest = (partial(told_simulation, b) for b in (begun, (0.0,) * len(self.start)))
+        run = around(Started(run, at_rest, known, begun), acting)
         return lambda inputs: run(inputs)[:, : self.noise.size]
 
     def _at(self, effects: Sequence[Change]) -> str:
