@@ -80,8 +80,8 @@ class BodyForces:
             bent[1:-1] = np.diff(v, 2) - kink * np.diff(acting)[1 - ahead : x.size - 1 - ahead]
             exact = x.copy()
             exact[1:] -= np.cumsum(bent[1:] + bent[:-1]) * dt / 24
-        pull, by_rule = (self.linear * y + self.cubic * y**3 for y in (exact, x))
-        slope = (self.linear + 3 * self.cubic * exact**2) * v
+        pull, by_rule = (self.linear * y + self.cubic * y * y * y for y in (exact, x))
+        slope = (self.linear + 3 * self.cubic * exact * exact) * v
         lacks = dt / 12 * np.diff(slope) + 0.5 * (by_rule - pull)[1:] + 0.5 * (by_rule - pull)[:-1]
         lacks += self.viscous * (0.5 * (v[1:] + v[:-1]) - np.diff(exact) / dt)
         steps = np.diff(pull + self.viscous * v)
