@@ -190,22 +190,19 @@ def with_forces(
     it gives.
     """
     held, extra = np.zeros(command.size), np.zeros(command.size)
+    sizes, k = astuple(forces), int(response.of_speed)
     outputs, now = free
-    error = np.inf
+    seen, error = response.motion(now, command), np.inf
     for _ in range(_ROUNDS):
-        before = error
         if not np.all(np.isfinite(now)):
             return outputs, np.inf
-        base = (*response.motion(now, command + held), held)
-        unsettled = 0.0
+        before, base, unsettled = error, held, 0.0
         for _ in range(_ROUNDS):
-            held, position, speed = _solve(
-                *base, extra, *response.recursion, response.ahead, *astuple(forces)
-            )
+            held, *motion = _solve(*seen, base, extra, *response.recursion, response.ahead, *sizes)
             if not forces.smooth:
                 break
             with np.errstate(over="ignore", invalid="ignore"):
-                last, extra = extra, forces.within_samples(position, speed, command + held, response)
+                last, extra = extra, forces.within_samples(*motion, command + held, response)
                 unsettled = float(np.linalg.norm(extra - last) / max(np.linalg.norm(held), 1e-300))
             if not unsettled > _CONVERGED:
                 break
@@ -213,12 +210,14 @@ def with_forces(
             return outputs, np.inf
         outputs, now = simulate(command + held)
         seen = response.motion(now, command + held)
-        k = int(response.of_speed)
-        missed = np.sqrt(np.mean((seen[k] - (position, speed)[k]) ** 2))
-        error = float(missed / max(np.sqrt(np.mean((now - free[1]) ** 2)), 1e-300)) + unsettled
+        error = unsettled + _rms(seen[k] - motion[k]) / max(_rms(now - free[1]), 1e-300)
         if error < _CONVERGED or 0.5 * before < error < _SETTLED:
             break
     return outputs, error
+
+
+def _rms(x: Real) -> float:
+    return float(np.sqrt(x @ x / x.size))
 
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
