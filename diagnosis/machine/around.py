@@ -62,7 +62,8 @@ class Body:
 
             command = inputs[:, self.force]
             free = self._remembered((started.key, started.start, inputs.tobytes()), lambda: under(command))
-            outputs, missed = with_forces(under, free, command, response, forces)
+            alone = (lambda motion: sign * motion[:, None]) if free[0].shape[1] == 1 else None
+            outputs, missed = with_forces(under, free, command, response, forces, alone)
             return outputs if missed < _MISSED else np.full_like(outputs, np.nan)
 
         return simulated

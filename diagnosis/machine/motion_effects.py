@@ -183,20 +183,21 @@ def with_forces(
     command: Real,
     response: PulseResponse,
     forces: BodyForces,
+    alone: Callable[[Real], Real] | None = None,
 ) -> tuple[Real, float]:
     """Outputs (T, Y) with the forces acting, and what the last round still moved, over what they change.
 
     simulate : force (T,) -> outputs (T, Y), motion (T,). command : force (T,) without the forces; free : what
-    it gives.
+    it gives. alone : outputs of a motion, where there are no others.
     """
     held, extra = np.zeros(command.size), np.zeros(command.size)
     sizes, k = astuple(forces), int(response.of_speed)
     outputs, now = free
-    seen, error = response.motion(now, command), np.inf
+    seen, before, error = response.motion(now, command), np.inf, np.inf
     for _ in range(_ROUNDS):
         if not np.all(np.isfinite(now)):
             return outputs, np.inf
-        before, base, unsettled = error, held, 0.0
+        base, unsettled = held, 0.0
         for _ in range(_ROUNDS):
             held, *motion = _solve(*seen, base, extra, *response.recursion, response.ahead, *sizes)
             if not forces.smooth:
@@ -208,6 +209,10 @@ def with_forces(
                 break
         if not np.isfinite(unsettled):
             return outputs, np.inf
+        if alone is not None and before < np.inf and error / before * error < _CONVERGED:
+            # As much closer again, what the next simulation would say is known.
+            return alone(motion[k]), error / before * error
+        before = error
         outputs, now = simulate(command + held)
         seen = response.motion(now, command + held)
         error = unsettled + _rms(seen[k] - motion[k]) / max(_rms(now - free[1]), 1e-300)
