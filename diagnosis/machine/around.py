@@ -68,6 +68,12 @@ class Body:
 
         return simulated
 
+    @property
+    def coarse(self) -> bool:
+        """Whether some motion seen so far has too few samples for smooth forces."""
+        tried = (kept[0] for kept in self._kept.values())
+        return any(isinstance(response, PulseResponse) and response.coarse for response in tried)
+
     def _response(self, run: Run, inputs: Real) -> tuple[PulseResponse, float]:
         """From rest, other inputs as at the start; -1 where force and motion count opposite ways, else 1."""
         still = np.repeat(inputs[:1], len(inputs), axis=0)

@@ -6,7 +6,8 @@ sticks, slips, turns round inside a sample), then simulated with that force; whe
 linear, what it says is the start of the next round (Newton's method over a waveform, with one linear
 response for all times).
 
-Neglected: friction acts as its mean over each sample, and the speed between samples is linear.
+Neglected: dry friction acts as its mean over each sample, and the speed between samples is linear. Of smooth
+forces (springs, viscous friction) mean and moment over a sample are exact to fourth order.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ _CONVERGED, _SETTLED = 1e-5, 0.01
 # Share of the response to a pulse that, in its own sample, shows an input that acts before its row.
 _AT_ONCE = 0.02
 _FORGOTTEN = 1e-7
-# A response is taken for one of these orders where all of it is, to the first share at once, else to the second
-# (the swing of a pendulum, whose rounds do not need more); from this many of its samples.
+# Orders of filters that a response may be of: the first that has all of it to the first share, else the best
+# to the second (rounds for the swing of a pendulum need no more). Samples that they are fitted to.
 _ORDERS, _EXACT, _CLOSE = (2, 3, 4, 5), 1e-9, 1e-4
 _FITTED = 100
 
@@ -66,10 +67,10 @@ class BodyForces:
         return self.viscous != 0 or self.linear != 0 or self.cubic != 0
 
     def within_samples(self, x: Real, v: Real, acting: Real, response: PulseResponse) -> Real:
-        """What smooth forces (T,), held over each sample, lack by the trapezoidal rule; acting (T,): all force.
+        """What smooth forces (T,), held over each sample, lack by the trapezoidal rule. acting: all.
 
-        Their means need the slopes at both ends of a sample (Euler and Maclaurin). That they push early or late
-        in it moves a body that integrates twice as a force of minus a twelfth of their second difference does.
+        Means need the slopes at both ends of a sample (Euler and Maclaurin). That they push early or late in
+        it moves a body as a force of minus a twelfth of their second difference does.
         """
         dt, ahead = response.dt_s, response.ahead
         exact = x
@@ -138,6 +139,14 @@ class PulseResponse:
         position, speed = position[:last], speed[:last]
         return cls(position, speed, corrections, ahead, dt_s, of_speed, _recursion(position, speed, ahead))
 
+    @property
+    def coarse(self) -> bool:
+        """Whether an oscillation has fewer than six samples per period: it turns back by the second."""
+        k, few = self.ahead, self.speed.size < self.ahead + 3
+        return bool(
+            few or (self.speed[k + 1] < 0 if self.of_speed else self.position[k + 2] < self.position[k])
+        )
+
     def motion(self, simulated: Real, force: Real) -> tuple[Real, Real]:
         """Position and speed (T,) of what was simulated (T,) under a force (T,)."""
         if self.of_speed:
@@ -161,20 +170,21 @@ def _recursion(position: Real, speed: Real, ahead: int) -> tuple[Real, Real, Rea
     for order in _ORDERS:
         # Speeds by differences are none of the filter in the first samples, nor in the last.
         first = 2 * order + 4
-        if L < 2 * first:
+        if 2 * first > L:
             break
         rows = np.unique(np.linspace(first, L - 2, _FITTED).astype(int))
         before = np.concatenate([h[rows[:, None] - np.arange(1, order + 1)] for h in responses])
         poles = np.linalg.lstsq(before, responses[:, rows].ravel(), rcond=None)[0]
         own = np.concatenate([[1.0], -poles])
         heads = lfilter(own, [1.0], responses[:, :first])
-        missed = np.max([np.abs(lfilter(b, own, pulse) - h)[:-1] for b, h in zip(heads, responses, strict=True)])
+        missed = np.max(
+            [np.abs(lfilter(b, own, pulse) - h)[:-1] for b, h in zip(heads, responses, strict=True)]
+        )
         if missed < closest:
             closest, found = missed, (poles, *heads)
         if missed < _EXACT:
             break
-    poles, *heads = found
-    return poles, heads[0] * np.max(np.abs(position)), heads[1] * np.max(np.abs(speed))
+    return found[0], found[1] * np.max(np.abs(position)), found[2] * np.max(np.abs(speed))
 
 
 def with_forces(
@@ -199,23 +209,23 @@ def with_forces(
             return outputs, np.inf
         base, unsettled = held, 0.0
         for _ in range(_ROUNDS):
-            held, *motion = _solve(*seen, base, extra, *response.recursion, response.ahead, *sizes)
+            held, x, v = _solve(*seen, base, extra, *response.recursion, response.ahead, *sizes)
             if not forces.smooth:
                 break
             with np.errstate(over="ignore", invalid="ignore"):
-                last, extra = extra, forces.within_samples(*motion, command + held, response)
-                unsettled = float(np.linalg.norm(extra - last) / max(np.linalg.norm(held), 1e-300))
+                last, extra = extra, forces.within_samples(x, v, command + held, response)
+                unsettled = _rms(extra - last) / max(_rms(held), 1e-300)
             if not unsettled > _CONVERGED:
                 break
         if not np.isfinite(unsettled):
             return outputs, np.inf
         if alone is not None and before < np.inf and error / before * error < _CONVERGED:
             # As much closer again, what the next simulation would say is known.
-            return alone(motion[k]), error / before * error
+            return alone((x, v)[k]), error / before * error
         before = error
         outputs, now = simulate(command + held)
         seen = response.motion(now, command + held)
-        error = unsettled + _rms(seen[k] - motion[k]) / max(_rms(now - free[1]), 1e-300)
+        error = unsettled + _rms(seen[k] - (x, v)[k]) / max(_rms(now - free[1]), 1e-300)
         if error < _CONVERGED or 0.5 * before < error < _SETTLED:
             break
     return outputs, error

@@ -202,8 +202,8 @@ class Plant:
             return found
 
         run, at_rest = (partial(told_simulation, b) for b in (begun, (0.0,) * len(self.start)))
-        run = around(Started(run, at_rest, known, begun), acting)
-        return lambda inputs: run(inputs)[:, : self.noise.size]
+        wrapped = around(Started(run, at_rest, known, begun), acting)
+        return lambda inputs: wrapped(inputs)[:, : self.noise.size]
 
     def _at(self, effects: Sequence[Change]) -> str:
         values = ", ".join(f"{key} {value:.6g}" for key, value in self.parameters.items())

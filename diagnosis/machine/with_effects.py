@@ -5,6 +5,7 @@ plant = with_effects(plant, "all", experiments, dt_s=0.01, motion="position_m")
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
@@ -27,6 +28,7 @@ _GROUPS = {"input": "actuator", "body": "body", "output": "sensor"}
 _TWINS = ("output_lag", "output_delay", "output_gain")
 # A play of a force is rare; friction one way looks like an offset beside friction both ways.
 _BY_NAME_ONLY = ("input_backlash", "one_sided_friction")
+_SMOOTH = ("viscous_friction", "spring", "hardening_spring")
 _SMOOTHED = 11  # samples, of a measured position whose speed is asked
 
 
@@ -61,6 +63,8 @@ def with_effects(
     largest_force : for ranges, where the column of the force is zero in the records.
     at_rest_before : before its first row a command is zero; else as in that row.
     prefix : before the names, where this is asked of several inputs, bodies or sensors.
+
+    Warns where springs and viscous friction have fewer than six samples per period.
 
     Raises ValueError, one line: an unknown name, column or output, a command of zeros, a simulation that
     friction and springs cannot be put around.
@@ -100,7 +104,8 @@ def with_effects(
     if measured_motion is not None:
         places["input"] = None
     found = list(plant.effects)
-    for name in _applying(plant, places) if names == "all" else names:
+    chosen = _applying(plant, places) if names == "all" else names
+    for name in chosen:
         kind, place = KINDS[name], places[KINDS[name].where]
         if place is None or (kind.where == "input" and not sizes.input > 0):
             raise ValueError(f"plant: {name} {_MISSING[kind.where]}")
@@ -119,6 +124,13 @@ def with_effects(
         )
     equipped = replace(plant, effects=tuple(found), dt_s=dt_s)
     _try(equipped, experiments[0], body)
+    smooth = [n for n in chosen if n in _SMOOTH]
+    if smooth and isinstance(body, Body) and body.coarse:
+        warnings.warn(
+            "plant: after a pulse of force the motion turns back within two samples, so that "
+            f"{' and '.join(smooth)} are some per cent off; sample finer or write their equations into it",
+            stacklevel=2,
+        )
     return equipped
 
 
