@@ -245,6 +245,8 @@ class Search:
             if self._late(f"further effects beside {' and '.join(parent.names)}"):
                 return
             self._beside(parent.end, _TRIED[count > 2])
+        if not self._unexplained:
+            return
         # Friction and tilt, which may be more than what is sought, take the first places; what else is likely
         # shows what it explains once they are beside it.
         tried, further = {_unusual(parent) for parent in parents} | {frozenset[str]()}, 0

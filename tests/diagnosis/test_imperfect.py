@@ -490,7 +490,10 @@ def test_an_answer_leaves_no_more_of_held_out_records_than_the_stated_values():
     assert _judged(sets, stated=less).answer != "actuator_dead_zone"
 
 
-def test_friction_and_tilt_are_fitted_beside_what_they_come_before(monkeypatch):
+@pytest.mark.parametrize(
+    ("left", "further"), [(0.1, [("input_delay", True), ("viscous_friction", True)]), (0.04, [])]
+)
+def test_friction_and_tilt_are_fitted_beside_what_they_come_before(monkeypatch, left, further):
     # The likeliest three are all of what every machine has some of; what is sought stands behind them.
     search, kinds = _hub_only(2)
     nothing, start = np.zeros(search.records.nominal.count), search.records.at_rest()
@@ -498,14 +501,14 @@ def test_friction_and_tilt_are_fitted_beside_what_they_come_before(monkeypatch):
     for k, name in enumerate(names):
         x = np.array([np.mean(axis.box) for axis in kinds[name].axes])
         end = descend(search.records, (kinds[name],), nothing, x, start, iterations=1)
-        search.found.append(Explanation(end, -float(k), 0.0, 0.0, (), (), np.zeros((2, 1))))
+        search.found.append(Explanation(end, -float(k), 0.0, 0.0, (), (), np.full((2, 1), left)))
     asked = []
     monkeypatch.setattr(
         search, "_beside", lambda end, most, everywhere=False: asked.append((*end.names, everywhere))
     )
     search._together(2)
-    usual = [(name, False) for name in names[:3]]
-    assert asked == [*usual, ("input_delay", True), ("viscous_friction", True)]
+    # Only where the likeliest leaves more than the model error.
+    assert asked == [*((name, False) for name in names[:3]), *further]
 
 
 @pytest.mark.slow
