@@ -46,9 +46,9 @@ def settled(
     for r, state in enumerate(start.states):
         best = _RecordStart(records, r, left, state)
         best.descend(columns[r])
-        if unknown.responses is None and best.better(
-            _begun(records, r, d, effects, Start(state, start.zeros))
-        ):
+        more = unknown.responses is None and best.loss > best.levels.loss_of(best.levels.floor)
+        # More is left than does not interest, and nobody knows a linear part.
+        if more and best.better(_begun(records, r, d, effects, Start(state, start.zeros))):
             best.descend()
         for near in (best.state, rest.states[r]) if touching else ():
             one = _RecordStart(records, r, left, near)
