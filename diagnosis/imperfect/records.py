@@ -191,6 +191,10 @@ class Records:
         before = np.concatenate([own @ columns.per_zero for own in columns.states])
         return StartColumns.of(columns.zeros - before, states, columns.per_zero)
 
+    def losses(self, e: Real) -> Real:
+        """(R,) -log likelihood of every record, from coefficients (N,)."""
+        return np.array([self.levels.within(part).loss(e[part]) for part in self.parts])
+
     def prior_cost(self, start: Start) -> float:
         """-2 log prior density of a start."""
         return float(

@@ -50,14 +50,14 @@ _LAST_ITERATIONS, _LAST_TOLERANCE = 20, 0.02
 class Explanation:
     """A fitted set of effects and what it leaves.
 
-    gain : what the records gain over the nominal alone, estimation and held-out, in log likelihood.
-    prior : log prior of deviations, start and effects with the volume the records leave them.
+    log_likelihoods : (R,) of every record, estimation and held-out.
+    log_prior, log_volume : of deviations, start and effects; what the records leave of them.
     left, left_held_out : experiment residuals (T, Y) in the outputs' units.
     shares : (2, Y) RMS left over the motion: estimation records, held-out records.
     """
 
     end: Descent
-    log_likelihood: float
+    log_likelihoods: Real
     log_prior: float
     log_volume: float
     left: tuple[Real, ...]
@@ -75,6 +75,10 @@ class Explanation:
     def pooled_held_out(self, noise: Real) -> float:
         """Energy left of the held-out records, in noise deviations (Y,)."""
         return float(sum(np.sum((part / noise) ** 2) for part in self.left_held_out))
+
+    @property
+    def log_likelihood(self) -> float:
+        return float(np.sum(self.log_likelihoods))
 
     @property
     def evidence(self) -> float:
@@ -471,10 +475,10 @@ class Search:
         touching = self._touching and end.non_smooth
         start, e = settled(held, end.deviations, end.effects, beginning, touching=touching)
         left, left_held_out = records.residuals_of(end.left), held.residuals_of(e)
-        held_out_loss = held.levels.loss(e) + 0.5 * float(np.sum((start.states / held.state_spread) ** 2))
+        states = 0.5 * np.sum((start.states / held.state_spread) ** 2, axis=1)
         return Explanation(
             end,
-            -records.levels.loss(end.left) - held_out_loss,
+            -np.concatenate([records.losses(end.left), held.losses(e) + states]),
             -end.prior,
             occam(records, end),
             left,

@@ -49,6 +49,8 @@ _WORSE, _WORSE_BY = 1.15, 0.2
 # How probable a cause beyond the list is that looks like an effect, beside the effect.
 _UNLISTED = 1 / 3
 _LISTED_AS = {name: str(kind.look_alike_of) for name, kind in LOOK_ALIKES.items()}
+# Draws of the Bayesian bootstrap over records.
+_DRAWS = 400
 # Sets this far behind in score take no part.
 _BEHIND, _MOST_SETS, _PASSES = 8.0, 8, 3
 
@@ -363,7 +365,6 @@ def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: f
     them only as far as the nominal alone leaves no more than imperfections (none_enough): where it leaves
     more and the set does not, the largest of its effects interests, however little it carries. With
     none_enough zero nobody has stated what does not interest: then that is unknown."""
-    weights = softmax([s.score for s in sets])
     shared: dict[tuple[str, ...], float] = {("unknown",): 0.0}
     cause = {"none": 0.0, **dict.fromkeys(listed, 0.0), "unknown": 0.0}
     presence = dict.fromkeys(listed, 0.0)
@@ -375,7 +376,7 @@ def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: f
         for name in presence.keys() & set(names):
             presence[name] += share
 
-    for weight, one in zip(weights, sets, strict=True):
+    for weight, one in zip(_weights(sets), sets, strict=True):
         give(["unknown"], weight * (1 - one.complete))
         parts = sorted(one.parts, key=lambda part: -part.share)
         some = (chosen for count in range(len(parts) + 1) for chosen in combinations(parts, count))
@@ -393,3 +394,16 @@ def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: f
         {names: float(p) for names, p in shared.items()},
         {name: float(p) for name, p in presence.items()},
     )
+
+
+def _weights(sets: Sequence[Judged]) -> Real:
+    """Posterior weights of sets, the mean over a Bayesian bootstrap of the records (Yao et al. 2018, 3.4).
+
+    What imperfections leave is alike within a record and another from one to the next: a set that most of the
+    records speak for is surer than one that a single record prefers as much.
+    """
+    likelihoods = np.array([s.explanation.log_likelihoods for s in sets]) / TEMPER
+    count = likelihoods.shape[1]
+    draws = count * np.random.default_rng(0).dirichlet(np.ones(count), _DRAWS)
+    scores = np.array([s.score for s in sets]) + (draws - 1) @ likelihoods.T
+    return np.asarray(np.mean(softmax(scores, axis=1), axis=0))

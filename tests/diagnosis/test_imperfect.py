@@ -26,7 +26,7 @@ from diagnosis.imperfect.records import Records, Start, StartColumns
 from diagnosis.imperfect.search import Explanation, Search
 from diagnosis.imperfect.settled import best_move, settled
 from diagnosis.imperfect.starts import points_of
-from diagnosis.imperfect.verdict import is_silent, judged
+from diagnosis.imperfect.verdict import TEMPER, _weights, is_silent, judged
 from diagnosis.imperfect.windows import in_windows
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Weighing
@@ -501,7 +501,7 @@ def test_friction_and_tilt_are_fitted_beside_what_they_come_before(monkeypatch, 
     for k, name in enumerate(names):
         x = np.array([np.mean(axis.box) for axis in kinds[name].axes])
         end = descend(search.records, (kinds[name],), nothing, x, start, iterations=1)
-        search.found.append(Explanation(end, -float(k), 0.0, 0.0, (), (), np.full((2, 1), left)))
+        search.found.append(Explanation(end, np.array([-float(k)]), 0.0, 0.0, (), (), np.full((2, 1), left)))
     asked = []
     monkeypatch.setattr(
         search, "_beside", lambda end, most, everywhere=False: asked.append((*end.names, everywhere))
@@ -695,7 +695,8 @@ def _judged(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
             StartColumns(np.zeros((0, 0)), (), np.zeros((0, 0))),
         )
         end = Descent(chosen, nothing, x, start, nothing, np.zeros((0, 0)), columns, -gain, 0.0, True)
-        return Explanation(end, gain, 0.0, 0.0, (), (), np.array([[left, left], [held_out, held_out]]))
+        shares = np.array([[left, left], [held_out, held_out]])
+        return Explanation(end, np.array([gain]), 0.0, 0.0, (), (), shares)
 
     found = {frozenset(names): fitted(names, *numbers) for names, numbers in sets.items()}
     search = SimpleNamespace(
@@ -710,6 +711,23 @@ def _judged(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
         acts_on_held_out=lambda whole, k: acts,
     )
     return judged(search, case.machine.weighing.listed)
+
+
+def test_a_set_that_one_record_alone_prefers_is_less_sure():
+    # The same gain in all, once shared by six records, once of a single one; and one record has no others.
+    def sets(gains):
+        likelihoods = (np.zeros(len(gains)), TEMPER * np.array(gains))
+        return [
+            SimpleNamespace(score=np.sum(own) / TEMPER, explanation=SimpleNamespace(log_likelihoods=own))
+            for own in likelihoods
+        ]
+
+    certain = 1 / (1 + np.exp(-3.0))
+    shared, single = (_weights(sets(gains))[1] for gains in ([0.5] * 6, [3.0] + [0.0] * 5))
+    assert shared == pytest.approx(certain, abs=0.01)
+    assert 0.5 < single < certain - 0.05
+    assert _weights(sets([3.0]))[1] == pytest.approx(certain)
+    assert np.sum(_weights(sets([0.3, -0.2]))) == pytest.approx(1.0)
 
 
 def test_a_simpler_effect_is_also_sought_where_the_one_that_contains_it_ended():
