@@ -37,6 +37,8 @@ _PULLED = 1.8
 _BESIDE_IN_WINDOWS, _FREED = 4, (2, 3)
 # Loss that the best of them gains in windows, or none is continued.
 _GAINED = 15.0
+# Loss that other starts of the records gain, or a set is not descended on from there.
+_GAINED_BY_START = 2.0
 # Scans of sets with contacts, each of the likeliest that is left or has gained this since its last.
 _SCANS, _GAINED_BY_SCAN = 2, 2.0
 # Sets of each size with contacts whose starts feel them, and how far behind in evidence they may be.
@@ -175,7 +177,7 @@ class Search:
         for k, (end, points) in enumerate(sorted(ends, key=lambda one: one[0].loss)):
             if k < _FINISHED and not end.converged:
                 end = descend(self.records, end.candidates, end.deviations, end.coordinates, end.start)
-            found = self.add(refined(self.records, end) if k < _FINISHED else end)
+            found = self.add(refined(self.records, self._begun(end)) if k < _FINISHED else end)
             # Where it ended alone may be far from every start, and right beside another effect.
             points.insert(0, _point(found.end))
 
@@ -287,7 +289,18 @@ class Search:
         nominal = parent.jacobian[:, : parent.deviations.size]
         ends = [self._from(parent, candidate, point, nominal) for candidate, point in chosen.values()]
         for k, end in enumerate(sorted(ends, key=lambda end: end.loss)):
-            self.add(refined(self.records, end) if k < _REFINED else end)
+            self.add(refined(self.records, self._begun(end)) if k < _REFINED else end)
+
+    def _begun(self, end: Descent) -> Descent:
+        """Descended on where starts sought with these effects leave less: the nominal's may be far off, and
+        where nobody knows a linear part no step leads from there."""
+        if self.case.machine.unknown_start.responses is not None or not end.start.states.size:
+            return end
+        start, e = settled(self.records, end.deviations, end.effects, end.start)
+        loss, _ = loss_at(self.records, e, end.deviations, start)
+        if loss > end.loss - _GAINED_BY_START:
+            return end
+        return descend(self.records, end.candidates, end.deviations, end.coordinates, start)
 
     def _from_windows(self) -> None:
         """Torques over the angle and what stands beside them, from where fits in windows ended."""

@@ -62,8 +62,14 @@ class Body:
 
             command = inputs[:, self.force]
             free = self._remembered((started.key, started.start, inputs.tobytes()), lambda: under(command))
-            alone = (lambda motion: sign * motion[:, None]) if free[0].shape[1] == 1 else None
-            outputs, missed = with_forces(under, free, command, response, forces, alone)
+
+            def placed(outputs: Real, motion: Real) -> Real:
+                found = outputs.copy()
+                found[:, self.motion] = sign * motion
+                return found
+
+            alone = free[0].shape[1] == 1
+            outputs, missed = with_forces(under, free, command, response, forces, placed, alone=alone)
             return outputs if missed < _MISSED else np.full_like(outputs, np.nan)
 
         return simulated

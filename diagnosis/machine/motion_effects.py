@@ -12,11 +12,14 @@ forces (springs, viscous friction) mean and moment over a sample are exact to fo
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import astuple, dataclass
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numba import njit
+from scipy.linalg import expm, logm
 from scipy.signal import lfilter
 
 from diagnosis.machine.machine_protocol import Real
@@ -31,9 +34,12 @@ _FORETOLD = 1e-6
 _AT_ONCE = 0.02
 _FORGOTTEN = 1e-7
 # Orders of filters that a response may be of: the first that has all of it to the first share, else the best
-# to the second (rounds for the swing of a pendulum need no more). Samples that they are fitted to.
-_ORDERS, _EXACT, _CLOSE = (2, 3, 4, 5), 1e-9, 1e-4
+# to the second (what it misses, rounds add). Samples that they are fitted to.
+_ORDERS, _EXACT, _CLOSE = (2, 3, 4, 5, 6), 1e-9, 0.03
 _FITTED = 100
+# Imaginary part of a real pole; largest pole; radians of a swing in a part of a sample, and the largest
+# power of two of parts.
+_REAL, _UNSTABLE, _TURNED, _MOST_PARTS = 1e-9, 1.1, 0.1, 4
 
 
 class NotFollowedError(ValueError, ArithmeticError):
@@ -68,30 +74,111 @@ class BodyForces:
         """Whether there are some that change little within a sample."""
         return self.viscous != 0 or self.linear != 0 or self.cubic != 0
 
-    def within_samples(self, x: Real, v: Real, acting: Real, response: PulseResponse) -> Real:
-        """What smooth forces (T,), held over each sample, lack by the trapezoidal rule. acting: all.
 
-        Means need the slopes at both ends of a sample (Euler and Maclaurin). That they push early or late in
-        it moves a body as a force of minus a twelfth of their second difference does.
+@dataclass(frozen=True, eq=False)
+class LinearBody:
+    """Continuous equivalent of a simulated response to held forces, to go through parts of a sample.
+
+    generator : (N + 2, N + 2) of states, command and force, per sample: a force inside the simulation acts
+        when it acts, a command as `early` (samples) as the steps of an integrator have it.
+    rows : (2, N) position and speed of states.
+    poles, numerator : (n,) each, the filter from force to what is simulated, position or speed.
+    """
+
+    generator: Real
+    rows: Real
+    early: float
+    poles: Real
+    numerator: Real
+    ahead: int
+    dt_s: float
+    of_speed: bool
+    _steps: dict[int, tuple[Real, ...]] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, poles: Real, head: Real, ahead: int, dt_s: float, *, of_speed: bool) -> LinearBody | None:
+        """head (ahead + n,): of the filter from force to what is simulated; None without poles."""
+        n, numerator = poles.size, head[ahead:]
+        if n == 0:
+            return None
+        held = np.zeros((n + 1, n + 1))
+        held[:n, 0], held[:n, n], held[n, n] = poles, numerator, 1.0
+        held[: n - 1, 1:n] = np.eye(n - 1)
+        with warnings.catch_warnings():
+            # It warns from a thousand roundings on, next to a double pole.
+            warnings.simplefilter("ignore", RuntimeWarning)
+            rates = np.real(logm(held))
+        own, command = rates[:n, :n], rates[:n, n]
+        at_once, later = command[0], own[0] @ command
+        early = 0.0 if of_speed or abs(at_once) > abs(later) else at_once / later
+        force = expm(-early * own) @ command
+        # Position of a speed is one more state.
+        N = n + of_speed
+        generator, rows = np.zeros((N + 2, N + 2)), np.zeros((2, N))
+        generator[:n, :n], generator[:n, N], generator[:n, N + 1] = own, command, force
+        if of_speed:
+            generator[n, 0] = dt_s
+            rows[0, n], rows[1, 0] = 1.0, 1.0
+        else:
+            rows[0, 0], rows[1, :n] = 1.0, own[0] / dt_s
+        return cls(generator, rows, early, poles, numerator, ahead, dt_s, of_speed)
+
+    @cached_property
+    def turns(self) -> tuple[float, float, float]:
+        """Radians that it swings by in a sample; position and speed after a unit force over one."""
+        step = expm(self.generator)
+        swing = float(np.max(np.abs(np.angle(np.linalg.eigvals(step[:-2, :-2])))))
+        moved = self.rows @ step[:-2, -1]
+        return swing, float(moved[0]), float(moved[1])
+
+    def parts(self, forces: BodyForces, largest: float) -> int:
+        """Of a sample, enough for the trapezoidal rule beside motion up to `largest`; powers of two, so that
+        small changes of parameters seldom change them."""
+        if not forces.smooth:
+            return 1
+        swing, gx, gv = self.turns
+        stiffness = abs(forces.linear) + 3 * abs(forces.cubic) * largest**2
+        turned = np.hypot(swing, np.sqrt(2 * abs(gx) * stiffness))
+        finer = max(turned, abs(forces.viscous * gv), _TURNED) / _TURNED
+        return int(2 ** min(np.ceil(np.log2(finer)), _MOST_PARTS))
+
+    def beyond(self, simulated: Real, force: Real) -> Real:
+        """(T,) what was simulated beside the response to the force (T,) from rest."""
+        head = np.concatenate([np.zeros(self.ahead), self.numerator])
+        return np.asarray(simulated - lfilter(head, np.concatenate([[1.0], -self.poles]), force))
+
+    def solve(
+        self, beyond: Real, command: Real, sizes: Sequence[float], parts: int
+    ) -> tuple[Real, Real, Real]:
+        """Held forces (T,) as good as those that act, and positions and speeds (T,) with them.
+
+        beyond : (T,) what moves beside the response to forces. sizes : of `BodyForces`.
         """
-        dt, ahead = response.dt_s, response.ahead
-        exact = x
-        if response.of_speed:
-            # Speed bends within samples, but for its kinks where the held force jumps.
-            kink = 0.5 * (3 * response.speed[ahead] - response.speed[ahead + 1])
-            bent = np.zeros(x.size)
-            bent[1:-1] = np.diff(v, 2) - kink * np.diff(acting)[1 - ahead : x.size - 1 - ahead]
-            exact = x.copy()
-            exact[1:] -= np.cumsum(bent[1:] + bent[:-1]) * dt / 24
-        pull, by_rule = (self.linear * y + self.cubic * y * y * y for y in (exact, x))
-        slope = (self.linear + 3 * self.cubic * exact * exact) * v
-        lacks = dt / 12 * np.diff(slope) + 0.5 * (by_rule - pull)[1:] + 0.5 * (by_rule - pull)[:-1]
-        lacks += self.viscous * (0.5 * (v[1:] + v[:-1]) - np.diff(exact) / dt)
-        steps = np.diff(pull + self.viscous * v)
-        lacks[1:-1] += (steps[2:] - steps[:-2]) / 24
-        found = np.zeros(x.size)
-        found[1 - ahead : x.size - ahead] = lacks
-        return found
+        if parts not in self._steps:
+            step = expm(self.generator / parts)
+            self._steps[parts] = tuple(
+                map(np.ascontiguousarray, (step[:-2, :-2], step[:-2, -2], step[:-2, -1]))
+            )
+        # Slopes of fourth order, to go through parts of samples along cubics.
+        slopes = np.gradient(beyond)
+        slopes[2:-2] = (8 * (beyond[3:-1] - beyond[1:-3]) - beyond[4:] + beyond[:-4]) / 12
+        held, moment, x, v = _through(
+            beyond,
+            slopes,
+            command,
+            *self._steps[parts],
+            *self.rows,
+            parts,
+            self.ahead,
+            self.of_speed,
+            self.dt_s,
+            *sizes,
+        )
+        # What comes early or late in a sample moves the body as a pair of forces around it does.
+        moment += self.early * held
+        held[1:] += 0.5 * moment[:-1]
+        held[:-1] -= 0.5 * moment[1:]
+        return held, x, v
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +186,7 @@ class PulseResponse:
     """Position and speed (L,) after a unit force over one sample; `ahead` samples before speed shows it.
 
     corrections : (2,) what a force in this sample and the one before adds to central differences of position.
-    recursion : poles (P,), and (M,) of position and of speed, as of a filter; without poles, the responses.
+    linear : the same as of a linear body, where it is one.
     """
 
     position: Real
@@ -108,7 +195,7 @@ class PulseResponse:
     ahead: int
     dt_s: float
     of_speed: bool
-    recursion: tuple[Real, Real, Real]
+    linear: LinearBody | None
 
     @classmethod
     def of(cls, motion: Real, dt_s: float, *, of_speed: bool) -> PulseResponse:
@@ -139,7 +226,10 @@ class PulseResponse:
         kept |= np.abs(position) > _FORGOTTEN * np.max(np.abs(position))
         last = int(np.flatnonzero(kept)[-1]) + 1
         position, speed = position[:last], speed[:last]
-        return cls(position, speed, corrections, ahead, dt_s, of_speed, _recursion(position, speed, ahead))
+        linear = LinearBody.of(
+            *_filter(speed if of_speed else position, ahead), ahead, dt_s, of_speed=of_speed
+        )
+        return cls(position, speed, corrections, ahead, dt_s, of_speed, linear)
 
     @property
     def coarse(self) -> bool:
@@ -162,31 +252,41 @@ class PulseResponse:
         return simulated, speed
 
 
-def _recursion(position: Real, speed: Real, ahead: int) -> tuple[Real, Real, Real]:
-    """The cheapest filter with these responses (L,), from the first that counts on."""
-    responses = np.stack([position / np.max(np.abs(position)), speed / np.max(np.abs(speed))])
-    responses[:, :ahead] = 0.0
-    L, closest, found = speed.size, _CLOSE, (np.zeros(0), *responses)
-    pulse = np.zeros(L)
+def _filter(response: Real, ahead: int) -> tuple[Real, Real]:
+    """Poles (P,) and numerator (M,) of the filter of lowest order with this response (L,), from the first
+    sample that counts on, and a continuous equivalent; without poles, the response."""
+    largest = np.max(np.abs(response))
+    h = response / largest
+    h[:ahead] = 0.0
+    L, pulse = h.size, np.zeros(h.size)
     pulse[0] = 1.0
+    closest, found = _CLOSE, (np.zeros(0), h)
+    # As close to small beginnings as to what they become.
+    counts = 1 / np.maximum(np.maximum.accumulate(np.abs(h)), 1e-6)
     for order in _ORDERS:
-        # Speeds by differences are none of the filter in the first samples, nor in the last.
         first = 2 * order + 4
         if 2 * first > L:
             break
         rows = np.unique(np.linspace(first, L - 2, _FITTED).astype(int))
-        before = np.concatenate([h[rows[:, None] - np.arange(1, order + 1)] for h in responses])
-        poles = np.linalg.lstsq(before, responses[:, rows].ravel(), rcond=None)[0]
+        before = h[rows[:, None] - np.arange(1, order + 1)]
+        poles = np.linalg.lstsq(before * counts[rows, None], h[rows] * counts[rows], rcond=None)[0]
         own = np.concatenate([[1.0], -poles])
-        heads = lfilter(own, [1.0], responses[:, :first])
-        missed = np.max(
-            [np.abs(lfilter(b, own, pulse) - h)[:-1] for b, h in zip(heads, responses, strict=True)]
+        roots = np.roots(own)
+        if np.max(np.abs(roots)) > _UNSTABLE or np.any((roots.real <= 0) & (np.abs(roots.imag) < _REAL)):
+            continue
+        rows = np.concatenate([np.arange(ahead, first), rows])
+        alone = lfilter([1.0], own, pulse)
+        delayed = np.column_stack(
+            [np.concatenate([np.zeros(j), alone[: L - j]]) for j in range(ahead, ahead + order)]
         )
+        head = np.linalg.lstsq(delayed[rows] * counts[rows, None], h[rows] * counts[rows], rcond=None)[0]
+        # What it lacks at the very end is what a response lacks that has been cut there.
+        missed = np.max((np.abs(delayed @ head - h) * counts)[ahead:-1])
         if missed < closest:
-            closest, found = missed, (poles, *heads)
-        if missed < _EXACT:
+            closest, found = missed, (poles, np.concatenate([np.zeros(ahead), head]))
+        if closest < _EXACT:
             break
-    return found[0], found[1] * np.max(np.abs(position)), found[2] * np.max(np.abs(speed))
+    return found[0], found[1] * largest
 
 
 def with_forces(
@@ -195,42 +295,68 @@ def with_forces(
     command: Real,
     response: PulseResponse,
     forces: BodyForces,
-    alone: Callable[[Real], Real] | None = None,
+    placed: Callable[[Real, Real], Real],
+    *,
+    alone: bool,
 ) -> tuple[Real, float]:
     """Outputs (T, Y) with the forces acting, and what the last round still moved, over what they change.
 
     simulate : force (T,) -> outputs (T, Y), motion (T,). command : force (T,) without the forces; free : what
-    it gives. alone : outputs of a motion, where there are no others.
+    it gives. placed : outputs with another motion in them; alone : whether there are no others.
     """
-    held, extra = np.zeros(command.size), np.zeros(command.size)
-    sizes, k = astuple(forces), int(response.of_speed)
+    if response.linear is not None:
+        return _by_parts(simulate, free, command, response.linear, forces, placed, alone=alone)
+    held, sizes, k = np.zeros(command.size), astuple(forces), int(response.of_speed)
     outputs, now = free
     seen, before, error = response.motion(now, command), np.inf, np.inf
     for _ in range(_ROUNDS):
         if not np.all(np.isfinite(now)):
             return outputs, np.inf
-        base, unsettled = held, 0.0
-        for _ in range(_ROUNDS):
-            held, x, v = _solve(*seen, base, extra, *response.recursion, response.ahead, *sizes)
-            if not forces.smooth:
-                break
-            with np.errstate(over="ignore", invalid="ignore"):
-                last, extra = extra, forces.within_samples(x, v, command + held, response)
-                unsettled = _rms(extra - last) / max(_rms(held), 1e-300)
-            if not unsettled > _FORETOLD:
-                break
-        if not np.isfinite(unsettled):
-            return outputs, np.inf
-        if alone is not None and before < np.inf and error / before * error < _FORETOLD:
+        held, x, v = _solve(*seen, held, response.position, response.speed, response.ahead, *sizes)
+        if alone and before < np.inf and error / before * error < _FORETOLD:
             # As much closer again, what the next simulation would say is known.
-            return alone((x, v)[k]), error / before * error
+            return placed(outputs, (x, v)[k]), error / before * error
         before = error
         outputs, now = simulate(command + held)
         seen = response.motion(now, command + held)
-        error = unsettled + _rms(seen[k] - (x, v)[k]) / max(_rms(now - free[1]), 1e-300)
+        error = _rms(seen[k] - (x, v)[k]) / max(_rms(now - free[1]), 1e-300)
         if error < (_FORETOLD if alone else _CONVERGED) or 0.5 * before < error < _SETTLED:
             break
     return outputs, error
+
+
+def _by_parts(
+    simulate: Callable[[Real], tuple[Real, Real]],
+    free: tuple[Real, Real],
+    command: Real,
+    body: LinearBody,
+    forces: BodyForces,
+    placed: Callable[[Real, Real], Real],
+    *,
+    alone: bool,
+) -> tuple[Real, float]:
+    """The same in parts of a sample: what is simulated beside the linear response counts, round by round."""
+    outputs, now = free
+    if not np.all(np.isfinite(now)):
+        return outputs, np.inf
+    beyond, before, error = body.beyond(now, command), np.inf, np.inf
+    travel = np.cumsum(now) * body.dt_s if body.of_speed else now
+    parts, sizes = body.parts(forces, float(np.max(np.abs(travel)))), astuple(forces)
+    for _ in range(_ROUNDS):
+        held, *moves = body.solve(beyond, command, sizes, parts)
+        motion = moves[body.of_speed]
+        if not np.all(np.isfinite(motion)):
+            return outputs, np.inf
+        if alone and before < np.inf and error / before * error < _FORETOLD:
+            # As much closer again, what the next simulation would say is known.
+            return placed(outputs, motion), error / before * error
+        before = error
+        outputs, now = simulate(command + held)
+        last, beyond = beyond, body.beyond(now, command + held)
+        error = _rms(beyond - last) / max(_rms(motion - free[1]), 1e-300)
+        if error < (_FORETOLD if alone else _CONVERGED) or 0.5 * before < error < _SETTLED:
+            break
+    return placed(outputs, motion + beyond - last), error
 
 
 def _rms(x: Real) -> float:
@@ -242,8 +368,6 @@ def _solve(
     position: Real,
     speed: Real,
     held: Real,
-    extra: Real,
-    poles: Real,
     hx: Real,
     hv: Real,
     ahead: int,
@@ -259,7 +383,7 @@ def _solve(
     """Forces (T,), positions and speeds (T,) with them, from those under the forces `held`."""
     T = position.size
     f, x, v = held.copy(), position.copy(), speed.copy()
-    change, moved_x, moved_v = np.zeros(T), np.zeros(T), np.zeros(T)
+    change = np.zeros(T)
     gx, gv = hx[ahead], hv[ahead]
     for k in range(T - ahead):
         n = k + ahead
@@ -267,9 +391,6 @@ def _solve(
         for j in range(max(0, n - hv.size + 1), k):
             dx += hx[n - j] * change[j]
             dv += hv[n - j] * change[j]
-        for i in range(min(poles.size, n)):
-            dx += poles[i] * moved_x[n - 1 - i]
-            dv += poles[i] * moved_v[n - 1 - i]
         ax, av = position[n] + dx - gx * held[k], speed[n] + dv - gv * held[k]
         x0, v0 = (x[n - 1], v[n - 1]) if n > 0 else (ax, av)
         end, dry, x1 = v0, 0.0, x0
@@ -277,7 +398,7 @@ def _solve(
             # Smooth forces by the trapezoidal rule, the cubic one by its tangent at the end.
             stiffness = linear + 3 * cubic * x1 * x1
             divisor = 1 + 0.5 * (viscous * gv + stiffness * gx)
-            smooth = extra[k] - 0.5 * (viscous * (v0 + av) + linear * x0 + stiffness * ax)
+            smooth = -0.5 * (viscous * (v0 + av) + linear * x0 + stiffness * ax)
             smooth += cubic * (x1**3 - 0.5 * x0**3)
             a, g = av + gv * smooth / divisor, gv / divisor
             level = coulomb + excess * np.exp(-0.5 * (abs(v0) + abs(end)) / falls)
@@ -286,7 +407,6 @@ def _solve(
             x1 = ax + gx * f[k]
         x[n], v[n] = x1, end
         change[k] = f[k] - held[k]
-        moved_x[n], moved_v[n] = dx + gx * change[k], dv + gv * change[k]
     return f, x, v
 
 
@@ -319,3 +439,86 @@ def _slowed(v0: float, a: float, g: float, up: float, down: float, at_rest: floa
         return 0.0, -a / g
     share = v0 / (g * up - pulled)
     return (1 - share) * (pulled + g * down), (1 - share) * down - share * up
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def _through(
+    beyond: Real,
+    slopes: Real,
+    command: Real,
+    step: Real,
+    commanded: Real,
+    pushed: Real,
+    of_x: Real,
+    of_v: Real,
+    parts: int,
+    ahead: int,
+    of_speed: bool,
+    dt_s: float,
+    coulomb: float,
+    excess: float,
+    falls: float,
+    up: float,
+    down: float,
+    viscous: float,
+    linear: float,
+    cubic: float,
+) -> tuple[Real, Real, Real, Real]:
+    """Means and moments of the forces in every sample (T,), positions and speeds (T,); beyond, slopes (T,):
+    position or speed beside the response to forces, and by how much it changes per sample."""
+    T, N = command.size, pushed.size
+    mean, moment, x, v = np.zeros(T), np.zeros(T), np.zeros(T), np.zeros(T)
+    state, moved = np.zeros(N), np.zeros(N)
+    gx, gv = 0.0, 0.0
+    for i in range(N):
+        gx += of_x[i] * pushed[i]
+        gv += of_v[i] * pushed[i]
+    travelled = 0.0
+    x0, v0 = (0.0, beyond[0]) if of_speed else (beyond[0], slopes[0] / dt_s)
+    if ahead == 1:
+        x[0], v[0] = x0, v0
+    again = 2 if excess > 0 or cubic > 0 else 1
+    for k in range(T - ahead):
+        # A cubic from sample to sample; before the first nothing is known to move.
+        n = k + ahead
+        start, end_value = beyond[max(n - 1, 0)], beyond[n]
+        rise, last = (slopes[n - 1], slopes[n]) if n > 0 else (0.0, 0.0)
+        bend = 3 * (end_value - start) - 2 * rise - last
+        twist = rise + last - 2 * (end_value - start)
+        for part in range(parts):
+            t = (part + 1) / parts
+            value = start + t * (rise + t * (bend + t * twist))
+            if of_speed:
+                way = t * (start + t * (rise / 2 + t * (bend / 3 + t * twist / 4)))
+                ax, av = travelled + dt_s * way, value
+            else:
+                ax, av = value, (rise + t * (2 * bend + 3 * t * twist)) / dt_s
+            for i in range(N):
+                moved[i] = commanded[i] * command[k]
+                for j in range(N):
+                    moved[i] += step[i, j] * state[j]
+                ax += of_x[i] * moved[i]
+                av += of_v[i] * moved[i]
+            end, x1, f = v0, x0, 0.0
+            for _ in range(again):
+                # Smooth forces by the trapezoidal rule, the cubic one by its tangent at the end.
+                stiffness = linear + 3 * cubic * x1 * x1
+                divisor = 1 + 0.5 * (viscous * gv + stiffness * gx)
+                smooth = -0.5 * (viscous * (v0 + av) + linear * x0 + stiffness * ax)
+                smooth += cubic * (x1**3 - 0.5 * x0**3)
+                a, g = av + gv * smooth / divisor, gv / divisor
+                level = coulomb
+                if excess > 0:
+                    level += excess * np.exp(-0.5 * (abs(v0) + abs(end)) / falls)
+                end, dry = _dry(v0, a, g, level + up, level + down, excess + coulomb - level)
+                f = (smooth + dry) / divisor
+                x1 = ax + gx * f
+            for i in range(N):
+                state[i] = moved[i] + pushed[i] * f
+            mean[k] += f / parts
+            moment[k] += f * ((part + 0.5) / parts - 0.5) / parts
+            x0, v0 = x1, end
+        if of_speed and n > 0:
+            travelled += dt_s * (start + rise / 2 + bend / 3 + twist / 4)
+        x[n], v[n] = x0, v0
+    return mean, moment, x, v
