@@ -1,21 +1,24 @@
 """Friction and springs on a body inside a simulation that knows neither: force in, motion out.
 
-Wanted is u = command - F(x(u), v(u)) over a record, where a simulation gives x(u) and nothing else. With its
-response to a short pulse of force the equation is solved sample by sample, dry friction exactly (a body
-sticks, slips, turns round inside a sample), then simulated with that force; where the simulation is not
-linear, what it says is the start of the next round (Newton's method over a waveform, with one linear
-response for all times).
+Wanted is u = command - F(x(u), v(u)) over a record, where a simulation gives x(u) and nothing else. From its
+response to a short pulse of force follows a continuous linear system; beside it the equation is solved in
+parts of a sample, dry friction exactly (a body sticks, slips, turns round inside a part), then simulated with
+the mean of that force over each sample; where the simulation is not linear, what it says beside the linear
+system is the start of the next round (Newton's method over a waveform, with one linear system for all times).
+A response that is none of a few poles is used as it is, sample by sample.
 
-Neglected: dry friction acts as its mean over each sample, and the speed between samples is linear. Of smooth
-forces (springs, viscous friction) mean and moment over a sample are exact to fourth order.
+Neglected: what is simulated beside the linear system is a cubic between samples. Outputs other than the
+body's own feel mean and moment of a force over each sample, no more. Without poles: friction acts as its mean
+over each sample, and smooth forces (springs, viscous friction) by the trapezoidal rule.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import astuple, dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -93,7 +96,7 @@ class LinearBody:
     ahead: int
     dt_s: float
     of_speed: bool
-    _steps: dict[int, tuple[Real, ...]] = field(default_factory=dict, repr=False)
+    _steps: dict[int, tuple[Real, Real, Real]] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, poles: Real, head: Real, ahead: int, dt_s: float, *, of_speed: bool) -> LinearBody | None:
@@ -148,7 +151,7 @@ class LinearBody:
         return np.asarray(simulated - lfilter(head, np.concatenate([[1.0], -self.poles]), force))
 
     def solve(
-        self, beyond: Real, command: Real, sizes: Sequence[float], parts: int
+        self, beyond: Real, command: Real, sizes: tuple[Any, ...], parts: int
     ) -> tuple[Real, Real, Real]:
         """Held forces (T,) as good as those that act, and positions and speeds (T,) with them.
 
@@ -156,9 +159,9 @@ class LinearBody:
         """
         if parts not in self._steps:
             step = expm(self.generator / parts)
-            self._steps[parts] = tuple(
-                map(np.ascontiguousarray, (step[:-2, :-2], step[:-2, -2], step[:-2, -1]))
-            )
+            of_states, of_command, of_force = step[:-2, :-2], step[:-2, -2], step[:-2, -1]
+            self._steps[parts] = (of_states.copy(), of_command.copy(), of_force.copy())
+        of_states, of_command, of_force = self._steps[parts]
         # Slopes of fourth order, to go through parts of samples along cubics.
         slopes = np.gradient(beyond)
         slopes[2:-2] = (8 * (beyond[3:-1] - beyond[1:-3]) - beyond[4:] + beyond[:-4]) / 12
@@ -166,8 +169,10 @@ class LinearBody:
             beyond,
             slopes,
             command,
-            *self._steps[parts],
-            *self.rows,
+            of_states,
+            of_command,
+            of_force,
+            self.rows,
             parts,
             self.ahead,
             self.of_speed,
@@ -449,8 +454,7 @@ def _through(
     step: Real,
     commanded: Real,
     pushed: Real,
-    of_x: Real,
-    of_v: Real,
+    rows: Real,
     parts: int,
     ahead: int,
     of_speed: bool,
@@ -469,6 +473,7 @@ def _through(
     T, N = command.size, pushed.size
     mean, moment, x, v = np.zeros(T), np.zeros(T), np.zeros(T), np.zeros(T)
     state, moved = np.zeros(N), np.zeros(N)
+    of_x, of_v = rows[0], rows[1]
     gx, gv = 0.0, 0.0
     for i in range(N):
         gx += of_x[i] * pushed[i]

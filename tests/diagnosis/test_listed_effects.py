@@ -170,6 +170,36 @@ def test_smooth_forces_at_few_samples_per_period(name, motion):
         assert missed["xv".index(motion)] < 0.002
 
 
+@njit
+def _semi_implicit(force, cubic, dt_s):
+    """(T, 1) position; twenty steps in a sample, in each of which the force acts half a step early."""
+    h, x, v, found = dt_s / 20, 0.0, 0.0, np.zeros((force.size, 1))
+    for k in range(force.size):
+        found[k] = x
+        for _ in range(20):
+            v += h * (force[k] - 0.6 * v - 40 * x - cubic * x**3)
+            x += h * v
+    return found
+
+
+@pytest.mark.parametrize("samples", [9, 30])
+def test_a_spring_around_a_simulation_is_the_one_written_into_it(samples):
+    """Half as stiff again at the largest swing. Measured 0.13 and 0.06 %; the integrator itself is 2.9 and
+    0.9 % off, and a spring that acts as early as the command would damp the swing away."""
+    dt_s = 2 * np.pi / np.sqrt(40) / samples
+    force = np.random.default_rng(3).uniform(-18, 18, 12 * samples)[:, None]
+    free = _semi_implicit(force[:, 0].copy(), 0.0, dt_s)
+    record = PlantExperiment("a", "estimation", force, free)
+    plant = Plant(
+        lambda p, effects, u: _semi_implicit(u[:, 0].copy(), 0.0, dt_s), {}, {}, ("x",), np.array([1e-4])
+    )
+    plant = with_effects(plant, ["hardening_spring"], [record], dt_s=dt_s, motion="x")
+    found = plant.simulated([Change("hardening_spring", {"cubic": 60.0})])(force)
+    inside = _semi_implicit(force[:, 0].copy(), 60.0, dt_s)
+    assert 60 * np.max(inside**2) > 0.4 * 40
+    assert np.linalg.norm(found - inside) < 0.002 * np.linalg.norm(free - inside)
+
+
 def test_fewer_than_six_samples_per_period_are_told():
     for samples, told in ((5.5, True), (6.5, False)):
         dt_s = 2 * np.pi / np.sqrt(40) / samples

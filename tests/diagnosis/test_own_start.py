@@ -7,7 +7,9 @@ from numba import njit
 from scipy.integrate import solve_ivp
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose
-from diagnosis.imperfect.records import Records
+from diagnosis.imperfect.descent import descend
+from diagnosis.imperfect.records import Records, Start
+from diagnosis.imperfect.search import Search
 from diagnosis.imperfect.settled import settled
 
 DT_S, SAMPLES, NOISE_RAD = 0.02, 500, 1e-3
@@ -110,3 +112,37 @@ def test_a_start_is_found_where_friction_holds_the_first_guess():
     start, left = settled(fitted, np.zeros(0), (), fitted.at_rest())
     np.testing.assert_allclose(start.states, begun, atol=0.01)
     assert np.all(fitted.shares(fitted.residuals_of(left)) < 0.01)
+
+
+def test_a_set_is_descended_on_from_starts_sought_with_its_effects():
+    """Without friction the nominal's starts are far off; with it, no step leads from there."""
+
+    def simulate(parameters, effects, inputs, start):
+        return _rubbing(effects.get("dry", {}).get("torque_Nm", 0.0), *start.values())[: len(inputs)]
+
+    plant = Plant(
+        simulate,
+        {"weight_Nm": 1.0},
+        {},
+        ("angle_rad",),
+        np.array([NOISE_RAD]),
+        (PlantEffect("dry", (EffectParameter("torque_Nm", 1e-3, 1.0),)),),
+        model_error=0.05,
+        start={"angle_rad": 1.0, "speed_rad_s": 5.0},
+    )
+    begun = np.array([[1.1, 0.3], [-0.6, -4.0]])
+    still = np.zeros((SAMPLES, 1))
+    records = tuple(
+        PlantExperiment(f"r{k}", role, still, _rubbing(0.1, *begun[k % 2]))
+        for k, role in enumerate(("estimation", "estimation", "held_out"))
+    )
+    search = Search(PlantCase("rubs", plant, records), lambda share, words: None)
+    dry = search.case.machine.candidates(records)[0]
+    held = Start(np.array([[0.05, 0.0], [-0.6, -4.0]]), np.zeros(0))
+    stuck = descend(search.records, (dry,), np.zeros(0), np.log([0.1]), held, iterations=3)
+    assert abs(stuck.start.states[0, 0] - 1.1) > 0.5
+    again = search._begun(stuck)
+    np.testing.assert_allclose(again.start.states, begun, atol=0.01)
+    assert again.loss < 0.1 * stuck.loss
+    # Nothing to gain: the same.
+    assert search._begun(again) is again
