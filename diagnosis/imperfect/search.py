@@ -43,6 +43,8 @@ _GAINED_BY_START = 2.0
 _SCANS, _GAINED_BY_SCAN = 2, 2.0
 # Sets of each size with contacts whose starts feel them, and how far behind in evidence they may be.
 _TOUCHING, _TOUCHING_ITERATIONS, _UNLIKELY = 2, 5, 150.0
+# An effect is exchanged for one that is no further behind in evidence in a part of the set.
+_AS_LIKELY = 15.0
 # Of octaves, what is felt where disturbances of the inputs are amplified.
 _AMPLIFIED = 0.5
 _LAST_ITERATIONS, _LAST_TOLERANCE = 20, 0.02
@@ -410,6 +412,33 @@ class Search:
                     end.coordinates, slice(first, first + len(containing.axes) - len(candidate.axes))
                 )
                 self.add(descend(self.records, candidates, end.deviations, x, end.start))
+
+    def exchanged(self, explanation: Explanation, sought: Iterable[str]) -> None:
+        """The same with one of the effects sought replaced by another, as likely in a part of the set.
+
+        Larger sets are sought beside the likeliest parts alone: of two effects that no record tells apart,
+        the one that was extended would win by what was found beside it.
+        """
+        end, best = explanation.end, best_of_sets(self.found)
+        for k, name in enumerate(explanation.names):
+            rest = {c.effect: c.kind.contains for c in end.candidates if c.effect != name}
+            for rival in [*best.values()] if name in sought else []:
+                new = set(rival.names) - {*explanation.names}
+                kept = set(rival.names) - new
+                part = best.get(tuple(sorted({*kept, name})))
+                if len(new) != 1 or not kept <= rest.keys() or part is None:
+                    continue
+                (other,) = (c for c in rival.end.candidates if c.effect in new)
+                key = tuple(sorted((*rest, other.effect)))
+                contained = other.effect in rest.values() or other.kind.contains in rest
+                if key in best or contained or rival.evidence < part.evidence - _AS_LIKELY:
+                    continue
+                candidates = (*end.candidates[:k], other, *end.candidates[k + 1 :])
+                x = [end.coordinates_of(j) for j in range(len(candidates))]
+                x[k] = rival.end.coordinates_of(rival.names.index(other.effect))
+                best[key] = self.add(
+                    descend(self.records, candidates, end.deviations, np.concatenate(x), end.start)
+                )
 
     def without(self, explanation: Explanation, k: int) -> Explanation:
         """The best explanation by the same effects but the k-th."""

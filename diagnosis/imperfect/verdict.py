@@ -53,6 +53,8 @@ _LISTED_AS = {name: str(kind.look_alike_of) for name, kind in LOOK_ALIKES.items(
 _DRAWS = 400
 # Sets this far behind in score take no part.
 _BEHIND, _MOST_SETS, _PASSES = 8.0, 8, 3
+# Sets no further behind have their effects exchanged for others that are as likely.
+_NEAR = 2.0
 
 
 @dataclass(frozen=True)
@@ -131,6 +133,8 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
     for _ in range(_PASSES):
         known = len(search.found)
         sets = _weighed(search, listed)
+        for near in [near for near in sets if near.score > sets[0].score - _NEAR]:
+            search.exchanged(near.explanation, {part.name for part in near.parts if part.matters > 0.5})
         for one in [sets[0].explanation, *search.found[known:]]:
             search.simpler(one)
         if len(search.found) == known:
