@@ -708,6 +708,7 @@ def _judged(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
         held_out=Records(case, case.held_out),
         without=lambda whole, k: found[frozenset(whole.names) - {whole.names[k]}],
         simpler=lambda explanation: None,
+        exchanged=lambda explanation, sought: None,
         acts_on_held_out=lambda whole, k: acts,
     )
     return judged(search, case.machine.weighing.listed)

@@ -16,6 +16,8 @@ from numba import njit
 from benchmarks import emps_axis
 from diagnosis import Plant, PlantCase, PlantExperiment, diagnose, with_effects
 from diagnosis.imperfect.answered import beside_imperfections, searched
+from diagnosis.imperfect.descent import descend
+from diagnosis.imperfect.search import Search
 from tests.diagnosis.machines import rubbing
 
 DT_S, SAMPLES = 0.01, 700
@@ -208,6 +210,56 @@ def test_what_is_wrong_is_named_beside_a_bias_that_drifts():
     delay = next(change.values["delay_s"] for change in found.repair if change.id == "input_delay")
     assert delay == pytest.approx(0.033, rel=0.05)
     assert found.gap_closed > 0
+
+
+def _pumped():
+    """A shaft driven one way alone, its command with a dead zone of .5 V; the reading drifts."""
+    rng, t = np.random.default_rng(17), DT_S * np.arange(SAMPLES)
+    records = []
+    for name, role in (("a", "estimation"), ("b", "estimation"), ("c", "held_out")):
+        voltage = rng.uniform(2.0, 8.0, SAMPLES // 20).repeat(20)
+        speed = _motor(voltage - 0.5, 0.2, 10.0)[:, 0] + 1.2 * t + 0.05 * rng.standard_normal(SAMPLES)
+        records.append(PlantExperiment(name, role, voltage[:, None], speed[:, None]))
+    plant = Plant(
+        _shaft,
+        {"time_constant_s": 0.21, "gain_rad_Vs": 10.0},
+        {"time_constant_s": 0.1, "gain_rad_Vs": 0.01},
+        ("speed_rad_s",),
+        np.array([0.05]),
+        model_error=0.05,
+    )
+    names = ["actuator_dead_zone", "input_offset", "output_drift", "input_drift", "actuator_lag"]
+    return PlantCase("pump", with_effects(plant, names, records, dt_s=DT_S), tuple(records))
+
+
+def test_an_effect_is_exchanged_for_its_twin():
+    """Where a command keeps its sign a dead zone is an offset: the one extended must not win by that."""
+    search = Search(_pumped(), lambda share, words: None)
+    kinds = {c.effect: c for c in search.case.machine.candidates(search.case.experiments)}
+    nothing = np.zeros(search.records.nominal.count)
+
+    def fitted(*names):
+        chosen = tuple(kinds[name] for name in names)
+        x = (
+            np.concatenate([np.array(c.starts[len(c.starts) // 2]) for c in chosen])
+            if chosen
+            else nothing[:0]
+        )
+        return search.add(descend(search.records, chosen, nothing, x, search.records.at_rest()))
+
+    fitted()
+    for name in ("input_offset", "actuator_dead_zone", "output_drift", "actuator_lag"):
+        fitted(name)
+    pair = fitted("input_offset", "output_drift")
+    search.exchanged(pair, ())
+    assert search.found[-1] is pair
+    search.exchanged(pair, {"input_offset"})
+    # The lag explains much less alone and is not tried.
+    (twin,) = search.found[search.found.index(pair) + 1 :]
+    assert twin.key == ("actuator_dead_zone", "output_drift")
+    assert abs(twin.log_likelihood - pair.log_likelihood) < 1
+    search.exchanged(pair, {"input_offset"})
+    assert search.found[-1] is twin
 
 
 @njit
