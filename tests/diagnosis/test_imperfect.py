@@ -26,7 +26,7 @@ from diagnosis.imperfect.records import Records, Start, StartColumns
 from diagnosis.imperfect.search import Explanation, Search
 from diagnosis.imperfect.settled import best_move, settled
 from diagnosis.imperfect.starts import points_of
-from diagnosis.imperfect.verdict import TEMPER, _weights, is_silent, judged
+from diagnosis.imperfect.verdict import TEMPER, _enough, _weights, is_silent, judged
 from diagnosis.imperfect.windows import in_windows
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Weighing
@@ -712,6 +712,11 @@ def _judged(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
         acts_on_held_out=lambda whole, k: acts,
     )
     return judged(search, case.machine.weighing.listed)
+
+
+def test_what_may_be_left_is_as_the_docs_say():
+    told = {1.0: 0.90, 1.5: 0.70, 2.0: 0.49, 3.0: 0.20}
+    assert {left: round(_enough(left * 0.05, 0.05), 2) for left in told} == told
 
 
 def test_a_set_that_one_record_alone_prefers_is_less_sure():
