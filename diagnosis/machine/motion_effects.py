@@ -18,7 +18,6 @@ import warnings
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -145,18 +144,18 @@ class LinearBody:
         finer = max(turned, abs(forces.viscous * gv), _TURNED) / _TURNED
         return int(2 ** min(np.ceil(np.log2(finer)), _MOST_PARTS))
 
-    def beyond(self, simulated: Real, force: Real) -> Real:
-        """(T,) what was simulated beside the response to the force (T,) from rest."""
-        head = np.concatenate([np.zeros(self.ahead), self.numerator])
-        return np.asarray(simulated - lfilter(head, np.concatenate([[1.0], -self.poles]), force))
-
-    def solve(
-        self, beyond: Real, command: Real, sizes: tuple[Any, ...], parts: int
+    def answer(
+        self, simulated: Real, force: Real, command: Real, forces: BodyForces
     ) -> tuple[Real, Real, Real]:
-        """Held forces (T,) as good as those that act, and positions and speeds (T,) with them.
-
-        beyond : (T,) what moves beside the response to forces. sizes : of `BodyForces`.
-        """
+        """Held forces (T,) as good as those that act, the motion (T,) with these, and what a simulation of
+        the former has in its place; simulated (T,): under the force (T,) of the round before."""
+        head, own = (
+            np.concatenate([np.zeros(self.ahead), self.numerator]),
+            np.concatenate([[1.0], -self.poles]),
+        )
+        beyond = np.asarray(simulated - lfilter(head, own, force))
+        travel = np.cumsum(simulated) * self.dt_s if self.of_speed else simulated
+        parts = self.parts(forces, float(np.max(np.abs(travel))))
         if parts not in self._steps:
             step = expm(self.generator / parts)
             of_states, of_command, of_force = step[:-2, :-2], step[:-2, -2], step[:-2, -1]
@@ -177,13 +176,13 @@ class LinearBody:
             self.ahead,
             self.of_speed,
             self.dt_s,
-            *sizes,
+            *astuple(forces),
         )
         # What comes early or late in a sample moves the body as a pair of forces around it does.
         moment += self.early * held
         held[1:] += 0.5 * moment[:-1]
         held[:-1] -= 0.5 * moment[1:]
-        return held, x, v
+        return held, v if self.of_speed else x, beyond + lfilter(head, own, command + held)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,6 +242,15 @@ class PulseResponse:
         return bool(
             few or (self.speed[k + 1] < 0 if self.of_speed else self.position[k + 2] < self.position[k])
         )
+
+    def answer(
+        self, simulated: Real, force: Real, command: Real, forces: BodyForces
+    ) -> tuple[Real, Real, Real]:
+        """The same as `LinearBody.answer`, the motion being that of a simulation under held forces."""
+        seen = self.motion(simulated, force)
+        held, x, v = _solve(*seen, force - command, self.position, self.speed, self.ahead, *astuple(forces))
+        motion = v if self.of_speed else x
+        return held, motion, motion
 
     def motion(self, simulated: Real, force: Real) -> tuple[Real, Real]:
         """Position and speed (T,) of what was simulated (T,) under a force (T,)."""
@@ -309,47 +317,15 @@ def with_forces(
     simulate : force (T,) -> outputs (T, Y), motion (T,). command : force (T,) without the forces; free : what
     it gives. placed : outputs with another motion in them; alone : whether there are no others.
     """
-    if response.linear is not None:
-        return _by_parts(simulate, free, command, response.linear, forces, placed, alone=alone)
-    held, sizes, k = np.zeros(command.size), astuple(forces), int(response.of_speed)
+    body = response.linear or response
+    held = np.zeros(command.size)
     outputs, now = free
-    seen, before, error = response.motion(now, command), np.inf, np.inf
+    motion = expected = now
+    before, error = np.inf, np.inf
     for _ in range(_ROUNDS):
         if not np.all(np.isfinite(now)):
             return outputs, np.inf
-        held, x, v = _solve(*seen, held, response.position, response.speed, response.ahead, *sizes)
-        if alone and before < np.inf and error / before * error < _FORETOLD:
-            # As much closer again, what the next simulation would say is known.
-            return placed(outputs, (x, v)[k]), error / before * error
-        before = error
-        outputs, now = simulate(command + held)
-        seen = response.motion(now, command + held)
-        error = _rms(seen[k] - (x, v)[k]) / max(_rms(now - free[1]), 1e-300)
-        if error < (_FORETOLD if alone else _CONVERGED) or 0.5 * before < error < _SETTLED:
-            break
-    return outputs, error
-
-
-def _by_parts(
-    simulate: Callable[[Real], tuple[Real, Real]],
-    free: tuple[Real, Real],
-    command: Real,
-    body: LinearBody,
-    forces: BodyForces,
-    placed: Callable[[Real, Real], Real],
-    *,
-    alone: bool,
-) -> tuple[Real, float]:
-    """The same in parts of a sample: what is simulated beside the linear response counts, round by round."""
-    outputs, now = free
-    if not np.all(np.isfinite(now)):
-        return outputs, np.inf
-    beyond, before, error = body.beyond(now, command), np.inf, np.inf
-    travel = np.cumsum(now) * body.dt_s if body.of_speed else now
-    parts, sizes = body.parts(forces, float(np.max(np.abs(travel)))), astuple(forces)
-    for _ in range(_ROUNDS):
-        held, *moves = body.solve(beyond, command, sizes, parts)
-        motion = moves[body.of_speed]
+        held, motion, expected = body.answer(now, command + held, command, forces)
         if not np.all(np.isfinite(motion)):
             return outputs, np.inf
         if alone and before < np.inf and error / before * error < _FORETOLD:
@@ -357,11 +333,10 @@ def _by_parts(
             return placed(outputs, motion), error / before * error
         before = error
         outputs, now = simulate(command + held)
-        last, beyond = beyond, body.beyond(now, command + held)
-        error = _rms(beyond - last) / max(_rms(motion - free[1]), 1e-300)
+        error = _rms(now - expected) / max(_rms(motion - free[1]), 1e-300)
         if error < (_FORETOLD if alone else _CONVERGED) or 0.5 * before < error < _SETTLED:
             break
-    return placed(outputs, motion + beyond - last), error
+    return placed(outputs, now + motion - expected), error
 
 
 def _rms(x: Real) -> float:
