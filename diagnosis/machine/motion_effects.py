@@ -72,6 +72,10 @@ class BodyForces:
         return np.asarray(dry + self.viscous * v + self.linear * x + self.cubic * x**3)
 
     @property
+    def sizes(self) -> tuple[float, ...]:
+        return tuple(map(float, astuple(self)))
+
+    @property
     def smooth(self) -> bool:
         """Whether there are some that change little within a sample."""
         return self.viscous != 0 or self.linear != 0 or self.cubic != 0
@@ -176,7 +180,7 @@ class LinearBody:
             self.ahead,
             self.of_speed,
             self.dt_s,
-            *astuple(forces),
+            forces.sizes,
         )
         # What comes early or late in a sample moves the body as a pair of forces around it does.
         moment += self.early * held
@@ -248,7 +252,7 @@ class PulseResponse:
     ) -> tuple[Real, Real, Real]:
         """The same as `LinearBody.answer`, the motion being that of a simulation under held forces."""
         seen = self.motion(simulated, force)
-        held, x, v = _solve(*seen, force - command, self.position, self.speed, self.ahead, *astuple(forces))
+        held, x, v = _solve(*seen, force - command, self.position, self.speed, self.ahead, forces.sizes)
         motion = v if self.of_speed else x
         return held, motion, motion
 
@@ -351,14 +355,7 @@ def _solve(
     hx: Real,
     hv: Real,
     ahead: int,
-    coulomb: float,
-    excess: float,
-    falls: float,
-    up: float,
-    down: float,
-    viscous: float,
-    linear: float,
-    cubic: float,
+    sizes: tuple[float, ...],
 ) -> tuple[Real, Real, Real]:
     """Forces (T,), positions and speeds (T,) with them, from those under the forces `held`."""
     T = position.size
@@ -373,21 +370,34 @@ def _solve(
             dv += hv[n - j] * change[j]
         ax, av = position[n] + dx - gx * held[k], speed[n] + dv - gv * held[k]
         x0, v0 = (x[n - 1], v[n - 1]) if n > 0 else (ax, av)
-        end, dry, x1 = v0, 0.0, x0
-        for _ in range(3 if excess > 0 or cubic > 0 else 1):
-            # Smooth forces by the trapezoidal rule, the cubic one by its tangent at the end.
-            stiffness = linear + 3 * cubic * x1 * x1
-            divisor = 1 + 0.5 * (viscous * gv + stiffness * gx)
-            smooth = -0.5 * (viscous * (v0 + av) + linear * x0 + stiffness * ax)
-            smooth += cubic * (x1**3 - 0.5 * x0**3)
-            a, g = av + gv * smooth / divisor, gv / divisor
-            level = coulomb + excess * np.exp(-0.5 * (abs(v0) + abs(end)) / falls)
-            end, dry = _dry(v0, a, g, level + up, level + down, excess + coulomb - level)
-            f[k] = (smooth + dry) / divisor
-            x1 = ax + gx * f[k]
-        x[n], v[n] = x1, end
+        f[k], x[n], v[n] = _acted(ax, av, x0, v0, gx, gv, sizes)
         change[k] = f[k] - held[k]
     return f, x, v
+
+
+@njit(cache=True)
+def _acted(
+    ax: float, av: float, x0: float, v0: float, gx: float, gv: float, sizes: tuple[float, ...]
+) -> tuple[float, float, float]:
+    """Mean force over a sample or a part of one, position and speed at its end.
+
+    ax, av : there without the forces; x0, v0 : at its start; gx, gv : what a unit force adds.
+    """
+    coulomb, excess, falls, up, down, viscous, linear, cubic = sizes
+    f, x1, end, level = 0.0, x0, v0, coulomb
+    for _ in range(2 if excess > 0 or cubic > 0 else 1):
+        # Smooth forces by the trapezoidal rule, the cubic one by its tangent at the end.
+        stiffness = linear + 3 * cubic * x1 * x1
+        divisor = 1 + 0.5 * (viscous * gv + stiffness * gx)
+        smooth = -0.5 * (viscous * (v0 + av) + linear * x0 + stiffness * ax)
+        smooth += cubic * (x1**3 - 0.5 * x0**3)
+        a, g = av + gv * smooth / divisor, gv / divisor
+        if excess > 0:
+            level = coulomb + excess * np.exp(-0.5 * (abs(v0) + abs(end)) / falls)
+        end, dry = _dry(v0, a, g, level + up, level + down, excess + coulomb - level)
+        f = (smooth + dry) / divisor
+        x1 = ax + gx * f
+    return f, x1, end
 
 
 @njit(cache=True)
@@ -434,14 +444,7 @@ def _through(
     ahead: int,
     of_speed: bool,
     dt_s: float,
-    coulomb: float,
-    excess: float,
-    falls: float,
-    up: float,
-    down: float,
-    viscous: float,
-    linear: float,
-    cubic: float,
+    sizes: tuple[float, ...],
 ) -> tuple[Real, Real, Real, Real]:
     """Means and moments of the forces in every sample (T,), positions and speeds (T,); beyond, slopes (T,):
     position or speed beside the response to forces, and by how much it changes per sample."""
@@ -457,7 +460,6 @@ def _through(
     x0, v0 = (0.0, beyond[0]) if of_speed else (beyond[0], slopes[0] / dt_s)
     if ahead == 1:
         x[0], v[0] = x0, v0
-    again = 2 if excess > 0 or cubic > 0 else 1
     for k in range(T - ahead):
         # A cubic from sample to sample; before the first nothing is known to move.
         n = k + ahead
@@ -479,20 +481,7 @@ def _through(
                     moved[i] += step[i, j] * state[j]
                 ax += of_x[i] * moved[i]
                 av += of_v[i] * moved[i]
-            end, x1, f = v0, x0, 0.0
-            for _ in range(again):
-                # Smooth forces by the trapezoidal rule, the cubic one by its tangent at the end.
-                stiffness = linear + 3 * cubic * x1 * x1
-                divisor = 1 + 0.5 * (viscous * gv + stiffness * gx)
-                smooth = -0.5 * (viscous * (v0 + av) + linear * x0 + stiffness * ax)
-                smooth += cubic * (x1**3 - 0.5 * x0**3)
-                a, g = av + gv * smooth / divisor, gv / divisor
-                level = coulomb
-                if excess > 0:
-                    level += excess * np.exp(-0.5 * (abs(v0) + abs(end)) / falls)
-                end, dry = _dry(v0, a, g, level + up, level + down, excess + coulomb - level)
-                f = (smooth + dry) / divisor
-                x1 = ax + gx * f
+            f, x1, end = _acted(ax, av, x0, v0, gx, gv, sizes)
             for i in range(N):
                 state[i] = moved[i] + pushed[i] * f
             mean[k] += f / parts
