@@ -344,7 +344,8 @@ def with_forces(
 
 
 def _rms(x: Real) -> float:
-    return float(np.sqrt(x @ x / x.size))
+    with np.errstate(over="ignore", invalid="ignore"):  # of a trial that runs away
+        return float(np.sqrt(x @ x / x.size))
 
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
