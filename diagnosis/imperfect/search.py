@@ -421,8 +421,10 @@ class Search:
         """
         end, best = explanation.end, best_of_sets(self.found)
         for k, name in enumerate(explanation.names):
+            if name not in sought:
+                continue
             rest = {c.effect: c.kind.contains for c in end.candidates if c.effect != name}
-            for rival in [*best.values()] if name in sought else []:
+            for rival in [*best.values()]:
                 new = set(rival.names) - {*explanation.names}
                 kept = set(rival.names) - new
                 part = best.get(tuple(sorted({*kept, name})))

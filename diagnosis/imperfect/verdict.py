@@ -133,7 +133,7 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
     for _ in range(_PASSES):
         known = len(search.found)
         sets = _weighed(search, listed)
-        for near in [near for near in sets if near.score > sets[0].score - _NEAR]:
+        for near in (one for one in sets if one.score > sets[0].score - _NEAR):
             search.exchanged(near.explanation, {part.name for part in near.parts if part.matters > 0.5})
         for one in [sets[0].explanation, *search.found[known:]]:
             search.simpler(one)

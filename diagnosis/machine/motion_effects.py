@@ -324,7 +324,6 @@ def with_forces(
     body = response.linear or response
     held = np.zeros(command.size)
     outputs, now = free
-    motion = expected = now
     before, error = np.inf, np.inf
     for _ in range(_ROUNDS):
         if not np.all(np.isfinite(now)):

@@ -89,17 +89,23 @@ def _rubbing(dry, angle, speed):
     return found
 
 
-def test_a_start_is_found_where_friction_holds_the_first_guess():
-    """At rest the pendulum sticks: no difference quotient there says how it began."""
-    plant = Plant(
-        lambda p, effects, inputs, start: _rubbing(0.03, *start.values())[: len(inputs)],
+def _held_plant(simulation, effect):
+    return Plant(
+        simulation,
         {"weight_Nm": 1.0},
         {},
         ("angle_rad",),
         np.array([NOISE_RAD]),
-        (PlantEffect("drag", (EffectParameter("coefficient_Nms2", 1e-3, 1.0),)),),
+        (PlantEffect(effect, (EffectParameter("size", 1e-3, 1.0),)),),
         model_error=0.05,
         start={"angle_rad": 1.0, "speed_rad_s": 5.0},
+    )
+
+
+def test_a_start_is_found_where_friction_holds_the_first_guess():
+    """At rest the pendulum sticks: no difference quotient there says how it began."""
+    plant = _held_plant(
+        lambda p, effects, inputs, start: _rubbing(0.03, *start.values())[: len(inputs)], "drag"
     )
     begun = np.array([[1.1, 0.3], [-0.6, -4.0]])
     still = np.zeros((SAMPLES, 1))
@@ -118,18 +124,9 @@ def test_a_set_is_descended_on_from_starts_sought_with_its_effects():
     """Without friction the nominal's starts are far off; with it, no step leads from there."""
 
     def simulate(parameters, effects, inputs, start):
-        return _rubbing(effects.get("dry", {}).get("torque_Nm", 0.0), *start.values())[: len(inputs)]
+        return _rubbing(effects.get("dry", {}).get("size", 0.0), *start.values())[: len(inputs)]
 
-    plant = Plant(
-        simulate,
-        {"weight_Nm": 1.0},
-        {},
-        ("angle_rad",),
-        np.array([NOISE_RAD]),
-        (PlantEffect("dry", (EffectParameter("torque_Nm", 1e-3, 1.0),)),),
-        model_error=0.05,
-        start={"angle_rad": 1.0, "speed_rad_s": 5.0},
-    )
+    plant = _held_plant(simulate, "dry")
     begun = np.array([[1.1, 0.3], [-0.6, -4.0]])
     still = np.zeros((SAMPLES, 1))
     records = tuple(
