@@ -75,10 +75,10 @@ class Body:
         return simulated
 
     @property
-    def coarse(self) -> bool:
-        """Whether some motion seen so far has too few samples for smooth forces."""
+    def doubt(self) -> str:
+        """Why smooth forces act less exactly on some motion seen so far, "" where they do not."""
         tried = (kept[0] for kept in self._kept.values())
-        return any(isinstance(response, PulseResponse) and response.coarse for response in tried)
+        return max((one.doubt for one in tried if isinstance(one, PulseResponse)), default="")
 
     def _response(self, run: Run, inputs: Real) -> tuple[PulseResponse, float]:
         """From rest, other inputs as at the start; -1 where force and motion count opposite ways, else 1."""

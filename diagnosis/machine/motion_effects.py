@@ -240,12 +240,13 @@ class PulseResponse:
         return cls(position, speed, corrections, ahead, dt_s, of_speed, linear)
 
     @property
-    def coarse(self) -> bool:
-        """Whether an oscillation has fewer than six samples per period: it turns back by the second."""
+    def doubt(self) -> str:
+        """Why smooth forces act less exactly, "" where they do not."""
         k, few = self.ahead, self.speed.size < self.ahead + 3
-        return bool(
-            few or (self.speed[k + 1] < 0 if self.of_speed else self.position[k + 2] < self.position[k])
-        )
+        # An oscillation has fewer than six samples per period.
+        if few or (self.speed[k + 1] < 0 if self.of_speed else self.position[k + 2] < self.position[k]):
+            return "turns back within two samples"
+        return "" if self.linear else f"is none of {_ORDERS[-1]} poles or fewer"
 
     def answer(
         self, simulated: Real, force: Real, command: Real, forces: BodyForces

@@ -64,7 +64,8 @@ def with_effects(
     at_rest_before : before its first row a command is zero; else as in that row.
     prefix : before the names, where this is asked of several inputs, bodies or sensors.
 
-    Warns where springs and viscous friction have fewer than six samples per period.
+    Warns where springs and viscous friction have fewer than six samples per period, or the response to a
+    pulse of force is not of a few poles.
 
     Raises ValueError, one line: an unknown name, column or output, a command of zeros, a simulation that
     friction and springs cannot be put around.
@@ -125,10 +126,10 @@ def with_effects(
     equipped = replace(plant, effects=tuple(found), dt_s=dt_s)
     _try(equipped, experiments[0], body)
     smooth = [n for n in chosen if n in _SMOOTH]
-    if smooth and isinstance(body, Body) and body.coarse:
+    if smooth and isinstance(body, Body) and body.doubt:
         warnings.warn(
-            "plant: after a pulse of force the motion turns back within two samples, so that "
-            f"{' and '.join(smooth)} are some per cent off; sample finer or write their equations into it",
+            f"plant: after a pulse of force the motion {body.doubt}, so that {' and '.join(smooth)} are some "
+            "per cent off; sample finer or write their equations into it",
             stacklevel=2,
         )
     return equipped
