@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -27,6 +28,7 @@ from diagnosis.evidence.search import Progress, search
 from diagnosis.fit.fit import Fit, fit, parameter_intervals
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.imperfect.answered import beside_imperfections, looked_at_again, reaches_noise, searched
+from diagnosis.imperfect.levels import quietest
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine
 from diagnosis.machine.own_plant import PlantCase
@@ -41,6 +43,9 @@ from plant.effects.search_space import Candidate
 
 # Share of the progress that the first search of an own machine is; the second may not be needed.
 _FIRST_SEARCH = 0.6
+# Noise of an own machine is what the quietest octave shows where that is below the one share of what is
+# stated, not below the other.
+_TOO_LOUD, _LEAST = 0.5, 1e-3
 # At most so many explanations are told apart by the next experiment.
 _MOST_COMPETING = 3
 # Difference of the cost that the records do not tell apart (chi-square, 95 %, two parameters).
@@ -63,13 +68,35 @@ def diagnose(
     time_limit_s : After it nothing more is tried, and the answer says what was not; only
         beside a model error.
     rng : Of interval draws and bootstrap; without it a fixed sequence, so that one case has one answer.
+
+    Warns where the records of an own machine show less noise than is stated, and an effect in what that hid.
     """
     rng = np.random.default_rng(0) if rng is None else rng
     progress = progress or (lambda fraction, message: None)
+    deadline_s = time.monotonic() + time_limit_s
+    answer = _answered(case, progress, rng, deadline_s)
+    if answer.verdict != "none" or not isinstance(case, PlantCase) or time.monotonic() > deadline_s:
+        return answer
+    seen = quietest([e * case.noise for e in answer.residuals_refit.values()])
+    if not np.any(seen < _TOO_LOUD * case.noise):
+        return answer
+    quieter = case.with_noise(np.clip(seen, _LEAST * case.noise, case.noise))
+    last = _answered(quieter, lambda done, what: progress(1.0, f"{what}, less noise"), rng, deadline_s)
+    if last.verdict != "effect":
+        return answer
+    told = zip(case.outputs, case.noise, quieter.noise, strict=True)
+    words = ", ".join(f"{name} {found:.3g}, stated {stated:.3g}" for name, stated, found in told)
+    warnings.warn(f"plant: the records show less noise than stated, which counts: {words}", stacklevel=2)
+    return last
+
+
+def _answered(
+    case: CaseOfMachine, progress: Progress, rng: np.random.Generator, deadline_s: float
+) -> Diagnosis:
+    """With the noise as stated."""
     weighing = case.machine.weighing
     if not weighing.model_error > 0:
         return _without_error(case, progress, rng)
-    deadline_s = time.monotonic() + time_limit_s
     if not isinstance(case, PlantCase):
         return beside_imperfections(searched(case, progress, deadline_s), rng)
     found = searched(case, lambda done, what: progress(_FIRST_SEARCH * done, what), deadline_s)

@@ -90,7 +90,7 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
     """The answer of a search beside a model error; what a time limit left out is said."""
     case = search.case
     listed = case.machine.weighing.listed
-    found = judging.judged(search, listed)
+    found = judging.judged(search)
     search.progress(1.0, "done")
     refit = search.base
     accepted = refit

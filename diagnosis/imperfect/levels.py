@@ -61,6 +61,17 @@ def coefficients(residuals: Real) -> Real:
     return np.asarray(dct(residuals, axis=0, norm="ortho")).ravel()
 
 
+def quietest(signals: Sequence[Real]) -> Real:
+    """(Y,) the largest white noise that signals (T, Y) may all hold: RMS of the quietest octave of the one
+    that has most there."""
+    rms = []
+    for signal in signals:
+        samples = np.bincount(octaves_of(len(signal)))
+        many = samples >= min(_MOST, np.max(samples))
+        rms.append(np.sqrt(np.min(octave_energies(signal)[many] / samples[many, None], axis=0)))
+    return np.asarray(np.max(rms, axis=0))
+
+
 @dataclass(frozen=True, eq=False)
 class Levels:
     """Bands of the coefficients of some records.

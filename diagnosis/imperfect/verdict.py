@@ -17,7 +17,7 @@ from scipy.special import expit, softmax
 
 from diagnosis.evidence.hypotheses import Probabilities
 from diagnosis.imperfect.search import Explanation, Search, best_of_sets
-from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.machine_protocol import Real, Weighing
 from diagnosis.machine.rounding import Rounding, rounding_effect
 from plant.effects import EFFECTS, LOOK_ALIKES
 
@@ -42,6 +42,9 @@ _WITHIN = 2.0
 # of shares of the motion, normal; any size above its median for an unknown cause), prior of the latter.
 _IMPERFECTIONS, _IMPERFECTIONS_WIDTH = 0.6, 0.65
 _UNKNOWN, _UNKNOWN_WIDTH, _PRIOR_UNKNOWN = 2.2, 0.6, 0.15
+# How far off (logarithm) the usual model error may be that stands for one that nobody has stated: simulations
+# from first principles miss 2 to 20 % of the motion of real machines.
+_UNSTATED_WIDTH = 0.9
 # After a contact that comes a little early all goes another way: what imperfections leave is more.
 _AFTER_CONTACTS = 2.0
 # A set is out that leaves so much more of the held-out records, in model errors too, than a part of it.
@@ -108,9 +111,10 @@ class Verdict:
         return self.probabilities.sets.get(tuple(sorted((*fitted, *beside))), 0.0)
 
 
-def score_of(explanation: Explanation, listed: Sequence[str], model_error: float) -> float:
+def score_of(explanation: Explanation, weighing: Weighing) -> float:
     """Log weight of a set of effects, out of those that are listed."""
-    return _gain(explanation, listed) + float(np.log(sum(_remaining(_beyond(explanation), model_error))))
+    left = _remaining(_beyond(explanation), weighing)
+    return _gain(explanation, weighing.listed) + float(np.log(sum(left)))
 
 
 def _gain(explanation: Explanation, listed: Sequence[str]) -> float:
@@ -127,12 +131,12 @@ def _gain(explanation: Explanation, listed: Sequence[str]) -> float:
     )
 
 
-def judged(search: Search, listed: Sequence[str]) -> Verdict:
+def judged(search: Search) -> Verdict:
     """The answer from everything that a search has fitted; fits the best set without each of its effects, and
     with simpler ones. What that finds is weighed with all others."""
     for _ in range(_PASSES):
         known = len(search.found)
-        sets = _weighed(search, listed)
+        sets = _weighed(search)
         for near in (one for one in sets if one.score > sets[0].score - _NEAR):
             search.exchanged(near.explanation, {part.name for part in near.parts if part.matters > 0.5})
         for one in [sets[0].explanation, *search.found[known:]]:
@@ -144,8 +148,8 @@ def judged(search: Search, listed: Sequence[str]) -> Verdict:
     # a veto.
     most = np.max(search.base.shares, axis=1)
     alike = max(float(np.sqrt(np.prod(most))), float(most[1]))
-    none_enough = _enough(alike, weighing.model_error) if weighing.stated else 0.0
-    probabilities = _probabilities(sets, listed, none_enough)
+    none_enough = _enough(alike, weighing) if weighing.stated else 0.0
+    probabilities = _probabilities(sets, weighing.listed, none_enough)
     rounding, beside = rounding_effect(search.case), dict[str, float]()
     if rounding is not None and (share := _rounded(search, rounding)) > _INTERESTS * weighing.model_error:
         beside[rounding.name] = share
@@ -177,23 +181,23 @@ def _rounded(search: Search, rounding: Rounding) -> float:
     return float(np.sqrt(np.max(energy / motion.sum(axis=0))))
 
 
-def _weighed(search: Search, listed: Sequence[str]) -> tuple[Judged, ...]:
+def _weighed(search: Search) -> tuple[Judged, ...]:
     """The sets that take part, best first: none that leaves more of the held-out records than the nominal, as
     stated or re-estimated."""
-    model_error = search.case.machine.weighing.model_error
+    weighing = search.case.machine.weighing
     best = best_of_sets(search.found)
     noise = search.case.noise
     farthest = min(e.pooled_held_out(noise) for e in (search.base, search.stated()))
     score = {
-        key: score_of(explanation, listed, model_error)
+        key: score_of(explanation, weighing)
         for key, explanation in best.items()
-        if not _contradicted(explanation, best.values(), model_error)
+        if not _contradicted(explanation, best.values(), weighing.model_error)
         and (not key or explanation.pooled_held_out(noise) <= farthest)
     }
     ranked = sorted((best[key] for key in score), key=lambda e: -score[e.key])
     top = score[ranked[0].key]
     chosen = [e for e in ranked[:_MOST_SETS] if score[e.key] > top - _BEHIND]
-    return tuple(_judged(search, e, best, model_error, listed, fit=k == 0) for k, e in enumerate(chosen))
+    return tuple(_judged(search, e, best, fit=k == 0) for k, e in enumerate(chosen))
 
 
 def _contradicted(explanation: Explanation, others: Iterable[Explanation], model_error: float) -> bool:
@@ -213,11 +217,10 @@ def _judged(
     search: Search,
     explanation: Explanation,
     best: Mapping[tuple[str, ...], Explanation],
-    model_error: float,
-    listed: Sequence[str],
     *,
     fit: bool,
 ) -> Judged:
+    weighing = search.case.machine.weighing
     parts, reduced = dict[str, Part](), explanation
     while reduced.names:
         rests = {
@@ -226,14 +229,14 @@ def _judged(
             else best_without(best, reduced, name)
             for k, name in enumerate(reduced.names)
         }
-        within = [_part(search, reduced, name, rest, parts.get(name), listed) for name, rest in rests.items()]
+        within = [_part(search, reduced, name, rest, parts.get(name)) for name, rest in rests.items()]
         parts |= {part.name: part for part in within}
         small = [part.name for part in within if part.matters < 0.5]
         if not small:
             break
         # Two effects that can replace each other would both seem to carry nothing: the one goes first without
         # which the records are the likelier.
-        rest = max((rests[name] for name in small), key=lambda e: score_of(e, listed, model_error))
+        rest = max((rests[name] for name in small), key=lambda e: score_of(e, weighing))
         if len(rest.names) < len(reduced.names) - 1:
             break
         reduced = rest
@@ -241,16 +244,16 @@ def _judged(
         c.at_edge(explanation.end.coordinates_of(k)) and parts[c.effect].matters > 0.5
         for k, c in enumerate(explanation.end.candidates)
     )
-    explains = complete = 0.0 if at_edge else _enough(_beyond(explanation), model_error)
+    explains = complete = 0.0 if at_edge else _enough(_beyond(explanation), weighing)
     answers = {
         name
         for name, effect in zip(explanation.names, explanation.end.effects, strict=True)
-        if name in listed and effect.as_listed
+        if name in weighing.listed and effect.as_listed
     }
     for part in parts.values():
         complete *= 1.0 if part.name in answers else 1 - part.matters
     named = tuple(parts[name] for name in explanation.names if name in answers)
-    return Judged(explanation, named, score_of(explanation, listed, model_error), explains, complete)
+    return Judged(explanation, named, score_of(explanation, weighing), explains, complete)
 
 
 def best_without(
@@ -270,11 +273,11 @@ def _part(
     name: str,
     rest: Explanation,
     seen: Part | None,
-    listed: Sequence[str],
 ) -> Part:
     """What an effect carries within a set, or within the larger one in which it was seen before; rest: the
     set without it."""
-    k, model_error = explanation.names.index(name), search.case.machine.weighing.model_error
+    k, weighing = explanation.names.index(name), search.case.machine.weighing
+    model_error, listed = weighing.model_error, weighing.listed
     estimated, held_out = map(float, _carried(rest, explanation))
     share, limit = float(np.sqrt(estimated * held_out)), _INTERESTS
     # What looks like a tilt is judged as a tilt: some of either is everywhere.
@@ -283,9 +286,7 @@ def _part(
         share, limit = min(share, held_out), _INTERESTS_EVERYWHERE
     elif share < limit * model_error < estimated and is_silent(search, explanation, name):
         share = estimated
-    elif estimated < held_out and score_of(explanation, listed, model_error) > _BEHIND + score_of(
-        rest, listed, model_error
-    ):
+    elif estimated < held_out and score_of(explanation, weighing) > _BEHIND + score_of(rest, weighing):
         # Without it the others fit the records they were fitted to as well, with values that others refute.
         share = held_out
     share = max(share, seen.share if seen else 0.0)
@@ -345,18 +346,21 @@ def _beyond(explanation: Explanation) -> float:
     return _left(explanation) / (_AFTER_CONTACTS if explanation.end.non_smooth else 1.0)
 
 
-def _enough(left: float, model_error: float) -> float:
+def _enough(left: float, weighing: Weighing) -> float:
     """Probability that what is left is no more than imperfections."""
-    enough, more = _remaining(left, model_error)
+    enough, more = _remaining(left, weighing)
     return enough / (enough + more)
 
 
-def _remaining(left: float, model_error: float) -> tuple[float, float]:
+def _remaining(left: float, weighing: Weighing) -> tuple[float, float]:
     """Densities of a share of the motion that is left by a complete answer, and beside an unknown cause."""
-    size = np.log(max(left / model_error, 1e-3))
-    z = max(size - np.log(_IMPERFECTIONS), 0.0) / _IMPERFECTIONS_WIDTH
+    width = (
+        _IMPERFECTIONS_WIDTH if weighing.stated else float(np.hypot(_IMPERFECTIONS_WIDTH, _UNSTATED_WIDTH))
+    )
+    size = np.log(max(left / weighing.model_error, 1e-3))
+    z = max(size - np.log(_IMPERFECTIONS), 0.0) / width
     u = min(size - np.log(_UNKNOWN), 0.0) / _UNKNOWN_WIDTH
-    enough = (1 - _PRIOR_UNKNOWN) / _IMPERFECTIONS_WIDTH * np.exp(-0.5 * z**2)
+    enough = (1 - _PRIOR_UNKNOWN) / width * np.exp(-0.5 * z**2)
     return float(enough), float(_PRIOR_UNKNOWN / _UNKNOWN_WIDTH * np.exp(-0.5 * u**2))
 
 

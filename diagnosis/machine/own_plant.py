@@ -275,6 +275,10 @@ class PlantCase(RecordedCase[PlantExperiment]):
         """The same with a simulation that is stated to be as good as the sensors."""
         return replace(self, plant=replace(self.plant, model_error=0.0))
 
+    def with_noise(self, noise: Real) -> PlantCase:
+        """The same with other noise of the outputs (Y,)."""
+        return replace(self, plant=replace(self.plant, noise=noise))
+
     @property
     def model_error(self) -> float:
         return self.plant.weighing.model_error

@@ -21,7 +21,7 @@ from diagnosis import (
 )
 from diagnosis.imperfect.carried import shares_of
 from diagnosis.imperfect.descent import Descent, descend, occam, refined, scanned
-from diagnosis.imperfect.levels import Levels, coefficients
+from diagnosis.imperfect.levels import Levels, coefficients, quietest
 from diagnosis.imperfect.records import Records, Start, StartColumns
 from diagnosis.imperfect.search import Explanation, Search
 from diagnosis.imperfect.settled import best_move, settled
@@ -125,6 +125,17 @@ def test_where_contacts_switch_a_fit_does_not_end_in_the_nearest_jump():
     end = descend(of, case.machine.candidates(case.experiments), nothing, np.log([0.6, 0.8]), of.at_rest())
     found = [change.values["gap_m"] for change in refined(of, end).effects]
     np.testing.assert_allclose(found, [1.0, 1.3], rtol=0.02)
+
+
+def test_the_quietest_octaves_tell_how_much_white_noise_there_may_be():
+    rng = np.random.default_rng(4)
+    noise, t = np.array([0.1, 0.02]), np.arange(1500)[:, None]
+    loud = np.sin(0.1 * t) + 3 * np.cos(0.011 * t)
+    signals = [(loud + noise * rng.standard_normal((1500, 2)))[:length] for length in (1500, 900)]
+    # An octave of sixteen values has an RMS that is off by a sixth; the quietest of several, below.
+    np.testing.assert_array_less(quietest(signals), 1.2 * noise)
+    np.testing.assert_array_less(0.6 * noise, quietest(signals))
+    assert quietest([noise * rng.standard_normal((12, 2))]).shape == (2,)
 
 
 def test_a_drift_stays_in_the_lowest_octaves():
@@ -250,7 +261,7 @@ def test_what_the_held_out_records_contradict_is_no_answer():
     )
     search = Search(Case("two", RIG, records, 0.05), lambda share, words: None)
     search.run()
-    found = judged(search, arm.weighing.listed)
+    found = judged(search)
     assert "hardening_spring" not in found.accepted
     shares = shares_of(search, found, search.base, rng)
     assert all(closed > 0 for _, closed in shares.closes)
@@ -711,12 +722,19 @@ def _judged(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
         exchanged=lambda explanation, sought: None,
         acts_on_held_out=lambda whole, k: acts,
     )
-    return judged(search, case.machine.weighing.listed)
+    return judged(search)
 
 
-def test_what_may_be_left_is_as_the_docs_say():
-    told = {1.0: 0.90, 1.5: 0.70, 2.0: 0.49, 3.0: 0.20}
-    assert {left: round(_enough(left * 0.05, 0.05), 2) for left in told} == told
+@pytest.mark.parametrize(
+    ("stated", "told"),
+    [
+        (True, {1.0: 0.90, 1.5: 0.70, 2.0: 0.49, 3.0: 0.20, 6.0: 0.01}),
+        (False, {1.0: 0.87, 1.5: 0.73, 2.0: 0.63, 3.0: 0.52, 6.0: 0.26}),
+    ],
+)
+def test_what_may_be_left_is_as_the_docs_say(stated, told):
+    weighing = Weighing(model_error=0.05, stated=stated)
+    assert {left: round(_enough(left * 0.05, weighing), 2) for left in told} == told
 
 
 def test_a_set_that_one_record_alone_prefers_is_less_sure():

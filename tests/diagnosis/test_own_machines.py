@@ -7,6 +7,7 @@ listed acts (2 % of the forces): a drag, a second harmonic of gravity, an uneven
 from __future__ import annotations
 
 import time
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -165,6 +166,22 @@ def test_the_effect_is_found_among_all_that_are_listed(name):
     # Stated values are off by up to a tolerance, 3 to 5 %; measured 0.1 to 1.3 %.
     assert found.repair[0].values[key] == pytest.approx(value, rel=0.05)
     assert found.gap_closed > 0.95
+
+
+def test_noise_stated_far_too_large_hides_no_effect():
+    case = _case("input_delay")
+    with pytest.warns(UserWarning, match=r"less noise than stated, which counts: y 0\.\d+, stated 5$"):
+        found = diagnose(case.with_noise(100 * case.noise))
+    assert (found.verdict, found.combination) == ("effect", ("input_delay",))
+    assert case.noise < found.case.noise < 5 * case.noise
+
+
+def test_noise_stated_too_large_makes_no_effect():
+    case = _case("backlash", mass_kg=0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        found = diagnose(case.with_noise(10 * case.noise))
+    assert found.verdict == "none"
 
 
 @pytest.mark.parametrize(("key", "tolerances", "true"), [("mass_kg", 6, 2.03), ("spring_N_m", -6, 78.0)])
