@@ -43,7 +43,8 @@ _GAINED_BY_START = 2.0
 _SCANS, _GAINED_BY_SCAN = 2, 2.0
 # Sets of each size with contacts whose starts feel them, and how far behind in evidence they may be.
 _TOUCHING, _TOUCHING_ITERATIONS, _UNLIKELY = 2, 5, 150.0
-# An effect is exchanged for one that is no further behind in evidence in a part of the set.
+# An effect is exchanged for one that is no further behind in evidence in a part of the set, nor in loss in
+# its place once all else has followed.
 _AS_LIKELY = 15.0
 # Of octaves, what is felt where disturbances of the inputs are amplified.
 _AMPLIFIED = 0.5
@@ -419,11 +420,11 @@ class Search:
         Larger sets are sought beside the likeliest parts alone: of two effects that no record tells apart,
         the one that was extended would win by what was found beside it.
         """
-        end, best = explanation.end, best_of_sets(self.found)
+        best = best_of_sets(self.found)
         for k, name in enumerate(explanation.names):
             if name not in sought:
                 continue
-            rest = {c.effect: c.kind.contains for c in end.candidates if c.effect != name}
+            rest = {c.effect: c.kind.contains for c in explanation.end.candidates if c.effect != name}
             for rival in [*best.values()]:
                 new = set(rival.names) - {*explanation.names}
                 kept = set(rival.names) - new
@@ -435,12 +436,12 @@ class Search:
                 contained = other.effect in rest.values() or other.kind.contains in rest
                 if key in best or contained or rival.evidence < part.evidence - _AS_LIKELY:
                     continue
-                candidates = (*end.candidates[:k], other, *end.candidates[k + 1 :])
-                x = [end.coordinates_of(j) for j in range(len(candidates))]
-                x[k] = rival.end.coordinates_of(rival.names.index(other.effect))
-                best[key] = self.add(
-                    descend(self.records, candidates, end.deviations, np.concatenate(x), end.start)
-                )
+                around = (best.get(tuple(sorted(rest))) or self.without(explanation, k)).end
+                at = rival.end.coordinates_of(rival.names.index(other.effect))
+                x, candidates = np.concatenate([around.coordinates, at]), (*around.candidates, other)
+                loss, d, x = best_following(self.records, around, candidates, [x])
+                if loss < explanation.end.loss + _AS_LIKELY:
+                    best[key] = self.add(descend(self.records, candidates, d, x, around.start))
 
     def without(self, explanation: Explanation, k: int) -> Explanation:
         """The best explanation by the same effects but the k-th."""
