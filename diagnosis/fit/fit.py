@@ -81,6 +81,14 @@ class Fit:
         return np.asarray(np.linalg.pinv(self.hessian, hermitian=True))
 
 
+def solved(matrix: Real, right: Real) -> Real:
+    """x of matrix x = right, the smallest where trials that ran away leave the matrix singular."""
+    try:
+        return np.asarray(np.linalg.solve(matrix, right))
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
+
+
 def fit(
     model: ResidualModel,
     candidates: Sequence[Candidate],
@@ -127,12 +135,12 @@ def fit(
         for _try in range(9):
             damped = Hu + damping * np.diag(size**2 + _UNIT)
             step = np.zeros(P + x.size)
-            step[use] = -np.linalg.solve(damped, gu)
+            step[use] = -solved(damped, gu)
             if exact:
                 probe = _PROBE * step
                 ahead = residuals(model.nominal.within(d + probe[:P]), np.clip(x + probe[P:], low, high))
                 bend = 2 / _PROBE * ((ahead - e) / _PROBE - J @ step)
-                second = -0.5 * np.linalg.solve(damped, Ju.T @ bend)
+                second = -0.5 * solved(damped, Ju.T @ bend)
                 if float(np.linalg.norm(size * second)) < _BEND * float(np.linalg.norm(size * step[use])):
                     step[use] += second
             trial_d = model.nominal.within(d + step[:P])

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from diagnosis.fit.fit import box, effects_at, non_smooth, quotients
+from diagnosis.fit.fit import box, effects_at, non_smooth, quotients, solved
 from diagnosis.fit.nominal import prior_cost, prior_curvature, prior_slope
 from diagnosis.imperfect.records import Records, Start, StartColumns
 from diagnosis.machine.machine_protocol import Real
@@ -190,7 +190,7 @@ def descend(
             damped = H + damping * np.diag(np.diag(H) + 1e-9)
             damped[range(P, P + A), range(P, P + A)] += 1e2 * damping
             step = np.zeros(g.size)
-            step[free] = -np.linalg.solve(damped[np.ix_(free, free)], g[free])
+            step[free] = -solved(damped[np.ix_(free, free)], g[free])
             d2 = np.clip(d + np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP), -FARTHEST, FARTHEST)
             x2 = np.clip(x + np.clip(step[P : P + A], -_LARGEST_MOVE, _LARGEST_MOVE), low, high)
             start2 = columns.moved(start, step[P + A :])
@@ -277,7 +277,7 @@ def follow(records: Records, around: Descent, e: Real, start: Start) -> tuple[fl
     P = around.deviations.size
     normal = around.normal(records)
     H = normal.hessian + np.diag(1e-9 * np.diag(normal.hessian) + 1e-12)
-    step = np.asarray(-np.linalg.solve(H, normal.gradient(start, e)), dtype=np.float64)
+    step = -solved(H, normal.gradient(start, e))
     step[:P] = np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP)
     moved = e + np.column_stack([around.jacobian, around.columns.zeros]) @ step[: -start.states.size or None]
     d, start2 = around.deviations + step[:P], around.columns.moved(start, step[around.jacobian.shape[1] :])

@@ -33,6 +33,8 @@ _ALIKE = 3
 _CONTINUED = 3
 # Beside values pulled this far (tolerances), effects that multiply one are tried as well.
 _PULLED = 1.8
+# Evidence that larger sets gain, or none that are larger still are tried.
+_WORTH = 15.0
 # Fits in windows: effects tried beside the best, and sets of one and of two continued in free runs.
 _BESIDE_IN_WINDOWS, _FREED = 4, (2, 3)
 # Loss that the best of them gains in windows, or none is continued.
@@ -129,7 +131,8 @@ class Search:
     def run(self) -> None:
         """The nominal, every effect alone, then sets of two, three and more beside the likeliest.
 
-        Beyond three only while the likeliest leaves more of the motion than is stated not to interest.
+        Beyond three only while the likeliest leaves more of the motion than is stated not to interest, and
+        the last size was worth it.
         """
         weighing = self.case.machine.weighing
         P = self.records.nominal.count
@@ -139,7 +142,7 @@ class Search:
         self._alone()
         self._containing(self.found)
         for count in range(2, weighing.most_effects + 1):
-            if count > 3 and not self._unexplained:
+            if count > 3 and not (self._unexplained and self._worth(count - 1)):
                 break
             self._together(count)
         if self._unexplained:
@@ -156,6 +159,14 @@ class Search:
         """Whether the likeliest leaves more of the motion than is stated not to interest."""
         likeliest = max(self.found, key=lambda e: e.evidence)
         return bool(np.max(likeliest.shares) > self.case.machine.weighing.model_error)
+
+    def _worth(self, count: int) -> bool:
+        """Whether the likeliest set of so many effects is much likelier than that of one fewer."""
+        largest, smaller = (
+            max((e.evidence for e in self.found if len(e.names) == n), default=-np.inf)
+            for n in (count, count - 1)
+        )
+        return largest > smaller + _WORTH
 
     def _late(self, what: str) -> bool:
         if time.monotonic() < self.deadline_s:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from diagnosis.fit.fit import quotients
+from diagnosis.fit.fit import quotients, solved
 from diagnosis.imperfect.levels import Levels
 from diagnosis.imperfect.records import Records, Start
 from diagnosis.machine.machine_protocol import Real
@@ -136,7 +136,7 @@ def best_move(levels: Levels, spread: Real, columns: Real, e: Real, state: Real)
         for _ in range(_ITERATIONS):
             weighted, before = np.tensordot(weights, energies, 1), move
             H, g = weighted[:-1, :-1] + np.diag(1 / spread**2), weighted[:-1, -1] + state / spread**2
-            move = np.asarray(-np.linalg.solve(H, g))
+            move = -solved(H, g)
             if np.all(np.abs(move - before) < _STILL * spread):
                 break
             weights = levels.counted / (left(move) + levels.floor)

@@ -96,6 +96,16 @@ def test_a_state_far_from_the_guess_is_found_in_one_move():
     assert at_the_end < near.fun + 0.1
 
 
+def test_a_start_is_sought_where_records_tell_two_states_apart_by_nothing():
+    # Trials that ran away: the same column twice, so large that what is known of the states is lost in it.
+    rng = np.random.default_rng(10)
+    of = Levels.of([_experiment("a", "estimation", _moving(rng))], np.array([1e-3, 1e-3]), 0.05)
+    column = 2.0**60 * np.ones(800)
+    e = 2.0**50 * np.ones(800)
+    move = best_move(of, np.ones(2), np.column_stack([column, column]), e, np.zeros(2))
+    assert np.sum(move) == pytest.approx(-(2.0**-10), rel=1e-6)
+
+
 def test_where_contacts_switch_a_fit_does_not_end_in_the_nearest_jump():
     # The response to two sizes is a slope with a step of a tenth of it at every two per cent.
     rng = np.random.default_rng(14)
