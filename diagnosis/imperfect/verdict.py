@@ -113,7 +113,7 @@ class Verdict:
 
 def score_of(explanation: Explanation, weighing: Weighing) -> float:
     """Log weight of a set of effects, out of those that are listed."""
-    left = _remaining(_beyond(explanation), weighing)
+    left = _remaining(_beyond(explanation), weighing.model_error)
     return _gain(explanation, weighing.listed) + float(np.log(sum(left)))
 
 
@@ -347,17 +347,18 @@ def _beyond(explanation: Explanation) -> float:
 
 
 def _enough(left: float, weighing: Weighing) -> float:
-    """Probability that what is left is no more than imperfections."""
-    enough, more = _remaining(left, weighing)
+    """Probability that what is left is no more than imperfections.
+
+    How large these are where nobody has stated it says nothing about which of several sets is right.
+    """
+    enough, more = _remaining(left, weighing.model_error, 0.0 if weighing.stated else _UNSTATED_WIDTH)
     return enough / (enough + more)
 
 
-def _remaining(left: float, weighing: Weighing) -> tuple[float, float]:
+def _remaining(left: float, model_error: float, uncertain: float = 0.0) -> tuple[float, float]:
     """Densities of a share of the motion that is left by a complete answer, and beside an unknown cause."""
-    width = (
-        _IMPERFECTIONS_WIDTH if weighing.stated else float(np.hypot(_IMPERFECTIONS_WIDTH, _UNSTATED_WIDTH))
-    )
-    size = np.log(max(left / weighing.model_error, 1e-3))
+    width = np.hypot(_IMPERFECTIONS_WIDTH, uncertain)
+    size = np.log(max(left / model_error, 1e-3))
     z = max(size - np.log(_IMPERFECTIONS), 0.0) / width
     u = min(size - np.log(_UNKNOWN), 0.0) / _UNKNOWN_WIDTH
     enough = (1 - _PRIOR_UNKNOWN) / width * np.exp(-0.5 * z**2)
