@@ -67,7 +67,7 @@ def quietest(signals: Sequence[Real]) -> Real:
     rms = []
     for signal in signals:
         samples = np.bincount(octaves_of(len(signal)))
-        many = samples >= min(_MOST, np.max(samples))
+        many = samples >= min(_MOST, float(np.max(samples)))
         rms.append(np.sqrt(np.min(octave_energies(signal)[many] / samples[many, None], axis=0)))
     return np.asarray(np.max(rms, axis=0))
 

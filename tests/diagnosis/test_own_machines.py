@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -277,6 +278,27 @@ def test_an_effect_is_exchanged_for_its_twin():
     assert abs(twin.log_likelihood - pair.log_likelihood) < 1
     search.exchanged(pair, {"input_offset"})
     assert search.found[-1] is twin
+
+
+@pytest.mark.parametrize(("gained", "sizes"), [(14.0, [2, 3]), (16.0, [2, 3, 4, 5])])
+def test_larger_sets_are_sought_while_the_last_size_was_worth_it(gained, sizes, monkeypatch):
+    search, tried = Search(_pumped(), lambda share, words: None), []
+
+    def together(search, count):
+        # What a size gains; and everything leaves more than interests.
+        likeliest = max(search.found, key=lambda e: e.evidence)
+        names, gain = tuple(f"effect {k}" for k in range(count)), gained if count > 1 else 0.0
+        end = replace(likeliest.end, candidates=tuple(SimpleNamespace(effect=name) for name in names))
+        log_prior = likeliest.log_prior + gain
+        search.found.append(replace(likeliest, end=end, log_prior=log_prior, shares=np.ones((2, 1))))
+        tried.append(count)
+
+    monkeypatch.setattr(Search, "_alone", lambda search: together(search, 1))
+    monkeypatch.setattr(Search, "_together", together)
+    for later in ("_containing", "_scanned", "_from_contacts"):
+        monkeypatch.setattr(Search, later, lambda search, *sets: None)
+    search.run()
+    assert tried[1:] == sizes
 
 
 @njit
