@@ -42,7 +42,7 @@ _WITHIN = 2.0
 # of shares of the motion, normal; any size above its median for an unknown cause), prior of the latter.
 _IMPERFECTIONS, _IMPERFECTIONS_WIDTH = 0.6, 0.65
 _UNKNOWN, _UNKNOWN_WIDTH, _PRIOR_UNKNOWN = 2.2, 0.6, 0.15
-# How far off (logarithm) the usual model error may be that stands for one that nobody has stated; a judgement.
+# How far off (logarithm) the usual model error may be which stands for one nobody has stated: a judgement.
 _UNSTATED_WIDTH = 0.9
 # After a contact that comes a little early all goes another way: what imperfections leave is more.
 _AFTER_CONTACTS = 2.0
