@@ -62,8 +62,7 @@ def coefficients(residuals: Real) -> Real:
 
 
 def quietest(signals: Sequence[Real]) -> Real:
-    """(Y,) the largest white noise that signals (T, Y) may all hold: RMS of the quietest octave of the one
-    that has most there."""
+    """(Y,) white noise that no signal (T, Y) has more of: at most the RMS of its quietest octave."""
     rms = []
     for signal in signals:
         samples = np.bincount(octaves_of(len(signal)))
