@@ -114,6 +114,8 @@ class Diagnosis:
         answers (none was fitted to them).
     unlisted : tuple of effects. What explains the records where the answer is unknown and yet can be named: a
         cause beyond the list that looks like one of it, with whatever it acts beside.
+    partial_model : tuple of str. Effects of the repaired model where the answer is unknown: they close most
+        of the held-out gap, and nobody says that they are the cause.
     competing : tuple of CompetingHypothesis. Fitted explanations that contradict each other, most probable
         first, for `next_experiment`; only for a flexible link.
     shares : Shares or None. Only of a machine with a stated model error.
@@ -143,8 +145,14 @@ class Diagnosis:
     simulations: int
     held_out_decided: bool = False
     unlisted: tuple[Any, ...] = ()
+    partial_model: tuple[str, ...] = ()
     competing: tuple[CompetingHypothesis, ...] = ()
     shares: Shares | None = None
+
+    @property
+    def added(self) -> tuple[str, ...]:
+        """Effects of the repaired model, whether they are the answer or only close most of the gap."""
+        return self.combination or self.partial_model
 
     @property
     def probability(self) -> float:
@@ -178,7 +186,7 @@ class Diagnosis:
     def models(self) -> tuple[Model, ...]:
         """Models to compare: re-estimated where there are tolerances, repaired where effects were found."""
         moved: tuple[Model, ...] = ("refit",) if self.deviations else ()
-        added: tuple[Model, ...] = ("repaired",) if self.combination else ()
+        added: tuple[Model, ...] = ("repaired",) if self.added else ()
         return ("stated", *moved, *added)
 
     @property

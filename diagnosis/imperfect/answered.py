@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from diagnosis.answer import (
 )
 from diagnosis.fit.fit import parameter_intervals
 from diagnosis.imperfect import verdict as judging
-from diagnosis.imperfect.carried import shares_of
+from diagnosis.imperfect.carried import closed_by, shares_of
 from diagnosis.imperfect.descent import Descent
 from diagnosis.imperfect.search import Explanation, Progress, Search, best_of_sets
 from diagnosis.machine.case import Case
@@ -37,6 +37,8 @@ _LEAST_KEPT = 0.3
 # Share of the stated model error that may act as an effect does: one standard deviation (set on 40 generated
 # cases, where dry friction and cogging of the background added to what was found).
 _ALIKE = 0.25
+# Share of the held-out gap that effects close, or of an unknown cause nothing is put into the model.
+_MOST_OF_IT = 0.5
 # RMS in noise deviations: what a simulation without error leaves, and a little that the search has not found.
 _NEAR_NOISE = 2.0
 
@@ -92,15 +94,17 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
     listed = case.machine.weighing.listed
     found = judging.judged(search)
     search.progress(1.0, "done")
-    refit = search.base
-    accepted = refit
-    if found.accepted:
+    refit, best = search.base, found.judged[0]
+    accepted, partial, looks_like = refit, tuple[str, ...](), False
+    if found.answer == "unknown":
+        looks_like = best.explains > 0.5 and not set(best.explanation.names) <= set(listed)
+        accepted = _in_part(search, found, looks_like=looks_like)
+        partial = tuple(sorted(accepted.names))
+    elif found.accepted:
         whole = next(
             one for one in found.judged if found.fitted(found.accepted) <= {p.name for p in one.parts}
         )
-        least = _LEAST_KEPT * case.machine.weighing.model_error
-        kept = [p.name for p in whole.parts if p.name in found.accepted or p.share > least]
-        accepted = search.finished(search.by_these(kept, whole.explanation))
+        accepted = _kept(search, whole, found.accepted)
         if accepted.pooled_held_out(case.noise) > refit.pooled_held_out(case.noise):
             accepted = whole.explanation
     before = _whitened(case, search.stated())
@@ -112,8 +116,6 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
     kind = named.get(found.answer, "effect")
     ambiguous = _ambiguous(found)
     keys = search.records.nominal.keys
-    best = found.judged[0]
-    looks_like = kind == "unknown" and best.explains > 0.5 and not set(best.explanation.names) <= set(listed)
     return Diagnosis(
         case=case,
         verdict=kind,
@@ -137,10 +139,36 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
         residuals_refit=moved,
         residuals_after=after,
         simulations=search.simulations,
-        unlisted=best.explanation.end.effects if looks_like else (),
-        shares=shares_of(search, found, accepted, rng),
+        unlisted=(accepted if partial else best.explanation).end.effects if looks_like else (),
+        partial_model=partial,
+        shares=shares_of(search, found.accepted or partial, accepted, rng),
         competing=_competing(search, found),
     )
+
+
+def _kept(search: Search, whole: judging.Judged, accepted: Iterable[str]) -> Explanation:
+    """A set without what is not accepted and carries next to nothing, fitted to its end."""
+    least = _LEAST_KEPT * search.case.machine.weighing.model_error
+    shares, accepted = {part.name: part.share for part in whole.parts}, set(accepted)
+    kept = [n for n in whole.explanation.names if n in accepted or shares.get(n, 0.0) > least]
+    return search.finished(search.by_these(kept, whole.explanation))
+
+
+def _in_part(search: Search, found: judging.Verdict, *, looks_like: bool) -> Explanation:
+    """What the records look like, or the likeliest set of listed effects.
+
+    The nominal re-estimated where that does not close most of the held-out gap, leaves half of the motion
+    there, or as much as the nominal as stated.
+    """
+    listed = (one for one in found.judged if one.parts and len(one.parts) == len(one.explanation.names))
+    whole = found.judged[0] if looks_like else next(listed, None)
+    if whole is None:
+        return search.base
+    unlisted = set(whole.explanation.names) - {part.name for part in whole.parts}
+    part, noise = _kept(search, whole, unlisted), search.case.noise
+    closes = closed_by(search, part) > _MOST_OF_IT and np.max(part.shares[1]) < 1 - _MOST_OF_IT
+    nearer = part.pooled_held_out(noise) < search.stated().pooled_held_out(noise)
+    return part if closes and nearer else search.base
 
 
 def _competing(search: Search, found: judging.Verdict) -> tuple[CompetingHypothesis, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 from diagnosis.answer import Shares
 from diagnosis.imperfect.horizon import horizon_samples, shares_over_horizon
 from diagnosis.imperfect.search import Explanation, Search
-from diagnosis.imperfect.verdict import Verdict, is_silent
+from diagnosis.imperfect.verdict import is_silent
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.rounding import rounding_effect
 
@@ -21,15 +21,19 @@ _BLOCK, _DRAWS, _MOST_TOLD = 50, 1000, 5
 _LEAST_CLOSED, _WORTH_A_THIRD = 0.02, 0.1
 
 
-def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.random.Generator) -> Shares:
-    """Shares of the energy of the held-out residuals beyond white noise of the stated size (design 6.2).
+def shares_of(
+    search: Search, matter: Sequence[str], accepted: Explanation, rng: np.random.Generator
+) -> Shares:
+    """matter : those of the effects of the repaired model that are not small.
+
+    Shares of the energy of the held-out residuals beyond white noise of the stated size (design 6.2).
 
     Carried is the Shapley value of every effect of the repaired model, small ones included: what it closes,
     averaged over the orders in which they could be added, so that it depends on none and all together are
     what the model closes; intervals by bootstrap over blocks of samples.
     """
     base = search.base
-    fitted = [name for name in found.accepted if name in accepted.names]
+    fitted = [name for name in matter if name in accepted.names]
     names = (*fitted, *(name for name in accepted.names if name not in fitted))
     subsets = {
         chosen: search.by_these(chosen, accepted)
@@ -49,12 +53,7 @@ def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.ran
         spread = _shapley(name, names, {c: b[drawn].sum(axis=1) for c, b in blocks.items()})
         low, high = np.quantile(spread, [0.025, 0.975])
         carried[name] = (float(value), float(low), float(high))
-    whole = float(np.sum(blocks[()]))
-    closed = {
-        e.key: 1 - float(np.sum(_blocks(search, e))) / whole
-        for e in sorted(search.found, key=lambda e: e.evidence)
-        if e.names
-    }
+    closed = {e.key: closed_by(search, e) for e in sorted(search.found, key=lambda e: e.evidence) if e.names}
     told = sorted(((c, key) for key, c in closed.items() if _tells(key, closed)), reverse=True)[:_MOST_TOLD]
     return Shares(
         names=tuple(search.case.machine.output_names),
@@ -62,13 +61,18 @@ def shares_of(search: Search, found: Verdict, accepted: Explanation, rng: np.ran
         after=tuple(map(float, accepted.shares[1])),
         interests=search.case.machine.weighing.model_error,
         carried=carried,
-        small=tuple(name for name in names if name not in found.accepted),
+        small=tuple(name for name in names if name not in matter),
         closes=tuple((key, c) for c, key in told),
         not_tried=tuple(search.left_out),
         silent=tuple(name for name in fitted if is_silent(search, accepted, name)),
         at_inputs=search.at_inputs,
         **_over_horizon(search, accepted),
     )
+
+
+def closed_by(search: Search, explanation: Explanation) -> float:
+    """Share of the energy of the held-out residuals beyond noise that a set closes."""
+    return 1 - float(np.sum(_blocks(search, explanation)) / np.sum(_blocks(search, search.base)))
 
 
 def _tells(key: tuple[str, ...], closed: Mapping[tuple[str, ...], float]) -> bool:

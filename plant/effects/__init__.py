@@ -31,7 +31,7 @@ __all__ = [
 
 
 def parse_effect(entry: Mapping[str, Any]) -> Effect:
-    """An effect from {"name": id, parameter: value, ...}.
+    """An effect from {"name": id, parameter: value, ...}, of the list or what looks like one of it.
 
     Raises ValueError: one line naming the effect and the parameter, or listing the known effects.
     """
@@ -39,11 +39,11 @@ def parse_effect(entry: Mapping[str, Any]) -> Effect:
         raise ValueError(f"an effect is a table with a name and its parameters; got {entry!r}")
     if "name" not in entry:
         raise ValueError(f"effect without a name; known effects: {', '.join(EFFECTS)}")
-    name = entry["name"]
-    if not isinstance(name, str) or name not in EFFECTS:
-        raise ValueError(f"unknown effect {name!r}; known effects: {', '.join(EFFECTS)}")
+    name, kinds = entry["name"], {**EFFECTS, **LOOK_ALIKES}
+    if not isinstance(name, str) or name not in kinds:
+        raise ValueError(f"unknown effect {name!r}; known effects: {', '.join(kinds)}")
     try:
-        return EFFECTS[name].model_validate({key: value for key, value in entry.items() if key != "name"})
+        return kinds[name].model_validate({key: value for key, value in entry.items() if key != "name"})
     except ValidationError as error:
         raise ValueError(f"effect {name}: {one_line(error)}") from error
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from plant import EFFECTS, Effect, paper_link, parse_effect, parse_effects, prbs, simulate
-from plant.effects.base import RatioEffect, register
+from plant.effects.base import LOOK_ALIKES, RatioEffect, register
 from plant.effects.joint import CoulombFriction
 from plant.machine import Machine
 from plant.simulation import Simulator, Start
@@ -153,6 +153,13 @@ class TestContract:
 def test_stiff_springs_are_rigid(effect, tolerance, nominal):
     # A spring k turns by torque / k: about 2 N m over k here.
     np.testing.assert_allclose(_output(parse_effect(effect)), nominal, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("name", LOOK_ALIKES)
+def test_what_looks_like_an_effect_is_read_as_well(name):
+    kind = LOOK_ALIKES[name]
+    effect = kind(**dict.fromkeys(kind.model_fields, 0.5))
+    assert parse_effect(effect.to_dict()) == effect
 
 
 def test_effects_commute():

@@ -58,7 +58,7 @@ def write_case(
 
 @dataclass(frozen=True)
 class KnownAnswer:
-    """Says what it was told, with the residuals that follow.
+    """Says what it was told, with the residuals that follow; of unknown with effects, that these are in part.
 
     verdict, detail, unlisted: as in a Diagnosis. fails: cases it raises an error for; dies: cases that kill
     their process. seen: file it appends the case's name to.
@@ -90,7 +90,8 @@ class KnownAnswer:
         still = np.zeros(model.nominal.count)
         effects = parse_effects(self.effects)
         before, after = model.by_experiment(still, ()), model.by_experiment(still, effects)
-        names = [effect.id for effect in effects]
+        fitted_names = [effect.id for effect in effects]
+        names = fitted_names if self.verdict == "effect" else []
         sure = 0.9 if self.ambiguous else 0.96 if self.verdict == "effect" else 0.98
         total = {"none": 0.0, **dict.fromkeys(EFFECTS, 0.0), "unknown": 0.0}
         for name in names or [self.verdict]:
@@ -127,6 +128,7 @@ class KnownAnswer:
             sets=sets,
             effects=tuple(sorted(named, key=lambda e: (e.name not in names, -e.probability))),
             combination=tuple(names),
+            partial_model=tuple(fitted_names) if self.verdict == "unknown" else (),
             ambiguous_with=self.ambiguous,
             gap_before=start,
             gap_refit=start,
@@ -144,7 +146,7 @@ class KnownAnswer:
             simulations=model.simulations,
             unlisted=self.unlisted,
             competing=() if case.model_error else self._competing(case, effects, sure),
-            shares=self._shares(case, names) if case.model_error else None,
+            shares=self._shares(case, fitted_names) if case.model_error else None,
         )
 
     def _shares(self, case: Case, names: list[str]) -> Shares:

@@ -156,6 +156,21 @@ def test_every_verdict_has_its_words(folder, engine, words, undrawn):
     assert (answer["verdict"], answer["detail_verdict"]) == (engine.verdict, engine.detail)
 
 
+def test_what_closes_most_of_the_gap_of_an_unknown_cause_is_written_down(folder, undrawn):
+    files = made(folder, KnownAnswer((FRICTION,), "unknown", "unknown"))
+    answer = json.loads(files["arm.json"])
+    closed = f"{100 * answer['gap_closed']:.4g} %"
+    words = re.sub("<[^>]*>", "", files["arm.html"].decode())
+    assert f"nothing on the list explains it all; dry (Coulomb) friction closes {closed} of it" in words
+    assert "friction may stand in for what is not on the list" in words
+    assert (answer["verdict"], answer["combination"]) == ("unknown", [])
+    assert answer["partial_model"] == ["coulomb_friction"]
+    assert answer["gap_after"] < 0.5 * answer["gap_refit"]
+    assert "the cause is not known" in files["arm.effects.toml"].decode()
+    held = tomllib.loads(files["arm.effects.toml"].decode())["effects"]
+    assert held == [FRICTION] == answer["repair"]["effects"]
+
+
 def test_a_cause_beyond_the_list_that_can_be_named_is_named(folder, undrawn):
     spring = GroundSpring(stiffness_Nm_rad=0.25)
     files = made(folder, KnownAnswer((), "unknown", "unknown", unlisted=(spring,)))
@@ -191,9 +206,16 @@ def test_what_was_suspected_is_spoken_of(tmp_path, undrawn):
             KnownAnswer((), "unknown", "unknown"),
             ("Partial answers, each by itself: backlash in the gear closes 62 % of the held-out gap",),
         ),
+        (
+            KnownAnswer((FRICTION,), "unknown", "unknown"),
+            (
+                "Numbers that bring your model nearer to the records, though the cause is not known: "
+                "arm.rig.toml",
+            ),
+        ),
         (KnownAnswer((), "none", "none"), ("No gap that interests:", "near the 5 %")),
     ],
-    ids=["effect", "unknown", "none"],
+    ids=["effect", "unknown", "unknown-in-part", "none"],
 )
 def test_beside_a_model_error_a_hub_angle_is_enough(folder, tmp_path, engine, words, undrawn):
     case = tmp_path / "arm"

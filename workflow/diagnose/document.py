@@ -21,7 +21,8 @@ def document_of(
 
     `effects` are all possible answers, best first, "none" and "unknown" among them: `probability` of being
     the main cause (they sum to one), `presence` of being there at all. gap_* are the pooled root mean square
-    of (measured - model)/noise over the held-out experiments. beside: what else was looked at.
+    of (measured - model)/noise over the held-out experiments. partial_model: what the repaired model holds of
+    an answer "unknown". beside: what else was looked at.
     """
     document = {
         "format": FORMAT,
@@ -30,6 +31,7 @@ def document_of(
         "detail_verdict": found.detail_verdict,
         "effects": found.effects,
         "combination": found.combination,
+        "partial_model": found.partial_model,
         "ambiguous_with": found.ambiguous_with,
         "probability": found.probability,
         "probabilities": found.probabilities,

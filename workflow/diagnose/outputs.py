@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,6 @@ import tomlkit
 
 from diagnosis.answer import Diagnosis
 from diagnosis.where.where import where
-from plant.effects import Effect
 from plant.rig import Rig
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.controller_check import ControllerCheck, NoControllerError, check_controller
@@ -67,7 +66,7 @@ class Work:
             report(_NEXT, "controller")
             check, no_check = _control(found) if self.options["controller"] else (None, "not_asked")
         rig_name, effects_name = f"{case.name}.rig.toml", f"{case.name}.effects.toml"
-        effects = effects_text(case.name, found.repair) if found.repair else ""
+        effects = effects_text(found) if found.repair else ""
         rig = rig_text(
             case.name, case.rig, found.rig, moved(found, found.deviations), effects_name if effects else ""
         )
@@ -140,7 +139,8 @@ def rig_text(
     return render_text("diagnosis/rig.toml.j2", case=case, moved=moved, effects_file=effects_file, toml=toml)
 
 
-def effects_text(case: str, effects: Sequence[Effect]) -> str:
+def effects_text(found: Diagnosis) -> str:
     """The effects as [[effects]] tables, in the spelling of [[source.effects]] in a run configuration."""
-    tables = tomlkit.dumps({"effects": [effect.to_dict() for effect in effects]})
-    return render_text("diagnosis/effects.toml.j2", case=case, toml=tables)
+    tables = tomlkit.dumps({"effects": [effect.to_dict() for effect in found.repair]})
+    cause = not found.partial_model
+    return render_text("diagnosis/effects.toml.j2", case=found.case.name, cause=cause, toml=tables)

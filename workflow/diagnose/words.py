@@ -71,7 +71,7 @@ def short_answer(document: Mapping[str, Any]) -> str:
 def closure_words(document: Mapping[str, Any]) -> str:
     """Share of the gap closed with its interval; a dash where nothing was added."""
     closed = document["gap_closed"]
-    if not document["combination"] or closed is None:
+    if not (document["combination"] or document["partial_model"]) or closed is None:
         return MISSING
     low, high = (100 * v if v is not None else float("nan") for v in document["gap_closed_interval"])
     return f"{number(100 * closed, 4)} % ({number(low, 4)} to {number(high, 4)})"
