@@ -110,7 +110,7 @@ class Search:
         self.records = Records(self.case, self.case.estimation, at_inputs=self.at_inputs)
         self.held_out = Records(self.case, self.case.held_out, at_inputs=self.at_inputs)
         self.points: list[tuple[Candidate, list[Point]]] = []
-        # Sets already fitted without one of their effects, or with a simpler one.
+        # Sets already fitted without one of their effects, with a simpler one, with one in place of another.
         self._reduced: set[tuple[object, ...]] = set()
         # Whether starts of held-out records feel contacts.
         self._touching = False
@@ -448,6 +448,9 @@ class Search:
                 if key in best or contained or rival.evidence < part.evidence - _AS_LIKELY:
                     continue
                 around = (best.get(tuple(sorted(rest))) or self.without(explanation, k)).end
+                if (this := (*key, around.loss, explanation.evidence, rival.evidence)) in self._reduced:
+                    continue
+                self._reduced.add(this)
                 at = rival.end.coordinates_of(rival.names.index(other.effect))
                 x, candidates = np.concatenate([around.coordinates, at]), (*around.candidates, other)
                 loss, d, x = best_following(self.records, around, candidates, [x])

@@ -34,6 +34,8 @@ _CONVERGED, _SETTLED = 1e-5, 0.01
 _FORETOLD = 1e-6
 # Share of the response to a pulse that, in its own sample, shows an input that acts before its row.
 _AT_ONCE = 0.02
+# Condition of the eigenvectors up to which a logarithm made with them is good to ten digits.
+_LOSES_LITTLE = 1e6
 _FORGOTTEN = 1e-7
 # Orders of filters that a response may be of: the first that has all of it to the first share, else the best
 # to the second (what it misses, rounds add). Samples that they are fitted to.
@@ -81,6 +83,19 @@ class BodyForces:
         return self.viscous != 0 or self.linear != 0 or self.cubic != 0
 
 
+def _logarithm(matrix: Real) -> Real:
+    """Real part of the principal logarithm: by eigenvectors, ten times as fast, where that loses no more than
+    a few digits."""
+    values, vectors = np.linalg.eig(matrix)
+    if np.min(np.abs(values)) > 0 and np.linalg.cond(vectors) < _LOSES_LITTLE:
+        logarithms = np.log(values.astype(np.complex128))
+        return np.asarray(np.real(vectors * logarithms @ np.linalg.inv(vectors)))
+    with warnings.catch_warnings():
+        # It warns from a thousand roundings on, next to a double pole.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.real(logm(matrix)))
+
+
 @dataclass(frozen=True, eq=False)
 class LinearBody:
     """Continuous equivalent of a simulated response to held forces, to go through parts of a sample.
@@ -110,10 +125,7 @@ class LinearBody:
         held = np.zeros((n + 1, n + 1))
         held[:n, 0], held[:n, n], held[n, n] = poles, numerator, 1.0
         held[: n - 1, 1:n] = np.eye(n - 1)
-        with warnings.catch_warnings():
-            # It warns from a thousand roundings on, next to a double pole.
-            warnings.simplefilter("ignore", RuntimeWarning)
-            rates = np.real(logm(held))
+        rates = _logarithm(held)
         own, command = rates[:n, :n], rates[:n, n]
         at_once, later = command[0], own[0] @ command
         early = 0.0 if of_speed or abs(at_once) > abs(later) else at_once / later
