@@ -25,6 +25,8 @@ def tell(out: Print, found: Diagnosis) -> None:
         f"  noise {noise}; below {100 * found.case.model_error:.0f} % of the motion nothing is named. "
         f"Verdict {found.verdict} ({found.detail_verdict}): {_names(found.combination)}"
     )
+    if found.partial_model:
+        out(f"  in the repaired model, and called no cause: {_names(found.partial_model)}")
     sets = sorted(found.sets.items(), key=lambda item: -item[1])[:4]
     out("  probable sets: " + "; ".join(f"{_names(names)} {p:.3f}" for names, p in sets))
     if found.ambiguous_with:

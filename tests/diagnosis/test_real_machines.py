@@ -35,6 +35,8 @@ def test_the_first_stage_of_the_serial_link_feels_the_other(flexlink_data):
     assert found.verdict == "unknown"
     assert found.shares is not None
     assert all("other_stage" in names and closed > 0.6 for names, closed in found.shares.closes)
+    assert "other_stage" in found.partial_model
+    assert found.gap_closed > 0.6
 
 
 @pytest.mark.slow

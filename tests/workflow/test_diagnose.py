@@ -7,6 +7,7 @@ import re
 import shutil
 import time
 import tomllib
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -169,6 +170,34 @@ def test_what_closes_most_of_the_gap_of_an_unknown_cause_is_written_down(folder,
     assert "the cause is not known" in files["arm.effects.toml"].decode()
     held = tomllib.loads(files["arm.effects.toml"].decode())["effects"]
     assert held == [FRICTION] == answer["repair"]["effects"]
+
+
+@pytest.mark.parametrize(
+    ("presence", "words", "other"),
+    [
+        (
+            0.3,
+            ("For dry (Coulomb) friction: raise the voltage", "If it is none of them, repeat"),
+            "no hypotheses",
+        ),
+        (0.1, ("there are no hypotheses to separate. Repeat",), "For dry"),
+    ],
+)
+def test_an_effect_that_is_likely_is_looked_for_before_an_unknown_cause(
+    folder, undrawn, presence, words, other
+):
+    answer = KnownAnswer((FRICTION,), "unknown", "unknown", ambiguous=("coulomb_friction",))
+
+    def likely(case, *, progress=None):
+        found = answer(case)
+        effects = (
+            replace(e, presence=presence) if e.name == "coulomb_friction" else e for e in found.effects
+        )
+        return replace(found, effects=tuple(effects))
+
+    html = re.sub("<[^>]*>", "", made(folder, likely)["arm.html"].decode())
+    assert all(one in html for one in words)
+    assert other not in html
 
 
 def test_a_cause_beyond_the_list_that_can_be_named_is_named(folder, undrawn):

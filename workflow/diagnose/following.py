@@ -20,6 +20,8 @@ from workflow.text.formats import listing
 # Below this probability not even a runner-up competes.
 _THINKABLE = 1e-4
 _SHORTEST = 200  # samples
+# From this probability on an effect is looked for at the machine first, though an unknown cause is likelier.
+_LOOKED_FOR = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +30,8 @@ class Following:
 
     advice: look at the machine for the unlisted cause (confirm); repeat the worst experiment, or all of them,
     to see what an unknown cause follows; nothing (none); the proposal, which separates the competing ones;
-    a look at the machine for every cause left (look), where no simulation can promise to separate them.
+    a look at the machine for every cause left (look), where no simulation can promise to separate them, or
+    where one is likely though an unknown cause is likelier.
     repeat : of one's own machine, the record that separates the competing ones.
     """
 
@@ -59,7 +62,10 @@ def following(found: Diagnosis) -> Following:
     """As long as the longest record, within the largest voltage, angle and deflection of all of them."""
     imitated = {kind.look_alike_of for kind in LOOK_ALIKES.values()}
     if found.verdict == "unknown" and not imitated & set(found.ambiguous_with):
-        return Following("confirm" if found.unlisted else "repeat_worst")
+        if found.unlisted:
+            return Following("confirm")
+        likely = {name for name in found.ambiguous_with if found.presence(name) >= _LOOKED_FOR} - {"none"}
+        return Following("look" if likely else "repeat_worst")
     competing = _left(found)
     if not isinstance(found.case, Case) or (found.case.model_error > 0 and len(competing) < 2):
         # Of a machine of one's own nobody has said what it can be asked for.
