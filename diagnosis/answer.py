@@ -116,6 +116,8 @@ class Diagnosis:
         cause beyond the list that looks like one of it, with whatever it acts beside.
     partial_model : tuple of str. Effects of the repaired model where the answer is unknown: they close most
         of the held-out gap, and nobody says that they are the cause.
+    noise_below_stated : tuple of (output, noise, stated noise). Of an own machine whose records show less
+        noise than is stated, in whose place it was counted.
     competing : tuple of CompetingHypothesis. Fitted explanations that contradict each other, most probable
         first, for `next_experiment`; only for a flexible link.
     shares : Shares or None. Only of a machine with a stated model error.
@@ -146,6 +148,7 @@ class Diagnosis:
     held_out_decided: bool = False
     unlisted: tuple[Any, ...] = ()
     partial_model: tuple[str, ...] = ()
+    noise_below_stated: tuple[tuple[str, float, float], ...] = ()
     competing: tuple[CompetingHypothesis, ...] = ()
     shares: Shares | None = None
 

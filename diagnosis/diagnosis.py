@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -84,8 +85,11 @@ def diagnose(
     last = _answered(quieter, lambda done, what: progress(1.0, f"{what}, less noise"), rng, deadline_s)
     if last.verdict != "effect":
         return answer
-    told = zip(case.outputs, case.noise, quieter.noise, strict=True)
-    words = ", ".join(f"{name} {found:.3g}, stated {stated:.3g}" for name, stated, found in told)
+    noise = zip(case.outputs, map(float, quieter.noise), map(float, case.noise), strict=True)
+    last = replace(last, noise_below_stated=tuple(noise))
+    words = ", ".join(
+        f"{name} {seen:.3g}, stated {stated:.3g}" for name, seen, stated in last.noise_below_stated
+    )
     warnings.warn(f"plant: the records show less noise than stated, which counts: {words}", stacklevel=2)
     return last
 

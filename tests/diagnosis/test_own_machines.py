@@ -175,6 +175,7 @@ def test_noise_stated_far_too_large_hides_no_effect():
         found = diagnose(case.with_noise(100 * case.noise))
     assert (found.verdict, found.combination) == ("effect", ("input_delay",))
     assert case.noise < found.case.noise < 5 * case.noise
+    assert found.noise_below_stated == (("y", found.case.noise[0], 100 * case.noise[0]),)
 
 
 def test_noise_stated_too_large_makes_no_effect():
