@@ -37,7 +37,8 @@ _LEAST_KEPT = 0.3
 # Share of the stated model error that may act as an effect does: one standard deviation (set on 40 generated
 # cases, where dry friction and cogging of the background added to what was found).
 _ALIKE = 0.25
-# Share of the held-out gap that effects close, or of an unknown cause nothing is put into the model.
+# What closes less than this share of the held-out gap, or leaves as much of the motion, is not put into the
+# model where the cause is unknown.
 _MOST_OF_IT = 0.5
 # RMS in noise deviations: what a simulation without error leaves, and a little that the search has not found.
 _NEAR_NOISE = 2.0

@@ -34,9 +34,9 @@ _CONVERGED, _SETTLED = 1e-5, 0.01
 _FORETOLD = 1e-6
 # Share of the response to a pulse that, in its own sample, shows an input that acts before its row.
 _AT_ONCE = 0.02
-# Condition of the eigenvectors up to which a logarithm made with them is good to ten digits.
-_LOSES_LITTLE = 1e6
 _FORGOTTEN = 1e-7
+# Condition of the eigenvectors up to which a logarithm made with them is good to nine digits.
+_LOSES_LITTLE = 1e6
 # Orders of filters that a response may be of: the first that has all of it to the first share, else the best
 # to the second (what it misses, rounds add). Samples that they are fitted to.
 _ORDERS, _EXACT, _CLOSE = (2, 3, 4, 5, 6), 1e-9, 0.03

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 from scipy.signal import lsim
 
 from diagnosis import EffectParameter, Plant, PlantEffect, PlantExperiment, with_effects
@@ -219,6 +220,24 @@ def test_a_spring_around_a_simulation_is_the_one_written_into_it(samples):
     inside = _semi_implicit(force[:, 0].copy(), 60.0, dt_s)
     assert 60 * np.max(inside**2) > 0.4 * 40
     assert np.linalg.norm(found - inside) < 0.002 * np.linalg.norm(free - inside)
+
+
+@pytest.mark.parametrize(
+    ("roots", "atol"),
+    [
+        ([0.9, 0.5], 1e-12),
+        ([0.8 + 0.3j, 0.8 - 0.3j, 0.99], 1e-12),
+        # The eigenvectors of two poles in one place are one vector, of two next to each other nearly.
+        ([0.9, 0.9, 0.5], 1e-7),
+        ([0.7, 0.7 + 1e-9], 1e-7),
+    ],
+)
+def test_a_body_between_samples_is_at_samples_the_filter_it_is_made_of(roots, atol):
+    n, poles = len(roots), -np.real(np.poly(roots))[1:]
+    body = LinearBody.of(poles, np.linspace(1.0, 0.5, n), 0, 0.01, of_speed=False)
+    step = expm(body.generator[:n, :n])
+    np.testing.assert_allclose(step[:, 0], poles, rtol=0, atol=atol)
+    np.testing.assert_allclose(step[:-1, 1:], np.eye(n - 1), rtol=0, atol=atol)
 
 
 def test_fewer_than_six_samples_per_period_are_told():
