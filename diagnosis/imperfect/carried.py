@@ -24,9 +24,9 @@ _LEAST_CLOSED, _WORTH_A_THIRD = 0.02, 0.1
 def shares_of(
     search: Search, matter: Sequence[str], accepted: Explanation, rng: np.random.Generator
 ) -> Shares:
-    """matter : those of the effects of the repaired model that are not small.
+    """Shares of the energy of the held-out residuals beyond white noise of the stated size (design 6.2).
 
-    Shares of the energy of the held-out residuals beyond white noise of the stated size (design 6.2).
+    matter : those of the effects of the repaired model that are not small.
 
     Carried is the Shapley value of every effect of the repaired model, small ones included: what it closes,
     averaged over the orders in which they could be added, so that it depends on none and all together are

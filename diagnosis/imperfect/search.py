@@ -110,7 +110,7 @@ class Search:
         self.records = Records(self.case, self.case.estimation, at_inputs=self.at_inputs)
         self.held_out = Records(self.case, self.case.held_out, at_inputs=self.at_inputs)
         self.points: list[tuple[Candidate, list[Point]]] = []
-        # Sets already fitted without one of their effects, with a simpler one, with one in place of another.
+        # Already tried: sets without one of their effects, with a simpler one, with another in its place.
         self._reduced: set[tuple[object, ...]] = set()
         # Whether starts of held-out records feel contacts.
         self._touching = False

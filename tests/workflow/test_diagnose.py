@@ -255,6 +255,10 @@ def test_beside_a_model_error_a_hub_angle_is_enough(folder, tmp_path, engine, wo
     html = re.sub("<[^>]*>", "", files["arm.html"].decode())
     for one in words:
         assert one in html
+    # What is no answer is not said to interest.
+    assert ("interests" in re.findall(r"<th[^>]*>([^<]*)</th>", files["arm.html"].decode())) == (
+        engine.verdict == "effect"
+    )
     # One meaning of the gap: per cent of the motion, computed here without the diagnosis.
     loaded = load_case(case).case
     (held,) = loaded.held_out

@@ -60,4 +60,4 @@ def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path, faults_seen):
         replace(found, noise_below_stated=(("speed_rad_s", 0.05, 0.5),)), tmp_path / "quiet.html"
     )
     page = " ".join(re.sub(r"<[^>]+>", " ", (tmp_path / "quiet.html").read_text()).split())
-    assert page.count("what counts here is what they show: speed 0.05 rad/s (stated: 0.5 rad/s).") == 2
+    assert page.count("What counts here is what they show: speed 0.05 rad/s (stated: 0.5 rad/s).") == 2
