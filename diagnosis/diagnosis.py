@@ -28,7 +28,13 @@ from diagnosis.evidence.look_alikes import look_alikes
 from diagnosis.evidence.search import Progress, search
 from diagnosis.fit.fit import Fit, fit, parameter_intervals
 from diagnosis.fit.residual import ResidualModel
-from diagnosis.imperfect.answered import beside_imperfections, looked_at_again, reaches_noise, searched
+from diagnosis.imperfect.answered import (
+    beside_imperfections,
+    looked_at_again,
+    looked_at_halves,
+    reaches_noise,
+    searched,
+)
 from diagnosis.imperfect.levels import quietest
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine
@@ -42,7 +48,7 @@ from diagnosis.next_experiment.discrimination import (
 from plant.effects import LOOK_ALIKES
 from plant.effects.search_space import Candidate
 
-# Share of the progress that the first search of an own machine is; the second may not be needed.
+# Share of the progress that the first search is; the second may not be needed.
 _FIRST_SEARCH = 0.6
 # Noise of an own machine is what the quietest octave shows where that is below the one share of what is
 # stated, not below the other.
@@ -101,8 +107,6 @@ def _answered(
     weighing = case.machine.weighing
     if not weighing.model_error > 0:
         return _without_error(case, progress, rng)
-    if not isinstance(case, PlantCase):
-        return beside_imperfections(searched(case, progress, deadline_s), rng)
     found = searched(case, lambda done, what: progress(_FIRST_SEARCH * done, what), deadline_s)
     if found.left_out:
         return beside_imperfections(found, rng)
@@ -110,6 +114,8 @@ def _answered(
     def again(done: float, what: str) -> None:
         progress(_FIRST_SEARCH + (1 - _FIRST_SEARCH) * done, what)
 
+    if not isinstance(case, PlantCase):
+        return looked_at_halves(beside_imperfections(found, rng), again, deadline_s, rng)
     if not weighing.stated and reaches_noise(found):
         exact = _without_error(case.without_model_error(), again, rng)
         if exact.verdict != "unknown":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -78,6 +79,32 @@ def looked_at_again(
     search.run()
     again = beside_imperfections(search, rng)
     return again if again.combination and not set(again.combination) & named else answer
+
+
+def looked_at_halves(
+    answer: Diagnosis, progress: Progress, deadline_s: float, rng: np.random.Generator
+) -> Diagnosis:
+    """The answer of an arm whose held-out records may show what its estimation records do not.
+
+    An effect that only held-out records excite is in no fit: it stays "unknown", or is none. The first halves
+    of these records are then fitted along, and the second halves judge. Taken where that names an effect
+    which closes most of the gap there; not sought where the answer is sure, nor where nothing interests.
+    """
+    case, shares = answer.case, answer.shares
+    left = max(shares.before) if shares else 0.0
+    if answer.probability >= SURE or not (answer.verdict == "unknown" or left > case.model_error):
+        return answer
+    halves, names = case.in_halves()
+    if not names:
+        return answer
+    search = Search(halves, progress, deadline_s, first_halves=names)
+    search.run()
+    again = beside_imperfections(search, rng)
+    if again.verdict == "effect" and again.gap_closed > _MOST_OF_IT:
+        return replace(again, first_halves=names, left_before_halves=left)
+    if shares and search.left_out:
+        return replace(answer, shares=replace(shares, not_tried=("first halves of held-out records",)))
+    return answer
 
 
 def reaches_noise(search: Search) -> bool:

@@ -32,7 +32,7 @@ def shares_of(
     averaged over the orders in which they could be added, so that it depends on none and all together are
     what the model closes; intervals by bootstrap over blocks of samples.
     """
-    base = search.base
+    base, held = search.base, search.held_out
     fitted = [name for name in matter if name in accepted.names]
     names = (*fitted, *(name for name in accepted.names if name not in fitted))
     subsets = {
@@ -57,8 +57,8 @@ def shares_of(
     told = sorted(((c, key) for key, c in closed.items() if _tells(key, closed)), reverse=True)[:_MOST_TOLD]
     return Shares(
         names=tuple(search.case.machine.output_names),
-        before=tuple(map(float, base.shares[1])),
-        after=tuple(map(float, accepted.shares[1])),
+        before=tuple(map(float, held.shares(base.left_held_out))),
+        after=tuple(map(float, held.shares(accepted.left_held_out))),
         interests=search.case.machine.weighing.model_error,
         carried=carried,
         small=tuple(name for name in names if name not in matter),

@@ -204,9 +204,18 @@ class Records:
     def shares(self, residuals: Sequence[Real]) -> Real:
         """(Y,) RMS left beyond what sensors may have over the RMS of the motion (about the mean), all
         records; of both what is felt (`Levels`)."""
+        return share_left(self.energies(residuals))
+
+    def energies(self, residuals: Sequence[Real]) -> Real:
+        """(2, R, Y) energies left beyond what sensors may have, and of the motion, of every record."""
         levels, Y = self.levels, self.case.noise.size
         energy = levels.energy(np.concatenate([coefficients(e) for e in residuals]))
         beyond = levels.felt * (energy - levels.noise)
-        left = np.maximum(np.bincount(levels.belongs, beyond), 0.0).reshape(-1, Y).sum(axis=0)
-        motion = levels.motion.reshape(-1, Y).sum(axis=0)
-        return np.asarray(np.sqrt(left / motion))
+        left = np.maximum(np.bincount(levels.belongs, beyond), 0.0)
+        return np.array([left, levels.motion]).reshape(2, -1, Y)
+
+
+def share_left(energies: Real) -> Real:
+    """(2, R, Y) energies of `Records.energies` -> (Y,) RMS left over the RMS of the motion."""
+    left, motion = energies.sum(axis=1)
+    return np.asarray(np.sqrt(left / motion))

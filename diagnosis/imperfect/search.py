@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from diagnosis.imperfect.descent import Descent, best_following, descend, loss_at, occam, refined, scanned
-from diagnosis.imperfect.records import Records, Start
+from diagnosis.imperfect.records import Records, Start, share_left
 from diagnosis.imperfect.settled import settled
 from diagnosis.imperfect.starts import Point, beside, points_of
 from diagnosis.imperfect.windows import in_windows
@@ -46,7 +46,7 @@ _SCANS, _GAINED_BY_SCAN = 2, 2.0
 # Sets of each size with contacts whose starts feel them, and how far behind in evidence they may be.
 _TOUCHING, _TOUCHING_ITERATIONS, _UNLIKELY = 2, 5, 150.0
 # An effect is exchanged for one that is no further behind in evidence in a part of the set, nor in loss in
-# its place once all else has followed.
+# its place once all else has followed; nor further are sets, before they are fitted together.
 _AS_LIKELY = 15.0
 # Of octaves, what is felt where disturbances of the inputs are amplified.
 _AMPLIFIED = 0.5
@@ -97,12 +97,15 @@ class Search:
     """All that was fitted to a case, the nominal alone first.
 
     at_inputs : the model error is one of the inputs, whatever the machine makes of it (`Levels`).
+    first_halves : names of the estimation records that are first halves of held-out ones (`Case.in_halves`):
+        what a set leaves of these counts as left of held-out records. A second look.
     """
 
     case: CaseOfMachine
     progress: Progress
     deadline_s: float = np.inf
     at_inputs: bool = False
+    first_halves: tuple[str, ...] = ()
     found: list[Explanation] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
 
@@ -120,6 +123,10 @@ class Search:
         return self.found[0]
 
     @property
+    def _likeliest(self) -> Explanation:
+        return max(self.found, key=lambda e: e.evidence)
+
+    @property
     def simulations(self) -> int:
         return self.records.simulations + self.held_out.simulations
 
@@ -132,7 +139,8 @@ class Search:
         """The nominal, every effect alone, then sets of two, three and more beside the likeliest.
 
         Beyond three only while the likeliest leaves more of the motion than is stated not to interest, and
-        the last size was worth it.
+        the last size was worth it. A second look is to take less time than the first: none beyond two where
+        contacts switch, and no scans, windows and starts of contacts.
         """
         weighing = self.case.machine.weighing
         P = self.records.nominal.count
@@ -144,12 +152,14 @@ class Search:
         for count in range(2, weighing.most_effects + 1):
             if count > 3 and not (self._unexplained and self._worth(count - 1)):
                 break
+            if count > 2 and self.first_halves and self._likeliest.end.non_smooth:
+                break
             self._together(count)
-        if self._unexplained:
+        if self._unexplained and not self.first_halves:
             self._from_windows()
         several = best_of_sets(e for e in self.found if len(e.names) > 1)
         self._containing(list(several.values())[:_CONTINUED])
-        if self._unexplained:
+        if self._unexplained and not self.first_halves:
             self._scanned()
             self._from_contacts()
         self._look_alikes()
@@ -157,8 +167,7 @@ class Search:
     @property
     def _unexplained(self) -> bool:
         """Whether the likeliest leaves more of the motion than is stated not to interest."""
-        likeliest = max(self.found, key=lambda e: e.evidence)
-        return bool(np.max(likeliest.shares) > self.case.machine.weighing.model_error)
+        return bool(np.max(self._likeliest.shares) > self.case.machine.weighing.model_error)
 
     def _worth(self, count: int) -> bool:
         """Whether the likeliest set of so many effects is much likelier than that of one fewer."""
@@ -451,11 +460,33 @@ class Search:
                 if (this := (*key, around.loss, explanation.evidence, rival.evidence)) in self._reduced:
                     continue
                 self._reduced.add(this)
-                at = rival.end.coordinates_of(rival.names.index(other.effect))
-                x, candidates = np.concatenate([around.coordinates, at]), (*around.candidates, other)
-                loss, d, x = best_following(self.records, around, candidates, [x])
-                if loss < explanation.end.loss + _AS_LIKELY:
-                    best[key] = self.add(descend(self.records, candidates, d, x, around.start))
+                joined = self._joined(around, rival, [other], explanation.end.loss)
+                if joined is not None:
+                    best[key] = joined
+
+    def joined(self, one: Explanation, other: Explanation) -> None:
+        """Both together where no set of their effects is known: each may explain other records, and larger
+        sets are sought beside the likeliest alone."""
+        further = [c for c in other.end.candidates if c.effect not in one.names]
+        together = (*one.end.candidates, *further)
+        key = tuple(sorted(c.effect for c in together))
+        contained = {c.kind.contains for c in together} & set(key)
+        if len(key) > self.case.machine.weighing.most_effects or contained or key in best_of_sets(self.found):
+            return
+        if (this := (*key, one.evidence, other.evidence)) not in self._reduced:
+            self._reduced.add(this)
+            self._joined(one.end, other, further, one.end.loss)
+
+    def _joined(
+        self, around: Descent, rival: Explanation, further: Sequence[Candidate], loss: float
+    ) -> Explanation | None:
+        """Effects of a rival beside others, from where it ended; None where they leave much more than loss."""
+        at = [rival.end.coordinates_of(rival.names.index(c.effect)) for c in further]
+        x, candidates = np.concatenate([around.coordinates, *at]), (*around.candidates, *further)
+        followed, d, x = best_following(self.records, around, candidates, [x])
+        if followed >= loss + _AS_LIKELY:
+            return None
+        return self.add(descend(self.records, candidates, d, x, around.start))
 
     def without(self, explanation: Explanation, k: int) -> Explanation:
         """The best explanation by the same effects but the k-th."""
@@ -535,6 +566,8 @@ class Search:
         start, e = settled(held, end.deviations, end.effects, beginning, touching=touching)
         left, left_held_out = records.residuals_of(end.left), held.residuals_of(e)
         states = 0.5 * np.sum((start.states / held.state_spread) ** 2, axis=1)
+        fitted, begun = records.energies(left), [e.name in self.first_halves for e in records.experiments]
+        predicted = np.concatenate([fitted[:, begun], held.energies(left_held_out)], axis=1)
         return Explanation(
             end,
             -np.concatenate([records.losses(end.left), held.losses(e) + states]),
@@ -542,7 +575,7 @@ class Search:
             occam(records, end),
             left,
             left_held_out,
-            np.array([records.shares(left), held.shares(left_held_out)]),
+            np.array([share_left(fitted), share_left(predicted)]),
         )
 
     def _beginning(self, held: Records, fitted: Start) -> Start:

@@ -138,6 +138,7 @@ def judged(search: Search) -> Verdict:
         sets = _weighed(search)
         for near in (one for one in sets if one.score > sets[0].score - _NEAR):
             search.exchanged(near.explanation, {part.name for part in near.parts if part.matters > 0.5})
+            search.joined(sets[0].explanation, near.explanation)
         for one in [sets[0].explanation, *search.found[known:]]:
             search.simpler(one)
         if len(search.found) == known:
@@ -287,6 +288,9 @@ def _part(
         share = estimated
     elif estimated < held_out and score_of(explanation, weighing) > _BEHIND + score_of(rest, weighing):
         # Without it the others fit the records they were fitted to as well, with values that others refute.
+        share = held_out
+    if search.first_halves:
+        # What is asked is what closes the gap that the other records do not show.
         share = held_out
     share = max(share, seen.share if seen else 0.0)
     matters = _soft(share / limit / model_error, _INTERESTS_WIDTH)

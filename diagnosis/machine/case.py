@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from diagnosis.machine.flexible_arm import NOISE, FlexibleArm
-from diagnosis.machine.machine_protocol import Real, RecordedCase, Role, check_record
+from diagnosis.machine.machine_protocol import FEWEST_SAMPLES, Real, RecordedCase, Role, check_record
 from diagnosis.machine.quantisation_grid import grid_step
 from ident.data.arrays import lock
 from plant.rig import Output, Rig
@@ -57,6 +57,19 @@ class Experiment:
         """(T, 1) the voltage."""
         return self.voltage_V[:, None]
 
+    def part(self, name: str, role: Role, first: int, end: int) -> Experiment:
+        """Its rows from first up to end as a record of its own."""
+        reference = None if self.reference_rad is None else self.reference_rad[first:end]
+        return replace(
+            self,
+            name=name,
+            role=role,
+            voltage_V=self.voltage_V[first:end],
+            output=self.output[first:end],
+            reference_rad=reference,
+            missing=tuple(row - first for row in self.missing if first <= row < end),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Case(RecordedCase[Experiment]):
@@ -86,6 +99,20 @@ class Case(RecordedCase[Experiment]):
                     f"case {self.name}: sensors.{NOISE[name]} is {level:g}; {name} needs a noise level above "
                     "zero to judge a gap by"
                 )
+
+    def in_halves(self) -> tuple[Case, tuple[str, ...]]:
+        """With the first half of every held-out record among the estimation records, and the names of these;
+        records that stand still in a half stay whole."""
+        experiments, halves = [*self.estimation], list[str]()
+        for e in self.held_out:
+            half, end = len(e.output) // 2, len(e.output)
+            if half < FEWEST_SAMPLES or not all(np.ptp(y, axis=0).all() for y in np.split(e.output, [half])):
+                experiments.append(e)
+                continue
+            halves.append(f"{e.name} (first half)")
+            experiments.append(e.part(halves[-1], "estimation", 0, half))
+            experiments.append(e.part(f"{e.name} (second half)", "held_out", half, end))
+        return replace(self, experiments=tuple(experiments)), tuple(halves)
 
     @property
     def outputs(self) -> tuple[Output, ...]:

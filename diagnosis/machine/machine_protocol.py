@@ -21,7 +21,7 @@ Real = npt.NDArray[np.float64]
 Role = Literal["estimation", "held_out"]
 Record = TypeVar("Record", bound="RecordOfMachine")
 
-_FEWEST_SAMPLES = 20
+FEWEST_SAMPLES = 20
 
 
 @dataclass(frozen=True)
@@ -194,8 +194,8 @@ def check_record(record: RecordOfMachine, output_names: Sequence[str] = ()) -> N
         raise ValueError(f"{what}: role must be estimation or held_out; got {record.role!r}")
     if not (np.all(np.isfinite(u)) and np.all(np.isfinite(y))):
         raise ValueError(f"{what}: a value is not finite")
-    if len(u) < _FEWEST_SAMPLES:
-        raise ValueError(f"{what}: {len(u)} samples, needs at least {_FEWEST_SAMPLES}")
+    if len(u) < FEWEST_SAMPLES:
+        raise ValueError(f"{what}: {len(u)} samples, needs at least {FEWEST_SAMPLES}")
     for column, output in zip(y.T, output_names, strict=False):
         if np.ptp(column) == 0:
             raise ValueError(f"{what}: {output} is {column[0]:.6g} throughout: is the sensor dead?")

@@ -19,7 +19,7 @@ from diagnosis import (
     PlantExperiment,
     diagnose,
 )
-from diagnosis.imperfect.answered import _in_part
+from diagnosis.imperfect.answered import _in_part, beside_imperfections, searched
 from diagnosis.imperfect.carried import shares_of
 from diagnosis.imperfect.descent import Descent, descend, occam, refined, scanned
 from diagnosis.imperfect.levels import Levels, coefficients, quietest
@@ -696,12 +696,13 @@ def _judged(sets, **told):
     return judged(_searched(sets, **told))
 
 
-def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
+def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0, first_halves=()):
     """A search that has found sets of effects by what they gain and leave: (log likelihood, shares of the
     motion left of estimation and of held-out records).
 
     step_m: of the tip's values. acts: share of the motion that each effect changes of held-out records.
     stated: what stated values leave, as an explanation. turned_rad: of every coordinate that is an angle.
+    first_halves: of held-out records, that are fitted along.
     """
     rng = np.random.default_rng(9)
     records = []
@@ -743,10 +744,73 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
         without=lambda whole, k: found[frozenset(whole.names) - {whole.names[k]}],
         simpler=lambda explanation: None,
         exchanged=lambda explanation, sought: None,
+        joined=lambda one, other: None,
+        first_halves=first_halves,
         acts_on_held_out=lambda whole, k: acts,
         by_these=lambda names, whole: found[frozenset(names)],
         finished=lambda explanation: explanation,
     )
+
+
+@pytest.mark.parametrize(("first_halves", "answer"), [((), "none"), (("a",), "hardening_spring")])
+def test_in_a_second_look_an_effect_carries_what_it_does_of_held_out_records(first_halves, answer):
+    sets = {(): (0.0, 0.02, 0.06), ("hardening_spring",): (24.0, 0.02, 0.01)}
+    assert _judged(sets, first_halves=first_halves).answer == answer
+
+
+def _swinging_out(effect):
+    """Records of an independent simulator: only the held-out one begins far from a hub angle of zero."""
+    rng = np.random.default_rng(21)
+    background = Background(dry_friction_Nm=0.004, presliding_rad=1e-3)
+    truth = Truth(RIG.model_dump(exclude={"tolerances"}), (effect,), background)
+    records = []
+    for name, role, start_rad, size in (
+        ("a", "estimation", 0.0, 0.6),
+        ("b", "estimation", 0.0, 0.6),
+        ("c", "held_out", 1.2, 1.5),
+    ):
+        voltage = size * rng.choice([-1.0, 1.0], 40).repeat(15)
+        clean = truth.record(voltage, None, None, Before(start_rad))
+        read = np.column_stack([clean.hub_angle_rad, clean.tip_m])
+        noise = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
+        records.append(Experiment(name, role, voltage, read + noise * rng.standard_normal(read.shape)))
+    return Case("swinging out", RIG, tuple(records), 0.05)
+
+
+def test_what_only_held_out_records_excite_is_found_in_their_first_halves():
+    case = _swinging_out({"name": "hardening_spring", "cubic_Nm_rad3": 0.02})
+    first = beside_imperfections(searched(case, lambda share, words: None), np.random.default_rng(0))
+    assert first.combination != ("hardening_spring",)
+    assert first.left_before_halves != first.left_before_halves
+    found = diagnose(case)
+    assert (found.combination, found.first_halves) == (("hardening_spring",), ("c (first half)",))
+    assert [(e.name, len(e.output)) for e in found.case.held_out] == [("c (second half)", 300)]
+    (spring,) = [e for e in found.effects if e.name == "hardening_spring"]
+    assert spring.parameters["cubic_Nm_rad3"] == pytest.approx(0.02, rel=0.05)
+    assert found.left_before_halves == max(first.shares.before) > 0.05
+    # What is said of held-out records is said of those that no fit has seen.
+    assert found.gap_closed > 0.95
+    before = found.residuals_refit["c (second half)"][:, 0] * case.noise[0]
+    share = np.sqrt(np.mean(before**2)) / np.std(case.held_out[0].output[300:, 0])
+    assert found.shares.before[0] == pytest.approx(share, rel=0.1)
+
+
+def test_two_likely_sets_that_explain_other_records_are_also_fitted_together():
+    search, kinds = _hub_only(2, {"name": "gravity", "acceleration_m_s2": 0.3})
+    nothing, start = np.zeros(search.records.nominal.count), search.records.at_rest()
+    fits = {
+        names: descend(search.records, [kinds[n] for n in names], nothing, np.log(sizes), start)
+        for names, sizes in {(): [], ("gravity",): [0.3], ("coulomb_friction",): [2e-3]}.items()
+    }
+    _, gravity, friction = (search.add(end) for end in fits.values())
+    search.joined(gravity, friction)
+    together = ("coulomb_friction", "gravity")
+    (both,) = [e for e in search.found if e.key == together]
+    assert both.end.loss < min(gravity.end.loss, friction.end.loss)
+    known = len(search.found)
+    search.joined(friction, gravity)
+    search.joined(both, gravity)
+    assert len(search.found) == known
 
 
 @pytest.mark.parametrize(

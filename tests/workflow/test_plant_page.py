@@ -61,3 +61,9 @@ def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path, faults_seen):
     )
     page = " ".join(re.sub(r"<[^>]+>", " ", (tmp_path / "quiet.html").read_text()).split())
     assert page.count("What counts here is what they show: speed 0.05 rad/s (stated: 0.5 rad/s).") == 2
+    assert "of their second halves" not in page
+    looked_again = replace(found, first_halves=("a (first half)",), left_before_halves=0.125)
+    write_plant_page(looked_again, tmp_path / "halves.html")
+    page = " ".join(re.sub(r"<[^>]+>", " ", (tmp_path / "halves.html").read_text()).split())
+    assert "re-estimated on them, miss 12.5 % of the motion of the held-out records." in page
+    assert "every number for held-out records is of their second halves, which no fit has seen." in page

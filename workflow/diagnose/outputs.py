@@ -59,8 +59,8 @@ class Work:
         with naming(f"case {case.name}"):
             found = self.diagnose(case, progress=lambda f, m: report(_DIAGNOSED * f, m))
             report(_DIAGNOSED, "where")
-            place = where(case, found.residuals_refit, found.probabilities)
-            remains = where(case, found.residuals_after)
+            place = where(found.case, found.residuals_refit, found.probabilities)
+            remains = where(found.case, found.residuals_after)
             report(_WHERE, "next experiment")
             coming = following(found)
             report(_NEXT, "controller")
