@@ -480,7 +480,7 @@ class Search:
     def _joined(
         self, around: Descent, rival: Explanation, further: Sequence[Candidate], loss: float
     ) -> Explanation | None:
-        """Effects of a rival beside others, from where it ended; None where they leave much more than loss."""
+        """Effects of a rival beside others, from where it ended; None where much more than `loss` is left."""
         at = [rival.end.coordinates_of(rival.names.index(c.effect)) for c in further]
         x, candidates = np.concatenate([around.coordinates, *at]), (*around.candidates, *further)
         followed, d, x = best_following(self.records, around, candidates, [x])
