@@ -119,7 +119,7 @@ class Diagnosis:
     noise_below_stated : tuple of (output, noise, stated noise). Of an own machine whose records show less
         noise than is stated, in whose place it was counted.
     first_halves : tuple of str. Estimation records of `case` that are first halves of held-out ones, fitted
-        along because these show what the others do not; held out are then the second halves.
+        along because the others leave the answer open; held out are then the second halves.
     left_before_halves : float. Share of the motion that the nominal, re-estimated on the other records alone,
         leaves of the whole held-out records, of the output with most; nan without first halves.
     competing : tuple of CompetingHypothesis. Fitted explanations that contradict each other, most probable

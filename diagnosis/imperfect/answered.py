@@ -87,8 +87,9 @@ def looked_at_halves(
     """The answer of an arm whose held-out records may show what its estimation records do not.
 
     An effect that only held-out records excite is in no fit: it stays "unknown", or is none. The first halves
-    of these records are then fitted along, and the second halves judge. Taken where that names an effect
-    which closes most of the gap there; not sought where the answer is sure, nor where nothing interests.
+    of these records are then fitted along, and the second halves judge. Taken where that names what the first
+    answer does not, and closes most of the gap there; not sought where that is sure, nor where nothing
+    interests.
     """
     case, shares = answer.case, answer.shares
     left = max(shares.before) if shares else 0.0
@@ -100,7 +101,8 @@ def looked_at_halves(
     search = Search(halves, progress, deadline_s, first_halves=names)
     search.run()
     again = beside_imperfections(search, rng)
-    if again.verdict == "effect" and again.gap_closed > _MOST_OF_IT:
+    named = set(again.combination) - set(answer.combination)
+    if named and again.gap_closed > _MOST_OF_IT:
         return replace(again, first_halves=names, left_before_halves=left)
     if shares and search.left_out:
         return replace(answer, shares=replace(shares, not_tried=("first halves of held-out records",)))

@@ -19,7 +19,12 @@ from diagnosis import (
     PlantExperiment,
     diagnose,
 )
-from diagnosis.imperfect.answered import _in_part, beside_imperfections, searched
+from diagnosis.imperfect.answered import (
+    _in_part,
+    beside_imperfections,
+    looked_at_halves,
+    searched,
+)
 from diagnosis.imperfect.carried import shares_of
 from diagnosis.imperfect.descent import Descent, descend, occam, refined, scanned
 from diagnosis.imperfect.levels import Levels, coefficients, quietest
@@ -782,6 +787,9 @@ def test_what_only_held_out_records_excite_is_found_in_their_first_halves():
     first = beside_imperfections(searched(case, lambda share, words: None), np.random.default_rng(0))
     assert first.combination != ("hardening_spring",)
     assert first.left_before_halves != first.left_before_halves
+    in_no_time = looked_at_halves(first, lambda share, words: None, -np.inf, np.random.default_rng(0))
+    assert in_no_time.combination == first.combination
+    assert in_no_time.shares.not_tried == ("first halves of held-out records",)
     found = diagnose(case)
     assert (found.combination, found.first_halves) == (("hardening_spring",), ("c (first half)",))
     assert [(e.name, len(e.output)) for e in found.case.held_out] == [("c (second half)", 300)]
