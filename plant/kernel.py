@@ -22,6 +22,7 @@ _SLACK_RAD = 1e-13
 _AT_START: Any = np.int64(0)
 _IN_THE_MIDDLE: Any = np.int64(1)
 _AT_END: Any = np.int64(2)
+_1, _2, _3, _4 = (np.uint64(i) for i in (1, 2, 3, 4))  # steps of unsigned indices
 _COMPILED: Any = {"cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
 
 
@@ -105,13 +106,30 @@ def _hold(held: Real, mode: Integer, reference: Real, element: Real) -> int:
 
 
 @_inlined
-def _add_rows(table: Real, first: int, values: Real, total: Real) -> None:
-    """Add the values times the table's rows from the first on: whole rows, which lie in one piece."""
-    for m in range(values.size):
-        value, row = values[m], first + m
-        if value != 0.0:
-            for i in range(total.size):
-                total[i] += table[row, i] * value
+def _add_rows(table: Real, first: int, values: Real, begin: int, end: int, total: Real) -> None:
+    """Add values begin..end - 1 times their rows of the table; that of values[0] is the first.
+
+    Four columns at a time, of a multiple of four: their sums stay in registers, and a row costs no loop of
+    its own. Unsigned, because an index that may be negative is looked at before every access.
+    """
+    base = np.uint64(first)
+    for i in range(np.uint64(0), np.uint64(total.size), _4):
+        a, b, c, d = total[i], total[i + _1], total[i + _2], total[i + _3]
+        for m in range(np.uint64(begin), np.uint64(end)):
+            value, row = values[m], base + m
+            a += table[row, i] * value
+            b += table[row, i + _1] * value
+            c += table[row, i + _2] * value
+            d += table[row, i + _3] * value
+        total[i], total[i + _1], total[i + _2], total[i + _3] = a, b, c, d
+
+
+@_inlined
+def _along(rows: Real, row: int, x: Real) -> float:
+    total, r = 0.0, np.uint64(row)
+    for i in range(np.uint64(rows.shape[1])):
+        total += rows[r, i] * x[i]
+    return total
 
 
 @_inlined
@@ -136,21 +154,21 @@ def _add_smooth_forces(
     """Add to new what the smooth forces do in the step, by collocation at its start, middle and end (order
     4).
 
-    base: row of these tables where the step's begin. free, later (2J,), position (3J,) and force (3J,) are
-    work space; the last force is that at the end of the step.
+    base: row of these tables where the step's begin. free, later (2J, filled up as reach), position (3J,) and
+    force (3J,) are work space; the last force is that at the end of the step.
     """
     n, n_channels = x.size, channel_kind.size
     first = base + n + held.size
+    for i in range(free.size):
+        free[i] = 0.0
     for j in range(n_channels):
-        position[j], free[j], free[n_channels + j] = 0.0, 0.0, 0.0
-    for i in range(n):
-        for j in range(n_channels):
-            position[j] += channel_rows[i, j] * x[i]
-    _add_rows(reach, base, x, free)
-    _add_rows(reach, base + n, held, free)
+        position[j] = _along(channel_rows, j, x)
+    _add_rows(reach, base, x, 0, n, free)
+    _add_rows(reach, base + n, held, 0, held.size, free)
     _smooth_forces(
         _AT_START, _AT_START, position, force, mode, channel_kind, channel, static_moment, geometric_stiffness
     )
+    _add_rows(reach, first, force, 0, n_channels, free)
     for j in range(n_channels):
         force[n_channels + j] = force[2 * n_channels + j] = force[j]
     # The sweeps contract by h |df/dv| / J, which `plant.plan` keeps below 0.3.
@@ -168,24 +186,17 @@ def _add_smooth_forces(
                 static_moment,
                 geometric_stiffness,
             )
-        for i in range(2 * n_channels):
+        for i in range(free.size):
             later[i] = free[i]
-        _add_rows(reach, first, force, later)
+        _add_rows(reach, first, force, n_channels, 3 * n_channels, later)
         change, size = 0.0, 1e-3
-        for i in range(2 * n_channels):
-            change = max(change, abs(later[i] - position[n_channels + i]))
+        for i in range(np.uint64(2 * n_channels)):
+            before = np.uint64(n_channels) + i
+            change = max(change, abs(later[i] - position[before]))
             size = max(size, abs(later[i]))
-            position[n_channels + i] = later[i]
+            position[before] = later[i]
         sweep += 1
-    _add_rows(step, first, force, new)
-
-
-@_inlined
-def _along(rows: Real, row: int, x: Real) -> float:
-    total = 0.0
-    for i in range(rows.shape[1]):
-        total += rows[row, i] * x[i]
-    return total
+    _add_rows(step, first, force, 0, 3 * n_channels, new)
 
 
 @_called
@@ -211,7 +222,7 @@ def _modes_still_hold(
     q: int,
 ) -> bool:
     """Fill wanted with the mode every element has in the state new; whether all are as assumed."""
-    n, n_held = new.size, held.size
+    n, n_held = element_rows.shape[1], held.size
     same = True
     for e in range(mode.size):
         angle, speed = _along(element_rows, 2 * e, new), _along(element_rows, 2 * e + 1, new)
@@ -288,18 +299,19 @@ def run(
     substeps (G,): steps per part of the sample (G = 1, or 2 with a fractional delay).
     step (G Q L R, N): transition of the R = N + 3 + E + 3J values (x, held inputs, node forces) per part of
         the sample, matrix set and step size 2^l, one below the other: views of them cost up to a fourth.
-    reach (G Q L R, 2J): the same to the channel positions at the middle and the end of the step.
+    reach (G Q L R, 2J): the same to the channel positions at the middle and the end of the step. Columns of
+        zeros fill both up to a multiple of four.
     element (E, 6): kind, then friction (k, Tc, Ts - Tc, vs, 0) or contact (gap/2, kc, cc, 0, 0).
     element_rows (2E, N): relative angle and speed.
     element_rate (Q E, N + 3 + E + J): relative acceleration.
-    channel_kind (J,), channel (J, 3), channel_rows (N, J): smooth forces and the position each depends on.
+    channel_kind (J,), channel (J, 3), channel_rows (J, N): smooth forces and the position each depends on.
     static_moment (M,), geometric_stiffness (M, M): of the modes under gravity; empty without it.
     """
     n, n_elements, n_channels = x.size, mode.size, channel_kind.size
     n_rows, n_sets = n + 3 + n_elements + 3 * n_channels, 1 << n_elements
     n_levels = step.shape[0] // (n_rows * n_sets * substeps.size)
-    held, new = np.zeros(3 + n_elements), np.empty(n)
-    free, later = np.empty(2 * n_channels), np.empty(2 * n_channels)
+    held, new = np.zeros(3 + n_elements), np.empty(step.shape[1])
+    free, later = np.empty(reach.shape[1]), np.empty(reach.shape[1])
     position, force = np.zeros(3 * n_channels), np.zeros(3 * n_channels)
     wanted = np.zeros(n_elements, dtype=np.int64)
     for k in range(inputs.shape[0]):
@@ -319,10 +331,10 @@ def run(
                 while remaining > 0:
                     q = _hold(held, mode, reference, element)
                     base = ((part * n_sets + q) * n_levels + level) * n_rows
-                    for i in range(n):
+                    for i in range(new.size):
                         new[i] = 0.0
-                    _add_rows(step, base, x, new)
-                    _add_rows(step, base + n, held, new)
+                    _add_rows(step, base, x, 0, n, new)
+                    _add_rows(step, base + n, held, 0, held.size, new)
                     if n_channels > 0:
                         _add_smooth_forces(
                             step,

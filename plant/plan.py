@@ -112,13 +112,12 @@ def make_plan(
     part_lengths = (dt_s,) if fraction == 0.0 else (fraction * dt_s, (1 - fraction) * dt_s)
     substeps = [int(np.ceil(length / longest * (1 - 1e-12))) if switching else 1 for length in part_lengths]
     rows = n + held_columns.shape[1] + 3 * n_channels
-    step = np.empty((len(part_lengths), len(state_matrices), halvings + 1, rows, n))
-    reach = np.empty((len(part_lengths), len(state_matrices), halvings + 1, rows, 2 * n_channels))
+    tables = len(part_lengths), len(state_matrices), halvings + 1, rows
+    step, reach = (np.zeros((*tables, -(-columns // 4) * 4)) for columns in (n, 2 * n_channels))
     for part, (length, count) in enumerate(zip(part_lengths, substeps, strict=True)):
         for q, a in enumerate(state_matrices):
-            _transitions(
-                a, held_columns, force_columns, channel_rows, length / count, step[part, q], reach[part, q]
-            )
+            into = step[part, q, ..., :n], reach[part, q, ..., : 2 * n_channels]
+            _transitions(a, held_columns, force_columns, channel_rows, length / count, *into)
     rate = np.zeros((len(state_matrices), n_elements, n + held_columns.shape[1] + n_channels))
     for q, a in enumerate(state_matrices):
         for e in range(n_elements):
@@ -126,15 +125,15 @@ def make_plan(
     output_rows = builder.outputs()
     arguments = (
         np.array(substeps, dtype=np.int64),
-        step.reshape(-1, n),
-        reach.reshape(step.size // n, 2 * n_channels),
+        step.reshape(-1, step.shape[-1]),
+        reach.reshape(-1, reach.shape[-1]) if n_channels else np.zeros((0, 0)),
         output_rows,
         element,
         element_rows.reshape(-1, n),
         rate.reshape(-1, rate.shape[2]),
         kinds,
         channel,
-        np.ascontiguousarray(channel_rows.T),
+        channel_rows,
         *builder.gravity(),
     )
     return Plan(
