@@ -22,6 +22,8 @@ Progress = Callable[[float, str], None]
 
 # Starts descended from alone; parents extended and effects fitted beside each: pairs, larger sets.
 _ALONE, _BESIDE_POINTS = 2, 4
+# Further ones of one value that are better than their neighbours, whatever they leave.
+_VALLEYS = 1
 _PARENTS, _TRIED = (3, 1), (6, 4)
 # Further parents beside which only what every machine has some of is fitted, how many of these beside each,
 # and how far behind in evidence they may be.
@@ -220,6 +222,7 @@ class Search:
                 break
             if all(point.far_from(other) for other in chosen):
                 chosen.append(point)
+        chosen += [point for point in _valleys(points) if all(map(point.far_from, chosen))][:_VALLEYS]
         ends = [self._from(around, candidate, point, nominal) for point in chosen]
         return min(ends, key=lambda end: end.loss)
 
@@ -611,6 +614,17 @@ def _spread(points: Sequence[Point]) -> Sequence[Point]:
     """The best and, because beside another effect any size may be right, some of the rest."""
     rest = points[_BESIDE_POINTS:]
     return [*points[:_BESIDE_POINTS], *rest[:: max(1, len(rest) // _BESIDE_POINTS)]]
+
+
+def _valleys(points: Sequence[Point]) -> list[Point]:
+    """Points of a grid of one value that are better than their neighbours, the best first: a delay of whole
+    periods leaves more than none, and another delay between them more than either."""
+    if points[0].coordinates.size != 1:
+        return []
+    line = sorted(points, key=lambda point: float(point.coordinates[0]))
+    losses = np.array([np.inf, *(point.loss for point in line), np.inf])
+    better = (losses[1:-1] < losses[:-2]) & (losses[1:-1] < losses[2:])
+    return sorted([line[k] for k in np.flatnonzero(better)], key=lambda point: point.loss)
 
 
 def _point(end: Descent) -> Point:

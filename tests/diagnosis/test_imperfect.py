@@ -29,9 +29,9 @@ from diagnosis.imperfect.carried import shares_of
 from diagnosis.imperfect.descent import Descent, descend, occam, refined, scanned
 from diagnosis.imperfect.levels import Levels, coefficients, quietest
 from diagnosis.imperfect.records import Records, Start, StartColumns
-from diagnosis.imperfect.search import Explanation, Search
+from diagnosis.imperfect.search import Explanation, Search, _valleys
 from diagnosis.imperfect.settled import best_move, settled
-from diagnosis.imperfect.starts import points_of
+from diagnosis.imperfect.starts import Point, points_of
 from diagnosis.imperfect.verdict import TEMPER, _enough, _weights, is_silent, judged
 from diagnosis.imperfect.windows import in_windows
 from diagnosis.machine.flexible_arm import FlexibleArm
@@ -559,6 +559,25 @@ def test_beside_another_effect_a_fit_also_starts_where_it_ended_alone(tmp_path):
     generate(48, 6023, tmp_path, jobs=1, workshop=True, finished=others)
     found = diagnose(load_case(tmp_path / "case_0005").case)
     assert set(found.combination) == {"hub_inertia", "hardening_spring"}
+
+
+@pytest.mark.slow
+def test_a_delay_of_more_than_a_period_is_found_beside_what_hides_it(tmp_path):
+    # Alone any delay of the grid leaves more than none; from the best far one both are found.
+    others = {f"case_{k:04d}": {"case": f"case_{k:04d}"} for k in range(1, 41) if k != 39}
+    generate(40, 6173, tmp_path, jobs=1, workshop=True, finished=others)
+    found = diagnose(load_case(tmp_path / "case_0039").case)
+    assert set(found.combination) == {"input_delay", "joint_compliance"}
+
+
+def test_a_value_is_also_sought_from_where_its_neighbours_leave_more():
+    def points(losses, values=1):
+        return [Point(loss, np.full(values, float(k)), *[None] * 2) for k, loss in enumerate(losses)]
+
+    found = _valleys(sorted(points([5, 6, 9, 7, 8, 4]), key=lambda point: point.loss))
+    assert [(point.loss, *point.coordinates) for point in found] == [(4, 5), (5, 0), (7, 3)]
+    assert _valleys(points([3.0]))
+    assert not _valleys(points([5, 6, 4], values=2))
 
 
 def _hub_only(seed, *effects):
