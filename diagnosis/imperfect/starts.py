@@ -17,7 +17,7 @@ from plant.effects.search_space import Candidate
 # Zeros that no other output tells are tried all around where a torque depends on the true one.
 _ZEROS_AROUND = 6
 _CYCLES = np.concatenate([np.arange(1.0, 12, 0.25), np.arange(12, 80.5, 1.0)])
-_HIGHEST_HZ, _LINES_PER_PERIOD = 60.0, 0.4
+_HIGHEST_HZ, _LINES_PER_PERIOD, _LINES_AT_ONCE = 60.0, 0.4, 16
 _APART = 0.3
 
 
@@ -108,34 +108,47 @@ def _harmonic(records: Records, around: Descent, candidate: Candidate) -> list[P
         else _CYCLES
     )
     zero = around.start.zeros[0] if around.start.zeros.size else 0.0
+    lengths = [len(e.output) for e in records.experiments]
 
     def moved(angle: Real) -> Real:
-        torque = np.stack([np.sin(angle), np.cos(angle)])
-        return np.fft.irfft(np.fft.rfft(torque, size)[:, :, None] * transfer, size, axis=1)
+        torque = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+        return np.fft.irfft(np.fft.rfft(torque, size)[..., None] * transfer, size, axis=2)
 
-    def column_pair(moved: Real) -> Real:
-        return -dct(moved, axis=1, norm="ortho").reshape(2, -1).T
+    def columns_of(moved: Real) -> Real:
+        return -dct(moved, axis=2, norm="ortho").reshape(2 * len(moved), -1).T
 
     found = []
-    for line in lines[(lines >= low) & (lines <= high)]:
+    lines = lines[(lines >= low) & (lines <= high)]
+    for first in range(0, lines.size, _LINES_AT_ONCE):
+        some = lines[first : first + _LINES_AT_ONCE]
         if periodic:
             # The same in all records, as far as each goes.
-            whole = moved(2 * np.pi * line * time_s)
-            of_length = {T: column_pair(whole[:, :T]) for T in {len(e.output) for e in records.experiments}}
-            pairs = [of_length[len(e.output)] for e in records.experiments]
+            whole = moved(2 * np.pi * some[:, None] * time_s)
+            of_length = {T: columns_of(whole[:, :, :T]) for T in {*lengths}}
+            parts = [of_length[T] for T in lengths]
         else:
-            angles = [line * (e.output[:, 0] - zero) for e in records.experiments]
-            pairs = [column_pair(moved(angle)[:, : angle.size]) for angle in angles]
-        columns = np.concatenate(pairs)
+            angles = [some[:, None] * (e.output[:, 0] - zero) for e in records.experiments]
+            parts = [columns_of(moved(angle)[:, :, : angle.shape[1]]) for angle in angles]
+        columns = np.concatenate(parts)
         weighted = columns * weights[:, None]
-        cross = np.empty((g.size, 2))
+        cross = np.empty((g.size, columns.shape[1]))
         cross[:k] = shared.T @ weighted
         for r, (part, own) in enumerate(zip(records.parts, around.columns.states, strict=True)):
             cross[k + r * S : k + (r + 1) * S] = own.T @ weighted[part]
-        inner = columns.T @ weighted - cross.T @ cho_solve(factor, cross)
-        slope = weighted.T @ around.left - cross.T @ cho_solve(factor, g)
-        ab = -np.linalg.solve(inner + 1e-12 * np.trace(inner) * np.eye(2), slope)
-        amplitude = float(np.clip(np.hypot(*ab), candidate.axes[0].low, candidate.axes[0].high))
-        x = np.array([np.log(amplitude), line, np.arctan2(ab[1], ab[0])])
-        found.append(Point(around.loss + 0.5 * float(slope @ ab), x, around.deviations, around.start))
+        solved = cho_solve(factor, cross)
+        inner = _of_pairs(columns, weighted) - _of_pairs(cross, solved)
+        slopes = (weighted.T @ around.left - solved.T @ g).reshape(-1, 2)
+        tiny = 1e-12 * np.trace(inner, axis1=1, axis2=2)[:, None, None] * np.eye(2)
+        ab = -np.linalg.solve(inner + tiny, slopes[:, :, None])[:, :, 0]
+        amplitudes = np.clip(np.hypot(*ab.T), candidate.axes[0].low, candidate.axes[0].high)
+        coordinates = np.column_stack([np.log(amplitudes), some, np.arctan2(ab[:, 1], ab[:, 0])])
+        losses = around.loss + 0.5 * np.sum(slopes * ab, axis=1)
+        for loss, x in zip(losses, coordinates, strict=True):
+            found.append(Point(float(loss), x, around.deviations, around.start))
     return found
+
+
+def _of_pairs(one: Real, other: Real) -> Real:
+    """(L, 2, 2) products of the columns (N, 2 L) of each line."""
+    pairs, others = (part.T.reshape(-1, 2, len(part)) for part in (one, other))
+    return np.asarray(pairs @ others.transpose(0, 2, 1))
