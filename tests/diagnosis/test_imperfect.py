@@ -543,31 +543,31 @@ def test_friction_and_tilt_are_fitted_beside_what_they_come_before(monkeypatch, 
     assert asked == [*((name, False) for name in names[:3]), *further]
 
 
+def _found(folder, cases, seed, k):
+    """Effects named for the k-th case of a series."""
+    names = [f"case_{i:04d}" for i in range(1, cases + 1)]
+    others = {name: {"case": name} for name in names if name != names[k - 1]}
+    generate(cases, seed, folder, jobs=1, workshop=True, finished=others)
+    return set(diagnose(load_case(folder / names[k - 1]).case).combination)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("cases", "seed", "k"), [(40, 6089, 26), (40, 6067, 16)])
 def test_a_spring_behind_friction_and_tilt_is_found(tmp_path, cases, seed, k):
     # One needs friction beside it, the other a tilt across the link.
-    others = {f"case_{i:04d}": {"case": f"case_{i:04d}"} for i in range(1, cases + 1) if i != k}
-    generate(cases, seed, tmp_path, jobs=1, workshop=True, finished=others)
-    assert diagnose(load_case(tmp_path / f"case_{k:04d}").case).combination == ("hardening_spring",)
+    assert _found(tmp_path, cases, seed, k) == {"hardening_spring"}
 
 
 @pytest.mark.slow
 def test_beside_another_effect_a_fit_also_starts_where_it_ended_alone(tmp_path):
     # Beside the heavy hub no size of the grid is near enough to the spring's, which its own fit has found.
-    others = {f"case_{k:04d}": {"case": f"case_{k:04d}"} for k in range(1, 49) if k != 5}
-    generate(48, 6023, tmp_path, jobs=1, workshop=True, finished=others)
-    found = diagnose(load_case(tmp_path / "case_0005").case)
-    assert set(found.combination) == {"hub_inertia", "hardening_spring"}
+    assert _found(tmp_path, 48, 6023, 5) == {"hub_inertia", "hardening_spring"}
 
 
 @pytest.mark.slow
 def test_a_delay_of_more_than_a_period_is_found_beside_what_hides_it(tmp_path):
     # Alone any delay of the grid leaves more than none; from the best far one both are found.
-    others = {f"case_{k:04d}": {"case": f"case_{k:04d}"} for k in range(1, 41) if k != 39}
-    generate(40, 6173, tmp_path, jobs=1, workshop=True, finished=others)
-    found = diagnose(load_case(tmp_path / "case_0039").case)
-    assert set(found.combination) == {"input_delay", "joint_compliance"}
+    assert _found(tmp_path, 40, 6173, 39) == {"input_delay", "joint_compliance"}
 
 
 def test_a_value_is_also_sought_from_where_its_neighbours_leave_more():
