@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.signal import find_peaks
 
 from diagnosis.imperfect.descent import Descent, best_following, descend, loss_at, occam, refined, scanned
 from diagnosis.imperfect.records import Records, Start, share_left
@@ -22,9 +23,9 @@ Progress = Callable[[float, str], None]
 
 # Starts descended from alone; parents extended and effects fitted beside each: pairs, larger sets.
 _ALONE, _BESIDE_POINTS = 2, 4
-# Further ones of one value that are better than their neighbours, whatever they leave.
-_VALLEYS = 1
 _PARENTS, _TRIED = (3, 1), (6, 4)
+# Further starts alone, local minima of a grid of one value, whatever they leave.
+_LOCAL_MINIMA = 1
 # Further parents beside which only what every machine has some of is fitted, how many of these beside each,
 # and how far behind in evidence they may be.
 _FURTHER, _TRIED_BESIDE_FURTHER, _FAR_BEHIND = 2, 2, 100.0
@@ -222,7 +223,8 @@ class Search:
                 break
             if all(point.far_from(other) for other in chosen):
                 chosen.append(point)
-        chosen += [point for point in _valleys(points) if all(map(point.far_from, chosen))][:_VALLEYS]
+        further = [point for point in _local_minima(points) if all(map(point.far_from, chosen))]
+        chosen += further[:_LOCAL_MINIMA]
         ends = [self._from(around, candidate, point, nominal) for point in chosen]
         return min(ends, key=lambda end: end.loss)
 
@@ -616,15 +618,13 @@ def _spread(points: Sequence[Point]) -> Sequence[Point]:
     return [*points[:_BESIDE_POINTS], *rest[:: max(1, len(rest) // _BESIDE_POINTS)]]
 
 
-def _valleys(points: Sequence[Point]) -> list[Point]:
-    """Points of a grid of one value that are better than their neighbours, the best first: a delay of whole
-    periods leaves more than none, and another delay between them more than either."""
+def _local_minima(points: Sequence[Point]) -> list[Point]:
+    """Of a grid of one value, best first; of several values none is sought."""
     if points[0].coordinates.size != 1:
         return []
     line = sorted(points, key=lambda point: float(point.coordinates[0]))
-    losses = np.array([np.inf, *(point.loss for point in line), np.inf])
-    better = (losses[1:-1] < losses[:-2]) & (losses[1:-1] < losses[2:])
-    return sorted([line[k] for k in np.flatnonzero(better)], key=lambda point: point.loss)
+    peaks, _ = find_peaks([-np.inf, *(-point.loss for point in line), -np.inf])
+    return sorted([line[k - 1] for k in peaks], key=lambda point: point.loss)
 
 
 def _point(end: Descent) -> Point:

@@ -29,7 +29,7 @@ from diagnosis.imperfect.carried import shares_of
 from diagnosis.imperfect.descent import Descent, descend, occam, refined, scanned
 from diagnosis.imperfect.levels import Levels, coefficients, quietest
 from diagnosis.imperfect.records import Records, Start, StartColumns
-from diagnosis.imperfect.search import Explanation, Search, _valleys
+from diagnosis.imperfect.search import Explanation, Search
 from diagnosis.imperfect.settled import best_move, settled
 from diagnosis.imperfect.starts import Point, points_of
 from diagnosis.imperfect.verdict import TEMPER, _enough, _weights, is_silent, judged
@@ -565,19 +565,54 @@ def test_beside_another_effect_a_fit_also_starts_where_it_ended_alone(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_delay_of_more_than_a_period_is_found_beside_what_hides_it(tmp_path):
-    # Alone any delay of the grid leaves more than none; from the best far one both are found.
+def test_a_long_delay_is_found_beside_what_hides_it(tmp_path):
+    # Alone every long delay of the grid leaves more than none; from the best of them both are found.
     assert _found(tmp_path, 40, 6173, 39) == {"input_delay", "joint_compliance"}
 
 
-def test_a_value_is_also_sought_from_where_its_neighbours_leave_more():
-    def points(losses, values=1):
-        return [Point(loss, np.full(values, float(k)), *[None] * 2) for k, loss in enumerate(losses)]
+@pytest.mark.parametrize(
+    ("losses", "begun"),
+    [
+        ([5, 6, 90, 70, 80, 95], [0, 3]),  # another local minimum, far above the best
+        ([5, 6, 90, 95, 94], [0, 4]),  # at the end of the grid
+        ([5, 40, 60, 70, 30, 90, 20], [0, 6]),  # of two, the better
+        ([5, 6, 90, 95, 99], [0]),
+    ],
+)
+def test_a_fit_alone_also_begins_at_a_local_minimum_of_its_grid(losses, begun):
+    def points(values):
+        start = SimpleNamespace(zeros=np.zeros(0))
+        grid = [Point(loss, np.full(values, float(k)), None, start) for k, loss in enumerate(losses)]
+        return sorted(grid, key=lambda point: point.loss)
 
-    found = _valleys(sorted(points([5, 6, 9, 7, 8, 4]), key=lambda point: point.loss))
-    assert [(point.loss, *point.coordinates) for point in found] == [(4, 5), (5, 0), (7, 3)]
-    assert _valleys(points([3.0]))
-    assert not _valleys(points([5, 6, 4], values=2))
+    tried: list[Point] = []
+    nominal = SimpleNamespace(end=SimpleNamespace(loss=0.5))
+    search = SimpleNamespace(
+        base=nominal, _turned=lambda c: False, _from=lambda a, c, point, n: tried.append(point) or point
+    )
+    for values, expected in ((1, begun), (2, [0])):
+        tried.clear()
+        Search._descended(search, None, None, points(values), None)
+        assert [point.coordinates[0] for point in tried] == expected
+
+
+def test_a_disturbance_is_found_by_its_frequency_whatever_is_computed_at_once(monkeypatch):
+    true = {"amplitude_Nm": 0.05, "frequency_Hz": 7.3, "phase_rad": 1.0}
+    search, kinds = _hub_only(4, {"name": "periodic_disturbance", **true})
+    nothing = np.zeros(search.records.nominal.count)
+    base = descend(search.records, (), nothing, np.zeros(0), search.records.at_rest())
+
+    def points():
+        found = points_of(search.records, base, kinds["periodic_disturbance"])
+        return found[0], np.array(sorted([p.coordinates[1], *p.coordinates, p.loss] for p in found))
+
+    best, together = points()
+    amplitude, frequency, _ = best.coordinates
+    longest_s = max(len(e.output) for e in search.case.estimation) * RIG.sampling.dt_s
+    assert frequency == pytest.approx(true["frequency_Hz"], abs=0.2 / longest_s)  # half a step of the grid
+    assert np.exp(amplitude) == pytest.approx(true["amplitude_Nm"], rel=0.1)
+    monkeypatch.setattr("diagnosis.imperfect.starts._LINES_AT_ONCE", 1)
+    np.testing.assert_allclose(together, points()[1], rtol=1e-6, atol=1e-6)
 
 
 def _hub_only(seed, *effects):
