@@ -107,6 +107,8 @@ def _answered(
     weighing = case.machine.weighing
     if not weighing.model_error > 0:
         return _without_error(case, progress, rng)
+    if isinstance(case, Case):
+        case = case.at_fast_lengths()
     found = searched(case, lambda done, what: progress(_FIRST_SEARCH * done, what), deadline_s)
     if found.left_out:
         return beside_imperfections(found, rng)

@@ -98,7 +98,7 @@ def looked_at_halves(
     halves, names = case.in_halves()
     if not names:
         return answer
-    search = Search(halves, progress, deadline_s, first_halves=names)
+    search = Search(halves.at_fast_lengths(), progress, deadline_s, first_halves=names)
     search.run()
     again = beside_imperfections(search, rng)
     named = set(again.combination) - set(answer.combination)
