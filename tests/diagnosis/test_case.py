@@ -88,3 +88,29 @@ def test_held_out_records_in_halves():
         np.testing.assert_array_equal(whole, getattr(c, name))
     # The grid of a sensor is read off all of its values.
     assert len(first.readings) == len(second.readings) == 31
+
+
+def test_records_are_cut_to_lengths_without_large_prime_factors():
+    rng = np.random.default_rng(4)
+
+    def record(name, role, samples):
+        output = rng.standard_normal((samples, 2))
+        return _experiment(
+            name, role, voltage_V=rng.standard_normal(samples), output=output, missing=(5, samples - 1)
+        )
+
+    case = _case(
+        record("a", "estimation", 2690), record("b", "held_out", 2700), record("c", "held_out", 2011)
+    )
+    for whole, cut in zip(case.experiments, case.at_fast_lengths().experiments, strict=True):
+        kept = len(cut.output)
+        assert 0.98 * len(whole.output) <= kept <= len(whole.output)
+        rest = kept
+        for factor in (2, 3, 5, 7, 11):
+            while rest % factor == 0:
+                rest //= factor
+        assert rest == 1
+        assert (cut.name, cut.role) == (whole.name, whole.role)
+        np.testing.assert_array_equal(cut.output, whole.output[:kept])
+        np.testing.assert_array_equal(cut.voltage_V, whole.voltage_V[:kept])
+        assert cut.missing == tuple(row for row in (5, len(whole.output) - 1) if row < kept)
