@@ -60,6 +60,8 @@ class Plan:
     parts: of a sample, two with a fractional delay. delay_samples: whole ones. output_rows: (6, N).
     start_columns: (N, 3 + 2M). State per unit of hub angle, hub speed, voltage, modal deflections and rates.
     slider_rows: (E, N). Angle of every switching element.
+    oscillators: of every disturbance, where its sine stands in the state, its cosine behind it, and its
+        angular frequency.
     """
 
     arguments: tuple[Any, ...]
@@ -69,18 +71,22 @@ class Plan:
     slider_rows: Real
     parts: int
     delay_samples: int
+    oscillators: tuple[tuple[int, float], ...]
 
     def advance(self, inputs: Real, observed: Real, state: PlanState) -> None:
         """Run the compiled stepper over inputs (T, 4), filling observed (T, 6) and changing the state."""
         run(inputs, observed, *state, *self.arguments)
 
-    def at(self, start: Real | None = None) -> PlanState:
-        """The state at time zero: every friction element stuck without a load, every contact open.
+    def at(self, start: Real | None = None, time_s: float = 0.0) -> PlanState:
+        """The state at the start: every friction element stuck without a load, every contact open.
 
         start (3 + 2m,): hub angle, hub speed, acting voltage, first m modal deflections and their rates;
-        without it at rest at zero.
+        without it at rest at zero. time_s: how long disturbances have been running.
         """
         x = self.initial_state.copy()
+        for sine, omega_rad_s in self.oscillators if time_s else ():
+            s, c = np.sin(omega_rad_s * time_s), np.cos(omega_rad_s * time_s)
+            x[sine : sine + 2] = [[c, s], [-s, c]] @ x[sine : sine + 2]
         if start is not None:
             m, modes = (start.size - 3) // 2, (self.start_columns.shape[1] - 3) // 2
             columns = [0, 1, 2, *range(3, 3 + m), *range(3 + modes, 3 + modes + m)]
@@ -144,6 +150,7 @@ def make_plan(
         element_rows[:, 0],
         len(substeps),
         whole,
+        builder.disturbances(),
     )
 
 
@@ -206,9 +213,7 @@ class _Builder:
             at, corner = self.accelerometer, _ACCELEROMETER_RAD_S
             a[at, at + 1] = corner
             a[at + 1] = self._acceleration() / corner
-        for i, disturbance in enumerate(machine.joint.disturbance):
-            sine = self.oscillators + 2 * i
-            omega = 2 * np.pi * disturbance.frequency_Hz
+        for (sine, omega), disturbance in zip(self.disturbances(), machine.joint.disturbance, strict=True):
             a[:, sine] += disturbance.amplitude_Nm * self._column(eq.hub)
             a[sine, sine + 1], a[sine + 1, sine] = omega, -omega
         columns = self._element_columns()
@@ -379,10 +384,14 @@ class _Builder:
 
     def initial_state(self) -> Real:
         x = np.zeros(self.n)
-        for i, disturbance in enumerate(self.machine.joint.disturbance):
-            sine = self.oscillators + 2 * i
+        for (sine, _), disturbance in zip(self.disturbances(), self.machine.joint.disturbance, strict=True):
             x[sine], x[sine + 1] = np.sin(disturbance.phase_rad), np.cos(disturbance.phase_rad)
         return x
+
+    def disturbances(self) -> tuple[tuple[int, float], ...]:
+        """Where the sine of each stands in the state, and its angular frequency."""
+        frequencies = (disturbance.frequency_Hz for disturbance in self.machine.joint.disturbance)
+        return tuple((self.oscillators + 2 * i, 2 * np.pi * f) for i, f in enumerate(frequencies))
 
     def longest_step_s(
         self, element: Real, element_rows: Real, held_columns: Real, substep_s: float

@@ -69,6 +69,7 @@ class Start:
     hub_angle_rad, hub_speed_rad_s : float. With the link straight behind the hub but for `deflections`.
     deflections, rates : (m,). Of the first m modes of the link (`plant.modal`), sqrt(kg) m and per second.
     voltage_V : float. Acting voltage up to the first sample.
+    time_s : float. Of the first sample, for what depends on time: a disturbance, a drift.
     """
 
     hub_angle_rad: float = 0.0
@@ -76,6 +77,7 @@ class Start:
     deflections: Real = field(default_factory=lambda: np.zeros(0))
     rates: Real = field(default_factory=lambda: np.zeros(0))
     voltage_V: float = 0.0
+    time_s: float = 0.0
 
     def vector(self) -> Real:
         """(3 + 2m,) as `plant.plan` takes it. Raises ValueError if deflections and rates differ in number."""
@@ -164,7 +166,8 @@ class Simulator:
         if tip_force_N is not None:
             inputs[:, 3] = _signal("tip_force_N", tip_force_N, n_samples)
         observed = np.empty((n_samples, 6))
-        plan.advance(inputs, observed, plan.at(None if start is None else start.vector()))
+        begun_s = 0.0 if start is None else start.time_s
+        plan.advance(inputs, observed, plan.at(None if start is None else start.vector(), begun_s))
         hub, tip, tip_behind, acceleration, speed, deflection = observed.T
         time = np.arange(n_samples, dtype=np.float64) * self.dt_s
         noise = _noise(machine, rng, n_samples, accelerometer=self.accelerometer)
@@ -172,7 +175,7 @@ class Simulator:
             time_s=time,
             voltage_V=voltage,
             hub_angle_rad=hub + noise[:, 0],
-            tip_m=_tip_reading(machine.sensor, tip_behind, time, noise[:, 1]),
+            tip_m=_tip_reading(machine.sensor, tip_behind, begun_s + time, noise[:, 1]),
             hub_angle_true_rad=hub,
             tip_true_m=tip,
             tip_acceleration_m_s2=machine.sensor.gain * acceleration + noise[:, 2],

@@ -118,7 +118,7 @@ class Records:
         """measured - model (T, Y) of the r-th record."""
         experiment, far = self.experiments[r], self._far[r]
         self.simulations += 1
-        e = experiment.output - simulate(experiment.input, state, zeros)
+        e = experiment.output - simulate(experiment.input, state, zeros, **later(experiment))
         missing, kept = self._missing[r]
         if missing:
             for column in e.T:
@@ -213,6 +213,12 @@ class Records:
         beyond = levels.felt * (energy - levels.noise)
         left = np.maximum(np.bincount(levels.belongs, beyond), 0.0)
         return np.array([left, levels.motion]).reshape(2, -1, Y)
+
+
+def later(experiment: RecordOfMachine) -> dict[str, int]:
+    """What a simulation of a part of a run is told beside its start."""
+    first_row: int = getattr(experiment, "first_row", 0)
+    return {"first_row": first_row} if first_row else {}
 
 
 def share_left(energies: Real) -> Real:

@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 
 from diagnosis.fit.fit import quotients, solved
 from diagnosis.imperfect.levels import Levels
-from diagnosis.imperfect.records import Records, Start
+from diagnosis.imperfect.records import Records, Start, later
 from diagnosis.machine.machine_protocol import Real
 
 _ITERATIONS, _STILL = 30, 1e-7
@@ -70,7 +70,9 @@ def _begun(records: Records, r: int, d: Real, effects: Sequence[Any], start: Sta
         T = max(len(record.output) // part, _FEWEST)
 
         def left(z: Real, T: int = T) -> Real:
-            e = (record.output[:T] - simulate(record.input[:T], z * spread, start.zeros)) / scale
+            e = (
+                record.output[:T] - simulate(record.input[:T], z * spread, start.zeros, **later(record))
+            ) / scale
             return np.append(np.clip(e, -1 / _LITTLE, 1 / _LITTLE), _LITTLE * z)
 
         def slopes(z: Real, left: Callable[[Real], Real] = left) -> Real:

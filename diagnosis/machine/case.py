@@ -29,6 +29,7 @@ class Experiment:
     outputs : names of the Y columns, the hub angle first.
     reference_rad : (T,) or None. What the controller was to follow, in the zero of the encoder.
     missing : rows that the log lacks; what stands there is interpolated.
+    first_row : of the run that it is a part of: a disturbance, a drift began with that.
     readings : (R, Y). The outputs' values before any interpolation, for the steps of their sensors; default
         `output`.
     """
@@ -43,6 +44,7 @@ class Experiment:
     reference_rad: Real | None = None
     missing: tuple[int, ...] = ()
     readings: Real | None = None
+    first_row: int = 0
 
     def __post_init__(self) -> None:
         lock(self, "voltage_V", "output")
@@ -69,6 +71,7 @@ class Experiment:
             output=self.output[first:end],
             reference_rad=reference,
             missing=tuple(row - first for row in self.missing if first <= row < end),
+            first_row=self.first_row + first,
         )
 
 

@@ -107,10 +107,13 @@ class FlexibleArm:
         prepared = self._prepared(effects)
         moved = [k for k, name in enumerate(self.outputs) if name in _ZERO]
 
-        def outputs(inputs: Real, state: Real | None = None, zeros: Real | None = None) -> Real:
+        def outputs(
+            inputs: Real, state: Real | None = None, zeros: Real | None = None, first_row: int = 0
+        ) -> Real:
             start = None
             if state is not None:
-                start = Start(state[0], state[1], state[2 : 2 + _MODES], state[2 + _MODES :])
+                modes, time_s = state[2:], first_row * self.rig.sampling.dt_s
+                start = Start(state[0], state[1], modes[:_MODES], modes[_MODES:], time_s=time_s)
             found = prepared.run(inputs[:, 0], start=start).columns(self.outputs)
             if zeros is not None:
                 found[:, moved] += zeros

@@ -83,6 +83,7 @@ def test_held_out_records_in_halves():
     assert names == ("c (first half)",)
     first, second = halves.experiments[1:3]
     assert (first.missing, second.missing) == ((3, 29), (0, 30))
+    assert (first.first_row, second.first_row) == (0, 30)
     for name in ("voltage_V", "output", "reference_rad"):
         whole = np.concatenate([getattr(first, name), getattr(second, name)])
         np.testing.assert_array_equal(whole, getattr(c, name))

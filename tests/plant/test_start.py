@@ -54,6 +54,22 @@ def test_dry_friction_holds_where_it_starts() -> None:
     assert np.allclose(record.hub_angle_rad, 1.3, atol=1e-9)
 
 
+def test_a_later_start_finds_disturbances_and_drift_where_they_are() -> None:
+    rig, first = paper_link(), 137
+    begun_s = first * rig.sampling.dt_s
+    at = {"name": "periodic_disturbance", "amplitude_Nm": 0.2, "frequency_Hz": 1.7}
+    drift = parse_effect({"name": "sensor_drift", "rate_m_s": 0.03})
+    still = np.zeros(80)
+    phases = [0.4, 0.4 + 2 * np.pi * 1.7 * begun_s]
+    started, later = (
+        Simulator(rig, [parse_effect(at | {"phase_rad": phase % (2 * np.pi)}), drift]).run(still, start=start)
+        for phase, start in zip(phases, (Start(time_s=begun_s), Start()), strict=True)
+    )
+    np.testing.assert_allclose(started.hub_angle_rad, later.hub_angle_rad, atol=1e-12)
+    np.testing.assert_allclose(started.tip_m, later.tip_m + 0.03 * begun_s, atol=1e-12)
+    assert np.ptp(started.hub_angle_rad) > 1e-3
+
+
 def test_a_voltage_held_before_the_first_row_acts_through_delay_and_lag(voltage_V: np.ndarray) -> None:
     rig = paper_link().perturbed({"sampling.transport_delay_s": 0.013})
     effects = [parse_effect({"name": "actuator_lag", "time_constant_s": 0.05})]
