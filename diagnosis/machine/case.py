@@ -105,8 +105,8 @@ class Case(RecordedCase[Experiment]):
                 )
 
     def at_fast_lengths(self) -> Case:
-        """With its records cut at their ends to lengths that a Fourier transform is fast at: a tenth of a
-        cheap search would be spent on lengths with large prime factors."""
+        """With its records cut at their ends to lengths without large prime factors, at which a cosine
+        transform is fast."""
         parts = (e.part(e.name, e.role, 0, prev_fast_len(len(e.output))) for e in self.experiments)
         return replace(self, experiments=tuple(parts))
 

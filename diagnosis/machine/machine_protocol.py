@@ -108,7 +108,7 @@ class Machine(Protocol):
     def simulator(self, effects: Sequence[Any]) -> Callable[..., Real]:
         """Inputs (T, U) -> outputs (T, Y) without noise; effects as its own candidates make them.
 
-        Further arguments, where a start is unknown: states (S,), zeros (Z,).
+        Further arguments, where a start is unknown: states (S,), zeros (Z,); first_row of a part of a run.
         """
 
     def torque_response(self, samples: int) -> tuple[Real, float] | None:

@@ -570,6 +570,12 @@ def test_a_long_delay_is_found_beside_what_hides_it(tmp_path):
     assert _found(tmp_path, 40, 6173, 39) == {"input_delay", "joint_compliance"}
 
 
+@pytest.mark.slow
+def test_a_disturbance_goes_on_in_the_second_halves_that_judge(tmp_path):
+    # Begun anew there it would leave more than none does, and no set with it could be the answer.
+    assert _found(tmp_path, 40, 6199, 35) == {"periodic_disturbance", "hardening_spring"}
+
+
 @pytest.mark.parametrize(
     ("losses", "begun"),
     [
