@@ -32,9 +32,7 @@ _REACHES, _POINTS = (0.1, 0.03), 9
 _FAR = np.array([-3.0, -2.0, -1.2, -0.6, -0.25, -0.08, 0.08, 0.25, 0.6, 1.2, 2.0, 3.0])
 # Above the loss of an end, that of a start which leads to no better one.
 _HOPELESS = 5.0
-# Iterations at which the Jacobian by the deviations is renewed: it changes little, and is most of the
-# simulations. Those at which the start columns are.
-_NOMINAL_AGAIN, _COLUMNS_AGAIN = (4, 8), (2,)
+_AGAIN = (2, 5, 8, 11)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,10 +172,10 @@ def descend(
     damping, converged = 1e-3, False
     by_effects = np.zeros((e.size, A))
     for iteration in range(iterations):
-        if nominal_jacobian is None or iteration in _NOMINAL_AGAIN:
+        if nominal_jacobian is None or iteration in _AGAIN:
             step = np.full(P, coarse.get("log", _DEVIATION_STEP))
             nominal_jacobian = quotients(lambda d: left(d, x, start), d, e, step)  # noqa: B023
-        if columns is None or iteration in _COLUMNS_AGAIN:
+        if columns is None or iteration == _AGAIN[0]:
             columns = records.start_columns(d, effects_at(candidates, x), start, touching=touching)
         if columns.zeros.shape[1] and any(c.kind.absolute_angle for c in candidates):
             columns = records.with_true_angles(columns, d, effects_at(candidates, x), start, e)
