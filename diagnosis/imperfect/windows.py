@@ -25,7 +25,8 @@ _FREE_RAD = 100.0
 
 @dataclass(frozen=True, eq=False)
 class ArmInWindows(FlexibleArm):
-    """States of all windows after each other. Delays and lags begin each window at rest: neglected."""
+    """States of all windows after each other. Delays and lags begin each window at rest, disturbances and drifts as
+    the record did: neglected."""
 
     window_samples: int = 1
     windows: int = 1
@@ -70,9 +71,9 @@ class ArmInWindows(FlexibleArm):
         simulate, L = self._once.simulator(effects), self.window_samples
         states = self._once.unknown_start.state_spread.size
 
-        def outputs(inputs: Real, state: Real, zeros: Real) -> Real:
+        def outputs(inputs: Real, state: Real, zeros: Real, first_row: int = 0) -> Real:
             runs = [
-                simulate(inputs[first : first + L], state[k * states : (k + 1) * states], zeros)
+                simulate(inputs[first : first + L], state[k * states : (k + 1) * states], zeros, first_row)
                 for k, first in enumerate(range(0, len(inputs), L))
             ]
             return np.concatenate(runs)
