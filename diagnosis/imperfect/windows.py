@@ -25,8 +25,8 @@ _FREE_RAD = 100.0
 
 @dataclass(frozen=True, eq=False)
 class ArmInWindows(FlexibleArm):
-    """States of all windows after each other. Delays and lags begin each window at rest, disturbances and drifts as
-    the record did: neglected."""
+    """States of all windows after each other. Neglected: delays and lags begin each window at rest,
+    disturbances and drifts as the record did."""
 
     window_samples: int = 1
     windows: int = 1
