@@ -94,14 +94,14 @@ def _hold(held: Real, mode: Integer, reference: Real, element: Real) -> int:
         if element[e, 0] == FRICTION:
             if mode[e] == 0:
                 q += 1 << e
-                held[3 + e] = element[e, 1] * reference[e]
+                held[4 + e] = element[e, 1] * reference[e]
             else:
-                held[3 + e] = -mode[e] * element[e, 2]
+                held[4 + e] = -mode[e] * element[e, 2]
         elif mode[e] != 0:
             q += 1 << e
-            held[3 + e] = -mode[e] * element[e, 1] * element[e, 2]
+            held[4 + e] = -mode[e] * element[e, 1] * element[e, 2]
         else:
-            held[3 + e] = 0.0
+            held[4 + e] = 0.0
     return q
 
 
@@ -273,14 +273,14 @@ def _switch(
 @njit(cache=True, error_model="numpy")
 def run(
     inputs: Real,
-    observed: Real,
+    states: Real,
     x: Real,
     reference: Real,
     mode: Integer,
     substeps: Integer,
+    whole: int,
     step: Real,
     reach: Real,
-    output_rows: Real,
     element: Real,
     element_rows: Real,
     element_rate: Real,
@@ -290,40 +290,50 @@ def run(
     static_moment: Real,
     geometric_stiffness: Real,
 ) -> None:
-    """Advance the state over T samples, writing the outputs at the start of each.
+    """Advance the state over T samples, writing down that at the start of each.
 
     inputs (T, 4): voltage of the first and second part of the sample, hub torque, tip force.
-    observed (T, O): filled with output_rows (O, N) applied to the state at the start of each sample.
+    states (T, N): filled.
     x (N,), reference (E,), mode (E,): state, friction slider positions, slip and contact signs; changed in
         place.
-    substeps (G,): steps per part of the sample (G = 1, or 2 with a fractional delay).
-    step (G Q L R, N): transition of the R = N + 3 + E + 3J values (x, held inputs, node forces) per part of
-        the sample, matrix set and step size 2^l, one below the other: views of them cost up to a fourth.
+    substeps (G,): steps per part of the sample: itself, or two with a fractional delay.
+    whole: 1 if the first of these parts is the sample as one step, in which the voltage changes: those behind
+        it are taken where in that step an element does not hold its mode. Else 0.
+    step (G Q L R, N): transition of the R = N + 4 + E + 3J values (x, held inputs with the voltage before and
+        after it changes, node forces) per part of the sample, matrix set and step size 2^l, one below the
+        other: views of them cost up to a fourth.
     reach (G Q L R, 2J): the same to the channel positions at the middle and the end of the step. Columns of
         zeros fill both up to a multiple of four.
     element (E, 6): kind, then friction (k, Tc, Ts - Tc, vs, 0) or contact (gap/2, kc, cc, 0, 0).
     element_rows (2E, N): relative angle and speed.
-    element_rate (Q E, N + 3 + E + J): relative acceleration.
+    element_rate (Q E, N + 4 + E + J): relative acceleration.
     channel_kind (J,), channel (J, 3), channel_rows (J, N): smooth forces and the position each depends on.
     static_moment (M,), geometric_stiffness (M, M): of the modes under gravity; empty without it.
     """
     n, n_elements, n_channels = x.size, mode.size, channel_kind.size
-    n_rows, n_sets = n + 3 + n_elements + 3 * n_channels, 1 << n_elements
+    n_rows, n_sets = n + 4 + n_elements + 3 * n_channels, 1 << n_elements
     n_levels = step.shape[0] // (n_rows * n_sets * substeps.size)
-    held, new = np.zeros(3 + n_elements), np.empty(step.shape[1])
+    held, new = np.zeros(4 + n_elements), np.empty(step.shape[1])
     free, later = np.empty(reach.shape[1]), np.empty(reach.shape[1])
     position, force = np.zeros(3 * n_channels), np.zeros(3 * n_channels)
     wanted = np.zeros(n_elements, dtype=np.int64)
     for k in range(inputs.shape[0]):
-        for o in range(observed.shape[1]):
-            observed[k, o] = _along(output_rows, o, x)
         # What has died away is zero: numbers near the smallest there is take a hundred times as long.
         for i in range(n):
+            states[k, i] = x[i]
             if abs(x[i]) < _NOTHING:
                 x[i] = 0.0
-        for part in range(substeps.size):
-            held[0], held[1], held[2] = inputs[k, part], inputs[k, 2], inputs[k, 3]
-            for _ in range(substeps[part]):
+        held[2], held[3] = inputs[k, 2], inputs[k, 3]
+        part = 0
+        while part < substeps.size:
+            if part < whole:
+                held[0], held[1] = inputs[k, 0], inputs[k, 1]
+            else:
+                held[1] = inputs[k, part - whole]
+            next_part = part + 1
+            steps = substeps[part]
+            while steps > 0:
+                steps -= 1
                 # Time left in this step in units of the smallest one; a step of size 2^level starts on a
                 # multiple of it.
                 level = n_levels - 1
@@ -358,6 +368,9 @@ def run(
                         same = _modes_still_hold(
                             new, held, force, mode, wanted, reference, element, element_rows, element_rate, q
                         )
+                        if not same and part < whole:
+                            remaining = 0
+                            continue
                         if not same and level > 0:
                             level -= 1
                             continue
@@ -365,7 +378,10 @@ def run(
                             _switch(new, mode, wanted, reference, element, element_rows)
                     for i in range(n):
                         x[i] = new[i]
+                    if part < whole:
+                        next_part = substeps.size
                     remaining -= 1 << level
                     level = 0
                     while remaining > 0 and (remaining >> level) & 1 == 0:
                         level += 1
+            part = next_part

@@ -15,6 +15,7 @@ Linearised; shear, rotary inertia of the section, air and motor inductance are n
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -70,13 +71,18 @@ class Equations:
         n = self.mass.shape[0]
         a = np.zeros((2 * n, 2 * n))
         a[:n, n:] = np.eye(n)
-        a[n:, :n] = -np.linalg.solve(self.mass, self.stiffness)
-        a[n:, n:] = -np.linalg.solve(self.mass, self.damping)
+        a[n:, :n] = -self._mobility @ self.stiffness
+        a[n:, n:] = -self._mobility @ self.damping
         return a
+
+    @cached_property
+    def _mobility(self) -> Real:
+        """(N, N) accelerations by unit generalised forces."""
+        return np.linalg.inv(self.mass)
 
     def input_column(self, direction: Real) -> Real:
         """State derivative (2N,) for a unit generalised force along a direction."""
-        return np.concatenate([np.zeros(direction.size), np.linalg.solve(self.mass, direction)])
+        return np.concatenate([np.zeros(direction.size), self._mobility @ direction])
 
     def position_row(self, direction: Real) -> Real:
         return np.concatenate([direction, np.zeros(direction.size)])

@@ -7,8 +7,9 @@ step, and only there the mode changes; step sizes are the basic one divided by p
 matrices are prepared once. Smooth forces (ripple, cubic spring, gravity, the falling part of Stribeck
 friction) enter as a parabola through their values at start, middle and end of the step (collocation, order
 4); linear dynamics stay exact. Lags and a sinusoidal disturbance are linear systems of their own and part
-of the state matrix. A delay splits every sample at the instant where the held voltage changes. Without
-switching or smooth forces there is one exact step a sample.
+of the state matrix. A delay splits every sample at the instant where the held voltage changes; where a
+sample is no longer than a basic step it is one step all the same, with this change inside it, unless an
+element does not hold its mode in it. Without switching or smooth forces there is one exact step a sample.
 """
 
 from __future__ import annotations
@@ -73,9 +74,11 @@ class Plan:
     delay_samples: int
     oscillators: tuple[tuple[int, float], ...]
 
-    def advance(self, inputs: Real, observed: Real, state: PlanState) -> None:
-        """Run the compiled stepper over inputs (T, 4), filling observed (T, 6) and changing the state."""
-        run(inputs, observed, *state, *self.arguments)
+    def advance(self, inputs: Real, state: PlanState) -> Real:
+        """(T, N) states at the start of every sample of inputs (T, 4); changes the state."""
+        states = np.empty((len(inputs), state.x.size))
+        run(inputs, states, *state, *self.arguments)
+        return states
 
     def at(self, start: Real | None = None, time_s: float = 0.0) -> PlanState:
         """The state at the start: every friction element stuck without a load, every contact open.
@@ -89,8 +92,8 @@ class Plan:
             x[sine : sine + 2] = [[c, s], [-s, c]] @ x[sine : sine + 2]
         if start is not None:
             m, modes = (start.size - 3) // 2, (self.start_columns.shape[1] - 3) // 2
-            columns = [0, 1, 2, *range(3, 3 + m), *range(3 + modes, 3 + modes + m)]
-            x += self.start_columns[:, columns] @ start
+            x += self.start_columns[:, : 3 + m] @ start[: 3 + m]
+            x += self.start_columns[:, 3 + modes : 3 + modes + m] @ start[3 + m :]
         sliders = self.slider_rows @ x
         return PlanState(x, sliders, np.zeros(sliders.size, dtype=np.int64))
 
@@ -114,26 +117,34 @@ def make_plan(
     state_matrices = [builder.state_matrix(q, element, element_rows) for q in range(2**n_elements)]
     longest = builder.longest_step_s(element, element_rows, held_columns, substep_s)
 
-    whole, fraction = _split_delay(machine.voltage.delay_s, dt_s)
-    part_lengths = (dt_s,) if fraction == 0.0 else (fraction * dt_s, (1 - fraction) * dt_s)
-    substeps = [int(np.ceil(length / longest * (1 - 1e-12))) if switching else 1 for length in part_lengths]
+    delay_samples, fraction = _split_delay(machine.voltage.delay_s, dt_s)
+    lengths = (dt_s,) if fraction == 0.0 else (fraction * dt_s, (1 - fraction) * dt_s)
+    substeps = [int(np.ceil(length / longest * (1 - 1e-12))) if switching else 1 for length in lengths]
+    parts = len(lengths)
+    whole = parts == 2 and (dt_s <= longest or not switching)
+    if whole:
+        # Only where an element may switch are its parts ever taken.
+        lengths, substeps = ((dt_s, *lengths), [1, *substeps]) if n_elements else ((dt_s,), [1])
     rows = n + held_columns.shape[1] + 3 * n_channels
-    tables = len(part_lengths), len(state_matrices), halvings + 1, rows
+    tables = len(lengths), len(state_matrices), halvings + 1, rows
     step, reach = (np.zeros((*tables, -(-columns // 4) * 4)) for columns in (n, 2 * n_channels))
-    for part, (length, count) in enumerate(zip(part_lengths, substeps, strict=True)):
+    for part, (length, count) in enumerate(zip(lengths, substeps, strict=True)):
         for q, a in enumerate(state_matrices):
             into = step[part, q, ..., :n], reach[part, q, ..., : 2 * n_channels]
+            if whole and part == 0:
+                into = into[0][-1:], into[1][-1:]
             _transitions(a, held_columns, force_columns, channel_rows, length / count, *into)
+            if whole and part == 0:
+                _change_inside(a, held_columns[:, 1], channel_rows, dt_s, fraction, into[0][0], into[1][0])
     rate = np.zeros((len(state_matrices), n_elements, n + held_columns.shape[1] + n_channels))
     for q, a in enumerate(state_matrices):
         for e in range(n_elements):
             rate[q, e] = element_rows[e, 1] @ np.hstack([a, held_columns, force_columns])
-    output_rows = builder.outputs()
     arguments = (
         np.array(substeps, dtype=np.int64),
+        int(whole),
         step.reshape(-1, step.shape[-1]),
         reach.reshape(-1, reach.shape[-1]) if n_channels else np.zeros((0, 0)),
-        output_rows,
         element,
         element_rows.reshape(-1, n),
         rate.reshape(-1, rate.shape[2]),
@@ -144,12 +155,12 @@ def make_plan(
     )
     return Plan(
         arguments,
-        output_rows,
+        builder.outputs(),
         builder.initial_state(),
         builder.start_columns(state_matrices[0]),
         element_rows[:, 0],
-        len(substeps),
-        whole,
+        parts,
+        delay_samples,
         builder.disturbances(),
     )
 
@@ -228,13 +239,15 @@ class _Builder:
         return a
 
     def held_columns(self) -> Real:
-        """Columns of what is constant over a step: voltage, hub torque, tip force, one force per element."""
+        """Columns of what is constant over a step: voltage before and after it changes in it, hub torque, tip
+        force, one force per element. The first is filled in where it does (`_change_inside`)."""
         eq = self.equations
         if self.voltage_state >= 0:
             voltage = np.eye(self.n)[self.voltage_state] / self.machine.voltage.lag_s
         else:
             voltage = self._motor_column()
-        return np.column_stack([voltage, self._column(eq.hub), self._column(eq.tip), self._element_columns()])
+        before, forces = np.zeros(self.n), self._element_columns()
+        return np.column_stack([before, voltage, self._column(eq.hub), self._column(eq.tip), forces])
 
     def _element_columns(self) -> Real:
         """One column per element: friction drives the shaft, contact the hub against the motor side."""
@@ -402,7 +415,7 @@ class _Builder:
                 longest = min(longest, _RIPPLE_PHASE_RAD / (_SLEW_RAD_S * max(torque.values[1], 1.0)))
         for e in range(element.shape[0]):
             stiffness = element[e, 1] if element[e, 0] == FRICTION else element[e, 2]  # see `run`
-            mobility = abs(element_rows[e, 1] @ held_columns[:, 3 + e])
+            mobility = abs(element_rows[e, 1] @ held_columns[:, 4 + e])
             if element[e, 0] == FRICTION and element[e, 3] != 0:
                 longest = min(longest, _GROWTH_PER_STEP * element[e, 4] / (element[e, 3] * mobility))
             longest = min(longest, _PHASE_PER_STEP_RAD[int(element[e, 0])] / np.sqrt(stiffness * mobility))
@@ -437,6 +450,23 @@ def _transitions(
     step[:] = end.swapaxes(1, 2)
     reach[:, :, :n_force] = (rows @ _by_nodes(halves[:-1], first, n_force, h)).swapaxes(1, 2)
     reach[:, :, n_force:] = (rows @ end).swapaxes(1, 2)
+
+
+def _change_inside(
+    a: Real, voltage: Real, rows: Real, length: float, fraction: float, step: Real, reach: Real
+) -> None:
+    """Share out what a voltage held over a step does in step (N + H + 3J, N) and reach (N + H + 3J, 2J) to
+    that before and after it changes at a fraction of the step's length."""
+    n, n_force = a.shape[0], len(rows)
+    block = np.zeros((n + 1, n + 1))
+    block[:n] = np.column_stack([a, voltage])
+    ends = (1.0, 0.5) if n_force else (1.0,)
+    changed = [expm(block * (max(end - fraction, 0.0) * length))[:n, n] for end in ends]
+    step[n] = step[n + 1] - changed[0]
+    step[n + 1] = changed[0]
+    for columns, after in zip((slice(n_force, None), slice(n_force)), changed, strict=False):
+        reach[n, columns] = reach[n + 1, columns] - rows @ after
+        reach[n + 1, columns] = rows @ after
 
 
 def _by_nodes(transition: Real, first: int, n_force: int, h: Real) -> Real:

@@ -18,6 +18,15 @@ from plant.rig import Rig
 
 F = TypeVar("F", float, Real)
 
+# Column of what is observed (`plant.plan`) of every sensor, in the order of their noise (`_noise`).
+_OBSERVED = {
+    "hub_angle_rad": 0,
+    "tip_m": 2,
+    "tip_acceleration_m_s2": 3,
+    "hub_speed_rad_s": 4,
+    "tip_deflection_m": 5,
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
@@ -152,12 +161,46 @@ class Simulator:
         start: Start | None = None,
     ) -> Trajectory:
         """One record, from rest at zero unless told."""
-        machine, plan = self.machine, self.plan
-        voltage = _signal("voltage_V", voltage_V, None)
-        n_samples = voltage.size
-        before = 0.0 if start is None else start.voltage_V
+        voltage, begun_s = _signal("voltage_V", voltage_V, None), 0.0 if start is None else start.time_s
+        observed = self._observed(slice(None), voltage, hub_torque_Nm, tip_force_N, start)
+        time = np.arange(voltage.size, dtype=np.float64) * self.dt_s
+        noise = _noise(self.machine, rng, voltage.size, accelerometer=self.accelerometer)
+        read = {
+            name: self._reading(name, observed[:, k], begun_s + time, own)
+            for (name, k), own in zip(_OBSERVED.items(), noise.T, strict=True)
+        }
+        true = {"hub_angle_true_rad": observed[:, 0], "tip_true_m": observed[:, 1]}
+        return Trajectory(time_s=time, voltage_V=voltage, **true, **read)
+
+    def measured(
+        self,
+        names: Sequence[str],
+        voltage_V: npt.ArrayLike,
+        *,
+        hub_torque_Nm: npt.ArrayLike | None = None,
+        start: Start | None = None,
+    ) -> Real:
+        """(T, Y): the quantities of these names of one record, without noise."""
+        voltage, begun_s = _signal("voltage_V", voltage_V, None), 0.0 if start is None else start.time_s
+        observed = self._observed([_OBSERVED[name] for name in names], voltage, hub_torque_Nm, None, start)
+        time = begun_s + np.arange(voltage.size) * self.dt_s
+        for name, column in zip(names, observed.T, strict=True):
+            column[:] = self._reading(name, column, time, 0.0)
+        return observed
+
+    def _observed(
+        self,
+        columns: list[int] | slice,
+        voltage: Real,
+        hub_torque_Nm: npt.ArrayLike | None,
+        tip_force_N: npt.ArrayLike | None,
+        start: Start | None,
+    ) -> Real:
+        """(T, 6) as `plant.plan` orders them, or some columns of these."""
+        plan, n_samples = self.plan, voltage.size
+        before, begun_s = (0.0, 0.0) if start is None else (start.voltage_V, start.time_s)
         acting = np.full(plan.delay_samples + 1 + n_samples, before)
-        acting[plan.delay_samples + 1 :] = machine.voltage.static(voltage)
+        acting[plan.delay_samples + 1 :] = self.machine.voltage.static(voltage)
         inputs = np.zeros((n_samples, 4))
         late, early = acting[:n_samples], acting[1 : n_samples + 1]
         inputs[:, 0], inputs[:, 1] = (late if plan.parts == 2 else early), early
@@ -165,23 +208,15 @@ class Simulator:
             inputs[:, 2] = _signal("hub_torque_Nm", hub_torque_Nm, n_samples)
         if tip_force_N is not None:
             inputs[:, 3] = _signal("tip_force_N", tip_force_N, n_samples)
-        observed = np.empty((n_samples, 6))
-        begun_s = 0.0 if start is None else start.time_s
-        plan.advance(inputs, observed, plan.at(None if start is None else start.vector(), begun_s))
-        hub, tip, tip_behind, acceleration, speed, deflection = observed.T
-        time = np.arange(n_samples, dtype=np.float64) * self.dt_s
-        noise = _noise(machine, rng, n_samples, accelerometer=self.accelerometer)
-        return Trajectory(
-            time_s=time,
-            voltage_V=voltage,
-            hub_angle_rad=hub + noise[:, 0],
-            tip_m=_tip_reading(machine.sensor, tip_behind, begun_s + time, noise[:, 1]),
-            hub_angle_true_rad=hub,
-            tip_true_m=tip,
-            tip_acceleration_m_s2=machine.sensor.gain * acceleration + noise[:, 2],
-            hub_speed_rad_s=speed + noise[:, 3],
-            tip_deflection_m=machine.sensor.gain * deflection + noise[:, 4],
-        )
+        states = plan.advance(inputs, plan.at(None if start is None else start.vector(), begun_s))
+        return np.asarray(states @ plan.output_rows[columns].T)
+
+    def _reading(self, name: str, values: Real, time_s: Real, noise: Real | float) -> Real:
+        """(T,) of a sensor from what it observes (T,)."""
+        sensor = self.machine.sensor
+        if name == "tip_m":
+            return _tip_reading(sensor, values, time_s, noise)
+        return np.asarray((1.0 if name.startswith("hub") else sensor.gain) * values + noise)
 
 
 class SampledArm(Simulator):
@@ -206,7 +241,6 @@ class SampledArm(Simulator):
         super().__init__(rig, effects, dt_s=dt_s, n_modes=n_modes, substep_s=substep_s)
         self._rng = rng
         self._inputs = np.zeros((1, 4))
-        self._unused = np.empty((1, 4))
         self._rows = self.plan.output_rows
         self.reset()
 
@@ -246,7 +280,7 @@ class SampledArm(Simulator):
         row = self._inputs[0]
         row[0], row[1] = late if self.plan.parts == 2 else self._pending[0], self._pending[0]
         row[2], row[3] = hub_torque_Nm, tip_force_N
-        self.plan.advance(self._inputs, self._unused, self._state)
+        self.plan.advance(self._inputs, self._state)
         self._sample += 1
         self._measurement = None
 
@@ -265,9 +299,9 @@ def _noise(machine: Machine, rng: np.random.Generator | None, n_samples: int, *,
     return noise
 
 
-def _tip_reading(sensor: SensorPath, tip: F, time: F, noise: F) -> F:
+def _tip_reading(sensor: SensorPath, tip: F, time_s: F, noise: F | float) -> F:
     """Gain, drift, noise and quantisation of a tip position that is already behind the sensor lag."""
-    reading = sensor.gain * tip + sensor.drift_m_s * time + noise
+    reading = sensor.gain * tip + sensor.drift_m_s * time_s + noise
     if sensor.step_m > 0:
         reading = sensor.step_m * np.rint(reading / sensor.step_m)
     return reading

@@ -114,7 +114,7 @@ class FlexibleArm:
             if state is not None:
                 modes, time_s = state[2:], first_row * self.rig.sampling.dt_s
                 start = Start(state[0], state[1], modes[:_MODES], modes[_MODES:], time_s=time_s)
-            found = prepared.run(inputs[:, 0], start=start).columns(self.outputs)
+            found = prepared.measured(self.outputs, inputs[:, 0], start=start)
             if zeros is not None:
                 found[:, moved] += zeros
             return found
@@ -131,7 +131,7 @@ class FlexibleArm:
     def torque_response(self, samples: int) -> tuple[Real, float]:
         pulse = np.zeros(samples)
         pulse[0] = 1.0
-        found = self._prepared(()).run(np.zeros(samples), hub_torque_Nm=pulse).columns(self.outputs)
+        found = self._prepared(()).measured(self.outputs, np.zeros(samples), hub_torque_Nm=pulse)
         return found, self.rig.sampling.dt_s
 
     def candidates(self, experiments: Sequence[RecordOfMachine]) -> tuple[Candidate, ...]:
