@@ -33,7 +33,8 @@ _RIPPLE_PHASE_RAD, _SLEW_RAD_S = 0.25, 5.0
 _HALVINGS = 9
 # A stuck friction element or a closed contact oscillates; its phase may advance by this much in one basic
 # step. Less for contacts, which bounce: what a step misses there is amplified by the bounces that follow.
-_PHASE_PER_STEP_RAD = {FRICTION: 0.8, CONTACT: 0.25}
+# That is so at the basic step above, and in proportion at others, up to as much as for friction.
+_PHASE_PER_STEP_RAD, _CONTACT_PHASE_RAD = 0.8, 0.25
 # Falling Stribeck friction is a negative damper; a step may cover this much of its growth time.
 _GROWTH_PER_STEP = 0.3
 # A fraction of a sample below this is no separate part of it.
@@ -418,7 +419,10 @@ class _Builder:
             mobility = abs(element_rows[e, 1] @ held_columns[:, 4 + e])
             if element[e, 0] == FRICTION and element[e, 3] != 0:
                 longest = min(longest, _GROWTH_PER_STEP * element[e, 4] / (element[e, 3] * mobility))
-            longest = min(longest, _PHASE_PER_STEP_RAD[int(element[e, 0])] / np.sqrt(stiffness * mobility))
+            phase = _PHASE_PER_STEP_RAD
+            if element[e, 0] == CONTACT:
+                phase = min(phase, _CONTACT_PHASE_RAD * substep_s / SUBSTEP_S)
+            longest = min(longest, phase / np.sqrt(stiffness * mobility))
         return float(longest)
 
 
