@@ -78,7 +78,7 @@ class Equations:
     @cached_property
     def _mobility(self) -> Real:
         """(N, N) accelerations by unit generalised forces."""
-        return np.linalg.inv(self.mass)
+        return np.asarray(np.linalg.inv(self.mass), dtype=np.float64)
 
     def input_column(self, direction: Real) -> Real:
         """State derivative (2N,) for a unit generalised force along a direction."""

@@ -27,8 +27,9 @@ from plant.modal import MOTOR_SIDE_SHARE, Equations, default_n_modes, equations_
 
 # Basic step where something switches: 8 a sample at 5 ms. Twice that where forces are smooth.
 SUBSTEP_S = 6.25e-4
-# A ripple of N cycles advances by at most this phase in one step at the speed of a brisk slew.
-_RIPPLE_PHASE_RAD, _SLEW_RAD_S = 0.25, 5.0
+# A ripple of N cycles advances by at most this phase in one step at the speed of a brisk slew. That is so at
+# the basic step above, and in proportion at others, up to the last.
+_RIPPLE_PHASE_RAD, _SLEW_RAD_S, _LARGEST_PHASE_RAD = 0.25, 5.0, 0.5
 # A basic step is halved this many times to place a switching instant (to 1.2 us at the basic step above).
 _HALVINGS = 9
 # A stuck friction element or a closed contact oscillates; its phase may advance by this much in one basic
@@ -410,10 +411,11 @@ class _Builder:
     def longest_step_s(
         self, element: Real, element_rows: Real, held_columns: Real, substep_s: float
     ) -> float:
-        longest = substep_s if element.shape[0] else 2 * substep_s
+        longest, coarse = substep_s if element.shape[0] else 2 * substep_s, substep_s / SUBSTEP_S
         for torque in self.machine.joint.torques:
             if torque.law == SINE:
-                longest = min(longest, _RIPPLE_PHASE_RAD / (_SLEW_RAD_S * max(torque.values[1], 1.0)))
+                phase = min(_RIPPLE_PHASE_RAD * coarse, _LARGEST_PHASE_RAD)
+                longest = min(longest, phase / (_SLEW_RAD_S * max(torque.values[1], 1.0)))
         for e in range(element.shape[0]):
             stiffness = element[e, 1] if element[e, 0] == FRICTION else element[e, 2]  # see `run`
             mobility = abs(element_rows[e, 1] @ held_columns[:, 4 + e])
@@ -421,7 +423,7 @@ class _Builder:
                 longest = min(longest, _GROWTH_PER_STEP * element[e, 4] / (element[e, 3] * mobility))
             phase = _PHASE_PER_STEP_RAD
             if element[e, 0] == CONTACT:
-                phase = min(phase, _CONTACT_PHASE_RAD * substep_s / SUBSTEP_S)
+                phase = min(phase, _CONTACT_PHASE_RAD * coarse)
             longest = min(longest, phase / np.sqrt(stiffness * mobility))
         return float(longest)
 

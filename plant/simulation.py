@@ -183,7 +183,7 @@ class Simulator:
         """(T, Y): the quantities of these names of one record, without noise."""
         voltage, begun_s = _signal("voltage_V", voltage_V, None), 0.0 if start is None else start.time_s
         observed = self._observed([_OBSERVED[name] for name in names], voltage, hub_torque_Nm, None, start)
-        time = begun_s + np.arange(voltage.size) * self.dt_s
+        time = begun_s + np.arange(voltage.size, dtype=np.float64) * self.dt_s
         for name, column in zip(names, observed.T, strict=True):
             column[:] = self._reading(name, column, time, 0.0)
         return observed
