@@ -37,8 +37,8 @@ _SPEED_RAD_S, _DEFLECTION, _RATE = 5.0, 1.0, 20.0
 # In free play the hub drifts until it touches, however slowly it did at first.
 _DRIFTS_RAD_S = np.outer([-1.0, 1.0], np.geomspace(3e-3, 0.1, 7)).ravel()
 # Beside a model error of per cents: within a thousandth of the motion in a third of the time, but for bounces
-# in a wide gap, which no step repeats. Accelerations feel modes that angles do not: on a light link three miss
-# 2.6 % of one, four 1.3 %.
+# in a wide gap, which no step repeats. Accelerations feel modes that angles do not: on a light link three
+# miss 2.6 % of one, four 1.3 %.
 _COARSE_MODES, _COARSE_ACCELERATION_MODES, _COARSE_S = 3, 4, 8 * SUBSTEP_S
 _SPEED_SAMPLES = 10
 
