@@ -133,10 +133,10 @@ def make_plan(
     for part, (length, count) in enumerate(zip(lengths, substeps, strict=True)):
         for q, a in enumerate(state_matrices):
             into = step[part, q, ..., :n], reach[part, q, ..., : 2 * n_channels]
-            if whole and part == 0:
+            if part < whole:
                 into = into[0][-1:], into[1][-1:]
             _transitions(a, held_columns, force_columns, channel_rows, length / count, *into)
-            if whole and part == 0:
+            if part < whole:
                 _change_inside(a, held_columns[:, 1], channel_rows, dt_s, fraction, into[0][0], into[1][0])
     rate = np.zeros((len(state_matrices), n_elements, n + held_columns.shape[1] + n_channels))
     for q, a in enumerate(state_matrices):

@@ -118,7 +118,8 @@ def test_a_ten_times_finer_step_gives_the_same_record(name):
 
 @pytest.mark.parametrize("twentieths", [7, 13])
 @pytest.mark.parametrize(
-    "name", ["coulomb_friction", "stribeck_friction", "torque_ripple", "hardening_spring", "gravity"]
+    "name",
+    ["coulomb_friction", "stribeck_friction", "torque_ripple", "hardening_spring", "gravity", "backlash"],
 )
 def test_a_late_sample_as_one_step_gives_the_same_record(name, twentieths):
     # The voltage changes inside that step; with the fine steps, at the end of one.
@@ -127,8 +128,9 @@ def test_a_late_sample_as_one_step_gives_the_same_record(name, twentieths):
     voltage = prbs(8, 4, 2.0, 1200, np.random.default_rng(0))
     whole, fine = (simulate(RIG, voltage, effects, substep_s=h).output for h in (DT, DT / 80))
     error = np.sqrt(np.mean((whole - fine) ** 2, axis=0) / np.mean(fine**2, axis=0))
-    # Measured 2e-4 for Stribeck friction, whose fall a step this long hardly follows, 1e-7 for the others.
-    assert np.all(error < (1e-3 if name == "stribeck_friction" else 1e-6))
+    # Measured 2e-4 for Stribeck friction, whose fall a step this long hardly follows, 7e-6 for contacts in a
+    # gap, 1e-7 for the others.
+    assert np.all(error < {"stribeck_friction": 1e-3, "backlash": 5e-5}.get(name, 1e-6))
 
 
 @pytest.mark.parametrize(
