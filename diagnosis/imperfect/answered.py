@@ -88,8 +88,8 @@ def looked_at_halves(
 
     An effect that only held-out records excite is in no fit: it stays "unknown", or is none. The first halves
     of these records are then fitted along, and the second halves judge. Taken where that names what the first
-    answer does not, and closes most of the gap there; not sought where that is sure, nor where nothing
-    interests.
+    answer does not, closes most of the gap there, and is surer of its main cause than a first answer that
+    names one; not sought where that is sure, nor where nothing interests.
     """
     case, shares = answer.case, answer.shares
     left = max(shares.before) if shares else 0.0
@@ -102,7 +102,9 @@ def looked_at_halves(
     search.run()
     again = beside_imperfections(search, rng)
     named = set(again.combination) - set(answer.combination)
-    if named and again.gap_closed > _MOST_OF_IT:
+    main_cause, main_again = (max(a.probabilities.values()) for a in (answer, again))
+    surer = answer.verdict != "effect" or main_again > main_cause
+    if named and surer and again.gap_closed > _MOST_OF_IT:
         return replace(again, first_halves=names, left_before_halves=left)
     if shares and search.left_out:
         return replace(answer, shares=replace(shares, not_tried=("first halves of held-out records",)))

@@ -258,7 +258,8 @@ class PeriodicDisturbance(Effect):
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        amplitude = log_axis("amplitude_Nm", 1e-6 * scales.torque_Nm, scales.torque_Nm)
+        # What shakes the hub may be stronger than what the motor was asked for.
+        amplitude = log_axis("amplitude_Nm", 1e-6 * scales.torque_Nm, 10 * scales.torque_Nm)
         low, high = 0.3 / scales.duration_s, 0.5 / scales.dt_s
         frequency = Axis("frequency_Hz", "linear", low, high, 1e-5, edge=True)
         return (cls._candidate([amplitude, frequency, PHASE]),)

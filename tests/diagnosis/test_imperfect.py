@@ -602,8 +602,10 @@ def test_a_fit_alone_also_begins_at_a_local_minimum_of_its_grid(losses, begun):
         assert [point.coordinates[0] for point in tried] == expected
 
 
-def test_a_disturbance_is_found_by_its_frequency_whatever_is_computed_at_once(monkeypatch):
-    true = {"amplitude_Nm": 0.05, "frequency_Hz": 7.3, "phase_rad": 1.0}
+# The other one is as strong as twice the motor at the largest voltage of the records.
+@pytest.mark.parametrize("amplitude_Nm", [0.05, 3.0 * RIG.motor.torque_per_volt_Nm_V])
+def test_a_disturbance_is_found_by_its_frequency_whatever_is_computed_at_once(monkeypatch, amplitude_Nm):
+    true = {"amplitude_Nm": amplitude_Nm, "frequency_Hz": 7.3, "phase_rad": 1.0}
     search, kinds = _hub_only(4, {"name": "periodic_disturbance", **true})
     nothing = np.zeros(search.records.nominal.count)
     base = descend(search.records, (), nothing, np.zeros(0), search.records.at_rest())
@@ -861,6 +863,17 @@ def test_what_only_held_out_records_excite_is_found_in_their_first_halves():
     before = found.residuals_refit["c (second half)"][:, 0] * case.noise[0]
     share = np.sqrt(np.mean(before**2)) / np.std(case.held_out[0].output[300:, 0])
     assert found.shares.before[0] == pytest.approx(share, rel=0.1)
+
+
+def test_a_second_look_replaces_no_effect_that_was_surer(monkeypatch):
+    case = _swinging_out({"name": "hardening_spring", "cubic_Nm_rad3": 0.02})
+    first = beside_imperfections(searched(case, lambda share, words: None), np.random.default_rng(0))
+    monkeypatch.setattr("diagnosis.imperfect.answered.SURE", 1.1)
+    for probability, replaced in ((0.3, True), (1.0, False)):
+        cause = {**dict.fromkeys(first.probabilities, 0.0), "gravity": probability}
+        named = replace(first, verdict="effect", combination=("gravity",), probabilities=cause)
+        found = looked_at_halves(named, lambda share, words: None, np.inf, np.random.default_rng(0))
+        assert (found.combination != ("gravity",)) == replaced
 
 
 def test_two_likely_sets_that_explain_other_records_are_also_fitted_together():
