@@ -136,10 +136,11 @@ def judged(search: Search) -> Verdict:
     for _ in range(_PASSES):
         known = len(search.found)
         sets = _weighed(search)
-        for near in (one for one in sets if one.score > sets[0].score - _NEAR):
+        near_sets = [one for one in sets if one.score > sets[0].score - _NEAR]
+        for near in near_sets:
             search.exchanged(near.explanation, {part.name for part in near.parts if part.matters > 0.5})
             search.joined(sets[0].explanation, near.explanation)
-        for one in [sets[0].explanation, *search.found[known:]]:
+        for one in [*(near.explanation for near in near_sets), *search.found[known:]]:
             search.simpler(one)
         if len(search.found) == known:
             break

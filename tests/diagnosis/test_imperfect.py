@@ -819,6 +819,18 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0, first_hal
     )
 
 
+@pytest.mark.parametrize(("further_gain", "sought"), [(12.0, True), (0.0, False)])
+def test_simpler_effects_are_sought_in_every_set_that_is_as_likely(further_gain, sought):
+    friction, with_tilt = ("stribeck_friction",), ("gravity", "stribeck_friction")
+    little, nothing = (0.01, 0.01), (0.0, 0.5, 0.5)
+    gains = {friction: (400.0, *little), with_tilt: (400.0 + further_gain, *little)}
+    search = _searched({(): nothing, ("gravity",): nothing, **gains})
+    asked = []
+    search.simpler = lambda explanation: asked.append(explanation.key)
+    assert len(judged(search).judged) > 1
+    assert asked == [friction, with_tilt][: 1 + sought]
+
+
 @pytest.mark.parametrize(("first_halves", "answer"), [((), "none"), (("a",), "hardening_spring")])
 def test_in_a_second_look_an_effect_carries_what_it_does_of_held_out_records(first_halves, answer):
     sets = {(): (0.0, 0.02, 0.06), ("hardening_spring",): (24.0, 0.02, 0.01)}
