@@ -42,6 +42,8 @@ _WORTH = 15.0
 _BESIDE_IN_WINDOWS, _FREED = 4, (2, 3)
 # Loss that the best of them gains in windows, or none is continued.
 _GAINED = 15.0
+# Frequencies tried beside others.
+_FREQUENCIES = 3
 # Loss that an effect beside others gains once all else has followed, or its set is not descended on; unless
 # it is so much worse that the linearisation says nothing (set on 44 generated cases: of 325 in between, one
 # ended more than 15 below).
@@ -307,7 +309,14 @@ class Search:
             # A frequency, and a zero that no other output tells, may be any other beside another effect.
             anew = candidate.kind.harmonic is not None or self._turned(candidate)
             near = beside(self.records, parent, candidate, points[:1] if anew else _spread(points))
-            near += points_of(self.records, parent, candidate, every=2)[:1] if anew else []
+            further = points_of(self.records, parent, candidate, every=2) if anew else []
+            if candidate.kind.harmonic is not None:
+                # Their losses are a linear arm's; where it is not, they may leave less than it would.
+                further = further[:_FREQUENCIES] + beside(
+                    self.records, parent, candidate, further[:_FREQUENCIES]
+                )
+                further.sort(key=lambda point: point.loss)
+            near += further[:1]
             trials += [(candidate, point) for point in sorted(near, key=lambda point: point.loss)[:1]]
         trials.sort(key=lambda trial: trial[1].loss)
         chosen: dict[tuple[str, float], tuple[Candidate, Point]] = {}
