@@ -623,6 +623,25 @@ def test_a_disturbance_is_found_by_its_frequency_whatever_is_computed_at_once(mo
     np.testing.assert_allclose(together, points()[1], rtol=1e-6, atol=1e-6)
 
 
+def test_beside_others_a_frequency_is_tried_as_simulated_not_as_a_linear_arm_would_have_it(monkeypatch):
+    true = {"amplitude_Nm": 0.03, "cycles_per_rev": 9.0, "phase_rad": 1.0}
+    search, kinds = _hub_only(4, {"name": "torque_ripple", **true})
+    nothing, ripple = np.zeros(search.records.nominal.count), kinds["torque_ripple"]
+    base = search.add(descend(search.records, (), nothing, np.zeros(0), search.records.at_rest())).end
+    right, wrong = (
+        Point(loss, np.array([np.log(0.03), cycles, 1.0]), nothing, base.start)
+        for loss, cycles in ((2 * base.loss, 9.0), (base.loss, 50.0))
+    )
+    search.points = [(ripple, [wrong])]
+    monkeypatch.setattr("diagnosis.imperfect.search.points_of", lambda *told, **more: [right])
+    search._beside(base, 2)
+    end = search.found[-1].end
+    assert end.loss < 0.1 * base.loss
+    found = ripple.parameters(end.coordinates)
+    assert found["cycles_per_rev"] == pytest.approx(9.0, rel=0.01)
+    assert found["amplitude_Nm"] == pytest.approx(0.03, rel=0.05)
+
+
 def _hub_only(seed, *effects):
     """Search of records of the hub angle alone, of an independent simulator that rubs a little."""
     rng = np.random.default_rng(seed)
