@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -875,9 +876,14 @@ def _swinging_out(effect):
     return Case("swinging out", RIG, tuple(records), 0.05)
 
 
-def test_what_only_held_out_records_excite_is_found_in_their_first_halves():
+@cache
+def _first_look_at_a_spring():
     case = _swinging_out({"name": "hardening_spring", "cubic_Nm_rad3": 0.02})
-    first = beside_imperfections(searched(case, lambda share, words: None), np.random.default_rng(0))
+    return case, beside_imperfections(searched(case, lambda share, words: None), np.random.default_rng(0))
+
+
+def test_what_only_held_out_records_excite_is_found_in_their_first_halves():
+    case, first = _first_look_at_a_spring()
     assert first.combination != ("hardening_spring",)
     assert np.isnan(first.left_before_halves)
     in_no_time = looked_at_halves(first, lambda share, words: None, -np.inf, np.random.default_rng(0))
@@ -897,8 +903,7 @@ def test_what_only_held_out_records_excite_is_found_in_their_first_halves():
 
 
 def test_a_second_look_replaces_no_effect_that_was_surer(monkeypatch):
-    case = _swinging_out({"name": "hardening_spring", "cubic_Nm_rad3": 0.02})
-    first = beside_imperfections(searched(case, lambda share, words: None), np.random.default_rng(0))
+    _, first = _first_look_at_a_spring()
     monkeypatch.setattr("diagnosis.imperfect.answered.SURE", 1.1)
     for probability, replaced in ((0.3, True), (1.0, False)):
         cause = {**dict.fromkeys(first.probabilities, 0.0), "gravity": probability}
