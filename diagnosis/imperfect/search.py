@@ -309,14 +309,11 @@ class Search:
             # A frequency, and a zero that no other output tells, may be any other beside another effect.
             anew = candidate.kind.harmonic is not None or self._turned(candidate)
             near = beside(self.records, parent, candidate, points[:1] if anew else _spread(points))
-            further = points_of(self.records, parent, candidate, every=2) if anew else []
+            further = points_of(self.records, parent, candidate, every=2)[:_FREQUENCIES] if anew else []
             if candidate.kind.harmonic is not None:
                 # Their losses are a linear arm's; where it is not, they may leave less than it would.
-                further = further[:_FREQUENCIES] + beside(
-                    self.records, parent, candidate, further[:_FREQUENCIES]
-                )
-                further.sort(key=lambda point: point.loss)
-            near += further[:1]
+                further += beside(self.records, parent, candidate, further)
+            near += further
             trials += [(candidate, point) for point in sorted(near, key=lambda point: point.loss)[:1]]
         trials.sort(key=lambda trial: trial[1].loss)
         chosen: dict[tuple[str, float], tuple[Candidate, Point]] = {}
