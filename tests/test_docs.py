@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import workshop_series
+from benchmarks import how_well
 from tests.workflow.command import Answer
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -97,28 +97,8 @@ def test_no_snippet_is_left_out():
     assert {page.stem for page in (DOCS / "tutorials").iterdir()} == set(NOTEBOOKS)
 
 
-def test_readme_counts_every_sealed_series():
-    lines: list[str] = []
-    workshop_series.run(lines.append)
-    count = {
-        what: counts for what, *counts in re.findall(r"^(.+?)\s+(\d+)/(\d+) ", "\n".join(lines), re.MULTILINE)
-    }
-    right, cases = count["verdict and set right, every case"]
-    single, singles = count["top-1, every single effect"]
-    exact, pairs = count["two effects, exact set"]
-    unlisted, unknown = count["unknown: precision"]
-    named, without = count["no effect, but one named"]
-    sure, _ = count["confident and wrong (p > 0.8)"]
-    text = re.sub(r"\s+", " ", (ROOT / "README.md").read_text(encoding="utf-8"))
-    assert f"On {cases} sealed cases" in text
-    assert f"{right} verdicts and sets were right: {single} of {singles} single effects" in text
-    assert f"of {pairs} pairs {exact}; {named} of {without} machines without an effect got one" in text
-    last = re.findall(r"\d+/\d+", lines[0])[-4:]
-    said = "the last four had {} of {}, {} of {}, {} of {} and {} of {} verdicts right"
-    assert said.format(*re.findall(r"\d+", " ".join(last))) in text
-    assert (
-        f'of {unknown} "unknown" {unlisted} had a cause beyond the list; {sure} of {cases} were wrong' in text
-    )
+def test_how_well_it_works_is_what_the_results_say():
+    assert how_well.PAGE.read_text(encoding="utf-8") == how_well.page()
 
 
 def test_every_key_of_a_configuration_has_a_meaning():

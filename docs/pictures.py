@@ -1,0 +1,43 @@
+"""The pictures of README and of the first page of the site: `python docs/pictures.py` draws them anew."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+import flexlink
+from diagnosis.diagnosis import diagnose
+from workflow.commands.run import run_from_files
+from workflow.diagnose.case_files import load_case
+from workflow.figures.gap_records import draw_measured_beside_simulated
+from workflow.figures.style import render
+
+DOCS = Path(__file__).parent
+
+
+def overview() -> bytes:
+    """The built-in arm: response, loop and step of `make run`."""
+    with tempfile.TemporaryDirectory() as folder:
+        run_from_files(None, Path(folder) / "run")
+        return (Path(folder) / "run" / "figures" / "overview.svg").read_bytes()
+
+
+def diagnosis() -> bytes:
+    """examples/gap_case: measured beside simulated, before and after the repair."""
+    case = load_case(DOCS.parent / "examples" / "gap_case").case
+    return render(draw_measured_beside_simulated(diagnose(case))).content
+
+
+def response() -> bytes:
+    """The response that the Python lines of README identify."""
+    voltage = flexlink.prbs(register_length=11, hold_samples=2, amplitude_V=12.0, n_samples=4000)
+    run = flexlink.simulate(flexlink.paper_link(), voltage, rng=np.random.default_rng(1))
+    found = flexlink.identify(run.record("hub_angle_rad"), integrators=1, n_real=1, n_pairs=2)
+    return render(flexlink.bode(flexlink.uncertainty(found))).content
+
+
+if __name__ == "__main__":
+    for draw in (overview, diagnosis, response):
+        (DOCS / f"{draw.__name__}.svg").write_bytes(draw())
