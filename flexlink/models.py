@@ -216,7 +216,7 @@ class Identification(Shown, Identified):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Uncertainty(Shown, posterior.ResponsePosterior):
-    """What `uncertainty` found: the response and its ellipses at any frequency (`at`); `joint_level`: the ellipse level for a whole curve.
+    """Response with ellipses at any frequency (`at`); `joint_level` gives the level for a whole curve.
 
     Examples
     --------
