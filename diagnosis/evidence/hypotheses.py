@@ -90,8 +90,9 @@ class Hypothesis:
         return cls(fit, exactly, besides)
 
 
-def log_prior(names: Sequence[str], n: int = len(EFFECTS)) -> float:
-    """log prior probability of exactly this set of effects out of n that are listed."""
+def log_prior(names: Sequence[str], n: int | None = None) -> float:
+    """log prior probability of exactly this set of effects out of n that are listed (None: the registry)."""
+    n = len(EFFECTS) if n is None else n
     if not names:
         return float(np.log(_PRIOR_NONE))
     count = len(names)

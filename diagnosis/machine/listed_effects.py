@@ -45,11 +45,15 @@ def _log(name: str, unit: float, low: float, high: float, first: float, last: fl
 
 @dataclass(frozen=True)
 class Kind:
-    """An effect of the list: where it acts, what it does, its parameters with their ranges."""
+    """An effect of the list: where it acts, what it does, its parameters with their ranges.
+
+    check: what anybody can do to see whether it is there; a command in a sentence.
+    """
 
     where: Where
     change: Callable[..., Any]
     parameters: Callable[[Sizes], tuple[EffectParameter, ...]]
+    check: str
     signed: bool = False
     grows: bool = True
     dependence: Dependence = "smooth"
@@ -139,31 +143,46 @@ def _gains(s: Sizes) -> tuple[EffectParameter, ...]:
 
 # Effects of the actuator act in this order, then those of the body, then those of the sensor.
 KINDS: dict[str, Kind] = {
-    "input_delay": Kind("input", _delayed, _delays),
-    "actuator_gain": Kind("input", _scaled, _gains, signed=True),
+    "input_delay": Kind(
+        "input",
+        _delayed,
+        _delays,
+        check="log the input at the actuator beside the command and compare when they step",
+    ),
+    "actuator_gain": Kind(
+        "input",
+        _scaled,
+        _gains,
+        signed=True,
+        check="hold two steady commands and measure what the actuator gives",
+    ),
     "input_offset": Kind(
         "input",
         _shifted,
         lambda s: (_log("offset", s.input, 1e-5, 1.0, 1e-3, 0.3, 8),),
         signed=True,
+        check="command zero and measure what the actuator gives; on a force, level the machine",
     ),
     "input_drift": Kind(
         "input",
         _drifting,
         lambda s: (_log("rate_per_s", s.input / s.duration_s, 1e-5, 3.0, 1e-3, 1.0, 8),),
         signed=True,
+        check="hold a steady command for some minutes and measure what the actuator gives",
     ),
     "input_backlash": Kind(
         "input",
         _with_play,
         lambda s: (_log("gap", s.input, 1e-4, 1.5, 1e-3, 1.0, 20),),
         dependence="non-smooth",
+        check="command slow ramps up and down: the width between the two ways is the play",
     ),
     "actuator_dead_zone": Kind(
         "input",
         _dead,
         lambda s: (_log("width", s.input, 1e-5, 1.0, 1e-3, 0.5, 12),),
         dependence="continuous",
+        check="raise the command slowly from zero and note where something begins to follow",
     ),
     "actuator_saturation": Kind(
         "input",
@@ -171,13 +190,20 @@ KINDS: dict[str, Kind] = {
         lambda s: (_log("limit", s.input, 0.05, 1.0, 0.1, 0.99, 24),),
         grows=False,
         dependence="continuous",
+        check="command the largest input and measure what arrives",
     ),
-    "actuator_lag": Kind("input", _lagged, _lags),
+    "actuator_lag": Kind(
+        "input",
+        _lagged,
+        _lags,
+        check="step the command and look at what the actuator gives: it should step as well",
+    ),
     "coulomb_friction": Kind(
         "body",
         lambda v: {"coulomb": v["force"]},
         lambda s: (_log("force", s.force, 1e-5, 1.0, 3e-4, 0.6, 14),),
         dependence="continuous",
+        check="raise the input slowly from rest and note where motion begins, in both directions",
     ),
     "stribeck_friction": Kind(
         "body",
@@ -189,6 +215,7 @@ KINDS: dict[str, Kind] = {
         ),
         dependence="continuous",
         contains="coulomb_friction",
+        check="creep at several slow, steady speeds and note the input that each takes",
     ),
     "one_sided_friction": Kind(
         "body",
@@ -196,41 +223,64 @@ KINDS: dict[str, Kind] = {
         lambda s: (_log("force", s.force, 1e-5, 1.0, 1e-3, 0.6, 8),),
         signed=True,
         dependence="continuous",
+        check="raise the input slowly from rest, once in each direction",
     ),
     "viscous_friction": Kind(
         "body",
         lambda v: {"viscous": v["coefficient"]},
         lambda s: (_log("coefficient", s.force / s.speed, 1e-5, 30.0, 1e-4, 3.0, 8),),
+        check="move at several steady speeds and note the input: it should grow in proportion",
     ),
     "spring": Kind(
         "body",
         lambda v: {"linear": v["stiffness"]},
         lambda s: (_log("stiffness", s.force / s.position, 1e-5, 30.0, 1e-4, 3.0, 8),),
+        check="let the machine go away from zero with the input off: it should stay where it is",
     ),
     "hardening_spring": Kind(
         "body",
         lambda v: {"cubic": v["cubic"]},
         lambda s: (_log("cubic", s.force / s.position**3, 1e-7, 1e3, 1e-5, 10.0, 12),),
+        check="push by hand at small and at large distances and look for cables and hoses",
     ),
     "backlash": Kind(
         "output",
         _with_play,
         lambda s: (_log("gap", s.output, 1e-4, 1.0, 1e-3, 0.5, 20),),
         dependence="non-smooth",
+        check="hold the drive and move the load to and fro by hand: the free play is the backlash",
     ),
-    "output_lag": Kind("output", _lagged_sensor, _lags),
-    "output_delay": Kind("output", _delayed, _delays),
-    "output_gain": Kind("output", _scaled, _gains, signed=True),
+    "output_lag": Kind(
+        "output",
+        _lagged_sensor,
+        _lags,
+        check="tap against the machine and compare when the sensors answer",
+    ),
+    "output_delay": Kind(
+        "output",
+        _delayed,
+        _delays,
+        check="tap against the machine and compare when the sensors answer",
+    ),
+    "output_gain": Kind(
+        "output",
+        _scaled,
+        _gains,
+        signed=True,
+        check="move by a known distance and compare the reading",
+    ),
     "output_offset": Kind(
         "output",
         _shifted,
         lambda s: (_log("offset", s.output, 1e-6, 3.0, 1e-4, 0.5, 8),),
         signed=True,
+        check="go to a known position and compare the reading",
     ),
     "output_drift": Kind(
         "output",
         _drifting,
         lambda s: (_log("rate_per_s", s.output / s.duration_s, 1e-6, 3.0, 1e-4, 1.0, 8),),
         signed=True,
+        check="log the sensor for some minutes with the machine held",
     ),
 }

@@ -36,7 +36,7 @@ class Weighing:
         what no effect explains is an unknown cause however small.
     """
 
-    listed: tuple[str, ...] = tuple(EFFECTS)
+    listed: tuple[str, ...] = field(default_factory=lambda: tuple(EFFECTS))
     model_error: float = 0.0
     most_effects: int = 3
     stated: bool = True

@@ -88,6 +88,7 @@ class PlantEffect:
     contains : str or None. Simpler effect that it is with its further parameters at an end of their ranges.
     everywhere : bool or None
         Every machine has some of it (dry friction, a lag); None: as the listed effect of that name has it.
+    check : str. What to do to see whether it is there: a command in a sentence; "" says nothing.
     acts : Acts or None
         What it does to a simulation that does not know it (`with_effects`); None: the simulation is told.
     """
@@ -101,6 +102,7 @@ class PlantEffect:
     contains: str | None = None
     acts: Acts | None = None
     everywhere: bool | None = None
+    check: str = ""
     # Which of its own parameters an effect multiplies nobody said.
     multiplies: ClassVar[str | None] = None
     harmonic: ClassVar[Harmonic | None] = None

@@ -121,6 +121,7 @@ def with_effects(
                 group=_GROUPS[kind.where],
                 contains=simpler,
                 acts=Acts(kind.where, place, kind.change, dt_s, at_rest_before),
+                check=kind.check,
             )
         )
     equipped = replace(plant, effects=tuple(found), dt_s=dt_s)

@@ -130,7 +130,8 @@ def subsystem_mass(probabilities: Mapping[str, float]) -> dict[str, float]:
             mass[name] += float(value)
         elif name in EFFECTS:
             effect = EFFECTS[name]
-            mass["environment" if effect.environment else effect.group] += float(value)
+            place = "environment" if effect.environment else effect.group
+            mass[place] = mass.get(place, 0.0) + float(value)
         else:
             raise ValueError(f"{name}: no such effect; known: {', '.join(EFFECTS)}, none, unknown")
     return mass

@@ -17,6 +17,7 @@ class InputDelay(Effect):
 
     id = "input_delay"
     words = "a delay of the command"
+    check = "log the voltage at the motor beside the command; the time between their steps is the delay"
     adds_to = "sampling.transport_delay_s"
     sought = Sought((2e-4, 100), (0.04, 30, 14), "dt_s")
 
@@ -32,6 +33,7 @@ class ActuatorGain(RatioEffect):
 
     id = "actuator_gain"
     words = "a wrong gain of the actuator"
+    check = "hold two steady commands and compare the voltage at the motor with them"
     multiplies = "motor.torque_constant_Nm_A"
 
     ratio: Positive = Field(description="acting voltage over commanded voltage")
@@ -46,6 +48,7 @@ class ActuatorDeadZone(Effect):
 
     id = "actuator_dead_zone"
     words = "a dead zone of the actuator"
+    check = "raise the command slowly from zero and note where the voltage at the motor begins to follow"
     dependence = "continuous"
     sought = Sought((1e-5, 1), (1e-3, 0.5, 12), "voltage_V", 1e-4)
 
@@ -61,6 +64,7 @@ class ActuatorSaturation(Effect):
 
     id = "actuator_saturation"
     words = "saturation of the actuator"
+    check = "command the largest voltage and measure what arrives at the motor"
     neutral = MappingProxyType({"limit_V": 1e6})
     dependence = "continuous"
     sought = Sought((0.05, 1), (0.1, 0.99, 24), "voltage_V", 1e-4, grows=False)
@@ -77,6 +81,7 @@ class ActuatorLag(Effect):
 
     id = "actuator_lag"
     words = "a lag of the actuator"
+    check = "step the command and look at the voltage at the motor: it should step as well"
     everywhere = True
     sought = Sought((2e-4, 200), (0.02, 40, 10), "dt_s")
 

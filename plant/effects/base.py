@@ -43,7 +43,9 @@ class Effect(BaseModel, ABC):
 
     id : str. Name in the registry and in configuration files.
     words : str. Its name in a sentence.
-    group : str. Where it acts: actuator, joint, link or sensor, after the module that it is registered in.
+    check : str or None. What a mechanic can do to see whether it is there: a command in a sentence.
+    group : str
+        Where it acts: actuator, joint, link or sensor. The name of its module, unless the class states one.
     neutral : mapping or None. Parameter values at which the effect vanishes exactly, zero for those not
         named; None if there are none within the bounds.
     dependence : str
@@ -70,6 +72,7 @@ class Effect(BaseModel, ABC):
 
     id: ClassVar[str]
     words: ClassVar[str]
+    check: ClassVar[str | None] = None
     group: ClassVar[Group]
     neutral: ClassVar[Mapping[str, float] | None] = MappingProxyType({})
     dependence: ClassVar[Dependence] = "smooth"
@@ -161,13 +164,17 @@ E = TypeVar("E", bound=Effect)
 def register(kind: type[E]) -> type[E]:
     """Class decorator: the effect can be configured and diagnosed by its id (look-alikes: only diagnosed).
 
-    Its group is the name of its module.
+    Its group is the name of its module, unless it states one.
 
-    Raises TypeError for a ratio without a stated value that it multiplies or a `modify` of its own.
+    Raises TypeError for a ratio without a stated value that it multiplies or a `modify` of its own, and for
+    an effect without id or words: the pages need them.
     """
     if issubclass(kind, RatioEffect) and kind.multiplies is None and kind.modify is RatioEffect.modify:
         raise TypeError(f"{kind.id} multiplies no stated value: it needs its own modify")
-    kind.group = cast(Group, kind.__module__.rpartition(".")[2])
+    if missing := [name for name in ("id", "words") if not hasattr(kind, name)]:
+        raise TypeError(f"effect {kind.__name__}: state its {' and '.join(missing)} in the class")
+    if not hasattr(kind, "group"):
+        kind.group = cast(Group, kind.__module__.rpartition(".")[2])
     (LOOK_ALIKES if kind.look_alike_of else EFFECTS)[kind.id] = kind
     return kind
 

@@ -49,6 +49,7 @@ class CoulombFriction(Effect):
 
     id = "coulomb_friction"
     words = "dry (Coulomb) friction"
+    check = "raise the voltage slowly from rest and note where the hub starts to turn, in both directions"
     everywhere = True
     friction = True
     dependence = "continuous"
@@ -67,6 +68,7 @@ class StribeckFriction(Effect):
 
     id = "stribeck_friction"
     words = "dry friction that falls with speed (Stribeck)"
+    check = "let the hub creep at several slow, steady speeds and note the voltage that each takes"
     everywhere = True
     contains = "coulomb_friction"
     friction = True
@@ -122,6 +124,7 @@ class ViscousFriction(Effect):
 
     id = "viscous_friction"
     words = "additional viscous friction"
+    check = "turn the hub at several steady speeds and note the voltage: it should grow in proportion"
     adds_to = "hub.viscous_friction_Nms"
     friction = True
 
@@ -167,6 +170,7 @@ class HubInertia(RatioEffect):
 
     id = "hub_inertia"
     words = "a wrong inertia of the hub"
+    check = "weigh what is fixed to the hub (clamp, coupling, cable) and measure how far out it sits"
     beside = "a body that something compliant holds to the hub, below its resonance; faster motions"
     multiplies = "hub.inertia_kg_m2"
 
@@ -219,6 +223,7 @@ class TorqueRipple(Effect):
 
     id = "torque_ripple"
     words = "torque ripple over the hub angle"
+    check = "turn the hub slowly by hand with the motor off and feel for places where it sticks"
     everywhere = True
     harmonic = "hub_angle"
 
@@ -245,6 +250,7 @@ class PeriodicDisturbance(Effect):
 
     id = "periodic_disturbance"
     words = "a periodic disturbance torque"
+    check = "log the arm for half a minute at zero voltage: a disturbance from outside goes on"
     environment = True
     harmonic = "time"
 
@@ -271,6 +277,7 @@ class HardeningSpring(Effect):
 
     id = "hardening_spring"
     words = "a hardening spring (cable, hose)"
+    check = "pull the hub with a spring balance at small and at large angles and look for cables and hoses"
     absolute_angle = True
 
     cubic_Nm_rad3: NotNegative = Field(description="coefficient k3")
@@ -318,6 +325,7 @@ class JointCompliance(Effect):
 
     id = "joint_compliance"
     words = "a compliant joint between hub and link"
+    check = "hold the hub and push the link sideways at its clamp: nothing should give"
     neutral = None  # the rigid joint is the limit of infinite stiffness
 
     stiffness_Nm_rad: Positive = Field(description="stiffness k")
@@ -345,6 +353,7 @@ class BaseCompliance(Effect):
 
     id = "base_compliance"
     words = "a compliant base under the motor"
+    check = "put a dial gauge on the base of the motor and shake the arm: nothing should move"
     neutral = None  # the fixed base is the limit of infinite stiffness
 
     stiffness_Nm_rad: Positive = Field(description="stiffness k to ground")
@@ -384,6 +393,7 @@ class Backlash(Effect):
 
     id = "backlash"
     words = "backlash in the gear"
+    check = "hold the motor shaft and turn the hub to and fro by hand: the free play is the backlash"
     neutral = None  # without a gap the contact is still elastic
     dependence = "non-smooth"
     sought = Sought((1e-5, 0.5), (3e-4, 0.2, 30), step=5e-3)

@@ -22,6 +22,7 @@ class TipPayload(Effect):
 
     id = "tip_payload"
     words = "an additional mass at the tip"
+    check = "weigh the tip with everything that is fixed to it"
     adds_to = "payload.mass_kg"
     sought = Sought((1e-6, 5), (1e-4, 1.5, 14), "link_mass_kg")
 
@@ -37,6 +38,7 @@ class LinkStiffness(RatioEffect):
 
     id = "link_stiffness"
     words = "a wrong bending stiffness of the link"
+    check = "clamp the hub, pull the tip with a known force and measure the deflection"
     multiplies = "link.youngs_modulus_Pa"
 
     ratio: Positive = Field(description="true over nominal bending stiffness")
@@ -48,6 +50,7 @@ class StructuralDamping(RatioEffect):
 
     id = "structural_damping"
     words = "wrong damping of the link"
+    check = "clamp the hub, pluck the tip and count the swings until half of them is left"
     multiplies = "link.kelvin_voigt_s"
     largest_ratio = 50.0
 
@@ -65,6 +68,7 @@ class Gravity(Effect):
 
     id = "gravity"
     words = "gravity in a tilted plane"
+    check = "put a spirit level on the base, and let the arm go with the motor off: it should stay"
     beside = "a linear spring from hub to ground, while motions are small; larger ones"
     environment = True
     everywhere = True

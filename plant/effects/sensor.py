@@ -18,6 +18,7 @@ class SensorGain(RatioEffect):
 
     id = "sensor_gain"
     words = "a wrong gain of the tip sensor"
+    check = "move the tip by a known length and compare the reading"
 
     ratio: Positive = Field(description="measured over true tip position")
 
@@ -31,6 +32,7 @@ class SensorDrift(Effect):
 
     id = "sensor_drift"
     words = "a drift of the tip sensor"
+    check = "log the tip sensor for some minutes with the arm clamped"
 
     rate_m_s: float = Field(description="drift of the tip sensor")
 
@@ -54,6 +56,7 @@ class Quantisation(Effect):
 
     id = "quantisation"
     words = "coarse quantisation of the tip sensor"
+    check = "move the tip slowly and look for steps in the reading"
     dependence = "non-smooth"
 
     # Values on a grid are plain to see: the step is read off them (`diagnosis.machine.quantisation_grid`).
@@ -69,6 +72,7 @@ class SensorLag(Effect):
 
     id = "sensor_lag"
     words = "a lag of the tip sensor"
+    check = "tap against the tip and compare when its sensor and the encoder answer"
     sought = Sought((2e-4, 200), (0.02, 40, 10), "dt_s")
 
     time_constant_s: NotNegative = Field(description="time constant; 0 is none")

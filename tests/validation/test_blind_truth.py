@@ -78,7 +78,9 @@ def _noise_deviations(ours: Truth, effects: list[dict[str, object]], voltage: np
 
 
 def test_effects_of_the_list_are_all_there():
-    assert set(LISTED) == set(EFFECTS) == set(EFFECTS_HERE)
+    # The diagnosis may know more than the protocol hides: an effect that is added there need not be here.
+    assert set(LISTED) == set(EFFECTS_HERE)
+    assert set(LISTED) <= set(EFFECTS)
     assert not set(LISTED) & set(UNLISTED)
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, Literal
+from typing import Annotated, Any, Final, Literal, NewType, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from typing_extensions import TypeAliasType
 
 from workflow.engine import codec, storage
 from workflow.engine.codec import CodecError
@@ -100,6 +101,44 @@ def test_a_plant_is_read_without_its_file_naming_the_type(fast_run):
     assert same(codec.from_arrays(IdentifiedPlant, codec.to_arrays(plant)), plant)
     with pytest.raises(CodecError, match="holds no IdentifiedPlant"):
         codec.from_arrays(IdentifiedPlant, {"a": np.zeros(2)})
+
+
+Item, Key = TypeVar("Item"), TypeVar("Key")
+# What `type X[...] = ...` of Python 3.12 makes, and `numpy.typing.NDArray` of numpy 2.5 with it.
+Samples = TypeAliasType(
+    "Samples",
+    np.ndarray[tuple[Any, ...], np.dtype[Item]],
+    type_params=(Item,),  # type: ignore[type-var]
+)
+Turned = TypeAliasType("Turned", tuple[Key, Item], type_params=(Item, Key))
+Shape = TypeAliasType("Shape", Small | Other)
+Metre = NewType("Metre", float)
+
+
+@dataclass(frozen=True, eq=False)
+class Named:
+    """Annotations that are names for others."""
+
+    signal: Samples[np.float64]
+    matrix: Samples[np.complex128] | None
+    pair: Turned[str, float]
+    rows: tuple[TypeAliasType("Row", Samples[np.float64]), ...]  # type: ignore[valid-type]
+    shape: Shape | None
+    length: Annotated[Metre | None, "m"]
+    always: Final[int]
+    again: TypeAliasType("Again", Callable[[], int]) = int  # type: ignore[valid-type]
+
+
+def test_names_for_kinds_are_read_back_as_the_kinds():
+    value = Named(np.arange(3.0), None, (0.5, "x"), (np.ones(2),), Other(7.0), Metre(2.0), 4)
+    arrays = codec.to_arrays(value)
+    back = codec.from_arrays(Named, arrays)
+    assert same(back, value)
+    assert (back.pair, back.shape, back.length, back.always) == ((0.5, "x"), Other(7.0), 2.0, 4)
+    with pytest.raises(CodecError, match=r"signal: holds .*complex128.*, expected float64"):
+        codec.from_arrays(Named, arrays | {"signal": np.ones(3) * 1j})
+    with pytest.raises(CodecError, match=r"pair\[0\]: expected float, got 'x'"):
+        codec.from_arrays(Named, codec.to_arrays(replace(value, pair=("x", "x"))))
 
 
 def document(**changes: Any) -> tuple[Any, dict[str, Any]]:

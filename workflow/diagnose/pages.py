@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from diagnosis.answer import Diagnosis, held_out_gap
+from diagnosis.machine.own_plant import Plant
 from diagnosis.where.findings import Where
 from diagnosis.where.where import motion_of, over_levels, where_in_records
 from plant.effects import EFFECTS
@@ -92,8 +93,16 @@ def _rendered(
         moved_refit=moved(found, found.deviations_refit),
         partial=partial_answers(found),
         effects=EFFECTS,
+        checks=checks(found),
         **values,
     ).html
+
+
+def checks(found: Diagnosis) -> dict[str, str]:
+    """Effect -> what to do to see whether it is there, as its class says."""
+    machine = found.case.machine
+    kinds = machine.effects if isinstance(machine, Plant) else EFFECTS.values()
+    return {kind.id: kind.check for kind in kinds if kind.check}
 
 
 def shown(found: Diagnosis) -> Diagnosis:

@@ -13,11 +13,11 @@ import dataclasses
 import json
 import math
 import types
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from enum import Enum
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -102,11 +102,39 @@ def plain_text(value: Any) -> str:
     return json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
+def bare(kind: Any) -> Any:
+    """An annotation without its names and notes: what `type X = ...`, NewType, Annotated and Final stand for.
+
+    NDArray[float64] is such a name since numpy 2.5, and ndarray[...] itself before.
+    """
+    while True:
+        origin = get_origin(kind)
+        alias = origin if hasattr(origin, "__value__") else kind
+        if hasattr(alias, "__value__"):
+            kind = _written_out(
+                alias.__value__, dict(zip(alias.__type_params__, get_args(kind), strict=False))
+            )
+        elif origin in (Annotated, Final):
+            kind = get_args(kind)[0]
+        elif hasattr(kind, "__supertype__"):
+            kind = kind.__supertype__
+        else:
+            return kind
+
+
+def _written_out(kind: Any, meant: Mapping[Any, Any]) -> Any:
+    """The right side of an alias with its parameters replaced; one that is not given stays open."""
+    if isinstance(kind, TypeVar):
+        return meant.get(kind, Any)
+    left = getattr(kind, "__parameters__", ())
+    return kind[tuple(meant.get(name, Any) for name in left)] if left else kind
+
+
 @cache
 def stored_fields(kind: type) -> dict[str, Any]:
     """Name and annotation of the fields of a dataclass that are data."""
     hints = get_type_hints(kind, include_extras=True)
-    known = {f.name: hints[f.name] for f in dataclasses.fields(kind) if f.init}
+    known = {f.name: bare(hints[f.name]) for f in dataclasses.fields(kind) if f.init}
     return {name: k for name, k in known.items() if get_origin(k) is not collections.abc.Callable}
 
 
@@ -153,9 +181,8 @@ def _join(at: str, name: str) -> str:
 
 
 def _unpack(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: str) -> Any:
+    kind = bare(kind)
     origin = get_origin(kind)
-    if origin is Annotated:
-        return _unpack(get_args(kind)[0], document, arrays, at)
     if origin in _UNIONS:
         return _unpack(_member(kind, document, at), document, arrays, at)
     if kind is Any or kind is object:
@@ -217,7 +244,7 @@ def _unpack_array(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: 
     _expect(isinstance(name, str) and name in arrays, document, at, "an array that is in the archive")
     array = arrays[str(name)]
     # The annotation is ndarray[shape, dtype[number]]; one that says less holds whatever there is.
-    wanted = next(iter(get_args(get_args(kind)[1])), None) if get_args(kind) else None
+    wanted = next(iter(get_args(bare(get_args(kind)[1]))), None) if get_args(kind) else None
     if isinstance(wanted, type) and not np.can_cast(array.dtype, wanted, "same_kind"):
         raise CodecError(f"{at}: holds {shown(str(array.dtype))}, expected {wanted.__name__}")
     return array
@@ -264,7 +291,7 @@ def _unpack_plain(document: Any, arrays: Mapping[str, AnyArray], at: str) -> Any
 
 def _member(union: Any, document: Any, at: str) -> Any:
     """The member of a union that a document is of: by null, by its tag, else the only one left."""
-    members = get_args(union)
+    members = tuple(_members(union))
     if document is None and type(None) in members:
         return type(None)
     rest = [member for member in members if member is not type(None)]
@@ -275,6 +302,15 @@ def _member(union: Any, document: Any, at: str) -> Any:
     if not rest:
         raise CodecError(f"{at}: {shown(document.get(_TYPE))} is none of {union}")
     return rest[0]
+
+
+def _members(union: Any) -> Iterator[Any]:
+    """The members of a union; one that is a name for another union is opened."""
+    for member in map(bare, get_args(union)):
+        if get_origin(member) in _UNIONS:
+            yield from _members(member)
+        else:
+            yield member
 
 
 def _expect(fits: bool, document: Any, at: str, wanted: str) -> None:
