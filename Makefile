@@ -12,13 +12,14 @@ export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help install run test test-all lint types check docs clean
+.PHONY: help install run test test-all lint types wheel check docs clean
 
 help:
 	@echo "make run    install into .venv and run the default arm end to end (OUT=$(OUT))"
 	@echo "make test   everything that guards behaviour   make test-all   with the long Monte Carlo"
 	@echo "make docs   the documentation as a site, build/site/index.html, with a gallery of pages"
-	@echo "make check  what CI runs: tests, lint, types"
+	@echo "make wheel  a wheel with the newest dependencies, tried on every Python from 3.11 to 3.13 that is here"
+	@echo "make check  what CI runs: tests, lint, types, wheel"
 
 $(PACKAGES): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "flexlink needs Python 3.11 or newer with venv"; exit 2; }
@@ -54,7 +55,11 @@ lint: $(PACKAGES)
 types: $(PACKAGES)
 	$(BIN)/mypy
 
-check: test-all lint types
+# Needs no installation of ours: it makes its own, with the newest dependencies, for every Python there is.
+wheel:
+	./.ci/wheel
+
+check: test-all lint types wheel
 
 # Pages of the gallery are drawn once; make clean has them drawn again.
 docs: $(STAMP) build/gallery/.drawn

@@ -9,9 +9,11 @@ What takes long runs on one thread, as the commands do: matrices here are small.
 
 Data        `Record`, `FrfRepeats`, `FrequencyUncertainty`, `band_limited`, `empirical_frf`
 Models      `identify`, `identify_frf`, `identify_miso`, `uncertainty`, `GobfModel`, `Poles`, `IdentOptions`,
-            `EmbeddingOptions`, `Identification`, `Uncertainty`, `pole_intervals`
+            `EmbeddingOptions`, `Identification`, `Uncertainty`, `pole_intervals`, `error_surface`
+Basis       `regressor`, `basis_response`
 Controllers `UncertainPlant`, `Specification`, `RationalWeight`, `synthesise`, `SynthesisOptions`, `certify`,
-            `Certificate`, `Controller`, `simulate_loop`, `step_metrics`, `c_source`
+            `Certificate`, `Controller`, `simulate_loop`, `step_metrics`, `c_source`,
+            `synthesise_jointly`, `youla_bracket`, `YoulaOptions`
 Machines    `Rig`, `paper_link`, `effect`, `simulate`, `SampledArm`, `prbs`, `multisine`
 Causes      `Case`, `Experiment`, `diagnose`, `Diagnosis`
 Pictures    `plot`, `bode`, `compare`

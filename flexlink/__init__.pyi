@@ -8,11 +8,14 @@ from .design import (
     SynthesisOptions as SynthesisOptions,
     SynthesisResult as SynthesisResult,
     UncertainPlant as UncertainPlant,
+    YoulaOptions as YoulaOptions,
     c_source as c_source,
     certify as certify,
     simulate_loop as simulate_loop,
     step_metrics as step_metrics,
     synthesise as synthesise,
+    synthesise_jointly as synthesise_jointly,
+    youla_bracket as youla_bracket,
 )
 from .machines import (
     Rig as Rig,
@@ -35,11 +38,14 @@ from .models import (
     Record as Record,
     Uncertainty as Uncertainty,
     band_limited as band_limited,
+    basis_response as basis_response,
     empirical_frf as empirical_frf,
+    error_surface as error_surface,
     identify as identify,
     identify_frf as identify_frf,
     identify_miso as identify_miso,
     pole_intervals as pole_intervals,
+    regressor as regressor,
     uncertainty as uncertainty,
 )
 from .pictures import bode as bode, compare as compare, plot as plot

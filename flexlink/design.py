@@ -15,13 +15,16 @@ from control_design.analysis import certificate, closed_loop
 from control_design.analysis.closed_loop import LinearMachine, SampledMachine, step_metrics
 from control_design.controllers.c_code import c_source
 from control_design.controllers.controller import Controller
+from control_design.convex import youla
+from control_design.convex.convex_options import YoulaOptions
 from control_design.plants import plant_set
 from control_design.plants.weights import RationalWeight
 from control_design.specification import Specification
-from control_design.synthesis import synthesis, synthesis_result
+from control_design.synthesis import joint_synthesis, synthesis, synthesis_result
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from flexlink.models import Uncertainty
 from flexlink.shown import Shown, dressed
+from ident.data.frequency_uncertainty import FrequencyUncertainty
 
 __all__ = [
     "Certificate",
@@ -32,19 +35,92 @@ __all__ = [
     "SynthesisOptions",
     "SynthesisResult",
     "UncertainPlant",
+    "YoulaOptions",
     "c_source",
     "certify",
     "simulate_loop",
     "step_metrics",
     "synthesise",
+    "synthesise_jointly",
+    "youla_bracket",
 ]
+
+
+class WrongSystemError(ValueError, TypeError):
+    """A system of another package that has no place here; one line that says what to do."""
+
+
+def state_space(system: Any, what: str = "the system") -> control.StateSpace:
+    """A system of python-control (ss, tf, zpk) or scipy.signal (dlti), or anything with `to_control()`, as a
+    discrete `control.StateSpace` with one input and one output.
+
+    what: its name in a refusal. Raises WrongSystemError (a ValueError) for a system in continuous time or
+    without a sampling time, with several inputs or outputs, or with more zeros than poles; for a measured
+    response (frd), which has no poles; and for anything else.
+    """
+    if hasattr(system, "to_control"):
+        system = system.to_control()
+    if isinstance(system, control.FrequencyResponseData):
+        raise WrongSystemError(
+            f"{what} is a frequency response (frd), which has no poles: identify it with "
+            "flexlink.identify_frf, or give a model beside it, UncertainPlant(model, uncertainty=frd)"
+        )
+    if type(system).__module__.startswith("scipy.signal") and hasattr(system, "to_ss"):
+        own = system.to_ss()
+        system = control.ss(own.A, own.B, own.C, own.D, own.dt or 0, remove_useless_states=False)
+    if not isinstance(system, (control.StateSpace, control.TransferFunction)):
+        raise WrongSystemError(
+            f"{what} is a {type(system).__name__}; expected a discrete system of python-control: "
+            "control.ss(A, B, C, D, dt_s) or control.tf(num, den, dt_s)"
+        )
+    _checked(system, what)
+    if isinstance(system, control.StateSpace):
+        return system
+    try:
+        return control.tf2ss(system)
+    except ValueError:
+        raise WrongSystemError(
+            f"{what} has more zeros than poles, so it answers before it is asked: expected as many poles, "
+            "control.tf(num, den, dt_s) with num no longer than den"
+        ) from None
+
+
+def measured_response(system: control.FrequencyResponseData, what: str = "the frd") -> FrequencyUncertainty:
+    """An frd of python-control as a response without uncertainty; refused as in `state_space`."""
+    _checked(system, what)
+    order = np.argsort(system.omega, kind="stable")
+    omega, centre = np.asarray(system.omega)[order], np.asarray(system.frdata[0, 0])[order]
+    return FrequencyUncertainty(omega, centre, np.zeros((omega.size, 2, 2)), float(system.dt))
+
+
+def _checked(system: Any, what: str) -> None:
+    """Refuses another number of signals than one, and a system without a sampling time."""
+    if (system.ninputs, system.noutputs) != (1, 1):
+        raise WrongSystemError(
+            f"{what} has {system.ninputs} inputs and {system.noutputs} outputs; take one channel: "
+            "system[output, input], as system[0, 0]"
+        )
+    measured = isinstance(system, control.FrequencyResponseData)
+    if system.dt == 0 and not isinstance(system.dt, bool):
+        mend = (
+            "state the sampling time of the records: control.frd(response, omega, dt_s)"
+            if measured
+            else "sample it: control.sample_system(system, dt_s, 'zoh')"
+        )
+        raise WrongSystemError(f"{what} is in continuous time, flexlink works in discrete time: {mend}")
+    if system.dt is None or system.dt is True:
+        raise WrongSystemError(
+            f"{what} has no sampling time in seconds (dt = {system.dt}), which discrete time needs: "
+            "state it, system.dt = dt_s"
+        )
 
 
 class UncertainPlant(Shown, plant_set.UncertainPlant):
     """What a controller is designed for: a nominal state space and the ellipses around its response.
 
-    plant : Uncertainty, or control.StateSpace, or a model with `to_control()`
+    plant : Uncertainty, or a discrete system of python-control (ss, tf), or a model with `to_control()`
         An `Uncertainty` brings its own ellipses; anything else is exact unless `uncertainty` is given.
+    uncertainty : as `control_design.UncertainPlant`, or a `control.frd`: a measured response, taken as exact.
 
     Other arguments as `control_design.UncertainPlant`.
 
@@ -53,6 +129,9 @@ class UncertainPlant(Shown, plant_set.UncertainPlant):
     >>> import control
     >>> flexlink.UncertainPlant(control.ss([[0.9]], [[1.0]], [[0.1]], [[0.0]], 0.01), name="motor")
     UncertainPlant 'motor': 1 state, dt = 0.01 s, no integrator, response taken as exact
+    >>> flexlink.UncertainPlant(control.tf([0.1], [1.0, 0.5]), name="motor")
+    Traceback (most recent call last):
+    flexlink.design.WrongSystemError: plant 'motor' is in continuous time, flexlink works in discrete ...
     """
 
     def __init__(
@@ -61,15 +140,19 @@ class UncertainPlant(Shown, plant_set.UncertainPlant):
         *,
         name: str = "plant",
         uncertainty: Any = None,
-        nominal: control.StateSpace | None = None,
+        nominal: Any = None,
         **more: Any,
     ) -> None:
         given = plant if nominal is None else nominal
+        if nominal is not None and uncertainty is None and isinstance(plant, control.FrequencyResponseData):
+            uncertainty = plant
+        if isinstance(uncertainty, control.FrequencyResponseData):
+            uncertainty = measured_response(uncertainty, f"the response of plant {name!r}")
         if uncertainty is None and isinstance(given, Uncertainty):
             uncertainty = given
         super().__init__(
             name=name,
-            nominal=given if isinstance(given, control.StateSpace) else given.to_control(),
+            nominal=state_space(given, f"plant {name!r}"),
             uncertainty=uncertainty,
             **more,
         )
@@ -102,8 +185,17 @@ class LoopRun(Shown, closed_loop.ClosedLoopTrajectory):
     """A closed loop in time, from `simulate_loop`."""
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class JointDesign(joint_synthesis.JointDesign):
+    """What `synthesise_jointly` found; its `result` is a `SynthesisResult`."""
+
+    def __repr__(self) -> str:
+        """The result, and how many sampled responses are unstable with it."""
+        return f"{self.result!r}\n  unstable of {self.draws} sampled responses: {self.unstable[-1:] or '-'}"
+
+
 def synthesise(
-    plants: plant_set.UncertainPlant | Sequence[plant_set.UncertainPlant],
+    plants: Any,
     specification: Specification,
     options: SynthesisOptions | None = None,
     *,
@@ -112,7 +204,8 @@ def synthesise(
 ) -> SynthesisResult:
     """One controller for one or several uncertain plants; arguments as `control_design.synthesise`.
 
-    rng: a generator, or the seed of one.
+    plants: an `UncertainPlant` or what makes one (ss, tf, a model), or several. rng: a generator, or the seed
+    of one.
 
     Examples
     --------
@@ -128,14 +221,64 @@ def synthesise(
     return dressed(SynthesisResult, result, plants=chosen, specification=specification)
 
 
+def synthesise_jointly(
+    plants: Any,
+    specification: Specification,
+    options: SynthesisOptions | None = None,
+    *,
+    rng: np.random.Generator | int = 0,
+    **more: Any,
+) -> JointDesign:
+    """As `synthesise`, until the stated share of sampled responses is stable (Monte Carlo, not a bound).
+
+    Arguments as `control_design.synthesise_jointly` (`stable_share`, `draws`, `rounds`); `rng` as in
+    `synthesise`. The plants need an uncertainty that can be drawn from, as of `flexlink.uncertainty`.
+
+    Examples
+    --------
+    >>> spread = flexlink.uncertainty(flexlink.identify(example_record(), n_pairs=1, n_real=0))
+    >>> asked = flexlink.Specification(modulus_margin=0.4, bandwidth_rad_s=0.5, controller_order=1)
+    >>> quick = flexlink.SynthesisOptions(starts=1, dense_points=1000)
+    >>> found = flexlink.synthesise_jointly(flexlink.UncertainPlant(spread), asked, quick, draws=2000)
+    >>> found.reached, found.unstable
+    (True, (0,))
+    """
+    chosen = _several(plants)
+    with threadpool_limits(1):
+        found = joint_synthesis.synthesise_jointly(
+            chosen, specification, options, rng=np.random.default_rng(rng), **more
+        )
+    result = dressed(SynthesisResult, found.result, plants=chosen, specification=specification)
+    return dressed(JointDesign, found, result=result)
+
+
+def youla_bracket(
+    plants: Any, specification: Specification, options: YoulaOptions | None = None
+) -> youla.YoulaBracket:
+    """What no controller of any order can fall below (`floor`); `control_design.youla_bracket`.
+
+    Examples
+    --------
+    >>> coarse = flexlink.YoulaOptions(grid_points=60, dense_points=1000)
+    >>> bound = flexlink.youla_bracket(example_plant(), example_specification(), coarse)
+    >>> 0.0 < bound.floor <= 1.0
+    True
+    """
+    with threadpool_limits(1):
+        return youla.youla_bracket(_several(plants), specification, options)
+
+
 def certify(
-    controller: Controller | SynthesisResult,
-    plants: plant_set.UncertainPlant | Sequence[plant_set.UncertainPlant] | None = None,
+    controller: Any,
+    plants: Any = None,
     specification: Specification | None = None,
     **more: Any,
 ) -> Certificate:
     """Check a controller from any source, independently of the optimiser; `control_design.certify`.
 
+    controller: a `Controller`, the result of `synthesise`, or a discrete system of python-control (ss, tf)
+    from error to command, behind which comes the specification's computational delay. plants: as in
+    `synthesise`.
     plants, specification: taken from the result of `synthesise` where that is given.
 
     Examples
@@ -151,6 +294,8 @@ def certify(
     if plants is None or specification is None:
         raise ValueError("certify needs plants and a specification beside a controller")
     chosen = _several(plants)
+    if controller is not None and not isinstance(controller, Controller):
+        controller = _as_controller(controller, specification.computational_delay_samples)
     with threadpool_limits(1):
         found = certificate.certify(controller, chosen, specification, **more)
     return dressed(
@@ -158,11 +303,12 @@ def certify(
     )
 
 
-def simulate_loop(controller: Controller, machine: Any, reference: npt.ArrayLike, **more: Any) -> LoopRun:
+def simulate_loop(controller: Any, machine: Any, reference: npt.ArrayLike, **more: Any) -> LoopRun:
     """Run the loop in time, limits and delay included; arguments as `control_design.simulate`.
 
-    machine: a `SampledArm` or anything with `measure`, `advance` and `reset`; a linear system or an
-    `UncertainPlant` (its nominal) as well.
+    controller: a `Controller`, or a discrete system of python-control (ss, tf) as in `certify`, with a delay
+    of one sample. machine: a `SampledArm` or anything with `measure`, `advance` and `reset`; a linear system
+    or an `UncertainPlant` (its nominal) as well.
 
     Examples
     --------
@@ -173,11 +319,27 @@ def simulate_loop(controller: Controller, machine: Any, reference: npt.ArrayLike
     """
     if isinstance(machine, plant_set.UncertainPlant):
         machine = machine.nominal
-    chosen: SampledMachine = LinearMachine(machine) if isinstance(machine, control.StateSpace) else machine
+    if isinstance(machine, control.lti.LTI):
+        machine = LinearMachine(state_space(machine, "the machine"))
+    chosen: SampledMachine = machine
+    if not isinstance(controller, Controller):
+        controller = _as_controller(controller, 1)
     return dressed(LoopRun, closed_loop.simulate(controller, chosen, reference, **more))
 
 
-def _several(
-    plants: plant_set.UncertainPlant | Sequence[plant_set.UncertainPlant],
-) -> tuple[plant_set.UncertainPlant, ...]:
-    return (plants,) if isinstance(plants, plant_set.UncertainPlant) else tuple(plants)
+def _as_controller(system: Any, delay_samples: int) -> Controller:
+    found = state_space(system, "the controller")
+    return Controller(
+        found.A, found.B, found.C, found.D, float(found.dt), computational_delay_samples=delay_samples
+    )
+
+
+def _several(plants: Any) -> tuple[plant_set.UncertainPlant, ...]:
+    """One plant or a list of them, each an `UncertainPlant` or what makes one."""
+    several = list(plants) if isinstance(plants, Sequence) and not isinstance(plants, str) else [plants]
+    return tuple(
+        each
+        if isinstance(each, plant_set.UncertainPlant)
+        else UncertainPlant(each, name="plant" if len(several) == 1 else f"plant {k + 1}")
+        for k, each in enumerate(several)
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from flexlink.shown import Shown, dressed
 from ident.basis import model, posterior
+from ident.basis.functions import basis_response, regressor
 from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.poles import Poles
 from ident.data.frequency_uncertainty import FrequencyUncertainty
@@ -25,6 +26,7 @@ from ident.data.table import Table
 from ident.frequency_fit import identify_frf
 from ident.identification import Identification as Identified
 from ident.one_input import identify as identify_records, identify_miso
+from ident.search.error_surface import ErrorSurface, error_surface as surface_of
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals
@@ -41,11 +43,14 @@ __all__ = [
     "Record",
     "Uncertainty",
     "band_limited",
+    "basis_response",
     "empirical_frf",
+    "error_surface",
     "identify",
     "identify_frf",
     "identify_miso",
     "pole_intervals",
+    "regressor",
     "uncertainty",
 ]
 
@@ -63,7 +68,10 @@ class Record(Shown, PlainRecord):
     dt_s : float. Sampling time in seconds.
     reference : as y, optional. Closed-loop reference.
 
-    The other arguments are the attributes of `ident.Record`. Raises ValueError where shapes do not fit;
+    input_names, output_names, reference_names : a name or several.
+
+    u may be a time response of python-control (`control.forced_response`): its inputs, outputs and times. The
+    other arguments are the attributes of `ident.Record`. Raises ValueError where shapes do not fit;
     nothing is transposed to make them.
 
     Examples
@@ -91,11 +99,13 @@ class Record(Shown, PlainRecord):
         reference: Any = None,
         input: Any = None,  # noqa: A002 (the attribute's name)
         output: Any = None,
-        input_names: Sequence[str] = (),
-        output_names: Sequence[str] = (),
-        reference_names: Sequence[str] = (),
+        input_names: str | Sequence[str] = (),
+        output_names: str | Sequence[str] = (),
+        reference_names: str | Sequence[str] = (),
         **more: Any,
     ) -> None:
+        if y is None and all(hasattr(u, part) for part in ("time", "inputs", "outputs")):
+            u, y, dt_s = _time_response(u, dt_s)
         if dt_s is None:
             raise ValueError("a record needs dt_s, the sampling time in seconds")
         u, y = (_either(*pair) for pair in (("u", u, "input", input), ("y", y, "output", output)))
@@ -111,16 +121,22 @@ class Record(Shown, PlainRecord):
             input_names=tuple(input_names),
             output_names=tuple(output_names),
             reference=reference,
-            reference_names=tuple(reference_names),
+            reference_names=_listed(reference_names),
             **more,
         )
+
+    @classmethod
+    def from_file(cls, path: Any, inputs: Any, outputs: Any, *, references: Any = (), **more: Any) -> Self:
+        """Columns of a log file, as `ident.Record.from_file`; a single name may stand by itself."""
+        named = _listed(inputs), _listed(outputs)
+        return super().from_file(path, *named, references=_listed(references), **more)
 
     @classmethod
     def from_table(
         cls,
         table: Any,
-        input: str,  # noqa: A002 (as in the command line)
-        output: str,
+        input: str | Sequence[str],  # noqa: A002 (as in the command line)
+        output: str | Sequence[str],
         *,
         time: str | None = None,
         **more: Any,
@@ -147,7 +163,7 @@ class Record(Shown, PlainRecord):
             columns["index"], time = table.index.to_numpy(), "index"
             if columns["index"].dtype.kind not in "mM":
                 raise ValueError("give time, the name of a column, or dt_s: the table's index holds no times")
-        return cls.from_file(Table(Path("table"), columns), [input], [output], time=time, **more)
+        return cls.from_file(Table(Path("table"), columns), input, output, time=time, **more)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -166,6 +182,29 @@ class GobfModel(Shown, model.GobfModel):
     table_in_notebook = True
 
 
+def _listed(names: str | Sequence[str]) -> tuple[str, ...]:
+    """One name or several."""
+    return (names,) if isinstance(names, str) else tuple(names)
+
+
+def _time_response(response: Any, dt_s: float | None) -> tuple[Any, Any, float]:
+    """Input (T, n), output (T, n) and sampling time of a `control.TimeResponseData` (a row per signal)."""
+    time = np.asarray(response.time, dtype=np.float64)
+    step = float(time[-1] - time[0]) / max(time.size - 1, 1)
+    if not step > 0 or not np.allclose(np.diff(time), step, rtol=0, atol=1e-6 * step):
+        raise ValueError("the time response is not evenly sampled: give control.forced_response even times")
+    if dt_s is not None and not np.isclose(dt_s, step, rtol=1e-6, atol=0):
+        raise ValueError(
+            f"dt_s is {dt_s:.6g} s, the times of the response are {step:.6g} s apart: leave dt_s out"
+        )
+    signals = [np.atleast_2d(np.asarray(part)) for part in (response.inputs, response.outputs)]
+    if response.inputs is None or any(part.ndim != 2 for part in signals):
+        raise ValueError(
+            "the time response needs one input signal per row: control.forced_response(system, T, U)"
+        )
+    return signals[0].T, signals[1].T, step if dt_s is None else dt_s
+
+
 def _either(short: str, first: Any, long: str, second: Any) -> Any:
     if (first is None) == (second is None):
         raise ValueError(f"give {short} (or, under its long name, {long}), once")
@@ -173,9 +212,10 @@ def _either(short: str, first: Any, long: str, second: Any) -> Any:
 
 
 def _signals(
-    default: str, values: Any, names: Sequence[str]
+    default: str, values: Any, names: str | Sequence[str]
 ) -> tuple[npt.NDArray[np.float64], Sequence[str]]:
     """(T, n) and n names, from a vector, a table or their pandas forms."""
+    names = _listed(names)
     if not names:  # pandas: a column has a name, a table has columns
         named = getattr(values, "columns", None)
         names = [str(c) for c in named] if named is not None else [str(getattr(values, "name", None) or "")]
@@ -296,6 +336,31 @@ def uncertainty(
     with threadpool_limits(1):
         found = tangent(used, identification.model, chosen)
     return dressed(Uncertainty, found, nominal_poles=identification.model.poles)
+
+
+def error_surface(
+    identification: Identified, records: PlainRecord | Sequence[PlainRecord] | None = None, **settings: Any
+) -> ErrorSurface:
+    """Mean square residual with one pole pair of an identified model moved over a grid, its others frozen.
+
+    records: those of the identification, taken from it if it came from `flexlink.identify`. The other
+    arguments as `ident.error_surface`: pair, coordinates ("log": omega and zeta, "raw": beta and gamma),
+    first and second (grids), n_points.
+
+    Examples
+    --------
+    >>> found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
+    >>> surface = flexlink.error_surface(found, n_points=21)
+    >>> i, j = surface.local_minima()[0]
+    >>> surface.names, bool(abs(surface.first[i] - 20) < 2)
+    (('omega_rad_s', 'zeta'), True)
+    """
+    used = records if records is not None else getattr(identification, "records", ())
+    used = (used,) if isinstance(used, PlainRecord) else tuple(used)
+    if not used:
+        raise ValueError("give the records of the identification")
+    with threadpool_limits(1):
+        return surface_of(used, identification.model, identification.structure, **settings)
 
 
 def _options(kind: type[Options], options: Options | None, settings: dict[str, Any]) -> Options | None:

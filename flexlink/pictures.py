@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import singledispatch
 from typing import TYPE_CHECKING, Any
 
+import control
 import numpy as np
 import numpy.typing as npt
 
@@ -13,7 +14,7 @@ from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant, frequency_response
 from control_design.specification import Specification
 from diagnosis.answer import Diagnosis
-from flexlink.design import Certificate, LoopRun, SynthesisResult
+from flexlink.design import Certificate, LoopRun, SynthesisResult, measured_response, state_space
 from flexlink.machines import Simulation
 from ident.basis.model import GobfModel
 from ident.data.frequency_uncertainty import FrequencyUncertainty
@@ -45,7 +46,7 @@ def plot(result: object) -> Figure:
 
 def bode(result: Any) -> Figure:
     """Gain, phase and size of the ellipses of one response: an identification, a model, an uncertainty, a
-    measured response, an uncertain plant, a controller, or a discrete SISO system of python-control.
+    measured response, an uncertain plant, a controller, or a discrete system of python-control (ss, tf, frd).
 
     Examples
     --------
@@ -57,11 +58,11 @@ def bode(result: Any) -> Figure:
     return _bode(as_response(result), getattr(model, "input_name", "u"), getattr(model, "output_name", "y"))
 
 
-def compare(*results: Any, names: Sequence[str] = ()) -> Figure:
+def compare(*results: Any, names: str | Sequence[str] = ()) -> Figure:
     """Several responses on one plot, each as for `bode`; ellipses as bands where there are any.
 
-    names: of the curves, in the same order. Raises ValueError for another number of names, TypeError for
-    what has no response.
+    names: of the curves, in the same order; one may stand by itself. Raises ValueError for another
+    number of names, TypeError for what has no response.
 
     Examples
     --------
@@ -73,7 +74,8 @@ def compare(*results: Any, names: Sequence[str] = ()) -> Figure:
     """
     from workflow.figures.bode import draw_comparison
 
-    chosen = list(names) or [f"{k + 1}: {type(result).__name__}" for k, result in enumerate(results)]
+    given = [names] if isinstance(names, str) else list(names)
+    chosen = given or [f"{k + 1}: {type(result).__name__}" for k, result in enumerate(results)]
     if not results or len(chosen) != len(results):
         raise ValueError(f"expected a name for each response; got {len(results)} and {len(chosen)} names")
     return draw_comparison(dict(zip(chosen, map(as_response, results), strict=True)))
@@ -89,19 +91,17 @@ def as_response(result: Any) -> FrequencyUncertainty:
         if isinstance(found.uncertainty, (FrequencyUncertainty, ResponsePosterior)):
             return as_response(found.uncertainty)
         found = found.nominal
-    dt_s = getattr(found, "dt_s", getattr(found, "dt", None))
-    if not isinstance(dt_s, float) or not dt_s > 0:
-        raise TypeError(f"a {type(result).__name__} has no response in discrete time")
-    omega = _grid(dt_s)
+    if isinstance(found, control.FrequencyResponseData):
+        return measured_response(found)
     if isinstance(found, ResponsePosterior):
-        return found.at(omega)
+        return found.at(_grid(found.dt_s))
     if isinstance(found, GobfModel):
+        omega, dt_s = _grid(found.dt_s), found.dt_s
         centre = found.frequency_response(omega)
-    elif hasattr(found, "to_control") or hasattr(found, "A"):
-        system = found.to_control() if hasattr(found, "to_control") else found
-        centre = frequency_response(system, omega)
     else:
-        raise TypeError(f"a {type(result).__name__} has no response")
+        system = state_space(found, f"a {type(result).__name__}")
+        omega, dt_s = _grid(float(system.dt)), float(system.dt)
+        centre = frequency_response(system, omega)
     return FrequencyUncertainty(omega, centre, np.zeros((omega.size, 2, 2)), dt_s)
 
 

@@ -13,7 +13,7 @@ import control
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from scipy.signal import lfilter
+from scipy.signal import dlti, lfilter, lti
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import flexlink
@@ -188,6 +188,113 @@ def test_responses_of_any_origin_on_one_plot():
         flexlink.compare(found, plant, names=["one"])
     with pytest.raises(TypeError, match="discrete time"):
         flexlink.bode(control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]))
+
+
+TF = control.tf([0.1, 0.05], [1.0, -1.5, 0.6], 0.01)
+OMEGA = np.array([20.0, 1.0, 5.0])
+
+
+def _by_hand(omega):
+    z = np.exp(1j * omega * 0.01)
+    return (0.1 * z + 0.05) / (z**2 - 1.5 * z + 0.6)
+
+
+@pytest.mark.parametrize(
+    "system",
+    [TF, control.ss(TF), control.zpk([-0.5], [0.75 - 0.19364916731j, 0.75 + 0.19364916731j], 0.1, 0.01),
+     dlti([0.1, 0.05], [1.0, -1.5, 0.6], dt=0.01), flexlink.UncertainPlant(TF)],
+    ids=["tf", "ss", "zpk", "scipy", "own"],
+)  # fmt: skip
+def test_systems_of_other_packages_are_plants_and_controllers(system):
+    line = flexlink.bode(system).axes[0].get_lines()[0]
+    np.testing.assert_allclose(line.get_ydata(), np.abs(_by_hand(line.get_xdata())), rtol=1e-6)
+    asked = flexlink.Specification(bandwidth_rad_s=1.0, modulus_margin=0.3)
+    own = flexlink.certify(flexlink.Controller.proportional(0.2, 0.01), flexlink.UncertainPlant(TF), asked)
+    given = flexlink.certify(control.tf([0.2], [1.0], 0.01), system, asked)
+    modulus = [each.plants[0].nominal_margins.modulus for each in (own, given)]
+    assert modulus[1] == pytest.approx(modulus[0], rel=1e-9)
+    # The delay of the specification is in the loop: |1 + 0.2 z^-1 G| on a grid.
+    omega = np.geomspace(1e-2, np.pi / 0.01, 20000)
+    loop = 0.2 * np.exp(-1j * omega * 0.01) * _by_hand(omega)
+    assert modulus[1] == pytest.approx(np.min(np.abs(1 + loop)), rel=1e-5)
+
+
+def test_a_measured_response_is_drawn_and_stands_beside_a_model():
+    frd = control.frd(_by_hand(OMEGA), OMEGA, 0.01)
+    line = flexlink.compare(frd, names="measured").axes[0].get_lines()[0]
+    np.testing.assert_array_equal(line.get_xdata(), np.sort(OMEGA))
+    np.testing.assert_allclose(line.get_ydata(), np.abs(_by_hand(np.sort(OMEGA))))
+    for plant in (flexlink.UncertainPlant(TF, uncertainty=frd), flexlink.UncertainPlant(frd, nominal=TF)):
+        np.testing.assert_array_equal(plant.own_grid, np.sort(OMEGA))
+
+
+def test_a_time_response_of_python_control_is_a_record():
+    u = np.r_[np.ones(20), -np.ones(30)]
+    record = flexlink.Record(control.forced_response(TF, inputs=u), name="simulated", input_names="voltage_V")
+    np.testing.assert_array_equal(record.input[:, 0], u)
+    np.testing.assert_allclose(
+        record.output[:, 0], lfilter([0.1, 0.05], [1.0, -1.5, 0.6], np.r_[0.0, u[:-1]])
+    )
+    assert record.dt_s == pytest.approx(0.01)
+    assert record.input_names == ("voltage_V",)
+
+
+def test_one_name_may_stand_by_itself(tmp_path):
+    (tmp_path / "log.csv").write_text("t_s,voltage_V,angle\n0,1,0\n0.1,1,2\n0.2,0,3\n")
+    record = flexlink.Record.from_file(tmp_path / "log.csv", "voltage_V", "angle", time="t_s")
+    assert (record.input_names, record.output_names) == (("voltage_V",), ("angle",))
+    assert flexlink.Record([1.0, 2.0], [3.0, 4.0], 0.1, output_names="angle").output_names == ("angle",)
+    table = record.table()
+    assert flexlink.Record.from_table(table, ["voltage_V"], ["angle"], time="time_s").output_names == (
+        "angle",
+    )
+
+
+TWO = control.ss(np.eye(2) / 2, np.eye(2), np.eye(2), np.zeros((2, 2)), 0.01)
+
+
+@pytest.mark.parametrize(
+    ("system", "message"),
+    [
+        (control.tf([1.0], [1.0, 1.0]), r"continuous time.*control\.sample_system\(system, dt_s, 'zoh'\)"),
+        (control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]], 0), r"control\.sample_system"),
+        (control.tf([0.1], [1.0, -0.9], True), r"dt = True.*system\.dt = dt_s"),
+        (control.tf([0.1], [1.0, -0.9], None), r"dt = None.*system\.dt = dt_s"),
+        (TWO, r"2 inputs and 2 outputs; take one channel.*system\[0, 0\]"),
+        (control.tf([1.0, 0.0, 0.0], [1.0, 0.5], 0.01), r"more zeros than poles.*num no longer than den"),
+        (lti([1.0], [1.0, 1.0]), r"continuous time"),
+        ("hub", r"is a str; expected a discrete system"),
+        (
+            control.frd([1.0, 2j], [1.0, 2.0]),
+            r"continuous time|no poles: identify it with flexlink\.identify_frf",
+        ),
+    ],
+)
+def test_systems_that_cannot_be_used_are_refused_with_what_to_do(system, message):
+    given = flexlink.Controller.proportional(0.1, 0.01)
+    for call in (
+        lambda: flexlink.UncertainPlant(system),
+        lambda: flexlink.certify(given, system, example_specification()),
+        lambda: flexlink.certify(system, example_plant(), example_specification()),
+        lambda: flexlink.bode(system),
+        lambda: flexlink.compare(TF, system),
+        lambda: flexlink.synthesise([system], example_specification()),
+        lambda: flexlink.youla_bracket(system, example_specification()),
+        lambda: flexlink.simulate_loop(system, example_plant(), [1.0] * 3),
+    ):
+        with pytest.raises((ValueError, TypeError), match=message) as raised:
+            call()
+        assert "\n" not in str(raised.value)
+
+
+def test_another_sampling_time_is_refused_with_what_to_do():
+    slow = control.tf([0.1], [1.0, -0.9], 0.02)
+    with pytest.raises(ValueError, match=r"0\.02.*0\.01|0\.01.*0\.02"):
+        flexlink.certify(slow, example_plant(), example_specification())
+    with pytest.raises(ValueError, match=r"0\.02.*sample"):
+        flexlink.certify(control.tf([0.1], [1.0], 0.01), [example_plant(), slow], example_specification())
+    with pytest.raises(ValueError, match=r"0\.02.*sample"):
+        flexlink.simulate_loop(slow, example_plant(), [1.0] * 3)
 
 
 @pytest.mark.parametrize(

@@ -134,7 +134,10 @@ def simulate(
     added = _signal("input_disturbance", input_disturbance, n)
     shift = _signal("output_disturbance", output_disturbance, n)
     if not np.isclose(machine.dt_s, controller.dt_s, rtol=1e-9, atol=0):
-        raise ValueError(f"controller and machine differ in dt_s: {controller.dt_s} and {machine.dt_s}")
+        raise ValueError(
+            f"controller and machine differ in dt_s: {controller.dt_s} and {machine.dt_s}; sample both with "
+            "the period of the loop"
+        )
     if not (measurement_step >= 0 and command_step >= 0):
         raise ValueError("measurement_step and command_step must not be negative")
     machine.reset()

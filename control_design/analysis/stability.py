@@ -47,7 +47,8 @@ def closed_loop_poles(controller: Controller, plant: UncertainPlant) -> Complex:
     """
     if not np.isclose(controller.dt_s, plant.dt_s, rtol=1e-9, atol=0):
         raise ValueError(
-            f"controller and plant {plant.name!r} differ in dt_s: {controller.dt_s} and {plant.dt_s}"
+            f"controller and plant {plant.name!r} differ in dt_s: {controller.dt_s} and {plant.dt_s}; "
+            "sample both with the period of the loop"
         )
     loop = NominalLoop(plant, controller.computational_delay_samples)
     poles = loop.poles(controller.A, controller.B, controller.C, controller.D)

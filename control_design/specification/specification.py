@@ -207,7 +207,10 @@ class Specification(BaseModel):
         if not plants:
             raise SpecificationError("no plant given: the design needs at least one uncertain plant")
         if len({plant.dt_s for plant in plants}) > 1:
-            raise SpecificationError(f"the plants differ in sampling time: {[p.dt_s for p in plants]} s")
+            raise SpecificationError(
+                f"the plants differ in sampling time: {[p.dt_s for p in plants]} s; sample all "
+                "with one period"
+            )
         for plant in plants:
             _refuse_frequencies(self, plant)
             _refuse_zeros(self, plant)

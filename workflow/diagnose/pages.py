@@ -72,9 +72,9 @@ def plant_page(found: Diagnosis, coming: Following) -> str:
     return _rendered("diagnosis/plant.html.j2", found, page=page)
 
 
-def write_plant_page(found: Diagnosis, path: Path) -> None:
+def write_plant_page(found: Diagnosis, path: str | Path) -> None:
     """`plant_page` as a file."""
-    storage.write_bytes(path, plant_page(found, following(found)).encode())
+    storage.write_bytes(Path(path), plant_page(found, following(found)).encode())
 
 
 def _rendered(
