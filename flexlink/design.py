@@ -276,10 +276,9 @@ def certify(
 ) -> Certificate:
     """Certify a controller from any source, independently of the optimiser.
 
-    controller: a `Controller`, the result of `synthesise`, or a discrete system of python-control (ss, tf)
-    from error to command, behind which comes the specification's computational delay. plants: as in
-    `synthesise`.
-    plants, specification: taken from the result of `synthesise` where that is given.
+    controller: a `Controller`, a result of `synthesise`, or a discrete system of python-control (ss, tf) from
+    error to command, to which the computational delay of the specification is added. plants: as in
+    `synthesise`. plants and specification default to those of a result of `synthesise`.
 
     Examples
     --------
@@ -304,7 +303,7 @@ def certify(
 
 
 def simulate_loop(controller: Any, machine: Any, reference: npt.ArrayLike, **more: Any) -> LoopRun:
-    """Run the loop in time, limits and delay included; arguments as `control_design.simulate`.
+    """Simulate the closed loop with limits and delay; arguments as in `control_design.simulate`.
 
     controller: a `Controller`, or a discrete system of python-control (ss, tf) as in `certify`, with a delay
     of one sample. machine: a `SampledArm` or anything with `measure`, `advance` and `reset`; a linear system
