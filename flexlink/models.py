@@ -17,6 +17,7 @@ from ident.basis import model, posterior
 from ident.basis.functions import basis_response, regressor
 from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.poles import Poles
+from ident.data.foreign_files import distinct
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
 from ident.data.nonparametric import empirical_frf
@@ -63,8 +64,8 @@ class Record(Shown, PlainRecord):
     """One uniformly sampled experiment, from arrays, pandas columns or (with `from_file`) a file.
 
     u, y : (T,) or (T, n), or a pandas column or table
-        Input and output, one row per sample; `input` and `output` are accepted, too. Names of pandas columns
-        become signal names; the default is u and y (u1, u2, ... if several).
+        Input and output, one row per sample; also under the names of the attributes, `input` and `output`.
+        Pandas names become the names of the signals; without, they are u and y (u1, u2, ... if several).
     dt_s : float. Sampling time in seconds.
     reference : as y, optional. Closed-loop reference.
 
@@ -109,6 +110,7 @@ class Record(Shown, PlainRecord):
         if dt_s is None:
             raise ValueError("a record needs dt_s, the sampling time in seconds")
         u, y = (_either(*pair) for pair in (("u", u, "input", input), ("y", y, "output", output)))
+        _refuse_other_rows(u, y, reference)
         inputs, input_names = _signals("u", u, input_names)
         outputs, output_names = _signals("y", y, output_names)
         if reference is not None:
@@ -143,8 +145,8 @@ class Record(Shown, PlainRecord):
     ) -> Record:
         """Columns of a `pandas.DataFrame`, checked like those of a file.
 
-        time: column of numbers (unit from its name, else seconds) or of date-times. Default: the index, if it
-        holds times; otherwise give dt_s. Other arguments as in `from_file`.
+        time: a column of numbers (its unit as in its name, else seconds) or of instants; without it the index
+        is taken where it is one of times, else dt_s has to be given. The other arguments as `from_file`.
 
         Examples
         --------
@@ -158,7 +160,8 @@ class Record(Shown, PlainRecord):
         >>> flexlink.Record.from_table(log, "u_V", "hub_rad").dt_s
         0.005
         """
-        columns = {str(name): table[name].to_numpy() for name in table.columns}
+        names = distinct([str(name) for name in table.columns])
+        columns = {name: table.iloc[:, k].to_numpy() for k, name in enumerate(names)}
         if time is None and "dt_s" not in more:
             columns["index"], time = table.index.to_numpy(), "index"
             if columns["index"].dtype.kind not in "mM":
@@ -168,9 +171,8 @@ class Record(Shown, PlainRecord):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GobfModel(Shown, model.GobfModel):
-    """Poles and coefficients of a model on generalised orthonormal basis functions.
-
-    Fields as in `ident.basis.model.GobfModel`.
+    """Poles and coefficients of a model on generalised orthonormal basis functions, as
+    `ident.basis.model.GobfModel`, that shows itself.
 
     Examples
     --------
@@ -220,7 +222,7 @@ def _signals(
     if not names:  # pandas: a column has a name, a table has columns
         named = getattr(values, "columns", None)
         names = [str(c) for c in named] if named is not None else [str(getattr(values, "name", None) or "")]
-    signals = np.asarray(values, dtype=np.float64)
+    signals = _real(default, values)
     if signals.ndim == 1:
         signals = signals[:, None]
     if signals.ndim != 2:
@@ -236,9 +238,36 @@ def _signals(
     return signals, names
 
 
+def _real(name: str, values: Any) -> npt.NDArray[np.float64]:
+    """As doubles, where nothing is lost."""
+    found = np.asarray(values)
+    if found.dtype.kind == "c":
+        raise ValueError(
+            f"{name} holds complex numbers; expected real ones: give {name}.real if that is meant"
+        )
+    if np.ma.is_masked(values):
+        row = int(np.argwhere(np.ma.getmaskarray(values))[0][0])
+        raise ValueError(f"{name} has no value at index {row} (masked); expected a number in every row")
+    if found.dtype.kind not in "fiubO":
+        raise ValueError(f"{name} holds {found.dtype}; expected real numbers")
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} holds what is no number; expected real numbers") from None
+
+
+def _refuse_other_rows(*signals: Any) -> None:
+    """Columns of pandas have to have the same rows: nothing is put in line by its index."""
+    rows: list[Any] = [one.index for one in signals if hasattr(getattr(one, "index", None), "equals")]
+    if any(not index.equals(rows[0]) for index in rows):
+        raise ValueError(
+            "u and y have rows of different index; put them in line first: u, y = u.align(y, join='inner')"
+        )
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification(Shown, Identified):
-    """Result of `identify`: the fields of `ident.Identification`, and the records.
+    """What `identify` found: `ident.Identification` and the records it came from.
 
     Examples
     --------
@@ -269,13 +298,13 @@ class Uncertainty(Shown, posterior.ResponsePosterior):
     nominal_poles: Poles = Poles()  # noqa: RUF009 (frozen)
 
     def nominal(self) -> GobfModel:
-        """Model on the identified poles, nearest to the centre in units of the ellipses."""
+        """The model on the identified poles that is nearest to the centre in units of the ellipses."""
         nyquist = np.pi / self.dt_s
         omega = np.geomspace(1e-3 * nyquist, nyquist, _NOMINAL_POINTS)
         return dressed(GobfModel, nominal_near(self, self.nominal_poles, omega))
 
     def at_modes(self) -> list[tuple[float, float]]:
-        """(frequency [rad/s], major semi-axis of the 95 % ellipse over gain) at every mode."""
+        """(frequency [rad/s], major semi-axis of the 95 % ellipse / gain) at every mode of the model."""
         omega = np.unique(self.nominal_poles.omega_rad_s(self.dt_s))
         here = self.at(omega[omega < np.pi / self.dt_s]) if omega.size else None
         if here is None:
@@ -284,16 +313,16 @@ class Uncertainty(Shown, posterior.ResponsePosterior):
         return list(zip(here.omega_rad_s.tolist(), share.tolist(), strict=True))
 
     def to_control(self) -> Any:
-        """`nominal` as `control.StateSpace`, without the ellipses."""
+        """`nominal` as `control.StateSpace`; the ellipses have no place there."""
         return self.nominal().to_control()
 
 
 def identify(
     records: PlainRecord | Sequence[PlainRecord], options: IdentOptions | None = None, **settings: Any
 ) -> Identification:
-    """Identify a model of one input and one output; the data choose the order unless you give it.
+    """Model of one input and one output, poles searched globally, order chosen from the data unless given.
 
-    settings: fields of `IdentOptions`, instead of `options`. Raises ValueError for a setting or a record that
+    `settings` are fields of `IdentOptions`, in place of `options`. Raises ValueError if a setting or a record
     cannot be used.
 
     Examples
@@ -315,10 +344,10 @@ def uncertainty(
     options: EmbeddingOptions | None = None,
     **settings: Any,
 ) -> Uncertainty:
-    """Posterior of the response around an identified model: noise, pole error and unmodelled dynamics.
+    """Posterior of the response around an identified model: noise, pole error and what the model lacks.
 
-    records: those of the identification; not needed if it came from `flexlink.identify`. settings: fields of
-    `EmbeddingOptions`, instead of `options`.
+    records: those of the identification, taken from it if it came from `flexlink.identify`. `settings` are
+    fields of `EmbeddingOptions`, in place of `options`.
 
     Examples
     --------

@@ -139,6 +139,8 @@ class Rig(_Checked):
         was expected.
         Raises FileNotFoundError if there is no such file.
         """
+        if Path(path).exists() and not Path(path).is_file():  # a pipe would be waited for
+            raise ValueError(f"{path}: not a file")
         try:
             text = Path(path).read_bytes().decode("utf-8-sig")  # some editors put a mark in front
             content = tomllib.loads(text)

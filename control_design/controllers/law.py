@@ -14,6 +14,7 @@ from pydantic import TypeAdapter
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import frequency_response
 from ident.data.arrays import lock
+from ident.data.json_text import json_value
 
 if TYPE_CHECKING:
     import control
@@ -132,8 +133,8 @@ class Law:
     def from_json(cls, text: str) -> Self:
         """Inverse of `to_json`; ValueError with one line on bad input."""
         try:
-            data = json.loads(text)
-        except (ValueError, RecursionError) as error:  # syntax; integers or nesting without end
+            data = json_value(text)
+        except ValueError as error:
             raise ValueError(f"{cls.kind} JSON: {error}") from error
         if not isinstance(data, dict):
             raise ValueError(f"{cls.kind} JSON must be an object; got {type(data).__name__}")

@@ -19,9 +19,11 @@ and the model is judged by what it does beside it. The start of a record is what
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -50,6 +52,7 @@ TOLERANCES = {
     "delay": 0.2,
 }
 _ELSE = 0.01  # gravity, sensors
+_LONGEST_MODEL = 2**26  # bytes
 _SMOOTHED = 9  # samples, of a measured angle whose speed is asked
 # Noise deviations that the largest start of an effect has to move a record somewhere to be looked for.
 _SEEN = 3.0
@@ -66,7 +69,32 @@ def measurable(path: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(one.name for one in (*spec.sensors, *spec.joints) if one.name))
 
 
+_FILES = re.compile(rb"""\b(file|(?:mesh|texture|asset)dir)\s*=\s*["']([^"'<]+)""")
+
+
+def _refuse_pipes(model: Path) -> None:
+    """Whatever a model names is a file, as far as it is there: MuJoCo would wait for a pipe without an end.
+
+    Included models, as MuJoCo does, from the folder of the first.
+    """
+    todo, seen = [model], set[Path]()
+    while todo:
+        path = todo.pop()
+        if path in seen or not path.exists():
+            continue
+        seen.add(path)
+        if not path.is_file():
+            raise ValueError(f"{path.name} is no file, but a folder, pipe or device")
+        if path.suffix.lower() not in (".xml", ".mjcf", ".urdf", "") or path.stat().st_size > _LONGEST_MODEL:
+            continue
+        named = [(key, value.decode("utf-8", "replace")) for key, value in _FILES.findall(path.read_bytes())]
+        folders = ["", *(value for key, value in named if key != b"file")]
+        files = [value for key, value in named if key == b"file"]
+        todo += [model.parent / folder / name for folder in folders for name in files if "\0" not in name]
+
+
 def _read(path: str) -> Any:
+    _refuse_pipes(Path(path))
     # Else a trial that runs away is told on the terminal and in a file.
     mujoco.set_mju_user_warning(lambda text: None)
     try:

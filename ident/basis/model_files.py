@@ -21,6 +21,7 @@ import scipy.io
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.json_text import json_value
 from ident.data.mat_files import mat_variables
 
 FORMAT = "flexlink GOBF model"
@@ -68,8 +69,8 @@ class ModelFile:
     def from_json(cls, text: str, source: str = "model file") -> ModelFile:
         """Inverse of `to_json`. ValueError: one line that begins with `source`."""
         try:
-            document = json.loads(text)
-        except (ValueError, RecursionError) as error:  # syntax; integers or nesting without end
+            document = json_value(text)
+        except ValueError as error:
             raise ValueError(f"{source}: not JSON ({error})") from None
         if not isinstance(document, dict):
             raise ValueError(f"{source}: expected a JSON object, found {type(document).__name__}")

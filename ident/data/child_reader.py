@@ -3,8 +3,9 @@ standard input to output.
 
 The libraries that read these formats are compiled, and a file can be made to end their process or to fill
 the memory. Here that process is not ours, and has limits of memory and time. Out come an npz archive (arrays
-0, 1, ..., and `about`: names and units as JSON) or, of a spreadsheet, a text table with tabs. Exit code 2:
-one line on standard error says what is wrong; 3: the library it names is not there.
+0, 1, ..., and `about`: names and units as JSON) or, of a spreadsheet, JSON: the text of each table, with
+tabs, by the name of its sheet. Exit code 2: one line on standard error says what is wrong; 3: the library it
+names is not there.
 """
 
 import io
@@ -22,13 +23,16 @@ CPU_SECONDS = 120
 _MEMORY_BYTES = 8 * LARGEST_BYTES
 _NUMBERS = "fiub"
 _LONGEST_FIELD = 256  # longer ones are pictures and point clouds
+_LARGEST_SHEETS = 2**28  # of XML: a million rows of four numbers
+_MOST_CELLS = 20_000_000
+_EMPTY_CELLS = 500_000  # in one piece: a sheet that somebody formatted to its end, or a trap
 
 
 class RefusedError(ValueError):
     """Something in the file that is not read; the message is for the user."""
 
 
-Columns = dict[str, tuple[Any, str]]  # array and unit by name
+Columns = list[tuple[str, Any, str]]  # name, array and unit; a name may be there twice
 
 
 def hdf5_columns(content: bytes) -> Columns:
@@ -36,7 +40,7 @@ def hdf5_columns(content: bytes) -> Columns:
     import h5py
     import numpy as np
 
-    found: Columns = {}
+    found: Columns = []
     with h5py.File(io.BytesIO(content), "r") as file:
         parts: list[tuple[str, Any]] = []
         file.visititems(
@@ -47,26 +51,62 @@ def hdf5_columns(content: bytes) -> Columns:
         for path, data in parts:
             if path.startswith("#") or data.external or data.is_virtual or "MATLAB_empty" in data.attrs:
                 continue  # what other files hold is none of this log's business
-            if data.shape is None or not 0 < data.ndim <= 2:
+            if data.shape is None or not 0 < data.ndim <= 2 or _is_only_a_length(data):
                 continue
             total += data.size * data.dtype.itemsize
             if total > LARGEST_BYTES:
                 raise RefusedError(f"unpacks to more than {LARGEST_BYTES >> 20} MiB: split the file")
             name = path.replace("/", ".") if matlab else path
             kind = data.attrs.get("MATLAB_class", b"")
-            unit = data.attrs.get("unit", data.attrs.get("units", ""))
-            unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
-            fields = data.dtype.names or ()
+            unit = _words(data.attrs.get("unit", data.attrs.get("units", "")))
             if data.dtype.kind in _NUMBERS and kind != b"char":
-                values = np.asarray(data[()])
+                values = _unpacked(path, np.asarray(data[()]), data.attrs)
                 # MATLAB stores column by column.
-                found[name] = (values.T if matlab else values), unit
-            elif fields and not matlab:
+                found.append((name, values.T if matlab else values, unit))
+            elif data.dtype.names and not matlab:
                 rows = data[()]
-                for field in fields:
-                    if rows.dtype[field].kind in _NUMBERS and not rows.dtype[field].shape:
-                        found[f"{name}.{field}"] = rows[field], ""
+                found += [
+                    (f"{name}.{field}", rows[field], "")
+                    for field in data.dtype.names
+                    if rows.dtype[field].kind in _NUMBERS and not rows.dtype[field].shape
+                ]
     return found
+
+
+def _words(attribute: Any) -> str:
+    return attribute.decode("utf-8", "replace") if isinstance(attribute, bytes) else str(attribute)
+
+
+def _is_only_a_length(data: Any) -> bool:
+    """netCDF writes a dimension without a variable as zeros."""
+    return _words(data.attrs.get("NAME", "")).startswith(
+        "This is a netCDF dimension but not a netCDF variable"
+    )
+
+
+def _unpacked(path: str, values: Any, attributes: Any) -> Any:
+    """The quantity behind packed numbers, after netCDF's conventions (CF 1.11, 2.5.1 and 8.1): scale_factor
+    times the number plus add_offset; NaN where the number says that there is none."""
+    import numpy as np
+
+    def number(key: str, usual: float) -> Any:
+        try:
+            return np.asarray(attributes.get(key, usual), dtype=np.float64).reshape(())
+        except (ValueError, TypeError):
+            raise RefusedError(f"'{path}': its {key} is no number") from None
+
+    fills = [
+        fill
+        for key in ("_FillValue", "missing_value")
+        if key in attributes
+        for fill in np.ravel(attributes[key])
+        if np.asarray(fill).dtype.kind in _NUMBERS and fill == fill  # NaN is NaN already
+    ]
+    empty = np.isin(values, fills) if fills else np.zeros(values.shape, dtype=bool)
+    if not empty.any() and not {"scale_factor", "add_offset"} & set(attributes):
+        return values
+    quantity = number("scale_factor", 1.0) * values + number("add_offset", 0.0)
+    return np.where(empty, np.nan, quantity)
 
 
 def parquet_columns(content: bytes) -> Columns:
@@ -81,17 +121,27 @@ def parquet_columns(content: bytes) -> Columns:
     if sum(sizes) > LARGEST_BYTES or 8 * about.num_rows * about.num_columns > 4 * LARGEST_BYTES:
         raise RefusedError(f"unpacks to more than {LARGEST_BYTES >> 20} MiB: split the file")
     table = file.read(use_threads=False)
-    found: Columns = {}
+    found: Columns = []
     for field, column in zip(table.schema, table.columns, strict=True):
         kind = field.type
-        if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
+        if pa.types.is_dictionary(kind):
+            kind, column = kind.value_type, column.cast(kind.value_type)
+        if pa.types.is_time(kind):  # of day
+            kind = pa.duration(kind.unit)
+            column = column.cast(pa.int32() if kind.unit in ("s", "ms") else pa.int64()).cast(pa.int64())
+            column = column.cast(kind)
+        if pa.types.is_integer(kind) and not column.null_count:
+            values = column.to_numpy()  # whole: doubles hold integers up to 2^53, stamps in ns are larger
+        elif pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
+            values = column.cast(pa.float64(), safe=False).to_numpy()
+        elif pa.types.is_decimal(kind):
             values = column.cast(pa.float64()).to_numpy()
         elif pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
             values = column.to_numpy()
         else:
             continue
         unit = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
-        found[field.name] = values, unit
+        found.append((field.name, values, unit))
     return found
 
 
@@ -161,10 +211,10 @@ def bag_columns(content: bytes, kind: str) -> Columns:
     if not rows:
         raise RefusedError("no messages that can be read; expected CDR, ROS 1 or JSON, and numbers in them")
     begin_ns = min(found[0][0] for found in rows.values())
-    columns: Columns = {}
+    columns: Columns = []
     for topic, found in rows.items():
         recorded_s = np.array([1e-9 * (at_ns - begin_ns) for at_ns, _ in found])
-        columns[f"{topic}\t"] = recorded_s, ""
+        columns.append((f"{topic}\t", recorded_s, ""))
         table = {
             name: np.asarray([fields[name] for _, fields in found])
             for name, first in found[0][1].items()
@@ -172,25 +222,48 @@ def bag_columns(content: bytes, kind: str) -> Columns:
         }
         stamp_ns = table.pop(f"{topic}.header.stamp_ns", np.zeros(1))
         stamped = stamp_ns.size > 1 and bool(np.all(np.diff(stamp_ns) > 0))
-        columns[f"{topic}.time"] = (1e-9 * (stamp_ns - stamp_ns[0]) if stamped else recorded_s), "s"
-        columns |= {name: (values, "") for name, values in table.items() if ".header." not in name}
+        columns.append((f"{topic}.time", 1e-9 * (stamp_ns - stamp_ns[0]) if stamped else recorded_s, "s"))
+        columns += [(name, values, "") for name, values in table.items() if ".header." not in name]
     return columns
 
 
-def sheet_text(content: bytes) -> str:
-    """The first sheet that has two rows and more, as text with tabs."""
-    import openpyxl
+def sheet_texts(content: bytes) -> dict[str, str]:
+    """The visible sheets that have two rows and more, as text with tabs, by name."""
+    from openpyxl.reader.excel import ExcelReader
+
+    class Reader(ExcelReader):  # type: ignore[misc]
+        def read_chartsheet(self, sheet: Any, rel: Any) -> None:
+            """A sheet that is a chart has no cells; openpyxl stumbles over it where it only reads."""
 
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        if sum(entry.file_size for entry in archive.infolist()) > LARGEST_BYTES:
-            raise RefusedError(f"unpacks to more than {LARGEST_BYTES >> 20} MiB: save it as CSV")
-    book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True)
-    for sheet in book.worksheets:
+        if sum(entry.file_size for entry in archive.infolist()) > _LARGEST_SHEETS:
+            raise RefusedError(f"unpacks to more than {_LARGEST_SHEETS >> 20} MiB: save it as CSV")
+    reader = Reader(io.BytesIO(content), read_only=True, data_only=True)
+    reader.read()
+    found: dict[str, str] = {}
+    cells = 0
+    for sheet in reader.wb.worksheets:
+        if sheet.sheet_state != "visible":  # its author does not show it either
+            continue
         sheet.reset_dimensions()  # which the file states, and need not be true
-        lines = ["\t".join(_cell(value) for value in row) for row in sheet.iter_rows(values_only=True)]
+        lines, last, empty = [], 0, 0
+        for row in sheet.iter_rows(values_only=True):
+            line = "\t".join(_cell(value) for value in row)
+            lines.append(line)
+            last, empty = (len(lines), 0) if line.strip() else (last, empty + max(len(row), 1))
+            if empty > _EMPTY_CELLS:
+                raise RefusedError(
+                    f"more than {_EMPTY_CELLS} empty cells below row {last} of '{sheet.title}': "
+                    "save it as CSV"
+                )
+            cells += len(row)
+            if cells > _MOST_CELLS:
+                raise RefusedError(f"more than {_MOST_CELLS // 10**6} million cells: save it as CSV")
         if sum(bool(line.strip()) for line in lines) > 1:
-            return "\n".join(lines) + "\n"
-    raise RefusedError("no sheet has a table; expected a row of names and rows of numbers")
+            found[sheet.title] = "\n".join(lines) + "\n"
+    if not found:
+        raise RefusedError("no visible sheet has a table; expected a row of names and rows of numbers")
+    return found
 
 
 def _cell(value: Any) -> str:
@@ -209,9 +282,9 @@ def _cell(value: Any) -> str:
 def _archive(columns: Columns) -> bytes:
     import numpy as np
 
-    about = json.dumps([[name, unit] for name, (_, unit) in columns.items()]).encode()
+    about = json.dumps([[name, unit] for name, _, unit in columns]).encode()
     stream = io.BytesIO()
-    arrays = {str(k): values for k, (values, _) in enumerate(columns.values())}
+    arrays = {str(k): values for k, (_, values, _) in enumerate(columns)}
     np.savez(stream, about=np.frombuffer(about, dtype=np.uint8), **arrays)
     return stream.getvalue()
 
@@ -224,7 +297,7 @@ def main(kind: str) -> int:
     content = sys.stdin.buffer.read()
     try:
         if kind == "xlsx":
-            found = sheet_text(content).encode("utf-8", "replace")
+            found = json.dumps(sheet_texts(content)).encode("utf-8", "replace")
         elif kind in ("hdf5", "parquet"):
             found = _archive(hdf5_columns(content) if kind == "hdf5" else parquet_columns(content))
         else:

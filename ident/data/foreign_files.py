@@ -9,6 +9,8 @@ import os
 import subprocess
 import sys
 import zipfile
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,11 +42,24 @@ def shown(value: object, longest: int = 80) -> str:
 
 
 def content_of(file: Path) -> bytes:
-    """The bytes of a file. Raises ValueError where there are more than `LARGEST_BYTES`, OSError as `open`."""
+    """The bytes of a file. Raises ValueError where it is none (a pipe would be waited for), or holds more
+    than `LARGEST_BYTES`; OSError as `open`."""
+    if not file.is_file():
+        raise ValueError("not a file" if file.exists() else "no such file")
     size = file.stat().st_size
     if size > LARGEST_BYTES:
         raise ValueError(f"{size / 2**20:.0f} MiB; expected at most {LARGEST_BYTES >> 20}: split the file")
     return file.read_bytes()
+
+
+def distinct(names: Sequence[str]) -> list[str]:
+    """Names of columns, those that are there several times numbered: '#1 angle', '#2 angle'."""
+    came: Counter[str] = Counter()
+    found = []
+    for name in names:
+        came[name] += 1
+        found.append(f"#{came[name]} {name}" if names.count(name) > 1 else name)
+    return found
 
 
 def as_numbers(values: Any) -> np.ndarray[Any, np.dtype[Any]]:
@@ -55,6 +70,10 @@ def as_numbers(values: Any) -> np.ndarray[Any, np.dtype[Any]]:
     if array.dtype.kind not in "fiubMm":
         what = "text" if array.dtype.kind in "USO" else f"{array.dtype}"
         raise ValueError(f"holds {shown(what)}; expected real numbers")
+    if array.dtype.kind in "Mm" and np.datetime_data(array.dtype)[0] in ("Y", "M", "generic"):
+        raise ValueError(
+            f"holds {array.dtype}, steps of no fixed length; expected instants, as datetime64[ns]"
+        )
     return array
 
 

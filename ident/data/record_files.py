@@ -12,7 +12,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from ident.data.foreign_files import LARGEST_BYTES, content_of, npz_arrays, read_in_child, shown
+from ident.data.foreign_files import LARGEST_BYTES, content_of, distinct, npz_arrays, read_in_child, shown
+from ident.data.json_columns import json_columns
 from ident.data.mat_files import mat_variables
 from ident.data.table import Table
 from ident.data.text_tables import read_text, text_of
@@ -36,7 +37,7 @@ def reads(*endings: str) -> Callable[[Reader], Reader]:
 def read_table(path: str | PathLike[str]) -> Table:
     """The columns of a log file; also of one packed by gzip (log.csv.gz). ValueError: one line."""
     file = Path(path)
-    if not file.is_file():
+    if not file.is_file():  # a pipe would be waited for
         raise ValueError(f"{file}: {'not a file' if file.exists() else 'no such file'}")
     packed = file.suffix.lower() == ".gz"
     ending = Path(file.stem).suffix.lower() if packed else file.suffix.lower()
@@ -48,7 +49,8 @@ def read_table(path: str | PathLike[str]) -> Table:
         return READERS[ending](file, _unpacked(content) if packed else content)
     except ValueError as error:
         text = str(error)
-        raise ValueError(text if text.startswith(str(file)) else f"{file}{text}") from None
+        between = "" if text.startswith((":", ",")) else ": "
+        raise ValueError(text if text.startswith(str(file)) else f"{file}{between}{text}") from None
 
 
 def _unpacked(content: bytes) -> bytes:
@@ -103,9 +105,39 @@ def _read_parquet(file: Path, content: bytes) -> Table:
 
 @reads(".xlsx")
 def _read_xlsx(file: Path, content: bytes) -> Table:
-    """The first sheet with a table, laid out as in a text file; rows are called lines."""
-    layout, columns = read_text(read_in_child("xlsx", "openpyxl", content).decode("utf-8"))
-    return Table(file, columns, layout.first, layout, layout.units)
+    """The visible sheet with a table, laid out as in a text file; rows are called lines. Where there are
+    several, their columns under the names of the sheets."""
+    texts: dict[str, str] = json.loads(read_in_child("xlsx", "openpyxl", content))
+    found, refused = {}, ValueError()
+    for title, text in texts.items():
+        try:
+            found[title] = read_text(text)
+        except ValueError as error:
+            refused = refused if refused.args else error
+    if not found:
+        raise refused
+    rows = {title: len(next(iter(columns.values()))) for title, (_, columns) in found.items()}
+    # Some settings in a few rows are no second log.
+    found = {title: one for title, one in found.items() if 10 * rows[title] >= max(rows.values())}
+    if len(found) == 1:
+        ((layout, columns),) = found.values()
+        return Table(file, columns, layout.first, layout, layout.units)
+    named = {
+        f"{title}/{name}": column for title, (_, table) in found.items() for name, column in table.items()
+    }
+    units = {f"{title}/{name}": u for title, (layout, _) in found.items() for name, u in layout.units.items()}
+    return Table(file, named, units=units)
+
+
+@reads(".json", ".jsonl", ".ndjson")
+def _read_json(file: Path, content: bytes) -> Table:
+    """Rows or columns as `json_columns` finds them; of `.jsonl` and `.ndjson` a row in each line."""
+    try:
+        text = text_of(content)
+    except ValueError as error:
+        raise ValueError(f": {error}") from None
+    ending = file.name.lower().removesuffix(".gz").rpartition(".")[2]
+    return Table(file, json_columns(text, in_lines=ending != "json"))
 
 
 @reads(".mcap", ".bag", ".db3")
@@ -124,8 +156,10 @@ def _read_bag(file: Path, content: bytes) -> Table:
 def _read_columns(file: Path, content: bytes, kind: str, library: str, extra: str = "logs") -> Table:
     arrays = npz_arrays(read_in_child(kind, library, content, extra))
     about = json.loads(arrays.pop("about").tobytes())
-    columns = {name: arrays[str(k)] for k, (name, _) in enumerate(about)}
-    return Table(file, columns, units={name: unit for name, unit in about if unit})
+    names = distinct([name for name, _ in about])
+    columns = {name: arrays[str(k)] for k, name in enumerate(names)}
+    units = {name: unit for name, (_, unit) in zip(names, about, strict=True) if unit}
+    return Table(file, columns, units=units)
 
 
 def _flat(name: str, value: Any) -> dict[str, Any]:

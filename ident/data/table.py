@@ -5,6 +5,7 @@ Every complaint is one line that names file, place and expectation.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -67,7 +68,9 @@ class Table:
         """
         for name in wanted:
             if name not in self.raw:
-                raise ValueError(f"{self.path}: no column '{shown(name)}'; the file has {self._listed(name)}")
+                there = "several" if self._alike(name) else "no"
+                columns = f"{there} column{'s' if there == 'several' else ''} '{shown(name)}'"
+                raise ValueError(f"{self.path}: {columns}; the file has {self._listed(name)}")
         found = {name: self._numbers(name) for name in dict.fromkeys(wanted)}
         if self.clocks:
             found = self._held(found)
@@ -85,9 +88,14 @@ class Table:
             for (name, values), clock, last in zip(found.items(), clocks, came, strict=True)
         }
 
+    def _alike(self, wanted: str) -> list[str]:
+        """Columns of one name, as `distinct` tells them apart."""
+        return [name for name in self.names if wanted and re.fullmatch(rf"#\d+ {re.escape(wanted)}", name)]
+
     def _listed(self, wanted: str = "") -> str:
-        # Of a matrix that was asked for by its own name, its columns.
-        parts = [name for name in self.names if wanted and name.startswith(f"{wanted}[")]
+        # Of a matrix or struct that was asked for by its own name, its columns.
+        parts = [name for name in self.names if wanted and name.startswith((f"{wanted}[", f"{wanted}."))]
+        parts = self._alike(wanted) or parts
         hint = (
             " (numbers?); expected column names in line 1" if self.layout and not self.layout.header else ""
         )
@@ -163,7 +171,17 @@ class Table:
             column = TimeColumn.of(name, unit, self.units.get(name, ""))
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from None
-        return column.seconds(stamps), replace(column, doubtful=column.doubtful_for(stamps))
+        doubtful = column.doubtful_for(stamps)
+        return column.seconds(self._since_first(name, stamps)), replace(column, doubtful=doubtful)
+
+    def _since_first(self, name: str, stamps: RealArray) -> RealArray:
+        """Stamps; of integers that doubles round, such as nanoseconds since 1970, what passed since the
+        first."""
+        values = self.raw[name]
+        if getattr(values, "dtype", np.dtype(float)).kind not in "iu" or np.abs(stamps).max() <= 2**53:
+            return stamps
+        # The difference of unsigned integers, taken as signed ones, is right whichever is larger.
+        return np.asarray((values - values[0]).astype(np.int64), dtype=np.float64)
 
     def increasing(self, stamps: RealArray, name: str | None) -> None:
         """Raises ValueError unless there are two time stamps at least, each later than the one before."""
@@ -235,14 +253,18 @@ def only_rounded(stamps: RealArray) -> bool:
 
 
 def _split(name: str, values: Any) -> dict[str, Any]:
-    """A matrix (T, C) as its columns; MATLAB's vectors, (T, 1) and (1, T), as vectors."""
+    """A matrix (T, C), or (C, T) as Simulink writes it, as its C columns (samples are more than signals);
+    MATLAB's vectors, (T, 1) and (1, T), as vectors; an array of records as its fields."""
+    if isinstance(values, np.ndarray) and values.dtype.names and values.ndim == 1:
+        return {f"{name}.{field}": values[field] for field in values.dtype.names}
     if not isinstance(values, np.ndarray) or values.ndim != 2:
         return {name: values}
     if 1 in values.shape or values.size == 0:
         return {name: values.ravel()}
-    if values.shape[1] > _MOST_NUMBERED:
+    if min(values.shape) > _MOST_NUMBERED:
         return {name: values}
-    return {f"{name}[{k}]": values[:, k] for k in range(values.shape[1])}
+    columns = values if values.shape[0] >= values.shape[1] else values.T
+    return {f"{name}[{k}]": column for k, column in enumerate(columns.T)}
 
 
 def _listed(names: Iterable[str], limit: int = 20) -> str:

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ident.data.foreign_files import shown
+from ident.data.foreign_files import distinct
 from ident.data.time_stamps import is_stamp
 from ident.data.units import is_unit
 
@@ -181,12 +181,7 @@ class _Fit:
             units, names, header = names, longer, over[0]
         while not any(self.rows[below]):
             below += 1
-        columns = [name or f"column {k + 1}" for k, name in enumerate(names)]
-        if len(set(columns)) < len(columns):
-            twice = next(name for name in columns if columns.count(name) > 1)
-            raise ValueError(
-                f", line {header + 1}: column names repeat: '{shown(twice)}'; expected each once"
-            )
+        columns = distinct([name or f"column {k + 1}" for k, name in enumerate(names)])
         known = {name: unit.strip("[]() ") for name, unit in zip(columns, units, strict=False)}
         return Layout(self.separator, self.decimal, tuple(columns), known, header + 1, below + 1)
 

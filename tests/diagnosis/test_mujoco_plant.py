@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
@@ -183,3 +185,25 @@ def test_the_equations_of_the_benchmark_are_those_of_mujoco():
 def test_what_is_not_there_is_refused_in_one_line(xml, outputs, complaint):
     with pytest.raises(ValueError, match=f"^{complaint}$"):
         MujocoArm(mujoco.MjSpec.from_string(xml), outputs, DT_S)
+
+
+NAMED = {
+    "an included model": '<include file="{}"/>',
+    "in an included model": '<include file="part.xml"/>',
+    "a mesh": '<asset><mesh name="m" file="{}"/></asset>',
+    "a mesh in its folder": '<compiler meshdir="parts"/><asset><mesh name="m" file="../{}"/></asset>',
+    "a height field": '<asset><hfield name="h" file="{}" size="1 1 1 1"/></asset>',
+}
+
+
+@pytest.mark.parametrize("named", NAMED)
+def test_a_pipe_in_a_model_is_refused_and_not_waited_for(tmp_path, named):
+    pipe, model = tmp_path / "pipe", tmp_path / "arm.xml"
+    os.mkfifo(pipe)
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "part.xml").write_text(f'<mujoco><include file="{pipe}"/><include file="arm.xml"/></mujoco>')
+    text = NAMED[named].format("pipe")
+    model.write_text(ROD.replace("<worldbody>", f"{text}<worldbody>", 1))
+    for path in (model, pipe, tmp_path / "parts"):
+        with pytest.raises(ValueError, match="is no file, but a folder, pipe or device"):
+            MujocoArm.from_file(str(path), outputs=("hinge",), dt_s=DT_S)

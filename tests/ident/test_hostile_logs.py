@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import os
 import subprocess
 import zipfile
 
@@ -107,7 +108,7 @@ def test_sizes_are_limited(tmp_path, monkeypatch):
         read_table(tmp_path / "a.csv.gz")
     monkeypatch.setattr(foreign_files, "LARGEST_BYTES", 2**10)
     (tmp_path / "a.csv").write_bytes(bytes(2**21))
-    with pytest.raises(ValueError, match="2 MiB; expected at most"):
+    with pytest.raises(ValueError, match=r"a\.csv: 2 MiB; expected at most"):
         read_table(tmp_path / "a.csv")
 
 
@@ -125,6 +126,39 @@ def test_entities_that_grow_do_not_fill_the_memory(tmp_path):
     (tmp_path / "a.xlsx").write_bytes(bomb.getvalue())
     with pytest.raises(ValueError, match=r"a\.xlsx: "):
         read_table(tmp_path / "a.xlsx").columns(["t_s"])
+
+
+ENDLESS = {
+    "rows without cells": (600_000, lambda k: b""),
+    "formatted rows": (600_000, lambda k: b'<c r="A%d" s="0"/>' % k),
+    "a cell far out in every row": (5_000, lambda k: b'<c r="XFD%d"><v>1</v></c>' % k),
+}
+
+
+@pytest.mark.parametrize(("last", "row"), ENDLESS.values(), ids=ENDLESS)
+def test_a_sheet_without_end_is_refused_within_seconds(tmp_path, last, row):
+    source, long = LOGS["a spreadsheet"].content, io.BytesIO()
+    rows = b"".join(b'<row r="%d">%b</row>' % (k, row(k)) for k in range(100, last))
+    with zipfile.ZipFile(io.BytesIO(source)) as old, zipfile.ZipFile(long, "w", zipfile.ZIP_DEFLATED) as new:
+        for entry in old.infolist():
+            text = old.read(entry)
+            if entry.filename == "xl/worksheets/sheet2.xml":
+                text = text.replace(b"</sheetData>", rows + b"</sheetData>")
+            new.writestr(entry, text)
+    (tmp_path / "a.xlsx").write_bytes(long.getvalue())
+    began_s = sum(os.times()[:4])
+    with pytest.raises(ValueError, match=r"a\.xlsx: more than .* cells.*: save it as CSV"):
+        read_table(tmp_path / "a.xlsx")
+    assert sum(os.times()[:4]) - began_s < 20
+
+
+def test_a_log_that_is_no_file_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "a.csv")
+    (tmp_path / "b.csv").mkdir()
+    (tmp_path / "c.npz").symlink_to("/dev/zero")
+    for name in ("a.csv", "b.csv", "c.npz"):
+        with pytest.raises(ValueError, match=f"{name}: not a file$"):
+            read_table(tmp_path / name)
 
 
 def test_the_child_reads_no_other_file(tmp_path):

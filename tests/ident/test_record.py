@@ -97,7 +97,10 @@ FAULTS = {
         [HEAD, *rows(10), *rows(5, start=11)],
         ["log.csv, line 12: time 't_s' steps by 0.02 s where most steps are 0.01 s", "within 1%"],
     ),
-    "repeated name": ([f"{T},{U},{U},{Y}", "0,1,2,3", "1,2,3,4"], ["column names repeat"]),
+    "repeated name": (
+        [f"{T},{U},{U},{Y}", "0,1,2,3", "1,2,3,4"],
+        ["several columns 'u_V'; the file has #1 u_V, #2 u_V"],
+    ),
     "nothing": ([""], []),
     "blank lines only": (["", ""], []),
     "header only": ([HEAD], []),

@@ -553,3 +553,26 @@ def test_what_is_refused_is_refused_before_anything_slow_is_loaded(tmp_path, com
     )
     assert words in done.stderr
     assert done.stdout.split() == ["2"]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["look"],
+        ["identify"],
+        ["run", "--config"],
+        ["simulate", "--config"],
+        ["study", "--config"],
+        ["design", "--spec", "pyproject.toml"],
+        ["diagnose"],
+        ["diagnose", "--log", "pyproject.toml", "--mjcf"],
+    ],
+    ids=" ".join,
+)
+@pytest.mark.parametrize("what", ["a pipe", "a device"])
+def test_nothing_is_waited_for(tmp_path, refused, command, what):
+    path = "/dev/zero"
+    if what == "a pipe":
+        os.mkfifo(path := tmp_path / "pipe")
+    out = ["--out", tmp_path / "out"] if command[0] in ("simulate", "study", "diagnose") else []
+    assert "expected a f" in refused(*command, path, *out)  # a file, or a folder with case.toml

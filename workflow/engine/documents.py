@@ -3,12 +3,13 @@ anything looks at what is said."""
 
 from __future__ import annotations
 
-import json
+import os
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from ident.data.json_text import json_value
 from workflow.engine.errors import InputError, cannot, shortened
 
 MOST_BYTES = 32 * 2**20
@@ -21,7 +22,7 @@ _LONGEST_TOML_LINE = 20_000
 
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
     """UTF-8 text of a file. Raises InputError naming it."""
-    with cannot("read", path), open(path, "rb") as stream:
+    with cannot("read", path), open(path, "rb", opener=_at_once) as stream:
         content = stream.read(most_bytes + 1)  # pipes have no size: one byte more than is allowed
     if len(content) > most_bytes:
         raise InputError(f"{path}: larger than {most_bytes / 2**20:g} MiB")
@@ -29,6 +30,13 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
         return content.decode("utf-8-sig")  # editors on Windows like to put a mark in front
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not UTF-8 text (byte {error.start})") from error
+
+
+def _at_once(path: str, flags: int) -> int:
+    # Else a pipe that nobody writes to is waited for.
+    descriptor = os.open(path, flags | os.O_NONBLOCK)
+    os.set_blocking(descriptor, True)
+    return descriptor
 
 
 def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
@@ -42,7 +50,7 @@ def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
 
 def read_json(path: Path) -> dict[str, Any]:
     """The object in a JSON file. Raises InputError naming the file."""
-    document = _parsed(json.loads, read_text(path), path, "JSON")
+    document = _parsed(json_value, read_text(path), path, "JSON")
     if not isinstance(document, dict):
         raise InputError(f"{path}: expected a JSON object, found {type(document).__name__}")
     return document

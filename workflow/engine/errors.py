@@ -64,10 +64,13 @@ class CommandInterruptedError(RuntimeError):
 
 
 def need(*paths: Path | None) -> None:
-    """Refuse a path that is not there, before anything slow is loaded. Raises InputError."""
+    """Refuse a path that is not there, and one that would be waited for, before anything slow is loaded.
+    Raises InputError."""
     for path in paths:
         if path is not None and not path.exists():
             raise InputError(f"cannot read {path}: no such file or directory")
+        if path is not None and not (path.is_file() or path.is_dir()):
+            raise InputError(f"cannot read {path}: a pipe, socket or device; expected a file")
 
 
 @contextmanager
