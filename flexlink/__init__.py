@@ -3,9 +3,8 @@
     >>> import flexlink
     >>> from numpy.random import default_rng
 
-Every name here is imported when it is first used, so that `import flexlink` itself costs nothing. Results
-show in a line or a few what was found; `plot()` draws them, `to_control()` hands them to python-control.
-What takes long runs on one thread, as the commands do: matrices here are small.
+Names are imported at first use, so `import flexlink` is fast. A result prints a short summary; `plot()` draws
+it, `to_control()` converts it for python-control. Long computations use one BLAS thread, as the commands do.
 
 Data        `Record`, `FrfRepeats`, `FrequencyUncertainty`, `band_limited`, `empirical_frf`
 Models      `identify`, `identify_frf`, `identify_miso`, `uncertainty`, `GobfModel`, `Poles`, `IdentOptions`,

@@ -16,15 +16,15 @@ __all__ = ["Case", "Diagnosis", "Experiment", "diagnose"]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis(Shown, answer.Diagnosis):
-    """What `diagnose` found, see there: `flexlink.Diagnosis` is `diagnosis.Diagnosis` that shows itself."""
+    """Result of `diagnose`; fields as in `diagnosis.Diagnosis`."""
 
     table_in_notebook = True
 
 
 def diagnose(case: Any, **more: Any) -> Diagnosis:
-    """Which effect explains the gap between a rig and its records; arguments as `diagnosis.diagnose`.
+    """Find the effect that explains the model error of a rig; arguments as in `diagnosis.diagnose`.
 
-    Takes some ten seconds for records of a few thousand samples.
+    Takes about ten seconds for records of a few thousand samples.
 
     Examples
     --------

@@ -116,13 +116,13 @@ def _checked(system: Any, what: str) -> None:
 
 
 class UncertainPlant(Shown, plant_set.UncertainPlant):
-    """What a controller is designed for: a nominal state space and the ellipses around its response.
+    """A nominal state space and the ellipses around its response, for which a controller is designed.
 
     plant : Uncertainty, or a discrete system of python-control (ss, tf), or a model with `to_control()`
-        An `Uncertainty` brings its own ellipses; anything else is exact unless `uncertainty` is given.
-    uncertainty : as `control_design.UncertainPlant`, or a `control.frd`: a measured response, taken as exact.
+        An `Uncertainty` has its own ellipses; anything else is exact unless you give `uncertainty`.
+    uncertainty : as in `control_design.UncertainPlant`, or a `control.frd` (measured response, exact).
 
-    Other arguments as `control_design.UncertainPlant`.
+    Other arguments as in `control_design.UncertainPlant`.
 
     Examples
     --------
@@ -160,7 +160,7 @@ class UncertainPlant(Shown, plant_set.UncertainPlant):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SynthesisResult(Shown, synthesis_result.SynthesisResult):
-    """What `synthesise` found, and what was asked of it."""
+    """Result of `synthesise`, with plants and specification."""
 
     plants: tuple[plant_set.UncertainPlant, ...] = ()
     specification: Specification = field(default_factory=Specification)
@@ -172,7 +172,7 @@ class SynthesisResult(Shown, synthesis_result.SynthesisResult):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Certificate(Shown, certificate.Certificate):
-    """What `certify` checked, and on what."""
+    """Result of `certify`, with controller, plants and specification."""
 
     table_in_notebook = True
     controller: Controller | None = None
@@ -182,12 +182,12 @@ class Certificate(Shown, certificate.Certificate):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoopRun(Shown, closed_loop.ClosedLoopTrajectory):
-    """A closed loop in time, from `simulate_loop`."""
+    """Closed-loop simulation, the result of `simulate_loop`."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JointDesign(joint_synthesis.JointDesign):
-    """What `synthesise_jointly` found; its `result` is a `SynthesisResult`."""
+    """Result of `synthesise_jointly`; its `result` is a `SynthesisResult`."""
 
     def __repr__(self) -> str:
         """The result, and how many sampled responses are unstable with it."""
@@ -202,7 +202,7 @@ def synthesise(
     rng: np.random.Generator | int = 0,
     **more: Any,
 ) -> SynthesisResult:
-    """One controller for one or several uncertain plants; arguments as `control_design.synthesise`.
+    """Design one controller for one or several uncertain plants; arguments as in `control_design.synthesise`.
 
     plants: an `UncertainPlant` or what makes one (ss, tf, a model), or several. rng: a generator, or the seed
     of one.
@@ -274,12 +274,11 @@ def certify(
     specification: Specification | None = None,
     **more: Any,
 ) -> Certificate:
-    """Check a controller from any source, independently of the optimiser; `control_design.certify`.
+    """Certify a controller from any source, independently of the optimiser.
 
-    controller: a `Controller`, the result of `synthesise`, or a discrete system of python-control (ss, tf)
-    from error to command, behind which comes the specification's computational delay. plants: as in
-    `synthesise`.
-    plants, specification: taken from the result of `synthesise` where that is given.
+    controller: a `Controller`, a result of `synthesise`, or a discrete system of python-control (ss, tf) from
+    error to command, to which the computational delay of the specification is added. plants: as in
+    `synthesise`. plants and specification default to those of a result of `synthesise`.
 
     Examples
     --------
@@ -292,7 +291,7 @@ def certify(
         specification = specification or controller.specification
         controller = controller.controller
     if plants is None or specification is None:
-        raise ValueError("certify needs plants and a specification beside a controller")
+        raise ValueError("certify needs plants and a specification for this controller")
     chosen = _several(plants)
     if controller is not None and not isinstance(controller, Controller):
         controller = _as_controller(controller, specification.computational_delay_samples)
@@ -304,7 +303,7 @@ def certify(
 
 
 def simulate_loop(controller: Any, machine: Any, reference: npt.ArrayLike, **more: Any) -> LoopRun:
-    """Run the loop in time, limits and delay included; arguments as `control_design.simulate`.
+    """Simulate the closed loop with limits and delay; arguments as in `control_design.simulate`.
 
     controller: a `Controller`, or a discrete system of python-control (ss, tf) as in `certify`, with a delay
     of one sample. machine: a `SampledArm` or anything with `measure`, `advance` and `reset`; a linear system

@@ -1,4 +1,4 @@
-"""Simulated machines: a rig, what separates it from its data sheet, and records of it."""
+"""Simulated machines: a rig, effects that its data sheet lacks, and records of it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["Rig", "SampledArm", "Simulation", "effect", "multisine", "paper_link
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Simulation(Shown, simulation.Trajectory):
-    """A simulated experiment: `plant.Trajectory`, and the record that an identification takes."""
+    """A simulated experiment: fields as in `plant.Trajectory`; `record` makes a `Record` of it."""
 
     @property
     def dt_s(self) -> float:
@@ -40,9 +40,9 @@ class Simulation(Shown, simulation.Trajectory):
 
 
 def effect(name: str, **parameters: Any) -> Effect:
-    """One of the effects that a rig file does not know: friction, backlash, delay, ... (`plant.EFFECTS`).
+    """An effect that a rig file does not describe: friction, backlash, delay, ... (`plant.EFFECTS`).
 
-    Raises ValueError, naming those there are, for another name or a parameter that does not fit.
+    Raises ValueError for an unknown name (and lists the known ones) or an unsuitable parameter.
 
     Examples
     --------
@@ -60,7 +60,7 @@ def simulate(
     rng: np.random.Generator | None = None,
     **settings: Any,
 ) -> Simulation:
-    """Drive a machine from rest with a held voltage (T,); arguments as `plant.simulate`.
+    """Drive a machine from rest with a held voltage (T,); arguments as in `plant.simulate`.
 
     Examples
     --------

@@ -64,8 +64,8 @@ class Record(Shown, PlainRecord):
     """One uniformly sampled experiment, from arrays, pandas columns or (with `from_file`) a file.
 
     u, y : (T,) or (T, n), or a pandas column or table
-        Input and output, one row per sample; also under the names of the attributes, `input` and `output`.
-        Pandas names become the names of the signals; without, they are u and y (u1, u2, ... if several).
+        Input and output, one row per sample; `input` and `output` are accepted, too. Names of pandas columns
+        become signal names; the default is u and y (u1, u2, ... if several).
     dt_s : float. Sampling time in seconds.
     reference : as y, optional. Closed-loop reference.
 
@@ -145,8 +145,8 @@ class Record(Shown, PlainRecord):
     ) -> Record:
         """Columns of a `pandas.DataFrame`, checked like those of a file.
 
-        time: a column of numbers (its unit as in its name, else seconds) or of instants; without it the index
-        is taken where it is one of times, else dt_s has to be given. The other arguments as `from_file`.
+        time: column of numbers (unit from its name, else seconds) or of date-times. Default: the index, if it
+        holds times; otherwise give dt_s. Other arguments as in `from_file`.
 
         Examples
         --------
@@ -171,8 +171,9 @@ class Record(Shown, PlainRecord):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GobfModel(Shown, model.GobfModel):
-    """Poles and coefficients of a model on generalised orthonormal basis functions, as
-    `ident.basis.model.GobfModel`, that shows itself.
+    """Poles and coefficients of a model on generalised orthonormal basis functions.
+
+    Fields as in `ident.basis.model.GobfModel`.
 
     Examples
     --------
@@ -267,7 +268,7 @@ def _refuse_other_rows(*signals: Any) -> None:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification(Shown, Identified):
-    """What `identify` found: `ident.Identification` and the records it came from.
+    """Result of `identify`: the fields of `ident.Identification`, and the records.
 
     Examples
     --------
@@ -298,13 +299,13 @@ class Uncertainty(Shown, posterior.ResponsePosterior):
     nominal_poles: Poles = Poles()  # noqa: RUF009 (frozen)
 
     def nominal(self) -> GobfModel:
-        """The model on the identified poles that is nearest to the centre in units of the ellipses."""
+        """Model on the identified poles, nearest to the centre in units of the ellipses."""
         nyquist = np.pi / self.dt_s
         omega = np.geomspace(1e-3 * nyquist, nyquist, _NOMINAL_POINTS)
         return dressed(GobfModel, nominal_near(self, self.nominal_poles, omega))
 
     def at_modes(self) -> list[tuple[float, float]]:
-        """(frequency [rad/s], major semi-axis of the 95 % ellipse / gain) at every mode of the model."""
+        """(frequency [rad/s], major semi-axis of the 95 % ellipse over gain) at every mode."""
         omega = np.unique(self.nominal_poles.omega_rad_s(self.dt_s))
         here = self.at(omega[omega < np.pi / self.dt_s]) if omega.size else None
         if here is None:
@@ -313,16 +314,16 @@ class Uncertainty(Shown, posterior.ResponsePosterior):
         return list(zip(here.omega_rad_s.tolist(), share.tolist(), strict=True))
 
     def to_control(self) -> Any:
-        """`nominal` as `control.StateSpace`; the ellipses have no place there."""
+        """`nominal` as `control.StateSpace`, without the ellipses."""
         return self.nominal().to_control()
 
 
 def identify(
     records: PlainRecord | Sequence[PlainRecord], options: IdentOptions | None = None, **settings: Any
 ) -> Identification:
-    """Model of one input and one output, poles searched globally, order chosen from the data unless given.
+    """Identify a model of one input and one output; the data choose the order unless you give it.
 
-    `settings` are fields of `IdentOptions`, in place of `options`. Raises ValueError if a setting or a record
+    settings: fields of `IdentOptions`, instead of `options`. Raises ValueError for a setting or a record that
     cannot be used.
 
     Examples
@@ -344,10 +345,10 @@ def uncertainty(
     options: EmbeddingOptions | None = None,
     **settings: Any,
 ) -> Uncertainty:
-    """Posterior of the response around an identified model: noise, pole error and what the model lacks.
+    """Posterior of the response around an identified model: noise, pole error and unmodelled dynamics.
 
-    records: those of the identification, taken from it if it came from `flexlink.identify`. `settings` are
-    fields of `EmbeddingOptions`, in place of `options`.
+    records: those of the identification; not needed if it came from `flexlink.identify`. settings: fields of
+    `EmbeddingOptions`, instead of `options`.
 
     Examples
     --------

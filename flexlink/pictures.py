@@ -30,10 +30,10 @@ __all__ = ["bode", "compare", "plot"]
 
 @singledispatch
 def plot(result: object) -> Figure:
-    """Draw a result as the pages do: records, poles, a response with its ellipses, loop gains, causes.
+    """Draw records, poles, a response with its ellipses, loop gains or causes, as on the pages.
 
-    Returns a `matplotlib.figure.Figure`: `figure.savefig("response.png")`. Raises TypeError for anything that
-    has no picture.
+    Returns a `matplotlib.figure.Figure`; save it with `figure.savefig("response.png")`. Raises TypeError if
+    there is no picture of the argument.
 
     Examples
     --------

@@ -30,13 +30,13 @@ class Shown:
         return said + self.table().to_html(index=False, na_rep="", float_format="{:.4g}".format, border=0)
 
     def plot(self) -> Figure:
-        """The picture one wants of it (matplotlib is imported now); see `flexlink.plot`."""
+        """Draw the result; see `flexlink.plot`."""
         from flexlink import plot
 
         return plot(self)
 
     def table(self) -> pd.DataFrame:
-        """The result as a tidy table; see `flexlink.table`."""
+        """Return the result as a table; see `flexlink.table`."""
         from flexlink import table
 
         return table(self)

@@ -23,12 +23,12 @@ __all__ = ["table"]
 
 @singledispatch
 def table(result: object) -> pd.DataFrame:
-    """A result as a `pandas.DataFrame`, units in the names of the columns; also `result.table()`.
+    """Return a result as `pandas.DataFrame`, with units in the column names; also `result.table()`.
 
     Record, simulation, closed loop: a row per sample. Model, identification: a row per mode or real pole.
-    Uncertainty, measured response: a row per frequency, gain and phase with the ends of their ellipses.
-    Certificate: a row per requirement. Synthesis: a row per frequency that limits it. Diagnosis: a row per
-    effect and parameter with its 95 % interval. Raises TypeError for anything else.
+    Uncertainty, measured response: a row per frequency, with the range of gain and phase over the ellipse.
+    Certificate: a row per requirement. Synthesis: a row per active constraint. Diagnosis: a row per effect
+    and parameter, with its 95 % interval. Raises TypeError for anything else.
 
     Examples
     --------

@@ -36,7 +36,7 @@ class ExperimentPlan(BaseModel):
     periods: int = Field(2, ge=1, le=1000, description="whole periods of a record, behind its lead-in")
     period_samples: int = Field(ge=8, le=1_000_000, description="length of a period")
     lead_in_samples: int = Field(
-        ge=0, le=1_000_000, description="from rest to steady state, before the whole periods"
+        ge=0, le=1_000_000, description="lead-in from rest to steady state, before the whole periods"
     )
     from_Hz: float = Field(gt=0, description="lowest frequency")
     to_Hz: float = Field(gt=0, description="highest frequency")

@@ -21,7 +21,7 @@ class YoulaOptions(GridOptions):
     exchange_rounds: int = Field(default=6, ge=0, le=20, description="rounds of adding violated frequencies")
     hull: bool = Field(
         default=False,
-        description="also bound from below by hulls of what every frequency allows; some seconds",
+        description="also compute a lower bound from hulls at every frequency; takes some seconds",
     )
 
 
@@ -35,6 +35,6 @@ class ReferenceFilterOptions(GridOptions):
         default=None, description="decay rates of the real poles, rad/s; none = searched"
     )
     unit_gain: bool = Field(
-        default=True, description="F(1) = 1: what the loop does with constant references stays as it is"
+        default=True, description="F(1) = 1: the loop treats constant references as before"
     )
     exchange_rounds: int = Field(default=3, ge=0, le=20, description="rounds of adding violated frequencies")

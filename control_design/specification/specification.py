@@ -67,7 +67,7 @@ class Specification(BaseModel):
         default=None, description="above it the limit on |K S| falls with 1/frequency"
     )
     delay_margin_s: _Positive | None = Field(
-        default=None, description="extra loop delay that must not destabilise, s"
+        default=None, description="extra loop delay that the loop must tolerate, s"
     )
     mode_peak_ratio: float | None = Field(
         default=None,
@@ -79,8 +79,8 @@ class Specification(BaseModel):
         default=None,
         gt=0,
         lt=1,
-        description="least damping ratio of the nominal closed loop's modes inside mode_band_rad_s; the "
-        "certificate checks it, the optimiser only sees what the other requirements make of it",
+        description="smallest damping ratio of the nominal closed-loop modes inside mode_band_rad_s; "
+        "checked by the certificate, not seen by the optimiser",
     )
     mode_band_rad_s: tuple[float, float] | None = Field(
         default=None,
@@ -101,17 +101,17 @@ class Specification(BaseModel):
         default=None,
         gt=0,
         le=1,
-        description="least damping ratio of the controller's own pole pairs; without it a controller may "
-        "answer a notch of the plant with a resonance of its own, which then rings in closed loop",
+        description="smallest damping ratio of the controller's own pole pairs; prevents a controller "
+        "resonance at a notch of the plant, which would ring in closed loop",
     )
     computational_delay_samples: int = Field(
         default=1, ge=0, le=10, description="samples between measuring and applying the command"
     )
     sensitivity_weight: RationalWeight | None = Field(
-        default=None, description="W1 given directly, in place of bandwidth_rad_s"
+        default=None, description="W1 itself, instead of bandwidth_rad_s"
     )
     effort_weight: RationalWeight | None = Field(
-        default=None, description="W3 given directly, in place of effort_limit"
+        default=None, description="W3 itself, instead of effort_limit"
     )
 
     @model_validator(mode="after")

@@ -11,10 +11,13 @@ class SynthesisOptions(GridOptions):
     """How hard to search; the defaults solve an order-5 design in a few seconds."""
 
     starts: int = Field(
-        default=6, ge=1, le=100, description="random low-gain starts of each order, and as many shaped ones"
+        default=6,
+        ge=1,
+        le=100,
+        description="random low-gain starts of each order, and as many starts shaped at the modes",
     )
     agreeing_starts: int = Field(
-        default=3, ge=1, description="stop early when so many starts reach the best value within 0.1 %"
+        default=3, ge=1, description="stop early when this many starts reach the best value within 0.1 %"
     )
     sufficient_gamma: float = Field(
         default=0.0,
@@ -27,11 +30,11 @@ class SynthesisOptions(GridOptions):
         default=100,
         ge=10,
         le=5000,
-        description="IPOPT iterations per start, which the descent then takes to its end",
+        description="IPOPT iterations per start; a descent then finishes it",
     )
     jobs: int = Field(
         default=1,
         ge=1,
         le=64,
-        description="processes that work on the starts; the result does not depend on it",
+        description="processes that work on the starts; the result does not depend on their number",
     )

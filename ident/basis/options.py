@@ -32,12 +32,8 @@ class IdentOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    n_real: int | None = Field(
-        None, ge=0, le=8, description="number of searched real poles; none: from the data"
-    )
-    n_pairs: int | None = Field(
-        None, ge=0, le=12, description="number of searched pole pairs; none: from the data"
-    )
+    n_real: int | None = Field(None, ge=0, le=8, description="number of real poles; default: from the data")
+    n_pairs: int | None = Field(None, ge=0, le=12, description="number of pole pairs; default: from the data")
     max_real: int = Field(
         4, ge=0, le=8, description="most real poles when their number is chosen from the data"
     )
@@ -45,54 +41,55 @@ class IdentOptions(BaseModel):
         5, ge=0, le=12, description="most pole pairs when their number is chosen from the data"
     )
     fixed_poles: tuple[tuple[float, float], ...] = Field(
-        (), description="known poles in the z plane, [real part, imaginary part >= 0], kept where they are"
+        (), description="known poles in the z plane, [real part, imaginary part >= 0]; not changed"
     )
 
     integrators: int = Field(0, ge=0, le=3, description="known poles at z = 1, as exact input filters")
     feedthrough: bool = Field(
         False, description="direct term from the input to the output of the same sample"
     )
-    input_delay_samples: int = Field(0, ge=0, description="known whole delay of the input")
+    input_delay_samples: int = Field(0, ge=0, description="known delay of the input in whole samples")
     relative_degree: Annotated[int, Field(ge=1, le=6)] | Literal["auto"] | None = Field(
         None,
-        description="known relative degree of the continuous-time plant behind a zero-order hold (torque to "
-        "angle: 2), tested and kept; auto: the largest of 1 to 3 that the data do not refuse",
+        description="known relative degree of the continuous-time plant behind a zero-order hold "
+        "(torque to angle: 2); tested and kept. auto: the largest of 1 to 3 that the data "
+        "allow",
     )
     estimate_offset: bool | Literal["auto"] = Field(
-        "auto", description="unknown constant on the output of each record; auto: kept if the data ask for it"
+        "auto", description="unknown constant on the output of each record; auto: kept if the data support it"
     )
     estimate_initial_state: bool | Literal["auto"] = Field(
-        "auto", description="records need not start from rest; auto: kept if the data ask for it"
+        "auto", description="records need not start at rest; auto: kept if the data support it"
     )
 
     noise: Literal["white", "auto"] = Field(
         "white",
-        description="white: plain least squares; auto: where the residuals are not white (dry friction, "
-        "drift), poles and coefficients are sought behind a noise model",
+        description="white: plain least squares; auto: a noise model where the residuals are not "
+        "white (dry friction, drift)",
     )
 
     algorithm: Algorithm = Field("GN_DIRECT_L", description="NLopt's variants of DIRECT")
     coordinates: Literal["log", "raw"] = Field(
         "log",
-        description="log10 of decay, frequency and damping; or the paper's (x, beta, gamma), which miss the "
-        "best poles more often than not",
+        description="log: log10 of decay, frequency and damping; raw: the paper's (x, beta, gamma), "
+        "which often miss the best poles",
     )
     evaluations: int = Field(
         250, ge=20, le=1_000_000, description="cost evaluations of the first global search"
     )
     search_samples: int = Field(
-        20_000, ge=100, description="longer data are searched on a part of them, then polished on all"
+        20_000, ge=100, description="longer data are searched on a part, then refined on all samples"
     )
     starts: int = Field(
         4,
         ge=1,
         le=20,
-        description="points of a global search that are polished; five times as many if the first disagree",
+        description="points of a global search that are refined; five times as many if the first disagree",
     )
 
     omega_min_rad_s: float | None = Field(None, gt=0, description="lowest natural frequency of a pair")
     omega_max_rad_s: float | None = Field(None, gt=0, description="highest natural frequency of a pair")
-    zeta_min: float | None = Field(None, gt=0, lt=0.98, description="least damping ratio of a pair")
+    zeta_min: float | None = Field(None, gt=0, lt=0.98, description="smallest damping ratio of a pair")
     zeta_max: float | None = Field(None, gt=0, le=0.98, description="largest damping ratio of a pair")
     decay_min_per_s: float | None = Field(None, gt=0, description="slowest decay of a real pole, 1/s")
     decay_max_per_s: float | None = Field(None, gt=0, description="fastest decay of a real pole, 1/s")
@@ -161,7 +158,7 @@ class EmbeddingOptions(BaseModel):
     fir_length: int | None = Field(
         default=None,
         ge=1,
-        description="taps of the kernel on the remainder; none given: 150, less for short records",
+        description="taps of the kernel for unmodelled dynamics; default: 150, fewer for short records",
     )
     hyperparameters: Literal["average", "maximum"] = Field(
         default="average",
@@ -171,8 +168,8 @@ class EmbeddingOptions(BaseModel):
         default=None,
         ge=0.0,
         lt=1.0,
-        description="prior probability that the poles explain everything (alpha = 0); none given: 1/2, and 0 "
-        "where the order was stated, for no machine ends where somebody stopped counting its modes",
+        description="prior probability that the poles explain everything (alpha = 0); default: 1/2, "
+        "or 0 where the order was given",
     )
     estimate_offset: bool = Field(default=True, description="a constant on each record's output")
     estimate_initial_state: bool = Field(
@@ -182,8 +179,8 @@ class EmbeddingOptions(BaseModel):
         default=0.5,
         ge=0.0,
         lt=1.0,
-        description="prior probability that the poles lack a lightly damped mode; 0: none is looked for. "
-        "For records only: a fit to a measured frequency response does not look for one",
+        description="prior probability that the poles lack a lightly damped mode; 0: do not look for "
+        "one. For records only, not for measured frequency responses",
     )
     coloured_noise: bool = Field(
         default=False, description="whiten with an AR model of the residuals, three rounds"
@@ -191,8 +188,8 @@ class EmbeddingOptions(BaseModel):
     max_ar_order: int = Field(default=8, ge=1, le=100, description="largest AR order that BIC may choose")
     order_given: bool | None = Field(
         default=None,
-        description="the order was stated, not chosen from these data: as likely as not it leaves out "
-        "what a choice would have kept; none given: no, or as the identification beside it says",
+        description="the order was given, not chosen from these data; default: as in the "
+        "identification of the same channel, else no",
     )
 
     @property
@@ -202,6 +199,4 @@ class EmbeddingOptions(BaseModel):
             return self.prior_no_remainder
         return 0.0 if self.order_given else 0.5
 
-    feedthrough: bool | None = Field(
-        default=None, description="direct term; none given: as the model has one or not"
-    )
+    feedthrough: bool | None = Field(default=None, description="direct term; default: as in the model")

@@ -22,25 +22,25 @@ if TYPE_CHECKING:
 class PlantSection(Section):
     """[plant] of a design file: what a file with a plant does not say itself."""
 
-    integrators: int = Field(0, ge=0, le=2, description="poles at z = 1 that the plant is known to have")
-    dt_s: float | None = Field(None, gt=0, description="sampling period behind a measured response [s]")
+    integrators: int = Field(0, ge=0, le=2, description="known poles of the plant at z = 1")
+    dt_s: float | None = Field(None, gt=0, description="sampling period of a measured response [s]")
     level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse of a measured response")
     ellipses: Literal["measured", "fitted"] = Field(
         "measured",
-        description="of a measured response: its own covariances at its own frequencies, or the posterior of "
-        "a model fitted to it, known at every frequency",
+        description="uncertainty of a measured response: its covariances at its frequencies, or the "
+        "posterior of a fitted model at every frequency",
     )
     nominal: InputPath | None = Field(
-        None, description="model (state space) whose poles stand for a measured response; none: one is fitted"
+        None, description="state-space model with the poles of a measured response; default: fitted"
     )
     fit: IdentOptions = Field(
-        default_factory=IdentOptions, description="how a model is fitted to a measured response"
+        default_factory=IdentOptions, description="settings of the model fit to a measured response"
     )
     pool_neighbours: int = Field(
-        0, ge=0, le=50, description="repeats: frequencies on either side whose scatter is pooled"
+        0, ge=0, le=50, description="repeats: neighbouring frequencies on either side whose scatter is pooled"
     )
     outlier_threshold: float | None = Field(
-        None, gt=0, description="repeats: points farther out, in robust standard deviations, are dropped"
+        None, gt=0, description="repeats: drop points farther out than this, in robust standard deviations"
     )
     between_points: Literal["nothing", "linear"] = Field(
         "nothing", description="what the certificate may assume of ellipses between their own frequencies"
@@ -59,10 +59,10 @@ class StatedUncertainty(Section):
     """[uncertainty] of a design file: how far a plant may be from a plain state space."""
 
     multiplicative: RationalWeight | None = Field(
-        None, description="|G - G_nom|/|G_nom| at most this: a number, or numerator and denominator in s"
+        None, description="limit of |G - G_nom|/|G_nom|: a number, or numerator and denominator in s"
     )
     additive: RationalWeight | None = Field(
-        None, description="|G - G_nom| at most this: a number, or numerator and denominator in s"
+        None, description="limit of |G - G_nom|: a number, or numerator and denominator in s"
     )
 
     @field_validator("multiplicative", "additive", mode="before")

@@ -20,16 +20,14 @@ class CertificateOptions(Section):
     """[certificate]: what is said of whole responses, of which the ellipses know one frequency at a time."""
 
     joint_coverage: float = Field(
-        0.95, gt=0, lt=1, description="share of whole responses for which the worst case shall hold"
+        0.95, gt=0, lt=1, description="share of posterior samples for which the worst case must hold"
     )
-    joint_draws: int = Field(
-        2000, ge=0, le=100_000, description="whole responses drawn from the posterior; 0: none"
-    )
+    joint_draws: int = Field(2000, ge=0, le=100_000, description="number of posterior samples; 0: none")
     calibrate: bool = Field(
         False,
-        description="certify over ellipses of the level at which the worst case holds for joint_coverage of "
-        "the whole responses, where that is above the level of the ellipses, and design so that 99.9 % of "
-        "them are stable; false: say what the worst case holds for",
+        description="raise the ellipse level until the worst case holds for joint_coverage of the "
+        "posterior samples, and design so that 99.9 % of them are stable; false: report "
+        "the coverage only",
     )
 
     @model_validator(mode="after")
@@ -44,7 +42,7 @@ class CertificateOptions(Section):
 class AchievableOptions(YoulaOptions):
     """[achievable_performance]: what a controller of any order could reach, and how finely it is sought."""
 
-    compute: bool = Field(True, description="false: the design is not compared with other orders")
+    compute: bool = Field(True, description="compare the design with other orders")
 
 
 class ReferenceFilterSettings(ReferenceFilterOptions):
@@ -53,17 +51,19 @@ class ReferenceFilterSettings(ReferenceFilterOptions):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     corner_rad_s: float | None = Field(
-        None, gt=0, description="the model is 1/(s/corner + 1)^model_order; this or model"
+        None,
+        gt=0,
+        description="corner of the reference model 1/(s/corner + 1)^model_order; give this or model",
     )
-    model_order: int = Field(2, ge=1, le=6, description="order of that model")
+    model_order: int = Field(2, ge=1, le=6, description="order of the reference model")
     model: RationalWeight | None = Field(
-        None, description="the model itself: numerator and denominator in s, e.g. of a step with overshoot"
+        None, description="reference model: numerator and denominator in s, e.g. of a step with overshoot"
     )
     weight: Literal["steps", "flat"] | RationalWeight = Field(
         "steps",
-        description="weight of the matching error. steps: (s + w)/(s + w/100), w the corner of the model, so "
-        "that errors which last weigh most; flat: 1, the largest error at any frequency, which a filter may "
-        "then keep for seconds; or numerator and denominator in s",
+        description="weight of the matching error. steps: (s + w)/(s + w/100) with w the corner of "
+        "the model, which weighs lasting errors most; flat: 1, the largest error at any "
+        "frequency; or numerator and denominator in s",
     )
 
     @model_validator(mode="after")

@@ -85,7 +85,7 @@ class Multisine(_Table):
     )
     phase_draws: int = Field(1, ge=1, le=1000, description="the draw with the lowest crest factor is kept")
     lead_in_samples: int = Field(
-        0, ge=0, le=1_000_000, description="of the same signal before the whole periods"
+        0, ge=0, le=1_000_000, description="lead-in of the same signal before the whole periods"
     )
     lines_seed: int | None = Field(
         None, ge=0, description="odd_random: draws the lines, for records that share them"
@@ -125,7 +125,7 @@ class Doublet(_Table):
     kind: Literal["doublet"] = Field(description="a pulse and its negative")
     amplitude_V: float = Field(gt=0, description="largest voltage")
     samples: int = Field(ge=2, le=1_000_000, description="length of the record")
-    start_s: float = Field(0.0, ge=0, description="rest before")
+    start_s: float = Field(0.0, ge=0, description="rest before the motion")
     pulse_s: float = Field(gt=0, description="length of each of the two pulses")
 
     def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
@@ -136,7 +136,7 @@ class BangBang(_Table):
     kind: Literal["bang_bang"] = Field(description="full voltage one way, then the other")
     amplitude_V: float = Field(gt=0, description="largest voltage")
     samples: int = Field(ge=2, le=1_000_000, description="length of the record")
-    start_s: float = Field(0.0, ge=0, description="rest before")
+    start_s: float = Field(0.0, ge=0, description="rest before the motion")
     slew_s: float = Field(gt=0, description="length of the move, half of it each way")
 
     def signal(self, dt_s: float, rng: np.random.Generator) -> Real:

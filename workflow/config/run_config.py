@@ -33,12 +33,12 @@ RecordRole = Annotated[
 
 class RunSection(Section):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=60)] = Field(
-        "run", description="names the default output directory; letters, digits, '_', '-' and '.'"
+        "run", description="name of the default output directory; letters, digits, '_', '-' and '.'"
     )
     title: Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]*$", max_length=120)] = Field(
         "", description="headline of the report; the name if empty"
     )
-    seed: int = Field(2006, ge=0, description="root of every random stream of the run")
+    seed: int = Field(2006, ge=0, description="seed of every random stream of the run")
 
 
 class SimulatedRecord(Section):
@@ -58,7 +58,7 @@ class SimulatedSource(Section):
         None, ge=1, le=20, description="flexible modes; default: all below Nyquist, at least 3"
     )
     effects: tuple[EffectTable, ...] = Field(
-        (), description="what the nominal rig does not have, e.g. coulomb_friction"
+        (), description="effects that the nominal rig lacks, e.g. coulomb_friction"
     )
     encoder_step_rad: float = Field(0.0, ge=0, description="resolution of the hub encoder; 0 is none")
     plan: ExperimentPlan | None = Field(
@@ -121,9 +121,7 @@ class FileRecord(Section):
     references: tuple[str, ...] | None = Field(None, description="reference columns, closed loop")
     start_sample: int = Field(0, ge=0, description="first row used, counted from 0")
     stop_sample: int | None = Field(None, ge=1, description="row after the last one used")
-    mirrored: bool = Field(
-        False, description="take every signal with its sign changed (all of them, so G is the same)"
-    )
+    mirrored: bool = Field(False, description="change the sign of every signal (G stays the same)")
 
 
 class FileSource(Section):
@@ -140,14 +138,16 @@ class FileSource(Section):
     input_limit: float | None = Field(
         None,
         gt=0,
-        description="what the amplifier gives at most: larger commands in the logs are taken as that",
+        description="limit of the amplifier: larger commands in the logs are clipped to it",
     )
     scale: Mapping[str, Scale] = Field(
-        default_factory=dict, description="of a column: quantity = scale * column + offset"
+        default_factory=dict, description="factor per column: quantity = scale * column + offset"
     )
-    offset: Mapping[str, float] = Field(default_factory=dict, description="of a column, added after scaling")
+    offset: Mapping[str, float] = Field(
+        default_factory=dict, description="offset per column, added after scaling"
+    )
     repair: bool = Field(
-        False, description="put time stamps that jitter, and single missing rows, on a uniform grid"
+        False, description="put jittering time stamps and single missing rows on a uniform grid"
     )
     records: tuple[FileRecord, ...] = Field(min_length=1)
 
@@ -191,21 +191,21 @@ class Channel(Section):
     name: Name | None = Field(None, description="default: the output's name")
     purpose: Literal["control", "performance"] | None = Field(
         None,
-        description="'control' is measured and fed back, 'performance' is what should not swing; "
-        "default: control for the first channel, performance for the others",
+        description="'control': measured and fed back; 'performance': must not swing; default: "
+        "control for the first channel, performance for the others",
     )
     increments: bool = Field(
         False,
-        description="fit sample-to-sample differences of input and output: the response is the same, "
-        "drift and friction weigh less",
+        description="fit differences between samples of input and output: same response, less weight "
+        "on drift and friction",
     )
     band_rad_s: Band | None = Field(
         None,
-        description="fit inside this band: input and output go through the same filter, which leaves the "
-        "response as it is and takes drift, friction and noise outside the band away",
+        description="fit inside this band: the same filter on input and output keeps the response and "
+        "removes drift, friction and noise outside the band",
     )
     bounds_band_rad_s: Band | None = Field(
-        None, description="band of the data behind the ellipses, where it is wider than that of the poles"
+        None, description="band of the data for the ellipses, if wider than that of the poles"
     )
     identification: IdentOptions = Field(default_factory=IdentOptions)
     uncertainty: UncertaintyOptions = Field(default_factory=UncertaintyOptions)
@@ -253,8 +253,9 @@ class RunSpecification(Specification):
 
     amplitudes: tuple[float, float] | None = Field(
         None,
-        description="smallest and largest rms of the input, in its unit, between which all of it is to hold "
-        "on the arm with its friction: sets the promise of every channel; none: as the channels promise",
+        description="smallest and largest rms of the input, in its unit: the specification holds "
+        "between them, for the arm with friction. Sets the model class (promise) of every "
+        "channel; default: as in the channels",
     )
 
 
@@ -263,7 +264,7 @@ class ClosedLoopData(Section):
 
     method: Literal["direct", "two_stage"] = Field(
         "direct",
-        description="direct: the logged input as it is; two_stage: the input explained by the reference",
+        description="direct: the logged input; two_stage: the part of the input that the reference explains",
     )
 
 
@@ -272,8 +273,8 @@ class ClosedLoopOptions(Section):
 
     machine: Literal["simulated", "identified"] | None = Field(
         None,
-        description="'simulated': nonlinear arm of [source]; 'identified': plants drawn from the identified "
-        "uncertain model; default: simulated where the records are",
+        description="'simulated': nonlinear arm of [source]; 'identified': plants drawn from the "
+        "identified uncertainty; default: simulated if the records are",
     )
     effects: tuple[EffectTable, ...] = Field(
         (), description="further effects on the simulated arm, e.g. tip_payload"
@@ -281,28 +282,34 @@ class ClosedLoopOptions(Section):
     reference_step: float | None = Field(
         None,
         gt=0,
-        description="in units of the measured output; default: half its spread in the estimation records",
+        description="reference step, in units of the measured output; default: half its spread in the "
+        "estimation records",
     )
     disturbance: float | None = Field(
         None,
-        description="step at the plant's input half-way, its units; default: a tenth of the input's spread",
+        description="disturbance step at the plant's input half-way, in its units; default: a tenth "
+        "of the input's spread",
     )
     quantisation: float = Field(
         0.0, ge=0, description="step of the converter at the plant's input, in its units"
     )
     measurement_step: float = Field(0.0, ge=0, description="step of the measured output, e.g. an encoder's")
-    duration_s: float | None = Field(None, gt=0, description="default: long enough for two settled steps")
+    duration_s: float | None = Field(
+        None, gt=0, description="length of a run; default: long enough for two settled steps"
+    )
     draws: int = Field(20, ge=1, le=2000, description="Monte Carlo runs")
     friction_feedforward: bool = Field(
         False,
-        description="the controller adds the identified dry friction at the reference's "
-        "speed; needs promise = 'without friction'",
+        description="add the identified dry friction at the reference speed to the command; needs "
+        "promise = 'without friction'",
     )
-    sensitivity: bool = Field(True, description="on the simulated arm: measure S, predicted beside measured")
+    sensitivity: bool = Field(
+        True, description="on the simulated arm: measure S and compare with the prediction"
+    )
     conditions: bool = Field(
         True,
-        description="on the simulated arm: run slew, push at the tip, payloads 0 to 200 %, delay, friction, "
-        "coarse converters and a step beyond the voltage limit",
+        description="on the simulated arm: also run a slew, a push at the tip, payloads of 0 to 200 "
+        "%, delay, friction, coarse converters and a step beyond the voltage limit",
     )
 
 
@@ -310,7 +317,7 @@ class Notes(Section):
     """What is known and not known about the rig; shown in the report as written."""
 
     known: tuple[str, ...] = Field((), description="sentences for the report")
-    unknown: tuple[str, ...] = Field((), description="sentences for the report: what limits its claims")
+    unknown: tuple[str, ...] = Field((), description="sentences for the report: limits of its statements")
 
 
 class SimulationConfig(Section):
@@ -334,7 +341,7 @@ class RunConfig(Section):
         default_factory=lambda: AchievableOptions.model_validate({})
     )
     reference_filter: ReferenceFilterSettings | None = Field(
-        None, description="second degree of freedom; none: the reference goes to the loop as it is"
+        None, description="second degree of freedom; default: the reference is not filtered"
     )
     closed_loop: ClosedLoopOptions = Field(default_factory=ClosedLoopOptions)
     notes: Notes = Field(default_factory=Notes)

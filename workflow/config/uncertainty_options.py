@@ -18,18 +18,20 @@ class UncertaintyOptions(EmbeddingOptions):
 
     method: Literal["tangent", "records", "conditions", "classical"] = Field(
         "tangent",
-        description="tangent: covers noise; records: tangent per record plus the scatter between records, "
-        "for arms that differ from run to run or with amplitude (four records or more); conditions: the same "
-        "between records of different condition; classical: the published recipe, for comparison",
+        description="tangent: noise; records: also the scatter between records, for arms that differ "
+        "from run to run or with amplitude (four records or more); conditions: the same "
+        "between records of different condition; classical: the published method, for "
+        "comparison",
     )
     level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse taken alone")
     promise: str = Field(
         "as recorded",
-        description="what response the ellipses are about: as recorded: a linear arm's, whatever is not "
-        "linear taken for noise. The others identify the dry friction of the control channel (its output "
-        "is the shaft's position). without friction: the linear arm behind it; this amplitude: the best "
-        "linear approximation, friction included, at the rms of the records' inputs; amplitudes from 2 to 8: "
-        "at any rms of the input between these, in its unit",
+        description="model class of the uncertainty. as recorded: linear dynamics, everything else "
+        "counts as noise. The others identify the dry friction of the control channel, "
+        "whose output must be the shaft's position. without friction: linear dynamics "
+        "without friction; this amplitude: best linear approximation with friction, at "
+        "the rms of the recorded inputs; amplitudes from 2 to 8: the same at any rms of "
+        "the input between these, in its unit",
     )
 
     @field_validator("promise")

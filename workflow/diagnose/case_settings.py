@@ -22,7 +22,8 @@ class Column(Section):
     column: str = Field(min_length=1, description="name of the column")
     scale: float | None = Field(
         None,
-        description="unit of the quantity per unit of the column, not 0; default 1, of time its header's",
+        description="unit of the quantity per unit of the column, not 0; default 1, for time the unit "
+        "in the header",
     )
     offset: float = Field(0.0, description="added after scaling, in the unit of the quantity")
 

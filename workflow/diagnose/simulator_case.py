@@ -44,7 +44,7 @@ class SimulatorSettings(Section):
     fmu: str | None = Field(None, description="FMI 2.0 for co-simulation")
     python: str | None = Field(None, description="file with simulate, PARAMETERS, INPUTS and OUTPUTS")
     log: str | Annotated[tuple[str, ...], Field(min_length=1)] = Field(
-        description="log files; the last one judges, and of a single one its last third"
+        description="log files; the last one is for validation, of a single one its last third"
     )
     columns: dict[str, str] = Field({}, description="name in the model -> column, where they differ")
     dt_s: PositiveFloat | None = Field(None, description="sampling period of logs without a time column")
@@ -55,7 +55,9 @@ class SimulatorSettings(Section):
     model_error: float = Field(0.05, ge=0, lt=1, description="share of the motion that the model may miss")
     tracking_rad_s: float | None = Field(None, ge=0, description="MJCF: see docs/simulators.md; 0: free run")
     motion: Literal["position", "speed"] | None = Field(
-        None, description="FMU and Python: the first output is that of the body which the first input pushes"
+        None,
+        description="FMU and Python: kind of the first output, if it is the motion of the body that "
+        "the first input pushes",
     )
 
     @model_validator(mode="after")

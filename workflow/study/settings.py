@@ -54,7 +54,7 @@ class Axis(Section):
     from_: int | float | None = Field(None, alias="from", description="lower end of a range")
     to: int | float | None = Field(None, description="upper end of a range")
     points: int | None = Field(None, ge=2, le=1000, description="points of the range in a grid")
-    log: bool = Field(False, description="range in equal ratios")
+    log: bool = Field(False, description="logarithmic spacing of the range")
 
     @model_validator(mode="after")
     def _list_or_range(self) -> Self:
@@ -111,11 +111,14 @@ class Search(Section):
     )
     trials: int = Field(30, ge=1, le=MOST_POINTS, description="points of a search")
     batch: int = Field(
-        4, ge=1, le=200, description="points chosen at a time; how many run at once changes no number"
+        4,
+        ge=1,
+        le=200,
+        description="points chosen at a time; the number that run at once does not change the results",
     )
     startup_trials: int = Field(8, ge=1, description="points drawn at random before the search learns")
     objectives: tuple[Judged, ...] = Field(
-        ("worst_gamma",), min_length=1, max_length=3, description="columns of the table to make better"
+        ("worst_gamma",), min_length=1, max_length=3, description="columns of the table to improve"
     )
 
 
@@ -148,7 +151,7 @@ class StudySection(Section):
         description="run configuration (TOML) or run directory, relative to this file; default: built-in arm",
     )
     seed: int | None = Field(
-        None, ge=0, description="root of every random stream of every point; default: that of the base"
+        None, ge=0, description="seed of every random stream of every point; default: that of the base"
     )
 
 
@@ -157,7 +160,7 @@ class StudyConfig(Section):
 
     study: StudySection = Field(default_factory=StudySection)
     changes: Mapping[DottedKey, Any] = Field(
-        default_factory=dict, description="dotted keys of the base set to other values for every point"
+        default_factory=dict, description="dotted keys of the base with other values for every point"
     )
     axes: tuple[Axis, ...] = Field(min_length=1, max_length=12)
     search: Search = Field(default_factory=Search)
