@@ -95,16 +95,16 @@ def identify_frf(
     """Fit a GOBF model to a measured frequency response, each frequency weighted by its covariance.
 
     response : FrequencyUncertainty. Measurement with a covariance at every frequency (`from_csv`,
-        `FrfRepeats.mean`, `empirical_frf`). Errors of different frequencies are taken as independent. One
-        that all of them share (the amplitude of a run, the gain of an amplifier) does not show in the
-        residual and is not averaged away by the fit: state it as shared_gain_std.
+        `FrfRepeats.mean`, `empirical_frf`). Errors of different frequencies count as independent. Specify an
+        error that all share (amplitude of a run, gain of an amplifier) as shared_gain_std: the residual does
+        not show it.
     options : IdentOptions. Numbers of poles, integrators, feedthrough, delay and bounds as for records. What
         only records have (offset, initial state) must be left at "auto" or False.
     embedding : EmbeddingOptions. fir_length, hyperparameters and prior_no_remainder are used.
     shared_gain_std : float
         Relative standard deviation of a real factor common to all frequencies; widens the posterior.
 
-    Raises ValueError if a frequency has no covariance, there are too few frequencies for the order asked for,
+    Raises ValueError if a frequency has no covariance, there are too few frequencies for the given order,
     or an option asks for an offset, an initial state or a relative degree.
 
     Poles by DIRECT in log coordinates and Levenberg-Marquardt, pair by pair; a pole is kept if chi-square

@@ -359,12 +359,12 @@ def identify_miso(
         nuisance columns (offset, initial state). An input may rest in some records, so experiments that
         excite one motor at a time can be put together; over all records the inputs must be distinguishable.
     options : IdentOptions
-        As for `identify`, the same for every input: integrators, delay and direct terms are those of all
-        channels. A relative degree is not imposed here, and what is stated as known is not tested.
+        As for `identify`, the same for every input: integrators, delay and direct terms. A relative degree is
+        refused, and what you know is not tested.
     progress : callable, optional. Called with a fraction 0..1 and a short message.
 
     Raises ValueError if a record cannot be used, the inputs of the records differ or are one signal, the data
-    are too short for the order asked for, or the options ask for a relative degree.
+    are too short for the given order, or the options have a relative degree.
 
     Search, descent and choice of the order are those of `identify` on the joint cost; with one input the
     results agree. Deterministic: the same records and options give the same numbers.

@@ -222,8 +222,7 @@ class Simulator:
 class SampledArm(Simulator):
     """The machine as a controller sees it: measure at t_k, then hold a voltage until t_(k+1).
 
-    The same compiled stepper and the same numbers as `simulate`. It is the one object of this package with
-    a state.
+    Same compiled stepper and same numbers as `simulate`. The only object of this package with a state.
     """
 
     output_names = OUTPUT_NAMES

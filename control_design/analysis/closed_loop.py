@@ -311,7 +311,7 @@ def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = 0.0
     """Rise time (10-90 %), overshoot, undershoot, settling time (into +-band of the step), steady error, peak
     command.
 
-    All relative to the reference's own step: from its first to its last value, timed from the first sample
+    All are relative to the reference step, from its first to its last value. Time starts at the first sample
     that differs from the first value. Steady error is the mean error over the last tenth of the record.
 
     Raises ValueError if the reference is not a step (no change, or more than one level after the change).

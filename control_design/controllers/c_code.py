@@ -67,9 +67,8 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
     `double` the two differ by the rounding of sums only. The computational delay is not in the code: a
     real-time loop that writes its command one sample later has it by itself.
 
-    Left out on purpose: fixed point. Which word lengths hold the certificate depends on the scaling of states
-    and signals of the one processor, which nothing here knows. Not covered: an error that is not finite (the
-    command then is not finite either: check the sensor before the call).
+    No fixed point: word lengths that keep the certificate depend on the scaling on the processor. An error
+    that is not finite gives a command that is not finite: check the sensor before the call.
 
     Examples
     --------

@@ -8,7 +8,7 @@ from control_design.plants.frequency_grid import GridOptions
 
 
 class YoulaOptions(GridOptions):
-    """How fine the basis and the grids are; the defaults take about two seconds a plant."""
+    """Size of the basis and of the grids; the defaults take about two seconds a plant."""
 
     real_poles: int = Field(default=32, ge=2, le=200, description="real poles of the basis of Q")
     pairs_per_mode: int = Field(

@@ -42,7 +42,7 @@ class SpecificationError(ValueError):
 
 
 class Specification(BaseModel):
-    """Requirements on the closed loop, for every member of the uncertainty."""
+    """Requirements on the closed loop, for every plant in the uncertainty set."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -152,7 +152,7 @@ class Specification(BaseModel):
         return (*head, *real, *([pair] * ((rest - len(real)) // 2)))
 
     def tracking_weight(self, plant_integrators: int = 0) -> RationalWeight | None:
-        """W1 without the modulus margin, or None where no tracking is asked for."""
+        """W1 without the modulus margin, or None without a tracking requirement."""
         if self.sensitivity_weight is not None or self.bandwidth_rad_s is None:
             return self.sensitivity_weight
         return bandwidth_weight(
@@ -169,7 +169,7 @@ class Specification(BaseModel):
         return effort_limit_weight(self.effort_limit, self.effort_rolloff_rad_s)
 
     def requirements(self, plant: UncertainPlant) -> tuple[Requirement, ...]:
-        """Everything asked of one plant's loop."""
+        """All requirements on the loop of one plant."""
         found = (kind.of(self, plant) for kind in REQUIREMENTS)
         return tuple(each for each in found if each is not None)
 
@@ -178,7 +178,7 @@ class Specification(BaseModel):
         return tuple(each for each in self.requirements(plant) if isinstance(each, WeightedRequirement))
 
     def on_controller(self) -> tuple[Requirement, ...]:
-        """What is asked of the controller alone."""
+        """Requirements on the controller alone."""
         found: list[Requirement] = []
         if self.controller_damping is not None:
             found.append(ControllerDamping(self.controller_damping))
@@ -196,7 +196,7 @@ class Specification(BaseModel):
         return np.max(sizes, axis=0) if sizes else np.zeros(np.shape(omega_rad_s))
 
     def check_against(self, plants: Sequence[UncertainPlant]) -> None:
-        """Refuse, before optimising, what no controller can do.
+        """Refuse a specification that no controller can meet, before optimising.
 
         Raises SpecificationError: one line: which requirement, what limits it, by how much.
 

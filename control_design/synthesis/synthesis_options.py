@@ -8,7 +8,7 @@ from control_design.plants.frequency_grid import GridOptions
 
 
 class SynthesisOptions(GridOptions):
-    """How hard to search; the defaults solve an order-5 design in a few seconds."""
+    """Effort of the search; the defaults solve an order-5 design in a few seconds."""
 
     starts: int = Field(
         default=6,

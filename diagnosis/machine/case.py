@@ -21,15 +21,15 @@ class Experiment:
 
     name : str
     role : "estimation" or "held_out"
-        Held-out records judge a repaired model; no parameter is fitted to them.
+        Held-out records are for validation; no parameter is fitted to them.
     voltage_V : (T,). Commanded voltage, held from its row to the next.
     output : (T, Y). The outputs as measured, at the instants at which the voltage changes.
-    kind : str. Sort of input, in the words of whoever made the record; only shown.
-    closed_loop : bool. The command came from a feedback. It is still the exact input of the actuator.
+    kind : str. Kind of input, free text for the page.
+    closed_loop : bool. The command came from a controller; it is still the exact input of the actuator.
     outputs : names of the Y columns, the hub angle first.
     reference_rad : (T,) or None. What the controller was to follow, in the zero of the encoder.
-    missing : rows that the log lacks; what stands there is interpolated.
-    first_row : of the run that it is a part of: a disturbance, a drift began with that.
+    missing : rows that the log lacks; their values are interpolated.
+    first_row : of the run that the record is a part of; disturbances and drifts began with the run.
     readings : (R, Y). The outputs' values before any interpolation, for the steps of their sensors; default
         `output`.
     """
@@ -77,12 +77,12 @@ class Experiment:
 
 @dataclass(frozen=True, eq=False)
 class Case(RecordedCase[Experiment]):
-    """A rig as its makers know it, and what it did.
+    """A rig as its maker knows it, and records of the machine.
 
     model_error : float. Share of the motion (RMS of an output about its mean) that a good model may miss.
 
     Raises ValueError if there is no estimation or no held-out experiment, a name comes twice, experiments
-    differ in their outputs, or a noise level is zero (then nothing can be said to lie beyond the noise).
+    differ in their outputs, or a noise level is zero.
     """
 
     name: str

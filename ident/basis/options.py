@@ -24,10 +24,10 @@ Algorithm = Literal[
 class IdentOptions(BaseModel):
     """What to fit and how to search for the poles (design 4.3).
 
-    What is stated as known (integrators, fixed_poles, input_delay_samples, relative_degree) is tested against
-    the data (`ident.checks.prior_tests`): if they refuse it, it is kept and a warning says so. Numbers of
-    poles left at None are chosen from the data, step by step. The box of the search comes from the data alone
-    (record length and sampling time) where no bound is given; a given bound also binds the polish.
+    What you know (integrators, fixed_poles, input_delay_samples, relative_degree) is kept and tested against
+    the data (`ident.checks.prior_tests`); a warning says if they disagree. The data choose numbers of poles
+    that are None. Record length and sampling time set the box of the search; bounds of yours also bind the
+    refinement.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -132,8 +132,8 @@ class IdentOptions(BaseModel):
     def fixed(self) -> Poles:
         """The fixed poles; ValueError if one is not inside the unit circle.
 
-        Each integrator brings a pole at z = 0: its filter z/(z - 1) puts a zero there, and only together
-        with a pole is the numerator as free as if the integrator were one of the poles.
+        Each integrator adds a pole at z = 0. Its filter z/(z - 1) puts a zero there; with the pole the
+        numerator is as free as with the integrator among the poles.
         """
         real = [0.0] * self.integrators + [re for re, im in self.fixed_poles if im == 0]
         pairs = [complex(re, im) for re, im in self.fixed_poles if im != 0]

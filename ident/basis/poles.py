@@ -13,7 +13,7 @@ from ident.data.arrays import ComplexArray, RealArray, lock
 
 @dataclass(frozen=True, eq=False)
 class Poles:
-    """Discrete-time poles, real ones first, each pair by its member in the upper half plane.
+    """Discrete-time poles: real ones first, then each pair by its pole in the upper half plane.
 
     real : (R,) array. Real poles, -1 < a < 1. Zeros are allowed (FIR).
     pairs : (P,) complex array. One pole p of each conjugate pair, imag(p) > 0 and |p| < 1.

@@ -115,7 +115,7 @@ class FrequencyUncertainty:
         return self.ellipse().semi_major
 
     def to_control(self) -> Any:
-        """The centre as `control.FrequencyResponseData` (covariances have no place there)."""
+        """The centre as `control.FrequencyResponseData`, without the covariances."""
         # Here and not above: python-control brings its plotting along.
         import control
 
@@ -123,7 +123,7 @@ class FrequencyUncertainty:
 
     @classmethod
     def from_csv(cls, path: str | Path, dt_s: float, *, level: float = 0.95) -> Self:
-        """A user's own frequency response with covariances.
+        """Read a frequency response with covariances.
 
         One header line; columns `omega_rad_s` or `frequency_Hz`, `real`, `imag`, `variance_real`,
         `variance_imag` and, if it is not zero, `covariance_real_imag`. Raises ValueError in one line naming

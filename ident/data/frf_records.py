@@ -21,8 +21,8 @@ class FrfRepeats:
     """Measured points of a frequency response: omega_rad_s (K,), response (K,), label (K,) or none.
 
     Points of equal frequency are repeats; the label says under which condition (date, amplitude) they were
-    taken. Runs within a condition need not be told apart. Raises ValueError for other shapes or numbers that
-    are not finite.
+    taken. Runs within a condition need no label of their own. Raises ValueError for other shapes or numbers
+    that are not finite.
     """
 
     omega_rad_s: RealArray

@@ -21,9 +21,9 @@ def band_limited(
     filter_order: int = 2,
     skip_s: float = 0.0,
 ) -> Record:
-    """Input, output and reference sent through one Butterworth filter; the first `skip_s` seconds left out.
+    """Filter input, output and reference with one Butterworth filter; drop the first `skip_s` seconds.
 
-    A linear system between input and output stays what it is, so a fit of the filtered record is a fit
+    A linear system between input and output does not change, so a fit of the filtered record is a fit
     weighted to the band. Meant for drift and friction below `low_rad_s` and noise above `high_rad_s`; None
     leaves that side open. The filter starts with its steady state for the first sample; what the plant did
     before the record (and before `skip_s`) is not in it, so that a lightly damped plant not at rest then
