@@ -101,6 +101,30 @@ def test_how_well_it_works_is_what_the_results_say():
     assert how_well.PAGE.read_text(encoding="utf-8") == how_well.page()
 
 
+def test_files_and_tests_that_pages_name_are_there():
+    defined = {
+        name
+        for path in (ROOT / "tests").rglob("test_*.py")
+        for name in re.findall(r"^def (test_\w+)", path.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    named = 0
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        for path in re.findall(r"`([a-z_]+/[a-z0-9_/]+\.(?:py|txt|toml|md))`", text):
+            if path.startswith(("runs/", "answer/", "stages/")):
+                continue  # a command writes it
+            places = (ROOT, *(ROOT / name for name in ("workflow", "ident", "control_design")))
+            assert any((place / path).exists() for place in places), f"{page.name}: {path}"
+            named += 1
+        for name in re.findall(r"`(test_\w+)`", text):
+            assert name in defined, f"{page.name}: {name}"
+            named += 1
+        for link in re.findall(r"\]\((?!https?:|#)([^)#]+)", text):
+            made = link.startswith(("reference/", "gallery", "../reference/", "../gallery"))
+            assert made or (page.parent / link).exists(), f"{page.name}: {link}"
+    assert named > 50
+
+
 def test_every_key_of_a_configuration_has_a_meaning():
     hook = pages()
     found = [
