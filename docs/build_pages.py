@@ -53,9 +53,9 @@ SHOWN = {
 def on_files(files: Files, config: Any) -> Files:
     """Generated pages join those of docs/."""
     made = {
-        "reference/configuration.md": configuration(),
+        **configuration(),
         "reference/command_line.md": command_line(),
-        "reference/python.md": python(),
+        **python(),
         "gallery.md": gallery(),
     }
     for name, text in made.items():
@@ -152,23 +152,42 @@ def roots() -> dict[str, type[BaseModel]]:
     return {"A run": RunConfig, "A design file": DesignFile, "A study": StudyConfig}
 
 
-def configuration() -> str:
-    """Every key of a run configuration, of a design file and of a study: unit, default, meaning."""
-    parts = [
-        "# Configuration",
-        "Made from the models that check the files: an unknown key is refused by name. Bold keys have to be "
-        "there. Examples: `examples/*.toml`. Rig and case files: [cases](../case_files.md).",
-    ]
-    seen: set[type[BaseModel]] = set()
-    for title, root in roots().items():
-        parts.append(f"## {title}")
-        for place, model in sections(root):
+CONFIGURATION_OVERVIEW = """# Configuration
+
+The models that check the files make these pages. An unknown key is refused by name.
+Examples: `examples/*.toml`. For rig and case files see [case files](../case_files.md)."""
+CONFIGURATION_SHARED = """A design file also has these tables of a run: `[specification]`, `[synthesis]`,
+`[certificate]`, `[achievable_performance]` and `[reference_filter]`."""
+# Pages of the configuration: title, which file, its tables.
+CONFIGURATION = {
+    "records": ("A run: records", "A run", ("", "run", "source")),
+    "channels": ("A run: models and uncertainty", "A run", ("channels", "closed_loop_data")),
+    "specification": (
+        "A run: controller",
+        "A run",
+        ("specification", "synthesis", "certificate", "achievable_performance", "reference_filter"),
+    ),
+    "closed_loop": ("A run: closed loop and notes", "A run", ("closed_loop", "notes")),
+    "design": ("A design file", "A design file", ("", "plant", "uncertainty")),
+    "study": ("A study", "A study", ("", "study", "axes", "search", "pareto")),
+}
+
+
+def configuration() -> dict[str, str]:
+    """Pages with every key of a run, a design file and a study: unit, default, meaning."""
+    made, lines = {}, ["| page | tables |", "|---|---|"]
+    for name, (title, root, tables) in CONFIGURATION.items():
+        parts = [f"# {title}", "Keys in bold are required."]
+        for place, model in sections(roots()[root]):
             rows = [row(key, field) for key, field in keys(model)]
-            if rows and model not in seen:
-                seen.add(model)
-                parts.append(f"### {place or 'top level'}\n\n{sentence(model)}")
+            if rows and re.split(r"[.:]", place)[0] in tables:
+                parts.append(f"## {place or 'top level'}\n\n{sentence(model)}")
                 parts.append("| key | unit | default | meaning |\n|---|---|---|---|\n" + "\n".join(rows))
-    return "\n\n".join(parts) + "\n"
+        made[f"reference/configuration_{name}.md"] = "\n\n".join(parts) + "\n"
+        listed = ", ".join(f"`[{table}]`" for table in tables if table)
+        lines.append(f"| [{title}](configuration_{name}.md) | {listed} |")
+    overview = [CONFIGURATION_OVERVIEW, "\n".join(lines), CONFIGURATION_SHARED]
+    return made | {"reference/configuration.md": "\n\n".join(overview) + "\n"}
 
 
 def sentence(model: type[BaseModel]) -> str:
@@ -209,25 +228,38 @@ def command_line() -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def python() -> str:
-    """Every name of the front door with its docstring."""
+# Pages of the Python reference.
+MODULES = {
+    "models": "Records, models and uncertainty",
+    "design": "Controllers and certificates",
+    "machines": "Simulated machines",
+    "causes": "Diagnosis",
+    "pictures": "Pictures",
+    "tables": "Tables",
+}
+
+
+def python() -> dict[str, str]:
+    """Pages with every name of the front door and its docstring."""
     import flexlink
 
-    parts = [
-        "# Python",
-        "What `import flexlink` offers. A walk through it: [flexlink from Python](../from_python.md).",
-    ]
-    for module in ("models", "design", "machines", "causes", "pictures", "tables"):
-        parts.append(f"## {module}")
-        for name in sorted(import_module(f"flexlink.{module}").__all__):
+    made, lines = {}, ["| page | names |", "|---|---|"]
+    for module, title in MODULES.items():
+        names = sorted(import_module(f"flexlink.{module}").__all__)
+        parts = [f"# {title}"]
+        for name in names:
             thing = getattr(flexlink, name)
             try:
                 signature = re.sub(r"(?:[A-Za-z_]+\.)+([A-Za-z_]+)", r"\1", str(inspect.signature(thing)))
             except (TypeError, ValueError):
                 signature = ""
             text = inspect.cleandoc(thing.__doc__ or "")
-            parts.append(f"### {name}\n\n```python\n{name}{signature}\n```\n\n```text\n{text}\n```")
-    return "\n\n".join(parts) + "\n"
+            parts.append(f"## {name}\n\n```python\n{name}{signature}\n```\n\n```text\n{text}\n```")
+        made[f"reference/python_{module}.md"] = "\n\n".join(parts) + "\n"
+        listed = ", ".join(f"`{name}`" for name in names)
+        lines.append(f"| [{title}](python_{module}.md) | {listed} |")
+    start = "# Python\n\nThe names of `import flexlink`. Start with [From Python](../from_python.md)."
+    return made | {"reference/python.md": start + "\n\n" + "\n".join(lines) + "\n"}
 
 
 def gallery() -> str:

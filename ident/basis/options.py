@@ -22,7 +22,7 @@ Algorithm = Literal[
 
 
 class IdentOptions(BaseModel):
-    """What to fit and how to search for the poles (design 4.3).
+    """Settings of the fit and of the pole search (design 4.3).
 
     What you know (integrators, fixed_poles, input_delay_samples, relative_degree) is kept and tested against
     the data (`ident.checks.prior_tests`); a warning says if they disagree. The data choose numbers of poles

@@ -1,4 +1,4 @@
-"""The TOML file of `flexlink design`: what a controller has to do, and what a plant's file does not say."""
+"""The TOML file of `flexlink design`: specification, and what the file of a plant does not contain."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class PlantSection(Section):
-    """[plant] of a design file: what a file with a plant does not say itself."""
+    """[plant] of a design file: what the file of a plant does not contain."""
 
     integrators: int = Field(0, ge=0, le=2, description="known poles of the plant at z = 1")
     dt_s: float | None = Field(None, gt=0, description="sampling period of a measured response [s]")
@@ -56,7 +56,7 @@ class PlantSection(Section):
 
 
 class StatedUncertainty(Section):
-    """[uncertainty] of a design file: how far a plant may be from a plain state space."""
+    """[uncertainty] of a design file: deviation of the plant from a state-space model."""
 
     multiplicative: RationalWeight | None = Field(
         None, description="limit of |G - G_nom|/|G_nom|: a number, or numerator and denominator in s"
@@ -84,7 +84,7 @@ class StatedUncertainty(Section):
 
 
 class DesignFile(Section):
-    """What a design file says; specification None where there is no file."""
+    """Content of a design file; specification is None without a file."""
 
     specification: Specification | None = None
     synthesis: SynthesisOptions = Field(default_factory=SynthesisOptions)

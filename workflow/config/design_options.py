@@ -1,4 +1,4 @@
-"""What is asked beyond margins: any order's reach, sampled responses, a reference filter."""
+"""Options beyond margins: achievable performance, posterior samples, reference filter."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LASTING = 100.0  # how much more than a passing error one weighs that lasts
 
 
 class CertificateOptions(Section):
-    """[certificate]: what is said of whole responses, of which the ellipses know one frequency at a time."""
+    """[certificate]: joint coverage, the share of posterior samples that meet the worst case."""
 
     joint_coverage: float = Field(
         0.95, gt=0, lt=1, description="share of posterior samples for which the worst case must hold"
@@ -40,13 +40,13 @@ class CertificateOptions(Section):
 
 
 class AchievableOptions(YoulaOptions):
-    """[achievable_performance]: what a controller of any order could reach, and how finely it is sought."""
+    """[achievable_performance]: bounds on what a controller of any order can reach."""
 
     compute: bool = Field(True, description="compare the design with other orders")
 
 
 class ReferenceFilterSettings(ReferenceFilterOptions):
-    """[reference_filter]: second degree of freedom, u = K (F r - y), designed after K to follow a model."""
+    """[reference_filter]: F in u = K (F r - y), designed after K to follow a reference model."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

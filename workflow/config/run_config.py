@@ -106,7 +106,7 @@ TimeUnit = Literal["s", "ms", "us", "ns", "min", "h"]
 
 
 class FileRecord(Section):
-    """One log file; keys left out are taken from [source]."""
+    """One log file; [source] gives the keys that are left out."""
 
     path: InputPath = Field(
         description="csv or named arrays (npz, mat, ...); relative to this file; ${FLEXLINK_DATA} is expanded"
@@ -249,7 +249,7 @@ class Channel(Section):
 
 
 class RunSpecification(Specification):
-    """[specification] of a run: what the loop has to do, and over which amplitudes."""
+    """[specification] of a run: requirements, and the amplitudes over which they hold."""
 
     amplitudes: tuple[float, float] | None = Field(
         None,
@@ -260,7 +260,7 @@ class RunSpecification(Specification):
 
 
 class ClosedLoopData(Section):
-    """How logs made under feedback are used."""
+    """Use of logs made in closed loop."""
 
     method: Literal["direct", "two_stage"] = Field(
         "direct",
@@ -269,7 +269,7 @@ class ClosedLoopData(Section):
 
 
 class ClosedLoopOptions(Section):
-    """The check in closed loop."""
+    """Simulation of the closed loop."""
 
     machine: Literal["simulated", "identified"] | None = Field(
         None,
@@ -314,7 +314,7 @@ class ClosedLoopOptions(Section):
 
 
 class Notes(Section):
-    """What is known and not known about the rig; shown in the report as written."""
+    """Known and unknown facts about the rig, shown in the report as written."""
 
     known: tuple[str, ...] = Field((), description="sentences for the report")
     unknown: tuple[str, ...] = Field((), description="sentences for the report: limits of its statements")

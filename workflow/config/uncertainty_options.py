@@ -1,4 +1,4 @@
-"""How ellipses are made, and what response they are about."""
+"""Method and model class of the ellipses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _RANGE = rf"amplitudes from {_NUMBER} to {_NUMBER}"
 
 
 class UncertaintyOptions(EmbeddingOptions):
-    """How the ellipses around an identified response are made (design 4.5)."""
+    """Ellipses around an identified response: method and model class (design 4.5)."""
 
     method: Literal["tangent", "records", "conditions", "classical"] = Field(
         "tangent",

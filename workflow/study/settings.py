@@ -104,7 +104,7 @@ def tidy(value: float) -> float:
 
 
 class Search(Section):
-    """How the points are chosen."""
+    """Choice of the points."""
 
     method: Literal["grid", "optuna"] = Field(
         "grid", description="grid: every combination; optuna: a tree-structured Parzen search (extra optuna)"
@@ -123,7 +123,7 @@ class Search(Section):
 
 
 class ParetoPlot(Section):
-    """Two columns to plot against each other."""
+    """Two columns of the table, plotted against each other."""
 
     x: Judged = Field(description="column of the table, across")
     y: Judged = Field(description="column of the table, up")
