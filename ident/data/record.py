@@ -12,14 +12,11 @@ import numpy as np
 from ident.data.arrays import RealArray, readonly
 from ident.data.finding import Finding
 from ident.data.record_files import read_table
-from ident.data.table import Table
+from ident.data.table import LARGEST, Table
 from ident.data.time_grid import Repair, TimeGrid
 from ident.data.units import TimeColumn
 
 T = TypeVar("T")
-
-# Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
-_LARGEST = 1e100
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +88,12 @@ class Record:
                 f"{self.label}: {key} has {signal.shape[0]} samples and input {np.shape(self.input)[0]}; "
                 "they must be equally long, at least one"
             )
-        bad = np.argwhere(~(np.abs(signal) <= _LARGEST))
+        bad = np.argwhere(~(np.abs(signal) <= LARGEST))
         if bad.size:
             k, column = bad[0]
             raise ValueError(
                 f"{self.label}: {key} column '{names[column]}' is {signal[k, column]:.6g} at index {k}; "
-                f"expected finite numbers, magnitudes up to {_LARGEST:g} (else choose another unit)"
+                f"expected finite numbers, magnitudes up to {LARGEST:g} (else choose another unit)"
             )
 
     @property

@@ -22,6 +22,8 @@ from ident.data.units import TimeColumn, written_unit
 # Each sampling interval may differ from the mean one by this fraction: at the Nyquist frequency the phase
 # of a sample is then wrong by at most 0.03 rad. A clock's jitter is far below it, a lost sample far above.
 TIME_TOLERANCE = 0.01
+# Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
+LARGEST = 1e100
 # Of a matrix so many columns at most are offered by number.
 _MOST_NUMBERED = 256
 
@@ -147,7 +149,7 @@ class Table:
 
     def _finite(self, name: str, numbers: RealArray, cells: Any) -> RealArray:
         """The numbers if all are finite; else a complaint that quotes the first that is not."""
-        bad = np.flatnonzero(~np.isfinite(numbers))
+        bad = np.flatnonzero(~(np.abs(numbers) <= LARGEST))
         if not bad.size:
             return numbers
         row = int(bad[0])
@@ -157,7 +159,7 @@ class Table:
         sign = " with a decimal comma" if self.layout and self.layout.decimal == "," else ""
         raise ValueError(
             f"{self.path}, {self.place(row)}: column '{shown(name)}' is {found}; "
-            f"expected a finite number{sign}"
+            f"expected a finite number{sign}{' up to 1e100' if np.isfinite(numbers[row]) else ''}"
         )
 
     def seconds(self, name: str, stamps: RealArray, unit: str | None) -> tuple[RealArray, TimeColumn]:

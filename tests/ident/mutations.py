@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
+import io
 import os
+import re
 import signal
-from collections.abc import Callable, Iterator
+import struct
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -81,3 +86,53 @@ def _at_most(seconds: float) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
+
+
+HUGE = (b"1e308", b"-1e308", b"9" * 400, b"1e999", b"18446744073709551616", b"4.9e-324", b"0x7f", b"1_000")
+DOUBLES = tuple(struct.pack("<d", x) for x in (1e308, -1e308, np.nan, np.inf, 1e-320, 2.0**63))
+
+
+def _numbers_replaced(
+    content: bytes, rng: np.random.Generator, words: Sequence[bytes], share: float
+) -> bytes:
+    """Of a text its numbers, else eight bytes in a row."""
+    if b"\x00" not in content[:4000]:
+        pick = iter(rng.integers(len(words), size=content.count(b"\n") * 40 + 4000))
+        lose = iter(rng.random(content.count(b"\n") * 40 + 4000))
+        return re.sub(
+            rb"\d+\.?\d*", lambda m: words[next(pick, 0)] if next(lose, 1) < share else m[0], content
+        )
+    data = bytearray(content)
+    for _ in range(max(1, int(share * len(data) / 64))):
+        at = int(rng.integers(max(1, len(data) - 8)))
+        data[at : at + 8] = DOUBLES[int(rng.integers(len(DOUBLES)))]
+    return bytes(data)
+
+
+def _zipped(content: bytes, rng: np.random.Generator) -> bytes:
+    for _ in range(int(rng.integers(1, 4))):
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr(str(rng.choice(["a.csv", "t_s.npy", "xl/workbook.xml", "../../a"])), content)
+        content = stream.getvalue()
+    return content
+
+
+Damage = Callable[[np.random.Generator, bytes, bytes], bytes]
+# Of a file, with the bytes of another one at hand.
+DAMAGE: dict[str, Damage] = {
+    "cut": lambda rng, one, other: one[: int(rng.integers(len(one) + 1))],
+    "bytes changed": lambda rng, one, other: mutated(one, rng),
+    "spliced": lambda rng, one, other: (
+        one[: int(rng.integers(len(one)))] + other[int(rng.integers(len(other))) :]
+    ),
+    "of another kind": lambda rng, one, other: other,
+    "in a zip": lambda rng, one, other: _zipped(one, rng),
+    "packed again": lambda rng, one, other: gzip.compress(gzip.compress(one)),
+    "empty": lambda rng, one, other: bytes(int(rng.integers(3))),
+    "zeros": lambda rng, one, other: one[: int(rng.integers(len(one)))] + bytes(int(rng.integers(1, 5000))),
+    "huge numbers": lambda rng, one, other: _numbers_replaced(one, rng, HUGE, float(rng.choice([0.01, 0.5]))),
+    "a flood of NaN": lambda rng, one, other: _numbers_replaced(one, rng, (b"nan", b"NaN", b""), 0.9),
+    "many times": lambda rng, one, other: one * int(rng.integers(2, 200)),
+    "as UTF-16": lambda rng, one, other: b"\xff\xfe" + one.decode("latin-1").encode("utf-16-le")[: len(one)],
+}

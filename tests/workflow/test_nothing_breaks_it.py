@@ -19,11 +19,13 @@ import numpy as np
 import pytest
 
 import workflow.commands.design
+import workflow.commands.identify
 import workflow.tasks.design_source
 import workflow.tasks.pipeline
 import workflow.tasks.simulated_rig
 from control_design.controllers.controller import Controller
-from tests.ident.mutations import Tally, tally
+from tests.ident.mutations import DAMAGE, Tally, tally
+from tests.ident.test_forty_logs import LOGS, Log
 from tests.workflow.command import FAST_ARM, ROOT, build_nothing, draw_nothing
 from tests.workflow.diagnosis_examples import FRICTION, write_case
 from tests.workflow.mutations import spoilt, tamper
@@ -157,6 +159,7 @@ def cut_computations_off(monkeypatch: pytest.MonkeyPatch) -> None:
     idle = [with_fields(stage, run=_computes) for stage in workflow.tasks.pipeline.STAGES]
     monkeypatch.setattr(workflow.tasks.pipeline, "STAGES", tuple(idle))
     monkeypatch.setattr(workflow.commands.design, "_design", _computes)
+    monkeypatch.setattr(workflow.commands.identify, "identify_logs", _computes)
     monkeypatch.setattr(workflow.tasks.design_source, "identify_frf", _computes)
     simulate = workflow.tasks.simulated_rig.simulate
     monkeypatch.setattr(
@@ -308,6 +311,41 @@ def tampered(one: Output, folder: Path, count: int, number: int) -> Tally:
     return tally(attempt, count, number)
 
 
+def damaged_logs(damage: str, folder: Path, count: int, *, binary: float = 0.4) -> Tally:
+    """Logs of every kind, damaged, as `look` and `identify` meet them; binary: share of those that take a
+    process of their own, where a file can do most."""
+    texts = [log for log in LOGS.values() if not log.refused and Path(log.file).suffix not in CHILDREN]
+    others = [log for log in LOGS.values() if not log.refused and Path(log.file).suffix in CHILDREN]
+    rows = [{"t_s": 0.01 * k, "u_V": k % 3, "y_rad": 0.1 * k, "more": [k, {"on": True}]} for k in range(60)]
+    json_logs = {"a.json": json.dumps(rows), "a.jsonl": "\n".join(map(json.dumps, rows))}
+    whole = {
+        True: [(log.file, _content(log)) for log in others],
+        False: [(log.file, _content(log)) for log in texts],
+    }
+    whole[False] += [(name, text.encode()) for name, text in json_logs.items()] * 2
+
+    def attempt(rng: np.random.Generator) -> str | None:
+        (name, one), (_, other) = (
+            some[int(rng.integers(len(some)))]
+            for some in (whole[bool(rng.random() < binary)], whole[bool(rng.random() < 0.5)])
+        )
+        path = folder / name
+        path.write_bytes(DAMAGE[damage](rng, one, other))
+        try:
+            return refusal([str(rng.choice(["look", "identify"])), str(path)], folder)
+        finally:
+            path.unlink()
+
+    return tally(attempt, count, list(DAMAGE).index(damage), 4700)
+
+
+CHILDREN = (".xlsx", ".parquet", ".h5", ".mcap", ".bag", ".db3")
+
+
+def _content(log: Log) -> bytes:
+    return log.content if isinstance(log.content, bytes) else log.content()
+
+
 def spoilt_controllers(count: int) -> Tally:
     """As a library call, which says ValueError."""
     system = arm()
@@ -354,6 +392,13 @@ def test_tampered_studies_and_diagnoses(replayed, tmp_path, monkeypatch, amount)
     monkeypatch.setattr(LocalProcesses, "run", replay)
     for number, one in enumerate(outputs.values(), 96):
         assert tampered(one, tmp_path, 12 if amount == "few" else 150, number).wrong == []
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.usefixtures("cut_off")
+def test_damaged_logs(tmp_path, damage):
+    """420 of each in benchmarks/damaged_logs.py."""
+    assert damaged_logs(damage, tmp_path, 5, binary=0.2).wrong == []
 
 
 @FEW_AND_ALL
