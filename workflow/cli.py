@@ -363,7 +363,7 @@ def identify(
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
     need(*log, *(validation or []))
     from ident.basis.options import IdentOptions
-    from workflow.commands.logs import read_logs
+    from workflow.commands.logs import are_responses, read_logs
     from workflow.config.settings import check
     from workflow.config.uncertainty_options import UncertaintyOptions
     from workflow.engine.storage import refuse_in_the_way
@@ -382,6 +382,26 @@ def identify(
         written = [("--out", out), ("--report", report_page), ("--export", export)]
         # A log given twice would count its noise twice as well known, or validate what it was fitted to.
         refuse_in_the_way([*log, *(validation or [])], [(name, path) for name, path in written if path])
+        if (input_name, output_name, time) == (None, None, None) and are_responses(log):
+            from workflow.commands.identify_response import identify_response
+
+            of_logs = {
+                "--report": report_page, "--validation": validation, "--reference": reference, "--band": band,
+                "--input-limit": input_limit, "--noise-order": noise_order, "--time-unit": time_unit,
+                "--scale": scale, "--offset": offset, "--unit": unit, "--repair": repair,
+            }  # fmt: skip
+            summary = identify_response(
+                log,
+                dt_s,
+                level=level,
+                options=options,
+                out=out,
+                export=export,
+                refused=[name for name, value in of_logs.items() if value],
+                progress=progress,
+            )
+            _identified(summary, as_json, export, out)
+            return
         logs = read_logs(
             log,
             input_name,
@@ -411,6 +431,10 @@ def identify(
             export=export,
             progress=progress,
         )
+    _identified(summary, as_json, export, out)
+
+
+def _identified(summary: RunSummary, as_json: bool, export: Path | None, out: Path | None) -> None:
     if as_json:
         document = summary.to_document()
         print_json({key: document[key] for key in ("title", "verdict", "report", "numbers", "table")})

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ident.data.arrays import BoolArray, ComplexArray, RealArray, lock, readonly
 from ident.data.ellipses import Ellipses, chi2_radius, ellipse_distance, relative_deficit, standard_axes
 from ident.data.record_files import read_table
-from ident.data.table import Table
+from ident.data.response_columns import read_response
 
 # A covariance computed as a product of factors can miss symmetry or semidefiniteness by rounding, not by
 # more.
@@ -20,21 +20,8 @@ from ident.data.table import Table
 _LARGEST = 1e100
 _PSD_TOLERANCE = 1e-9
 
-FREQUENCY_COLUMNS = {"omega_rad_s": 1.0, "omega_rad_per_s": 1.0, "frequency_Hz": 2 * np.pi}
-"""Names a frequency column may have, and the factor to rad/s."""
 _COLUMNS = ("real", "imag", "variance_real", "variance_imag")
 _CROSS = "covariance_real_imag"
-
-
-def frequencies(table: Table) -> RealArray:
-    """omega (K,) in rad/s from the one column of `FREQUENCY_COLUMNS` that a table has; else ValueError."""
-    found = [name for name in FREQUENCY_COLUMNS if name in table.names]
-    if len(found) != 1:
-        raise ValueError(
-            f"{table.path}, line 1: need exactly one of the columns {', '.join(FREQUENCY_COLUMNS)}; found "
-            f"{list(table.names)}"
-        )
-    return table.columns(found)[found[0]] * FREQUENCY_COLUMNS[found[0]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,20 +112,20 @@ class FrequencyUncertainty:
     def from_csv(cls, path: str | Path, dt_s: float, *, level: float = 0.95) -> Self:
         """Read a frequency response with covariances.
 
-        One header line; columns `omega_rad_s` or `frequency_Hz`, `real`, `imag`, `variance_real`,
+        Frequency and response as `FrfRepeats.from_csv` reads them, and columns `variance_real`,
         `variance_imag` and, if it is not zero, `covariance_real_imag`. Raises ValueError in one line naming
         file, line and column.
         """
         table = read_table(path)
-        omega = frequencies(table)
-        re, im, variance_re, variance_im = table.columns(_COLUMNS).values()
+        omega, centre = read_response(table)
+        variance_re, variance_im = table.columns(_COLUMNS[2:]).values()
         negative = np.flatnonzero((variance_re < 0) | (variance_im < 0))
         if negative.size:
             raise ValueError(f"{path}, {table.place(int(negative[0]))}: a variance is negative")
         cross = table.columns([_CROSS])[_CROSS] if _CROSS in table.names else np.zeros_like(omega)
         covariance = np.stack([np.stack([variance_re, cross], -1), np.stack([cross, variance_im], -1)], -2)
         try:
-            return cls(omega, re + 1j * im, covariance, dt_s, level, f"given in {table.path.name}")
+            return cls(omega, centre, covariance, dt_s, level, f"given in {table.path.name}")
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 

@@ -10,10 +10,12 @@ import numpy as np
 
 from ident.data.arrays import BoolArray, ComplexArray, IntArray, RealArray, factor_matrices, lock
 from ident.data.ellipses import hotelling_widening
-from ident.data.frequency_uncertainty import FrequencyUncertainty, frequencies
+from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record_files import read_table
+from ident.data.response_columns import read_response
 
-_PARTS = (("real", "imag"), ("gain", "phase_rad"))
+# Neighbours on either side that a hint may propose to pool.
+_MOST_NEIGHBOURS = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,23 +46,17 @@ class FrfRepeats:
 
     @classmethod
     def from_csv(cls, path: str | Path, *, label: str | None = None) -> Self:
-        """One row per measured point: a column `omega_rad_s`, `omega_rad_per_s` or `frequency_Hz`, the
-        columns `real`, `imag` or `gain`, `phase_rad`, and the column named by `label`.
+        """One row per measured point: a frequency (Hz, rad/s), real and imaginary part or gain (factor, dB)
+        and phase (rad, degrees), under any usual names that say their units, and the column named by `label`.
 
-        Raises ValueError in one line naming file, line and column.
+        Raises ValueError in one line naming file, line and column; where a unit is not said, it asks for it.
         """
         table = read_table(path)
-        parts = [pair for pair in _PARTS if set(pair) <= set(table.names)]
-        if len(parts) != 1:
-            raise ValueError(
-                f"{table.path}, line 1: need one of real, imag and gain, phase_rad; found {list(table.names)}"
-            )
         if label is not None and label not in table.names:
             raise ValueError(f"{table.path}, line 1: missing column {label}; found {list(table.names)}")
-        first, second = table.columns(parts[0]).values()
-        response = first + 1j * second if parts[0] == _PARTS[0] else first * np.exp(1j * second)
+        omega, response = read_response(table)
         labels = [""] * response.size if label is None else [str(cell).strip() for cell in table.raw[label]]
-        return cls(frequencies(table), response, tuple(labels))
+        return cls(omega, response, tuple(labels))
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -129,13 +125,8 @@ class FrfRepeats:
         freedom = count - 1
         if pool_neighbours:
             scatter, freedom = _pooled(scatter, freedom, centre, pool_neighbours)
-        short = freedom < 2
-        if np.any(short):
-            at = int(np.argmax(short))
-            raise ValueError(
-                f"at omega = {grid[at]:.6g} rad/s there are {count[at]} repeats: a 2x2 covariance needs "
-                "at least 3 (or pool_neighbours > 0)"
-            )
+        if np.any(freedom < 2):
+            raise ValueError(_too_few(grid, count, freedom))
         share = 1 / count if of == "mean" else 1 + 1 / count
         covariance = scatter * (hotelling_widening(freedom, level) * share / freedom)[:, None, None]
         method = "repeated measurements" if of == "mean" else "one more run"
@@ -149,6 +140,22 @@ class FrfRepeats:
             self.response[keep],
             tuple(name for name, kept in zip(self.label, keep, strict=True) if kept),
         )
+
+
+def _too_few(grid: RealArray, count: IntArray, freedom: IntArray) -> str:
+    """What is missing for a covariance, and only what mends it."""
+    spread = "give variance_real, variance_imag or a stated uncertainty"
+    if np.all(count == 1):
+        return f"one sweep: every frequency is measured once, so its spread is not known; {spread}"
+    at = int(np.argmax(freedom < 2))
+    times = "is 1 measurement" if count[at] == 1 else f"are {count[at]} repeats"
+    text = f"at omega = {grid[at]:.6g} rad/s there {times}: a 2x2 covariance needs at least 3"
+    # The fewest neighbours whose repeats suffice everywhere, each frequency giving one less than it has.
+    for m in range(1, _MOST_NEIGHBOURS + 1):
+        sums = np.convolve(count - 1, np.ones(2 * m + 1, dtype=np.int64))[m:-m]
+        if np.all(sums >= 2):
+            return f"{text}, or pool_neighbours = {m}"
+    return f"{text}; {spread}"
 
 
 def inliers(points: ComplexArray, threshold: float) -> ComplexArray:

@@ -99,3 +99,46 @@ def test_sentences_of_the_page_end_with_their_words(flexlink, tmp_path):
     assert flexlink("look", tmp_path / "log.csv", "--out", tmp_path / "page.html").code == 0
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "numbers from line 2.</li>" in page
+
+
+@pytest.mark.parametrize("sweeps", [1, 4])
+def test_a_bode_table_is_said_to_be_one_and_goes_on(sweeps, flexlink, refused, tmp_path):
+    rng, hz = np.random.default_rng(3), np.geomspace(0.5, 40.0, 40)
+    # 30 / (s + 10), sampled at 100 Hz and held; 0.5 % of noise.
+    z = np.exp(2j * np.pi * hz * 0.01)
+    true = 3 * (1 - np.exp(-0.1)) / (z - np.exp(-0.1))
+    lines = ["Frequency (Hz);Trace 1: Gain: Magnitude (dB);Trace 1: Gain: Phase (°)"]
+    for _ in range(sweeps):
+        noise = rng.standard_normal((2, hz.size)) * 0.005
+        for f, g in zip(hz, true * (1 + noise[0] + 1j * noise[1]), strict=True):
+            lines.append(f"{f:.6f};{20 * np.log10(abs(g)):.6f};{np.rad2deg(np.angle(g)):.6f}")
+    path = tmp_path / "bode.txt"
+    path.write_text("\n".join(lines) + "\n")
+    answer = flexlink("look", path, "--out", tmp_path / "page.html")
+    assert answer.code == 0, answer.err
+    assert "frequency response" in answer.out
+    assert "Frequency response:" in (tmp_path / "page.html").read_text()
+    spec = tmp_path / "SPEC.toml"
+    wish = (
+        "bandwidth_rad_s = 2.0\ncontroller_order = 1\n[plant]\ndt_s = 0.01\nfit = {n_real = 1, n_pairs = 0}\n"
+    )
+    quick = "[synthesis]\nstarts = 1\ndense_points = 500\n"
+    if sweeps == 1:
+        assert f"flexlink design {path} --spec SPEC.toml, with [plant] dt_s and [uncertainty]" in answer.out
+        spec.write_text(wish)
+        line = refused("design", path, "--spec", spec)
+        assert "give variance_real, variance_imag or a stated uncertainty" in line
+        assert "pool" not in line
+        assert "one sweep" in refused("identify", path, "--dt-s", "0.01")
+        spec.write_text(f"{wish}[uncertainty]\nmultiplicative = 0.05\n{quick}")
+        assert flexlink("design", path, "--spec", spec).code == 0
+        return
+    assert f"flexlink identify {path} --dt-s SECONDS" in answer.out
+    assert "--dt-s SECONDS" in refused("identify", path)
+    assert "leave out --repair" in refused("identify", path, "--dt-s", "0.01", "--repair")
+    found = flexlink("identify", path, "--dt-s", "0.01", "--real", "1", "--pairs", "0", "--export",
+                     tmp_path / "m.json", "--out", tmp_path / "m.npz", "--json").document()  # fmt: skip
+    assert found["numbers"]["real_poles_per_s"] == pytest.approx([10.0], rel=0.02)
+    spec.write_text(wish.partition("[plant]")[0] + quick)
+    for model in ("m.json", "m.npz"):
+        assert flexlink("design", tmp_path / model, "--spec", spec).code == 0

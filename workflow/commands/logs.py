@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ident.data.record import Record
 from ident.data.record_files import read_table
+from ident.data.response_columns import has_response
 from ident.data.roles import roles_of
 from workflow.engine.errors import naming
 
@@ -21,6 +22,14 @@ class Logs:
     fresh: tuple[Record, ...]
     files: tuple[Path, ...]
     input_limit: float | None
+
+
+def are_responses(paths: Sequence[Path]) -> bool:
+    """Whether the files are frequency responses; one that cannot be read is left to who reads logs."""
+    try:
+        return all(has_response(read_table(path)) for path in paths)
+    except ValueError:
+        return False
 
 
 def read_logs(

@@ -8,7 +8,7 @@ from pathlib import Path
 from workflow.engine import codec, storage
 from workflow.tasks.log_look import LogLook, look_at
 from workflow.tasks.summary import RunSummary
-from workflow.text.templates import rows_of
+from workflow.text.templates import rows_of, said
 
 
 def look(
@@ -36,6 +36,8 @@ def look(
 
 def _next(found: LogLook) -> str:
     """The command that goes on from here."""
+    if found.response is not None:
+        return said("response_next", found.response, shlex.quote(str(found.path)))
     if found.roles is None:
         return found.unclear
     roles = found.roles
@@ -57,5 +59,5 @@ def _numbers(found: LogLook) -> dict[str, object]:
         }
         for column in found.columns
     }
-    time, layout = codec.plain(found.time), codec.plain(found.layout)
-    return {"rows": found.rows, "layout": layout, "time": time, "columns": columns}
+    time, layout, response = (codec.plain(part) for part in (found.time, found.layout, found.response))
+    return {"rows": found.rows, "layout": layout, "time": time, "response": response, "columns": columns}

@@ -2,8 +2,8 @@
 
 A source is one of: a run directory; .npz written by `flexlink identify --out` (model and posterior); .json or
 .mat written by `flexlink identify --export` (model and ellipses); .json, .mat or .npz with plain A, B, C, D
-and dt_s of a user's own discrete model; .csv with a measured frequency response: with variances, or repeated
-points.
+and dt_s of a user's own discrete model; a table with a measured frequency response: with variances, as
+repeated points, or as one sweep with a stated uncertainty.
 Several sources are several plants that one controller has to serve.
 """
 
@@ -17,15 +17,18 @@ from typing import Any
 import control
 import numpy as np
 
-from control_design.plants.plant_set import UncertainPlant, count_integrators
+from control_design.plants.plant_set import UncertainPlant, count_integrators, frequency_response
 from control_design.plants.stated_uncertainty import StatedDiscs
 from ident.basis.model_files import FORMAT
+from ident.data.ellipses import chi2_radius
 from ident.data.foreign_files import content_of
 from ident.data.frf_records import FrfRepeats
 from ident.data.mat_files import mat_variables
+from ident.data.record_files import READERS, read_table
+from ident.data.response_columns import has_response
 from ident.frequency_fit import identify_frf
 from ident.uncertainty import FrequencyUncertainty
-from workflow.config.design_file import DesignFile, PlantSection
+from workflow.config.design_file import DesignFile
 from workflow.config.run_config import RunConfig
 from workflow.engine import codec, documents, storage
 from workflow.engine.errors import InputError, naming
@@ -36,6 +39,8 @@ from workflow.tasks.results import IdentifiedPlant, RunResults
 from workflow.tasks.uncertainty import agreement_of
 from workflow.text.templates import said, words
 
+# Endings that may hold a model; a table of any other that is read holds a measured response.
+_DOCUMENTS = (".json", ".mat", ".npz")
 _SAMPLING_TIME = ("dt_s", "dt", "Ts")
 # Of an entry of a state space in any units: products of some of them are still numbers.
 _LARGEST = 1e50
@@ -89,9 +94,11 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
         about = certified_for(results, config)
         plant = results.uncertainty.plant(config)
         return DesignSource(plant, "run directory", (f"about {about}",), config, about)
-    if path.suffix.lower() == ".csv":
+    if _ending(path) in READERS and _ending(path) not in _DOCUMENTS:
         return _measured(path, design)
     document = _read_document(path)
+    if "A" not in document and _ending(path) in READERS and _holds_response(path):
+        return _measured(path, design)
     with naming(str(path)):
         if codec.DOCUMENT in document:
             found = codec.from_arrays(IdentifiedPlant, document)
@@ -110,6 +117,18 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
         return _stated(path.stem, nominal, design, "state space")
 
 
+def _ending(path: Path) -> str:
+    """The ending that says the format; of a file packed by gzip that before .gz."""
+    return Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
+
+
+def _holds_response(path: Path) -> bool:
+    try:
+        return has_response(read_table(path))
+    except ValueError:
+        return False  # whoever reads it as a model says what is wrong
+
+
 def _read_document(path: Path) -> dict[str, Any]:
     """Top-level names and values of a .npz, .json or .mat file. Raises InputError."""
     suffix = path.suffix.lower()
@@ -118,7 +137,8 @@ def _read_document(path: Path) -> dict[str, Any]:
     if suffix == ".json":
         return documents.read_json(path)
     if suffix != ".mat":
-        raise InputError(f"{path}: not a run directory, and the ending is none of .json, .mat, .npz, .csv")
+        known = ", ".join((*_DOCUMENTS, *(ending for ending in READERS if ending not in _DOCUMENTS)))
+        raise InputError(f"{path}: not a run directory, and the ending is none of {known}")
     with naming(str(path)):
         return mat_variables(content_of(path), path)
 
@@ -195,7 +215,8 @@ def _refuse_untold_integrators(path: Path, nominal: control.StateSpace, design: 
 
 
 def _measured(path: Path, design: DesignFile) -> DesignSource:
-    """A measured frequency response with variances, or as repeated points."""
+    """A measured frequency response with variances, as repeated points, or as one sweep where the design file
+    states the uncertainty."""
     about = design.plant
     if about.dt_s is None:
         raise InputError(
@@ -203,7 +224,7 @@ def _measured(path: Path, design: DesignFile) -> DesignSource:
             f"[plant] of {design.name}"
         )
     with naming(str(path)):
-        response = _read_response(path, about)
+        response, stated = _read_response(path, design)
         if response.omega_rad_s.size < 2:
             raise InputError(f"{path}: one frequency is no response; expected many")
     origin, said = "measured response", tuple[str, ...]()
@@ -215,9 +236,15 @@ def _measured(path: Path, design: DesignFile) -> DesignSource:
             )
         _refuse_untold_integrators(about.nominal, nominal, design)
     with naming(str(path)):
+        if stated and about.nominal is not None:
+            return replace(_stated(path.stem, nominal, design, origin), remarks=_inside(response, nominal))
         if about.nominal is None:
             found = identify_frf(response, about.fit.model_copy(update={"integrators": about.integrators}))
             nominal, origin = found.model.to_control(), "measured response, poles of a fitted model"
+            if stated:
+                # Chi-square tells nothing of an uncertainty that somebody stated.
+                said = (*(words(item) for item in found.warnings), *_inside(response, nominal))
+                return replace(_stated(path.stem, nominal, design, origin), remarks=said)
             said = tuple(words(item) for item in (*found.verdicts, *found.warnings))
             if about.ellipses == "fitted":
                 plant = UncertainPlant(path.stem, nominal, found.posterior, level=response.level)
@@ -226,28 +253,43 @@ def _measured(path: Path, design: DesignFile) -> DesignSource:
     return DesignSource(plant, origin, (*said, *_grid_remarks(plant)))
 
 
-def _read_response(path: Path, about: PlantSection) -> FrequencyUncertainty:
+def _read_response(path: Path, design: DesignFile) -> tuple[FrequencyUncertainty, bool]:
+    """The response, and whether its size is what the design file states."""
+    about, table = design.plant, read_table(path)
     assert about.dt_s is not None
-    try:
-        header = path.read_text(encoding="utf-8-sig").partition("\n")[0]
-    except (OSError, UnicodeDecodeError):
-        header = "variance_real"  # whoever reads it in earnest complains properly
-    if "variance_real" in header:
-        _refuse_strange_spread(path, header)
-        return FrequencyUncertainty.from_csv(path, about.dt_s, level=about.level)
+    if "variance_real" in table.names:
+        _refuse_strange_spread(path, table.names)
+        return FrequencyUncertainty.from_csv(path, about.dt_s, level=about.level), False
     repeats = FrfRepeats.from_csv(path)
-    return repeats.mean(
-        about.dt_s,
-        level=about.level,
-        pool_neighbours=about.pool_neighbours,
-        outlier_threshold=about.outlier_threshold,
-    )
+    grid, first = np.unique(repeats.omega_rad_s, return_index=True)
+    if grid.size < repeats.omega_rad_s.size:
+        response = repeats.mean(
+            about.dt_s,
+            level=about.level,
+            pool_neighbours=about.pool_neighbours,
+            outlier_threshold=about.outlier_threshold,
+        )
+        return response, False
+    if design.uncertainty is None:
+        raise InputError(
+            f"{path}: one sweep: every frequency is measured once, so its spread is not known; give "
+            "variance_real, variance_imag or a stated uncertainty, as [uncertainty] multiplicative = 0.1 in "
+            f"{design.name}"
+        )
+    centre, weight = repeats.response[first], design.uncertainty.multiplicative or design.uncertainty.additive
+    assert weight is not None
+    size = np.abs(centre) if design.uncertainty.multiplicative is not None else 1.0
+    # As `StatedDiscs` sees the weight.
+    tustin = 2j / about.dt_s * np.tan(np.minimum(grid * about.dt_s / 2, np.pi / 2))
+    deviation = size * np.abs(weight.at(tustin)) / chi2_radius(about.level)
+    covariance = deviation[:, None, None] ** 2 * np.eye(2)
+    return FrequencyUncertainty(grid, centre, covariance, about.dt_s, about.level, "stated"), True
 
 
-def _refuse_strange_spread(path: Path, header: str) -> None:
+def _refuse_strange_spread(path: Path, names: Sequence[str]) -> None:
     """A covariance under another name would be left out in silence, and the ellipses be wrong."""
     known = {"variance_real", "variance_imag", "covariance_real_imag"}
-    for column in (name.strip().strip('"') for name in header.split(",")):
+    for column in names:
         if column not in known and ("covar" in column.lower() or "varian" in column.lower()):
             raise InputError(
                 f"{path}, line 1: unknown column {column!r}; the spread stands in {', '.join(sorted(known))}"
@@ -258,9 +300,13 @@ def _grid_remarks(plant: UncertainPlant) -> tuple[str, ...]:
     """How well the nominal, which brings the poles, agrees with the ellipses on their own grid."""
     own: Any = plant.uncertainty
     assert isinstance(own, FrequencyUncertainty)
+    return _inside(own, plant.nominal)
+
+
+def _inside(own: FrequencyUncertainty, nominal: control.StateSpace) -> tuple[str, ...]:
     inside = own.omega_rad_s > 0
     at = FrequencyUncertainty(
         own.omega_rad_s[inside], own.centre[inside], own.covariance[inside], own.dt_s, own.level, own.method
     )
-    found = agreement_of(at, plant.channel.nominal_response)
+    found = agreement_of(at, lambda omega: frequency_response(nominal, omega))
     return (said("nominal_inside", found, own.omega_rad_s.size),)

@@ -11,6 +11,7 @@ from diagnosis.machine.quantisation_grid import grid_step
 from ident.checks.input_checks import clipped_share
 from ident.data.arrays import RealArray
 from ident.data.record_files import read_table
+from ident.data.response_columns import has_response, read_response
 from ident.data.roles import Roles, is_time, roles_of
 from ident.data.table import Table, only_rounded
 from ident.data.text_tables import Layout
@@ -50,10 +51,23 @@ class ColumnLook:
     step: float = 0.0
 
 
+@dataclass(frozen=True)
+class ResponseLook:
+    """A frequency response: so many points at so many frequencies between two of them, or why it is not
+    understood. spread: it has variances."""
+
+    points: int = 0
+    frequencies: int = 0
+    low_Hz: float = 0.0
+    high_Hz: float = 0.0
+    spread: bool = False
+    why: str = ""
+
+
 @dataclass(frozen=True, eq=False)
 class LogLook:
     """A log: layout of a text file, time, signals; roles: the channel that its names and units tell, if they
-    do, else `unclear` says what to type."""
+    do, else `unclear` says what to type. response: what it is where it is no log but a frequency response."""
 
     path: Path
     rows: int
@@ -62,6 +76,7 @@ class LogLook:
     columns: tuple[ColumnLook, ...]
     roles: Roles | None
     unclear: str
+    response: ResponseLook | None = None
 
 
 def look_at(path: Path, time: str | None = None, time_unit: str | None = None) -> LogLook:
@@ -70,17 +85,30 @@ def look_at(path: Path, time: str | None = None, time_unit: str | None = None) -
         table = read_table(path)
         if time is not None and time not in table.names:
             table.columns([time])
-    times = [name for name in table.names if is_time(table, name)]
+    response = None if time is not None else _response(table)
+    times = [name for name in table.names if response is None and is_time(table, name)]
     time = time or (times[0] if times else None)
     roles, unclear = None, ""
     try:
-        roles = roles_of(table, str(path), time=time)
+        roles = roles_of(table, str(path), time=time) if response is None else None
     except ValueError as error:
         unclear = str(error)
     columns = tuple(_column(table, name) for name in table.names if name != time)
     rows = max((len(values) for values in table.raw.values() if hasattr(values, "__len__")), default=0)
     about = None if time is None else _time(table, time, time_unit)
-    return LogLook(path, rows, table.layout, about, columns, roles, unclear)
+    return LogLook(path, rows, table.layout, about, columns, roles, unclear, response)
+
+
+def _response(table: Table) -> ResponseLook | None:
+    if not has_response(table):
+        return None
+    try:
+        omega, _ = read_response(table)
+    except ValueError as error:
+        return ResponseLook(why=str(error).removeprefix(str(table.path)).lstrip(":, "))
+    different = np.unique(omega) / (2 * np.pi)
+    spread = {"variance_real", "variance_imag"} <= set(table.names)
+    return ResponseLook(omega.size, different.size, float(different[0]), float(different[-1]), spread)
 
 
 def _time(table: Table, name: str, unit: str | None) -> TimeLook:

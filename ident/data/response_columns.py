@@ -1,0 +1,293 @@
+"""Which columns of a table are a frequency response, under the names that analysers and programs give them.
+
+A quantity is found by a word of its name and read by the unit that the name (or a line of units) states. What
+does not say its unit is asked for: a gain may be a factor or in dB, a phase in rad or degrees, a frequency in
+Hz or rad/s, and nothing in the numbers tells.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident.data.arrays import BoolArray, ComplexArray, RealArray
+from ident.data.foreign_files import shown
+from ident.data.table import Table
+
+Convert = Callable[[RealArray], RealArray]
+
+
+def _times(factor: float) -> Convert:
+    return lambda values: np.asarray(values * factor, dtype=np.float64)
+
+
+def _of_decibels(values: RealArray) -> RealArray:
+    return np.asarray(10 ** (values / 20), dtype=np.float64)
+
+
+_RPM = 2 * np.pi / 60
+_UNITS: Mapping[str, Mapping[str, Convert]] = {
+    "frequency": {
+        **dict.fromkeys(("hz", "1/s", "cycles/s"), _times(2 * np.pi)),
+        **dict.fromkeys(("khz",), _times(2e3 * np.pi)),
+        **dict.fromkeys(("rad/s", "rad/sec", "rads/sec", "rad/second", "rad/per/s", "rads"), _times(1.0)),
+        **dict.fromkeys(("rpm", "1/min"), _times(_RPM)),
+    },
+    "gain": {
+        "db": _of_decibels,
+        **dict.fromkeys(("abs", "absolute", "1", "-", "lin", "linear", "ratio", "factor"), _times(1.0)),
+    },
+    "phase": {
+        **dict.fromkeys(("deg", "degs", "degree", "degrees", "°", "º", "˚"), _times(np.pi / 180)),
+        **dict.fromkeys(("rad", "radian", "radians"), _times(1.0)),
+    },
+    "real": {},
+    "imag": {},
+}
+_WORDS: Mapping[str, frozenset[str]] = {
+    "frequency": frozenset(
+        {"frequency", "freq", "frequenz", "fréquence", "frecuencia", "f", "omega", "ω", "w", "hz"}
+    ),
+    "gain": frozenset(
+        {
+            "gain",
+            "mag",
+            "magnitude",
+            "amplitude",
+            "ampl",
+            "amp",
+            "betrag",
+            "modulus",
+            "verstärkung",
+            "abs",
+            "db",
+        }
+    ),
+    "phase": frozenset({"phase", "phas", "ph", "arg", "argument", "phi", "φ", "deg"}),
+    "real": frozenset({"re", "real", "realteil"}),
+    "imag": frozenset({"im", "imag", "imaginary", "imaginaer", "imaginär", "imaginärteil"}),
+}
+# Beside such a word a column is about something else: its spread, its sign turned, its slope.
+_OTHER = frozenset(
+    {
+        "variance",
+        "var",
+        "std",
+        "stddev",
+        "sigma",
+        "error",
+        "err",
+        "coherence",
+        "coh",
+        "covariance",
+        "cov",
+        "noise",
+        "margin",
+        "delay",
+        "group",
+        "lag",
+        "attenuation",
+        "difference",
+        "reference",
+    }
+)
+# Units and letters, that count where no other word says what it is.
+_SHORT = frozenset({"hz", "db", "deg", "f", "w", "amp", "re", "im"})
+# Words of a gain that no signal of a log is called by.
+_CLEARLY = frozenset({"gain", "magnitude", "mag", "betrag", "db", "modulus"})
+_ASKED = {
+    "frequency": ("Hz or rad/s", "'Frequency (Hz)' or 'Frequency (rad/s)'"),
+    "gain": ("a factor or in dB", "'Gain (abs)' or 'Gain (dB)'"),
+    "phase": ("rad or degrees", "'Phase (rad)' or 'Phase (deg)'"),
+}
+# Two columns of one quantity may differ by the digits they are printed with.
+_AGREE = 0.02
+
+
+class DoubtError(ValueError):
+    """The table is a frequency response, and something of it is not understood: asked for in one line."""
+
+
+@dataclass(frozen=True)
+class ResponseColumns:
+    """The columns of a frequency response: frequency, and real, imag or gain, phase. convert: by column, to
+    rad/s, a factor, rad. double: (column, second column of the same quantity), to be compared."""
+
+    frequency: str
+    pair: tuple[str, str]
+    rectangular: bool
+    convert: Mapping[str, Convert]
+    double: tuple[tuple[str, str], ...] = ()
+    other_pair: tuple[str, str] | None = None
+
+    def read(self, table: Table) -> tuple[RealArray, ComplexArray]:
+        """omega (K,) in rad/s and response (K,). Raises ValueError naming file, line and column; DoubtError
+        where columns contradict each other."""
+        named = [self.frequency, *self.pair, *(name for two in self.double for name in two)]
+        given = table.columns([*named, *(self.other_pair or ())])
+        values = {name: self.convert[name](numbers) for name, numbers in given.items()}
+        for one, two in self.double:
+            scale = np.maximum(np.abs(values[one]), 1e-3 * np.max(np.abs(values[one]), initial=0.0))
+            _refuse_apart(table, np.abs(values[two] - values[one]) > _AGREE * scale, one, two)
+        first, second = (values[name] for name in self.pair)
+        response = first + 1j * second if self.rectangular else first * np.exp(1j * second)
+        if self.other_pair is not None:
+            gain, phase = (values[name] for name in self.other_pair)
+            apart = np.abs(gain * np.exp(1j * phase) - response) > _AGREE * np.abs(response)
+            _refuse_apart(table, apart, " and ".join(self.pair), " and ".join(self.other_pair))
+        return values[self.frequency], response
+
+
+def response_columns(table: Table) -> ResponseColumns | None:
+    """The columns of a frequency response; None where the table is none: it has no frequency, or a time.
+
+    Raises DoubtError: one line that says what is not understood and what to write.
+    """
+    found: dict[str, list[str]] = {role: [] for role in _WORDS}
+    for name in table.names:
+        role = _role(name, table.unit(name))
+        if role is not None:
+            found[role].append(name)
+    rectangular = bool(found["real"] and found["imag"])
+    polar = bool(found["phase"]) or any(_words(name) & _CLEARLY for name in found["gain"])
+    if not found["frequency"] or not (polar or rectangular) or any(map(_is_time, table.names)):
+        return None
+    wanted = ("real", "imag") if rectangular else ("gain", "phase")
+    lacking = [role for role in wanted if not found[role]]
+    if lacking:
+        listed = shown(", ".join(shown(name, 30) for name in table.names), 120)
+        raise DoubtError(
+            f"{table.path}: a frequency response without {lacking[0]}: it needs real and imag, or gain and "
+            f"phase; found {listed}"
+        )
+    both = rectangular and bool(found["gain"] and found["phase"])
+    used = ["frequency", *wanted, *(("gain", "phase") if both else ())]
+    convert: dict[str, Convert] = {}
+    for role in used:
+        for name in found[role]:
+            convert[name] = _conversion(table, role, name, found)
+    for role in ("real", "imag"):
+        if len(found[role]) > 1 and rectangular:
+            raise DoubtError(
+                f"{table.path}: {' and '.join(map(repr, found[role]))} are both {role} parts: keep the "
+                "columns of one response"
+            )
+    first = {role: found[role][0] for role in used}
+    return ResponseColumns(
+        first["frequency"],
+        (first[wanted[0]], first[wanted[1]]),
+        rectangular,
+        convert,
+        tuple((first[role], other) for role in used for other in found[role][1:]),
+        (first["gain"], first["phase"]) if both else None,
+    )
+
+
+def has_response(table: Table) -> bool:
+    """Whether the table is a frequency response, understood or not."""
+    try:
+        return response_columns(table) is not None
+    except DoubtError:
+        return True
+
+
+def read_response(table: Table) -> tuple[RealArray, ComplexArray]:
+    """omega (K,) in rad/s and response (K,) of a table that has to be one. Raises ValueError."""
+    columns = response_columns(table)
+    if columns is None:
+        found = {_role(name, table.unit(name)) for name in table.names}
+        need = "one of real, imag and gain, phase_rad"
+        if "frequency" not in found:
+            need = "exactly one of the columns omega_rad_s, frequency_Hz"
+        elif {"real", "imag"} & found:
+            need += f"; no column {'imag' if 'real' in found else 'real'!r}"
+        listed = ", ".join(shown(name, 30) for name in table.names)
+        raise ValueError(f"{table.path}, line 1: need {need}; the file has {shown(listed, 120)}")
+    return columns.read(table)
+
+
+def _conversion(table: Table, role: str, name: str, found: Mapping[str, Sequence[str]]) -> Convert:
+    units = _UNITS[role]
+    if not units:
+        return _times(1.0)
+    unit = _unit(name, table.unit(name))
+    if unit in units:
+        return units[unit]
+    words = _words(name)
+    if role == "frequency" and not unit and words & {"omega", "ω"}:
+        return units["rad/s"]
+    # The table of our own documentation: gain beside phase_rad is a factor.
+    if name == "gain" and not unit and "phase_rad" in found["phase"]:
+        return units["abs"]
+    if role == "gain" and re.fullmatch(r"\S+/\S+", unit) and "db" not in unit:
+        return units["abs"]  # of one unit per another, as rad/V
+    what, write = _ASKED[role]
+    raise DoubtError(
+        f"{table.path}: is {shown(name, 60)!r} {what}? "
+        + (f"Unit '{shown(unit, 20)}' is not known. " if unit else "Its name does not say. ")
+        + f"Call the column {write} in the file"
+    )
+
+
+def _role(name: str, unit: str) -> str | None:
+    """What a column is by the words of its name; by its unit where these are none that is known."""
+    words, plain = _words(name), unicodedata.normalize("NFKC", name)
+    if words & _OTHER:
+        return None
+    if words & {"f", "w"} and (stated := _unit(name, unit)) and stated not in _UNITS["frequency"]:
+        return None  # a force in N, a power in W
+    if re.match(r"\s*\|.*\|", plain):
+        return "gain"
+    hits = [role for role in ("real", "imag", "phase", "gain", "frequency") if words & _WORDS[role]]
+    spoken = [role for role in hits if words & _WORDS[role] - _SHORT]
+    hits = spoken or hits
+    if len(hits) > 1:
+        # 'Trace 1: Gain: Phase (°)': what the unit is of.
+        hits = [role for role in hits if _unit(name, unit) in _UNITS[role]] or hits[:1]
+    return hits[0] if hits else None
+
+
+def _words(name: str) -> frozenset[str]:
+    """Words of a name in lower case, parted at blanks, signs and capitals."""
+    plain = unicodedata.normalize("NFKC", name)
+    parted = re.sub(r"(?<=[a-z])(?=[A-Z][A-Za-z])", " ", plain).lower()
+    return frozenset(re.findall(r"[^\W\d_]+", parted))
+
+
+def _unit(name: str, stated: str) -> str:
+    """The unit in lower case: what the file states, else in the last brackets, else the last words."""
+    # Of 'Re(G)' and '|G| (dB)' only the latter is a unit.
+    plain = unicodedata.normalize("NFKC", name).strip().lower()
+    text = unicodedata.normalize("NFKC", stated).strip().lower().strip("[]() ")
+    text = text.replace(" ", "").replace("·", "")
+    known = {unit for units in _UNITS.values() for unit in units}
+    if text in known or text.replace("_", "/") in known:
+        return text if text in known else text.replace("_", "/")
+    bracket = re.search(r"[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$", plain)
+    if bracket and bracket[1].replace(" ", "") in known:
+        return bracket[1].replace(" ", "")
+    parted = re.sub(r"(?<=[a-z])(?=[A-Z][A-Za-z])", " ", unicodedata.normalize("NFKC", name)).lower()
+    words = re.split(r"[\s_./:,;\-\[\]()]+", parted.strip("[]() "))
+    for count in (3, 2, 1):
+        last = "/".join(word for word in words[-count:] if word)
+        if len(words) >= count and last in known and not (last == "abs" and len(words) == 1):
+            return last
+    if bracket and len(bracket[1]) <= 2 and bracket[1].isalpha() and not text:
+        return ""
+    return "" if bracket and text == bracket[1] and re.fullmatch(r"\w", text) else text
+
+
+def _is_time(name: str) -> bool:
+    return bool(_words(name) & {"time", "zeit", "timestamp", "t"})
+
+
+def _refuse_apart(table: Table, apart: BoolArray, one: str, two: str) -> None:
+    if np.any(apart):
+        raise DoubtError(
+            f"{table.path}, {table.place(int(np.argmax(apart)))}: {shown(one, 60)} and {shown(two, 60)} "
+            "contradict each other: keep the columns of one response"
+        )

@@ -1,0 +1,112 @@
+"""`flexlink identify` of a measured frequency response: a table of points in; model files and numbers out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ident.basis.model_files import ModelFile
+from ident.basis.options import IdentOptions
+from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.frf_records import FrfRepeats
+from ident.data.record_files import read_table
+from ident.frequency_fit import FrfIdentification, identify_frf
+from ident.uncertainty.nominal import nominal_near
+from workflow.engine import codec, interrupts, storage
+from workflow.engine.errors import InputError, naming
+from workflow.engine.progress import Progress
+from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
+from workflow.tasks.results import IdentifiedPlant
+from workflow.tasks.summary import RunSummary
+from workflow.text.formats import count
+from workflow.text.templates import rows_of, words
+
+_EXPORTED_POINTS = 400
+
+
+def identify_response(
+    paths: Sequence[Path],
+    dt_s: float | None,
+    *,
+    level: float = 0.95,
+    options: IdentOptions | None = None,
+    out: Path | None = None,
+    export: Path | None = None,
+    refused: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> RunSummary:
+    """Fit a model to a measured response with variances, or to repeated sweeps (in one file or several).
+
+    refused: options of logs that were given, which mean nothing here. out, export: as in `identify_logs`.
+    Raises InputError.
+    """
+    if refused:
+        raise InputError(
+            f"{paths[0]}: a frequency response, not a log over time: leave out {' and '.join(refused)}"
+        )
+    if dt_s is None:
+        raise InputError(
+            f"{paths[0]}: a frequency response does not say at which period the model runs: "
+            "give it, --dt-s SECONDS"
+        )
+    if export is not None and export.suffix.lower() not in MODEL_SUFFIXES:
+        raise InputError(f"--export {export}: the ending must be {' or '.join(MODEL_SUFFIXES)}")
+    progress = progress or Progress()
+    progress.plan((("identify", 1.0),))
+    with progress.stage("identify"), naming(str(paths[0])):
+        response = _read(paths, dt_s, level)
+        found = identify_frf(response, options)
+    written: dict[Path, bytes] = {}
+    if out is not None or export is not None:
+        ends = response.omega_rad_s[response.omega_rad_s > 0]
+        omega = np.geomspace(ends[0], ends[-1], _EXPORTED_POINTS)
+        if out is not None:
+            nominal = nominal_near(found.posterior, found.model.poles, omega)
+            written[out] = storage.npz_bytes(
+                codec.to_arrays(IdentifiedPlant(nominal, found.posterior, level))
+            )
+        if export is not None:
+            written[export] = model_bytes(export, ModelFile(found.model, found.posterior.at(omega, level)))
+    interrupts.check()
+    storage.write_together(written)
+    return RunSummary(
+        title=f"frequency response {paths[0].name}",
+        sections=rows_of("summary/response.j2", found=found, response=response),
+        numbers=_numbers(found, out, export),
+        verdict=count(len(found.warnings), "warning"),
+    )
+
+
+def _read(paths: Sequence[Path], dt_s: float, level: float) -> FrequencyUncertainty:
+    if len(paths) == 1 and "variance_real" in read_table(paths[0]).names:
+        return FrequencyUncertainty.from_csv(paths[0], dt_s, level=level)
+    sweeps = [FrfRepeats.from_csv(path) for path in paths]
+    omega = np.concatenate([sweep.omega_rad_s for sweep in sweeps])
+    if np.unique(omega).size == omega.size:
+        raise InputError(
+            f"{paths[0]}: one sweep: every frequency is measured once, so its spread is not known; give "
+            "variance_real, variance_imag or more sweeps (flexlink identify SWEEP1 SWEEP2 SWEEP3); or a "
+            "stated uncertainty, [uncertainty] multiplicative = 0.1 in the file of flexlink design --spec"
+        )
+    return FrfRepeats(omega, np.concatenate([sweep.response for sweep in sweeps])).mean(dt_s, level=level)
+
+
+def _numbers(found: FrfIdentification, out: Path | None, export: Path | None) -> dict[str, object]:
+    poles, dt_s = found.model.poles, found.model.dt_s
+    return {
+        "order": found.model.order,
+        "dt_s": dt_s,
+        "real_poles_per_s": codec.plain(poles.decay_per_s(dt_s)),
+        "modes": [
+            {"omega_rad_s": omega, "frequency_Hz": omega / (2 * np.pi), "damping": zeta}
+            for omega, zeta in zip(poles.omega_rad_s(dt_s).tolist(), poles.zeta().tolist(), strict=True)
+        ],
+        "chi_square": found.rss,
+        "degrees_of_freedom": found.degrees_of_freedom,
+        "verdicts": [words(item) for item in found.verdicts],
+        "warnings": [words(item) for item in found.warnings],
+        "file": None if out is None else str(out),
+        "model_file": None if export is None else str(export),
+    }
