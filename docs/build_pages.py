@@ -113,7 +113,7 @@ def unit_of(key: str, meaning: str) -> str:
     for ending, unit in UNITS.items():
         if key == ending or key.endswith(f"_{ending}"):
             return unit
-    found = re.search(r"\[([^\]]+)\]", meaning)
+    found = re.search(r"\[(s|m|V|rad|rad/s|Hz|kg)\]", meaning)
     return found.group(1) if found else ""
 
 
@@ -249,17 +249,31 @@ def python() -> dict[str, str]:
         parts = [f"# {title}"]
         for name in names:
             thing = getattr(flexlink, name)
-            try:
-                signature = re.sub(r"(?:[A-Za-z_]+\.)+([A-Za-z_]+)", r"\1", str(inspect.signature(thing)))
-            except (TypeError, ValueError):
-                signature = ""
-            text = inspect.cleandoc(thing.__doc__ or "")
-            parts.append(f"## {name}\n\n```python\n{name}{signature}\n```\n\n```text\n{text}\n```")
+            parts.append(f"## {name}\n\n{settings(thing) or docstring(name, thing)}")
         made[f"reference/python_{module}.md"] = "\n\n".join(parts) + "\n"
         listed = ", ".join(f"`{name}`" for name in names)
         lines.append(f"| [{title}](python_{module}.md) | {listed} |")
     start = "# Python\n\nThe names of `import flexlink`. Start with [From Python](../from_python.md)."
     return made | {"reference/python.md": start + "\n\n" + "\n".join(lines) + "\n"}
+
+
+def settings(thing: Any) -> str:
+    """Keys of settings as a table; nothing for other things."""
+    if not (isinstance(thing, type) and issubclass(thing, BaseModel)):
+        return ""
+    rows = [row(key, field) for key, field in keys(thing)]
+    table = "| key | unit | default | meaning |\n|---|---|---|---|\n" + "\n".join(rows)
+    return f"{sentence(thing)}\n\n{table}" if rows else ""
+
+
+def docstring(name: str, thing: Any) -> str:
+    """Signature and docstring."""
+    try:
+        signature = re.sub(r"(?:[A-Za-z_]+\.)+([A-Za-z_]+)", r"\1", str(inspect.signature(thing)))
+    except (TypeError, ValueError):
+        signature = ""
+    text = inspect.cleandoc(thing.__doc__ or "")
+    return f"```python\n{name}{signature}\n```\n\n```text\n{text}\n```"
 
 
 def gallery() -> str:

@@ -181,3 +181,17 @@ def test_the_site_is_built_whole_and_asks_no_network(tmp_path):
             r"<(?:script|img|link|iframe|source)\b[^>]*(?:src|href)=\"?(https?:[^\" >]+)", text
         )
         assert fetched == [], page.name
+
+
+def test_the_search_works_in_pages_that_are_opened_as_files(tmp_path, browser):
+    build(tmp_path / "site", run=False)
+    browser.open(tmp_path / "site" / "theory" / "arm.html")
+    browser.ask("document.querySelector('#__search').click()")
+    browser.ask("document.querySelector('[data-md-component=search-query]').focus()")
+    for letter in "quantisation":
+        browser.press(letter)
+    found = "[...document.querySelectorAll('.md-search-result__link')].map(link => link.href).join()"
+    look = f"const look = () => {found} ? done({found}) : setTimeout(look, 50)"
+    until = f"new Promise(done => {{ {look}; look() }})"
+    assert (tmp_path / "site" / "glossary.html").as_uri() in browser.ask(until)
+    assert browser.complaints() == []

@@ -41,7 +41,8 @@ class IdentOptions(BaseModel):
         5, ge=0, le=12, description="most pole pairs when their number is chosen from the data"
     )
     fixed_poles: tuple[tuple[float, float], ...] = Field(
-        (), description="known poles in the z plane, [real part, imaginary part >= 0]; not changed"
+        (),
+        description="known poles in the z plane, each a list of real part and imaginary part >= 0; not changed",
     )
 
     integrators: int = Field(0, ge=0, le=3, description="known poles at z = 1, as exact input filters")
