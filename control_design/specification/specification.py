@@ -95,7 +95,7 @@ class Specification(BaseModel):
     controller_order: int = Field(default=4, ge=1, le=16, description="number of controller states")
     structure: Literal["biquads", "pi_d_notch"] = Field(
         default="biquads",
-        description="biquads: free cascade; pi_d_notch: integrator if set, lead/lag, notches at free frequencies",
+        description="biquads: free cascade; pi_d_notch: integrator (if set), lead/lag and free notches",
     )
     controller_damping: float | None = Field(
         default=None,

@@ -42,7 +42,7 @@ class IdentOptions(BaseModel):
     )
     fixed_poles: tuple[tuple[float, float], ...] = Field(
         (),
-        description="known poles in the z plane, each a list of real part and imaginary part >= 0; not changed",
+        description="known poles in the z plane, each as real part, imaginary part >= 0; not changed",
     )
 
     integrators: int = Field(0, ge=0, le=3, description="known poles at z = 1, as exact input filters")
