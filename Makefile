@@ -12,13 +12,14 @@ export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help install run test test-all lint types wheel check docs clean
+.PHONY: help install run test test-all lint types wheel dist check docs clean
 
 help:
 	@echo "make run    install into .venv and run the default arm end to end (OUT=$(OUT))"
 	@echo "make test   everything that guards behaviour   make test-all   with the long Monte Carlo"
 	@echo "make docs   the documentation as a site, build/site/index.html, with a gallery of pages"
 	@echo "make wheel  a wheel with the newest dependencies, tried on every Python from 3.11 to 3.13 that is here"
+	@echo "make dist   wheel and source archive in build/dist, the same bytes from the same commit"
 	@echo "make check  what CI runs: tests, lint, types, wheel"
 
 $(PACKAGES): pyproject.toml constraints.txt
@@ -58,6 +59,11 @@ types: $(PACKAGES)
 # Needs no installation of ours: it makes its own, with the newest dependencies, for every Python there is.
 wheel:
 	./.ci/wheel
+
+# The same bytes from the same commit: files in the wheel carry the time of the commit.
+dist: $(PACKAGES)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check build
+	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(BIN)/python -m build --outdir build/dist .
 
 check: test-all lint types wheel
 
