@@ -63,7 +63,8 @@ wheel:
 # The same bytes from the same commit: files in the wheel carry the time of the commit.
 dist: $(PACKAGES)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check build
-	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(BIN)/python -m build --outdir build/dist .
+	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(BIN)/python -m build --wheel --outdir build/dist .
+	git archive --format=tar.gz --prefix=flexlink/ --output=build/dist/flexlink-source.tar.gz HEAD
 
 check: test-all lint types wheel
 
