@@ -263,7 +263,10 @@ def identify(
             "'Zeit [ms]'), else s]"
         ),
     ] = None,
-    dt_s: Annotated[float | None, typer.Option(help="Sampling period [s], if there is no --time.")] = None,
+    dt_s: Annotated[
+        float | None,
+        typer.Option(help="Sampling period [s], if there is no --time; beside it, the exact one within 1 %."),
+    ] = None,
     scale: Annotated[
         list[str] | None,
         typer.Option(help="COLUMN=FACTOR: quantity = factor * column + offset (repeatable).", metavar="TEXT"),
@@ -276,6 +279,10 @@ def identify(
             "--repair", help="Put time stamps that jitter, and single missing rows, on a uniform grid."
         ),
     ] = False,
+    resample_s: Annotated[
+        float | None,
+        typer.Option(help="Put all rows on a coarser grid of this step [s], where stamps keep to none."),
+    ] = None,
     report_page: Annotated[
         Path | None,
         typer.Option(
@@ -414,6 +421,7 @@ def identify(
             offset={name: _number("--offset", text) for name, text in _named("--offset", offset).items()},
             units=_named("--unit", unit),
             repair=repair,
+            resample_s=resample_s,
             reference=reference,
             input_limit=input_limit,
         )

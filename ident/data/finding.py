@@ -32,6 +32,7 @@ class FindingKind(Enum):
     # Records.
     TIME_UNIT = auto()
     REPAIRED = auto()
+    RESAMPLED = auto()
     FEW_SAMPLES = auto()
     UNKNOWN_TIME_CONSTANT = auto()
     UNKNOWN_DAMPING = auto()

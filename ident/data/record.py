@@ -13,10 +13,14 @@ from ident.data.arrays import RealArray, readonly
 from ident.data.finding import Finding
 from ident.data.record_files import read_table
 from ident.data.table import LARGEST, Table
-from ident.data.time_grid import Repair, TimeGrid
+from ident.data.time_grid import CoarseGrid, Repair, TimeGrid, sampling_time
 from ident.data.units import TimeColumn
 
 T = TypeVar("T")
+
+# Clocks of one machine that differ by less are one: a thousandth of every frequency, below what most records
+# tell.
+_SAME_CLOCK = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +121,10 @@ class Record:
         """Sampling instants (T,), starting at 0."""
         return np.arange(self.n_samples, dtype=np.float64) * self.dt_s
 
+    def sampled_like(self, other: Record) -> bool:
+        """Whether the sampling times are one but for the clocks of hosts, to 0.1 %."""
+        return abs(self.dt_s - other.dt_s) <= _SAME_CLOCK * other.dt_s
+
     def refuse_several(self, dt_s: float | None = None) -> None:
         """Raise ValueError unless there are one input and one output, sampled at dt_s where that is given."""
         if self.input.shape[1] != 1 or self.output.shape[1] != 1:
@@ -188,6 +196,7 @@ class Record:
         offset: Mapping[str, float] | None = None,
         units: Mapping[str, str] | None = None,
         repair: bool = False,
+        resample_s: float | None = None,
     ) -> Self:
         """Read columns of a log file, or of a table that is there; readers: `ident.data.record_files`.
 
@@ -196,7 +205,8 @@ class Record:
         signals keep the unit in their names. What was taken stands in `time_column`, `input_units` and
         `output_units`. scale, offset, units: by column, quantity = scale * column + offset in that unit.
         repair: stamps that jitter, and single missing rows, are put on a uniform grid (`TimeGrid`), not
-        refused. Raises ValueError in one line naming file and place.
+        refused. resample_s: all rows are put on a grid of this step, not shorter than the log's own
+        (`CoarseGrid`), whatever repair says. Raises ValueError in one line naming file and place.
         """
         table = path if isinstance(path, Table) else read_table(path)
         for key, names in (("inputs", inputs), ("outputs", outputs), ("references", references)):
@@ -224,11 +234,16 @@ class Record:
                 raise ValueError(
                     f"{table.path}: scale, offset or unit of column {item!r}, which is not used as a signal"
                 )
-        grid = None
-        if repair and time is not None and stamps is not None:
+        grid: TimeGrid | CoarseGrid | None = None
+        if resample_s is not None:
+            if time is None or stamps is None or dt_s is not None:
+                raise ValueError(f"{table.path}: resample_s needs a time column, and no dt_s beside it")
+            grid = CoarseGrid.of(table, time, stamps, resample_s)
+        elif repair and time is not None and stamps is not None:
             grid = TimeGrid.of(table, time, stamps)
-            stamps = np.asarray(grid.dt_s * np.arange(int(grid.rows[-1]) + 1), dtype=np.float64)
-        step = table.sampling_time(stamps, time, dt_s)
+        if grid is not None:
+            stamps = np.asarray(grid.dt_s * np.arange(grid.n_samples), dtype=np.float64)
+        step = sampling_time(table, stamps, time, dt_s)
 
         def stack(names: Sequence[str], held: bool = False) -> RealArray:
             if not names:

@@ -19,9 +19,6 @@ from ident.data.text_tables import Layout, is_number
 from ident.data.time_stamps import StampError, is_stamp, seconds_since_first
 from ident.data.units import TimeColumn, written_unit
 
-# Each sampling interval may differ from the mean one by this fraction: at the Nyquist frequency the phase
-# of a sample is then wrong by at most 0.03 rad. A clock's jitter is far below it, a lost sample far above.
-TIME_TOLERANCE = 0.01
 # Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
 LARGEST = 1e100
 # Of a matrix so many columns at most are offered by number.
@@ -72,7 +69,7 @@ class Table:
             if name not in self.raw:
                 there = "several" if self._alike(name) else "no"
                 columns = f"{there} column{'s' if there == 'several' else ''} '{shown(name)}'"
-                raise ValueError(f"{self.path}: {columns}; the file has {self._listed(name)}")
+                raise ValueError(f"{self.path}: {columns}; the file has {self.listed(name)}")
         found = {name: self._numbers(name) for name in dict.fromkeys(wanted)}
         if self.clocks:
             found = self._held(found)
@@ -94,8 +91,8 @@ class Table:
         """Columns of one name, as `distinct` tells them apart."""
         return [name for name in self.names if wanted and re.fullmatch(rf"#\d+ {re.escape(wanted)}", name)]
 
-    def _listed(self, wanted: str = "") -> str:
-        # Of a matrix or struct that was asked for by its own name, its columns.
+    def listed(self, wanted: str = "") -> str:
+        """Names in a line: all, or the columns of a matrix or struct that was asked for by its own name."""
         parts = [name for name in self.names if wanted and name.startswith((f"{wanted}[", f"{wanted}."))]
         parts = self._alike(wanted) or parts
         hint = (
@@ -199,59 +196,6 @@ class Table:
                 f"{self.path}, {self.place(row)}: time '{name}' goes from {stamps[row - 1]:.9g} to "
                 f"{stamps[row]:.9g} s; expected increasing time ({what})"
             )
-
-    def sampling_time(self, stamps: RealArray | None, name: str | None, dt_s: float | None) -> float:
-        """dt in seconds from the time stamps (mean interval), or the given one; both must agree where both
-        are there.
-
-        Raises ValueError if neither is given, dt_s is not positive, or the stamps are not increasing and
-        uniform to `TIME_TOLERANCE`, rounding to their last digit aside.
-        """
-        if dt_s is not None and not (np.isfinite(dt_s) and dt_s > 0):
-            raise ValueError(f"{self.path}: dt_s must be a positive number of seconds; got {dt_s}")
-        if stamps is None:
-            if dt_s is None:
-                raise ValueError(
-                    f"{self.path}: give the time column or dt_s; the file has {_listed(self.names)}"
-                )
-            return float(dt_s)
-        self.increasing(stamps, name)
-        interval = np.diff(stamps)
-        # The median says what the step is even where samples are lost; the mean over all is the better
-        # estimate after.
-        median = float(np.median(interval))
-        uneven = np.flatnonzero(~(np.abs(interval - median) <= TIME_TOLERANCE * median))
-        if uneven.size and not only_rounded(stamps):
-            row = int(uneven[0]) + 1
-            # A few wide steps are lost samples; many uneven ones are a clock that was read late now and then.
-            few = uneven.size <= 0.05 * interval.size
-            what = "samples are missing: split the file there" if few else "resample it to a uniform step"
-            raise ValueError(
-                f"{self.path}, {self.place(row)}: time '{name}' steps by {interval[row - 1]:.6g} s "
-                f"where most steps are {median:.6g} s; expected uniform sampling (each step within "
-                f"{TIME_TOLERANCE:.0%}; {uneven.size} of {interval.size} are not: {what}, or --repair)"
-            )
-        mean = float((stamps[-1] - stamps[0]) / interval.size)
-        if dt_s is None:
-            # Rounding noise of decimal stamps: 0.0020000000000000005 is 0.002.
-            return float(f"{mean:.12g}")
-        if not abs(dt_s - mean) <= TIME_TOLERANCE * mean:
-            raise ValueError(
-                f"{self.path}: dt_s = {dt_s:.6g} s, but the time column '{name}' steps by {mean:.6g} s"
-            )
-        return float(dt_s)
-
-
-def only_rounded(stamps: RealArray) -> bool:
-    """Whether increasing stamps (T,) [s] are a uniform clock's, rounded to their last decimal digit: 0.008,
-    0.016, 0.023 for steps of 1/128 s."""
-    since = stamps - stamps[0]
-    digit = next((10.0**-k for k in range(10) if np.allclose(since, np.round(since, k), 0, 1e-10)), 0.0)
-    uniform = np.polyval(np.polyfit(np.arange(since.size), since, 1), np.arange(since.size))
-    # A line through rounded stamps is itself off by part of the digit.
-    return bool(
-        0 < digit <= 0.5 * np.median(np.diff(stamps)) and np.max(np.abs(since - uniform)) <= 0.75 * digit
-    )
 
 
 def _split(name: str, values: Any) -> dict[str, Any]:

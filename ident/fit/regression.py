@@ -44,7 +44,7 @@ def prepare_inputs(records: Sequence[Record], structure: Structure) -> Regressio
             raise ValueError(
                 f"{record.label}: columns {list(names)}, but the first record has {list(first.input_names)}"
             )
-        if not abs(record.dt_s - first.dt_s) <= 1e-3 * first.dt_s:
+        if not record.sampled_like(first):
             raise ValueError(
                 f"{record.label}: dt_s = {record.dt_s:.6g}, but the first record has {first.dt_s:.6g}"
             )

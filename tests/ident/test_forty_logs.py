@@ -242,7 +242,9 @@ LOGS = {
         "a.csv", text(time=lambda t: f"{t / DT_S / 128:.3f}"), dt_s=1 / 128, dt_error_s=1e-3 / (N - 1)
     ),
     "a lost row": Log(
-        "a.csv", text(keep=LOST), refused=("line 22", "steps by 0.02 s", "split the file there, or --repair")
+        "a.csv",
+        text(keep=LOST),
+        refused=("line 22", "steps by 0.02 s", "rows missing: 1 of 60: --repair (repair = true)"),
     ),
     "a lost row, repaired": Log("a.csv", text(keep=LOST), options={"repair": True}),
     "jitter, repaired": Log(

@@ -142,9 +142,11 @@ def test_what_to_do_about_time_stamps_is_said(tmp_path):
     assert "take the repeated row out" in said_of(np.insert(even, 50, even[50]))
     assert "split the file there" in said_of(np.concatenate([even, even]))
     lost = said_of(np.delete(even, [70, 71]))
-    assert "1 of 197 are not: samples are missing: split the file there" in lost
+    assert "line 72" in lost
+    assert "rows missing: 2 of 200: --repair" in lost
     jitter = said_of(even + 0.001 * np.random.default_rng(0).normal(size=200))
-    assert "resample it to a uniform step" in jitter
+    assert "the stamps keep to no grid" in jitter
+    assert "--resample-s 0.03 (resample_s = 0.03)" in jitter
 
 
 def test_paths_that_are_not_there(tmp_path):

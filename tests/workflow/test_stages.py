@@ -347,8 +347,13 @@ def test_scatter_between_records_needs_four_and_widens_the_ellipses():
 def test_sampling_times_that_differ_are_refused_and_jitter_is_not():
     with pytest.raises(InputError, match=r"'a' and 'b' differ in sampling time \(0\.01 and 0\.02 s\)"):
         with_common_sampling_time([make_record("a"), make_record("b", 0.02)])
-    alike = with_common_sampling_time([make_record("a"), make_record("b", 0.01 * (1 + 1e-9))])
-    assert alike[0].dt_s == alike[1].dt_s
+    with pytest.raises(InputError, match=r"--resample-s 0\.02 \(resample_s\)"):
+        with_common_sampling_time([make_record("b", 0.02), make_record("a")])
+    with pytest.raises(InputError, match="differ in sampling time"):
+        with_common_sampling_time([make_record("a"), make_record("b", 0.01 * (1 + 2e-3))])
+    for apart in (1e-9, 40e-6, -9e-4):  # clocks of hosts
+        alike = with_common_sampling_time([make_record("a"), make_record("b", 0.01 * (1 + apart))])
+        assert alike[0].dt_s == alike[1].dt_s == 0.01
 
 
 def test_slice_and_mirror(tmp_path, flexlink_data):

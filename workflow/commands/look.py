@@ -44,6 +44,7 @@ def _next(found: LogLook) -> str:
     named = {"--input": roles.input, "--output": roles.output, "--time": roles.time}
     options = [f"{option} {shlex.quote(name)}" for option, name in named.items() if name]
     options += [] if roles.time else ["--dt-s SECONDS"]
+    options += [found.time.option] if found.time and found.time.option.startswith("--") else []
     return " ".join(["flexlink identify", shlex.quote(str(found.path)), *options])
 
 

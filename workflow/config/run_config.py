@@ -149,6 +149,11 @@ class FileSource(Section):
     repair: bool = Field(
         False, description="put jittering time stamps and single missing rows on a uniform grid"
     )
+    resample_s: float | None = Field(
+        None,
+        gt=0,
+        description="put all rows on a coarser grid of this step [s], for stamps that keep to none",
+    )
     records: tuple[FileRecord, ...] = Field(min_length=1)
 
     @model_validator(mode="after")

@@ -122,7 +122,7 @@ def _experiment(
             time = names["time_s"]
             if time.scale is None:
                 values["time_s"] = table.seconds(time.column, values["time_s"], None)[0]
-            grid = TimeGrid.of(table, time.column, values["time_s"])
+            grid = TimeGrid.of(table, time.column, values["time_s"], options=False)
         stated = rig.sampling.dt_s
         if not abs(grid.dt_s - stated) <= _SAMPLING_TOLERANCE * stated:
             raise InputError(

@@ -20,6 +20,7 @@ from diagnosis.machine.own_plant import Plant, PlantCase, PlantExperiment
 from diagnosis.machine.with_effects import with_effects
 from ident.data.record_files import read_table
 from ident.data.table import Table
+from ident.data.time_grid import sampling_time
 from workflow.config.settings import Section, check
 from workflow.diagnose.case_settings import CaseName
 from workflow.engine import storage
@@ -247,7 +248,8 @@ def _sampling(tables: Sequence[Table], settings: SimulatorSettings) -> float:
             )
         stamps = table.columns([column])[column] if column in table.names else None
         with naming(str(table.path)):
-            found.append(table.sampling_time(stamps, column, None if stamps is not None else settings.dt_s))
+            given = None if stamps is not None else settings.dt_s
+            found.append(sampling_time(table, stamps, column, given, options=False))
     if max(found) > 1.001 * min(found):
         raise InputError(f"{tables[0].path}: logs are sampled every {min(found):.6g} to {max(found):.6g} s")
     return found[0]

@@ -13,8 +13,9 @@ from ident.data.arrays import RealArray
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response, read_response
 from ident.data.roles import Roles, is_time, roles_of
-from ident.data.table import Table, only_rounded
+from ident.data.table import Table
 from ident.data.text_tables import Layout
+from ident.data.time_grid import LARGEST_JITTER, jitter_of, only_rounded, option_for
 from workflow.engine.errors import naming
 
 
@@ -24,7 +25,8 @@ class TimeLook:
 
     unit: of the column, as `TimeColumn.unit`. period_s: the usual step. jitter: largest distance of a step
     from a whole number of them, as a share, 0 where it is the rounding of the stamps. missing: rows that
-    larger steps lack; gap_s: the largest step; gap_row: after which row. why: why the stamps are none.
+    larger steps lack, where jitter leaves no doubt of them; gap_s: the largest step; gap_place: after which
+    row. option: as `option_for`. why: why the stamps are none.
     """
 
     name: str
@@ -35,6 +37,7 @@ class TimeLook:
     missing: int = 0
     gap_s: float = 0.0
     gap_place: str = ""
+    option: str = ""
     why: str = ""
 
 
@@ -120,17 +123,18 @@ def _time(table: Table, name: str, unit: str | None) -> TimeLook:
     steps = np.diff(stamps)
     period = float(np.median(steps))
     counts = np.maximum(np.rint(steps / period), 1)
-    rounded = only_rounded(stamps)
+    rounded, jitter = only_rounded(stamps), jitter_of(stamps)
     row = int(np.argmax(steps))
     return TimeLook(
         name,
         column.unit,
         float((stamps[-1] - stamps[0]) / steps.size) if rounded else period,
-        0.0 if rounded else float(np.max(np.abs(steps / period - counts))),
+        0.0 if rounded else jitter,
         rounded,
-        int(np.sum(counts - 1)),
+        int(np.sum(counts - 1)) if jitter <= LARGEST_JITTER else 0,
         float(steps[row]),
         table.place(row + 1),
+        option_for(stamps),
     )
 
 

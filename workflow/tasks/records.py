@@ -71,6 +71,7 @@ def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channe
             offset=source.offset,
             units=units,
             repair=source.repair,
+            resample_s=source.resample_s,
         )
         if entry.start_sample or entry.stop_sample is not None:
             record = record.slice(entry.start_sample, entry.stop_sample or record.n_samples)
@@ -91,8 +92,7 @@ def with_common_sampling_time(records: Sequence[Record]) -> list[Record]:
     """The records with the first one's sampling time. Raises InputError where they really differ, or are
     together longer than the memory of most machines allows.
 
-    Time stamps are written with a few digits, so that the mean interval of equal clocks differs in its last
-    digits.
+    Clocks of hosts differ by some ten parts in a million, and time stamps are written with a few digits.
     """
     samples = sum(len(record.input) for record in records)
     if samples > MOST_SAMPLES:
@@ -102,9 +102,11 @@ def with_common_sampling_time(records: Sequence[Record]) -> list[Record]:
         )
     first = records[0]
     for other in records[1:]:
-        if not abs(other.dt_s - first.dt_s) <= 1e-6 * first.dt_s:
+        if not other.sampled_like(first):
             raise InputError(
                 f"records {first.name!r} and {other.name!r} differ in sampling time "
-                f"({first.dt_s:.6g} and {other.dt_s:.6g} s); identify them in separate runs"
+                f"({first.dt_s:.6g} and {other.dt_s:.6g} s); put all on one grid, --resample-s "
+                f"{max(record.dt_s for record in records):.6g} (resample_s), or identify them in separate "
+                "runs"
             )
     return [replace(record, dt_s=first.dt_s) for record in records]
