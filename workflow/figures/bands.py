@@ -12,6 +12,7 @@ from ident.uncertainty import FrequencyUncertainty
 
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
+_SEEN = 0.1  # half a band's height over the gain: two pixels of two hundred on an axis of six decades
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +53,12 @@ def response_band(uncertainty: FrequencyUncertainty) -> ResponseBand:
         phase_low_deg=phase + np.where(holds_origin, -180.0, swing.min(axis=1)),
         phase_high_deg=phase + np.where(holds_origin, 180.0, swing.max(axis=1)),
     )
+
+
+def enlargement(band: ResponseBand) -> int:
+    """1, 10, 100 or 1000: how much larger a band has to be drawn to be seen on a log axis of some decades."""
+    half = float(np.median((band.gain_high - band.gain_low) / (2 * band.gain)))
+    return next((factor for factor in (1, 10, 100) if factor * half >= _SEEN), 1000)
 
 
 def unwrapped_degrees(response: Complex) -> Real:

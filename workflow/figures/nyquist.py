@@ -19,6 +19,7 @@ from workflow.figures.subjects import RunView
 from workflow.text.formats import share
 
 _MOST_ELLIPSES = 220
+_SEEN = 0.01  # of the panel's width: two pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +128,11 @@ def _draw_loop(
     index = np.union1d(index, [loop.nearest])
     polygons = np.stack([edges[index].real, edges[index].imag], axis=-1)
     look: Any = {"facecolors": style.UNCERTAIN, "edgecolors": style.MODEL, "linewidths": 0.4, "alpha": 0.2}
-    label, dense = f"{share(level)} ellipses", polygons.shape[0] * polygons.shape[1] > 6000
+    # Ellipses thinner than a line are not to be found in the picture: no entry of the legend. They are not drawn
+    # enlarged here, where they might seem to reach into the disc.
+    width = np.median(np.ptp(polygons, axis=1).max(axis=-1))
+    label = f"{share(level)} ellipses" if width > _SEEN * (real[1] - real[0]) else "_ellipses"
+    dense = polygons.shape[0] * polygons.shape[1] > 6000
     axes.add_collection(PolyCollection(list(polygons), **look, label=label, rasterized=dense))
     axes.plot(loop.centre.real, loop.centre.imag, **style.PREDICTED_LINE, label="loop at the centres")
     _arrow(axes, loop.centre, real, imag)

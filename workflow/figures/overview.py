@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from workflow.figures import style
-from workflow.figures.bands import envelope, outline, response_band
+from workflow.figures.bands import enlargement, envelope, outline, response_band
 from workflow.figures.nyquist import draw_around_minus_one, loop_of
 from workflow.figures.subjects import MACHINE, RunView
 from workflow.text.formats import share
@@ -20,10 +20,12 @@ def draw_overview(run: RunView) -> Figure:
     spread, loop = run.control.spread, run.loop
     assert loop is not None
     band = response_band(spread.frequency)
+    factor = enlargement(band)
     # Where the ellipse holds the origin the lower end is zero, which a log axis cannot show.
-    low = np.maximum(band.gain_low, 1e-3 * band.gain)
-    label = f"gain over the {share(spread.frequency.level)} ellipses"
-    gain.fill_between(band.omega_rad_s, low, band.gain_high, **style.BAND, label=label)
+    low = np.maximum(band.gain + factor * (band.gain_low - band.gain), 1e-3 * band.gain)
+    high = band.gain + factor * (band.gain_high - band.gain)
+    label = f"{share(spread.frequency.level)} band" + (f", enlarged {factor} times" if factor > 1 else "")
+    gain.fill_between(band.omega_rad_s, low, high, **style.BAND, label=label)
     gain.plot(band.omega_rad_s, band.gain, **style.MODEL_LINE, label="identified response (centre)")
     nominal = np.abs(spread.nominal.frequency_response(band.omega_rad_s))
     dotted = {"color": style.REFERENCE, "lw": 1.0, "ls": (0, (1, 1.5))}

@@ -279,12 +279,39 @@ class RunView:
         return max(float(np.max(np.abs(record.input))) for record in fitted)
 
     @property
+    def lasting_error(self) -> float:
+        """Largest error that the constant disturbance leaves, predicted or in a run."""
+        loop = self.loop
+        if loop is None:
+            return 0.0
+        return max(abs(row.disturbance_left) for row in (loop.predicted, *loop.achieved))
+
+    @property
     def lasting_error_share(self) -> float:
         """Of the reference step that a constant disturbance leaves as error; 0 without tracking."""
         loop = self.loop
         if loop is None or not loop.tracking:
             return 0.0
-        return abs(loop.predicted.disturbance_left) / loop.reference_step
+        return self.lasting_error / loop.reference_step
+
+    @property
+    def damped_mode(self) -> tuple[ModelMode, Mode | None] | None:
+        """The slowest lightly damped mode that is fed back, and what the loop makes of it.
+
+        Of the nominal closed-loop modes within a fifth of its frequency the least damped one, else the nearest
+        within an octave; None where the loop has none there (its modes end at a damping ratio of 0.4).
+        """
+        light = [mode for _, mode in self.control.light]
+        if not light or self.certificate is None:
+            return None
+        mode = min(light, key=lambda found: found.omega_rad_s)
+        loops = [p.closed_loop_modes for p in self.certificate.plants if p.plant == self.plant.name]
+        octaves = {found: abs(np.log2(found.omega_rad_s / mode.omega_rad_s)) for found in sum(loops, ())}
+        near = [found for found, away in octaves.items() if away < np.log2(1.2)]
+        within = [found for found, away in octaves.items() if away < 1]
+        if near:
+            return mode, min(near, key=lambda found: found.zeta)
+        return mode, min(within, key=lambda found: octaves[found], default=None)
 
     @cached_property
     def loop_grid(self) -> Real:

@@ -42,7 +42,7 @@ def write_report(
         title=config.run.title or config.run.name,
         run=view,
         study=study,
-        summary=summarise(results, config),
+        certified=summarise(results, config).certified,
     )
     run.figures_path.mkdir(exist_ok=True)
     files = {

@@ -403,5 +403,5 @@ const open = () => {
 };
 addEventListener("hashchange", open);
 open();
-addEventListener("beforeprint", () => document.querySelectorAll("section > details").forEach(part => part.open = true));
+addEventListener("beforeprint", () => document.querySelectorAll("details").forEach(part => part.open = true));
 })();
