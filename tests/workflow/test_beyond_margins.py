@@ -80,9 +80,11 @@ def test_shares_of_sampled_responses_have_wilson_intervals(count, total, expecte
 def test_words_of_the_achievable_performance():
     found = achievable(0.8)
     words = said("any_order", found, 0.88, 4)
-    assert "is 0.88 with this controller of order 4: 10 % above the 0.8 that" in words
+    # The bound of the hull is 0.798: 9.3 % of 0.88 lie above it.
+    assert "order 4 reaches γ = 0.88 (needed: 1 or less); a higher order can gain at most 9.3 %" in words
+    assert "gains nothing" in said("any_order", found, 0.79, 4)
     assert bracket_numbers(found, 0.88)["above_percent"] == pytest.approx(10.0)
-    assert "known to reach gamma 0.8" in said("any_order", found, float("inf"), 4)
+    assert "some controller of a higher order reaches γ = 0.8" in said("any_order", found, float("inf"), 4)
     assert said("any_order", AchievablePerformance(), 0.88, 4) == ""
 
 
@@ -161,8 +163,8 @@ def test_without_calibration_the_ellipses_keep_their_level(monkeypatch):
     assert "calibrate = true" in said("calibration", kept.sampled)
     assert "certified over ellipses of 99 %" in said("calibration", raised.sampled)
     standing = environment().get_template("certificate.j2").module
-    assert "joint level: sampled" in standing.not_checked(kept.certificate, sampled=True)
-    assert "joint level: the ellipses hold" in standing.not_checked(kept.certificate)
+    assert "all frequencies together: checked on models" in standing.not_checked(kept.certificate, sampled=True)
+    assert "all frequencies together: the ellipses hold" in standing.not_checked(kept.certificate)
 
 
 def test_calibration_is_designed_for(monkeypatch):
@@ -183,7 +185,7 @@ def test_calibration_is_designed_for(monkeypatch):
     options = CertificateOptions.model_validate({"calibrate": True})
     rng, how = np.random.default_rng(1), SynthesisOptions()
     jointly_said = find_design([plant()], spec(), how, options, rng).jointly
-    assert jointly_said == "2 of 10000 sampled responses unstable (enough are stable)"
+    assert jointly_said == "2 of 10000 models drawn from the posterior are unstable (enough are stable)"
     assert find_design([exact], spec(), how, options, rng).jointly is None
     kept = CertificateOptions.model_validate({})
     assert find_design([plant()], spec(), how, kept, rng).jointly is None
@@ -195,7 +197,7 @@ def test_words_of_sampled_responses():
         return said("sampled", found, joint_numbers(found))
 
     found = sampled_responses(0.9)
-    assert "of 1000 responses sampled" in words(found)
+    assert "of 1000 models drawn from the posterior" in words(found)
     assert "99 % stay within the worst case" in words(found)
     assert "98.17 % to 99.46 % with 95 % confidence" in words(found)
     assert "100 % give a stable loop" in words(found)
@@ -216,7 +218,7 @@ def test_what_cannot_be_drawn_says_why():
         controller(), [exact], spec(), CertificateOptions.model_validate({}), np.random.default_rng(1)
     )
     assert found.certificate.joint is None
-    assert "no uncertainty is stated" in said("sampled", found.sampled, {})
+    assert "no uncertainty is specified" in said("sampled", found.sampled, {})
 
 
 def test_model_of_a_corner_is_a_power_of_a_lag():

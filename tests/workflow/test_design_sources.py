@@ -142,7 +142,7 @@ def test_design_says_how_far_it_is_from_any_order_and_brings_its_reference_filte
     assert found["files"] == [str(out), str(beside)]
     assert np.array_equal(ReferenceFilter.from_json(beside.read_text()).A, filtered["A"])
     table = {row["label"]: row["value"] for row in answer.document()["table"]}
-    assert "that a controller of any order is known to reach" in table["achievable performance"]
+    assert "lower bound for any order" in table["controller order"]
     assert "times smaller" in table["model matching"]
 
 

@@ -60,7 +60,7 @@ def pictures(name: str = "hub", unit: str = "V") -> Mapping[str, Figure]:
         patch.setattr(rendering, "embedded", lambda name, *_: rendering.Drawn(name, Markup("<img>")))
         view = RunView(settings, run, "", run.run.manifest())
         page = rendering.render_page(
-            "report.html.j2", title="", run=view, study=False, summary=summarise(run, settings)
+            "report.html.j2", title="", run=view, study=False, certified=summarise(run, settings).certified
         )
     asked = settings.specification
     curves = sensitivity_curves(example.plant(), example.controller(), asked, OMEGA, input_unit=unit)

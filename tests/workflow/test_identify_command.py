@@ -180,7 +180,7 @@ def test_commands_beyond_what_the_amplifier_gives_are_taken_as_that(flexlink, un
     for key in ("modes", "real_poles_z", "fit_estimation_percent"):
         assert str(numbers["commanded"][key]).replace("commanded", "given") == str(numbers["given"][key])
     cut = int(np.sum(np.abs(u) > 1.5))
-    told = f"{cut} samples of the commanded input went beyond the 1.5 V that the amplifier gives"
+    told = f"{cut} samples of the command exceeded the amplifier's 1.5 V"
     assert told in Page(page.read_text(encoding="utf-8")).text
     assert any(told in row["value"] for row in found["commanded"]["table"])
     # That the input stands at a limit is no doubt where it was stated.
@@ -311,7 +311,7 @@ def test_a_log_in_milliseconds_gives_the_poles_of_the_same_log_in_seconds(flexli
     told_ms = told["milliseconds"]
     assert told_ms["milliseconds"] == "time column 'Zeit [ms]': milliseconds, sampled every 5 ms, 3 s"
     assert (told_ms["input"], told_ms["output"]) == ("'u_V' in V", "'tip_m' in m")
-    assert told["stated"]["stated"] == "time column 't': milliseconds as stated, sampled every 5 ms, 3 s"
+    assert told["stated"]["stated"] == "time column 't': milliseconds as given, sampled every 5 ms, 3 s"
 
 
 def test_integers_called_seconds_are_doubted(flexlink, tmp_path):
@@ -324,7 +324,7 @@ def test_integers_called_seconds_are_doubted(flexlink, tmp_path):
     document = flexlink(*command).document()
     assert "--time-unit ms" in document["numbers"]["warnings"][0]
     (said,) = [row["value"] for row in document["table"] if row["label"] == "log"]
-    assert said == "time column 't': seconds (no unit stated), sampled every 5 s, 3000 s"
+    assert said == "time column 't': seconds (no unit given), sampled every 5 s, 3000 s"
     document = flexlink(*command, "--time-unit", "s").document()
     assert not any("--time-unit" in sentence for sentence in document["numbers"]["warnings"])
 

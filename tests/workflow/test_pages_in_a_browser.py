@@ -15,6 +15,7 @@ import pytest
 from plant import paper_link
 from tests.browser import PROGRAM, Browser
 from tests.workflow import report_examples as example
+from tests.workflow.page_shape import shape_faults
 from workflow.figures.bode import draw_bode
 from workflow.figures.poles import draw_poles
 from workflow.report import rendering
@@ -31,7 +32,7 @@ PAGE = """
 {% extends "base.html.j2" %}
 {% from "macros.html.j2" import section, figure with context %}
 {% block body %}
-{% call section("shown", "Shown", "Shown") %}
+{% call section("shown", "Shown", "Shown", open=true) %}
 {% call figure("bode") %}A response.{% endcall %}
 {% call figure("poles") %}Its poles.{% endcall %}
 {% endcall %}
@@ -183,8 +184,24 @@ def test_report_of_a_run(browser, faults_seen, tmp_path):
     path = write_report(RunResults(run), settings)
     assert faults_seen(path) == []
     assert path.stat().st_size < 1_000_000
-    browser.open(path, 1280, 800)
-    assert browser.ask("document.documentElement.scrollHeight") < 12 * 800  # as it opens
+    # Two channels of one made-up model say the same of themselves.
+    settings = example.config(channels=1)
+    path = write_report(RunResults(example.build_run(tmp_path / "one", settings)), settings)
+    assert shape_faults(browser, path, screens=5) == []
+
+
+def test_the_shape_of_a_page_is_measured(browser, tmp_path):
+    """Every fault is found on a page that has them all."""
+    path = tmp_path / "long.html"
+    words = "The same six words are here. " * 160
+    tall = '<div class="plot"><svg style="display:block;height:5000px"></svg></div>'
+    bullets = f"<ul class='bullets'>{'<li>x</li>' * 6}</ul>"
+    headline = f"<p class='headline' style='line-height:20px'>{'verdict ' * 90}</p>"
+    path.write_text(f"<!DOCTYPE html><body><h1>x</h1>{headline}{tall}<p>{words}</p>{bullets}")
+    faults = "; ".join(shape_faults(browser, path, screens=5))
+    for fault in ("screens", "words, at most", "more than a line", "picture ends", "0 numbers", "6 bullets"):
+        assert fault in faults
+    assert "said twice: the same six words are here" in faults
 
 
 def test_page_of_a_planned_experiment(faults_seen, tmp_path):

@@ -43,7 +43,7 @@ def test_a_pair_that_is_no_mode_says_so_and_has_no_truth():
     true = [truth.TrueMode(frequency_Hz=hertz, damping=0.01) for hertz in (7.6, 33.0)]
     matched = truth.beside(found, true)
     assert matched == (None, true[0], None, None)
-    none = "slow or overdamped pair (no mode)"
+    none = "slow or overdamped pair"
     assert [said("pair_kind", found, mode) for mode in found.modes] == [none, "mode", "mode", none]
     assert said("true_mode", matched, 1) == "true of the linear arm 7.6 Hz, damping 0.01"
     assert said("true_mode", matched, 2) == said("true_mode", (), 0) == ""
