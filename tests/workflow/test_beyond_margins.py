@@ -163,7 +163,9 @@ def test_without_calibration_the_ellipses_keep_their_level(monkeypatch):
     assert "calibrate = true" in said("calibration", kept.sampled)
     assert "certified over ellipses of 99 %" in said("calibration", raised.sampled)
     standing = environment().get_template("certificate.j2").module
-    assert "all frequencies together: checked on models" in standing.not_checked(kept.certificate, sampled=True)
+    assert "all frequencies together: checked on models" in standing.not_checked(
+        kept.certificate, sampled=True
+    )
     assert "all frequencies together: the ellipses hold" in standing.not_checked(kept.certificate)
 
 

@@ -340,7 +340,7 @@ def test_page_tells_of_any_order_whole_responses_and_reference_filter(tmp_path, 
     run = example.build_run(tmp_path / "run", settings)
     text = text_of(run, settings)
     gamma = RunResults(run).design.gamma
-    # Made up: 0.797 is the bound for any order, and the worst case of the ellipses holds for 990 of 1000 draws.
+    # Made up: the bound for any order, and a worst case of the ellipses that holds for 990 of 1000 draws.
     assert f"Order 1 reaches γ = {gamma:.3g} (needed: 1 or less); a higher order" in text
     assert "(lower bound for any order: 0.798)" in text
     assert "any order 0.8 such a controller is known" in text

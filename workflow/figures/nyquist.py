@@ -128,8 +128,8 @@ def _draw_loop(
     index = np.union1d(index, [loop.nearest])
     polygons = np.stack([edges[index].real, edges[index].imag], axis=-1)
     look: Any = {"facecolors": style.UNCERTAIN, "edgecolors": style.MODEL, "linewidths": 0.4, "alpha": 0.2}
-    # Ellipses thinner than a line are not to be found in the picture: no entry of the legend. They are not drawn
-    # enlarged here, where they might seem to reach into the disc.
+    # Ellipses thinner than a line cannot be seen: no entry of the legend. Enlarged they might seem to reach
+    # into the disc.
     width = np.median(np.ptp(polygons, axis=1).max(axis=-1))
     label = f"{share(level)} ellipses" if width > _SEEN * (real[1] - real[0]) else "_ellipses"
     dense = polygons.shape[0] * polygons.shape[1] > 6000

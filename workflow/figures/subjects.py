@@ -298,8 +298,8 @@ class RunView:
     def damped_mode(self) -> tuple[ModelMode, Mode | None] | None:
         """The slowest lightly damped mode that is fed back, and what the loop makes of it.
 
-        Of the nominal closed-loop modes within a fifth of its frequency the least damped one, else the nearest
-        within an octave; None where the loop has none there (its modes end at a damping ratio of 0.4).
+        Of the nominal closed-loop modes within a fifth of its frequency the least damped one, else the
+        nearest within an octave. None where there is none: the list ends at a damping ratio of 0.4.
         """
         light = [mode for _, mode in self.control.light]
         if not light or self.certificate is None:
