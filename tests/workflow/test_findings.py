@@ -12,6 +12,7 @@ STORED = Path(__file__).parent / "data" / "findings.txt"
 VALUES = {
     "in_header": "s",
     "dt_s": 1.0,
+    "own_s": 0.013,
     "a": 0.9999999,
     "integrators": 0,
     "omega_rad_s": 12.3456,
