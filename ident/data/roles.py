@@ -82,10 +82,12 @@ def is_time(table: Table, name: str) -> bool:
 
 
 def _is_signal(table: Table, name: str) -> bool:
-    try:
-        return not is_time(table, name) and bool(np.ptp(table.columns([name])[name]) > 0)
-    except ValueError:
+    if is_time(table, name):
         return False
+    try:
+        return bool(np.ptp(table.columns([name])[name]) > 0)
+    except ValueError:
+        return True  # not left out for another one in silence: who takes it is told what is wrong with it
 
 
 def _says(table: Table, name: str, unit: re.Pattern[str], word: re.Pattern[str]) -> bool:

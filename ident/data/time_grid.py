@@ -49,7 +49,10 @@ def sampling_time(
         raise ValueError(f"{table.path}: dt_s must be a positive number of seconds; got {dt_s}")
     if stamps is None:
         if dt_s is None:
-            raise ValueError(f"{table.path}: give the time column or dt_s; the file has {table.listed()}")
+            raise ValueError(
+                f"{table.path}: give the time column or dt_s (--time NAME or --dt-s SECONDS); the file has "
+                f"{table.listed()}"
+            )
         return float(dt_s)
     table.increasing(stamps, name)
     interval = np.diff(stamps)
