@@ -231,6 +231,9 @@ def look(
         str | None, typer.Option(help="Name of the time column [default: what looks like it]")
     ] = None,
     time_unit: Annotated[str | None, typer.Option(help="Unit of the time column, as in identify.")] = None,
+    decimal: Annotated[
+        str | None, typer.Option(help="What separates decimals in text: point or comma.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Write a page here (HTML, one file).")] = None,
     time_limit: TimeLimit = None,
     as_json: Json = False,
@@ -239,7 +242,7 @@ def look(
     need(log)
     from workflow.commands.look import look as look_at_log
 
-    _show(look_at_log(log, time=time, time_unit=time_unit, out=out), as_json)
+    _show(look_at_log(log, time=time, time_unit=time_unit, decimal=decimal, out=out), as_json)
 
 
 @app.command(short_help="Identify one channel from log files; one-page report.")
@@ -259,7 +262,7 @@ def identify(
     time_unit: Annotated[
         str | None,
         typer.Option(
-            help="Unit of the time column: s, ms, us, ns, min, h [default: as in its name ('t_ms', "
+            help="Unit of the time column: s, ms, us, ns, min, h, d [default: as in its name ('t_ms', "
             "'Zeit [ms]'), else s]"
         ),
     ] = None,
@@ -282,6 +285,14 @@ def identify(
     resample_s: Annotated[
         float | None,
         typer.Option(help="Put all rows on a coarser grid of this step [s], where stamps keep to none."),
+    ] = None,
+    unwrap: Annotated[
+        list[str] | None,
+        typer.Option(help="COLUMN=PERIOD of a column that wraps: encoder=4096, angle_deg=360 (repeatable)."),
+    ] = None,
+    decimal: Annotated[
+        str | None,
+        typer.Option(help="What separates decimals in text: point or comma [default: as the numbers say]"),
     ] = None,
     report_page: Annotated[
         Path | None,
@@ -422,6 +433,8 @@ def identify(
             units=_named("--unit", unit),
             repair=repair,
             resample_s=resample_s,
+            unwrap={name: _number("--unwrap", text) for name, text in _named("--unwrap", unwrap).items()},
+            decimal=decimal,
             reference=reference,
             input_limit=input_limit,
         )

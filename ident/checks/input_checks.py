@@ -174,8 +174,10 @@ def clipped(records: Sequence[Record]) -> list[Finding]:
             ("output", record.output, record.output_names),
         ):
             share = clipped_share(signal[:, 0])
-            # An input that stands at the amplifier's limit because that is known is no doubt.
-            if share > 0 and not (kind == "input" and record.cut):
+            # An input that stands at the amplifier's limit because that is known is no doubt, nor are means
+            # of a binary one.
+            known = record.cut or (record.repair is not None and record.repair.own_s)
+            if share > 0 and not (kind == "input" and known):
                 found.append(
                     finding(FindingKind.CLIPPED, record=record.label, signal=kind, name=names[0], share=share)
                 )

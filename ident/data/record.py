@@ -10,11 +10,12 @@ from typing import Self, TypeVar
 import numpy as np
 
 from ident.data.arrays import RealArray, readonly
-from ident.data.finding import Finding
+from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record_files import read_table
 from ident.data.table import LARGEST, Table
 from ident.data.time_grid import CoarseGrid, Repair, TimeGrid, sampling_time
 from ident.data.units import TimeColumn
+from ident.data.wrapping import unwrapped, wraps_at
 
 T = TypeVar("T")
 
@@ -40,6 +41,7 @@ class Record:
         What the file's time stamps were taken for; None where dt_s was given without any.
     repair : Repair or None. What was done to rows that jittered or were missing.
     cut : int. Samples of the commanded input beyond what the amplifier gives (`limited`).
+    notes : tuple of Finding. What else there is to know of how the file was read.
 
     Raises ValueError if a shape or a name does not fit, dt_s is not positive, or a sample is not finite or
     above 1e100 (names the first one).
@@ -59,6 +61,7 @@ class Record:
     time_column: TimeColumn | None = None
     repair: Repair | None = None
     cut: int = 0
+    notes: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         for key in ("input_names", "output_names", "reference_names", "input_units", "output_units"):
@@ -110,7 +113,8 @@ class Record:
         """What to know of the time base before trusting a frequency."""
         column, repair = self.time_column, self.repair
         found = [column.doubt(self.dt_s)] if column is not None and column.doubtful else []
-        return (*found, *([repair.finding(self.label, self.dt_s)] if repair is not None else []))
+        repaired = [repair.finding(self.label, self.dt_s)] if repair is not None else []
+        return (*found, *repaired, *self.notes)
 
     @property
     def n_samples(self) -> int:
@@ -197,6 +201,8 @@ class Record:
         units: Mapping[str, str] | None = None,
         repair: bool = False,
         resample_s: float | None = None,
+        unwrap: Mapping[str, float] | None = None,
+        decimal: str | None = None,
     ) -> Self:
         """Read columns of a log file, or of a table that is there; readers: `ident.data.record_files`.
 
@@ -206,9 +212,11 @@ class Record:
         `output_units`. scale, offset, units: by column, quantity = scale * column + offset in that unit.
         repair: stamps that jitter, and single missing rows, are put on a uniform grid (`TimeGrid`), not
         refused. resample_s: all rows are put on a grid of this step, not shorter than the log's own
-        (`CoarseGrid`), whatever repair says. Raises ValueError in one line naming file and place.
+        (`CoarseGrid`), whatever repair says. unwrap: by column, the period at which its readings wrap (4096,
+        360), before scale and offset. decimal: the sign that separates decimals in text, 'point' or 'comma',
+        where the numbers leave a doubt. Raises ValueError in one line naming file and place.
         """
-        table = path if isinstance(path, Table) else read_table(path)
+        table = (path if isinstance(path, Table) else read_table(path)).with_decimal(decimal)
         for key, names in (("inputs", inputs), ("outputs", outputs), ("references", references)):
             if isinstance(names, str):
                 raise ValueError(
@@ -226,14 +234,32 @@ class Record:
             raise ValueError(
                 f"{table.path}: column {both[0]!r} is asked for as input and output; expected two"
             )
-        columns = table.columns(wanted if time is None else [time, *wanted])
-        stamps, base = (None, None) if time is None else table.seconds(time, columns[time], time_unit)
-        scale, offset, units = scale or {}, offset or {}, units or {}
-        for item in (*scale, *offset, *units):
+        if table.sparse and time is None:
+            raise ValueError(
+                f"{table.path}: columns have rows of their own (other cells are empty); name the time column "
+                "(--time)"
+            )
+        # Of a text table the rows of the output: what drives it is held, as in a bag.
+        base = outputs[0] if table.sparse else None
+        columns = table.columns(wanted if time is None else [time, *wanted], base)
+        stamps, time_column = (None, None) if time is None else table.seconds(time, columns[time], time_unit)
+        scale, offset, units, unwrap = scale or {}, offset or {}, units or {}, unwrap or {}
+        for item in (*scale, *offset, *units, *unwrap):
             if item not in wanted:
                 raise ValueError(
-                    f"{table.path}: scale, offset or unit of column {item!r}, which is not used as a signal"
+                    f"{table.path}: scale, offset, unit or unwrap of column {item!r}, which is not used as a "
+                    "signal"
                 )
+        doubtful = list[Finding]()
+        for item, period in unwrap.items():
+            if not (np.isfinite(period) and period > 0):
+                raise ValueError(f"{table.path}: column {item!r} wraps at a positive number; got {period}")
+            columns[item], longest = unwrapped(columns[item], period)
+            if longest:
+                doubtful.append(
+                    finding(FindingKind.LONG_STEPS, record=str(table.path), name=item, share=longest)
+                )
+        notes = (*doubtful, *reading_notes(table, columns, inputs, outputs))
         grid: TimeGrid | CoarseGrid | None = None
         if resample_s is not None:
             if time is None or stamps is None or dt_s is not None:
@@ -269,9 +295,32 @@ class Record:
             input_units=stated(inputs),
             output_units=stated(outputs),
             source=str(table.path),
-            time_column=base,
+            time_column=time_column,
             repair=None if grid is None else grid.repair,
+            notes=notes,
         )
+
+
+def reading_notes(
+    table: Table, columns: Mapping[str, RealArray], inputs: Sequence[str], outputs: Sequence[str]
+) -> tuple[Finding, ...]:
+    """What is said of the way a file was read; columns: inputs and outputs as they are used."""
+    found, record = list[Finding](), str(table.path)
+    if table.layout is not None and table.layout.commented:
+        first = table.layout.skipped[0]
+        found.append(
+            finding(FindingKind.SKIPPED_ROWS, record=record, rows=table.layout.commented, line=first)
+        )
+    if table.sparse:
+        others = [name for name in inputs if not np.array_equal(table.clocks[name], table.clocks[outputs[0]])]
+        found += [finding(FindingKind.HELD, record=record, name=name, output=outputs[0]) for name in others]
+    for name in (*inputs, *outputs):
+        if units := table.contradiction(name):
+            found.append(finding(FindingKind.UNIT_CONTRADICTED, record=record, name=name, units=units))
+    for name in outputs:
+        if period := wraps_at(columns[name]):
+            found.append(finding(FindingKind.WRAPS, record=record, name=name, period=period))
+    return tuple(found)
 
 
 def in_groups(items: Iterable[T], alike: Callable[[T, T], bool]) -> list[list[T]]:

@@ -12,11 +12,14 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ident.data.foreign_files import LARGEST_BYTES, content_of, distinct, npz_arrays, read_in_child, shown
 from ident.data.json_columns import json_columns
 from ident.data.mat_files import mat_variables
 from ident.data.table import Table
-from ident.data.text_tables import read_text, text_of
+from ident.data.text_tables import Layout, read_text, text_of
+from ident.data.units import says_time
 
 Reader = Callable[[Path, bytes], Table]
 READERS: dict[str, Reader] = {}
@@ -64,7 +67,11 @@ def _unpacked(content: bytes) -> bytes:
     return unpacked
 
 
-@reads(".csv", ".tsv", ".txt", ".dat", ".asc")
+# A column with values in fewer of the rows has rows of its own.
+_OWN_ROWS = 0.8
+
+
+@reads(".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm")
 def _read_text(file: Path, content: bytes) -> Table:
     """A text table; its layout is found from the lines (`text_tables`)."""
     try:
@@ -72,7 +79,34 @@ def _read_text(file: Path, content: bytes) -> Table:
     except ValueError as error:
         raise ValueError(f": {error}") from None
     layout, columns = read_text(text)
-    return Table(file, columns, layout.first, layout, layout.units)
+    return _text_table(file, layout, columns)
+
+
+def _text_table(file: Path, layout: Layout, columns: Mapping[str, tuple[str, ...]]) -> Table:
+    """Stamps made from a stated start and step, where a scope writes these instead, and columns that have
+    rows of their own."""
+    raw, units = dict[str, Any](columns), dict(layout.units)
+    n_rows = len(next(iter(columns.values())))
+    if layout.increment is not None:
+        start, step = layout.increment
+        counted = next((name for name, unit in units.items() if unit.lower() == "sequence"), None)
+        given = [name for name in raw if (says_time(name) or units.get(name) == "s") and any(raw[name])]
+        name = counted or next((n for n in raw if units.get(n) == "s" and not any(raw[n])), "time")
+        # Rows that were skipped would be missing in it: then nobody knows the time.
+        if (counted is not None or not given) and not layout.skipped:
+            raw[name], units[name] = start + step * np.arange(n_rows), "s"
+    raw = {name: cells for name, cells in raw.items() if not isinstance(cells, tuple) or any(cells)}
+    table = Table(file, raw, layout.first, layout, units)
+    filled = {name: [k for k, cell in enumerate(cells) if cell] for name, cells in columns.items()}
+    ends = {name: rows for name, rows in filled.items() if rows and len(rows) < n_rows}
+    # An empty cell now and then is a reading that is missing; empty cells at the end are of a shorter vector.
+    own = any(len(rows) <= _OWN_ROWS * n_rows and rows[-1] - rows[0] >= len(rows) for rows in ends.values())
+    if not own or n_rows < 10:
+        return table
+    kept = {name: rows for name, rows in filled.items() if rows}
+    raw = {name: tuple(columns[name][k] for k in rows) for name, rows in kept.items()}
+    clocks = {name: np.array(rows, dtype=np.float64) for name, rows in kept.items()}
+    return replace(table, raw=raw, clocks=clocks)
 
 
 @reads(".npz")
@@ -121,7 +155,7 @@ def _read_xlsx(file: Path, content: bytes) -> Table:
     found = {title: one for title, one in found.items() if 10 * rows[title] >= max(rows.values())}
     if len(found) == 1:
         ((layout, columns),) = found.values()
-        return Table(file, columns, layout.first, layout, layout.units)
+        return _text_table(file, layout, columns)
     named = {
         f"{title}/{name}": column for title, (_, table) in found.items() for name, column in table.items()
     }

@@ -10,9 +10,8 @@ import numpy as np
 
 from ident.data.foreign_files import shown
 from ident.data.table import Table
-from ident.data.units import TIME_UNITS
+from ident.data.units import TIME_UNITS, ends_with_time, says_time
 
-_TIME = re.compile(r"(t|time|zeit|timestamp|zeitstempel|elapsed)(?![a-z])", re.IGNORECASE)
 _INPUT = re.compile(
     r"(u|v|input|command|cmd|drive|voltage|spannung|current|strom|torque|moment|force)(?![a-z])", re.I
 )
@@ -43,7 +42,7 @@ def roles_of(table: Table, log: str, **stated: str | None) -> Roles:
     closed loop: it lists all columns, and says what to type.
     """
     moving = [name for name in table.names if _is_signal(table, name)]
-    time = stated.get("time") or _only([name for name in table.names if is_time(table, name)])
+    time = stated.get("time") or time_of(table)
     rest = [name for name in moving if name not in (time, *stated.values())]
     wished = [name for name in rest if _WISHED.search(name)]
     inputs = _not_in(wished, [name for name in rest if _says(table, name, _DRIVEN, _INPUT)])
@@ -55,15 +54,21 @@ def roles_of(table: Table, log: str, **stated: str | None) -> Roles:
     )
     if input_ is not None and output is not None and input_ != output and not wished:
         return Roles(time, input_, output)
-    options = [
-        ("--input", input_ or next(iter(inputs), "NAME")),
-        ("--output", output or next(iter(outputs), "NAME")),
-    ]
+    listed = shown(", ".join(shown(name, 30) for name in table.names), 90)
+    if outputs and not inputs and not stated.get("input") and set(rest) <= {*outputs, *wished}:
+        raise ValueError(
+            f"{table.path}: no column looks like an input; it has {listed}. A model needs what drives the "
+            f"machine (in V, A, N or Nm): record it too, or name it: flexlink identify {log} --input NAME"
+        )
+    # Of several that fit, two different ones.
+    first = input_ or next((name for name in inputs if name != output), "NAME")
+    second = output or next((name for name in [*outputs, *inputs] if name != first), "NAME")
+    options = [("--input", first), ("--output", second)]
     reference = stated.get("reference") or _only(wished)
     options += [("--reference", reference)] if reference else []
-    options += [("--time", time)] if time else [("--dt-s", "SECONDS")]
+    times = [] if time else times_in(table)
+    options += [("--time", time or times[0])] if time or times else [("--dt-s", "SECONDS")]
     command = " ".join(f"{option} {shlex.quote(shown(value, 30))}" for option, value in options)
-    listed = shown(", ".join(shown(name, 30) for name in table.names), 90)
     raise ValueError(f"{table.path}: which columns? It has {listed}; type: flexlink identify {log} {command}")
 
 
@@ -78,7 +83,30 @@ def _only(names: list[str]) -> str | None:
 
 def is_time(table: Table, name: str) -> bool:
     """Whether a column looks like time: dates, a unit of time, or its name."""
-    return table.is_clock(name) or _TIME.match(name) is not None or table.unit(name).lower() in TIME_UNITS
+    if table.is_clock(name) or says_time(name):
+        return True
+    unit = TIME_UNITS.get(table.unit(name).lower(), "")
+    # A suffix is no unit for certain: pos_min is a minimum.
+    return bool(unit) and (unit not in ("min", "h") or not name.lower().endswith(f"_{unit}"))
+
+
+def times_in(table: Table) -> list[str]:
+    """The columns that look like time; of several those that increase."""
+    found = [name for name in table.names if is_time(table, name)]
+    found = found or [name for name in table.names if ends_with_time(name) and _increases(table, name)]
+    return found if len(found) < 2 else [name for name in found if _increases(table, name)] or found
+
+
+def time_of(table: Table) -> str | None:
+    """The one column that looks like time, if there is one."""
+    return _only(times_in(table))
+
+
+def _increases(table: Table, name: str) -> bool:
+    try:
+        return bool(np.all(np.diff(table.columns([name])[name]) > 0))
+    except ValueError:
+        return False
 
 
 def _is_signal(table: Table, name: str) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,9 @@ import numpy as np
 
 from ident.data.arrays import RealArray
 from ident.data.foreign_files import as_numbers, shown
-from ident.data.text_tables import Layout, is_number
-from ident.data.time_stamps import StampError, is_stamp, seconds_since_first
-from ident.data.units import TimeColumn, written_unit
+from ident.data.text_tables import Layout, doubtful_groups, is_number, number
+from ident.data.time_stamps import StampError, is_stamp, may_be_minutes, seconds_since_first
+from ident.data.units import SIGNAL_WORDS, TimeColumn, is_unit, written_unit
 
 # Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
 LARGEST = 1e100
@@ -51,16 +52,45 @@ class Table:
     def names(self) -> tuple[str, ...]:
         return tuple(self.raw)
 
-    def place(self, row: int) -> str:
-        return f"index {row}" if self.first_line is None else f"line {row + self.first_line}"
+    def place(self, row: int, name: str | None = None) -> str:
+        if self.first_line is None:
+            return f"index {row}"
+        if name is not None and name in self.clocks:
+            row = int(self.clocks[name][row])
+        return f"line {self.layout.line(row) if self.layout else row + self.first_line}"
+
+    @property
+    def sparse(self) -> bool:
+        """Whether it is a table of text whose columns have rows of their own."""
+        return bool(self.clocks) and self.layout is not None
+
+    def with_decimal(self, sign: str | None) -> Table:
+        """The same text with this decimal sign, then not asked for. Raises ValueError for another."""
+        if sign is None:
+            return self
+        sign = {"point": ".", "comma": ","}.get(sign, sign)
+        if sign not in (".", ","):
+            raise ValueError(f"{self.path}: unknown decimal sign '{shown(sign)}'; expected point or comma")
+        if self.layout is None:
+            raise ValueError(f"{self.path}: a decimal sign is of text; this file holds numbers")
+        return replace(self, layout=replace(self.layout, decimal=sign, stated=True))
 
     def unit(self, name: str) -> str:
         """The unit of a column as the file has it, beside the name or in it; empty if there is none."""
-        return self.units.get(name, "") or written_unit(name)
+        unit = self.units.get(name, "") or written_unit(name)
+        return SIGNAL_WORDS.get(unit.lower(), unit)
 
-    def columns(self, wanted: Sequence[str]) -> dict[str, RealArray]:
+    def contradiction(self, name: str) -> str:
+        """The two units of a signal whose name says another one than the file does beside it, else empty."""
+        beside, written = self.units.get(name, ""), written_unit(name)
+        both = [SIGNAL_WORDS.get(unit.lower(), unit).replace("_", "/").lower() for unit in (beside, written)]
+        known = is_unit(beside) and is_unit(written.replace("/", "_"))
+        return f"{written} and {beside}" if known and both[0] != both[1] else ""
+
+    def columns(self, wanted: Sequence[str], rows_of: str | None = None) -> dict[str, RealArray]:
         """The wanted columns as equally long finite vectors; dates and clock times in seconds. With clocks,
-        on the rows of the first: the others hold what came last, and rows before all have come are left out.
+        on the rows of the first, or of `rows_of`: the others hold what came last, and rows before all have
+        come are left out.
 
         Raises ValueError if one is missing (lists those there are), not numeric, not finite or of another
         length.
@@ -72,19 +102,21 @@ class Table:
                 raise ValueError(f"{self.path}: {columns}; the file has {self.listed(name)}")
         found = {name: self._numbers(name) for name in dict.fromkeys(wanted)}
         if self.clocks:
-            found = self._held(found)
+            found = self._held(found, self.clocks[rows_of or next(iter(found))])
         sizes = {name: column.size for name, column in found.items()}
         if len(set(sizes.values())) > 1:
-            raise ValueError(f"{self.path}: columns must be equally long; got {shown(str(sizes), 160)}")
+            raise ValueError(
+                f"{self.path}: columns must be equally long; got {shown(str(sizes), 160)}: cut them to the "
+                "samples of one time"
+            )
         return found
 
-    def _held(self, found: Mapping[str, RealArray]) -> dict[str, RealArray]:
+    def _held(self, found: Mapping[str, RealArray], base: RealArray) -> dict[str, RealArray]:
         clocks = [self.clocks[name] for name in found]
-        rows = clocks[0] >= max(clock[0] for clock in clocks)
-        came = [np.searchsorted(clock, clocks[0][rows], side="right") - 1 for clock in clocks]
+        rows = base[base >= max(clock[0] for clock in clocks)]
         return {
-            name: values[rows] if clock is clocks[0] else values[last]
-            for (name, values), clock, last in zip(found.items(), clocks, came, strict=True)
+            name: values[np.searchsorted(clock, rows, side="right") - 1]
+            for (name, values), clock in zip(found.items(), clocks, strict=True)
         }
 
     def _alike(self, wanted: str) -> list[str]:
@@ -122,7 +154,7 @@ class Table:
         if values.dtype.kind in "Mm":
             if np.isnat(values).any():
                 row = int(np.argmax(np.isnat(values)))
-                raise ValueError(f"{self.path}, {self.place(row)}: column '{shown(name)}' is empty")
+                raise ValueError(f"{self.path}, {self.place(row, name)}: column '{shown(name)}' is empty")
             values = (values - values[:1]) / np.timedelta64(1, "ns") / 1e9
         return self._finite(name, values.astype(np.float64), values)
 
@@ -133,16 +165,29 @@ class Table:
             if self.is_clock(name):
                 return seconds_since_first(cells)
         except StampError as error:
-            what = f"{self.path}, {self.place(error.row)}: column '{shown(name)}' {error}"
+            what = f"{self.path}, {self.place(error.row, name)}: column '{shown(name)}' {error}"
             raise ValueError(what) from None
         plain = [cell.replace(",", ".") for cell in cells] if decimal == "," else cells
+        self._refuse_doubtful_groups(name, cells)
         try:
-            if not any("_" in cell for cell in cells):  # which Python takes for a separator of digits
+            # Python takes _ for a separator of digits; with a decimal comma a point is no decimal sign.
+            if not any("_" in cell or (decimal == "," and "." in cell) for cell in cells):
                 return np.array(list(map(float, plain)))
         except ValueError:
             pass
-        pairs = zip(cells, plain, strict=True)
-        return np.array([float(p) if is_number(c, decimal) else np.nan for c, p in pairs])
+        return np.array([number(cell, decimal) if is_number(cell, decimal) else np.nan for cell in cells])
+
+    def _refuse_doubtful_groups(self, name: str, cells: tuple[str, ...]) -> None:
+        if self.layout is None or self.layout.stated:
+            return
+        row = doubtful_groups(cells, self.layout)
+        if row is not None:
+            sign = "," if "," in cells[row] else "."
+            raise ValueError(
+                f"{self.path}, {self.place(row, name)}: column '{shown(name, 40)}' is "
+                f"'{shown(cells[row], 20)}': does the '{sign}' separate decimals or thousands? "
+                "State the decimal sign: --decimal point, or --decimal comma"
+            )
 
     def _finite(self, name: str, numbers: RealArray, cells: Any) -> RealArray:
         """The numbers if all are finite; else a complaint that quotes the first that is not."""
@@ -155,7 +200,7 @@ class Table:
             found = f"'{shown(found, 40)}'" if found else "empty"
         sign = " with a decimal comma" if self.layout and self.layout.decimal == "," else ""
         raise ValueError(
-            f"{self.path}, {self.place(row)}: column '{shown(name)}' is {found}; "
+            f"{self.path}, {self.place(row, name)}: column '{shown(name)}' is {found}; "
             f"expected a finite number{sign}{' up to 1e100' if np.isfinite(numbers[row]) else ''}"
         )
 
@@ -163,24 +208,44 @@ class Table:
         """Time stamps in seconds, from the unit stated or written in the header, and what was taken for
         which. Raises ValueError for an unknown unit."""
         if self.is_clock(name):
-            if unit is not None:
-                raise ValueError(f"{self.path}: '{shown(name)}' holds clock times; they have no unit")
-            return stamps, TimeColumn(name, "s", "s")
+            return self._clock_seconds(name, stamps, unit)
         try:
             column = TimeColumn.of(name, unit, self.units.get(name, ""))
+            column.refuse_dates(float(stamps[0]) if stamps.size else 0.0)
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from None
         doubtful = column.doubtful_for(stamps)
         return column.seconds(self._since_first(name, stamps)), replace(column, doubtful=doubtful)
 
+    def _clock_seconds(self, name: str, stamps: RealArray, unit: str | None) -> tuple[RealArray, TimeColumn]:
+        cells = self.raw[name]
+        doubt = isinstance(cells, tuple) and may_be_minutes(cells)
+        if doubt and unit is None:
+            raise ValueError(
+                f"{self.path}: time '{shown(name, 40)}' like '{shown(cells[0], 20)}' may be hours:minutes or "
+                "minutes:seconds; state what comes first: --time-unit h, or --time-unit min"
+            )
+        if unit is not None and not (doubt and unit in ("h", "min")):
+            raise ValueError(f"{self.path}: '{shown(name)}' holds clock times; they have no unit")
+        return (stamps / 60 if unit == "min" else stamps), TimeColumn(name, "s", "s")
+
     def _since_first(self, name: str, stamps: RealArray) -> RealArray:
-        """Stamps; of integers that doubles round, such as nanoseconds since 1970, what passed since the
-        first."""
+        """Stamps; of integers and text with more digits than doubles keep, such as nanoseconds since 1970,
+        what passed since the first."""
         values = self.raw[name]
-        if getattr(values, "dtype", np.dtype(float)).kind not in "iu" or np.abs(stamps).max() <= 2**53:
+        if not isinstance(values, tuple):
+            if getattr(values, "dtype", np.dtype(float)).kind not in "iu" or np.abs(stamps).max() <= 2**53:
+                return stamps
+            # The difference of unsigned integers, taken as signed ones, is right whichever is larger.
+            return np.asarray((values - values[0]).astype(np.int64), dtype=np.float64)
+        if self.clocks or max(map(len, values)) < 16:
             return stamps
-        # The difference of unsigned integers, taken as signed ones, is right whichever is larger.
-        return np.asarray((values - values[0]).astype(np.int64), dtype=np.float64)
+        decimal = self.layout.decimal if self.layout else "."
+        try:
+            exact = [Decimal(cell.replace(decimal, ".")) for cell in values]
+            return np.array([float(value - exact[0]) for value in exact])
+        except InvalidOperation:
+            return stamps
 
     def increasing(self, stamps: RealArray, name: str | None) -> None:
         """Raises ValueError unless there are two time stamps at least, each later than the one before."""

@@ -10,11 +10,11 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ident.data.foreign_files import distinct
 from ident.data.time_stamps import is_stamp
-from ident.data.units import is_unit
+from ident.data.units import is_unit, says_time
 
 LARGEST_TEXT_BYTES = 2**28
 """Of a text file: cells as text take several times as much memory."""
@@ -27,7 +27,24 @@ _KINDS = (
     *(("|", ","), (",", ",")),
 )
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
-_COMMENT = re.compile(r"^\s*(#+|%+|//+)\s*")
+_COMMENT = re.compile(r"^\s*(?:#+|%+|//+|!+|--+(?=\D)|\*+|rem\s)\s*", re.IGNORECASE)
+# Digits in groups of three, by a comma or a point as others write decimals, or by what is neither.
+_GROUPS = {
+    sign: re.compile(
+        rf"[+-]?[1-9]\d{{0,2}}([{other}'’\u00a0\u202f\u2009])\d{{3}}(\1\d{{3}})*({re.escape(sign)}\d*)?"
+    )
+    for sign, other in ((".", ","), (",", "."))
+}
+_GROUP = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
+# A statement of the sampling above the rows: Rigol's tInc = 1e-06 and t0 = -0.005 between the names.
+_START = re.compile(r"(?:t0|x0|start)\b", re.IGNORECASE)
+_INCREMENT = re.compile(
+    r"(?:tinc|xinc|x ?increment|increment|delta[_ ]?[xt]|hresolution|sampl(?:e|ing) (?:interval|period))\b",
+    re.IGNORECASE,
+)
+_UNITS_OF_X = re.compile(r"(?:horizontal|x)[_ ]units?\b|x_dimension\b", re.IGNORECASE)
+_UNITS_OF_Y = re.compile(r"(?:vertical|y)[_ ]unit", re.IGNORECASE)
+_SIGNS = frozenset("#%/!-*rR")
 _NO_TEXT = re.compile(r"[\x00-\x08\x0e-\x1f]")
 
 
@@ -37,7 +54,10 @@ class Layout:
 
     separator: one of , ; tab | or a blank for any run of blanks. decimal: point or comma. names: of the
     columns, numbered where there is no header line. units: by name, of a line of units. header, first: line
-    (from 1) of the names, 0 where there are none, and of the first row.
+    (from 1) of the names, 0 where there are none, and of the first row. skipped: lines from there on that are
+    no rows: commented out, or blank; commented: how many of them are commented out. increment: (start, step)
+    of the rows in seconds, where the lines above say so. plain: whether the decimal sign separates no groups
+    of digits for certain; stated: whether the user says which it is.
     """
 
     separator: str
@@ -46,6 +66,18 @@ class Layout:
     units: dict[str, str]
     header: int
     first: int
+    skipped: tuple[int, ...] = ()
+    commented: int = 0
+    increment: tuple[float, float] | None = None
+    plain: bool = True
+    stated: bool = False
+
+    def line(self, row: int) -> int:
+        """The line of a row, which is counted from 0."""
+        line = self.first + row
+        for skipped in self.skipped:
+            line += skipped <= line
+        return line
 
 
 def text_of(content: bytes) -> str:
@@ -82,19 +114,34 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
     if not lines:
         raise ValueError(": the file is empty; expected a header line and rows of numbers")
     layout = _layout(lines[:_SAMPLE], len(lines))
-    body = lines[layout.first - 1 :]
+    first = layout.first - 1
+    commented = [k for k in range(first, len(lines)) if _is_comment(lines[k])]
+    blank = [k for k in range(first, len(lines)) if not lines[k].strip()]
+    # Behind every row they are a line end too many (written twice by some programs); one alone may be a
+    # sample that is missing.
+    double = 2 * len(blank) >= len(lines) - first - len(commented) - 2
+    skipped = {*commented, *(blank if double else ())}
+    body = [line for k, line in enumerate(lines[first:], first) if k not in skipped]
     if not body:
         raise ValueError(": no rows under the header line; expected numbers")
+    found = tuple(k + 1 for k in sorted(skipped))
+    layout = replace(layout, skipped=found, commented=len(commented))
     rows, width = _rows(body, layout.separator), len(layout.names)
     lengths = set(map(len, rows))
     if max(lengths) > width:
         for k, row in enumerate(rows):
             if any(row[width:]):
-                raise ValueError(_ragged(k + layout.first, len(row), layout.header, width, layout.separator))
+                raise ValueError(_ragged(layout.line(k), len(row), layout.header, width, layout.separator))
             del row[width:]
     if min(lengths) < width:
         for row in rows:
             row.extend([""] * (width - len(row)))
+    sure = (layout.separator, layout.decimal) == (",", ".") or any(
+        layout.decimal in cell and is_number(cell, layout.decimal) and not _GROUP.fullmatch(cell)
+        for row in rows
+        for cell in row
+    )
+    layout = replace(layout, plain=sure)
     return layout, dict(zip(layout.names, zip(*rows, strict=True), strict=True))
 
 
@@ -110,7 +157,11 @@ def _layout(lines: Sequence[str], n_lines: int) -> Layout:
 
 @dataclass(frozen=True)
 class _Fit:
-    """How well a separator and a decimal sign fit: first of all there must be as many names as numbers."""
+    """How well a separator and a decimal sign fit: first of all there must be as many names as numbers.
+
+    first: of the lines that look like a row; start: of those that begin the table, a row that is followed by
+    another one, with no word where the others hold numbers.
+    """
 
     separator: str
     decimal: str
@@ -120,11 +171,13 @@ class _Fit:
     most: int = 0
     share: float = 0.0
     first: int = 0
+    start: int = 0
 
     @classmethod
     def of(cls, lines: Sequence[str], separator: str, decimal: str) -> _Fit:
         rows = _rows(lines, separator)
-        filled = [row for row in rows[-100:] if any(_is_value(cell, decimal) for cell in row)]
+        live = [k for k, row in enumerate(rows) if any(row) and not _is_comment(lines[k])]
+        filled = [rows[k] for k in live[-100:] if any(_is_value(cell, decimal) for cell in rows[k])]
         if not filled:
             return cls(separator, decimal, lines, rows)
         most = Counter(map(len, filled)).most_common(1)[0][0]
@@ -136,61 +189,138 @@ class _Fit:
         cells = sum(1 for row in usual for cell in row if cell)
         if not typical or (most == 1 and separator != ";"):
             return cls(separator, decimal, lines, rows)
-        first = next(
-            k
-            for k, row in enumerate(rows)
-            if len(row) == most and 2 * sum(_is_value(cell, decimal) for cell in row) >= typical
-        )
-        return cls(separator, decimal, lines, rows, least, most, sum(numbers) / cells, first)
+
+        def looks(row: list[str]) -> bool:
+            return len(row) == most and 2 * sum(_is_value(cell, decimal) for cell in row) >= typical
+
+        first = next(k for k in live if looks(rows[k]))
+        columns = [[row[k] for row in usual if row[k]] for k in range(most)]
+        numeric = [2 * sum(_is_value(cell, decimal) for cell in column) > len(column) for column in columns]
+
+        def fits(row: list[str]) -> bool:
+            known = zip(row, numeric, strict=False)
+            return looks(row) and all(_is_value(x, decimal) for x, is_numeric in known if is_numeric and x)
+
+        pairs = zip(live, [*live[1:], live[-1]], strict=True)
+        start = next((k for k, after in pairs if fits(rows[k]) and fits(rows[after])), first)
+        return cls(separator, decimal, lines, rows, least, most, sum(numbers) / cells, first, start)
 
     @property
     def score(self) -> tuple[bool, float, int]:
-        above = self._above(self.first)
+        above = self._above(self.start)
         matches = not above or any(self._names_at(k) is not None for k in above)
         return bool(self.share) and matches, self.share, self.least
 
     def _above(self, row: int) -> list[int]:
-        """The next lines above that are not blank; of names there may be a faulty row in between."""
-        return [k for k in range(row - 1, -1, -1) if any(self.rows[k])][:3]
+        """The next three lines above that are not blank, and comments between them that are no rows; of names
+        there may be a faulty row in between."""
+        found, lines = list[int](), 0
+        for k in range(row - 1, -1, -1):
+            comment = _is_comment(self.lines[k])
+            if any(self.rows[k]) and not (comment and self._has_value(k)):
+                found.append(k)
+                lines += not comment
+            if lines == 3:
+                break
+        return found
 
     def _has_value(self, row: int) -> bool:
         return any(_is_value(cell, self.decimal) for cell in self.rows[row])
 
-    def _names_at(self, row: int) -> list[str] | None:
-        """The cells of a line, if they can be the names of the columns."""
+    def _names_at(self, row: int, numbered: bool = False) -> list[str] | None:
+        """The cells of a line, if they can be the names of the columns; numbered: channels 1, 2, ... too."""
         cells = self.rows[row]
         if self.separator == " " and len(cells) > self.most:  # names of several words
-            cells = re.split(r"\s{2,}|\t", self.lines[row].strip())
+            cells = re.split(r"\s{2,}|\t", _COMMENT.sub("", self.lines[row]).strip())
         cells = cells[: len(cells) - _empty_at_end(cells)]
         words = sum(bool(cell) and not _is_value(cell, self.decimal) for cell in cells)
+        if numbered and cells and all(re.fullmatch(r"\d{1,3}", cell) for cell in cells[1:]):
+            words = len(cells)
         return cells if self.least <= len(cells) <= self.most and 2 * words > len(cells) else None
 
+    def _header(self) -> int | None:
+        """The line of the names: the nearest; a comment only where it says time, or no other line will do."""
+        found = [k for k in self._above(self.start) if self._names_at(k) is not None]
+        live = [k for k in found if not _is_comment(self.lines[k])]
+        if not live or not found:
+            return found[0] if found else None
+        for k in found:
+            if k == live[0] or self._has_value(live[0]) or any(map(says_time, self._names_at(k) or [])):
+                return k
+        return live[0]
+
     def layout(self) -> Layout:
-        above = self._above(self.first)
-        header = next((k for k in above if self._names_at(k) is not None), None)
+        above, header = self._above(self.start), self._header()
         if header is None:
             named = next((k for k in above if len(self.rows[k]) > 1 and not self._has_value(k)), None)
-            if named is not None:
+            if named is not None and named + 1 < len(self.rows):
                 there, cells = (len(self.rows[k]) - _empty_at_end(self.rows[k]) for k in (named, named + 1))
                 raise ValueError(_ragged(named + 2, cells, named + 1, there, self.separator))
             numbered = tuple(f"column {k + 1}" for k in range(self.least))
             return Layout(self.separator, self.decimal, numbered, {}, 0, self.first + 1)
         names, units, below = self._names_at(header) or [], list[str](), header + 1
         over = self._above(header)[:1]
-        if over and _are_units(names) and (longer := self._names_at(over[0])) is not None:
+        longer = self._names_at(over[0], numbered=True) if over else None
+        if longer is not None and self._are_units(names):
             units, names, header = names, longer, over[0]
-        while not any(self.rows[below]):
+        elif longer is not None and self._are_units(longer):
+            units = longer  # of some loggers they stand above the names
+        while not any(self.rows[below]) and below + 1 < len(self.rows):
             below += 1
         columns = distinct([name or f"column {k + 1}" for k, name in enumerate(names)])
-        known = {name: unit.strip("[]() ") for name, unit in zip(columns, units, strict=False)}
-        return Layout(self.separator, self.decimal, tuple(columns), known, header + 1, below + 1)
+        pairs = zip(columns, units, strict=False)
+        known = {name: unit.strip("[](){} ") for name, unit in pairs if not _is_value(unit, self.decimal)}
+        known = {name: unit for name, unit in known.items() if unit not in ("", "-", "1")}
+        beside = {columns[k]: unit for k, unit in self._units_above(header).items() if k < len(columns)}
+        sampling = self._increment(header, columns, units)
+        separator, decimal = self.separator, self.decimal
+        return Layout(
+            separator, decimal, tuple(columns), beside | known, header + 1, below + 1, increment=sampling
+        )
+
+    def _are_units(self, cells: Sequence[str]) -> bool:
+        """Whether most words of a line are units; numbers are no words (Rigol's start and step)."""
+        words = [cell for cell in cells if cell and not (cell != "1" and _is_value(cell, self.decimal))]
+        known = [
+            bool(re.fullmatch(r"[\[(].*[\])]|-|1|sequence", cell, re.I)) or is_unit(cell) for cell in words
+        ]
+        return 2 * sum(known) > len(words)
+
+    def _units_above(self, header: int) -> dict[int, str]:
+        """Units that lines above the names state with a word before them, by column."""
+        found = dict[int, str]()
+        for row in self.rows[:header]:
+            if _UNITS_OF_X.match(row[0]) and len(row) > 1:
+                found[0] = "s" if row[1].lower() == "time" else row[1]
+            elif _UNITS_OF_Y.match(row[0]):
+                found |= {k: unit for k, unit in enumerate(row) if k and is_unit(unit)}
+        return found
+
+    def _increment(
+        self, header: int, names: Sequence[str], units: Sequence[str]
+    ) -> tuple[float, float] | None:
+        """Start and step of the rows [s], as oscilloscopes state them beside or above the names."""
+        told = list(zip(names, units, strict=False))
+        told += [(name, value) for name, _, value in (cell.partition("=") for cell in names) if value]
+        told += [(row[0], row[1]) for row in self.rows[:header] if len(row) > 1]
+        values = [(name.strip(), value.strip()) for name, value in told if is_number(value, self.decimal)]
+
+        def of(pattern: re.Pattern[str]) -> float | None:
+            return next((number(value, self.decimal) for name, value in values if pattern.match(name)), None)
+
+        step, start = of(_INCREMENT), of(_START)
+        return (start or 0.0, step) if step is not None and step > 0 else None
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip()[:1] in _SIGNS and _COMMENT.match(line) is not None
 
 
 def _rows(lines: Sequence[str], separator: str) -> list[list[str]]:
     """The cells of every line, without blanks around them; of comment lines without the sign."""
     if separator == " ":
         return [_blanks(_COMMENT.sub("", line)) for line in lines]
-    plain = [_COMMENT.sub("", line) if line[:1] in "#%/" else line for line in lines]
+    plain = [_COMMENT.sub("", line) if _is_comment(line) else line for line in lines]
     if not any('"' in line for line in plain):
         return [[cell.strip() for cell in line.split(separator)] for line in plain]
     try:
@@ -216,6 +346,8 @@ def _empty_at_end(row: Sequence[str]) -> int:
 def is_number(cell: str, decimal: str) -> bool:
     """Whether the cell is a number with this decimal sign; blanks around it do no harm."""
     text = cell.strip()
+    if _GROUPS[decimal].fullmatch(text):
+        return True
     if decimal == ",":
         if "." in text:
             return False
@@ -223,13 +355,33 @@ def is_number(cell: str, decimal: str) -> bool:
     return _NUMBER.fullmatch(text) is not None
 
 
+def number(cell: str, decimal: str) -> float:
+    """The number in a cell for which `is_number` holds; digits in groups of three are one number."""
+    text = cell.strip()
+    grouped = _GROUPS[decimal].fullmatch(text)
+    return float((text.replace(grouped[1], "") if grouped else text).replace(",", "."))
+
+
+def doubtful_groups(cells: Sequence[str], layout: Layout) -> int | None:
+    """The first row of a column whose commas, or points, may be decimal or separate groups of three digits:
+    '1,020' beside '898'. None where the column says which ('1,020.5', '1,020,300', '0,125')."""
+    decimal = layout.decimal
+    other = "," if decimal == "." else "."
+    rows = [k for k, cell in enumerate(cells) if other in cell]
+    if rows:
+        return rows[0] if all(_GROUP.fullmatch(cells[k]) for k in rows) else None
+    if layout.plain:
+        return None
+    rows = [k for k, cell in enumerate(cells) if decimal in cell]
+    if rows and all(_GROUP.fullmatch(cells[k]) for k in rows):
+        whole = [cell for cell in cells if cell and decimal not in cell]
+        if whole and all(re.fullmatch(r"[+-]?\d{1,3}", cell) for cell in whole):
+            return rows[0]
+    return None
+
+
 def _is_value(cell: str, decimal: str) -> bool:
     return is_number(cell, decimal) or is_stamp(cell)
-
-
-def _are_units(cells: Sequence[str]) -> bool:
-    known = [bool(re.fullmatch(r"[\[(].*[\])]|-|1|", cell)) or is_unit(cell) for cell in cells]
-    return 2 * sum(known) > len(cells)
 
 
 def _ragged(line: int, cells: int, header: int, names: int, separator: str) -> str:

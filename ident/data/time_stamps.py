@@ -1,7 +1,8 @@
 """Dates and clock times as logs write them, in seconds since the first of them.
 
 ISO 8601 ('2024-03-01T12:00:00.25Z', with a blank for the T and slashes for the dashes as well), '01.03.2024
-12:00:00,250', '3/1/2024 1:02:03.5 PM', and '12:00:00.250' without a day, which may pass midnight.
+12:00:00,250', '3/1/2024 1:02:03.5 PM', and '12:00:00.250' without a day, which may pass midnight; '01:02.5'
+is minutes and seconds, and of '12:30' alone nobody knows (`may_be_minutes`).
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from ident.data.arrays import RealArray
 from ident.data.foreign_files import shown
 
 _DAY = r"(?:(\d{4})([-/])(\d\d?)\2(\d\d?)|(\d\d?)([./])(\d\d?)\6(\d{4}))"
-_CLOCK = r"(\d\d?):(\d\d)(?::(\d\d)(?:[.,](\d{1,9}))?)?\s*([AaPp][Mm])?"
+_CLOCK = r"(\d{1,4}):(\d\d)(?::(\d\d))?(?:[.,](\d{1,9}))?\s*([AaPp][Mm])?"
 _ZONE = r"(?:Z|([+-])(\d\d):?(\d\d))"
 _STAMP = re.compile(rf"(?:{_DAY}(?:T|\s+|$))?(?:{_CLOCK})?\s*{_ZONE}?")
 _DAY_NS = 86_400 * 10**9
+_MINUTES_NS = 3600 * 10**9
 
 
 def is_stamp(cell: str) -> bool:
@@ -36,22 +38,41 @@ def seconds_since_first(cells: Sequence[str]) -> RealArray:
         if found is None:
             raise StampError(f"is '{shown(cell)}'; expected a date or time like '{shown(cells[0])}'", row)
         matches.append(found)
+    minutes = _are_minutes(matches)
     month_first = _month_first(matches)
     days: dict[str, int] = {}
     nanoseconds = []
     for row, found in enumerate(matches):
         try:
-            nanoseconds.append(_nanoseconds(found, month_first, days))
+            nanoseconds.append(_nanoseconds(found, month_first, days, minutes))
         except ValueError as error:
             raise StampError(f"is '{shown(cells[row])}', no possible date or time ({error})", row) from None
     if not any(found[1] or found[5] for found in matches):
+        around = _MINUTES_NS if minutes else _DAY_NS
         passed, since = 0, [nanoseconds[0]]
         for before, now in pairwise(nanoseconds):
-            passed += _DAY_NS if before - now > _DAY_NS // 2 else 0
+            passed += around if before - now > around // 2 else 0
             since.append(now + passed)
         nanoseconds = since
     # The difference in whole nanoseconds first: doubles hold dates to a fraction of a microsecond only.
     return np.array([now - nanoseconds[0] for now in nanoseconds], dtype=np.float64) / 1e9
+
+
+def may_be_minutes(cells: Sequence[str]) -> bool:
+    """Whether stamps are like '12:30', hours and minutes or minutes and seconds, and none tells which;
+    `seconds_since_first` takes hours."""
+    matches = [found for cell in cells if (found := _matched(cell)) is not None]
+    return bool(matches) and all(map(_has_two_parts, matches)) and not _are_minutes(matches)
+
+
+def _has_two_parts(found: re.Match[str]) -> bool:
+    return bool(found[9] and not (found[11] or found[13] or found[1] or found[5]))
+
+
+def _are_minutes(matches: Sequence[re.Match[str]]) -> bool:
+    """Whether clock times of two parts are minutes and seconds: only seconds have a fraction, and no day has
+    more than 24 hours."""
+    return all(map(_has_two_parts, matches)) and any(found[12] or int(found[9]) > 23 for found in matches)
 
 
 class StampError(ValueError):
@@ -64,7 +85,7 @@ class StampError(ValueError):
 
 def _matched(cell: str) -> re.Match[str] | None:
     text = cell.strip()
-    found = _STAMP.fullmatch(text) if 4 < len(text) < 60 else None
+    found = _STAMP.fullmatch(text) if 3 < len(text) < 60 else None
     return found if found is not None and (found[1] or found[5] or found[9]) else None
 
 
@@ -78,13 +99,18 @@ def _month_first(matches: Sequence[re.Match[str]]) -> bool:
     return True
 
 
-def _nanoseconds(found: re.Match[str], month_first: bool, days: dict[str, int]) -> int:
+def _nanoseconds(found: re.Match[str], month_first: bool, days: dict[str, int], minutes: bool) -> int:
     hour, minute, second = (int(found[k] or 0) for k in (9, 10, 11))
+    if minutes:
+        hour, minute, second = hour // 60, hour % 60, minute
+    elif found[12] and not found[11]:
+        raise ValueError("hours, minutes and seconds")
     if found[13]:
         if not 1 <= hour <= 12:
             raise ValueError("12-hour clock")
         hour = hour % 12 + (12 if found[13].lower() == "pm" else 0)
-    if hour > 23 or minute > 59 or second > 60:
+    # What passed since the start, without a day, may be more than one.
+    if (hour > 23 and (found[1] or found[5])) or minute > 59 or second > 60:
         raise ValueError("hours to 23, minutes and seconds to 59")
     zone = 0
     if found[14]:

@@ -6,39 +6,157 @@ Time is converted to seconds; every other signal keeps its unit, which is carrie
 from __future__ import annotations
 
 import re
+import unicodedata
 from dataclasses import dataclass
 
 import numpy as np
 
 from ident.data.arrays import RealArray
 from ident.data.finding import Finding, FindingKind, finding
+from ident.data.foreign_files import shown
 
 # Units per second, or seconds per unit. Both are integers, so that 2 [ms] becomes the very double that 0.002
 # is: division by an exact number is rounded once.
 _PER_SECOND = {"s": 1, "ms": 1000, "us": 10**6, "ns": 10**9}
-_SECONDS_PER = {"min": 60, "h": 3600}
+_SECONDS_PER = {"min": 60, "h": 3600, "d": 86400}
 _SPELLED = {
-    "s": "s sec secs second seconds sek sekunde sekunden",
-    "ms": "ms msec millisecond milliseconds millisekunden",
-    "us": "us µs μs usec microsecond microseconds mikrosekunden",
-    "ns": "ns nsec nanosecond nanoseconds nanosekunden",
-    "min": "min minute minutes minuten",
-    "h": "h hr hour hours stunden",
+    "s": "s sec secs second seconds sek sekunde sekunden seconde secondes segundo segundos secondi с сек 秒",
+    "ms": "ms msec msecs millis millisec millisecs millisecond milliseconds millisekunde millisekunden "
+    "millisecondes milisegundos millisecondi мс 毫秒",
+    "us": "us µs μs usec usecs micros microsec microsecs microsecond microseconds mikrosekunde mikrosekunden "
+    "microsecondes microsegundos microsecondi мкс 微秒",
+    "ns": "ns nsec nsecs nanos nanosec nanosecs nanosecond nanoseconds nanosekunde nanosekunden",
+    "min": "min mins minute minutes minuten minuto minutos мин",
+    "h": "h hr hrs hour hours stunde stunden heure heures hora horas",
+    "d": "days tage",
 }
 TIME_UNITS = {spelling: unit for unit, spellings in _SPELLED.items() for spelling in spellings.split()}
-"""The unit of each spelling in lower case; values: s, ms, us, ns, min, h."""
+"""The unit of each spelling in lower case; values: s, ms, us, ns, min, h, d."""
 KNOWN_TIME_UNITS = tuple(_SPELLED)
 
 # Of signals, where no bracket says that it is a unit: a name's last letters must be no other word.
 _SIGNAL = re.compile(
     r"[mukµμM]?(V|A|N|Nm|rad|W|Hz|Pa)|[cmuµμk]?m|deg|rpm|(rad|deg|m|mm)(_s|/s|_s2|/s2|/s\^2|/s²)|°|%"
 )
+# Words for them, as instruments write them in a line of units.
+SIGNAL_WORDS = {
+    **dict.fromkeys(("volt", "volts"), "V"),
+    **dict.fromkeys(("ampere", "amperes", "amp", "amps"), "A"),
+    **dict.fromkeys(("degree", "degrees", "grad"), "deg"),
+    **dict.fromkeys(("radian", "radians"), "rad"),
+    **dict.fromkeys(("newton", "newtons"), "N"),
+}
 _BRACKETED = re.compile(r"\[([^\[\]]*)\]\s*$|\(([^()]*)\)\s*$")
+_BRACKETS = re.compile(r"[\[({<【〔]([^\[\](){}<>【】〔〕]*)[\])}>】〕]")
+# timeMs is time and Ms, TimeUS is Time and US.
+_CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
+_WORD = re.compile(r"[^\W\d_]+")
+_GLUED = re.compile(r"(?:t|time|timestamp)((?:[mun]|milli|micro|nano)s(?:ecs?|econds?)?|secs?|seconds?)")
+# A number just before a word, or behind it: 0.1 ms, 100us, sec/1000; not that of a word, as in t0 ms.
+_FACTOR = re.compile(
+    r"(?<![^\W_])(?<![.,])\d[\d.,]*(?:e[+-]?\d+)?\s*[x*·]?\s*([^\W\d_]+)|([^\W\d_]+)\s*[/x*·^]\s*\d",
+    re.IGNORECASE,
+)
+_TIME_WORD = re.compile(
+    r"t|ts|time|zeit|uhrzeit|timestamps?|zeitstempel|zeitpunkt|elapsed|clock|stamp|temps|tiempo|tempo|date|datum|"
+    r"datetime|время|时间|時間"
+)
+# What stands beside these and says nothing of the unit.
+_NO_UNIT = re.compile(
+    r"in|of|to|by|at|on|up|no|nr|id|ch|io|pc|ab|is|since|start|begin|epoch|unix|posix|utc|gmt|ce?s?t|local|rel|abs|"
+    r"relative|absolute|from|seit|beginn|log|host|sys|system|boot|trigger|raw|the|a|and|hh|mm|ss|hhmmss|day"
+)
+# Counts of something whose length nobody has said, and units of time that are not known.
+_COUNTS = re.compile(
+    r"ticks?|counts?|cycles?|samples?|frames?|steps?|jiffies|index|idx|sequence|takte?|zykl(?:en|us)|weeks?|"
+    r"months?|years?|picosec\w*|[cdkpf]s"
+)
 _AFTER = re.compile(r"\sin\s+(\S+)\s*$|^\w+\s*/\s*(\w+)\s*$")
 
 # A log of more samples than this, with steps of at least so many seconds, is rather one in milliseconds.
 _MANY_SAMPLES = 1000
 _LONG_STEP_S = 0.5
+# Seconds since 1970 of the years 2001 and 2100: stamps in between, in whatever unit, are dates.
+_DATES_S = (978_307_200.0, 4_102_444_800.0)
+# No clock counts 3000 years.
+_NO_CLOCK_S = 1e11
+
+
+@dataclass(frozen=True)
+class UnitEvidence:
+    """What a file says of the unit of a time column, in its name and beside it.
+
+    unit: the one known unit, or empty. unclear: why it has to be asked for, or empty: units that contradict
+    each other, or a word that may be a unit and is none that is known. Neither: the file says nothing.
+    """
+
+    unit: str = ""
+    unclear: str = ""
+
+    @classmethod
+    def of(cls, name: str, beside: str = "") -> UnitEvidence:
+        """beside: the unit that the file gives outside of the name, as in a line of units."""
+        name, beside = (unicodedata.normalize("NFKC", text).strip() for text in (name, beside))
+        texts = [beside.strip("[](){}<> "), *_BRACKETS.findall(name)]
+        said, strange = dict[str, str](), ""
+        for text in (text for text in texts if _WORD.search(text)):
+            words = [word.lower() for word in _words(text)]
+            units = ["d"] if words == ["d"] else [TIME_UNITS[word] for word in words if word in TIME_UNITS]
+            known = units or all(_TIME_WORD.fullmatch(word) or _NO_UNIT.fullmatch(word) for word in words)
+            if not known or (units and re.search(r"\d", text)):
+                strange = strange or text
+            said |= dict.fromkeys(units, text)
+        outside = _BRACKETS.sub(" ", name)
+        words = [word.lower() for word in _words(outside)]
+        if any(word.lower() in TIME_UNITS for found in _FACTOR.findall(outside) for word in found):
+            strange = strange or outside.strip()
+        units = [TIME_UNITS[word] for word in words if word in TIME_UNITS]
+        if not units and not said and not strange:
+            # After the word for time a short one is rather a unit than a name: t_m, time_cs.
+            strange = next(
+                (
+                    word
+                    for k, word in enumerate(words)
+                    if _COUNTS.fullmatch(word)
+                    or (k and len(word) <= 2 and not (_TIME_WORD.fullmatch(word) or _NO_UNIT.fullmatch(word)))
+                ),
+                "",
+            )
+        for unit in units:
+            said.setdefault(unit, name)
+        if strange:
+            return cls(unclear=f"unknown unit '{strange}'")
+        if len(said) > 1:
+            return cls(unclear=f"contradicting units {' and '.join(said)}")
+        return cls(next(iter(said), ""))
+
+
+def _words(text: str) -> list[str]:
+    """The words of a name, without digits; a unit that is glued to the word for time is one of its own."""
+    found = []
+    for part in _CAMEL.split(text):
+        for word in _WORD.findall(part.replace("_", " ")):
+            glued = _GLUED.fullmatch(word.lower())
+            found += ["t", glued[1]] if glued else [word]
+    return found
+
+
+def says_time(name: str) -> bool:
+    """Whether a name is one of time: 'Zeit', '__time', 'timeMs', 'millis', 'us since start'."""
+    words = [word.lower() for word in _words(unicodedata.normalize("NFKC", name))]
+    return bool(words) and (
+        _TIME_WORD.fullmatch(words[0]) is not None
+        or (
+            all(word in TIME_UNITS or _NO_UNIT.fullmatch(word) or _COUNTS.fullmatch(word) for word in words)
+            and any(word in TIME_UNITS for word in words)
+        )
+    )
+
+
+def ends_with_time(name: str) -> bool:
+    """Whether a name may be one of time: 'host_time', 'rosbagTimestamp', but also 'cycle_time'."""
+    words = [word.lower() for word in _words(name)]
+    return bool(words) and re.fullmatch(r"time|timestamp|stamp|zeit|clock", words[-1]) is not None
 
 
 @dataclass(frozen=True)
@@ -65,22 +183,40 @@ class TimeColumn:
     @classmethod
     def of(cls, name: str, stated: str | None = None, beside: str = "") -> TimeColumn:
         """stated: by the user; beside: by the file, outside of the name. Raises ValueError (one line) for a
-        unit that nobody knows."""
+        unit that is not known, or where the file contradicts itself, unless it is stated."""
+        evidence = UnitEvidence.of(name, beside)
         if stated is not None:
-            if stated.lower() not in TIME_UNITS:
+            unit = TIME_UNITS.get(stated.lower(), stated.lower())
+            if unit not in KNOWN_TIME_UNITS:
                 raise ValueError(f"unknown unit of time '{stated}'; expected {', '.join(KNOWN_TIME_UNITS)}")
-            unit = TIME_UNITS[stated.lower()]
-            return cls(name, unit, TIME_UNITS.get(written_unit(name).lower(), ""), stated=True)
-        # 'time ms', or just 'ms': no unit in the name of any other signal, but of time it is.
-        last = re.split(r"[\s_./]", name.strip())[-1]
-        written = beside or written_unit(name) or (last if last.lower() in TIME_UNITS else "")
-        known = TIME_UNITS.get(written.lower(), "")
-        if written and not known and (beside or _BRACKETED.search(name)):
+            return cls(name, unit, evidence.unit, stated=True)
+        if evidence.unclear:
             raise ValueError(
-                f"time column '{name}': unknown unit '{written}'; expected {', '.join(KNOWN_TIME_UNITS)}, "
-                "or state it with --time-unit (time_unit)"
+                f"time column '{shown(name, 60)}': {shown(evidence.unclear, 60)}; expected "
+                f"{', '.join(KNOWN_TIME_UNITS)}: state it with --time-unit (time_unit), or give --dt-s "
+                "SECONDS instead of --time"
             )
-        return cls(name, known or "s", known)
+        return cls(name, evidence.unit or "s", evidence.unit)
+
+    def refuse_dates(self, first: float) -> None:
+        """Raise ValueError where stamps that begin with this number are dates of this century in another unit
+        than the one taken, or no time of any clock."""
+        others = [
+            unit
+            for unit in ("s", "ms", "us", "ns")
+            if _DATES_S[0] <= first / _PER_SECOND[unit] <= _DATES_S[1] and unit != self.unit
+        ]
+        if not self.stated and first > 0 and float(self.seconds(np.array(first))) > _NO_CLOCK_S:
+            taken = "no unit is stated" if not self.in_header else f"its unit is said to be {self.unit}"
+            looks = (
+                f"{others[0]} since 1970: state --time-unit {others[0]}"
+                if others
+                else ("another unit: state it with --time-unit, or give --dt-s SECONDS instead of --time")
+            )
+            raise ValueError(
+                f"time column '{shown(self.name, 60)}' begins with {first:.6g}, {taken}; this looks "
+                f"like {looks}"
+            )
 
     def seconds(self, stamps: RealArray) -> RealArray:
         """The stamps in seconds."""
@@ -104,6 +240,7 @@ def written_unit(name: str) -> str:
     Brackets at the end hold a unit whatever they say (a number is an index); after 'in', '/' and an
     underscore only known units count, for other words stand there as well.
     """
+    name = unicodedata.normalize("NFKC", name)
     found = _BRACKETED.search(name)
     if found:
         text = (found[1] if found[1] is not None else found[2]).strip()
@@ -119,4 +256,4 @@ def written_unit(name: str) -> str:
 
 def is_unit(text: str) -> bool:
     """Whether the word is a unit that headers use: of time, or of a signal."""
-    return text.lower() in TIME_UNITS or _SIGNAL.fullmatch(text) is not None
+    return text.lower() in TIME_UNITS or text.lower() in SIGNAL_WORDS or _SIGNAL.fullmatch(text) is not None

@@ -46,20 +46,22 @@ def read_logs(
     units: Mapping[str, str] | None = None,
     repair: bool = False,
     resample_s: float | None = None,
+    unwrap: Mapping[str, float] | None = None,
+    decimal: str | None = None,
     reference: str | None = None,
     input_limit: float | None = None,
 ) -> Logs:
     """One channel of log files; input, output and time that are not named are found where names and units
     leave no doubt.
 
-    scale, offset, units, repair, resample_s: as in `Record.from_file`. time_unit: of the time column, where
-    its name does not say it. reference: column of the reference of logs made in closed loop, for the
-    two-stage method. input_limit: what the amplifier gives at most; larger commands in the logs are taken as
-    that. Raises InputError: one line naming file, column or line.
+    scale, offset, units, repair, resample_s, unwrap, decimal: as in `Record.from_file`. time_unit: of the
+    time column, where its name does not say it. reference: column of the reference of logs made in closed
+    loop, for the two-stage method. input_limit: what the amplifier gives at most; larger commands in the logs
+    are taken as that. Raises InputError: one line naming file, column or line.
     """
     if input_name is None or output_name is None or (time is None and dt_s is None):
         with naming(str(logs[0])):
-            table, log = read_table(logs[0]), shlex.quote(str(logs[0]))
+            table, log = read_table(logs[0]).with_decimal(decimal), shlex.quote(str(logs[0]))
             roles = roles_of(table, log, input=input_name, output=output_name, time=time, reference=reference)
         input_name, output_name = roles.input, roles.output
         time = roles.time if time is None and dt_s is None else time
@@ -78,6 +80,8 @@ def read_logs(
                 units=units,
                 repair=repair,
                 resample_s=resample_s,
+                unwrap=unwrap,
+                decimal=decimal,
                 references=[] if reference is None else [reference],
             )
             return record if input_limit is None else record.limited(input_limit)

@@ -12,14 +12,19 @@ from workflow.text.templates import rows_of, said
 
 
 def look(
-    log: Path, *, time: str | None = None, time_unit: str | None = None, out: Path | None = None
+    log: Path,
+    *,
+    time: str | None = None,
+    time_unit: str | None = None,
+    decimal: str | None = None,
+    out: Path | None = None,
 ) -> RunSummary:
     """Columns, units, sampling, ranges, clipping and quantisation of one log; out: the same as a page.
 
     Raises InputError.
     """
     storage.refuse_in_the_way([log], [] if out is None else [("--out", out)])
-    found = look_at(log, time, time_unit)
+    found = look_at(log, time, time_unit, decimal)
     if out is not None:
         from workflow.report.rendering import render_page  # loads matplotlib: a second
 

@@ -102,7 +102,7 @@ def _not_zero(scale: float) -> float:
 
 
 Scale = Annotated[float, AfterValidator(_not_zero)]
-TimeUnit = Literal["s", "ms", "us", "ns", "min", "h"]
+TimeUnit = Literal["s", "ms", "us", "ns", "min", "h", "d"]
 
 
 class FileRecord(Section):
@@ -153,6 +153,13 @@ class FileSource(Section):
         None,
         gt=0,
         description="put all rows on a coarser grid of this step [s], for stamps that keep to none",
+    )
+    unwrap: Mapping[str, Annotated[float, Field(gt=0)]] = Field(
+        default_factory=dict,
+        description="of a column that wraps, the period: {encoder = 4096}, {angle_deg = 360}; before scale",
+    )
+    decimal: Literal["point", "comma"] | None = Field(
+        None, description="what separates decimals in text; default: as the numbers say"
     )
     records: tuple[FileRecord, ...] = Field(min_length=1)
 

@@ -10,9 +10,11 @@ import numpy as np
 from diagnosis.machine.quantisation_grid import grid_step
 from ident.checks.input_checks import clipped_share
 from ident.data.arrays import RealArray
+from ident.data.finding import Finding, distinct
+from ident.data.record import reading_notes
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response, read_response
-from ident.data.roles import Roles, is_time, roles_of
+from ident.data.roles import Roles, roles_of, times_in
 from ident.data.table import Table
 from ident.data.text_tables import Layout
 from ident.data.time_grid import LARGEST_JITTER, jitter_of, only_rounded, option_for
@@ -70,7 +72,8 @@ class ResponseLook:
 @dataclass(frozen=True, eq=False)
 class LogLook:
     """A log: layout of a text file, time, signals; roles: the channel that its names and units tell, if they
-    do, else `unclear` says what to type. response: what it is where it is no log but a frequency response."""
+    do, else `unclear` says what to type. response: what it is where it is no log but a frequency response.
+    doubts: what identify says of the way the log is read."""
 
     path: Path
     rows: int
@@ -80,16 +83,19 @@ class LogLook:
     roles: Roles | None
     unclear: str
     response: ResponseLook | None = None
+    doubts: tuple[Finding, ...] = ()
 
 
-def look_at(path: Path, time: str | None = None, time_unit: str | None = None) -> LogLook:
+def look_at(
+    path: Path, time: str | None = None, time_unit: str | None = None, decimal: str | None = None
+) -> LogLook:
     """Raises InputError: no such file, another format, damaged, no such column."""
     with naming(str(path)):
-        table = read_table(path)
+        table = read_table(path).with_decimal(decimal)
         if time is not None and time not in table.names:
             table.columns([time])
     response = None if time is not None else _response(table)
-    times = [name for name in table.names if response is None and is_time(table, name)]
+    times = times_in(table) if response is None else []
     time = time or (times[0] if times else None)
     roles, unclear = None, ""
     try:
@@ -98,8 +104,20 @@ def look_at(path: Path, time: str | None = None, time_unit: str | None = None) -
         unclear = str(error)
     columns = tuple(_column(table, name) for name in table.names if name != time)
     rows = max((len(values) for values in table.raw.values() if hasattr(values, "__len__")), default=0)
-    about = None if time is None else _time(table, time, time_unit)
-    return LogLook(path, rows, table.layout, about, columns, roles, unclear, response)
+    about, doubts = None, list[Finding]()
+    if time is not None:
+        # Of a table with rows of their own the stamps of the output's.
+        about, doubts = _time(table, time, time_unit, roles.output if roles and table.sparse else None)
+    for column in columns:
+        if column.values is not None:
+            inputs, outputs = (
+                ([column.name], []) if roles and column.name == roles.input else ([], [column.name])
+            )
+            if table.sparse and inputs and roles is not None:
+                outputs = [roles.output]
+            values = {name: table.columns([name])[name] for name in (*inputs, *outputs)}
+            doubts += reading_notes(table, values, inputs, outputs)
+    return LogLook(path, rows, table.layout, about, columns, roles, unclear, response, distinct(doubts))
 
 
 def _response(table: Table) -> ResponseLook | None:
@@ -114,18 +132,19 @@ def _response(table: Table) -> ResponseLook | None:
     return ResponseLook(omega.size, different.size, float(different[0]), float(different[-1]), spread)
 
 
-def _time(table: Table, name: str, unit: str | None) -> TimeLook:
+def _time(table: Table, name: str, unit: str | None, rows_of: str | None) -> tuple[TimeLook, list[Finding]]:
     try:
-        stamps, column = table.seconds(name, table.columns([name])[name], unit)
+        wanted = [name] if rows_of is None else [name, rows_of]
+        stamps, column = table.seconds(name, table.columns(wanted, rows_of)[name], unit)
         table.increasing(stamps, name)
     except ValueError as error:
-        return TimeLook(name, why=str(error).removeprefix(str(table.path)).lstrip(":, "))
+        return TimeLook(name, why=str(error).removeprefix(str(table.path)).lstrip(":, ")), []
     steps = np.diff(stamps)
     period = float(np.median(steps))
     counts = np.maximum(np.rint(steps / period), 1)
     rounded, jitter = only_rounded(stamps), jitter_of(stamps)
     row = int(np.argmax(steps))
-    return TimeLook(
+    found = TimeLook(
         name,
         column.unit,
         float((stamps[-1] - stamps[0]) / steps.size) if rounded else period,
@@ -136,6 +155,7 @@ def _time(table: Table, name: str, unit: str | None) -> TimeLook:
         table.place(row + 1),
         option_for(stamps),
     )
+    return found, [column.doubt(period)] if column.doubtful else []
 
 
 def _column(table: Table, name: str) -> ColumnLook:

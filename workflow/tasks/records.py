@@ -72,6 +72,8 @@ def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channe
             units=units,
             repair=source.repair,
             resample_s=source.resample_s,
+            unwrap=source.unwrap,
+            decimal=source.decimal,
         )
         if entry.start_sample or entry.stop_sample is not None:
             record = record.slice(entry.start_sample, entry.stop_sample or record.n_samples)

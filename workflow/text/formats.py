@@ -7,6 +7,7 @@ and every sentence, stands in the templates.
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -172,6 +173,7 @@ _NAMED: tuple[Callable[..., Any], ...] = (
     in_decibels, unit, listing, sparkline, count, sentence, yes_no, setting,
 )  # fmt: skip
 FILTERS: Mapping[str, Callable[..., Any]] = {
+    "quoted": shlex.quote,
     **{function.__name__: function for function in _NAMED},
     "fmt": format,
     "ln": math.log,

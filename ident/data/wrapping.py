@@ -1,0 +1,65 @@
+"""Readings that wrap: an encoder's counts after a turn, an angle at 180 degrees, a counter of 16 bits."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.data.arrays import RealArray
+
+# Where readings usually start again: powers of two, turns in degrees, tenths, arc minutes and radians, round
+# numbers of lines of an encoder.
+_PERIODS = tuple(
+    sorted(
+        {
+            *(2.0**k for k in range(8, 33)),
+            *(360.0, 3600.0, 21600.0, 36000.0, 400.0, 6400.0, np.pi, 2 * np.pi, 1.0),
+            *(
+                float(f"{digit}e{k}")
+                for digit in (1, 1.2, 1.44, 1.8, 2, 2.4, 2.5, 3, 4, 5, 6, 7.2, 8)
+                for k in (2, 3, 4, 5)
+            ),
+        }
+    )
+)
+# Steps of a wrapping signal are short, or nearly as long as the range: of those from .4 to .6 of it there are
+# no more than this share of the longer ones. (A sine near the Nyquist frequency has .25, random levels 1.2.)
+_VALLEY = 0.15
+# A signal that switches between two levels, or a spike, is seldom in between.
+_BETWEEN = 0.1
+# Unwrapped, its second differences are smaller by this factor.
+_SMOOTHER = 0.5
+# Steps this close to half a period may go either way.
+_NEARLY_HALF = 0.4
+
+
+def wraps_at(values: RealArray) -> float:
+    """The period at which readings (T,) seem to wrap, 0 where they do not: they jump by nearly their whole
+    range from one to the next, and go on smoothly once they are unwrapped.
+
+    A sawtooth that is meant to be one looks the same. Readings that never came near both ends of their range
+    are not seen.
+    """
+    span = float(np.ptp(values)) if values.size >= 20 else 0.0
+    if not span > 0:
+        return 0.0
+    share = np.abs(np.diff(values)) / span
+    jumps = share > 0.6
+    low = float(values.min())
+    between = float(np.mean((values > low + 0.2 * span) & (values < low + 0.8 * span)))
+    if not jumps.any() or np.sum((share > 0.4) & ~jumps) > _VALLEY * jumps.sum() or between < _BETWEEN:
+        return 0.0
+    # The readings next to a jump are within a step of both ends.
+    step = float(np.quantile(share[~jumps], 0.9)) if not jumps.all() else 0.0
+    whole = bool(np.all(values == np.round(values)))
+    usual = [p for p in _PERIODS if span < p * (1 + 1e-9) <= (1 + 2 * max(step, 1e-3)) * span]
+    period = usual[0] if usual else float(f"{span + 1 if whole else span:.6g}")
+    smooth = np.std(np.diff(np.unwrap(values, period=period), 2))
+    return period if smooth <= _SMOOTHER * np.std(np.diff(values, 2)) else 0.0
+
+
+def unwrapped(values: RealArray, period: float) -> tuple[RealArray, float]:
+    """Readings (T,) that wrap at this period, going on instead; and their longest step as a share of the
+    period where it is so near to half of it that some may go the wrong way, else 0."""
+    found = np.unwrap(values, period=period)
+    longest = float(np.max(np.abs(np.diff(found)), initial=0.0)) / period
+    return found, longest if longest > _NEARLY_HALF else 0.0
