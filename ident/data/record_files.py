@@ -19,7 +19,7 @@ from ident.data.json_columns import json_columns
 from ident.data.mat_files import mat_variables
 from ident.data.table import Table
 from ident.data.text_tables import Layout, read_text, text_of
-from ident.data.units import says_time
+from ident.data.units import TIME_UNITS, says_time
 
 Reader = Callable[[Path, bytes], Table]
 READERS: dict[str, Reader] = {}
@@ -90,7 +90,11 @@ def _text_table(file: Path, layout: Layout, columns: Mapping[str, tuple[str, ...
     if layout.increment is not None:
         start, step = layout.increment
         counted = next((name for name, unit in units.items() if unit.lower() == "sequence"), None)
-        given = [name for name in raw if (says_time(name) or units.get(name) == "s") and any(raw[name])]
+        given = [
+            name
+            for name, cells in raw.items()
+            if any(cells) and (says_time(name) or units.get(name, "").lower() in TIME_UNITS)
+        ]
         name = counted or next((n for n in raw if units.get(n) == "s" and not any(raw[n])), "time")
         # Rows that were skipped would be missing in it: then nobody knows the time.
         if (counted is not None or not given) and not layout.skipped:

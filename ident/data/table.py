@@ -22,6 +22,8 @@ from ident.data.units import SIGNAL_WORDS, TimeColumn, is_unit, written_unit
 
 # Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
 LARGEST = 1e100
+# Larger stamps, as those since 1970, lose digits where they are divided by a unit.
+_LONG_STAMP = 1e9
 # Of a matrix so many columns at most are offered by number.
 _MOST_NUMBERED = 256
 
@@ -231,21 +233,23 @@ class Table:
 
     def _since_first(self, name: str, stamps: RealArray) -> RealArray:
         """Stamps; of integers and text with more digits than doubles keep, such as nanoseconds since 1970,
-        what passed since the first."""
+        what passed since the first; small ones as they are."""
         values = self.raw[name]
-        if not isinstance(values, tuple):
-            if getattr(values, "dtype", np.dtype(float)).kind not in "iu" or np.abs(stamps).max() <= 2**53:
-                return stamps
-            # The difference of unsigned integers, taken as signed ones, is right whichever is larger.
-            return np.asarray((values - values[0]).astype(np.int64), dtype=np.float64)
-        if self.clocks or max(map(len, values)) < 16:
+        if not stamps.size or abs(stamps[0]) < _LONG_STAMP:
             return stamps
-        decimal = self.layout.decimal if self.layout else "."
-        try:
-            exact = [Decimal(cell.replace(decimal, ".")) for cell in values]
-            return np.array([float(value - exact[0]) for value in exact])
-        except InvalidOperation:
-            return stamps
+        if self.clocks:
+            return stamps - stamps[0]
+        if isinstance(values, tuple):
+            decimal = self.layout.decimal if self.layout else "."
+            try:
+                exact = [Decimal(cell.replace(decimal, ".")) for cell in values]
+                return np.array([float(value - exact[0]) for value in exact])
+            except InvalidOperation:
+                return stamps - stamps[0]
+        if getattr(values, "dtype", np.dtype(float)).kind not in "iu":
+            return stamps - stamps[0]
+        # The difference of unsigned integers, taken as signed ones, is right whichever is larger.
+        return np.asarray((values - values[0]).astype(np.int64), dtype=np.float64)
 
     def increasing(self, stamps: RealArray, name: str | None) -> None:
         """Raises ValueError unless there are two time stamps at least, each later than the one before."""

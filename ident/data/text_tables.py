@@ -233,6 +233,8 @@ class _Fit:
         if self.separator == " " and len(cells) > self.most:  # names of several words
             cells = re.split(r"\s{2,}|\t", _COMMENT.sub("", self.lines[row]).strip())
         cells = cells[: len(cells) - _empty_at_end(cells)]
+        if len(cells) == self.most + 1 and cells[-1].lower() == "comment":
+            cells = cells[:-1]  # of LabVIEW, whose rows have none
         words = sum(bool(cell) and not _is_value(cell, self.decimal) for cell in cells)
         if numbered and cells and all(re.fullmatch(r"\d{1,3}", cell) for cell in cells[1:]):
             words = len(cells)
