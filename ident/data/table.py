@@ -238,16 +238,16 @@ class Table:
         if not stamps.size or abs(stamps[0]) < _LONG_STAMP:
             return stamps
         if self.clocks:
-            return stamps - stamps[0]
+            return np.asarray(stamps - stamps[0])
         if isinstance(values, tuple):
             decimal = self.layout.decimal if self.layout else "."
             try:
                 exact = [Decimal(cell.replace(decimal, ".")) for cell in values]
                 return np.array([float(value - exact[0]) for value in exact])
             except InvalidOperation:
-                return stamps - stamps[0]
+                return np.asarray(stamps - stamps[0])
         if getattr(values, "dtype", np.dtype(float)).kind not in "iu":
-            return stamps - stamps[0]
+            return np.asarray(stamps - stamps[0])
         # The difference of unsigned integers, taken as signed ones, is right whichever is larger.
         return np.asarray((values - values[0]).astype(np.int64), dtype=np.float64)
 

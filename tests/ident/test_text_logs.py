@@ -139,7 +139,7 @@ def test_thousands_are_read_or_asked_for(tmp_path, form, decimal, separator):
     lines = [separator.join([f"{5 * k}", f"{2 * (k % 2)}", cell(WHOLE[k])]) for k in K[:70]]
     path = written(tmp_path, separator, names, lines=lines)
     if decimal:
-        with pytest.raises(ValueError, match="decimals or thousands.*--decimal"):
+        with pytest.raises(ValueError, match=r"decimals or thousands.*--decimal"):
             Record.from_file(path, ["u_V"], ["y_counts"], time="t_ms")
     record = Record.from_file(path, ["u_V"], ["y_counts"], time="t_ms", decimal=decimal)
     np.testing.assert_array_equal(record.output[:, 0], WHOLE[:70])
@@ -171,7 +171,7 @@ def test_minutes_and_seconds_are_no_hours_and_minutes(tmp_path, cell, asked, dt_
     path = written(tmp_path, ";", ["Zeit", "u_V", "y_rad"], lines=lines)
     if asked:
         with pytest.raises(
-            ValueError, match="hours:minutes or minutes:seconds.*--time-unit h, or --time-unit min"
+            ValueError, match=r"hours:minutes or minutes:seconds.*--time-unit h, or --time-unit min"
         ):
             Record.from_file(path, ["u_V"], ["y_rad"], time="Zeit")
         assert Record.from_file(path, ["u_V"], ["y_rad"], time="Zeit", time_unit="h").dt_s == 60 * dt_s
@@ -182,10 +182,9 @@ def test_minutes_and_seconds_are_no_hours_and_minutes(tmp_path, cell, asked, dt_
 @pytest.mark.parametrize(("unit", "digits"), [("ms", 3), ("us", 6), ("ns", 9)])
 @pytest.mark.parametrize("name", ["time", "timestamp", "time_s"])
 def test_dates_counted_in_another_unit_are_asked_for(tmp_path, name, unit, digits):
-    lines = [
-        f"{(17_000_000_000_000 + 50 * k) * 10 ** (digits - 4) if digits > 3 else 1_700_000_000_000 + 5 * k},{U[k]},{Y[k]}"
-        for k in map(int, K)
-    ]
+    # Whole numbers: doubles do not hold nanoseconds since 1970.
+    stamps = [1_700_000_000 * 10**digits + 5 * 10 ** (digits - 3) * int(k) for k in K]
+    lines = [f"{stamp},{u},{y}" for stamp, u, y in zip(stamps, U, Y, strict=True)]
     path = written(tmp_path, ",", [name, "u_V", "y_rad"], lines=lines)
     with pytest.raises(ValueError, match=f"since 1970: state --time-unit {unit}"):
         Record.from_file(path, ["u_V"], ["y_rad"], time=name)
