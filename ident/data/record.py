@@ -254,6 +254,11 @@ class Record:
         for item, period in unwrap.items():
             if not (np.isfinite(period) and period > 0):
                 raise ValueError(f"{table.path}: column {item!r} wraps at a positive number; got {period}")
+            if (span := float(np.ptp(columns[item]))) > period * (1 + 1e-6):
+                raise ValueError(
+                    f"{table.path}: column {item!r} spans {span:.9g}, more than the {period:g} at which it "
+                    "is said to wrap"
+                )
             columns[item], longest = unwrapped(columns[item], period)
             if longest:
                 doubtful.append(

@@ -121,4 +121,7 @@ def _is_signal(table: Table, name: str) -> bool:
 def _says(table: Table, name: str, unit: re.Pattern[str], word: re.Pattern[str]) -> bool:
     """What the unit says, where there is one; else what the name does."""
     stated = table.unit(name)
-    return (unit.fullmatch(stated) if stated else word.match(name)) is not None
+    if stated:
+        return unit.fullmatch(stated) is not None
+    # Of a topic, as /cmd/voltage, the last word counts like the first.
+    return any(word.match(part) for part in (name, name.rpartition("/")[2]))

@@ -26,10 +26,14 @@ _PERIODS = tuple(
 _VALLEY = 0.15
 # A signal that switches between two levels, or a spike, is seldom in between.
 _BETWEEN = 0.1
+# Noise spans 7 of its median steps in some thousand samples, a motion many more.
+_MOTION = 12.0
 # Unwrapped, its second differences are smaller by this factor.
 _SMOOTHER = 0.5
 # Steps this close to half a period may go either way.
 _NEARLY_HALF = 0.4
+# A speed that changes by less than this share of a period per sample leaves no doubt: half would.
+_SAME_SPEED = 0.25
 
 
 def wraps_at(values: RealArray) -> float:
@@ -46,20 +50,40 @@ def wraps_at(values: RealArray) -> float:
     jumps = share > 0.6
     low = float(values.min())
     between = float(np.mean((values > low + 0.2 * span) & (values < low + 0.8 * span)))
-    if not jumps.any() or np.sum((share > 0.4) & ~jumps) > _VALLEY * jumps.sum() or between < _BETWEEN:
+    if not jumps.any() or np.sum((share > 0.4) & ~jumps) > _VALLEY * jumps.sum():
         return 0.0
     # The readings next to a jump are within a step of both ends.
     step = float(np.quantile(share[~jumps], 0.9)) if not jumps.all() else 0.0
     whole = bool(np.all(values == np.round(values)))
     usual = [p for p in _PERIODS if span < p * (1 + 1e-9) <= (1 + 2 * max(step, 1e-3)) * span]
     period = usual[0] if usual else float(f"{span + 1 if whole else span:.6g}")
-    smooth = np.std(np.diff(np.unwrap(values, period=period), 2))
+    going_on = np.unwrap(values, period=period)
+    if between < _BETWEEN:
+        # It switches between two levels, or swings about the place where it wraps: then that is a usual one,
+        # and noise is not all that is left.
+        usual_place = min(abs(low), abs(low + period / 2)) <= 2 * max(step * span, 1e-3 * period)
+        usual_step = float(np.median(np.abs(np.diff(going_on))))
+        if not (usual and usual_place and np.ptp(going_on) > _MOTION * usual_step and usual_step > 0):
+            return 0.0
+    smooth = np.std(np.diff(going_on, 2))
     return period if smooth <= _SMOOTHER * np.std(np.diff(values, 2)) else 0.0
 
 
 def unwrapped(values: RealArray, period: float) -> tuple[RealArray, float]:
     """Readings (T,) that wrap at this period, going on instead; and their longest step as a share of the
-    period where it is so near to half of it that some may go the wrong way, else 0."""
+    period where it is so near to half of it that some may go the wrong way, else 0.
+
+    Where steps come near half a period the turn is taken that changes the speed least, if that is by less
+    than a quarter of a period per sample: a machine turns on. It is a guess all the same, and the first step
+    is always the shorter one.
+    """
     found = np.unwrap(values, period=period)
     longest = float(np.max(np.abs(np.diff(found)), initial=0.0)) / period
-    return found, longest if longest > _NEARLY_HALF else 0.0
+    if longest <= _NEARLY_HALF:
+        return found, 0.0
+    going_on = values[0] + np.concatenate([[0.0], np.cumsum(np.unwrap(np.diff(found), period=period))])
+    # Whole turns onto the readings, so that sums do not round these.
+    going_on = values + period * np.round((going_on - values) / period)
+    changes = float(np.max(np.abs(np.diff(going_on, 2)), initial=0.0))
+    found = going_on if changes <= _SAME_SPEED * period else found
+    return found, float(np.max(np.abs(np.diff(found)))) / period

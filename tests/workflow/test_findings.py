@@ -111,6 +111,7 @@ OTHERWISE = {
     "TIME_UNIT": [{"in_header": ""}],
     "REPAIRED": [{"missing": 0}],
     "SKIPPED_ROWS": [{"rows": 1}],
+    "WRAPS": [{"name": "hub angle", "period": 2 * 3.141592653589793}],
     "NUISANCE": [{"needed": False}],
     "INTEGRATORS": [{"accepted": 0}, {"refused": False}],
     "DELAY": [{"other_delay": 1}],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
+from ident.data.finding import FindingKind
 from workflow.engine import codec, storage
 from workflow.tasks.log_look import LogLook, look_at
 from workflow.tasks.summary import RunSummary
@@ -50,6 +51,11 @@ def _next(found: LogLook) -> str:
     options = [f"{option} {shlex.quote(name)}" for option, name in named.items() if name]
     options += [] if roles.time else ["--dt-s SECONDS"]
     options += [found.time.option] if found.time and found.time.option.startswith("--") else []
+    options += [
+        f"--unwrap {shlex.quote(roles.output)}={doubt.values['period']:.17g}"
+        for doubt in found.doubts
+        if doubt.kind is FindingKind.WRAPS and doubt.values["name"] == roles.output
+    ]
     return " ".join(["flexlink identify", shlex.quote(str(found.path)), *options])
 
 

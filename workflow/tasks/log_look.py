@@ -106,8 +106,11 @@ def look_at(
     rows = max((len(values) for values in table.raw.values() if hasattr(values, "__len__")), default=0)
     about, doubts = None, list[Finding]()
     if time is not None:
-        # Of a table with rows of their own the stamps of the output's.
-        about, doubts = _time(table, time, time_unit, roles.output if roles and table.sparse else None)
+        # Of a table with rows of their own the stamps of the output's; where it is not known, of those with
+        # the most.
+        own = [name for name in table.clocks if name != time] if table.sparse else []
+        longest = max(own, key=lambda name: table.clocks[name].size, default=None)
+        about, doubts = _time(table, time, time_unit, roles.output if roles and own else longest)
     for column in columns:
         if column.values is not None:
             inputs, outputs = (
