@@ -26,6 +26,8 @@ _PERIODS = tuple(
 _VALLEY = 0.15
 # A signal that switches between two levels, or a spike, is seldom in between.
 _BETWEEN = 0.1
+# A spike, or a reading that drops out, stands at one level or a few.
+_LEVELS = 5
 # Noise spans 7 of its median steps in some thousand samples, a motion many more.
 _MOTION = 12.0
 # Unwrapped, its second differences are smaller by this factor.
@@ -59,11 +61,15 @@ def wraps_at(values: RealArray) -> float:
     period = usual[0] if usual else float(f"{span + 1 if whole else span:.6g}")
     going_on = np.unwrap(values, period=period)
     if between < _BETWEEN:
-        # It switches between two levels, or swings about the place where it wraps: then that is a usual one,
-        # and noise is not all that is left.
+        # It switches between two levels, drops out, or swings about the place where it wraps: then that is a
+        # usual one, it moves on both sides, and noise is not all that is left.
+        sides = (values[values < low + 0.5 * span], values[values > low + 0.5 * span])
+        moves = min(np.unique(side).size for side in sides) >= _LEVELS
         usual_place = min(abs(low), abs(low + period / 2)) <= 2 * max(step * span, 1e-3 * period)
         usual_step = float(np.median(np.abs(np.diff(going_on))))
-        if not (usual and usual_place and np.ptp(going_on) > _MOTION * usual_step and usual_step > 0):
+        if not (
+            usual and usual_place and moves and np.ptp(going_on) > _MOTION * usual_step and usual_step > 0
+        ):
             return 0.0
     smooth = np.std(np.diff(going_on, 2))
     return period if smooth <= _SMOOTHER * np.std(np.diff(values, 2)) else 0.0

@@ -63,6 +63,7 @@ NO_WRAP = {
         180 * np.sign(np.sin(0.005 * K)), 0.05 * np.exp(-0.01 * K) * np.sin(0.2 * K)
     )[: K.size],
     "a spike": np.where(K == 700, 360.0, np.sin(0.01 * K)),
+    "a sensor that drops out": np.where(K % 500 < 9, 0.0, 4040 + 40 * np.sin(0.01 * K)).round(),
     "a clipped reading": np.clip(8000 * np.sin(0.3 * K) + 2048, 0, 4095).round(),
     "standing still": np.ones(K.size),
 }
