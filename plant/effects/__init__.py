@@ -56,7 +56,7 @@ def parse_effects(entries: Iterable[Mapping[str, Any]]) -> tuple[Effect, ...]:
 def in_words(name: str) -> str:
     """An effect, "none" or "unknown" in a sentence; an effect of one's own by its id without underscores."""
     kind = EFFECTS.get(name) or LOOK_ALIKES.get(name)
-    answers = {"none": "no effect at all", "unknown": "a cause outside the list"}
+    answers = {"none": "no effect at all", "unknown": "none of the candidate effects"}
     return kind.words if kind else answers.get(name, name.replace("_", " "))
 
 

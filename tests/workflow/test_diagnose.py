@@ -18,6 +18,7 @@ from plant import EFFECTS, Rig, parse_effects, simulate
 from plant.effects.joint import GroundSpring
 from tests.workflow.command import finish, kill, start_flexlink, wait_until
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
+from tests.workflow.page_shape import shape_faults
 from workflow.config.run_config import SimulatedSource
 from workflow.diagnose import command, outputs
 from workflow.diagnose.case_files import load_case
@@ -27,13 +28,12 @@ from workflow.engine.errors import InputError, StageError
 from workflow.engine.executor import LocalProcesses, attempt
 
 QUESTIONS = (
-    "Is there a gap beyond noise?",
-    "Where does it lie?",
-    "Which effect, and how sure?",
-    "How far does the gap shrink?",
-    "What remains?",
-    "Which experiment to run next?",
-    "What does it mean for the controller?",
+    "Size of the model error",
+    "Where it lies",
+    "Which effect, and how sure",
+    "What the effects explain",
+    "What remains",
+    "What it means for the controller",
     "What was not checked",
 )
 
@@ -121,8 +121,9 @@ def test_the_page_answers_in_order(files, tmp_path, faults_seen):
     assert faults_seen(tmp_path / "arm.html") == []
     places = [html.index(f"<h2>{question}</h2>") for question in QUESTIONS]
     assert places == sorted(places)
-    assert "The gap comes from dry (Coulomb) friction" in html
-    assert "torque 0.05 N m (95 %: 0.049 to 0.051)" in html
+    assert "The model error comes from dry (Coulomb) friction" in html
+    number = "<dt>Torque, dry (Coulomb) friction</dt><dd>0.05 N m<small>95 %: 0.049 to 0.051</small></dd>"
+    assert number in html
     cells = re.sub("<td[^>]*>", "<td>", html)
     assert "<td>torque</td><td>0.05 N m</td><td>0.049 to 0.051</td>" in cells
     assert "<td>coulomb_friction</td>" not in cells
@@ -132,12 +133,17 @@ def test_the_page_answers_in_order(files, tmp_path, faults_seen):
     ).lower().replace("nan m", "")
 
 
+def test_the_first_screen_of_a_diagnosis(files, tmp_path, browser):
+    (tmp_path / "arm.html").write_bytes(files["arm.html"])
+    assert shape_faults(browser, tmp_path / "arm.html", screens=5) == []
+
+
 @pytest.mark.parametrize(
     ("engine", "words"),
     [
-        (KnownAnswer((), "none", "none"), "No gap beyond sensor noise"),
-        (KnownAnswer((), "none", "parametric"), "further off than their tolerances allow"),
-        (KnownAnswer((), "unknown", "unknown"), "nothing on the list explains it"),
+        (KnownAnswer((), "none", "none"), "No model error beyond sensor noise"),
+        (KnownAnswer((), "none", "parametric"), "outside their tolerances"),
+        (KnownAnswer((), "unknown", "unknown"), "None of the candidate effects explains the model error"),
         (KnownAnswer((FRICTION,), "effect", "not_converged"), "the fit did not converge"),
         (
             KnownAnswer((FRICTION,), "effect", "ambiguous", ambiguous=("viscous_friction",)),
@@ -145,7 +151,7 @@ def test_the_page_answers_in_order(files, tmp_path, faults_seen):
         ),
         (
             KnownAnswer((FRICTION, {"name": "tip_payload", "mass_kg": 0.01})),
-            "Dry (Coulomb) friction and an additional mass at the tip together",
+            "comes from dry (Coulomb) friction and an additional mass at the tip",
         ),
     ],
     ids=["none", "parametric", "unknown", "not_converged", "ambiguous", "two"],
@@ -162,8 +168,8 @@ def test_what_closes_most_of_the_gap_of_an_unknown_cause_is_written_down(folder,
     answer = json.loads(files["arm.json"])
     closed = f"{100 * answer['gap_closed']:.4g} %"
     words = re.sub("<[^>]*>", "", files["arm.html"].decode())
-    assert f"nothing on the list explains it all; dry (Coulomb) friction closes {closed} of it" in words
-    assert "friction may stand in for what is not on the list" in words
+    assert f"explains the model error completely; dry (Coulomb) friction explains {closed}" in words
+    assert "friction may stand in for the true cause" in words
     assert (answer["verdict"], answer["combination"]) == ("unknown", [])
     assert answer["partial_model"] == ["coulomb_friction"]
     assert answer["gap_after"] < 0.5 * answer["gap_refit"]
@@ -177,10 +183,10 @@ def test_what_closes_most_of_the_gap_of_an_unknown_cause_is_written_down(folder,
     [
         (
             0.3,
-            ("For dry (Coulomb) friction: raise the voltage", "If it is none of them, repeat"),
+            ("For dry (Coulomb) friction: raise the voltage", "If none of these is the cause, repeat"),
             "no hypotheses",
         ),
-        (0.1, ("there are no hypotheses to separate. Repeat",), "For dry"),
+        (0.1, ("There are no hypotheses to separate. Repeat",), "For dry"),
     ],
 )
 def test_an_effect_that_is_likely_is_looked_for_before_an_unknown_cause(
@@ -204,11 +210,8 @@ def test_a_cause_beyond_the_list_that_can_be_named_is_named(folder, undrawn):
     spring = GroundSpring(stiffness_Nm_rad=0.25)
     files = made(folder, KnownAnswer((), "unknown", "unknown", unlisted=(spring,)))
     html = files["arm.html"].decode()
-    assert "nothing on the list explains it; it looks like a linear spring from hub to ground" in html
-    assert (
-        "what explains the records best is a linear spring from hub to ground (stiffness 0.25 N m/rad)"
-        in html
-    )
+    assert "explains the model error; it looks like a linear spring from hub to ground" in html
+    assert "Best explanation: a linear spring from hub to ground (stiffness 0.25 N m/rad)" in html
     assert "Look at the machine for a linear spring from hub to ground" in html
     assert json.loads(files["arm.json"])["unlisted"] == [{"name": "ground_spring", "stiffness_Nm_rad": 0.25}]
 
@@ -219,8 +222,8 @@ def test_what_was_suspected_is_spoken_of(tmp_path, undrawn):
     (folder / "case.toml").write_text('suspected = ["backlash", "coulomb_friction"]\n' + text)
     files = made(folder, KnownAnswer((FRICTION,)))
     html = files["arm.html"].decode()
-    assert "Asked about: backlash in the gear has probability under 0.1 %." in html
-    assert "dry (Coulomb) friction has probability 96 % and is part of the answer" in html
+    assert "You asked about backlash in the gear: probability under 0.1 %." in html
+    assert "dry (Coulomb) friction: probability 96 % and is part of the answer" in html
     assert json.loads(files["arm.json"])["suspected"] == {"backlash": 0.0, "coulomb_friction": 0.96}
 
 
@@ -233,16 +236,13 @@ def test_what_was_suspected_is_spoken_of(tmp_path, undrawn):
         ),
         (
             KnownAnswer((), "unknown", "unknown"),
-            ("Partial answers, each by itself: backlash in the gear closes 62 % of the held-out gap",),
+            ("Partial answers, each by itself: backlash in the gear explains 62 %",),
         ),
         (
             KnownAnswer((FRICTION,), "unknown", "unknown"),
-            (
-                "Numbers that bring your model nearer to the records, though the cause is not known: "
-                "arm.rig.toml",
-            ),
+            ("These numbers bring your model nearer to the records; the cause is unknown: arm.rig.toml",),
         ),
-        (KnownAnswer((), "none", "none"), ("No gap that interests:", "near the 5 %")),
+        (KnownAnswer((), "none", "none"), ("No significant model error:", "close to your threshold of 5 %")),
     ],
     ids=["effect", "unknown", "unknown-in-part", "none"],
 )
@@ -255,8 +255,8 @@ def test_beside_a_model_error_a_hub_angle_is_enough(folder, tmp_path, engine, wo
     html = re.sub("<[^>]*>", "", files["arm.html"].decode())
     for one in words:
         assert one in html
-    # What is no answer is not said to interest.
-    assert ("interests" in re.findall(r"<th[^>]*>([^<]*)</th>", files["arm.html"].decode())) == (
+    # What is no answer is not said to be significant.
+    assert ("significant" in re.findall(r"<th[^>]*>([^<]*)</th>", files["arm.html"].decode())) == (
         engine.verdict == "effect"
     )
     # One meaning of the gap: per cent of the motion, computed here without the diagnosis.
@@ -264,8 +264,8 @@ def test_beside_a_model_error_a_hub_angle_is_enough(folder, tmp_path, engine, wo
     (held,) = loaded.held_out
     missed = held.output[:, 0] - simulate(loaded.rig, held.voltage_V).hub_angle_rad
     percent = 100 * pooled_rms(missed) / np.std(held.output[:, 0])
-    assert f"the model misses {percent:.3g} % of the motion" in html
-    assert "times the sensor noise" not in html
+    assert f"Model error before{percent:.3g} % of the motion" in html
+    assert "× noise" not in html
     assert re.search(r"of the motion, and moves [^.]*inertia \(hub\) by -2\.60 tolerances", html)
     assert "gravity" not in html.split("Partial answers")[-1].split("None of them")[0]
     document = json.loads(files["arm.json"])

@@ -44,7 +44,7 @@ def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path, faults_seen):
     result = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(test, clear_globs=False)
     assert (result.failed, result.attempted > 8) == (0, True)
     page = (tmp_path / "motor.html").read_text()
-    for section in ("measured", "gap", "where", "which", "closure", "remains", "next", "unchecked"):
+    for section in ("gap", "where", "which", "closure", "remains", "unchecked"):
         assert f'<section id="{section}">' in page
     # Measured, gap, two of where, probabilities, partial answers, spectra.
     assert page.count("<figure>") == 7
@@ -53,17 +53,17 @@ def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path, faults_seen):
     found = test.globs["found"]
     assert "a delay of the command" in words
     assert "output offset" in words
-    assert f"delay {found.repair[0].values['delay_s']:.4g}" in words
+    assert f"Delay, a delay of the command {found.repair[0].values['delay_s']:.4g} s" in words
     assert f"{found.rig.parameters['time_constant_s']:.5g} s" in words
-    assert "less noise than is stated" not in words
+    assert "less noise than specified" not in words
     write_plant_page(
         replace(found, noise_below_stated=(("speed_rad_s", 0.05, 0.5),)), tmp_path / "quiet.html"
     )
     page = " ".join(re.sub(r"<[^>]+>", " ", (tmp_path / "quiet.html").read_text()).split())
-    assert page.count("What counts here is what they show: speed 0.05 rad/s (stated: 0.5 rad/s).") == 2
+    assert page.count("the noise they show is used: speed 0.05 rad/s (specified: 0.5 rad/s).") == 1
     assert "of their second halves" not in page
     looked_again = replace(found, first_halves=("a (first half)",), left_before_halves=0.125)
     write_plant_page(looked_again, tmp_path / "halves.html")
     page = " ".join(re.sub(r"<[^>]+>", " ", (tmp_path / "halves.html").read_text()).split())
-    assert "re-estimated on them, miss 12.5 % of the motion of the held-out records." in page
-    assert "every number for held-out records is of their second halves, which no fit has seen." in page
+    assert "the nominal parameters miss 12.5 % of the motion of the validation records." in page
+    assert "Every number for validation records is of their second halves." in page

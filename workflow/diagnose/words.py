@@ -62,14 +62,14 @@ def short_answer(document: Mapping[str, Any]) -> str:
     if document["detail_verdict"] == "not_converged":
         return "not converged"
     if document["verdict"] != "effect":
-        none = "no gap that interests" if "shares" in document else "no gap"
-        return none if document["verdict"] == "none" else "outside the list"
+        none = "no significant model error" if "shares" in document else "no model error"
+        return none if document["verdict"] == "none" else "none of the candidate effects"
     names = listing([in_words(name) for name in document["combination"]])
     return f"{names} (ambiguous)" if document["detail_verdict"] == "ambiguous" else names
 
 
 def closure_words(document: Mapping[str, Any]) -> str:
-    """Share of the gap closed with its interval; a dash where nothing was added."""
+    """Share of the model error that is explained, with its interval; a dash where nothing was added."""
     closed = document["gap_closed"]
     if not (document["combination"] or document["partial_model"]) or closed is None:
         return MISSING

@@ -58,7 +58,7 @@ def draw_waterfall(found: Diagnosis) -> Figure:
     left.bar_label(bars, [f"{v:.3f}" if v < 10 else f"{v:.1f}" for v in gaps.values()], padding=3)
     left.axhline(floor, **line, zorder=1)
     left.set(xlim=(-0.6, max(len(gaps), 3) - 0.4), ylim=(0, 1.15 * max(*gaps.values(), floor)))
-    left.set(ylabel=words, title="Held-out experiments together")
+    left.set(ylabel=words, title="Validation records together")
     left.grid(visible=False, axis="x")
     for model in gaps:
         marker, offset = _LOOKS[model]
@@ -66,7 +66,7 @@ def draw_waterfall(found: Diagnosis) -> Figure:
         right.plot([entry[model] for entry in rows.values()], at, marker, ms=6, **_label(model))
     right.axvline(floor, **line)
     every = [value for entry in rows.values() for value in entry.values()]
-    # Beside a model error the repaired model may lie far below what does not interest.
+    # Beside a model error the repaired model may lie far below the threshold.
     right.set(xscale="log", xlim=(0.8 * min(*every, floor), 1.3 * max(*every, 2 * floor)))
     right.set_yticks(range(len(rows)), [style.plain(name, 34) for name in rows])
     right.set(ylim=(len(rows) - 0.5, -0.5), xlabel=words, title="Every experiment alone")

@@ -22,7 +22,7 @@ _MODES = 3
 
 @style.drawing("gap_measured")
 def draw_measured_beside_simulated(found: Diagnosis) -> Figure:
-    """Held-out record with the largest gap, a column per output in its own unit; residuals below."""
+    """Validation record with the largest model error, a column per output in its unit; residuals below."""
     case = found.case
     worst = max(case.held_out, key=lambda e: pooled_rms(found.residuals_before[e.name]))
     time = np.arange(len(worst.output), dtype=np.float64) * case.dt_s
@@ -63,7 +63,7 @@ def draw_residual_traces(found: Diagnosis) -> Figure:
     for row, experiment in zip(grid, case.experiments, strict=True):
         residuals = {model: found.residuals[model][experiment.name] for model in models}
         time = np.arange(len(experiment.output), dtype=np.float64) * case.dt_s
-        role = " (held out)" if experiment.role == "held_out" else ""
+        role = " (validation)" if experiment.role == "held_out" else ""
         for column, axes in enumerate(row):
             if not case.model_error > 0:
                 axes.axhspan(-2, 2, **gap_style.NOISE_BAND)

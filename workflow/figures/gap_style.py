@@ -23,7 +23,7 @@ WORDS: Mapping[str, str] = {
 }
 RESIDUAL_AXIS = "residual over noise, RMS [1]"
 SHARE_AXIS = "residual, RMS [% of the motion]"
-UNINTERESTING = "does not interest"
+UNINTERESTING = "significance threshold"
 NOISE_BAND = {"color": "#e6e6e6", "lw": 0, "label": "2 standard deviations of the sensor noise"}
 # What is measured: words, unit, colour.
 OUTPUTS: Mapping[Output, tuple[str, str, str]] = {

@@ -77,7 +77,7 @@ def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure
             left.plot([middle, middle], np.maximum(interval, factor * _SMALLEST), **_WHISKER)
         left.plot([], [], color=colour, lw=4.0, label=name)
     left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel=words)
-    # Up to what does not interest at least, so that a frame in which nothing is large is not empty.
+    # Up to the threshold at least, so that a frame in which nothing is large is not empty.
     left.set_ylim(factor * _SMALLEST, max(left.get_ylim()[1], factor))
     left.set_title("By frequency")
     for row, entry in enumerate(experiments):
@@ -104,7 +104,7 @@ def draw_regimes(where: Where, model_error: float = 0.0) -> Figure | None:
     findings = [finding for finding in where.regimes if finding.found][:_MOST_REGIMES]
     if not findings:
         return None
-    floor = "what does\nnot interest" if model_error > 0 else "the noise"
+    floor = "the\nthreshold" if model_error > 0 else "the noise"
     figure, panels = style.small_multiples(len(findings), min(3, max(2, len(findings))), 2.6, 0.9)
     for axes, finding in zip(panels, findings, strict=True):
         at, count = np.arange(len(finding.bins)), len(finding.bins)
