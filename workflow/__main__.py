@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import atexit
+import codecs
+import io
 import os
+import resource
 import sys
 from contextlib import suppress
 
@@ -13,6 +16,10 @@ from workflow.engine import interrupts
 def main() -> int:
     """The command line, from loading it to its end: an interrupt is one line at any moment."""
     try:
+        usable_streams()
+        if short := too_little_memory():
+            sys.stderr.write(f"flexlink: {short}\n")
+            return 2
         interrupts.watch(later=True)
         from workflow.cli import main as command  # half a second, then it knows what continues
 
@@ -28,6 +35,60 @@ def main() -> int:
             sys.stdout.flush()
         os._exit(code)
     return code
+
+
+# What pages and tables draw with, for a terminal that knows other characters only; else '?'.
+_PLAIN = dict(zip("▁▂▃▄▅▆▇█µμ–−·×", "_.-=+*%#uu-- x", strict=True)) | {
+    "°": "deg",
+    "±": "+-",
+    "…": "...",
+    "≤": "<=",
+    "≥": ">=",
+    "²": "^2",
+    "³": "^3",
+    "→": "->",
+}
+
+
+# What the libraries alone take of the address space; with less OpenBLAS tries for ever to get its buffers.
+_LEAST_MIB = 600
+
+
+def too_little_memory() -> str:
+    """What to do where `ulimit -v` leaves less than the libraries need; else empty."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if soft == resource.RLIM_INFINITY or soft >= _LEAST_MIB << 20:
+        return ""
+    wanted = f"flexlink needs {_LEAST_MIB}: ulimit -v {_LEAST_MIB << 10}"
+    return f"ulimit -v leaves {soft >> 20} MiB of memory, {wanted}"
+
+
+def usable_streams() -> None:
+    """Streams that are closed go nowhere; one that is not UTF-8 gets what it has no character for in others.
+
+    A descriptor that is closed would go to the next file that is opened, which gets what a library prints.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        with suppress(OSError):
+            try:
+                os.fstat(number)
+            except OSError:
+                nowhere = os.open(os.devnull, os.O_RDONLY if number == 0 else os.O_WRONLY)
+                if nowhere != number:
+                    os.dup2(nowhere, number)
+                    os.close(nowhere)
+            if getattr(sys, name) is None:
+                mode = "r" if number == 0 else "w"
+                setattr(sys, name, os.fdopen(number, mode, encoding="utf-8", closefd=False))
+    codecs.register_error("flexlink", _plainer)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors in ("strict", "surrogateescape"):
+            stream.reconfigure(errors="flexlink")
+
+
+def _plainer(error: UnicodeError) -> tuple[str, int]:
+    assert isinstance(error, UnicodeEncodeError)
+    return "".join(_PLAIN.get(c, "?") for c in error.object[error.start : error.end]), error.end
 
 
 if __name__ == "__main__":

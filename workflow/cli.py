@@ -702,10 +702,11 @@ def _degree(text: str | None) -> int | str | None:
 
 
 def print_json(document: Mapping[str, Any]) -> None:
-    """A document, and nothing else, on standard output."""
+    """A document, and nothing else, on standard output; in ASCII where that is not UTF-8."""
     from workflow.engine.codec import plain_text
 
-    sys.stdout.write(plain_text(document))
+    ascii_only = "utf" not in (getattr(sys.stdout, "encoding", None) or "utf-8").lower()
+    sys.stdout.write(plain_text(document, ascii_only=ascii_only))
 
 
 def _show_files(files: Sequence[Path], as_json: bool) -> None:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
+import subprocess
+import sys
 import time
 
 import numba
 import pytest
 
+from tests.workflow.command import ROOT
 from workflow import console
 from workflow.tasks.summary import RunSummary
 from workflow.text.templates import Row, Section
@@ -77,3 +82,41 @@ def test_tables_in_a_pipe_are_as_wide_as_asked(asked, width, capsys, monkeypatch
         monkeypatch.setenv("COLUMNS", asked)
     console.print_summary(RunSummary("arm", [Section("model", [Row("modes", "7.6 Hz " * 40)])]))
     assert max(map(len, capsys.readouterr().out.splitlines())) == width
+
+
+PRINTS_A_TABLE = "voltage_V,hub_angle_rad\n" + "".join(f"{k % 3},{k * k}\n" for k in range(40))
+STREAMS = {
+    "ascii": ({"PYTHONIOENCODING": "ascii"}, ""),
+    "latin-1": ({"PYTHONIOENCODING": "latin-1"}, ""),
+    "C locale": ({"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}, ""),
+    "stdout closed": ({}, ">&-"),
+    "both closed": ({}, ">&- 2>&-"),
+    "all closed": ({}, "<&- >&- 2>&-"),
+    "reader leaves": ({}, "| head -1"),
+}
+
+
+@pytest.mark.parametrize("kind", STREAMS)
+@pytest.mark.parametrize("more", ["", "--json"])
+def test_any_kind_of_output_will_do(kind, more, tmp_path):
+    (tmp_path / "l°g.csv").write_text(PRINTS_A_TABLE)
+    set_, streams = STREAMS[kind]
+    command = (
+        f"{sys.executable} -m workflow look {tmp_path}/*.csv {more} --out {tmp_path}/page.html {streams}"
+    )
+    shell = ["bash", "-o", "pipefail", "-c", command]
+    done = subprocess.run(shell, cwd=ROOT, env={**os.environ, **set_}, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert b"rror" not in done.stderr
+    assert (tmp_path / "page.html").read_text().endswith("</html>\n")
+    if not streams:
+        text = done.stdout.decode("latin-1" if kind == "latin-1" else "ascii")
+        assert json.loads(text) if more else "_" in text and "hub_angle_rad" in text
+
+
+def test_too_little_memory_is_said_before_anything_is_loaded(tmp_path):
+    command = f"ulimit -v 150000; exec {sys.executable} -m workflow look x.csv"
+    done = subprocess.run(["bash", "-c", command], cwd=ROOT, capture_output=True, check=False, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.startswith(b"flexlink: ulimit -v leaves 146 MiB of memory, flexlink needs")
+    assert done.stderr.count(b"\n") == 1

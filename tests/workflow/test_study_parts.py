@@ -25,17 +25,19 @@ from matplotlib.colors import to_hex
 from control_design.analysis.margins import Margins
 from control_design.convex.reference_filter import ReferenceFilter
 from control_design.plants.plant_set import Mode
+from control_design.specification import Specification
 from tests.workflow.command import FAST_ARM, ROOT
-from tests.workflow.report_examples import achievable, sampled_responses
+from tests.workflow.report_examples import achievable, build_run, config as example_config, sampled_responses
 from tests.workflow.study_examples import PLAIN, assert_same_study, write_study
 from workflow.config.run_config import RunConfig, built_in_config, load_config
 from workflow.config.settings import check
 from workflow.engine.errors import StageError
 from workflow.engine.executor import LocalProcesses
+from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import PREDICTED, render
 from workflow.report.rendering import render_page
 from workflow.study.columns import COLUMNS, numbers_of
-from workflow.study.page import PointRow, StudyView, draw_pareto, pareto_front
+from workflow.study.page import PointRow, StudyView, draw_pareto, pareto_front, row_of
 from workflow.study.points import Point, short
 from workflow.study.settings import Axis, ParetoPlot, last_name, load_study, parse_key, tidy, with_values
 from workflow.study.task import Task
@@ -46,6 +48,7 @@ from workflow.tasks.results import (
     ClosedLoopResult,
     DesignResult,
     ReferenceFilterResult,
+    RunResults,
 )
 
 
@@ -293,6 +296,7 @@ _INTERRUPTED = """
 import signal, sys
 from workflow.engine import interrupts
 from workflow.engine.executor import LocalProcesses
+from workflow.engine.run_directory import RunDirectory
 
 class Large:
     def __init__(self):
@@ -406,3 +410,30 @@ def test_tables_show_what_was_asked_for_and_no_empty_column():
     assert heads[1] == ["point", "asked", "peak of S, predicted", "peak of S, measured", "come to rest"]
     assert rows[1] == [point, "1", "1.4", "1.42", "1 of 2"]
     assert all('<tr class="no">' in body for _, body in tables)
+
+
+@pytest.mark.parametrize(("offset", "state"), [(0.0, "certified"), (0.05, "does not settle")])
+def test_a_loop_at_rest_beside_its_reference_does_not_settle(offset, state, tmp_path):
+    """Three runs at rest, of which the last stays a tenth of the step away."""
+    run = build_run(tmp_path / "run", example_config(), settled=3)
+    found = RunResults(run)
+    check = found.closed_loop.check
+    times = (0.5, 0.6, None if offset else 0.7)
+    achieved = tuple(
+        replace(row, settled=True, settling_time_s=time)
+        for row, time in zip(check.achieved, times, strict=True)
+    )
+    run.save_stage("closed_loop", ClosedLoopResult(check=replace(check, achieved=achieved)), "00")
+    run.save_stage("certify", replace(found.certify, certified=True), "00")
+    point: Any = SimpleNamespace(
+        number=1,
+        name="1",
+        values={},
+        config=SimpleNamespace(specification=Specification(bandwidth_rad_s=1.0)),
+    )
+    row = row_of(point, RunDirectory.open(tmp_path / "run"))
+    assert (row.state, row.good) == (state, state == "certified")
+    assert ("1 of 3 runs never settle" in row.why) == (offset > 0)
+    view = _view([row, replace(row, number=2, state="certified")])
+    assert [each.number for each in view.in_order] == ([2, 1] if offset else [1, 2])
+    assert view.best == [] or all(best.good for _, best in view.best)

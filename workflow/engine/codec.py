@@ -97,9 +97,9 @@ def plain(value: Any, *, arrays: bool = True) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def plain_text(value: Any) -> str:
-    """`plain` as strict JSON; equal values give equal text."""
-    return json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+def plain_text(value: Any, *, ascii_only: bool = False) -> str:
+    """`plain` as strict JSON; equal values give equal text. ascii_only: other characters as escapes."""
+    return json.dumps(plain(value), indent=1, ensure_ascii=ascii_only, allow_nan=False) + "\n"
 
 
 def bare(kind: Any) -> Any:

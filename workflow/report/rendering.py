@@ -62,6 +62,8 @@ def render_page(
     page = environment(*filters).get_template(template)
     with _garbage_left():
         html = page.render(draw=draw, contents=[], styles=styles, **values)
+    # The name of a file, in a locale that cannot read it, holds halves of characters.
+    html = html.encode("utf-8", "replace").decode()
     return RenderedPage(html.strip() + "\n", pictures)
 
 

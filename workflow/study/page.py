@@ -24,7 +24,9 @@ from workflow.tasks.results import RunResults
 from workflow.tasks.summary import RunSummary, verdict_of
 from workflow.text.templates import render_text, rows_of, said
 
-State = Literal["certified", "does not come to rest", "not certified", "impossible", "failed"]
+State = Literal[
+    "certified", "does not settle", "does not come to rest", "not certified", "impossible", "failed"
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +39,7 @@ class PointRow(Combination):
 
     @property
     def good(self) -> bool:
-        """Certified, and every run in closed loop settles."""
+        """Certified, and every run in closed loop comes to rest at its reference."""
         return self.state == "certified"
 
 
@@ -52,6 +54,8 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
         state = "not certified"
     elif loop.check is None or loop.check.settled_draws != loop.check.draws:
         state = "does not come to rest"
+    elif loop.check.tracking and loop.check.spread_of("settling_time_s")[-1] is None:
+        state = "does not settle"  # at rest beside the reference
     else:
         state = "certified"
     numbers = numbers_of(results, specification.mode_band_rad_s)
@@ -63,6 +67,8 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
         why = f"{why}; {advice}" if advice else why
     if certify.certified:
         why = verdict_of(replace(design, met=True), certify, loop)
+    if state == "does not settle":
+        why = said("never_settles", loop.check)
     return PointRow(point.number, point.name, point.values, state, why, numbers)
 
 
@@ -128,6 +134,11 @@ class StudyView:
     def fronts(self) -> list[list[int]]:
         """Numbers of the points on the Pareto front of each plot of the settings."""
         return [pareto_front(self.rows, plot) for plot in self.config.pareto]
+
+    @property
+    def in_order(self) -> list[PointRow]:
+        """The good points first, each kind by its number."""
+        return sorted(self.rows, key=lambda row: not row.good)
 
     @property
     def counts(self) -> Mapping[State, int]:
