@@ -189,6 +189,8 @@ class _Fit:
         cells = sum(1 for row in usual for cell in row if cell)
         if not typical or (most == 1 and separator != ";"):
             return cls(separator, decimal, lines, rows)
+        if separator == " " and all("\t" in lines[k].strip() for k in live[-100:]):
+            return cls(separator, decimal, lines, rows)  # blanks are then inside of cells
 
         def looks(row: list[str]) -> bool:
             return len(row) == most and 2 * sum(_is_value(cell, decimal) for cell in row) >= typical
@@ -267,6 +269,9 @@ class _Fit:
             units, names, header = names, longer, over[0]
         elif longer is not None and self._are_units(longer):
             units = longer  # of some loggers they stand above the names
+        elif below < self.first and any(self.rows[below]) and self._are_units(self.rows[below]):
+            # Cells at its end are empty: those columns have no unit.
+            units, below = self.rows[below], below + 1
         while not any(self.rows[below]) and below + 1 < len(self.rows):
             below += 1
         columns = distinct([name or f"column {k + 1}" for k, name in enumerate(names)])

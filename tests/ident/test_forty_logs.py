@@ -214,6 +214,23 @@ LOGS = {
         text("\t", header=("Time", "Drive", "Hub"), above=("Channels: 3", ""), below=("[s]\t[V]\t[rad]", "")),
         ("Time", "Drive", "Hub"),
     ),
+    "line of units, none of the last columns": Log(
+        "a.csv",
+        text(
+            header=("Time", "Drive", "Hub", "n", "ok"),
+            below=("s,V,rad,,",),
+            cells=lambda row: [*row, "3", "1"],
+        ),
+        ("Time", "Drive", "Hub"),
+    ),
+    "tabs, blanks in the dates, comments of as many words": Log(
+        "a.tsv",
+        text(
+            "\t",
+            above=("# made by a script",),
+            time=lambda t: clock("%Y-%m-%d %H:%M:%S.%f")(t),
+        ),
+    ),
     "names and numbers in quotation marks": Log(
         "a.csv",
         text(",", ",", ('"t, s"', '"u_V"', '"y_rad"'), cells=lambda row: [f'"{cell}"' for cell in row]),
@@ -387,4 +404,4 @@ def test_forty_logs(name, tmp_path: Path):
 
 
 def test_there_are_forty_and_more():
-    assert len(LOGS) == 53
+    assert len(LOGS) == 55
