@@ -111,7 +111,7 @@ def long_arx_filter(records: Sequence[Record], options: IdentOptions) -> RealArr
 def _on_records(records: Sequence[Record], behind: Identification, noise_filter: RealArray) -> Identification:
     """The model found behind the filter with its residuals on the records as they are."""
     fits = [fit_on_fresh_data(behind.model, record) for record in records]
-    residuals = tuple(fit.residual[behind.model.input_delay_samples :] for fit in fits)
+    residuals = tuple(fit.residual for fit in fits)
     rss = float(sum(residual @ residual for residual in residuals))
     n_samples = sum(residual.size for residual in residuals)
     unknowns = 2 * behind.model.order + len(records) * (1 + behind.model.order)

@@ -18,6 +18,7 @@ import numpy as np
 from ident.basis.model import GobfModel, MisoModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
+from ident.checks.answer import explains_nothing
 from ident.checks.input_checks import advice, few_samples, least_independence, refuse_unusable
 from ident.checks.plausible_modes import implausible_pairs, pole_warnings
 from ident.checks.prior_tests import (
@@ -342,7 +343,9 @@ def _advice(
 ) -> list[Finding]:
     """All that `Identification.warnings` has to say."""
     data, fixed, bounds = fitted.data, fitted.search.fixed, fitted.search.bounds
+    unanswered = explains_nothing(data, model.poles, fixed, np.concatenate(residuals)) if model.order else []
     return [
+        *unanswered,
         *advice(records, data, model, residuals, fixed),
         *pole_warnings(model, fixed, bounds),
         *implausible_pairs(model.poles, fixed, data.dt_s, data.longest * data.dt_s),
@@ -392,6 +395,8 @@ def identify_miso(
 def _advice_on_inputs(fitted: Fitted, model: MisoModel, residuals: tuple[RealArray, ...]) -> list[Finding]:
     data, search = fitted.data, fitted.search
     found = pole_warnings(model, search.fixed, search.bounds)
+    if model.order:
+        found += explains_nothing(data, model.poles, search.fixed, np.concatenate(residuals))
     found += few_samples(data, model.order)
     if least_independence(data) < _ALIKE_INPUT:
         found.append(finding(FindingKind.ALIKE_INPUTS, inputs=str(list(model.input_names))))

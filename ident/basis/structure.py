@@ -56,6 +56,23 @@ def filter_input(u: RealArray, integrators: int, delay_samples: int) -> RealArra
     return delayed
 
 
+def answered(signal: RealArray, delay_samples: int) -> RealArray:
+    """Rows (T - delay, ...) of a signal (T, ...) of a record that answer to its input.
+
+    The first `delay_samples` rows answer to an input that was not recorded. Fit, bounds, validation and
+    residual tests all leave them out, and the initial state acts from the first row that is left. Raises
+    ValueError where none is left.
+    """
+    if not len(signal) > delay_samples:
+        raise ValueError(f"{len(signal)} samples, not more than the input delay {delay_samples}")
+    return signal[delay_samples:]
+
+
+def driving_input(u: RealArray, integrators: int, delay_samples: int) -> RealArray:
+    """(1 - q^-1)^-integrators q^-delay u in the rows that answer to u (T,): (T - delay,), from rest."""
+    return answered(filter_input(u, integrators, delay_samples), delay_samples)
+
+
 def front_response(omega_rad_s: RealArray, dt_s: float, integrators: int, delay_samples: int) -> ComplexArray:
     """(z/(z - 1))^integrators z^-delay at omega (F,) in rad/s (not 0 with integrators), (F,)."""
     response = np.exp(-1j * omega_rad_s * dt_s * delay_samples)

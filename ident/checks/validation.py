@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from ident.basis.functions import nuisance_columns
 from ident.basis.model import GobfModel
 from ident.basis.posterior import ResponsePosterior
+from ident.basis.structure import answered
 from ident.data.arrays import BoolArray, RealArray, lock, real_rows
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
@@ -21,13 +22,16 @@ from ident.data.record import Record
 class FreshFit:
     """Free run on a record the model was not fitted to.
 
-    fit_percent = 100 (1 - |y - y_hat| / |y - mean y|); simulated and residual (T,) in output units.
+    fit_percent = 100 (1 - |y - y_hat| / |y - mean y|); simulated and residual (T - delay,) in output units, in
+    the rows that answer to the record's input. answers: the response to the input brings the model nearer to
+    the record than a response of zero.
     """
 
     name: str
     fit_percent: float
     simulated: RealArray
     residual: RealArray
+    answers: bool = True
 
     def __post_init__(self) -> None:
         lock(self, "simulated", "residual")
@@ -47,18 +51,26 @@ def fit_on_fresh_data(
     ValueError for another sampling time, more than one channel, or a constant output.
     """
     record.refuse_several(model.dt_s)
-    y = record.output[:, 0]
+    try:
+        y = answered(record.output[:, 0], model.input_delay_samples)
+    except ValueError as error:
+        raise ValueError(f"{record.label}: {error}") from None
     spread = float(np.linalg.norm(y - y.mean()))
     if spread == 0:
         raise ValueError(f"{record.label}: the output is constant")
-    simulated = model.simulate(record.input[:, 0])
+    simulated = answered(model.simulate(record.input[:, 0]), model.input_delay_samples)
+    without = y
     degrees = max(int(estimate_offset), model.integrators if estimate_initial_state else 0)
     nuisance = nuisance_columns(model.poles, y.size, degrees, estimate_initial_state)
     if nuisance.shape[1]:
-        coefficients, *_ = np.linalg.lstsq(nuisance, y - simulated, rcond=1e-10)
-        simulated = simulated + nuisance @ coefficients
+        both = np.column_stack([y - simulated, y])
+        coefficients, *_ = np.linalg.lstsq(nuisance, both, rcond=1e-10)
+        simulated = simulated + nuisance @ coefficients[:, 0]
+        without = y - nuisance @ coefficients[:, 1]
     residual = y - simulated
-    return FreshFit(record.name, 100 * (1 - float(np.linalg.norm(residual)) / spread), simulated, residual)
+    left = float(np.linalg.norm(residual))
+    answers = left < float(np.linalg.norm(without))
+    return FreshFit(record.name, 100 * (1 - left / spread), simulated, residual, answers)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,9 @@ class FindingKind(Enum):
     DAMPING_BOUND = auto()
     NO_DECAY = auto()
     FREQUENCY_BOUND = auto()
+    # A model that explains nothing.
+    NO_ANSWER = auto()
+    NO_ANSWER_THERE = auto()
     # Pole pairs that can be no mode, or that nothing measured surrounds.
     SLOW_PAIR = auto()
     DAMPED_PAIR = auto()

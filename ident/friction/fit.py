@@ -27,7 +27,7 @@ from ident.basis.functions import regressor
 from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.basis.structure import filter_input
+from ident.basis.structure import answered, driving_input
 from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.data.arrays import RealArray
 from ident.data.record import Record
@@ -114,7 +114,12 @@ def moved_to(found: FrictionFit, records: Sequence[Record], model: GobfModel) ->
 
 
 def _rss(found: FrictionFit, records: Sequence[Record]) -> float:
-    return found.noise_std**2 * sum(record.n_samples for record in records)
+    return found.noise_std**2 * _n_rows(found, records)
+
+
+def _n_rows(found: FrictionFit, records: Sequence[Record]) -> int:
+    """Rows that answer to the inputs of the records."""
+    return sum(record.n_samples - found.arm.structure.input_delay_samples for record in records)
 
 
 def _start(records: Sequence[Record], options: IdentOptions) -> tuple[float, GobfModel]:
@@ -127,19 +132,22 @@ def _start(records: Sequence[Record], options: IdentOptions) -> tuple[float, Gob
         signs.append(0.5 * (sign + np.append(sign[1:], sign[-1])))
     # One pair more than asked for: what a wrong level leaves would otherwise take the place of a weak mode.
     options = options.model_copy(update={"n_pairs": None if options.n_pairs is None else options.n_pairs + 1})
-    level = 0.0
+    level, delay = 0.0, options.input_delay_samples
     for _ in range(_START_ROUNDS):
         less = [
-            less_friction(record, level * sign, options.input_delay_samples)
+            less_friction(record, level * sign, delay)
             for record, sign in zip(records, signs, strict=True)
         ]
         model = untested_model(less, options)
         undelayed = replace(model, input_delay_samples=0)
         blocks = [
-            np.column_stack([_basis(model.poles.doubled(), record, options), -undelayed.simulate(sign)])
+            np.column_stack(
+                [_basis(model.poles.doubled(), record, options), -answered(undelayed.simulate(sign), delay)]
+            )
             for record, sign in zip(less, signs, strict=True)
         ]
-        targets, nothing = [r.output[:, 0] for r in less], np.zeros((0, blocks[0].shape[1] + 1))
+        targets = [answered(record.output[:, 0], delay) for record in less]
+        nothing = np.zeros((0, blocks[0].shape[1] + 1))
         before = level
         level = max(level + float(least_squares(blocks, targets, nothing)[0][-1]), 0.0)
         if abs(level - before) < 0.02 * level:
@@ -153,12 +161,13 @@ def _with_stribeck(
     """The same with friction that falls with speed, where that is worth its two parameters."""
     speed = float(np.sqrt(np.mean([np.mean(np.diff(r.output[:, 0]) ** 2) for r in records]))) / found.arm.dt_s
     blocks, targets = equations(found, records)
-    nothing = np.zeros((0, blocks[0].shape[1] + 2))
+    nothing, delay = np.zeros((0, blocks[0].shape[1] + 2)), found.arm.structure.input_delay_samples
 
     def left(law: FrictionLaw) -> float:
         """What the fit would leave to first order in an excess of this law."""
         columns = [
-            (found.arm.run(found.coefficients, r.input[:, 0], law)[0] - found.motion(r)[0]) for r in records
+            answered(found.arm.run(found.coefficients, r.input[:, 0], law)[0] - found.motion(r)[0], delay)
+            for r in records
         ]
         more = [np.column_stack(pair) for pair in zip(blocks, columns, strict=True)]
         return least_squares(more, targets, nothing)[3]
@@ -166,7 +175,7 @@ def _with_stribeck(
     laws = [replace(found.law, excess=_EXCESS * found.level, fall=share * speed) for share in _FALLS]
     rests = [left(law) for law in laws]
     k, rss = int(np.argmin(rests)), _rss(found, records)
-    worth = 2 * np.log(sum(record.n_samples for record in records)) * found.noise_std**2
+    worth = 2 * np.log(_n_rows(found, records)) * found.noise_std**2
     if rests[k] > rss - worth:
         return found
     tried = descended(replace(found, law=laws[k]), records, presliding, least)
@@ -175,9 +184,8 @@ def _with_stribeck(
 
 
 def _basis(poles: Poles, record: Record, options: IdentOptions) -> RealArray:
-    return regressor(
-        poles, filter_input(record.input[:, 0], options.integrators, options.input_delay_samples)
-    )
+    driving = driving_input(record.input[:, 0], options.integrators, options.input_delay_samples)
+    return regressor(poles, driving)
 
 
 def refuse_unseen_shaft(found: FrictionFit, records: Sequence[Record]) -> None:

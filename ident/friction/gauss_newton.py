@@ -15,7 +15,7 @@ from scipy.linalg import solve_triangular
 from ident.basis.functions import basis_response, regressor
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
-from ident.basis.structure import Structure, filter_input
+from ident.basis.structure import Structure, answered, filter_input
 from ident.data.arrays import RealArray, real_rows
 from ident.data.record import Record
 from ident.friction.arm import FrictionLaw, SteppedArm, less_friction
@@ -78,8 +78,9 @@ class FrictionFit:
         return self.arm.run(self.coefficients, record.input[:, 0], self.law)
 
     def residual(self, record: Record) -> RealArray:
-        """(T,) what the simulation leaves of the position, less its mean."""
-        left = record.output[:, 0] - self.motion(record)[0]
+        """(T - delay,) what the simulation leaves of the position, less its mean, in the rows that answer to
+        the record's input."""
+        left = answered(record.output[:, 0] - self.motion(record)[0], self.arm.structure.input_delay_samples)
         return np.asarray(left - left.mean())
 
     def taken_off(self, record: Record) -> Record:
@@ -145,11 +146,16 @@ def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: Re
 
 
 def equations(found: FrictionFit, records: Sequence[Record]) -> tuple[list[RealArray], list[RealArray]]:
-    """Of every record the derivatives (T, P + Q) of the simulated position, and what it leaves (T,)."""
+    """Of every record the derivatives (T - delay, P + Q) of the simulated position, and what it leaves, in the
+    rows that answer to the record's input."""
+    delay = found.arm.structure.input_delay_samples
     local = [linearised(found.arm, found.coefficients, found.law, record.input[:, 0]) for record in records]
     return (
-        [np.column_stack([part.by_coefficients, part.by_law]) for part in local],
-        [record.output[:, 0] - part.position for record, part in zip(records, local, strict=True)],
+        [answered(np.column_stack([part.by_coefficients, part.by_law]), delay) for part in local],
+        [
+            answered(record.output[:, 0] - part.position, delay)
+            for record, part in zip(records, local, strict=True)
+        ],
     )
 
 
@@ -169,7 +175,7 @@ def descended(
     held: logarithms in the law stay where they are. Far from the arm, what is wrong with it would be laid to
     them. Otherwise the pre-sliding deflection is expected near presliding, a Stribeck speed where it begins.
     """
-    n = sum(record.n_samples for record in records)
+    n = sum(found.residual(record).size for record in records)
     expected = _parameters(found.law if held else replace(found.law, presliding=presliding))
     p, q = found.coefficients.size, expected.size
     logs, trust = np.arange(1, q, 2), _HELD if held else 1 / STD_LOG

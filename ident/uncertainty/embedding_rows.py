@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from ident.basis.functions import all_pass_signal, nuisance_columns, regressor
 from ident.basis.poles import Poles
-from ident.basis.structure import Structure, filter_input
+from ident.basis.structure import Structure, answered, driving_input
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.uncertainty.autoregression import Absorbed, first_rows, whitened
@@ -30,7 +30,8 @@ _NUISANCE_RANK = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """One record: nuisance (T,n), regressors F (T,p), output y (T,), all whitened.
+    """The rows of one record that answer to its input: nuisance (T,n), regressors F (T,p), output y (T,), all
+    whitened.
 
     input (T,) is the input after integrators, delay and A(q); head (n,) its first samples before A(q), and
     first (n,n) the matrix that whitens those rows: zero where they are dropped, and so are they.
@@ -112,24 +113,26 @@ class EmbeddingRows:
         nuisance columns and the first rows, which A(q) does not whiten, are made from plain signals.
         """
         structure, whitening = self.structure, self.whitening
+        delay = structure.input_delay_samples
         first = first_rows(whitening)
-        plain = filter_input(record.input[:, 0], structure.integrators, structure.input_delay_samples)
+        plain = driving_input(record.input[:, 0], structure.integrators, delay)
         head = plain[: len(first)]
         u = plain if whitening.size == 1 else np.asarray(lfilter(whitening, np.ones(1), plain))
         regressors = self._driven(u)
         if first.size:
             regressors[: len(first)] = first @ self._driven(head)
         if beside is not None:
-            more = whitened(np.column_stack([beside.first, beside.columns]), whitening)
+            rows = answered(np.column_stack([beside.first, beside.columns]), delay)
+            more = whitened(rows, whitening)
             p = beside.first.shape[1]
             regressors = np.column_stack([more[:, :p], regressors[:, p:], more[:, p:]])
         known = nuisance_columns(
-            self.poles, record.n_samples, structure.n_polynomials, structure.estimate_initial_state
+            self.poles, plain.size, structure.n_polynomials, structure.estimate_initial_state
         )
         return Rows(
             nuisance=whitened(known, whitening),
             regressors=regressors,
-            output=whitened(record.output[:, 0], whitening),
+            output=whitened(answered(record.output[:, 0], delay), whitening),
             input=u,
             head=head,
             first=first,

@@ -171,7 +171,7 @@ def pair_statistics(
         first, second = products[:n, 0::2], products[:n, 1::2]
         gram += gram_here - np.stack([np.sum(first**2, 0), np.sum(first * second, 0), np.sum(second**2, 0)])
         inner += products[n:].T
-    onto = inner[:, :q].reshape(-1, 2, q).transpose(0, 2, 1)
+    onto = inner[:, :q].reshape(poles.size, 2, q).transpose(0, 2, 1)
     matrices = gram[[0, 1, 1, 2]].T.reshape(-1, 2, 2) - onto.transpose(0, 2, 1) @ onto
     residual = reduced.rest + float(reduced.z @ reduced.z)
     return PairStatistics(matrices, inner[:, q].reshape(-1, 2), onto, residual, size)

@@ -121,8 +121,9 @@ def dense(records, poles, structure, alpha, lam, s2, length):
     integrators, delay, direct = structure
     flat, kernel, output = [], [], []
     for index, record in enumerate(records):
-        n = record.n_samples
-        u = np.concatenate([np.zeros(delay), record.input[:, 0]])[:n]
+        # The first rows answer to an input that was not recorded: none of them is data.
+        n = record.n_samples - delay
+        u = record.input[:n, 0]
         for _ in range(integrators):
             u = np.cumsum(u)
         impulse = np.zeros(n + 1)
@@ -143,7 +144,7 @@ def dense(records, poles, structure, alpha, lam, s2, length):
         flat.append(np.column_stack([here, *columns]))
         shifted = [np.concatenate([np.zeros(k), u])[:n] for k in range(1, length + 1)]
         kernel.append(np.column_stack(shifted))
-        output.append(record.output[:, 0])
+        output.append(record.output[delay:, 0])
     flat, kernel, y = np.vstack(flat), np.vstack(kernel), np.concatenate(output)
     index = np.arange(1, length + 1)
     prior = s2 * alpha * lam ** np.maximum.outer(index, index)
@@ -170,7 +171,8 @@ def test_whole_path_equals_dense_formulas(structure):
     for n in (70, 90):
         u = rng.standard_normal((n, 1))
         # A resonance that the two real poles cannot follow, so that the kernel has something to explain.
-        y = signal.lfilter([0.0, 0.2], [1.0, -0.6, 0.4], u, axis=0) + 0.3 * rng.standard_normal((n, 1))
+        late = [0.0] * delay + [0.0, 0.2]
+        y = signal.lfilter(late, [1.0, -0.6, 0.4], u, axis=0) + 0.3 * rng.standard_normal((n, 1))
         records.append(Record("r", u, y, DT, ("u",), ("y",)))
     model = GobfModel(Poles(poles), np.zeros(2), DT, integrators=integrators, input_delay_samples=delay)
     options = EmbeddingOptions(
@@ -178,7 +180,7 @@ def test_whole_path_equals_dense_formulas(structure):
     )
     posterior = tangent(records, model, options)
     report = posterior.report
-    assert report.n_rows == 160 - 2 * (max(1, integrators) + 4)
+    assert report.n_rows == 160 - 2 * delay - 2 * (max(1, integrators) + 4)
     mean, covariance = dense(
         records, np.repeat(poles, 2), structure, report.alpha, report.lam, report.noise_std**2, length
     )

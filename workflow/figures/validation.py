@@ -34,7 +34,8 @@ def draw_validation(channel: ChannelView) -> Figure:
         fit = fit_on_fresh_data(found.model, record)
     else:
         record, role, fit = channel.fresh_records[shown], found.fresh_roles[shown], found.fresh[shown]
-    measured, time_s = record.output[:, 0], record.time_s
+    answering = slice(record.n_samples - fit.residual.size, None)  # a delayed answer begins later
+    measured, time_s = record.output[answering, 0], record.time_s[answering]
     noise = 2 * found.identification.noise_std
     figure, grid = style.panels(4.7, 2, 2, sharex="col", height_ratios=[1.5, 1.0], width_ratios=[1.7, 1.0])
     length = min(400, max(time_s.size // 4, min(100, time_s.size)))

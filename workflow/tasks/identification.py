@@ -10,7 +10,7 @@ from ident.checks.distortion_findings import amplitude_effects
 from ident.checks.input_checks import clipped
 from ident.checks.validation import fit_on_fresh_data
 from ident.closed_loop import two_stage
-from ident.data.finding import Finding, FindingKind
+from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, increments
 from ident.friction import FrictionFit, fit_friction, refuse_unrecorded, refuse_unseen_shaft
@@ -133,8 +133,14 @@ def identified_channel(
     """Model of SISO records as the fit is to see them, with free runs on the records it does not see."""
     share = _OF_THE_FIT if with_plot else 1.0
     found = identify(used, options, progress=lambda done, what: report(share * done, what))
+    fits = tuple(fit_on_fresh_data(found.model, record) for record, _ in fresh)
+    unseen = [
+        finding(FindingKind.NO_ANSWER_THERE, record=record.label, fit_percent=fit.fit_percent)
+        for fit, (record, _) in zip(fits, fresh, strict=True)
+        if not fit.answers
+    ]
     # All of its warnings are looked for now, so that it is a plain value.
-    found = replace(found, search=replace(found.search, warnings=found.warnings), advise=tuple)
+    found = replace(found, search=replace(found.search, warnings=(*found.warnings, *unseen)), advise=tuple)
     plot = None
     if with_plot:
         plot = stabilisation(
@@ -145,7 +151,7 @@ def identified_channel(
         identification=found,
         used=tuple(used),
         bounded=tuple(used),
-        fresh=tuple(fit_on_fresh_data(found.model, record) for record, _ in fresh),
+        fresh=fits,
         fresh_roles=tuple(role for _, role in fresh),
         stabilisation=plot,
         two_stage=two_stage,

@@ -14,9 +14,11 @@ from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import Mode
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
+from ident.checks.answer import zero_is_inside
 from ident.checks.residual_tests import independence_test, whiteness_test
 from ident.checks.validation import ScatterRow, fit_on_fresh_data, repeat_scatter
 from ident.data.distortion import distortion_of
+from ident.data.finding import FindingKind
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
 from ident.data.signal_filter import increments
@@ -151,6 +153,7 @@ def uncertain_channel(
     if linear is not None and linear is not posterior:
         behind = IdentifiedPlant(nominal_of(linear, model.poles, nominal_omega), linear, level)
     linear = linear or posterior
+    refuse_unanswered(result, linear, omega)
     frequency = posterior.at(omega, level)
     nominal = nominal_of(posterior, poles or model.poles, nominal_omega)
     return UncertainChannel(
@@ -173,6 +176,19 @@ def uncertain_channel(
         intervals=intervals_of(linear, model.poles, level),
         repeat_scatter=repeat_scatter,
     )
+
+
+def refuse_unanswered(result: IdentifiedChannel, posterior: ResponsePosterior, omega: Real) -> None:
+    """Raises ValueError, one line, where a response of zero lies inside all ellipses: no number of such a model
+    means anything. omega (F,): where ellipses are shown."""
+    doubts = {FindingKind.NO_POLE, FindingKind.NO_ANSWER} & {
+        warning.kind for warning in result.identification.warnings
+    }
+    if zero_is_inside(posterior, omega, doubted=bool(doubts)):
+        raise ValueError(
+            f"the output '{result.output}' does not answer to the input '{result.input}': no response at all "
+            "explains the log as well as any model; check columns, wiring and unit"
+        )
 
 
 def posterior_of(
@@ -278,8 +294,7 @@ def residual_tests(
     whitened = [lfilter(filter_of_noise, np.ones(1), residual)[len(colour) :] for residual in residuals]
     delay = posterior.input_delay_samples
     inputs = [record.input[: record.n_samples - delay, 0] for record in records]
-    driven = [residual[delay:] for residual in residuals]
-    return whiteness_test(whitened), independence_test(inputs, driven)
+    return whiteness_test(whitened), independence_test(inputs, residuals)
 
 
 def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> Intervals | None:

@@ -1,0 +1,50 @@
+"""Does the output answer to the input at all? A model that explains no more than chance has no number to show.
+
+Two tests. The fit: what the driven columns explain against the price that the choice of the order asks of any
+pole (`ident.search.order_selection`), beside nuisances that need no input. The ellipses: a response of zero
+inside all of them. Only the second sees that an output which wanders by itself (drift, hum) can be followed by
+slow or undamped poles behind any input; only the first knows that poles were searched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from ident.basis.poles import NO_POLES, Poles
+from ident.basis.posterior import ResponsePosterior
+from ident.data.arrays import RealArray
+from ident.data.finding import Finding, FindingKind, finding
+from ident.fit.least_squares import Regression, project
+
+# A response of zero is kept up to this level.
+_LEVEL = 0.999
+
+
+def explains_nothing(data: Regression, poles: Poles, fixed: Poles, residual: RealArray) -> list[Finding]:
+    """One finding where the driven columns explain no more than poles fitted to noise would.
+
+    residual (N,): of the fit with these poles, of which `fixed` were given. Nuisances (offset, free responses)
+    are on both sides: a free decay or a hum is no answer to the input.
+    """
+    undriven = replace(data, structure=replace(data.structure, feedthrough=False, relative_degree=1))
+    without = project(undriven, NO_POLES, poles).residual
+    power, rest = float(without @ without), float(residual @ residual)
+    worth = data.colour(residual).effective_samples
+    numbers = data.n_inputs * (poles.order + data.structure.feedthrough) + poles.order - fixed.order
+    if not power > 0 or rest <= power * np.exp(-numbers * np.log(worth) / worth):
+        return []
+    return [finding(FindingKind.NO_ANSWER, explained_percent=100 * max(1 - np.sqrt(rest / power), 0.0))]
+
+
+def zero_is_inside(posterior: ResponsePosterior, omega_rad_s: RealArray, *, doubted: bool) -> bool:
+    """Whether a response of zero lies inside all ellipses at omega (F,), at 99.9 %: frequency by frequency, or
+    where the fit is `doubted` over all of the N / 2 frequencies at which noise may have led the search to put a
+    pole (Bonferroni)."""
+    ellipses = posterior.at(omega_rad_s)
+    squared = ellipses.normalised_distance(np.zeros(ellipses.centre.size)) ** 2 * chi2.ppf(ellipses.level, 2)
+    n_rows = 2 if posterior.report is None else max(posterior.report.n_rows, 2)
+    places = n_rows / 2 if doubted else 1.0
+    return bool(np.all(squared <= chi2.isf((1 - _LEVEL) / places, 2)))
