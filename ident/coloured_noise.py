@@ -49,6 +49,7 @@ def identify_in_noise(records: Sequence[Record], options: IdentOptions, identify
     lowest mode found behind the noise model. Above it, a mode for which no pair was left is more likely.
     """
     plain = identify(records, options, 0.0, 0.5)
+    options = options.model_copy(update={"input_delay_samples": plain.model.input_delay_samples})
     noise_filter = long_arx_filter(records, options)
     if noise_filter.size == 1 or plain.rss == 0 or whiteness_test(plain.residuals).passed:
         return plain
@@ -59,7 +60,8 @@ def identify_in_noise(records: Sequence[Record], options: IdentOptions, identify
     lowest_Hz = np.min(np.abs(np.log(modes)), initial=np.inf) / (2 * np.pi * behind.model.dt_s)
     if not _half_power_Hz(plain) < lowest_Hz < np.inf:
         return plain
-    return _on_records(records, behind, noise_filter)
+    sought = tuple(said for said in plain.verdicts if said.kind is FindingKind.DEAD_TIME)
+    return _on_records(records, replace(behind, verdicts=(*sought, *behind.verdicts)), noise_filter)
 
 
 def prewhitened(record: Record, noise_filter: RealArray) -> Record:

@@ -42,6 +42,7 @@ from ident.fit.refinement import Refined, free_optimality
 from ident.fit.regression import prepare, prepare_inputs, restructured, thinned
 from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
 from ident.identification import Identification, MisoIdentification
+from ident.search.dead_time import seek
 from ident.search.order_selection import OrderSelection, Progress, silent
 from ident.search.pole_search import Fitted, PoleSearch, PolishedMinimum, SearchTrace
 
@@ -96,7 +97,10 @@ def _identified(records: Sequence[Record], options: IdentOptions, report: Progre
     data = prepare(records, options.structure())
     refuse_unusable(records, data, least_order(options))
     outcome, part = searched(records, data, options, report)
+    outcome = _behind_dead_time(part, outcome, report)
     fitted, verdicts = fitted_on_all(records, outcome)
+    if outcome.dead_time is not None:
+        verdicts = (outcome.dead_time, *verdicts)
     report(0.9, "tests of what is stated as known")
     fitted, tests = _priors_judged(records, part, outcome, fitted)
     model, found = description(records, outcome, fitted)
@@ -138,17 +142,38 @@ def searched(
     return outcome, part
 
 
+def _behind_dead_time(records: Sequence[Record], plain: Outcome, report: Progress) -> Outcome:
+    """The search behind a delay that the data show, where nobody stated one.
+
+    Not where a reference says that a loop was closed: noise that comes back in the input looks like an answer
+    before, and like dead time after.
+    """
+    looped = any(record.reference is not None for record in records)
+    if looped or not plain.search.options.delay_left_to_data:
+        return plain
+    report(0.5, "dead time")
+    found = seek(records, plain)
+    if found is None:
+        return plain
+    search = found.fitted.search
+    search.minima = [*plain.search.minima, *search.minima]
+    search.stages = [*plain.search.stages, *search.stages]
+    search.evaluations += plain.search.evaluations
+    return Outcome(search, found.fitted.end, found.selection, dead_time=found.finding)
+
+
 @dataclass(frozen=True, eq=False)
 class Outcome(Fitted):
     """A search that has come to an end on one structure.
 
     `from_rest` is the test that left the initial states out; where it took a descent with them, `free` is its
-    end.
+    end. dead_time says which delay was found, where nobody stated one.
     """
 
     selection: OrderSelection
     free: Refined | None = None
     from_rest: NuisanceTest | None = None
+    dead_time: Finding | None = None
 
 
 def _searched(
@@ -232,7 +257,8 @@ def _priors_judged(
     """
     options = outcome.search.options
     stated = options.integrators or options.fixed_poles or options.relative_degree is not None
-    if fitted.poles.order == 0 or not (stated or "input_delay_samples" in options.model_fields_set):
+    delay_stated = not options.delay_left_to_data and outcome.dead_time is None
+    if fitted.poles.order == 0 or not (stated or delay_stated):
         return fitted, ()
     search = PoleSearch(fitted.data, options)
     search.minima = list(outcome.search.minima)
@@ -264,7 +290,7 @@ def _priors_judged(
         tests.append(test)
         relative_degree = trial
         end = constrained if judged is given else best_under_relative_degree(given, trial)
-    if "input_delay_samples" in options.model_fields_set:
+    if delay_stated:
         tests.append(delay_test(records, given, relative_degree))
     if relative_degree > 1:
         structure = replace(fitted.data.structure, relative_degree=relative_degree)

@@ -321,7 +321,10 @@ def identify(
         int | None, typer.Option(min=0, max=8, help="Real poles [default: from the data]")
     ] = None,
     integrators: Annotated[int, typer.Option(min=0, max=3, help="Known poles at z = 1.")] = 0,
-    delay: Annotated[int, typer.Option(min=0, help="Known delay of the input [samples].")] = 0,
+    delay: Annotated[
+        int | None,
+        typer.Option(min=0, help="Known delay of the input [samples] [default: sought in the data]"),
+    ] = None,
     feedthrough: Annotated[bool, typer.Option("--feedthrough", help="Fit a direct term.")] = False,
     relative_degree: Annotated[
         str | None,
@@ -391,9 +394,9 @@ def identify(
     chosen |= {"zeta_min": zeta_min, "zeta_max": zeta_max}
     chosen |= {
         "feedthrough": feedthrough,
-        "input_delay_samples": delay,
         "relative_degree": _degree(relative_degree),
     }
+    chosen |= {} if delay is None else {"input_delay_samples": delay}
     options = check(IdentOptions, chosen, source="options")
     with _watched(quiet) as progress:
         promised = check(UncertaintyOptions, {"level": level, "promise": promise}, source="options")

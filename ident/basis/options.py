@@ -49,7 +49,9 @@ class IdentOptions(BaseModel):
     feedthrough: bool = Field(
         False, description="direct term from the input to the output of the same sample"
     )
-    input_delay_samples: int = Field(0, ge=0, description="known delay of the input in whole samples")
+    input_delay_samples: int = Field(
+        0, ge=0, description="known delay of the input in whole samples; left out: sought in the data of one input"
+    )
     relative_degree: Annotated[int, Field(ge=1, le=6)] | Literal["auto"] | None = Field(
         None,
         description="known relative degree of the continuous-time plant behind a zero-order hold "
@@ -139,6 +141,15 @@ class IdentOptions(BaseModel):
         real = [0.0] * self.integrators + [re for re, im in self.fixed_poles if im == 0]
         pairs = [complex(re, im) for re, im in self.fixed_poles if im != 0]
         return Poles(real, pairs)  # type: ignore[arg-type]
+
+    @property
+    def delay_left_to_data(self) -> bool:
+        """Nobody stated a delay, not even that there is none."""
+        return "input_delay_samples" not in self.model_fields_set
+
+    def with_delay_stated(self) -> IdentOptions:
+        """The same, the delay no longer sought: what is no record of one input and one output has none."""
+        return self.model_copy(update={"input_delay_samples": self.input_delay_samples})
 
     def structure(self) -> Structure:
         """The structure these settings describe, before the data were asked: offset on, start from rest."""

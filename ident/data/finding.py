@@ -56,6 +56,7 @@ class FindingKind(Enum):
     SPARE_INTEGRATORS = auto()
     FIXED_POLES = auto()
     DELAY = auto()
+    DEAD_TIME = auto()
     DIRECT_TERM = auto()
     RELATIVE_DEGREE = auto()
     TOO_FEW_POLES = auto()

@@ -65,12 +65,16 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
                 finding = opened.finding
                 if channel.bounds_band_rad_s is not None:
                     used = [as_fitted(record, channel) for record in bounded]
+            options = channel.identification
+            if known is not None or finding is not None:
+                # The arm with friction was fitted without delay, and a closed loop looks like one.
+                options = options.with_delay_stated()
             found = identified_channel(
                 channel.label,
                 used,
                 # A free run of an integrating plant drifts away with friction; it is judged as it was fitted.
                 [(as_fitted(item.record, channel, known), item.role) for item in unseen],
-                channel.identification,
+                options,
                 report,
                 two_stage=finding,
             )

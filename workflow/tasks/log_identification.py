@@ -107,6 +107,9 @@ def identify_records(
             used, fresh_records = (
                 [_inside(band_rad_s, record) for record in part] for part in (used, fresh_records)
             )
+        if friction is not None or any(record.reference is not None for record in measured):
+            # The arm with friction was fitted without delay, and a closed loop looks like one.
+            options = options.with_delay_stated()
         if any(record.reference is not None for record in measured):
             # The first stage runs its model from rest, so it has to be fitted as from rest: free responses
             # that it estimated would be missing in the input it makes.

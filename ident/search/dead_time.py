@@ -1,0 +1,200 @@
+"""Dead time of the input, sought together with the order.
+
+Without it a search puts poles in its place: 14 samples of delay before one real pole look like two resonances
+and two real poles. Two steps. Where may the response begin? A long ARX model (no poles, any noise) tells up to
+which lag the inputs are not missed. Is it a delay? The order is selected again behind that many samples, the
+number moved to the best one, and the delay stays where the criterion of the order, which charges it as one
+number more, prefers the delayed model: a response that only rises slowly needs as many poles behind a delay as
+before it.
+
+Neglected: a delay of each input by itself; a loop closed around the plant (its noise comes back in the input).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import correlate
+from scipy.stats import chi2
+
+from ident.data.finding import Finding, FindingKind, finding
+from ident.data.record import Record
+from ident.fit.least_squares import EXPLAINED, Regression
+from ident.fit.regression import prepare_inputs
+from ident.search.order_selection import OrderSelection
+from ident.search.pole_search import Fitted, PoleSearch
+
+# Lags of output and input of the long model, as far as the shortest record has this many rows for each.
+_OUTPUT_LAGS, _INPUT_LAGS = 30, 100
+_ROWS_PER_LAG = 20
+# Lags that are missed less probably than this are missed: what is found here is judged again.
+_MISSED = 1e-3
+# Numbers of samples that are tried from the best one so far: next to it, and over a gap where a band-limited
+# input leaves several alike.
+_STEPS = (-1, 1, -3, 3, -8, 8)
+# Numbers of samples beside the best one where the order is selected again, and whether from the start.
+_NEIGHBOURS = ((-1, False), (1, False), (-2, True), (0, True), (2, True))
+# Selections of the order behind one number of samples after the other, at most.
+_ROUNDS = 6
+# The criterion of the order is -2 log of a Bayes factor: from 6 on evidence is called strong (Kass and Raftery,
+# JASA 90(430), 1995). Below, a fast pole explains as much, and a machine has those more often.
+_STRONG = 6.0
+# Numbers of samples that the data do not refuse beside the best one.
+_LEVEL = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class DeadTime:
+    """A model behind a delay that was found, and the finding that says so."""
+
+    fitted: Fitted
+    selection: OrderSelection
+    finding: Finding
+
+
+def seek(records: Sequence[Record], plain: Fitted) -> DeadTime | None:
+    """The model behind a delay that the criterion of the order prefers to `plain`, the end of a search without
+    one on these records; None where there is none.
+
+    records: one input each.
+    """
+    start = silent_lags(records) or 0
+    if start == 0:
+        return None
+    best = _behind(records, plain, start)
+    for _ in range(_ROUNDS):
+        moved, _ = _moved(records, best[0])
+        if _delay(moved) == _delay(best[0]):
+            break
+        best = _behind(records, moved, _delay(moved))
+    for _ in range(_ROUNDS):
+        if _delay(best[0]) == 0 or criterion_gain(best[0], plain) <= _STRONG:
+            return None
+        # A pole too many stands for what is wrong with the number of samples: select the order at neighbours,
+        # and from the start.
+        delay = _delay(best[0])
+        near = [_behind(records, best[0], delay + step, again) for step, again in _NEIGHBOURS]
+        other = max(near, key=lambda item: criterion_gain(item[0], best[0]))
+        if criterion_gain(other[0], best[0]) <= 0:
+            break
+        best = other
+    found, selection = best
+    _, known = _moved(records, found)
+    limit = float(chi2.ppf(_LEVEL, 1))
+    likely = [delay for delay, other in known.items() if gain(found, other) <= limit]
+    if min(likely) < _delay(found):
+        # Ellipses hold a response that begins later than the delay, never one that begins earlier.
+        found, selection = _behind(records, known[min(likely)], min(likely))
+    return DeadTime(
+        found,
+        selection,
+        finding(
+            FindingKind.DEAD_TIME,
+            delay=_delay(found),
+            delay_ms=1e3 * _delay(found) * found.data.dt_s,
+            low=min(likely),
+            high=max(likely),
+            order=found.poles.order,
+            order_without=plain.poles.order,
+            gain=criterion_gain(found, plain),
+        ),
+    )
+
+
+def silent_lags(records: Sequence[Record]) -> int | None:
+    """How many of the latest inputs the output does not miss; None where the records are too short to say.
+
+    In a long ARX model the inputs stand last in one factorisation, the latest at the very end, so that the sum
+    of the last squares is what leaving out the latest inputs costs. Where none of its lags is missed the
+    response begins later: at the largest correlation between changes of input and output.
+    """
+    shortest = min(record.n_samples for record in records)
+    lags = min(_INPUT_LAGS, shortest // _ROWS_PER_LAG)
+    own = min(_OUTPUT_LAGS, lags)
+    if lags < 2:
+        return None
+    blocks, targets = [], []
+    for record in records:
+        u, y = (signal[:, 0] - signal[0, 0] for signal in (record.input, record.output))
+        past, late = (np.lib.stride_tricks.sliding_window_view(signal[:-1], lags) for signal in (y, u))
+        blocks.append(np.hstack([past[:, lags - own :], late]))
+        targets.append(y[lags:])
+    offsets = np.repeat(np.eye(len(records)), [block.shape[0] for block in blocks], axis=0)
+    columns = np.column_stack([offsets, np.vstack(blocks), np.concatenate(targets)])
+    scale = np.linalg.norm(columns, axis=0)
+    triangle = np.linalg.qr(columns / np.where(scale > 0, scale, 1.0), mode="r")
+    freedom = columns.shape[0] - columns.shape[1] + 1
+    noise = float(triangle[-1, -1] ** 2) / max(freedom, 1)
+    if freedom < 1 or not noise > 0:
+        return None
+    cost = np.cumsum(triangle[-2 : -lags - 2 : -1, -1] ** 2) / noise
+    missed = chi2.sf(cost, np.arange(1, lags + 1)) < _MISSED
+    return int(np.argmax(missed)) if missed.any() else _most_correlated_lag(records, shortest // 2)
+
+
+def _most_correlated_lag(records: Sequence[Record], limit: int) -> int:
+    total = np.zeros(limit)
+    for record in records:
+        u, y = np.diff(record.input[:, 0]), np.diff(record.output[:, 0])
+        total += correlate(y, u, mode="full", method="fft")[u.size - 1 :][:limit]
+    return max(int(np.argmax(np.abs(total))) - 1, 0)
+
+
+def _behind(
+    records: Sequence[Record], near: Fitted, delay: int, again: bool = False
+) -> tuple[Fitted, OrderSelection]:
+    """Order and poles selected behind a delay, from the poles of a model with another one or from the start."""
+    search = _search(records, near, max(delay, 0))
+    selection = OrderSelection(search)
+    known = near.poles.order > search.fixed.order and not again
+    start = search.descend(near.poles, f"delay {delay}") if known else None
+    return Fitted(search, selection.run(start)), selection
+
+
+def _search(records: Sequence[Record], near: Fitted, delay: int) -> PoleSearch[Regression]:
+    data = prepare_inputs(records, replace(near.data.structure, input_delay_samples=delay))
+    return PoleSearch(data, near.search.options.model_copy(update={"input_delay_samples": delay}))
+
+
+def _delay(found: Fitted) -> int:
+    return found.data.structure.input_delay_samples
+
+
+def _moved(records: Sequence[Record], found: Fitted) -> tuple[Fitted, dict[int, Fitted]]:
+    """The same order behind the number of samples that fits best, and behind all that were tried."""
+    known = {_delay(found): found}
+    longest = min(record.n_samples for record in records) // 2
+    while True:
+        for step in _STEPS:
+            delay = _delay(found) + step
+            if not 0 <= delay < longest or delay in known:
+                continue
+            search = _search(records, found, delay)
+            known[delay] = there = Fitted(search, search.descend(found.poles, f"delay {delay}"))
+            if gain(there, found) > 0:
+                found = there
+                break
+        else:
+            return found, known
+
+
+def gain(found: Fitted, other: Fitted) -> float:
+    """Ne ln(J of other / J of found) on the rows that both answer to."""
+    delay = max(_delay(found), _delay(other))
+    ours, theirs = (_power_from(item, delay - _delay(item)) for item in (found, other))
+    floor = EXPLAINED * found.data.power
+    return found.worth() * float(np.log(max(theirs, floor) / max(ours, floor)))
+
+
+def _power_from(found: Fitted, skip: int) -> float:
+    residual = found.residual
+    return float(sum(residual[here][skip:] @ residual[here][skip:] for here in found.data.segments))
+
+
+def criterion_gain(found: Fitted, plain: Fitted) -> float:
+    """By how much the criterion of the order is lower for found; a delay is one number more."""
+    fewer = plain.data.n_parameters(plain.poles.order) - found.data.n_parameters(found.poles.order)
+    fewer += bool(_delay(plain)) - bool(_delay(found))
+    return gain(found, plain) + fewer * float(np.log(found.worth()))
