@@ -151,7 +151,7 @@ def _behind_dead_time(records: Sequence[Record], plain: Outcome, report: Progres
     looped = any(record.reference is not None for record in records)
     if looped or not plain.search.options.delay_left_to_data:
         return plain
-    report(0.5, "dead time")
+    report(0.86, "dead time")
     found = seek(records, plain)
     if found is None:
         return plain

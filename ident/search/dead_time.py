@@ -87,6 +87,9 @@ def seek(records: Sequence[Record], plain: Fitted) -> DeadTime | None:
     if min(likely) < _delay(found):
         # Ellipses hold a response that begins later than the delay, never one that begins earlier.
         found, selection = _behind(records, known[min(likely)], min(likely))
+    # The poles that were left may also do without a delay, in a place that the first search has missed.
+    if criterion_gain(found, _behind(records, found, 0)[0]) <= _STRONG:
+        return None
     return DeadTime(
         found,
         selection,

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
+import pytest
+import typer.main
+
+from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.data.finding import FindingKind, finding
+from workflow.cli import app
+from workflow.config.uncertainty_options import UncertaintyOptions
+from workflow.text.options import OPTIONS, speaking
 from workflow.text.templates import words
 
 STORED = Path(__file__).parent / "data" / "findings.txt"
@@ -51,6 +59,13 @@ VALUES = {
     "order": 4,
     "free_poles": "0.998, 0.9 +- 0.1j",
     "other_delay": 2,
+    "delay": 14,
+    "delay_ms": 70.0,
+    "low": 14,
+    "high": 14,
+    "order_without": 6,
+    "gain": 83.21,
+    "fit_percent": -0.123,
     "half_power_Hz": 0.512,
     "unpredictable_share": 0.0123,
     "passed": False,
@@ -115,6 +130,7 @@ OTHERWISE = {
     "NUISANCE": [{"needed": False}],
     "INTEGRATORS": [{"accepted": 0}, {"refused": False}],
     "DELAY": [{"other_delay": 1}],
+    "DEAD_TIME": [{"delay": 1, "low": 1, "high": 2}],
     "RELATIVE_DEGREE": [{"imposed": False}],
     "WHITENESS": [{"passed": True}, {"probability": 0.0}],
     "INDEPENDENCE": [
@@ -141,3 +157,46 @@ def test_every_kind_has_its_sentences():
         for other in ({}, *OTHERWISE.get(kind.name, ()))
     ]
     assert said == STORED.read_text(encoding="utf-8").splitlines()
+
+
+def every_sentence():
+    priors = ("integrators = 2", "fixed_poles", "input_delay_samples = 3", "relative_degree = 2")
+    return [
+        words(finding(kind, **(VALUES | other | {"prior": prior, "friction": True})))
+        for kind in FindingKind
+        for other in ({}, *OTHERWISE.get(kind.name, ()))
+        for prior in priors
+    ]
+
+
+def options_of(command):
+    return {
+        name for parameter in typer.main.get_command(app).commands[command].params for name in parameter.opts
+    }
+
+
+KEYS = {
+    key for settings in (IdentOptions, EmbeddingOptions, UncertaintyOptions) for key in settings.model_fields
+}
+
+
+@pytest.mark.parametrize("command", OPTIONS)
+def test_hints_of_a_command_name_its_own_options(command):
+    elsewhere = re.compile(r"\w+( = \S+)? \(in a configuration of flexlink run\)|uncertainty\.method = 'records'")
+    with speaking(command):
+        sentences = every_sentence()
+    named = {name for sentence in sentences for name in re.findall(r"--[a-z][a-z-]*", sentence)}
+    assert named <= options_of(command)
+    # Every option that the table knows is really an option, and the sentences reach most of them.
+    assert {text.split()[0] for text in OPTIONS[command].values()} <= options_of(command)
+    assert {"--delay", "--feedthrough", "--noise-order", "--zeta-max", "--promise"} <= named
+    for sentence in sentences:
+        rest = elsewhere.sub("", sentence)
+        assert not {key for key in KEYS if "_" in key} & set(re.findall(r"\w+", rest)), sentence
+
+
+def test_hints_of_a_configuration_name_its_keys():
+    told = KEYS | {"time_unit", "flexlink"}
+    for sentence in every_sentence():
+        assert "--" not in sentence, sentence
+        assert {name for name in re.findall(r"\b([a-z]+(?:_[a-zA-Z]+)+)\b", sentence)} <= told, sentence

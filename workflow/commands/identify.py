@@ -21,6 +21,7 @@ from workflow.tasks.results import IdentifiedPlant
 from workflow.tasks.simulated_rig import beside, truth_beside
 from workflow.tasks.summary import RunSummary, model_numbers, uncertainty_numbers
 from workflow.text.formats import count
+from workflow.text.options import speaking
 from workflow.text.templates import rows_of, words
 
 
@@ -70,7 +71,8 @@ def identify_logs(
 
         with progress.stage("report") as update:
             inputs = {str(path): storage.sha256_of_file(path) for path in logs.files}
-            written[report] = identify_page(result, inputs, update).encode()
+            with speaking("identify"):
+                written[report] = identify_page(result, inputs, update).encode()
     if out is not None:
         plant = IdentifiedPlant(result.spread.nominal, result.spread.posterior, promised.level)
         written[out] = storage.npz_bytes(codec.to_arrays(plant))
@@ -78,7 +80,8 @@ def identify_logs(
         written[export] = model_bytes(export, ModelFile(result.about.model, result.spread.frequency))
     interrupts.check()
     storage.write_together(written)
-    return _summary(result, out, report, export)
+    with speaking("identify"):
+        return _summary(result, out, report, export)
 
 
 def _summary(

@@ -20,6 +20,7 @@ from markupsafe import Markup
 
 from ident.data.finding import Finding
 from workflow.text.formats import FILTERS, TESTS
+from workflow.text.options import option, stated
 
 
 @cache
@@ -36,7 +37,7 @@ def environment(*own: tuple[str, Callable[..., Any]], package: str = "workflow")
         lstrip_blocks=True,
         bytecode_cache=None if own else CompiledTemplates(),
     )
-    made.filters.update(FILTERS, words=words, labelled=labelled)
+    made.filters.update(FILTERS, words=words, labelled=labelled, option=option, stated=stated)
     made.filters.update(own)
     made.tests.update(TESTS)
     return made
