@@ -87,8 +87,10 @@ def long_arx_filter(records: Sequence[Record], options: IdentOptions) -> RealArr
         return best
     longest = orders[-1]
     blocks, targets = [], []
+    sizes = [max(float(np.std(signal)) for signal in signals) for signals in _signals(part)]
     for record in part:
-        u, y = record.input[:, 0], record.output[:, 0] - record.output[:, 0].mean()
+        # In units of their own: a rank is told from how large the columns are.
+        u, y = record.input[:, 0] / sizes[0], (record.output[:, 0] - record.output[:, 0].mean()) / sizes[1]
         rows = np.arange(longest + delay, y.size)
         lags = np.arange(1, longest + 1)
         blocks.append(np.hstack([-y[rows[:, None] - lags], u[rows[:, None] - delay - lags + 1]]))
@@ -108,6 +110,10 @@ def long_arx_filter(records: Sequence[Record], options: IdentOptions) -> RealArr
         if criterion < least:
             best, least = np.concatenate([[1.0], theta[:order]]), criterion
     return best
+
+
+def _signals(records: Sequence[Record]) -> tuple[list[RealArray], list[RealArray]]:
+    return [record.input for record in records], [record.output for record in records]
 
 
 def _on_records(records: Sequence[Record], behind: Identification, noise_filter: RealArray) -> Identification:

@@ -42,7 +42,7 @@ from ident.fit.refinement import Refined, free_optimality
 from ident.fit.regression import prepare, prepare_inputs, restructured, thinned
 from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
 from ident.identification import Identification, MisoIdentification
-from ident.search.dead_time import seek
+from ident.search.dead_time import first_answer, seek
 from ident.search.order_selection import OrderSelection, Progress, silent
 from ident.search.pole_search import Fitted, PoleSearch, PolishedMinimum, SearchTrace
 
@@ -97,7 +97,7 @@ def _identified(records: Sequence[Record], options: IdentOptions, report: Progre
     data = prepare(records, options.structure())
     refuse_unusable(records, data, least_order(options))
     outcome, part = searched(records, data, options, report)
-    outcome = _behind_dead_time(part, outcome, report)
+    outcome, at_once = _behind_dead_time(part, outcome, report)
     fitted, verdicts = fitted_on_all(records, outcome)
     if outcome.dead_time is not None:
         verdicts = (outcome.dead_time, *verdicts)
@@ -107,6 +107,9 @@ def _identified(records: Sequence[Record], options: IdentOptions, report: Progre
     refused = tuple(
         test.finding for test in tests if test.refused and (test.imposed or options.relative_degree != "auto")
     )
+    if at_once and not options.feedthrough and options.relative_degree is None and fitted.poles.order:
+        test = direct_term_test(records, fitted)
+        refused += (finding(FindingKind.ANSWERS_AT_ONCE, **test.finding.values),) if test.refused else ()
     only = model.channel(0)
     report(1.0, "identified")
     return Identification(
@@ -142,24 +145,26 @@ def searched(
     return outcome, part
 
 
-def _behind_dead_time(records: Sequence[Record], plain: Outcome, report: Progress) -> Outcome:
-    """The search behind a delay that the data show, where nobody stated one.
+def _behind_dead_time(records: Sequence[Record], plain: Outcome, report: Progress) -> tuple[Outcome, bool]:
+    """The search behind a delay that the data show, where nobody stated one; and whether the output answers
+    in the very sample of the input, which only a direct term does.
 
     Not where a reference says that a loop was closed: noise that comes back in the input looks like an answer
     before, and like dead time after.
     """
     looped = any(record.reference is not None for record in records)
-    if looped or not plain.search.options.delay_left_to_data:
-        return plain
+    if looped or plain.search.options.input_delay_samples:
+        return plain, False
     report(0.86, "dead time")
-    found = seek(records, plain)
+    starts, at_once = first_answer(records)
+    found = seek(records, plain, starts) if plain.search.options.delay_left_to_data else None
     if found is None:
-        return plain
+        return plain, at_once
     search = found.fitted.search
     search.minima = [*plain.search.minima, *search.minima]
     search.stages = [*plain.search.stages, *search.stages]
     search.evaluations += plain.search.evaluations
-    return Outcome(search, found.fitted.end, found.selection, dead_time=found.finding)
+    return Outcome(search, found.fitted.end, found.selection, dead_time=found.finding), False
 
 
 @dataclass(frozen=True, eq=False)

@@ -135,3 +135,7 @@ class Poles:
 
 
 NO_POLES = Poles()
+
+DEADBEAT = 0.2
+"""Modulus below which a pole stands for a sample of delay, or part of one: it falls to a fifth within a
+sample."""

@@ -1,9 +1,10 @@
-"""Does the output answer to the input at all? A model that explains no more than chance has no number to show.
+"""Does the output answer to the input at all? A model that explains no more than chance has no number to
+show.
 
 Two tests. The fit: what the driven columns explain against the price that the choice of the order asks of any
 pole (`ident.search.order_selection`), beside nuisances that need no input. The ellipses: a response of zero
-inside all of them. Only the second sees that an output which wanders by itself (drift, hum) can be followed by
-slow or undamped poles behind any input; only the first knows that poles were searched.
+inside all of them. Only the second sees that an output which wanders by itself (drift, hum) can be followed
+by slow or undamped poles behind any input; only the first knows that poles were searched.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ _LEVEL = 0.999
 def explains_nothing(data: Regression, poles: Poles, fixed: Poles, residual: RealArray) -> list[Finding]:
     """One finding where the driven columns explain no more than poles fitted to noise would.
 
-    residual (N,): of the fit with these poles, of which `fixed` were given. Nuisances (offset, free responses)
-    are on both sides: a free decay or a hum is no answer to the input.
+    residual (N,): of the fit with these poles, of which `fixed` were given. Nuisances (offset, free
+    responses) are on both sides: a free decay or a hum is no answer to the input.
     """
     undriven = replace(data, structure=replace(data.structure, feedthrough=False, relative_degree=1))
     without = project(undriven, NO_POLES, poles).residual
@@ -40,9 +41,9 @@ def explains_nothing(data: Regression, poles: Poles, fixed: Poles, residual: Rea
 
 
 def zero_is_inside(posterior: ResponsePosterior, omega_rad_s: RealArray, *, doubted: bool) -> bool:
-    """Whether a response of zero lies inside all ellipses at omega (F,), at 99.9 %: frequency by frequency, or
-    where the fit is `doubted` over all of the N / 2 frequencies at which noise may have led the search to put a
-    pole (Bonferroni)."""
+    """Whether a response of zero lies inside all ellipses at omega (F,), at 99.9 %: frequency by frequency,
+    or where the fit is `doubted` over all of the N / 2 frequencies at which noise may have led the search to
+    put a pole (Bonferroni)."""
     ellipses = posterior.at(omega_rad_s)
     squared = ellipses.normalised_distance(np.zeros(ellipses.centre.size)) ** 2 * chi2.ppf(ellipses.level, 2)
     n_rows = 2 if posterior.report is None else max(posterior.report.n_rows, 2)

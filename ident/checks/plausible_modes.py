@@ -8,7 +8,7 @@ import numpy as np
 
 from ident.basis.coordinates import ZETA_LIMIT
 from ident.basis.model import GobfModel, MisoModel
-from ident.basis.poles import Poles
+from ident.basis.poles import DEADBEAT, Poles
 from ident.data.finding import Finding, FindingKind, finding
 from ident.fit.refinement import Bounds
 
@@ -73,6 +73,11 @@ def pole_warnings(model: GobfModel | MisoModel, fixed: Poles, bounds: Bounds) ->
             found.append(finding(FindingKind.SLOW_BOUND, a=a, integrators=model.integrators))
         elif 1 - a >= bounds.distance_max / close:
             found.append(finding(FindingKind.FAST_BOUND, a=a))
+    real, pairs = poles.real[fixed.real.size :], poles.pairs[fixed.pairs.size :]
+    late = np.count_nonzero(np.abs(real) < DEADBEAT) + 2 * np.count_nonzero(np.abs(pairs) < DEADBEAT)
+    # A single one is the part of a sample that a delay has beyond whole ones.
+    if late > 1:
+        found.append(finding(FindingKind.DEADBEAT, poles=late, delay=model.input_delay_samples + late))
     omegas, zetas = poles.omega_rad_s(dt_s), poles.zeta()
     for pole, omega, zeta in list(zip(poles.pairs, omegas, zetas, strict=True))[fixed.pairs.size :]:
         if zeta >= ZETA_LIMIT - 1e-6:

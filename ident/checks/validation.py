@@ -22,9 +22,9 @@ from ident.data.record import Record
 class FreshFit:
     """Free run on a record the model was not fitted to.
 
-    fit_percent = 100 (1 - |y - y_hat| / |y - mean y|); simulated and residual (T - delay,) in output units, in
-    the rows that answer to the record's input. answers: the response to the input brings the model nearer to
-    the record than a response of zero.
+    fit_percent = 100 (1 - |y - y_hat| / |y - mean y|); simulated and residual (T - delay,) in output units,
+    in the rows that answer to the record's input. answers: the response to the input brings the model nearer
+    to the record than a response of zero.
     """
 
     name: str

@@ -57,6 +57,8 @@ class FindingKind(Enum):
     FIXED_POLES = auto()
     DELAY = auto()
     DEAD_TIME = auto()
+    DEADBEAT = auto()
+    ANSWERS_AT_ONCE = auto()
     DIRECT_TERM = auto()
     RELATIVE_DEGREE = auto()
     TOO_FEW_POLES = auto()

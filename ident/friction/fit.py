@@ -135,8 +135,7 @@ def _start(records: Sequence[Record], options: IdentOptions) -> tuple[float, Gob
     level, delay = 0.0, options.input_delay_samples
     for _ in range(_START_ROUNDS):
         less = [
-            less_friction(record, level * sign, delay)
-            for record, sign in zip(records, signs, strict=True)
+            less_friction(record, level * sign, delay) for record, sign in zip(records, signs, strict=True)
         ]
         model = untested_model(less, options)
         undelayed = replace(model, input_delay_samples=0)

@@ -146,8 +146,8 @@ def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: Re
 
 
 def equations(found: FrictionFit, records: Sequence[Record]) -> tuple[list[RealArray], list[RealArray]]:
-    """Of every record the derivatives (T - delay, P + Q) of the simulated position, and what it leaves, in the
-    rows that answer to the record's input."""
+    """Of every record the derivatives (T - delay, P + Q) of the simulated position, and what it leaves, in
+    the rows that answer to the record's input."""
     delay = found.arm.structure.input_delay_samples
     local = [linearised(found.arm, found.coefficients, found.law, record.input[:, 0]) for record in records]
     return (

@@ -1,24 +1,27 @@
 """Dead time of the input, sought together with the order.
 
 Without it a search puts poles in its place: 14 samples of delay before one real pole look like two resonances
-and two real poles. Two steps. Where may the response begin? A long ARX model (no poles, any noise) tells up to
-which lag the inputs are not missed. Is it a delay? The order is selected again behind that many samples, the
-number moved to the best one, and the delay stays where the criterion of the order, which charges it as one
-number more, prefers the delayed model: a response that only rises slowly needs as many poles behind a delay as
-before it.
+and two real poles. Two steps. Where may the response begin? A long ARX model (no poles, any noise) tells up
+to which lag the inputs are not missed. Is it a delay? The order is selected again behind that many samples,
+the number moved to the best one, and the delay stays where the criterion of the order, which charges it as
+one number more, prefers the delayed model: a response that only rises slowly needs as many poles behind a
+delay as before it.
 
-Neglected: a delay of each input by itself; a loop closed around the plant (its noise comes back in the input).
+Neglected: a delay of each input by itself; a loop closed around the plant (its noise comes back in the
+input).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import correlate
 from scipy.stats import chi2
 
+from ident.basis.poles import DEADBEAT
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.fit.least_squares import EXPLAINED, Regression
@@ -35,11 +38,11 @@ _MISSED = 1e-3
 # input leaves several alike.
 _STEPS = (-1, 1, -3, 3, -8, 8)
 # Numbers of samples beside the best one where the order is selected again, and whether from the start.
-_NEIGHBOURS = ((-1, False), (1, False), (-2, True), (0, True), (2, True))
+_NEIGHBOURS = ((-1, False), (1, False), *((step, True) for step in (-3, -2, -1, 0, 1, 2, 3)))
 # Selections of the order behind one number of samples after the other, at most.
 _ROUNDS = 6
-# The criterion of the order is -2 log of a Bayes factor: from 6 on evidence is called strong (Kass and Raftery,
-# JASA 90(430), 1995). Below, a fast pole explains as much, and a machine has those more often.
+# The criterion of the order is -2 log of a Bayes factor: from 6 on evidence is called strong (Kass and
+# Raftery, JASA 90(430), 1995). Below, a fast pole explains as much, and a machine has those more often.
 _STRONG = 6.0
 # Numbers of samples that the data do not refuse beside the best one.
 _LEVEL = 0.95
@@ -54,87 +57,99 @@ class DeadTime:
     finding: Finding
 
 
-def seek(records: Sequence[Record], plain: Fitted) -> DeadTime | None:
-    """The model behind a delay that the criterion of the order prefers to `plain`, the end of a search without
-    one on these records; None where there is none.
+def seek(records: Sequence[Record], plain: Fitted, starts: Sequence[int]) -> DeadTime | None:
+    """The model behind a delay that the criterion of the order prefers to `plain`, the end of a search
+    without one on these records; None where there is none.
 
-    records: one input each.
+    records: one input each. starts: where the search begins, as of `first_answer`.
     """
-    start = silent_lags(records) or 0
-    if start == 0:
+    if not starts:
         return None
-    best = _behind(records, plain, start)
+    best = max((_behind(records, plain, start) for start in starts), key=lambda end: end.gain_over(plain))
     for _ in range(_ROUNDS):
-        moved, _ = _moved(records, best[0])
-        if _delay(moved) == _delay(best[0]):
+        moved, _ = _moved(records, best.fitted)
+        if _delay(moved) == _delay(best.fitted):
             break
         best = _behind(records, moved, _delay(moved))
     for _ in range(_ROUNDS):
-        if _delay(best[0]) == 0 or criterion_gain(best[0], plain) <= _STRONG:
+        if _delay(best.fitted) == 0 or best.gain_over(plain) <= _STRONG:
             return None
-        # A pole too many stands for what is wrong with the number of samples: select the order at neighbours,
-        # and from the start.
-        delay = _delay(best[0])
-        near = [_behind(records, best[0], delay + step, again) for step, again in _NEIGHBOURS]
-        other = max(near, key=lambda item: criterion_gain(item[0], best[0]))
-        if criterion_gain(other[0], best[0]) <= 0:
+        other = _better_neighbour(records, best)
+        if other is None:
             break
         best = other
-    found, selection = best
-    _, known = _moved(records, found)
+    _, known = _moved(records, best.fitted)
+    found = best.fitted
     limit = float(chi2.ppf(_LEVEL, 1))
     likely = [delay for delay, other in known.items() if gain(found, other) <= limit]
     if min(likely) < _delay(found):
         # Ellipses hold a response that begins later than the delay, never one that begins earlier.
-        found, selection = _behind(records, known[min(likely)], min(likely))
+        early = _behind(records, known[min(likely)], min(likely))
+        best = early if early.fitted.poles.order <= found.poles.order else best
+        found = best.fitted
     # The poles that were left may also do without a delay, in a place that the first search has missed.
-    if criterion_gain(found, _behind(records, found, 0)[0]) <= _STRONG:
+    if best.gain_over(_behind(records, found, 0).fitted) <= _STRONG:
         return None
     return DeadTime(
         found,
-        selection,
+        best.selection,
         finding(
             FindingKind.DEAD_TIME,
             delay=_delay(found),
             delay_ms=1e3 * _delay(found) * found.data.dt_s,
             low=min(likely),
             high=max(likely),
+            partial=bool(np.any(np.abs(found.poles.real[found.search.fixed.real.size :]) < DEADBEAT)),
             order=found.poles.order,
             order_without=plain.poles.order,
-            gain=criterion_gain(found, plain),
+            gain=best.gain_over(plain),
         ),
     )
 
 
-def silent_lags(records: Sequence[Record]) -> int | None:
-    """How many of the latest inputs the output does not miss; None where the records are too short to say.
+class FirstAnswer(NamedTuple):
+    """starts: how many of the latest inputs the output may not miss, nothing where it misses the latest.
+    at_once: it misses that of the very sample."""
 
-    In a long ARX model the inputs stand last in one factorisation, the latest at the very end, so that the sum
-    of the last squares is what leaving out the latest inputs costs. Where none of its lags is missed the
-    response begins later: at the largest correlation between changes of input and output.
+    starts: tuple[int, ...]
+    at_once: bool
+
+
+def first_answer(records: Sequence[Record]) -> FirstAnswer:
+    """Where the response begins, as a long ARX model says; nothing is missed where records are too short for
+    it.
+
+    The inputs stand last in one factorisation, the latest at the very end, so that the sum of the last
+    squares is what leaving out the latest inputs costs. What answers beyond
+    its lags shows in the correlation between changes of input and output.
     """
     shortest = min(record.n_samples for record in records)
     lags = min(_INPUT_LAGS, shortest // _ROWS_PER_LAG)
     own = min(_OUTPUT_LAGS, lags)
     if lags < 2:
-        return None
+        return FirstAnswer((), False)
     blocks, targets = [], []
     for record in records:
         u, y = (signal[:, 0] - signal[0, 0] for signal in (record.input, record.output))
-        past, late = (np.lib.stride_tricks.sliding_window_view(signal[:-1], lags) for signal in (y, u))
-        blocks.append(np.hstack([past[:, lags - own :], late]))
+        past = np.lib.stride_tricks.sliding_window_view(y[:-1], lags)[:, lags - own :]
+        blocks.append(np.hstack([past, np.lib.stride_tricks.sliding_window_view(u, lags + 1)]))
         targets.append(y[lags:])
     offsets = np.repeat(np.eye(len(records)), [block.shape[0] for block in blocks], axis=0)
     columns = np.column_stack([offsets, np.vstack(blocks), np.concatenate(targets)])
     scale = np.linalg.norm(columns, axis=0)
-    triangle = np.linalg.qr(columns / np.where(scale > 0, scale, 1.0), mode="r")
+    triangle = np.asarray(np.linalg.qr(columns / np.where(scale > 0, scale, 1.0), mode="r"))
     freedom = columns.shape[0] - columns.shape[1] + 1
     noise = float(triangle[-1, -1] ** 2) / max(freedom, 1)
     if freedom < 1 or not noise > 0:
-        return None
-    cost = np.cumsum(triangle[-2 : -lags - 2 : -1, -1] ** 2) / noise
-    missed = chi2.sf(cost, np.arange(1, lags + 1)) < _MISSED
-    return int(np.argmax(missed)) if missed.any() else _most_correlated_lag(records, shortest // 2)
+        return FirstAnswer((), False)
+    squares = triangle[-2 : -lags - 3 : -1, -1] ** 2 / noise
+    missed = np.asarray(chi2.sf(np.cumsum(squares[1:]), np.arange(1, lags + 1)) < _MISSED)
+    at_once = bool(chi2.sf(squares[0], 1) < _MISSED)
+    if missed[0]:
+        return FirstAnswer((), at_once)
+    starts = [int(np.argmax(missed))] if missed.any() else []
+    late = _most_correlated_lag(records, shortest // 2)
+    return FirstAnswer((*starts, *([late] if late > lags or (late and not starts) else [])), at_once)
 
 
 def _most_correlated_lag(records: Sequence[Record], limit: int) -> int:
@@ -145,15 +160,45 @@ def _most_correlated_lag(records: Sequence[Record], limit: int) -> int:
     return max(int(np.argmax(np.abs(total))) - 1, 0)
 
 
-def _behind(
-    records: Sequence[Record], near: Fitted, delay: int, again: bool = False
-) -> tuple[Fitted, OrderSelection]:
-    """Order and poles selected behind a delay, from the poles of a model with another one or from the start."""
+@dataclass(frozen=True, eq=False)
+class _Selected:
+    """An order selected behind a delay."""
+
+    fitted: Fitted
+    selection: OrderSelection
+
+    def gain_over(self, other: Fitted) -> float:
+        """By how much the criterion of the order is lower; a delay is one number more."""
+        found = self.fitted
+        fewer = other.data.n_parameters(other.poles.order) - found.data.n_parameters(found.poles.order)
+        fewer += bool(_delay(other)) - bool(_delay(found))
+        return gain(found, other) + fewer * float(np.log(found.worth()))
+
+
+def _behind(records: Sequence[Record], near: Fitted, delay: int, again: bool = False) -> _Selected:
+    """Order and poles selected behind a delay, from the poles of a model with another one or from the
+    start."""
     search = _search(records, near, max(delay, 0))
     selection = OrderSelection(search)
     known = near.poles.order > search.fixed.order and not again
     start = search.descend(near.poles, f"delay {delay}") if known else None
-    return Fitted(search, selection.run(start)), selection
+    return _Selected(Fitted(search, selection.run(start)), selection)
+
+
+def _better_neighbour(records: Sequence[Record], best: _Selected) -> _Selected | None:
+    """The order selected again, at neighbours and from the start: a pole too many stands for what is wrong
+    with the number of samples. None where nothing is better."""
+    found = best.fitted
+    _, known = _moved(records, found)
+    # What a neighbour loses with these poles, fewer of them would have to be worth.
+    most = found.data.n_parameters(found.poles.order) * float(np.log(found.worth()))
+    near = [
+        _behind(records, found, _delay(found) + step, again)
+        for step, again in _NEIGHBOURS
+        if _delay(found) + step not in known or gain(found, known[_delay(found) + step]) < most
+    ]
+    other = max(near, key=lambda item: item.gain_over(found), default=best)
+    return other if other.gain_over(found) > 0 else None
 
 
 def _search(records: Sequence[Record], near: Fitted, delay: int) -> PoleSearch[Regression]:
@@ -194,10 +239,3 @@ def gain(found: Fitted, other: Fitted) -> float:
 def _power_from(found: Fitted, skip: int) -> float:
     residual = found.residual
     return float(sum(residual[here][skip:] @ residual[here][skip:] for here in found.data.segments))
-
-
-def criterion_gain(found: Fitted, plain: Fitted) -> float:
-    """By how much the criterion of the order is lower for found; a delay is one number more."""
-    fewer = plain.data.n_parameters(plain.poles.order) - found.data.n_parameters(found.poles.order)
-    fewer += bool(_delay(plain)) - bool(_delay(found))
-    return gain(found, plain) + fewer * float(np.log(found.worth()))

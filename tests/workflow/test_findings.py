@@ -65,6 +65,8 @@ VALUES = {
     "high": 14,
     "order_without": 6,
     "gain": 83.21,
+    "partial": False,
+    "poles": 2,
     "fit_percent": -0.123,
     "half_power_Hz": 0.512,
     "unpredictable_share": 0.0123,
@@ -130,7 +132,7 @@ OTHERWISE = {
     "NUISANCE": [{"needed": False}],
     "INTEGRATORS": [{"accepted": 0}, {"refused": False}],
     "DELAY": [{"other_delay": 1}],
-    "DEAD_TIME": [{"delay": 1, "low": 1, "high": 2}],
+    "DEAD_TIME": [{"delay": 1, "low": 1, "high": 2}, {"partial": True}],
     "RELATIVE_DEGREE": [{"imposed": False}],
     "WHITENESS": [{"passed": True}, {"probability": 0.0}],
     "INDEPENDENCE": [
@@ -182,7 +184,9 @@ KEYS = {
 
 @pytest.mark.parametrize("command", OPTIONS)
 def test_hints_of_a_command_name_its_own_options(command):
-    elsewhere = re.compile(r"\w+( = \S+)? \(in a configuration of flexlink run\)|uncertainty\.method = 'records'")
+    elsewhere = re.compile(
+        r"\w+( = \S+)? \(in a configuration of flexlink run\)|uncertainty\.method = 'records'"
+    )
     with speaking(command):
         sentences = every_sentence()
     named = {name for sentence in sentences for name in re.findall(r"--[a-z][a-z-]*", sentence)}
@@ -199,4 +203,4 @@ def test_hints_of_a_configuration_name_its_keys():
     told = KEYS | {"time_unit", "flexlink"}
     for sentence in every_sentence():
         assert "--" not in sentence, sentence
-        assert {name for name in re.findall(r"\b([a-z]+(?:_[a-zA-Z]+)+)\b", sentence)} <= told, sentence
+        assert set(re.findall(r"\b([a-z]+(?:_[a-zA-Z]+)+)\b", sentence)) <= told, sentence

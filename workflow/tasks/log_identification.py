@@ -205,8 +205,8 @@ def _posterior(
 ) -> tuple[ResponsePosterior, Tests]:
     """Tangent posterior and its residual tests, with as much of a noise model as the residuals ask for.
 
-    White-noise bounds around coloured residuals are far too narrow, so the data decide, unless noise_order asks
-    for a noise model.
+    White-noise bounds around coloured residuals are far too narrow, so the data decide, unless noise_order
+    asks for a noise model.
     """
     if noise_order is None and whiteness_test(found.residuals).passed:
         posterior = tangent(used, found.model, bounds)

@@ -179,8 +179,8 @@ def uncertain_channel(
 
 
 def refuse_unanswered(result: IdentifiedChannel, posterior: ResponsePosterior, omega: Real) -> None:
-    """Raises ValueError, one line, where a response of zero lies inside all ellipses: no number of such a model
-    means anything. omega (F,): where ellipses are shown."""
+    """Raises ValueError, one line, where a response of zero lies inside all ellipses: no number of such a
+    model means anything. omega (F,): where ellipses are shown."""
     doubts = {FindingKind.NO_POLE, FindingKind.NO_ANSWER} & {
         warning.kind for warning in result.identification.warnings
     }

@@ -1,7 +1,7 @@
 """What a setting is called by the command that speaks: a hint has to work where it is read.
 
-Configurations and Python call a setting by its key. `flexlink identify` has options of its own for some; what it
-has none for is named with the command that has it.
+Configurations and Python call a setting by its key. `flexlink identify` has options of its own for some;
+what it has none for is named with the command that has it.
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ def option(_: Any, key: str, value: object = None) -> str:
     if key not in own:
         return f"{key}{' = ' + told if told else ''} (in a configuration of flexlink run)"
     name = own[key]
+    told = told.strip("'")
     return f"{name} {told}" if told and name not in _SWITCHES and " " not in name else name
 
 
