@@ -50,7 +50,9 @@ class IdentOptions(BaseModel):
         False, description="direct term from the input to the output of the same sample"
     )
     input_delay_samples: int = Field(
-        0, ge=0, description="known delay of the input in whole samples; left out: sought in the data of one input"
+        0,
+        ge=0,
+        description="known delay of the input in whole samples; left out: sought in the data of one input",
     )
     relative_degree: Annotated[int, Field(ge=1, le=6)] | Literal["auto"] | None = Field(
         None,

@@ -73,6 +73,17 @@ def driving_input(u: RealArray, integrators: int, delay_samples: int) -> RealArr
     return answered(filter_input(u, integrators, delay_samples), delay_samples)
 
 
+def level_before(u: RealArray) -> float:
+    """Input before a record (T,) whose offset and initial state are unknown: zero, unless the input never
+    comes near it; then its first value.
+
+    Both are alike to the basis functions, whose free responses and offset hold the difference. Taps of an
+    impulse response have no free response: a step of the whole operating point at the first sample would be
+    excitation that never was.
+    """
+    return 0.0 if np.min(u) <= 0 <= np.max(u) else float(u[0])
+
+
 def front_response(omega_rad_s: RealArray, dt_s: float, integrators: int, delay_samples: int) -> ComplexArray:
     """(z/(z - 1))^integrators z^-delay at omega (F,) in rad/s (not 0 with integrators), (F,)."""
     response = np.exp(-1j * omega_rad_s * dt_s * delay_samples)

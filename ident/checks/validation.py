@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from ident.basis.functions import nuisance_columns
 from ident.basis.model import GobfModel
 from ident.basis.posterior import ResponsePosterior
-from ident.basis.structure import answered
+from ident.basis.structure import answered, level_before
 from ident.data.arrays import BoolArray, RealArray, lock, real_rows
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
@@ -58,7 +58,9 @@ def fit_on_fresh_data(
     spread = float(np.linalg.norm(y - y.mean()))
     if spread == 0:
         raise ValueError(f"{record.label}: the output is constant")
-    simulated = answered(model.simulate(record.input[:, 0]), model.input_delay_samples)
+    unknown = estimate_offset and estimate_initial_state and not model.integrators
+    level = level_before(record.input[:, 0]) if unknown else 0.0
+    simulated = answered(model.simulate(record.input[:, 0] - level), model.input_delay_samples)
     without = y
     degrees = max(int(estimate_offset), model.integrators if estimate_initial_state else 0)
     nuisance = nuisance_columns(model.poles, y.size, degrees, estimate_initial_state)

@@ -3,8 +3,8 @@
 Without it a search puts poles in its place: 14 samples of delay before one real pole look like two resonances
 and two real poles. Two steps. Where may the response begin? A long ARX model (no poles, any noise) tells up
 to which lag the inputs are not missed. Is it a delay? The order is selected again behind that many samples,
-the number moved to the best one, and the delay stays where the criterion of the order, which charges it as
-one number more, prefers the delayed model: a response that only rises slowly needs as many poles behind a
+the number moved to the best one, and the delay stays where the criterion of the order, which charges for it,
+prefers the delayed model: a response that only rises slowly needs as many poles behind a
 delay as before it.
 
 Neglected: a delay of each input by itself; a loop closed around the plant (its noise comes back in the
@@ -157,7 +157,9 @@ def _most_correlated_lag(records: Sequence[Record], limit: int) -> int:
     for record in records:
         u, y = np.diff(record.input[:, 0]), np.diff(record.output[:, 0])
         total += correlate(y, u, mode="full", method="fft")[u.size - 1 :][:limit]
-    return max(int(np.argmax(np.abs(total))) - 1, 0)
+    # A peak that lags of nothing but chance would show once in a thousand such records.
+    peak, usual = int(np.argmax(np.abs(total))), float(np.sqrt(np.mean(total**2)))
+    return max(peak - 1, 0) if abs(total[peak]) > usual * np.sqrt(2 * np.log(limit / _MISSED)) else 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,11 +170,12 @@ class _Selected:
     selection: OrderSelection
 
     def gain_over(self, other: Fitted) -> float:
-        """By how much the criterion of the order is lower; a delay is one number more."""
+        """By how much the criterion of the order is lower; a delay of d samples costs 2 ln(1 + d), as an
+        integer of which the small ones are the likelier (Rissanen)."""
         found = self.fitted
         fewer = other.data.n_parameters(other.poles.order) - found.data.n_parameters(found.poles.order)
-        fewer += bool(_delay(other)) - bool(_delay(found))
-        return gain(found, other) + fewer * float(np.log(found.worth()))
+        longer = float(np.log1p(_delay(found)) - np.log1p(_delay(other)))
+        return gain(found, other) + fewer * float(np.log(found.worth())) - 2 * longer
 
 
 def _behind(records: Sequence[Record], near: Fitted, delay: int, again: bool = False) -> _Selected:

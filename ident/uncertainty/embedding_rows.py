@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from ident.basis.functions import all_pass_signal, nuisance_columns, regressor
 from ident.basis.poles import Poles
-from ident.basis.structure import Structure, answered, driving_input
+from ident.basis.structure import Structure, answered, driving_input, level_before
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.uncertainty.autoregression import Absorbed, first_rows, whitened
@@ -115,7 +115,9 @@ class EmbeddingRows:
         structure, whitening = self.structure, self.whitening
         delay = structure.input_delay_samples
         first = first_rows(whitening)
-        plain = driving_input(record.input[:, 0], structure.integrators, delay)
+        unknown = structure.estimate_offset and structure.estimate_initial_state and not structure.integrators
+        level = level_before(record.input[:, 0]) if unknown else 0.0
+        plain = driving_input(record.input[:, 0] - level, structure.integrators, delay)
         head = plain[: len(first)]
         u = plain if whitening.size == 1 else np.asarray(lfilter(whitening, np.ones(1), plain))
         regressors = self._driven(u)
