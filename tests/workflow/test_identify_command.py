@@ -230,7 +230,7 @@ def test_repeats_that_differ_between_amplitudes_are_warned_of(flexlink, undrawn,
                 y += 0.003 * rng.standard_normal(y.size)
                 logs.append(write_log(tmp_path / f"{gain}_{size}_{k}.csv", size * swept, y))
         answer = flexlink("identify", *logs, *COLUMNS, "--real", 1, "--pairs", 0, "--json")
-        said = [w for w in answer.document()["numbers"]["warnings"] if "depends on the amplitude" in w]
+        said = [w for w in answer.document()["numbers"]["warnings"] if "depends on amplitude" in w]
         assert len(said) == warned
         assert not warned or "% higher at the larger amplitude, as under dry friction" in said[0]
 

@@ -18,7 +18,7 @@ from ident.checks.answer import zero_is_inside
 from ident.checks.residual_tests import independence_test, whiteness_test
 from ident.checks.validation import ScatterRow, fit_on_fresh_data, repeat_scatter
 from ident.data.distortion import distortion_of
-from ident.data.finding import FindingKind
+from ident.data.finding import FindingKind, distinct
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
 from ident.data.signal_filter import increments
@@ -54,6 +54,7 @@ from workflow.tasks.results import (
     UncertaintyResult,
 )
 from workflow.tasks.stage import StageInput
+from workflow.text.templates import words
 
 _FEWEST_FREQUENCIES = 100
 _SHARE_INSIDE = 0.9
@@ -185,9 +186,17 @@ def refuse_unanswered(result: IdentifiedChannel, posterior: ResponsePosterior, o
         warning.kind for warning in result.identification.warnings
     }
     if zero_is_inside(posterior, omega, doubted=bool(doubts)):
+        wrapped = distinct(
+            [doubt for record in result.bounded for doubt in record.doubts if doubt.kind is FindingKind.WRAPS]
+        )
         raise ValueError(
-            f"the output '{result.output}' does not answer to the input '{result.input}': no response at all "
-            "explains the log as well as any model; check columns, wiring and unit"
+            "; ".join(
+                [
+                    f"the output '{result.output}' does not answer to the input '{result.input}': no response at "
+                    "all explains the log as well as any model; check columns, wiring and unit",
+                    *(words(doubt) for doubt in wrapped),
+                ]
+            )
         )
 
 
