@@ -189,14 +189,10 @@ def refuse_unanswered(result: IdentifiedChannel, posterior: ResponsePosterior, o
         wrapped = distinct(
             [doubt for record in result.bounded for doubt in record.doubts if doubt.kind is FindingKind.WRAPS]
         )
+        why = "no response at all explains the log as well as any model; check columns, wiring and unit"
         raise ValueError(
-            "; ".join(
-                [
-                    f"the output '{result.output}' does not answer to the input '{result.input}': no response at "
-                    "all explains the log as well as any model; check columns, wiring and unit",
-                    *(words(doubt) for doubt in wrapped),
-                ]
-            )
+            f"the output '{result.output}' does not answer to the input '{result.input}': "
+            f"{words(wrapped[0]) if wrapped else why}"
         )
 
 
