@@ -210,7 +210,11 @@ class _Fit:
     @property
     def score(self) -> tuple[bool, float, int]:
         above = self._above(self.start)
-        matches = not above or any(self._names_at(k) is not None for k in above)
+        header = self._header()
+        matches = not above or header is not None
+        if header is not None and _is_comment(self.lines[header]):
+            # Words of a comment are no names where a line of the table stands below them.
+            matches = all(k <= header or _is_comment(self.lines[k]) for k in above)
         return bool(self.share) and matches, self.share, self.least
 
     def _above(self, row: int) -> list[int]:
@@ -291,7 +295,7 @@ class _Fit:
         known = [
             bool(re.fullmatch(r"[\[(].*[\])]|-|1|sequence", cell, re.I)) or is_unit(cell) for cell in words
         ]
-        return 2 * sum(known) > len(words)
+        return bool(words) and 2 * sum(known) > len(words)
 
     def _units_above(self, header: int) -> dict[int, str]:
         """Units that lines above the names state with a word before them, by column."""

@@ -42,7 +42,7 @@ _SIGNAL = re.compile(
 SIGNAL_WORDS = {
     **dict.fromkeys(("volt", "volts"), "V"),
     **dict.fromkeys(("ampere", "amperes", "amp", "amps"), "A"),
-    **dict.fromkeys(("degree", "degrees", "grad"), "deg"),
+    **dict.fromkeys(("degree", "degrees"), "deg"),
     **dict.fromkeys(("radian", "radians"), "rad"),
     **dict.fromkeys(("newton", "newtons"), "N"),
 }

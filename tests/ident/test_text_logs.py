@@ -81,6 +81,20 @@ def test_units_above_the_names(tmp_path):
     assert (record.dt_s, record.input_units, record.output_units) == (DT_S, ("V",), ("rad",))
 
 
+def test_units_of_the_first_columns_only(tmp_path):
+    lines = [f"{line};ok" for line in rows(";", 1e9 * T_S)]
+    path = written(tmp_path, ";", ["Time", "u_V", "y_rad", "note"], below=["[ns];;;"], lines=lines)
+    assert Record.from_file(path, ["u_V"], ["y_rad"], time="Time").dt_s == DT_S
+
+
+@pytest.mark.parametrize("above", ["# a comment line here", "% four words of it", "// names t u y"])
+def test_words_of_a_comment_are_no_names(tmp_path, above):
+    """A date and a clock time are two cells between blanks, so that four words fit as well."""
+    lines = [f"05.03.2024 12:00:{t:06.3f}\t{u}\t{y}" for t, u, y in zip(T_S, U, Y, strict=True)]
+    path = written(tmp_path, "\t", ["timestamp", "u_V", "y_rad"], above=[above], lines=lines)
+    assert read_table(path).names == ("timestamp", "u_V", "y_rad")
+
+
 def test_signals_whose_units_contradict_each_other_are_told(tmp_path):
     path = written(tmp_path, ";", ["t_s", "u_V", "hub_deg"], below=["s;V;rad"])
     (note,) = Record.from_file(path, ["u_V"], ["hub_deg"], time="t_s").doubts
