@@ -17,6 +17,7 @@ import numpy as np
 from ident.data.arrays import BoolArray, ComplexArray, RealArray
 from ident.data.foreign_files import shown
 from ident.data.table import Table
+from ident.data.units import written_unit
 
 Convert = Callable[[RealArray], RealArray]
 
@@ -149,7 +150,7 @@ def response_columns(table: Table) -> ResponseColumns | None:
     """
     found: dict[str, list[str]] = {role: [] for role in _WORDS}
     for name in table.names:
-        role = _role(name, table.unit(name))
+        role = _role(name, _stated(table, name))
         if role is not None:
             found[role].append(name)
     rectangular = bool(found["real"] and found["imag"])
@@ -199,7 +200,7 @@ def read_response(table: Table) -> tuple[RealArray, ComplexArray]:
     """omega (K,) in rad/s and response (K,) of a table that has to be one. Raises ValueError."""
     columns = response_columns(table)
     if columns is None:
-        found = {_role(name, table.unit(name)) for name in table.names}
+        found = {_role(name, _stated(table, name)) for name in table.names}
         need = "one of real, imag and gain, phase_rad"
         if "frequency" not in found:
             need = "exactly one of the columns omega_rad_s, frequency_Hz"
@@ -214,7 +215,7 @@ def _conversion(table: Table, role: str, name: str, found: Mapping[str, Sequence
     units = _UNITS[role]
     if not units:
         return _times(1.0)
-    unit = _unit(name, table.unit(name))
+    unit = _unit(name, _stated(table, name))
     if unit in units:
         return units[unit]
     words = _words(name)
@@ -231,6 +232,11 @@ def _conversion(table: Table, role: str, name: str, found: Mapping[str, Sequence
         + (f"Unit '{shown(unit, 20)}' is not known. " if unit else "Its name does not say. ")
         + f"Call the column {write} in the file"
     )
+
+
+def _stated(table: Table, name: str) -> str:
+    """The unit as it is written: 'grad' may be a degree or a gradian, and is asked for."""
+    return written_unit(name) or table.units.get(name, "")
 
 
 def _role(name: str, unit: str) -> str | None:
