@@ -22,6 +22,8 @@ _OUTPUT = re.compile(
 _WISHED = re.compile(
     r"(^|[^a-z])(ref|reference|setpoint|set_point|desired|target|soll|sollwert|des)(?![a-z])", re.I
 )
+# Of a PLC's variable, its type: rVoltage, lrAngle.
+_PREFIX = re.compile(r"^(l?r|f|n|i|di|ui|w)(?=[A-Z])")
 _DRIVEN = re.compile(r"[mkµμ]?(V|A|N|Nm)")
 _MOVED = re.compile(r"[mµμ]?(rad|deg|m)((/|_)s2?|/s\^2|/s²)?|°|[cm]m|rpm|counts?|ticks?", re.I)
 
@@ -123,5 +125,6 @@ def _says(table: Table, name: str, unit: re.Pattern[str], word: re.Pattern[str])
     stated = table.unit(name)
     if stated:
         return unit.fullmatch(stated) is not None
-    # Of a topic, as /cmd/voltage, the last word counts like the first.
-    return any(word.match(part) for part in (name, name.rpartition("/")[2]))
+    # Of a topic, /cmd/voltage, and of a PLC's variable, PLC_PRG.rVoltage, the last word counts too.
+    last = re.split(r"[/.]", name)[-1]
+    return any(word.match(part) for part in (name, last, _PREFIX.sub("", last)))

@@ -200,6 +200,11 @@ class Table:
         found = str(cells[row])
         if isinstance(cells, tuple):
             found = f"'{shown(found, 40)}'" if found else "empty"
+            if row and not any(cells[row:]):
+                raise ValueError(
+                    f"{self.path}: column '{shown(name)}' ends at {self.place(row - 1, name)}, others at "
+                    f"{self.place(len(cells) - 1, name)}; expected equal lengths: cut the rows behind it"
+                )
         sign = " with a decimal comma" if self.layout and self.layout.decimal == "," else ""
         raise ValueError(
             f"{self.path}, {self.place(row, name)}: column '{shown(name)}' is {found}; "

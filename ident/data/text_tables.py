@@ -37,11 +37,13 @@ _GROUPS = {
 }
 _GROUP = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
 # A statement of the sampling above the rows: Rigol's tInc = 1e-06 and t0 = -0.005 between the names.
-_START = re.compile(r"(?:t0|x0|start)\b", re.IGNORECASE)
+_START = re.compile(r"(?:t0|x0|start|x ?org|x ?origin)\b", re.IGNORECASE)
 _INCREMENT = re.compile(
     r"(?:tinc|xinc|x ?increment|increment|delta[_ ]?[xt]|hresolution|sampl(?:e|ing) (?:interval|period))\b",
     re.IGNORECASE,
 )
+# What names hold beyond those of the columns: LabVIEW's comments, Rigol's start and step and their values.
+_BEYOND = re.compile(r"comment|start|increment|[+-]?\d+\.?\d*(e[+-]?\d+)?|", re.IGNORECASE)
 _UNITS_OF_X = re.compile(r"(?:horizontal|x)[_ ]units?\b|x_dimension\b", re.IGNORECASE)
 _UNITS_OF_Y = re.compile(r"(?:vertical|y)[_ ]unit", re.IGNORECASE)
 _SIGNS = frozenset("#%/!-*rR")
@@ -211,7 +213,8 @@ class _Fit:
     def score(self) -> tuple[bool, float, int]:
         above = self._above(self.start)
         header = self._header()
-        matches = not above or header is not None
+        # Of a preamble of 'XInc:,5e-3' alone there are no names.
+        matches = header is not None or all(self.rows[k][0].endswith(":") for k in above)
         if header is not None and _is_comment(self.lines[header]):
             # Words of a comment are no names where a line of the table stands below them.
             matches = all(k <= header or _is_comment(self.lines[k]) for k in above)
@@ -239,8 +242,10 @@ class _Fit:
         if self.separator == " " and len(cells) > self.most:  # names of several words
             cells = re.split(r"\s{2,}|\t", _COMMENT.sub("", self.lines[row]).strip())
         cells = cells[: len(cells) - _empty_at_end(cells)]
-        if len(cells) == self.most + 1 and cells[-1].lower() == "comment":
-            cells = cells[:-1]  # of LabVIEW, whose rows have none
+        if all(_BEYOND.fullmatch(cell) for cell in cells[self.most :]):
+            cells = cells[: self.most]
+        if _is_key(cells):
+            return None
         words = sum(bool(cell) and not _is_value(cell, self.decimal) for cell in cells)
         if numbered and cells and all(re.fullmatch(r"\d{1,3}", cell) for cell in cells[1:]):
             words = len(cells)
@@ -260,12 +265,16 @@ class _Fit:
     def layout(self) -> Layout:
         above, header = self._above(self.start), self._header()
         if header is None:
-            named = next((k for k in above if len(self.rows[k]) > 1 and not self._has_value(k)), None)
+            lines = (k for k in above if len(self.rows[k]) > 1 and not _is_key(self.rows[k]))
+            named = next((k for k in lines if not self._has_value(k)), None)
             if named is not None and named + 1 < len(self.rows):
                 there, cells = (len(self.rows[k]) - _empty_at_end(self.rows[k]) for k in (named, named + 1))
                 raise ValueError(_ragged(named + 2, cells, named + 1, there, self.separator))
             numbered = tuple(f"column {k + 1}" for k in range(self.least))
-            return Layout(self.separator, self.decimal, numbered, {}, 0, self.first + 1)
+            stated = any(map(_is_key, self.rows[: self.start]))
+            sampling = self._increment(self.start, [], []) if stated else None
+            first = self.start if stated else self.first
+            return Layout(self.separator, self.decimal, numbered, {}, 0, first + 1, increment=sampling)
         names, units, below = self._names_at(header) or [], list[str](), header + 1
         over = self._above(header)[:1]
         longer = self._names_at(over[0], numbered=True) if over else None
@@ -312,6 +321,7 @@ class _Fit:
     ) -> tuple[float, float] | None:
         """Start and step of the rows [s], as oscilloscopes state them beside or above the names."""
         told = list(zip(names, units, strict=False))
+        told += zip(self.rows[header], self.rows[min(header + 1, len(self.rows) - 1)], strict=False)
         told += [(name, value) for name, _, value in (cell.partition("=") for cell in names) if value]
         told += [(row[0], row[1]) for row in self.rows[:header] if len(row) > 1]
         values = [(name.strip(), value.strip()) for name, value in told if is_number(value, self.decimal)]
@@ -321,6 +331,11 @@ class _Fit:
 
         step, start = of(_INCREMENT), of(_START)
         return (start or 0.0, step) if step is not None and step > 0 else None
+
+
+def _is_key(cells: Sequence[str]) -> bool:
+    """Whether a line of a preamble states something of a name: 'XInc:,5e-3'."""
+    return bool(cells) and cells[0].endswith(":") and not all(cell.endswith(":") for cell in cells)
 
 
 def _is_comment(line: str) -> bool:

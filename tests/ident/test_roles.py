@@ -68,3 +68,18 @@ def test_many_long_names_stay_on_a_line():
     with pytest.raises(ValueError) as caught:
         roles_of(table(*(f"channel {k} " + "x" * 500 for k in range(300))), "a.csv")
     assert len(str(caught.value)) <= 300
+
+
+@pytest.mark.parametrize(
+    ("input_", "output"),
+    [
+        ("/cmd/voltage", "/joint_states/motor/position"),
+        ("PLC_PRG.rVoltage", "PLC_PRG.rAngle"),
+        ("MAIN.fTorque", "MAIN.lrPosition"),
+        ("bus.command", "bus.theta"),
+    ],
+)
+def test_the_last_word_of_a_path_counts(input_, output):
+    k = np.arange(50.0)
+    table = Table("a.npz", {"t": 0.01 * k, input_: np.sin(k), output: np.cos(k), "bus.count": k})
+    assert roles_of(table, "a.npz") == Roles("t", input_, output)

@@ -9,7 +9,9 @@ import pandas as pd
 import pytest
 
 from tests.workflow.diagnosis_examples import FRICTION, write_case
+from workflow.config.settings import check
 from workflow.diagnose.case_files import load_case
+from workflow.diagnose.case_settings import Column
 from workflow.engine.errors import InputError
 
 
@@ -245,3 +247,12 @@ def test_a_case_folder_reads_nothing_outside_itself(folder, tmp_path):
             load_case(folder)
         assert load_case(folder / "case.toml").case.experiments[0].name == "01_prbs"
         edit(folder / "case.toml", other, "experiments/01_prbs.csv")
+
+
+def test_a_column_that_wraps_goes_on_before_it_is_scaled():
+    turns = np.sin(0.05 * np.arange(300))
+    entry = check(Column, {"column": "counts", "unwrap": 4096, "scale": 2.0, "offset": 1.0}, source="x")
+    found = entry.quantity(np.round(4096 * turns) % 4096)
+    np.testing.assert_array_equal(found, 2 * np.round(4096 * turns) + 1)
+    with pytest.raises(InputError, match="unwrap"):
+        check(Column, {"column": "counts", "unwrap": 0}, source="x")

@@ -390,3 +390,19 @@ def test_the_default_arm_is_identified_behind_its_friction(tmp_path):
         assert not [w for w in found.identification.warnings if w.kind is FindingKind.CLIPPED]
         assert spread.intervals is not None
         assert spread.bands[0].median_radius_percent < 0.1
+
+
+def test_a_configuration_resamples_and_unwraps(tmp_path):
+    rng = np.random.default_rng(3)
+    time = np.cumsum(0.01 * rng.uniform(0.8, 1.2, 400))
+    turned = 2000 * np.sin(3 * time) + 3000
+    table = {"t_s": time, "u": np.sign(np.sin(9 * time)), "counts": np.round(turned) % 4096}
+    np.savez(tmp_path / "log.npz", **table)
+    options = {"kind": "files", "time": "t_s", "records": [{"path": str(tmp_path / "log.npz")}]}
+    options |= {"resample_s": 0.02, "unwrap": {"counts": 4096}}
+    source = check(FileSource, options, source="x")
+    channels = [check(Channel, {"input": "u", "output": "counts"}, source="x")]
+    record = read_record(source, source.records[0], channels)
+    truth = 2000 * np.sin(3 * (time[0] + record.time_s)) + 3000
+    # Half a count, and a straight line between readings 12 ms apart: (3 h)^2 / 8 of 2000.
+    np.testing.assert_allclose(record.output[:, 0], truth, atol=0.5 + 2000 * (3 * 0.012) ** 2 / 8)

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from ident.data.arrays import RealArray
+from ident.data.wrapping import unwrapped
 from plant.effects import EFFECTS
 from plant.rig import Output
 from workflow.config.settings import Section, check, meant, read_toml, repeated
@@ -17,7 +18,8 @@ CASE_FILE, RIG_FILE = "case.toml", "rig.toml"
 
 
 class Column(Section):
-    """Where a quantity stands in a log: quantity = scale * column + offset."""
+    """Where a quantity stands in a log: quantity = scale * column + offset, of a column that goes on where it
+    wraps."""
 
     column: str = Field(min_length=1, description="name of the column")
     scale: float | None = Field(
@@ -27,7 +29,13 @@ class Column(Section):
     )
     offset: float = Field(0.0, description="added after scaling, in the unit of the quantity")
 
+    unwrap: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="period of a column that wraps: 4096 counts, 360 degrees"
+    )
+
     def quantity(self, values: RealArray) -> RealArray:
+        if self.unwrap is not None:
+            values = unwrapped(values, self.unwrap)[0]
         return values * (1.0 if self.scale is None else self.scale) + self.offset
 
 
