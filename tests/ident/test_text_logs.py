@@ -355,7 +355,8 @@ def test_topics_at_rows_of_their_own(tmp_path, share):
             lines.append(f"{1.7e9 + T_S[k] - 1e-3:.6f},{U[k]},")
         lines.append(f"{1.7e9 + T_S[k]:.6f},,{Y[k]}")
     path = written(tmp_path, ",", ["__time", "/cmd/voltage", "/arm/position"], lines=lines)
-    assert time_of(read_table(path)) == "__time"
+    roles = roles_of(read_table(path), "a.csv")
+    assert (roles.time, roles.input, roles.output) == ("__time", "/cmd/voltage", "/arm/position")
     record = Record.from_file(path, ["/cmd/voltage"], ["/arm/position"], time="__time")
     np.testing.assert_array_equal(record.output[:, 0], Y)
     np.testing.assert_array_equal(record.input[:, 0], sent)
