@@ -105,6 +105,8 @@ class Law:
         """A field of a file: an array of numbers, or what its annotation says."""
         value = data[name]
         try:
+            if _holds_truth(value):
+                raise TypeError
             if name in _ARRAYS:
                 return np.array(value, dtype=np.float64)
             return TypeAdapter(hint).validate_python(value.item() if isinstance(value, np.generic) else value)
@@ -139,3 +141,9 @@ class Law:
         if not isinstance(data, dict):
             raise ValueError(f"{cls.kind} JSON must be an object; got {type(data).__name__}")
         return cls.from_dict(data)
+
+
+def _holds_truth(value: Any) -> bool:
+    """Whether there is a `true` or `false`, which is no number, in a value of JSON."""
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return isinstance(value, bool) or any(map(_holds_truth, parts))

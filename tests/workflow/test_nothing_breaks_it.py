@@ -404,3 +404,19 @@ def test_damaged_logs(tmp_path, damage):
 @FEW_AND_ALL
 def test_spoilt_controllers(amount):
     assert spoilt_controllers(50 if amount == "few" else 1000).wrong == []
+
+
+@pytest.mark.parametrize(
+    ("good", "bad", "words"),
+    [
+        ('"dt_s": 0.01', '"dt_s": true', "dt_s: expected float, got True"),
+        ('"input_limit": 3.0', '"input_limit": false', "input_limit: expected"),
+        ('"D": [', '"D": [true, ', "D: expected an array of numbers, got"),
+        ('"dt_s": 0.01', '"dt_s": 0.01, "dt_s": 0.02', "'dt_s' is there twice in one object"),
+    ],
+)
+def test_true_is_no_number_and_no_name_is_there_twice(good, bad, words):
+    text = Controller.proportional(2.0, 0.01, input_limit=3.0).to_json()
+    assert good in text
+    with pytest.raises(ValueError, match=re.escape(words)):
+        Controller.from_json(text.replace(good, bad, 1))
