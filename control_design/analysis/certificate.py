@@ -15,9 +15,10 @@ from control_design.analysis.margins import Margins, ellipse_margins, nominal_ma
 from control_design.analysis.stability import NyquistCount, closed_loop_poles, loop_integrators, nyquist_count
 from control_design.analysis.worst_case import worst_case
 from control_design.controllers.controller import Controller
-from control_design.plants.ellipses import Complex, Real
-from control_design.plants.frequency_grid import checked_grid, with_own_grid
+from control_design.plants.ellipses import Complex, Ellipses, Real
+from control_design.plants.frequency_grid import checked_grid, near_the_circle, with_own_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
+from control_design.plants.set_expansion import with_straight_between
 from control_design.specification import Specification
 from control_design.specification.requirement import Findings, SpecificationItem
 
@@ -80,7 +81,7 @@ def certify(
     specification: Specification,
     *,
     n_dense: int = 6000,
-    between_own_points: Literal["nothing", "linear"] = "nothing",
+    between_own_points: Literal["nothing", "linear"] = "linear",
     joint_coverage: float | None = None,
     rng: np.random.Generator | None = None,
     joint_draws: int = 4000,
@@ -93,8 +94,9 @@ def certify(
     (`between_grid_points`), for plants whose uncertainty can be evaluated with its derivatives: posteriors of
     coefficients, plants without uncertainty, and uncertainties that offer `first_order`.
 
-    between_own_points: what may be assumed of a response known on its own frequencies only. "nothing": no
-    statement between them. "linear": at fraction x between two neighbours it lies in (1 - x) E_k + x E_{k+1}.
+    between_own_points: what may be assumed of a response known on its own frequencies only. "linear": at
+    fraction x between two neighbours it lies in (1 - x) E_k + x E_{k+1}; the verdict says that this was
+    assumed. "nothing": no statement between them, whatever the controller does there.
 
     joint_coverage: probability with which the weighted worst case shall hold for a whole response; needs rng
     and draws `joint_draws` responses (`joint_coverage.joint_coverage`). None: each frequency by itself.
@@ -160,22 +162,41 @@ def _check_plant(
     own_modes = modes_of(controller.poles, plant.dt_s)
     near = [m for m in (*plant.modes, *loop_modes, *own_modes) if m.omega_rad_s < plant.nyquist_rad_s]
     light = [Mode(m.omega_rad_s, max(abs(m.zeta), 1e-5)) for m in near if abs(m.zeta) < 0.4]
-    grid = with_own_grid(plant, checked_grid(plant, light, n_dense, 120))
+    # Whatever is narrow: poles and zeros of the loop next to the circle, before and after it is closed.
+    roots = np.concatenate([plant.poles, plant.zeros, controller.poles, _zeros(controller), poles])
+    narrow = near_the_circle(roots, plant.dt_s)
+    grid = checked_grid(plant, light, n_dense, 120, roots=roots, extra=narrow)
+    assumed_linear = plant.own_grid is not None and between_own_points == "linear"
+    own_points = with_own_grid(plant, grid)
+    seen = with_straight_between(plant) if assumed_linear else plant
+    grid = np.union1d(grid, own_points) if assumed_linear else own_points
 
-    worst = worst_case(partial(controller.response, with_delay=False), plant, specification, grid)
-    refinable = plant.own_grid is None
+    worst = worst_case(partial(controller.response, with_delay=False), seen, specification, grid)
+    refinable = seen.own_grid is None
+
+    def between(omega: Real) -> tuple[Complex, Ellipses]:
+        return controller.response(omega), seen.at(omega)
 
     def loop_gain(omega: Real) -> Complex:
-        return controller.response(omega) * plant.at(omega).centre
+        return controller.response(omega) * seen.at(omega).centre
 
     integrators, unstable = loop_integrators(controller, plant)
     dense = worst.omega_rad_s
+    # On a plant's own frequencies the count is that of its data; what lies between them is the proof's.
+    counted = own_points if assumed_linear else dense
     count = nyquist_count(
-        loop_gain, dense, integrators=integrators, unstable_poles=unstable, refinable=refinable
+        loop_gain, counted, integrators=integrators, unstable_poles=unstable, refinable=plant.own_grid is None
     )
-    nominal = nominal_margins(loop_gain, dense, refinable=refinable)
+    at_zero = None if integrators else float(loop_gain(np.zeros(1))[0].real)
+    nominal = nominal_margins(loop_gain, dense, refinable=refinable, at_zero=at_zero)
     distance = worst.values["distance"]
-    margins = ellipse_margins(worst.loop_factor, worst.ellipses, distance).worse(nominal)
+    margins = ellipse_margins(
+        worst.loop_factor,
+        worst.ellipses,
+        distance,
+        between=between if refinable else None,
+        at_zero=not integrators,
+    ).worse(nominal)
     at = int(np.argmin(distance))
     peaks = {name: worst.peak(name) for name in worst.names}
     weighted = max(peak for peak, _ in peaks.values())
@@ -209,7 +230,7 @@ def _check_plant(
         own_grid_rad_s=None
         if plant.own_grid is None
         else (float(plant.own_grid[0]), float(plant.own_grid[-1])),
-        assumed_linear=plant.own_grid is not None and between_own_points == "linear",
+        assumed_linear=assumed_linear,
         stated=plant.uncertainty is not None,
         own_performance=plant.performance is not None,
         all_frequencies=proof,
@@ -224,3 +245,10 @@ def _check_plant(
         controller,
     )
     return verdict, [requirement.check(found) for requirement in specification.requirements(plant)]
+
+
+def _zeros(controller: Controller) -> Complex:
+    """Finite zeros of the controller in z."""
+    system = controller.to_control()
+    zeros = np.asarray(system.zeros() if controller.order else [], dtype=np.complex128)
+    return np.asarray(zeros[np.isfinite(zeros)], dtype=np.complex128)

@@ -8,11 +8,17 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from control_design.plants.ellipses import Integer, Real
+from control_design.plants.ellipses import Complex, Integer, Real
 from control_design.plants.plant_set import Mode, UncertainPlant
 
-CHECKED_FROM_RAD_S = 1e-4
-"""Lowest frequency of the grids that a design is checked on, whatever it was made on."""
+_LOWEST_ANGLE = 5e-7
+"""Lowest frequency of the grids, rad per sample (1e-4 rad/s at 200 Hz), above slower poles."""
+_BELOW_SLOWEST = 1e-2
+"""Share of the slowest root's distance from z = 1 that the grids begin at, where that is lower."""
+_INTEGRATES = 1e-9
+"""Roots nearer to z = 1 count as integrators (`count_integrators`)."""
+_WIDE = 0.1
+"""Roots farther from the circle than this, rad per sample, leave nothing narrow between grid points."""
 
 
 class GridOptions(BaseModel):
@@ -23,7 +29,34 @@ class GridOptions(BaseModel):
     grid_points: int = Field(default=110, ge=20, le=2000, description="logarithmic points of the programme")
     mode_points: int = Field(default=60, ge=0, le=1000, description="points spread around the flexible modes")
     dense_points: int = Field(default=8000, ge=500, le=100_000, description="points of the dense check")
-    omega_min_rad_s: float = Field(default=1e-4, gt=0, description="lowest frequency of all grids, rad/s")
+    omega_min_rad_s: float | None = Field(
+        default=None,
+        gt=0,
+        description="lowest frequency of all grids, rad/s; none = 5e-7 rad per sample, or a hundredth of the "
+        "slowest pole",
+    )
+
+
+def lowest_rad_s(dt_s: float, roots_z: Complex) -> float:
+    """Where grids begin for a sampling time and the poles and zeros that are to be seen, rad/s."""
+    away = np.abs(np.asarray(roots_z, dtype=np.complex128) - 1.0)
+    slowest = float(np.min(away, initial=np.inf, where=away > _INTEGRATES))
+    return min(_LOWEST_ANGLE, _BELOW_SLOWEST * slowest) / dt_s
+
+
+def near_the_circle(roots_z: Complex, dt_s: float, per_decade: int = 25) -> Real:
+    """Frequencies [rad/s] around poles and zeros close to the unit circle, geometric from a tenth of their
+    distance to it outwards: what they do to a response, however narrow, is seen there."""
+    parts = [np.zeros(0)]
+    for root in np.unique(np.asarray(roots_z, dtype=np.complex128)):
+        angle, distance = abs(float(np.angle(root))), abs(abs(complex(root)) - 1.0)
+        if not 1e-16 < distance < _WIDE:
+            continue
+        decades = np.log10(_WIDE / distance) + 1.0
+        step = np.geomspace(0.1 * distance, _WIDE, int(np.ceil(per_decade * decades)))
+        parts.append(np.concatenate([angle - step, [angle], angle + step]))
+    angles = np.concatenate(parts)
+    return np.asarray(np.unique(angles[(angles > 0) & (angles < np.pi)]) / dt_s, dtype=np.float64)
 
 
 def mode_points(mode: Mode, count: int, half_widths: float = 20.0) -> Real:
@@ -58,10 +91,20 @@ def frequency_grid(
     return np.asarray(grid[keep], dtype=np.float64)
 
 
-def checked_grid(plant: UncertainPlant, modes: Sequence[Mode], n_log: int, per_mode: int) -> Real:
-    """Grid that a design is checked on, whatever it was made on: from `CHECKED_FROM_RAD_S`."""
-    n_mode, low = per_mode * len(modes), CHECKED_FROM_RAD_S
-    return frequency_grid(plant.nyquist_rad_s, modes, omega_min_rad_s=low, n_log=n_log, n_mode=n_mode)
+def checked_grid(
+    plant: UncertainPlant,
+    modes: Sequence[Mode],
+    n_log: int,
+    per_mode: int,
+    *,
+    roots: npt.ArrayLike = (),
+    extra: npt.ArrayLike = (),
+) -> Real:
+    """Grid that a design is checked on, whatever it was made on: from `lowest_rad_s` of the plant and the
+    further `roots`."""
+    low = lowest_rad_s(plant.dt_s, np.concatenate([plant.poles, np.asarray(roots, dtype=np.complex128)]))
+    n_mode, top = per_mode * len(modes), plant.nyquist_rad_s
+    return frequency_grid(top, modes, omega_min_rad_s=low, n_log=n_log, n_mode=n_mode, extra=extra)
 
 
 def programme_grid(
@@ -76,7 +119,7 @@ def programme_grid(
     points = options.grid_points, options.mode_points
     if dense:
         points = int(0.7 * options.dense_points), int(0.3 * options.dense_points)
-    low = options.omega_min_rad_s
+    low = options.omega_min_rad_s or lowest_rad_s(plant.dt_s, plant.poles)
     grid = frequency_grid(
         plant.nyquist_rad_s, modes, omega_min_rad_s=low, n_log=points[0], n_mode=points[1], extra=extra
     )
@@ -124,7 +167,7 @@ def with_violations(grid: Real, omega: Real, value: Real, limit: float, most: in
 
 def starting_edges(plant: UncertainPlant, modes: Sequence[Mode], extra: npt.ArrayLike = ()) -> Real:
     """Edges of a first partition of [0, Nyquist] for bounds on intervals: logarithmic, finer around modes."""
-    count = max(60, int(40 * np.log10(plant.nyquist_rad_s / CHECKED_FROM_RAD_S)))
+    count = max(60, int(40 * np.log10(plant.nyquist_rad_s / lowest_rad_s(plant.dt_s, plant.poles))))
     inner = checked_grid(plant, modes, count, 40)
     more = np.asarray(extra, dtype=np.float64)
     more = more[(more > 0) & (more < plant.nyquist_rad_s)]

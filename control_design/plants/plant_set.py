@@ -116,7 +116,7 @@ class Channel:
         index = np.clip(np.searchsorted(own, omega), 0, own.size - 1)
         before = np.maximum(index - 1, 0)
         index = np.where(np.abs(own[before] - omega) < np.abs(own[index] - omega), before, index)
-        missing = ~outside & (np.abs(own[index] - omega) > 1e-9 * np.maximum(omega, 1e-12))
+        missing = ~outside & (np.abs(own[index] - omega) > 1e-9 * omega)
         if np.any(missing):
             raise ValueError(
                 f"the uncertainty is known on its own grid only; {omega[np.argmax(missing)]:.6g} "

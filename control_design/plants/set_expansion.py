@@ -9,17 +9,17 @@ them; the one assumption offered here is stated in `own_grid_set`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from control_design.plants.ellipses import Complex, Real, radius_of
+from control_design.plants.ellipses import Complex, Real, quotient, radius_of
 from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
-from control_design.plants.plant_set import Channel
+from control_design.plants.plant_set import Channel, UncertainPlant
 from ident.basis.functions import block_parameters
-from ident.uncertainty import ResponsePosterior
+from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +185,51 @@ def own_grid_set(
         here = axes[index] * inside[:, None]
         groups.append(clear.times(FirstOrder(here * weight[:, None], here * rate[:, None], none, h)))
     return SetExpansion(centre, tuple(groups))
+
+
+@dataclass(frozen=True, eq=False)
+class StraightBetween:
+    """A response known on its own frequencies as one at any: the assumption of `own_grid_set`.
+
+    at: per frequency the ellipse that encloses (1 - x) E_k + x E_{k+1}; with shapes P and Q of the two and
+    p^2 = tr P, q^2 = tr Q it is (p + q)(P/p + Q/q), exact where one of them vanishes or both are alike.
+    """
+
+    channel: Channel
+
+    def at(self, omega_rad_s: Real, level: float) -> FrequencyUncertainty:
+        """Centre and covariances at omega (F,), so that ellipses of `level` enclose those of the record."""
+        own = self.channel.own_grid
+        assert own is not None
+        record: Any = self.channel.uncertainty
+        omega = np.asarray(omega_rad_s, dtype=np.float64)
+        inside = (omega >= own[0] * (1 - 1e-9)) & (omega <= own[-1] * (1 + 1e-9))
+        left = np.clip(np.searchsorted(own, omega, side="right") - 1, 0, own.size - 2)
+        share = np.clip((omega - own[left]) / (own[left + 1] - own[left]), 0.0, 1.0)
+        centres = np.asarray(record.centre, dtype=np.complex128)
+        centre = (1 - share) * centres[left] + share * centres[left + 1]
+        centre = np.where(inside, centre, self.channel.nominal_response(np.where(inside, np.pi / 2 / self.channel.dt_s, omega)))
+        scale = (radius_of(float(record.level)) / radius_of(level)) ** 2
+        shapes = np.asarray(record.covariance, dtype=np.float64) * scale
+        parts = [(1 - share)[:, None, None] ** 2 * shapes[left], share[:, None, None] ** 2 * shapes[left + 1]]
+        sizes = [np.sqrt(np.trace(part, axis1=1, axis2=2)) for part in parts]
+        covariance = sum(
+            part * np.asarray(quotient(sizes[0] + sizes[1], size))[:, None, None]
+            for part, size in zip(parts, sizes, strict=True)
+        )
+        covariance = np.where(inside[:, None, None], covariance, 0.0)
+        dt_s = self.channel.dt_s
+        return FrequencyUncertainty(omega, centre, covariance, dt_s, level=level, method="straight between")
+
+
+def with_straight_between(plant: UncertainPlant) -> UncertainPlant:
+    """The plant with `StraightBetween` in place of records on their own frequencies."""
+    performance = plant.performance
+    if performance is not None and performance.own_grid is not None:
+        performance = replace(performance, uncertainty=StraightBetween(performance))
+    if plant.own_grid is None:
+        return replace(plant, performance=performance)
+    return replace(plant, uncertainty=StraightBetween(plant.channel), performance=performance)
 
 
 def stacked(columns: Sequence[FirstOrder]) -> FirstOrder:

@@ -23,6 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from control_design.controllers.biquads import SOLVER_SLACK, SectionKind
 from control_design.plants.ellipses import Real
+from control_design.plants.frequency_grid import lowest_rad_s
 from control_design.plants.plant_set import UncertainPlant, count_integrators
 from control_design.plants.weights import RationalWeight, bandwidth_weight, effort_limit_weight
 from control_design.specification.requirement import (
@@ -282,7 +283,7 @@ class ModePeak(WeightedRequirement):
         high = min(band[1], plant.nyquist_rad_s)
         omega = np.geomspace(band[0], high, 2000)
         for mode in modes:
-            width = max(mode.zeta * mode.omega_rad_s, 1e-9)
+            width = max(mode.zeta, 1e-9) * mode.omega_rad_s
             omega = np.append(omega, mode.omega_rad_s + width * np.sinh(np.linspace(-3, 3, 121)))
         omega = np.unique(omega[(omega >= band[0]) & (omega <= high)])
         peak = float(np.max(np.abs(plant.damped.nominal_response(omega))))
@@ -375,7 +376,7 @@ def _refuse_frequencies(spec: Specification, plant: UncertainPlant) -> None:
         raise SpecificationError(
             f"mode_band_rad_s starts at {low:.4g} rad/s, beyond the Nyquist frequency {nyquist:.4g} rad/s"
         )
-    if plant.n_integrators and low < 1e-3:
+    if plant.n_integrators and low * plant.dt_s < 5e-6:  # where the open loop is its integrator and no more
         raise SpecificationError(
             f"mode_band_rad_s starts at {low:.4g} rad/s, where plant {plant.name!r} integrates and has no "
             "finite peak"
@@ -419,7 +420,7 @@ def _refuse_zeros(spec: Specification, plant: UncertainPlant) -> None:
 
 
 def _refuse_effort(spec: Specification, plant: UncertainPlant) -> None:
-    omega = np.geomspace(1e-4, plant.nyquist_rad_s, 4000)
+    omega = np.geomspace(lowest_rad_s(plant.dt_s, plant.poles), plant.nyquist_rad_s, 4000)
     effort = spec.magnitude(plant, omega, LoopFunction.EFFORT)
     if not np.any(effort > 0):
         return

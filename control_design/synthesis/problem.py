@@ -11,7 +11,7 @@ from control_design.analysis.worst_case import Grids, PlantData, worst_of
 from control_design.controllers.biquads import SOLVER_SLACK, Cascade
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Ellipses, Real, scale_to_minus_one
-from control_design.plants.frequency_grid import mode_points, with_violations
+from control_design.plants.frequency_grid import lowest_rad_s, mode_points, with_violations
 from control_design.plants.guards import GUARD_MODULUS, Guard, sorted_by_plant
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification
@@ -102,7 +102,8 @@ class Problem(Grids):
             if plant.own_grid is not None or not light:
                 continue
             points = np.concatenate([_around(mode) for mode in light])
-            low, high = self.options.omega_min_rad_s, plant.nyquist_rad_s
+            low = self.options.omega_min_rad_s or lowest_rad_s(plant.dt_s, plant.poles)
+            high = plant.nyquist_rad_s
             points = np.unique(points[(points > low) & (points < high)])
             if points.size:
                 found.append((number, PlantData.build(plant, self.spec, points)))

@@ -43,7 +43,7 @@ class PlantSection(Section):
         None, gt=0, description="repeats: drop points farther out than this, in robust standard deviations"
     )
     between_points: Literal["nothing", "linear"] = Field(
-        "nothing", description="what the certificate may assume of ellipses between their own frequencies"
+        "linear", description="what the certificate may assume of ellipses between their own frequencies"
     )
 
     @model_validator(mode="after")

@@ -80,7 +80,7 @@ def certify_asked(
     options: CertificateOptions,
     rng: np.random.Generator,
     *,
-    between_own_points: Literal["nothing", "linear"] = "nothing",
+    between_own_points: Literal["nothing", "linear"] = "linear",
 ) -> CertifyResult:
     """The certificate, and for how many sampled responses its worst case holds.
 
