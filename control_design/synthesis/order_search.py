@@ -86,13 +86,13 @@ class OrderSearch:
     def _nearest(self, ends: Sequence[Candidate]) -> Real:
         """Parameters that are stable on the grid, the smallest worst case first; else nearest to the
         circle."""
-
-        def radius(parameters: Real) -> float:
-            poles = self.problem.closed_loop_poles(self.cascade, parameters)
-            return max(float(np.max(np.abs(z), initial=0.0)) for z in poles)
-
-        key = [(c.gamma_grid, radius(c.parameters)) for c in ends]
+        key = [(c.gamma_grid, self._radius(c.parameters)) for c in ends]
         return ends[min(range(len(ends)), key=lambda at: key[at])].parameters
+
+    def _radius(self, parameters: Real) -> float:
+        """Largest pole modulus of the nominal loops."""
+        poles = self.problem.closed_loop_poles(self.cascade, parameters)
+        return max(float(np.max(np.abs(z), initial=0.0)) for z in poles)
 
     def _retrieved(self, found: Sequence[Candidate]) -> list[Candidate]:
         """What is stable on the dense grid, best first, enlarged by what can be saved of the rest.
@@ -162,9 +162,15 @@ class OrderSearch:
             keeps_sign=self.problem.asks_tracking or self.problem.integrators > 0,
         )
         tracking = self.problem.asks_tracking
+        given = [self._task(x) for x in self.given]
+        if any(plant.unstable_poles for plant in self.problem.plants):
+            stable = maker.stabilising(self._radius, max(self.options.starts, _SHAPED_TRACKING))
+            # The second half as they are: the interior point leaves some valleys the descent stays in.
+            half = (len(stable) + 1) // 2
+            tasks = [self._task(x, eased=tracking and at < half) for at, x in enumerate(stable)]
+            return [*given, *tasks]
         shaped = [self._task(x) for x, _ in maker.shaped(_DRAWS, self.options.starts)]
         random = [self._task(maker.low_gain(), eased=tracking) for _ in range(self.options.starts)]
-        given = [self._task(x) for x in self.given]
         if tracking:
             # The interior point finds valleys the descent alone does not: its starts come first, so that no
             # agreement of the others ends the search before them.

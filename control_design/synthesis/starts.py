@@ -1,4 +1,5 @@
-"""Where the search starts from: random low-gain loops, and loops shaped by hand-book rules.
+"""Where the search starts from: random low-gain loops, loops shaped by hand-book rules, and for unstable plants
+loops that a search for stability has found.
 
 A start is worth the more the closer it already is to what is asked. The *shaped* starts wish for a loop gain
 L where the specification speaks: large and positive real at the peak of a mode that is to be damped (1 + L =
@@ -22,6 +23,7 @@ from control_design.specification.specification import ModulusMargin
 from ident.data.arrays import real_rows
 
 _DECADES_OF_TRACKING = 1.5  # below the crossover, in which the integrator-like loop is wished for
+_DRAWN_UNSTABLE, _FOLLOWED = 400, 12  # loops around unstable poles drawn, and led to stability
 _HIGHEST = 0.95  # of Nyquist: the Tustin frequency has its pole there
 
 
@@ -177,6 +179,63 @@ class StartMaker:
                 break
             parameters = with_gain(self.cascade, parameters, 0.5)
         return parameters
+
+    # Starts for plants that are unstable in open loop
+
+    def stabilising(self, radius: Callable[[Real], float], most: int) -> list[Real]:
+        """Up to `most` loops led to stability, those with the smallest worst case first.
+
+        radius: largest pole modulus of the nominal loops of a parameter vector. Neither little gain nor much
+        of it stabilises an unstable plant: the best of many leads and random sections around the unstable
+        poles are taken and the radius is minimised from there, below 1 the share of |1 + L| that the
+        ellipses leave (Nelder and Mead's simplex, as the radius has kinks).
+        """
+        from scipy.optimize import minimize  # here: every command would wait for it
+
+        def cost(x: Real) -> float:
+            ringing = max(self.least_damping - self.cascade.least_damping(x), 0.0)
+            found = radius(x)
+            if not found < 1.0 or ringing > 0:
+                return min(found, 1e6) + ringing
+            left = 1.0
+            for data in self.data:
+                loop = self.cascade.response(x, data.ellipses.omega_rad_s) * data.delay
+                back = np.abs(1.0 + loop * data.ellipses.centre)
+                reach = np.abs(loop) * data.ellipses.semi_major
+                left = min(left, float(np.min(back / (1.0 + reach / np.maximum(back, 1e-300)))))
+            return 1.0 - left
+
+        drawn = [self._around_unstable_poles() for _ in range(_DRAWN_UNSTABLE)]
+        drawn = sorted(drawn, key=cost)[:_FOLLOWED]
+        found: list[tuple[Real, float]] = []
+        for x in drawn:
+            # Steps in proportion to the parameters, of which some are logarithms near zero.
+            size = np.where(np.abs(x) > 1e-3, 0.2 * np.abs(x), 0.1)
+            simplex = np.vstack([x, x + np.diag(size)])
+            options = {"maxfev": 200 * x.size, "initial_simplex": simplex, "adaptive": True, "fatol": 1e-4}
+            end = np.asarray(minimize(cost, x, method="Nelder-Mead", options=options).x, dtype=np.float64)
+            found.append((end, self.score(end)))
+            if sum(np.isfinite(gamma) for _, gamma in found) >= most:
+                break
+        found.sort(key=lambda entry: entry[1])
+        return [x for x, _ in found[:most]]
+
+    def _around_unstable_poles(self) -> Real:
+        """Sections and a gain of either sign whose crossover lies at or above the unstable poles."""
+        speeds = [
+            float(np.max(np.abs(np.log(data.plant.poles[np.abs(data.plant.poles) > 1.0]))))
+            for data in self.data
+            if data.plant.unstable_poles
+        ]
+        nyquist = self.data[0].plant.nyquist_rad_s
+        crossover = max(speeds, default=0.0) / self.cascade.dt_s * 10 ** self.rng.uniform(-0.1, 0.9)
+        crossover = min(crossover, 0.6 * nyquist)
+        if "notch" in self.cascade.sections or self.rng.uniform() < 0.5:
+            parameters = self._lead_sections(crossover / self.cascade.scale_rad_s)
+        else:
+            parameters = self._random_sections()
+        gain = abs(self._crossover_gain(parameters, crossover)) * 10 ** self.rng.uniform(-0.2, 0.5)
+        return with_gain(self.cascade, parameters, gain * self.rng.choice([-1.0, 1.0]))
 
     def _random_sections(self) -> Real:
         """Sections with corners within a factor 5 of the scale, numerators near their denominators."""
