@@ -11,6 +11,7 @@ Many are drawn, few kept.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +50,7 @@ class StartMaker:
         self.score, self.rng = score, rng
         self.least_damping = controller_damping or 0.0
         self.keeps_sign = keeps_sign
+        self.tracks = any(np.any(part.sensitivity > 1.0) for part in data)
 
     # Shaped starts
 
@@ -205,6 +207,9 @@ class StartMaker:
                 left = min(left, float(np.min(back / (1.0 + reach / np.maximum(back, 1e-300)))))
             return 1.0 - left
 
+        def worst(x: Real) -> float:
+            return float(np.log(min(self.score(x), 1e6)))
+
         drawn = [self._around_unstable_poles() for _ in range(_DRAWN_UNSTABLE)]
         drawn = sorted(drawn, key=cost)[:_FOLLOWED]
         found: list[tuple[Real, float]] = []
@@ -212,8 +217,11 @@ class StartMaker:
             # Steps in proportion to the parameters, of which some are logarithms near zero.
             size = np.where(np.abs(x) > 1e-3, 0.2 * np.abs(x), 0.1)
             simplex = np.vstack([x, x + np.diag(size)])
-            options = {"maxfev": 200 * x.size, "initial_simplex": simplex, "adaptive": True, "fatol": 1e-4}
+            options: dict[str, Any] = {"maxfev": 200 * x.size, "initial_simplex": simplex, "adaptive": True, "fatol": 1e-4}
             end = np.asarray(minimize(cost, x, method="Nelder-Mead", options=options).x, dtype=np.float64)
+            if np.isfinite(self.score(end)):  # on towards what is asked, over valleys the descent stays in
+                options |= {"maxfev": 60 * x.size, "initial_simplex": np.vstack([end, end + np.diag(size)])}
+                end = np.asarray(minimize(worst, end, method="Nelder-Mead", options=options).x)
             found.append((end, self.score(end)))
             if sum(np.isfinite(gamma) for _, gamma in found) >= most:
                 break
@@ -230,12 +238,32 @@ class StartMaker:
         nyquist = self.data[0].plant.nyquist_rad_s
         crossover = max(speeds, default=0.0) / self.cascade.dt_s * 10 ** self.rng.uniform(-0.1, 0.9)
         crossover = min(crossover, 0.6 * nyquist)
-        if "notch" in self.cascade.sections or self.rng.uniform() < 0.5:
+        kind = self.rng.uniform()
+        if self.tracks and "integrator" not in self.cascade.sections and kind < 0.6:
+            parameters = self._slow_lag_sections(crossover / self.cascade.scale_rad_s)
+        elif "notch" in self.cascade.sections or kind < 0.8:
             parameters = self._lead_sections(crossover / self.cascade.scale_rad_s)
         else:
             parameters = self._random_sections()
         gain = abs(self._crossover_gain(parameters, crossover)) * 10 ** self.rng.uniform(-0.2, 0.5)
         return with_gain(self.cascade, parameters, gain * self.rng.choice([-1.0, 1.0]))
+
+    def _slow_lag_sections(self, crossover: float) -> Real:
+        """As `_lead_sections`, the first one with a slow real pole in place of an integrator, which tracking
+        without one needs."""
+        x, at = self._lead_sections(crossover), 0
+        slow = crossover * 10 ** self.rng.uniform(-5.0, -2.0)
+        low, high = crossover * 10 ** self.rng.uniform(-1.3, -0.3, 2), crossover * self.rng.uniform(3.0, 10.0)
+        for kind in self.cascade.sections:
+            if kind == "second_order":
+                x[at : at + 3] = np.poly(-low)
+                x[at + 3 : at + 5] = np.log([high + slow, high * slow])
+                return x
+            if kind == "first_order" and "second_order" not in self.cascade.sections:
+                x[at : at + 3] = [1.0, low[0], np.log(slow)]
+                return x
+            at += _numbers(kind)
+        return x
 
     def _random_sections(self) -> Real:
         """Sections with corners within a factor 5 of the scale, numerators near their denominators."""
@@ -296,6 +324,11 @@ class StartMaker:
         size = float(np.abs(loop[int(np.argmin(np.abs(omega - crossover_rad_s)))]))
         sign = 1.0 if (loop[0] * 1j**self.integrators).real >= 0 else -1.0
         return sign / max(size, 1e-12)
+
+
+def _numbers(kind: SectionKind) -> int:
+    """Parameters of one section."""
+    return Cascade((kind,), 1.0, 1.0).parameters
 
 
 def with_gain(cascade: Cascade, parameters: Real, factor: float) -> Real:
