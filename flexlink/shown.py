@@ -56,11 +56,12 @@ def _lines(result: object) -> list[str]:
 def _macros() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
+    from workflow.text.formats import at_least, at_most, bound
     from workflow.text.templates import words
 
     # Text; the HTML is escaped line by line.
     loader = PackageLoader("flexlink")
     environment = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["words"] = words
+    environment.filters |= {"words": words, "at_least": at_least, "at_most": at_most, "bound": bound}
     environment.globals |= {"zip": zip, "abs": abs}
     return environment.get_template("results.j2").module

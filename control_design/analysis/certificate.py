@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
@@ -135,7 +135,8 @@ def certify(
         name = plants[0].name if len(plants) == 1 else "all plants together"
         caption = f"share of {joint.draws} sampled responses that are stable"
         found_share, enough = joint.stable_share, bool(joint.stable_share >= joint_stable_share)
-        items.append(SpecificationItem(caption, name, joint_stable_share, found_share, "", enough))
+        share = SpecificationItem(caption, name, joint_stable_share, found_share, "", enough)
+        items.append(replace(share, at_least=True, about="sampled responses"))
     robust = all(v.stable and v.nyquist.matches and v.worst_margins.modulus > 0 for v in verdicts)
     proofs = [v.all_frequencies for v in verdicts]
     robust = robust and all(proof.proved or not proof.possible for proof in proofs)

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -51,7 +51,8 @@ class LoopFunction(Enum):
 class SpecificationItem:
     """One requirement on one plant: met or not, with the number that decides it and where.
 
-    bound: what was proved of `achieved` for all frequencies, where that was possible.
+    bound: what was proved of `achieved` for all frequencies, where that was possible. at_least: `required` is
+    the smallest value allowed, else the largest. about: what `achieved` is a number of.
     """
 
     requirement: str
@@ -62,6 +63,13 @@ class SpecificationItem:
     met: bool
     omega_rad_s: float | None = None
     bound: float | None = None
+    at_least: bool = False
+    about: Literal["worst case", "nominal loop", "controller", "sampled responses"] = "worst case"
+
+    @property
+    def proved(self) -> bool:
+        """Whether it is met for all frequencies by proof."""
+        return self.met and self.bound is not None and bool(np.isfinite(self.bound))
 
     @property
     def only_unproved(self) -> bool:

@@ -245,7 +245,7 @@ class ModulusMargin(WeightedRequirement):
         achieved, omega = found.modulus
         bound = None if found.bounds is None else wanted / found.bounds.get(self.name, np.inf)
         met = bool(achieved >= wanted) and found.proved(self.name)
-        return SpecificationItem(self.caption, found.plant, wanted, achieved, "", met, omega, bound)
+        return SpecificationItem(self.caption, found.plant, wanted, achieved, "", met, omega, bound, True)
 
 
 class Effort(WeightedRequirement):
@@ -304,7 +304,7 @@ class DelayMargin(Requirement):
 
     def check(self, found: Findings) -> SpecificationItem:
         met = bool(found.delay_s >= self.delay_s)
-        return SpecificationItem(self.caption, found.plant, self.delay_s, found.delay_s, "s", met)
+        return SpecificationItem(self.caption, found.plant, self.delay_s, found.delay_s, "s", met, at_least=True)
 
 
 @dataclass(frozen=True)
@@ -326,7 +326,9 @@ class ModeDamping(Requirement):
         least = min(inside, key=lambda mode: mode.zeta, default=None)
         achieved, omega = (1.0, None) if least is None else (least.zeta, least.omega_rad_s)
         met = least is None or achieved >= self.zeta
-        return SpecificationItem(self.caption, found.plant, self.zeta, achieved, "", met, omega)
+        return SpecificationItem(
+            self.caption, found.plant, self.zeta, achieved, "", met, omega, None, True, "nominal loop"
+        )
 
 
 @dataclass(frozen=True)
@@ -345,7 +347,9 @@ class ControllerDamping(Requirement):
         least = int(np.argmin(zeta)) if pairs.size else None
         achieved, omega = (1.0, None) if least is None else (float(zeta[least]), float(np.abs(pairs[least])))
         met = achieved >= self.zeta * (1 - SOLVER_SLACK)
-        return SpecificationItem(self.caption, "controller", self.zeta, achieved, "", met, omega)
+        return SpecificationItem(
+            self.caption, "controller", self.zeta, achieved, "", met, omega, None, True, "controller"
+        )
 
 
 @dataclass(frozen=True)
@@ -356,7 +360,10 @@ class ControllerIntegrator(Requirement):
 
     def check(self, found: Findings) -> SpecificationItem:
         own = count_integrators(found.controller.poles)
-        return SpecificationItem(self.caption, "controller", 1.0, float(own), "", bool(own >= 1))
+        met = bool(own >= 1)
+        return SpecificationItem(
+            self.caption, "controller", 1.0, float(own), "", met, None, None, True, "controller"
+        )
 
 
 REQUIREMENTS = (ModulusMargin, Tracking, Effort, ModePeak, DelayMargin, ModeDamping)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,29 @@ def number(value: float | None, digits: int = 3) -> str:
     if "e" in text and 1e-3 <= abs(value) < 1e6:
         text = f"{value:.0f}"
     return text
+
+
+def at_least(value: float | None, digits: int = 3) -> str:
+    """A lower bound (a margin): as `number`, rounded down."""
+    return number(_rounded(value, digits, ROUND_FLOOR), digits)
+
+
+def at_most(value: float | None, digits: int = 3) -> str:
+    """An upper bound (a peak, an error): as `number`, rounded up."""
+    return number(_rounded(value, digits, ROUND_CEILING), digits)
+
+
+def bound(value: float | None, lower: bool, digits: int = 4) -> str:
+    """`at_least` for a lower bound, else `at_most`."""
+    return at_least(value, digits) if lower else at_most(value, digits)
+
+
+def _rounded(value: float | None, digits: int, way: str) -> float | None:
+    """To significant digits, towards one side."""
+    if value is None or value == 0 or not math.isfinite(value):
+        return value
+    exact = Decimal(repr(float(value)))
+    return float(exact.quantize(Decimal(1).scaleb(exact.adjusted() - digits + 1), rounding=way))
 
 
 def si(value: float | None, unit: str, digits: int = 3) -> str:
@@ -95,11 +119,17 @@ def hertz(omega_rad_s: float) -> float:
     return omega_rad_s / (2 * math.pi)
 
 
-def decibels(factor: float) -> str:
-    """A gain factor with its dB; as a gain margin, inf sets no upper limit and 0 no lower one."""
+def decibels(factor: float, lower: bool = True) -> str:
+    """A gain margin with its dB: inf sets no upper limit and 0 no lower one. lower: the gain may rise at least
+    so far, rounded down; else it may fall to this, rounded up."""
     if math.isinf(factor):
         return "unlimited"
-    return f"{number(factor)} ({in_decibels(factor):+.1f} dB)" if factor > 0 else "no lower limit"
+    if not factor > 0:
+        return "no lower limit"
+    in_db = Decimal(repr(in_decibels(factor))).quantize(
+        Decimal("0.1"), rounding=ROUND_FLOOR if lower else ROUND_CEILING
+    )
+    return f"{bound(factor, lower, 3)} ({in_db:+} dB)"
 
 
 def in_decibels(factor: float) -> float:
@@ -169,7 +199,7 @@ def _finite(value: float | None) -> bool:
 
 TESTS: Mapping[str, Callable[..., bool]] = {"finite": _finite, "nan": math.isnan}
 _NAMED: tuple[Callable[..., Any], ...] = (
-    number, si, percent, share, portion, signed, fixed, interval, extent, frequency, hertz, decibels,
+    number, at_least, at_most, bound, si, percent, share, portion, signed, fixed, interval, extent, frequency, hertz, decibels,
     in_decibels, unit, listing, sparkline, count, sentence, yes_no, setting,
 )  # fmt: skip
 FILTERS: Mapping[str, Callable[..., Any]] = {
