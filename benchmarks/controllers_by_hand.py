@@ -1,10 +1,10 @@
 """Controllers as people write them, certified; every number of the certificate against eigenvalues and dense
 responses computed here, which share no code with `control_design`.
 
-Stability for a gain, a rotation or a member of the uncertainty set is decided by eigenvalues of the closed loop;
-the delay margin by the zeros of L(z) L(1/z) - 1, a generalised eigenvalue problem; peaks by dense responses
-around every pole and zero. Members of the set are G (1 + r a(z)), a an all-pass of either sign. A number is false
-where it promises more than that.
+Stability for a gain, a rotation or a member of the uncertainty set is decided by eigenvalues of the closed
+loop; the delay margin by the zeros of L(z) L(1/z) - 1, a generalised eigenvalue problem; peaks by dense
+responses around every pole. Members of the set are G (1 + r a(z)), a an all-pass of either sign. A number is
+false where it promises more than that.
 """
 
 from __future__ import annotations
@@ -51,7 +51,9 @@ def _case(rng: np.random.Generator) -> dict[str, Any]:
     delay = int(rng.integers(0, 4))
     grid = np.geomspace(1e-3, np.pi, 400)
     loop = np.abs(_response(_series(k, plant), grid))
-    gain = 10 ** rng.uniform(-1.5, 0.8) / max(float(np.median(loop)), 1e-9) * rng.choice([-1, 1], p=[0.25, 0.75])
+    gain = (
+        10 ** rng.uniform(-1.5, 0.8) / max(float(np.median(loop)), 1e-9) * rng.choice([-1, 1], p=[0.25, 0.75])
+    )
     if rng.uniform() < 0.7:  # most of those that stabilise, and some on the edge
         gains = gain * 10 ** rng.uniform(-3, 2, 40)
         good = [g for g in gains if _radius(_loop(k, plant, delay), float(g)) < 1]
@@ -67,7 +69,7 @@ def _case(rng: np.random.Generator) -> dict[str, Any]:
 def checked_case(
     case: dict[str, Any], rng: np.random.Generator
 ) -> tuple[list[str], tuple[bool, bool], int, int]:
-    """What the certificate says falsely; (stable, certified); numbers checked; margins that are too careful."""
+    """What the certificate says falsely; (stable, certified); numbers checked; margins too careful."""
     import control
 
     from control_design import Controller, Specification, UncertainPlant, certify
@@ -127,7 +129,9 @@ def checked_case(
             numbers += 2
             if proof.distance > nearest * (1 + _SLACK):
                 false.append(f"proved distance {proof.distance:.8g}, true {nearest:.8g}")
-            if answer.gamma_bound is None or answer.gamma_bound < asked.modulus_margin / nearest * (1 - _SLACK):
+            if answer.gamma_bound is None or answer.gamma_bound < asked.modulus_margin / nearest * (
+                1 - _SLACK
+            ):
                 false.append(f"gamma_bound {answer.gamma_bound}, true {asked.modulus_margin / nearest:.8g}")
         within = theta <= verdict.bandwidth_rad_s * _DT_S
         if np.any(within) and np.min(back[within]) < np.sqrt(2) * (1 - 1e-4):

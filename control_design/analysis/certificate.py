@@ -56,6 +56,14 @@ class PlantVerdict:
 
 
 @dataclass(frozen=True)
+class Resonance:
+    """A pole pair of the controller that a grid may miss: its mode, and the gain |K| there."""
+
+    mode: Mode
+    gain: float
+
+
+@dataclass(frozen=True)
 class Certificate:
     """Verdict on a controller for a set of uncertain plants.
 
@@ -65,6 +73,7 @@ class Certificate:
     weighted worst case on the dense grid (<= 1 met). gamma_bound: upper bound of it for all frequencies, or
     None where some plant allows no proof. joint: calibration of the ellipses to whole responses, where asked
     for; the ellipses checked are then those of the calibrated level where it is above the given one.
+    resonances: pole pairs of the controller with a damping ratio below `LIGHT_CONTROLLER_POLES`.
     """
 
     certified: bool
@@ -73,6 +82,11 @@ class Certificate:
     items: tuple[SpecificationItem, ...]
     gamma_bound: float | None = None
     joint: JointCoverage | None = None
+    resonances: tuple[Resonance, ...] = ()
+
+
+LIGHT_CONTROLLER_POLES = 1e-3
+"""Damping ratio; less is narrower than what anybody measures a machine on, and is told."""
 
 
 def certify(
@@ -147,6 +161,11 @@ def certify(
         items=tuple(items),
         gamma_bound=max(proof.gamma for proof in proofs) if all(p.possible for p in proofs) else None,
         joint=joint,
+        resonances=tuple(
+            Resonance(mode, float(np.abs(controller.response(np.array([mode.omega_rad_s]))[0])))
+            for mode in modes_of(controller.poles, controller.dt_s, zeta_below=LIGHT_CONTROLLER_POLES)
+            if mode.omega_rad_s < np.pi / controller.dt_s
+        ),
     )
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
+from control_design.plants.ellipses import Complex, Ellipses, Real
 from control_design.plants.frequency_grid import local_maxima
 
 _TOUCHES = 1e-9  # relative distance from the real axis or the unit circle that counts as a crossing without

@@ -158,6 +158,10 @@ def observer_gain(A: Real, B: Real, C: Real, D: Real) -> Real:
     n = A.shape[0]
     if n == 0:
         return np.zeros((0, 1))
+    # States and output in units of their own, in which the equation is the same and well scaled.
+    state_unit = float(np.linalg.norm(B)) or 1.0
+    output_unit = float(np.linalg.norm(C)) * state_unit or abs(float(D[0, 0])) or 1.0
+    B, C, D = B / state_unit, C * (state_unit / output_unit), D / output_unit
     size = float(np.linalg.norm(B)) ** 2 or 1.0
     state_noise = B @ B.T + 1e-6 * size * np.eye(n)
     scale = float((C @ state_noise @ C.T).item()) or 1.0
@@ -168,7 +172,7 @@ def observer_gain(A: Real, B: Real, C: Real, D: Real) -> Real:
         raise ValueError(
             "no anti-windup gain found: the controller has a marginal mode that its output does not show"
         ) from error
-    gain = A @ p @ C.T / (C @ p @ C.T + output_noise)
+    gain = A @ p @ C.T / (C @ p @ C.T + output_noise) * (state_unit / output_unit)
     return np.asarray(gain, dtype=np.float64)
 
 

@@ -208,7 +208,11 @@ class StraightBetween:
         share = np.clip((omega - own[left]) / (own[left + 1] - own[left]), 0.0, 1.0)
         centres = np.asarray(record.centre, dtype=np.complex128)
         centre = (1 - share) * centres[left] + share * centres[left + 1]
-        centre = np.where(inside, centre, self.channel.nominal_response(np.where(inside, np.pi / 2 / self.channel.dt_s, omega)))
+        centre = np.where(
+            inside,
+            centre,
+            self.channel.nominal_response(np.where(inside, np.pi / 2 / self.channel.dt_s, omega)),
+        )
         scale = (radius_of(float(record.level)) / radius_of(level)) ** 2
         shapes = np.asarray(record.covariance, dtype=np.float64) * scale
         parts = [(1 - share)[:, None, None] ** 2 * shapes[left], share[:, None, None] ** 2 * shapes[left + 1]]

@@ -304,7 +304,9 @@ class DelayMargin(Requirement):
 
     def check(self, found: Findings) -> SpecificationItem:
         met = bool(found.delay_s >= self.delay_s)
-        return SpecificationItem(self.caption, found.plant, self.delay_s, found.delay_s, "s", met, at_least=True)
+        return SpecificationItem(
+            self.caption, found.plant, self.delay_s, found.delay_s, "s", met, at_least=True
+        )
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
-"""Where the search starts from: random low-gain loops, loops shaped by hand-book rules, and for unstable plants
-loops that a search for stability has found.
+"""Where the search starts from: random low-gain loops, loops shaped by hand-book rules, and for unstable
+plants loops that a search for stability has found.
 
 A start is worth the more the closer it already is to what is asked. The *shaped* starts wish for a loop gain
 L where the specification speaks: large and positive real at the peak of a mode that is to be damped (1 + L =
@@ -192,7 +192,6 @@ class StartMaker:
         poles are taken and the radius is minimised from there, below 1 the share of |1 + L| that the
         ellipses leave (Nelder and Mead's simplex, as the radius has kinks).
         """
-        from scipy.optimize import minimize  # here: every command would wait for it
 
         def cost(x: Real) -> float:
             ringing = max(self.least_damping - self.cascade.least_damping(x), 0.0)
@@ -217,11 +216,9 @@ class StartMaker:
             # Steps in proportion to the parameters, of which some are logarithms near zero.
             size = np.where(np.abs(x) > 1e-3, 0.2 * np.abs(x), 0.1)
             simplex = np.vstack([x, x + np.diag(size)])
-            options: dict[str, Any] = {"maxfev": 200 * x.size, "initial_simplex": simplex, "adaptive": True, "fatol": 1e-4}
-            end = np.asarray(minimize(cost, x, method="Nelder-Mead", options=options).x, dtype=np.float64)
+            end = _simplex(cost, simplex, 200 * x.size)
             if np.isfinite(self.score(end)):  # on towards what is asked, over valleys the descent stays in
-                options |= {"maxfev": 60 * x.size, "initial_simplex": np.vstack([end, end + np.diag(size)])}
-                end = np.asarray(minimize(worst, end, method="Nelder-Mead", options=options).x)
+                end = _simplex(worst, np.vstack([end, end + np.diag(size)]), 60 * x.size)
             found.append((end, self.score(end)))
             if sum(np.isfinite(gamma) for _, gamma in found) >= most:
                 break
@@ -324,6 +321,14 @@ class StartMaker:
         size = float(np.abs(loop[int(np.argmin(np.abs(omega - crossover_rad_s)))]))
         sign = 1.0 if (loop[0] * 1j**self.integrators).real >= 0 else -1.0
         return sign / max(size, 1e-12)
+
+
+def _simplex(cost: Callable[[Real], float], start: Real, evaluations: int) -> Real:
+    """Least cost that Nelder and Mead's simplex finds from a simplex (n + 1, n)."""
+    from scipy.optimize import minimize  # here: every command would wait for it
+
+    options: Any = {"maxfev": evaluations, "initial_simplex": start, "adaptive": True, "fatol": 1e-4}
+    return np.asarray(minimize(cost, start[0], method="Nelder-Mead", options=options).x, dtype=np.float64)
 
 
 def _numbers(kind: SectionKind) -> int:

@@ -120,8 +120,8 @@ def hertz(omega_rad_s: float) -> float:
 
 
 def decibels(factor: float, lower: bool = True) -> str:
-    """A gain margin with its dB: inf sets no upper limit and 0 no lower one. lower: the gain may rise at least
-    so far, rounded down; else it may fall to this, rounded up."""
+    """A gain margin with its dB: inf sets no upper limit and 0 no lower one. lower: the gain may rise so far,
+    rounded down; else it may fall to this, rounded up."""
     if math.isinf(factor):
         return "unlimited"
     if not factor > 0:
@@ -199,8 +199,8 @@ def _finite(value: float | None) -> bool:
 
 TESTS: Mapping[str, Callable[..., bool]] = {"finite": _finite, "nan": math.isnan}
 _NAMED: tuple[Callable[..., Any], ...] = (
-    number, at_least, at_most, bound, si, percent, share, portion, signed, fixed, interval, extent, frequency, hertz, decibels,
-    in_decibels, unit, listing, sparkline, count, sentence, yes_no, setting,
+    number, at_least, at_most, bound, si, percent, share, portion, signed, fixed, interval, extent, frequency,
+    hertz, decibels, in_decibels, unit, listing, sparkline, count, sentence, yes_no, setting,
 )  # fmt: skip
 FILTERS: Mapping[str, Callable[..., Any]] = {
     "quoted": shlex.quote,
