@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import stat
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from validation.blind.cases import NOT_TOGETHER, SHARES, schedule
 from validation.blind.generate import answer_toml, folder_hash, generate
 from validation.blind.protocol import run_blind
 from validation.blind.rigs import TOLERANCES, draw_rig, draw_tolerances, rig_toml, stated
-from validation.blind.seal import COMMITMENT, close_seal, open_seal
+from validation.blind.seal import COMMITMENT, close_seal, has_labels, off_disk, open_seal
 from validation.blind.truth import LISTED, UNLISTED
 from validation.blind.worker import BlindCase, failed
 from workflow.engine.errors import InputError
@@ -206,6 +207,28 @@ def test_a_finished_run_resumes_without_a_diagnosis_and_only_as_itself(finished_
         run_blind(2, 8, finished_run, diagnose=never)
 
 
+def test_no_label_is_in_a_file_while_cases_are_diagnosed(tmp_path):
+    close_seal(tmp_path, LABELS)
+    with off_disk(tmp_path):
+        written = "".join(path.read_text() for path in tmp_path.rglob("*.json"))
+        assert not has_labels(tmp_path)
+        assert "verdict" not in written
+    assert open_seal(tmp_path) == LABELS
+
+
+@pytest.mark.slow
+def test_a_run_killed_while_it_diagnosed_draws_its_labels_again(finished_run, tmp_path):
+    """What such a run leaves: the salt alone, and a case without its prediction."""
+    out = tmp_path / "run"
+    shutil.copytree(finished_run, out)
+    sealed = json.loads((out / "seal" / "labels.json").read_text())
+    (out / "seal" / "labels.json").write_text(json.dumps({"salt": sealed["salt"]}))
+    (out / "predictions" / "case_0002.json").unlink()
+    run_blind(2, 8, out, resume=True, jobs=1, diagnose=_says_none)
+    assert (out / "scores.json").read_bytes() == (finished_run / "scores.json").read_bytes()
+    assert json.loads((out / "seal" / "labels.json").read_text()) == sealed
+
+
 @pytest.mark.slow
 def test_records_exchanged_after_sealing_are_noticed(finished_run):
     path = finished_run / "cases" / "case_0001" / "rig.toml"
@@ -235,14 +258,18 @@ def test_bad_requests_are_one_line(tmp_path):
 def test_the_diagnosing_process_cannot_reach_the_labels(tmp_path):
     close_seal(tmp_path, LABELS)
     program = (
-        "import sys, pathlib, os\n"
+        "import sys, pathlib, os, shutil, sqlite3\n"
         "from validation.blind.worker import keep_out\n"
         "place = pathlib.Path(sys.argv[1])\n"
         "keep_out(place)\n"
         "attempts = [lambda: open(place / 'seal' / 'labels.json'), lambda: os.listdir(place / 'seal'),\n"
         "    lambda: os.open(place / 'seal' / 'labels.json', os.O_RDONLY),\n"
         "    lambda: os.rename(place / 'seal', '/tmp/never'), lambda: os.system('true'),\n"
-        "    lambda: os.chdir(place), lambda: (place / 'commitment.json').read_text()]\n"
+        "    lambda: os.chdir(place), lambda: (place / 'commitment.json').read_text(),\n"
+        "    lambda: os.mkdir(place / 'own'), lambda: os.utime(place / 'seal'),\n"
+        "    lambda: os.rmdir(place / 'seal'), lambda: shutil.copytree(place, '/tmp/never'),\n"
+        "    lambda: sqlite3.connect(place / 'seal' / 'labels.json'),\n"
+        "    lambda: os.getxattr(place / 'seal' / 'labels.json', 'user.any')]\n"
         "for attempt in attempts:\n"
         "    try:\n"
         "        attempt()\n"
@@ -252,7 +279,7 @@ def test_the_diagnosing_process_cannot_reach_the_labels(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True, check=True
     )
-    assert done.stdout.count("refused") == 7, done.stdout
+    assert done.stdout.count("refused") == 13, done.stdout
 
 
 def test_a_diagnosis_that_fails_counts_as_a_wrong_answer(tmp_path):

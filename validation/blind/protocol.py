@@ -25,8 +25,11 @@ from validation.blind.seal import (
     COMMITMENT,
     SEAL_DIRECTORY,
     close_seal,
+    has_labels,
+    off_disk,
     open_seal,
     private_directory,
+    renew_seal,
     write_private,
 )
 from validation.blind.worker import BlindCase, diagnose_folder, failed
@@ -88,7 +91,8 @@ def run_blind(
     progress.plan([("cases", _CASE_S * n_cases / width), ("diagnosis", _DIAGNOSIS_S * n_cases / width)])
     _sealed_cases(out, settings, width, progress)
     names = sorted(path.name for path in (out / "cases").iterdir() if path.is_dir())
-    _predict(out, names, width, diagnose, progress)
+    with off_disk(out):
+        _predict(out, names, width, diagnose, progress)
     predictions = [read_json(out / "predictions" / f"{name}.json") for name in names]
     write_json(
         out / "predictions.json",
@@ -126,10 +130,11 @@ def _begin(store: BlindDirectory, settings: Mapping[str, Any], resume: bool) -> 
 def _sealed_cases(out: Path, settings: Mapping[str, Any], jobs: int, progress: Progress) -> None:
     """Cases and closed seal; an interrupted generation goes on where it stopped."""
     n_cases = settings["cases"]
-    taken_up = (out / COMMITMENT).is_file()
+    taken_up = (out / COMMITMENT).is_file() and has_labels(out)
     with progress.stage("cases", taken_up=taken_up) as update:
         if taken_up:
             return
+        begun = (out / COMMITMENT).is_file()  # and killed while cases were diagnosed
         parts = private_directory(private_directory(out / SEAL_DIRECTORY) / "parts")
         finished: dict[str, Answer] = {path.stem: read_json(path) for path in sorted(parts.glob("*.json"))}
         count = len(finished)
@@ -150,7 +155,7 @@ def _sealed_cases(out: Path, settings: Mapping[str, Any], jobs: int, progress: P
             finished=finished,
             keep=keep,
         )
-        close_seal(out, answers)
+        (renew_seal if begun else close_seal)(out, answers)
         shutil.rmtree(parts)
 
 

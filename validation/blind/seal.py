@@ -3,8 +3,8 @@
     seal/labels.json     labels and salt, readable by the owner only (mode 0600 in a directory 0700)
     commitment.json      SHA-256 over salt and labels; changing a single label afterwards is noticed
 
-The processes that diagnose get a case folder only, and refuse to open anything below the directory of the
-run (`validation.blind.worker`).
+While cases are diagnosed the labels are in no file at all (`off_disk`). The processes that diagnose get a
+case folder only, and are kept out of the directory of the run (`validation.blind.worker`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ import hmac
 import json
 import os
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,32 @@ def close_seal(directory: Path, labels: Sequence[Mapping[str, Any]]) -> str:
     digest = commitment(salt, plain)
     write_json(directory / COMMITMENT, {"sha256": digest, "algorithm": _ALGORITHM, "n_labels": len(plain)})
     return digest
+
+
+@contextmanager
+def off_disk(directory: Path) -> Iterator[None]:
+    """Hold the labels in memory alone while the block runs. Of a run that is killed in it the salt is left:
+    the cases are drawn again from their seed, and the commitment tells whether the labels are the same
+    (`renew_seal`)."""
+    path = directory / SEAL_DIRECTORY / LABELS
+    sealed = read_json(path)
+    write_private(path, json.dumps({"salt": sealed["salt"]}) + "\n")
+    try:
+        yield
+    finally:
+        write_private(path, json.dumps(sealed, indent=1) + "\n")
+
+
+def has_labels(directory: Path) -> bool:
+    """Whether a closed seal holds its labels; false where a run was killed while they were off the disk."""
+    return "labels" in read_json(directory / SEAL_DIRECTORY / LABELS)
+
+
+def renew_seal(directory: Path, labels: Sequence[Mapping[str, Any]]) -> None:
+    """Put labels that were drawn again beside the salt that is left."""
+    path = directory / SEAL_DIRECTORY / LABELS
+    sealed = {"salt": read_json(path)["salt"], "labels": json.loads(canonical(labels))}
+    write_private(path, json.dumps(sealed, indent=1) + "\n")
 
 
 def open_seal(directory: Path) -> list[dict[str, Any]]:

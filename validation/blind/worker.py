@@ -1,7 +1,7 @@
 """What diagnoses one case of the blind protocol, in a process of its own: it knows a folder and nothing else.
 
-From before the diagnosis on the process cannot open, list, rename or remove anything below the directory of
-the run with its sealed labels, nor start a process that could.
+From before the diagnosis on the process can do nothing to a path below the directory of the run, nor start a
+process that could. The labels are not there anyway while cases are diagnosed (`validation.blind.seal`).
 """
 
 from __future__ import annotations
@@ -23,18 +23,6 @@ from workflow.diagnose.document import document_of
 from workflow.engine import codec
 from workflow.engine.executor import Report
 
-_PATH_EVENTS = (
-    "open",
-    "os.listdir",
-    "os.scandir",
-    "os.rename",
-    "os.remove",
-    "os.link",
-    "os.symlink",
-    "os.chmod",
-    "os.truncate",
-    "os.chdir",
-)
 _PROCESS_EVENTS = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.fork", "os.forkpty")
 
 
@@ -45,12 +33,14 @@ def keep_out(directory: Path) -> None:
     def watch(event: str, arguments: tuple[Any, ...]) -> None:
         if event in _PROCESS_EVENTS:
             raise PermissionError("a blind diagnosis starts no processes")
-        if event in _PATH_EVENTS:
-            for argument in arguments:
-                if isinstance(argument, (str, bytes, os.PathLike)):
-                    path = os.path.realpath(os.fsdecode(argument))
-                    if path == wall or path.startswith(wall + os.sep):
-                        raise PermissionError("below the directory of a blind run: sealed")
+        # Whatever the event: a list of those that take a path would leave some out.
+        for argument in arguments:
+            if isinstance(argument, (str, bytes, os.PathLike)) and (named := os.fsdecode(argument)):
+                if "\0" in named:
+                    continue  # no path
+                path = os.path.realpath(named)
+                if path == wall or path.startswith(wall + os.sep):
+                    raise PermissionError("below the directory of a blind run: sealed")
 
     sys.addaudithook(watch)
 
