@@ -72,7 +72,7 @@ def test_page_and_pictures_are_written(drawn):
     names = {path.name for path in drawn.figures_path.iterdir()}
     families = {re.sub(r"(-\d.*)?\.(svg|png)$", "", name) for name in names}
     # Other pages have the rest; distortion is drawn of periodic records.
-    elsewhere = ("gap_", "pareto", "excitation", "distortion", "log")
+    elsewhere = ("gap_", "pareto", "excitation", "distortion", "log", "response")
     assert families == {name for name in drawings() if not name.startswith(elsewhere)}
     text = drawn.report_path.read_text(encoding="utf-8")
     page = Page(text)
@@ -213,8 +213,8 @@ def test_without_validation_data_the_page_warns(undrawn, tmp_path):
     ("chosen", "words"),
     [
         ({}, "Structures tried; the smallest criterion wins."),
-        ({"n_real": 1}, "n_real = 1 was asked for, the smallest criterion decides the rest."),
-        ({"n_real": 1, "n_pairs": 2}, "n_real = 1 and n_pairs = 2 was asked for; the criterion"),
+        ({"n_real": 1}, "n_real = 1 was specified, the smallest criterion decides the rest."),
+        ({"n_real": 1, "n_pairs": 2}, "n_real = 1 and n_pairs = 2 was specified; the criterion"),
     ],
 )
 def test_the_page_says_who_chose_the_order(undrawn, tmp_path, chosen, words):

@@ -13,7 +13,7 @@ from ident.basis.model import GobfModel
 from ident.data.distortion import Distortion
 from ident.uncertainty import FrequencyUncertainty
 from workflow.figures import style
-from workflow.figures.bands import Complex, Real, degrees_near, response_band
+from workflow.figures.bands import Complex, Real, degrees_near, enlargement, response_band
 from workflow.figures.subjects import ChannelView
 from workflow.text.formats import share
 
@@ -40,6 +40,39 @@ def draw_channel(channel: ChannelView, name: str) -> Figure:
         model=spread.nominal,
         empirical=spread.empirical,
     )
+
+
+@style.drawing("response")
+def draw_response(channel: ChannelView) -> Figure:
+    """Gain and phase side by side with the band of the ellipses, lightly damped modes marked.
+
+    The band of the gain is drawn enlarged where it is too narrow to be seen.
+    """
+    found, spread = channel.found, channel.spread
+    band = response_band(spread.frequency)
+    omega, factor = band.omega_rad_s, enlargement(band)
+    figure, (gain, phase) = style.panels(4.4, 1, 2, width_in=12.0)
+    floor = _gain_floor(band.gain, np.empty(0))
+    label = f"{share(spread.frequency.level)} band" + (f", enlarged {factor} times" if factor > 1 else "")
+    for axes, centre, low, high in (
+        (gain, band.gain, band.gain_low, band.gain_high),
+        (phase, band.phase_deg, band.phase_low_deg, band.phase_high_deg),
+    ):
+        ends = [centre + factor * (end - centre) for end in (low, high)]
+        if axes is gain:
+            ends[0] = np.maximum(ends[0], floor)
+        axes.fill_between(omega, *ends, **style.BAND, label=label)
+        axes.plot(omega, centre, **style.MODEL_LINE, label="identified response (centre)")
+        for number, (_, mode) in enumerate(channel.light, 1):
+            if omega[0] < mode.omega_rad_s < omega[-1]:
+                style.tag_below(axes, mode.omega_rad_s, f"mode {number}")
+        axes.set(xscale="log", xlabel="frequency [rad/s]", xlim=(omega[0], omega[-1]))
+    unit = style.plain(style.ratio_unit(channel.units[1], channel.units[0]), 24)
+    gain.set(yscale="log", ylabel=f"gain [{unit}]", ylim=(floor, 3 * band.gain.max()))
+    phase.set_ylabel("phase [deg]")
+    phase.set_ylim(*style.pad_limits(float(band.phase_deg.min()), float(band.phase_deg.max()), 0.15))
+    gain.set_title(f"{style.plain(found.input, 26)} to {style.plain(found.output, 26)}")
+    return figure
 
 
 @style.finished
