@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.workflow.page_shape import shape_faults
 from tests.workflow.test_figures import is_whole, panels
 from validation.paper import command
 from validation.paper.command import DRAWERS, PAGE, headlines_of, page_html, redraw_paper
@@ -67,6 +68,7 @@ def test_page_stands_alone_and_says_both_sides(results, pictures, tmp_path, faul
     (tmp_path / "paper.html").write_text(page)
     assert faults_seen(tmp_path / "paper.html") == []
     assert "--seed 7" in page
+    assert re.search(r"\d of 7 figures come out as the paper reports", page)
     assert page.count("The paper reports") == page.count("We find") == 7
     for item in REPORTED:
         assert page.count(item.place) >= 2  # beside the figure and over its table
@@ -75,6 +77,12 @@ def test_page_stands_alone_and_says_both_sides(results, pictures, tmp_path, faul
     # Nothing is fetched: names of XML dialects are no addresses to load from.
     assert not re.search(r"""(src|href)=["'](?!#|data:)""", page.replace("xlink:href", "href"))
     assert not re.search(r"\bnan\b", page)
+
+
+def test_the_first_screen_of_the_paper(results, pictures, tmp_path, browser):
+    page = page_html(results, pictures, findings_of(results), rows_of(results))
+    (tmp_path / "paper.html").write_text(page)
+    assert shape_faults(browser, tmp_path / "paper.html", screens=8) == []
 
 
 def test_sentences_and_rows_are_made_for_every_figure(results):

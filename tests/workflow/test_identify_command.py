@@ -11,6 +11,7 @@ import scipy.signal
 
 from ident.basis.model_files import ModelFile
 from tests.ident.benchmark_plants import P2_HZ, p2
+from tests.workflow.page_shape import shape_faults
 from tests.workflow.test_report import ATTACK, Page, is_one_file
 from workflow.commands.identify import identify_logs
 from workflow.commands.logs import read_logs
@@ -84,7 +85,7 @@ def test_page_says_in_words_what_the_numbers_say(identified, faults_seen):
         assert interval(known["damping"]) in page.text
     for test in numbers["uncertainty"]["tests"]:
         assert test["verdict"] in page.text
-    assert len(re.findall("<figure>", (logs / "page.html").read_text())) == 6
+    assert len(re.findall("<figure>", (logs / "page.html").read_text())) == 7
     assert faults_seen(logs / "page.html") == []
 
 

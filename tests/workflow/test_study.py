@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests.workflow.command import FAST_ARM, finish, kill, start_flexlink, wait_until
+from tests.workflow.page_shape import shape_faults
 from tests.workflow.study_examples import PLAIN, SMALL_STUDY, assert_same_study, point_bytes, write_study
 from workflow.config.run_config import load_config
 from workflow.engine import codec
@@ -151,10 +152,14 @@ def test_page_and_picture_are_there(small_study, faults_seen):
     page = (out / "study.html").read_text()
     assert faults_seen(out / "study.html") == []
     assert "small" in page
-    assert "Why not certified" in page
+    assert "(impossible): bandwidth_rad_s = 1e+05" in page
     assert "<figure>" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert (out / "pareto.svg").is_file()
+
+
+def test_the_first_screen_of_a_study(small_study, browser):
+    assert shape_faults(browser, small_study[0] / "study.html", screens=3) == []
 
 
 def test_a_run_directory_is_a_base(fast_run, tmp_path):
