@@ -79,6 +79,6 @@ def said_twice(html: str) -> list[str]:
     parser = _Blocks()
     parser.feed(html)
     blocks = (" ".join(block.split()) for block in parser.blocks)
-    every = (sentence for block in blocks for sentence in re.split(r"(?<=[.;:]) ", block))
+    every = (sentence for block in blocks for sentence in re.split(r"(?<=[.;]) ", block))
     counts = Counter(sentence.strip(" .;:").lower() for sentence in every)
     return [sentence for sentence, times in counts.items() if times > 1 and len(sentence.split()) >= 6]

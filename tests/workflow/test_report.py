@@ -17,6 +17,7 @@ from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import drawings
 from workflow.report.pages import write_report
 from workflow.tasks.results import ClosedLoopResult, ReferenceFilterResult, RunResults
+from workflow.text.formats import at_least, at_most, bound
 from workflow.text.templates import environment, words
 
 ATTACK = "<script>alert(1)</script>"
@@ -138,11 +139,11 @@ def test_numbers_on_the_page_are_the_stages_numbers(undrawn, tmp_path):
             assert words(test.finding) in text
     certificate = results.certify.certificate
     worst = certificate.plants[0].worst_margins
-    assert f"{worst.modulus:.3g}" in text
-    assert f"{np.degrees(worst.phase_rad):.3g}" in text
-    assert f"{1e3 * worst.delay_s:.3g}" in text
+    assert at_least(worst.modulus) in text
+    assert at_least(np.degrees(worst.phase_rad)) in text
+    assert at_least(1e3 * worst.delay_s) in text
     for item in certificate.items:
-        assert f"{item.achieved:.4g}" in text
+        assert bound(item.achieved, item.at_least) in text
     # Responses were sampled in a stage of their own, and the page says that instead.
     standing = environment().get_template("certificate.j2").module
     opened = standing.not_checked(certificate, True, True).splitlines()
@@ -341,7 +342,7 @@ def test_page_tells_of_any_order_whole_responses_and_reference_filter(tmp_path, 
     text = text_of(run, settings)
     gamma = RunResults(run).design.gamma
     # Made up: the bound for any order, and a worst case of the ellipses that holds for 990 of 1000 draws.
-    assert f"Order 1 reaches γ = {gamma:.3g} (needed: 1 or less); a higher order" in text
+    assert f"Order 1 reaches γ = {at_most(gamma)} (needed: 1 or less); a higher order" in text
     assert "(lower bound for any order: 0.798)" in text
     assert "any order 0.8 such a controller is known" in text
     assert "Of 1000 models drawn from the posterior, 99 % stay within the worst case" in text

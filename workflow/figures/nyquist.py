@@ -16,7 +16,7 @@ from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from workflow.figures import style
 from workflow.figures.bands import Complex, Real
 from workflow.figures.subjects import RunView
-from workflow.text.formats import share
+from workflow.text.formats import at_least, share
 
 _MOST_ELLIPSES = 220
 _SEEN = 0.01  # of the panel's width: two pixels
@@ -92,7 +92,7 @@ def draw_around_minus_one(axes: Axes, loop: UncertainLoop, *, level: float, modu
     _draw_loop(axes, loop, (-1 - side, -1 + 1.25 * side), (-1.12 * side, 1.12 * side), level)
     _mark_forbidden(axes, modulus_margin)
     touch = _nearest_point(loop.outline[nearest])
-    label = f"nearest: {closest:.3f} at {loop.omega_rad_s[nearest]:.4g} rad/s"
+    label = f"nearest: {at_least(closest)} at {loop.omega_rad_s[nearest]:.4g} rad/s"
     axes.plot([-1, touch.real], [0, touch.imag], color=style.ACHIEVED, lw=1.2)
     axes.plot([touch.real], [touch.imag], marker="o", ms=6, color=style.ACHIEVED, ls="none", label=label)
     axes.set_title("Around -1")
