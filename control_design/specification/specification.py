@@ -103,7 +103,8 @@ class Specification(BaseModel):
         gt=0,
         le=1,
         description="smallest damping ratio of the controller's own pole pairs; prevents a controller "
-        "resonance at a notch of the plant, which would ring in closed loop",
+        "resonance at a notch of the plant, which would ring in closed loop (default: none; for plants known "
+        "on their own frequencies only, half the relative spacing of these)",
     )
     computational_delay_samples: int = Field(
         default=1, ge=0, le=10, description="samples between measuring and applying the command"

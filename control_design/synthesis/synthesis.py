@@ -25,6 +25,7 @@ Progress = Callable[[float, str], None]
 
 _STILL_BLOCKING = 0.98  # a weighted maximum within 2 % of the worst one blocks the specification too
 _MEANINGLESS = 1e4  # a weighted worst case above it is a loop on the edge of stability, whatever its digits
+_MOST_DAMPING = 0.3  # asked of the controller where data are sparse: wider than that is no resonance
 _EMBEDDINGS = 3  # ways to add a cancelling section to the result of the order below
 _LOWEST_ORDER, _LOWEST_TRACKING = 2, 3  # first rung of the ladder; two states rarely track and damp
 NOMINAL = "stability of the nominal loop"
@@ -61,6 +62,7 @@ def synthesise(
     """
     options = options or SynthesisOptions()
     specification.check_against(plants)
+    specification = _seen_by_the_data(specification, plants)
     tell = progress or (lambda fraction, message: None)
     problem = Problem(tuple(plants), specification, options, tuple(guards))
     own_damping = max(0.8, 1.01 * (specification.controller_damping or 0.0))
@@ -98,6 +100,16 @@ def synthesise(
         gamma_history=result.history,
         grid_points=sum(grid.size for grid in problem.grids),
     )
+
+
+def _seen_by_the_data(specification: Specification, plants: Sequence[UncertainPlant]) -> Specification:
+    """With a least damping of the controller's own poles where some plant is known on its own frequencies
+    only and none is asked: a resonance narrower than their spacing would stand between them, unseen."""
+    own = [plant.own_grid for plant in plants if plant.own_grid is not None]
+    if specification.controller_damping is not None or not own:
+        return specification
+    widest = max(float(np.max(np.diff(grid) / grid[1:])) for grid in own)
+    return specification.model_copy(update={"controller_damping": min(widest / 2, _MOST_DAMPING)})
 
 
 def _ladder(sections: tuple[SectionKind, ...], lowest: int) -> list[tuple[SectionKind, ...]]:

@@ -208,3 +208,17 @@ def test_controller_keeps_the_damping_of_its_own_poles_that_was_asked_for():
     # Left free, the optimiser answers the arm's notch with a resonance; the bound then decides.
     assert damping[None] < 0.6
     assert damping[0.7] >= 0.7 * (1 - 1e-3)
+
+
+def test_a_controller_has_no_resonance_between_the_points_of_a_measured_response():
+    """Sixty points from .5 to 200 rad/s are 10 % apart: what is narrower than half of that lies between."""
+    system = hub_arm()
+    own = np.geomspace(0.5, 200.0, 60)
+    measured = UncertainPlant("frf", system, RelativeDisc(system, 0.02, 60.0).at(own, 0.95))
+    wish = Specification(modulus_margin=0.4, bandwidth_rad_s=2.0, controller_order=4)
+    quick = SynthesisOptions(starts=2, sufficient_gamma=0.0, exchange_rounds=2, dense_points=800)
+    found = synthesise([measured], wish, quick, rng=np.random.default_rng(1))
+    h = found.controller.dt_s / 2
+    tustin = (found.controller.poles - 1) / (found.controller.poles + 1) / h
+    pairs = tustin[tustin.imag > 0]
+    assert np.all(-pairs.real / np.abs(pairs) >= 0.5 * (1 - own[0] / own[1]) * 0.999)
