@@ -36,6 +36,7 @@ class FindingKind(Enum):
     TIME_UNIT = auto()
     REPAIRED = auto()
     RESAMPLED = auto()
+    CLOCK_DRIFTS = auto()
     SKIPPED_ROWS = auto()
     HELD = auto()
     WRAPS = auto()

@@ -13,7 +13,7 @@ from ident.data.arrays import RealArray, readonly
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record_files import read_table
 from ident.data.table import LARGEST, Table
-from ident.data.time_grid import CoarseGrid, Repair, TimeGrid, sampling_time
+from ident.data.time_grid import CoarseGrid, Repair, TimeGrid, clock_doubts, sampling_time
 from ident.data.units import TimeColumn
 from ident.data.wrapping import unwrapped, wraps_at
 
@@ -275,6 +275,8 @@ class Record:
         if grid is not None:
             stamps = np.asarray(grid.dt_s * np.arange(grid.n_samples), dtype=np.float64)
         step = sampling_time(table, stamps, time, dt_s)
+        if grid is None and stamps is not None:
+            notes += clock_doubts(stamps, str(table.path))
 
         def stack(names: Sequence[str], held: bool = False) -> RealArray:
             if not names:

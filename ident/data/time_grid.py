@@ -33,6 +33,8 @@ _FAITHFUL = (0.01 * 384 / 5) ** 0.25
 _FAITHFUL_LINE = (0.01 * 8) ** 0.5
 _FAITHFUL_MEAN = (0.01 * 12) ** 0.5
 # A coarser grid that is proposed has about as many readings in each of its steps.
+# In so many parts of a log the mean step is compared with that of the whole.
+_PARTS = 10
 _READINGS = 3
 
 
@@ -96,6 +98,21 @@ def only_rounded(stamps: RealArray) -> bool:
     return bool(
         0 < digit <= 0.5 * np.median(np.diff(stamps)) and np.max(np.abs(since - uniform)) <= 0.75 * digit
     )
+
+
+def clock_doubts(stamps: RealArray, record: str) -> tuple[Finding, ...]:
+    """What is said of uniform stamps (T,) [s] whose small deviations add up to more than a repair would take:
+    the clock drifts, and a frequency is known no better than its rate."""
+    interval = np.diff(stamps)
+    if interval.size < 2 * _PARTS or only_rounded(stamps):
+        return ()
+    stray = float(np.max(np.abs(_fitted(stamps)[1])))
+    if stray <= LARGEST_JITTER:
+        return ()
+    mean = float(np.mean(interval))
+    share = max(abs(float(np.mean(part)) / mean - 1) for part in np.array_split(interval, _PARTS))
+    coarse = _coarser(interval)
+    return (finding(FindingKind.CLOCK_DRIFTS, record=record, samples=stray, share=share, dt_s=coarse),)
 
 
 def jitter_of(stamps: RealArray) -> float:

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 from hypothesis import given, strategies as st
 
+from ident.data.finding import FindingKind
 from ident.data.record import Record
 from ident.data.record_files import Table, read_table
 from ident.data.time_grid import CoarseGrid, TimeGrid, option_for, sampling_time
@@ -185,3 +186,28 @@ def test_a_gap_is_not_bridged_by_a_coarse_grid(tmp_path):
     with pytest.raises(ValueError, match=r"line 202: .* split the file there"):
         CoarseGrid.of(table_of(tmp_path, time), "t", time, 0.02)
     assert CoarseGrid.of(table_of(tmp_path, time), "t", time, 0.1).repair.missing == 3
+
+
+@pytest.mark.parametrize(
+    ("interval", "told"),
+    [
+        (0.01 * (1 + 0.004 * np.sin(np.linspace(0, 6, 3000))), True),  # temperature goes up and down
+        (np.linspace(0.00995, 0.01005, 3000), True),  # a clock that warms up
+        (np.repeat([0.01, 0.01003], 1500), True),  # the rate was changed in between
+        (np.full(3000, 0.01), False),
+        (0.01 + 2e-5 * np.sin(np.arange(3000.0)), False),  # jitter that does not add up
+    ],
+)
+def test_a_clock_that_drifts_within_every_step_is_told(interval, told, tmp_path):
+    """Every step is within 1 % of the usual one; what is told is the rate of the parts, known here."""
+    t = np.concatenate([[0.0], np.cumsum(interval)])
+    u = np.sign(np.sin(1.3 * t))
+    rows = "\n".join(f"{a:.9f},{b:g},{c:.6f}" for a, b, c in zip(t, u, np.sin(6 * np.pi * t), strict=True))
+    path = tmp_path / "log.csv"
+    path.write_text(f"time_s,u_V,y_rad\n{rows}\n")
+    notes = Record.from_file(path, ["u_V"], ["y_rad"], time="time_s").notes
+    found = [note for note in notes if note.kind is FindingKind.CLOCK_DRIFTS]
+    assert bool(found) is told
+    if told:
+        parts = [np.mean(part) for part in np.array_split(interval, 10)]
+        assert found[0].values["share"] == pytest.approx(max(np.abs(parts / np.mean(interval) - 1)), rel=1e-3)

@@ -200,7 +200,7 @@ def test_hints_of_a_command_name_its_own_options(command):
 
 
 def test_hints_of_a_configuration_name_its_keys():
-    told = KEYS | {"time_unit", "flexlink"}
+    told = KEYS | {"time_unit", "resample_s", "flexlink"}
     for sentence in every_sentence():
         if "--unwrap" in sentence or "--unit" in sentence:
             continue  # doubts about columns name both ways themselves

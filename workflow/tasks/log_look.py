@@ -17,7 +17,7 @@ from ident.data.response_columns import has_response, read_response
 from ident.data.roles import Roles, roles_of, times_in
 from ident.data.table import Table
 from ident.data.text_tables import Layout
-from ident.data.time_grid import LARGEST_JITTER, jitter_of, only_rounded, option_for
+from ident.data.time_grid import LARGEST_JITTER, clock_doubts, jitter_of, only_rounded, option_for
 from workflow.engine.errors import naming
 
 
@@ -158,7 +158,9 @@ def _time(table: Table, name: str, unit: str | None, rows_of: str | None) -> tup
         table.place(row + 1),
         option_for(stamps),
     )
-    return found, [column.doubt(period)] if column.doubtful else []
+    doubts = [column.doubt(period)] if column.doubtful else []
+    # Of uneven stamps the look says what they are itself.
+    return found, [*doubts, *(clock_doubts(stamps, str(table.path)) if not found.option else ())]
 
 
 def _column(table: Table, name: str) -> ColumnLook:

@@ -31,6 +31,7 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "promise": "--promise",
         "band_rad_s": "--band",
         "time_unit": "--time-unit",
+        "resample_s": "--resample-s",
         "validation": "--validation",
     },
 }
