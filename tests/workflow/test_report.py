@@ -161,7 +161,7 @@ def test_numbers_on_the_page_are_the_stages_numbers(undrawn, tmp_path):
 
 def test_a_certified_run_says_so_and_why(undrawn, tmp_path):
     page = page_for(tmp_path, example.config())
-    assert "Certified: all 2 requirements hold for every plant in the uncertainty set" in page.text
+    assert "Certified: all 2 requirements are met" in page.text
     assert "All 3 runs on the simulated arm settle" in page.text
     assert "The certificate covers linear dynamics at the recorded amplitudes: the 95 % ellipses" in page.text
     assert any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
