@@ -587,7 +587,10 @@ def diagnose(
         ),
     ] = None,
     mjcf: Annotated[str | None, typer.Option(help="MuJoCo model of the machine, in place of a case.")] = None,
-    fmu: Annotated[str | None, typer.Option(help="FMU (FMI 2.0, co-simulation), in place of a case.")] = None,
+    fmu: Annotated[
+        str | None,
+        typer.Option(help="FMU (FMI 2.0, co-simulation), in place of a case; runs its native code."),
+    ] = None,
     python: Annotated[
         str | None, typer.Option(help="Python file with a simulation, in place of a case.")
     ] = None,

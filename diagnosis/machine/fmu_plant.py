@@ -1,12 +1,19 @@
 """A functional mock-up unit (FMI 2.0, co-simulation) as the simulation of an own plant.
 
-Its parameters with their start values are the nominal ones; a parameter that starts at zero and states a
-maximum is an effect that may be missing.
+Its code is native and not ours: it runs in a process of its own (`fmu_child`). Its parameters with their
+start values are the nominal ones; a parameter that starts at zero and states a maximum is an effect that may
+be missing.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
 import shutil
+import subprocess
+import sys
+import threading
 import weakref
 import zipfile
 from collections.abc import Mapping
@@ -18,11 +25,13 @@ from typing import Any
 
 import fmpy
 import numpy as np
-from fmpy.fmi2 import FMU2Slave
 
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.plant_effect import EffectParameter, PlantEffect
 
+_CHILD = Path(__file__).with_name("fmu_child.py")
+# A simulation of a log takes milliseconds to seconds; a search makes thousands of them.
+_LONGEST_S = 60.0
 # Of a maximum: where an effect is next to nothing.
 _NOTHING = 1e-4
 
@@ -83,35 +92,81 @@ class Fmu:
         )
 
     @cached_property
-    def _slave(self) -> Any:
-        folder = mkdtemp(prefix="flexlink-fmu-")
-        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        fmpy.extract(str(self.path), folder)
-        slave = FMU2Slave(
-            guid=self.description.guid,
-            unzipDirectory=folder,
-            modelIdentifier=self.description.coSimulation.modelIdentifier,
-            instanceName="flexlink",
-        )
-        slave.instantiate()
-        return slave
+    def _simulator(self) -> _Simulator:
+        simulator = _Simulator(self.path, self.description)
+        weakref.finalize(self, simulator.end)
+        return simulator
 
     def __call__(
         self, parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]], inputs: Real
     ) -> Real:
-        slave = self._slave
         values = {**parameters, **{name: size[name] for name, size in effects.items()}}
         known = self._of("parameter")
-        driven = [v.valueReference for v in self._of("input").values()]
-        seen = [v.valueReference for v in self._of("output").values()]
-        slave.reset()
-        slave.setupExperiment(startTime=0.0)
-        slave.setReal([known[name].valueReference for name in values], list(values.values()))
-        slave.enterInitializationMode()
-        slave.exitInitializationMode()
-        found = np.empty((len(inputs), len(seen)))
-        for k, row in enumerate(inputs):
-            slave.setReal(driven, row)
-            found[k] = slave.getReal(seen)
-            slave.doStep(k * self.dt_s, self.dt_s)
-        return found
+        call = {
+            "set": [known[name].valueReference for name in values],
+            "driven": [v.valueReference for v in self._of("input").values()],
+            "seen": [v.valueReference for v in self._of("output").values()],
+            "dt_s": self.dt_s,
+            "samples": len(inputs),
+        }
+        return self._simulator.answer(call, np.array(list(values.values()), dtype=np.float64), inputs)
+
+
+class _Simulator:
+    """The process that runs the FMU's code (`fmu_child`); a new one where it has ended."""
+
+    def __init__(self, path: Path, description: Any) -> None:
+        self._path = path
+        self._named = (description.coSimulation.modelIdentifier, description.guid)
+        self._process: subprocess.Popen[bytes] | None = None
+        self._owner, self._folder = 0, ""
+
+    def answer(self, call: Mapping[str, Any], values: Real, inputs: Real) -> Real:
+        """Outputs (T, Y). Raises ArithmeticError, one line, where the FMU reports an error, ends its process
+        or does not answer within `_LONGEST_S`: of a trial that is a trial that failed."""
+        # A process that was forked off this one has to have its own.
+        if self._process is None or self._owner != os.getpid():
+            self._owner, self._folder = os.getpid(), mkdtemp(prefix="flexlink-fmu-")
+            command = [sys.executable, "-I", str(_CHILD), str(self._path), self._folder, *self._named]
+            pipe, nowhere = subprocess.PIPE, subprocess.DEVNULL
+            self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=nowhere)
+        process = self._process
+        assert process.stdin is not None
+        assert process.stdout is not None
+        watch = threading.Timer(_LONGEST_S, process.kill)
+        watch.start()
+        try:
+            asked = json.dumps(call).encode() + b"\n" + values.tobytes()
+            process.stdin.write(asked + np.ascontiguousarray(inputs, dtype=np.float64).tobytes())
+            process.stdin.flush()
+            head = json.loads(process.stdout.readline() or b"null")
+            count = 8 * len(inputs) * len(call["seen"])
+            content = process.stdout.read(count) if head == {} else b""
+        except (BrokenPipeError, ValueError):
+            head = None
+        finally:
+            late = not watch.is_alive()
+            watch.cancel()
+        if head is None or (head == {} and len(content) < count):
+            self.end()
+            how = f"did not answer within {_LONGEST_S:g} s" if late else f"ended with {process.returncode}"
+            raise ArithmeticError(f"{self._path}: the process of the FMU {how}")
+        if head:
+            raise ArithmeticError(f"{self._path}: the FMU reports: {head['error']}")
+        return np.frombuffer(content).reshape(len(inputs), -1)
+
+    def end(self) -> None:
+        """Let the process leave, and remove the files that the FMU had unpacked."""
+        process, self._process = self._process, None
+        if process is None or self._owner != os.getpid():
+            return
+        for stream in (process.stdin, process.stdout):
+            with contextlib.suppress(OSError):
+                if stream is not None:
+                    stream.close()
+        try:
+            process.wait(2.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        shutil.rmtree(self._folder, ignore_errors=True)

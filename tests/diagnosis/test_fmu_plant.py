@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
+import sys
+import tempfile
+import time
 import zipfile
 from pathlib import Path
 
@@ -19,18 +23,24 @@ HERE = Path(__file__).parent / "fmu"
 DT_S = 0.02
 
 
-@pytest.fixture(scope="module")
-def carriage(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("fmu")
+def compiled(folder: Path, *flags: str) -> Path:
     library = folder / "carriage.so"
-    subprocess.run(
-        ["gcc", "-O2", "-shared", "-fPIC", "-o", str(library), str(HERE / "carriage.c")], check=True
-    )
+    source = str(HERE / "carriage.c")
+    subprocess.run(["gcc", "-O2", "-shared", "-fPIC", *flags, "-o", str(library), source], check=True)
     path = folder / "carriage.fmu"
     with zipfile.ZipFile(path, "w") as archive:
         archive.write(HERE / "modelDescription.xml", "modelDescription.xml")
         archive.write(library, "binaries/linux64/carriage.so")
     return path
+
+
+@pytest.fixture(scope="module")
+def carriage(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return compiled(tmp_path_factory.mktemp("fmu"))
+
+
+def unpacked() -> set[Path]:
+    return set(Path(tempfile.gettempdir()).glob("flexlink-fmu-*"))
 
 
 def exact(force: np.ndarray, mass: float, spring: float, damper: float) -> np.ndarray:
@@ -93,3 +103,58 @@ def test_what_is_no_fmu_is_refused_in_one_line(tmp_path: Path) -> None:
     broken.write_text("nothing")
     with pytest.raises(ValueError, match=r"^.*broken\.fmu: cannot be read as an FMU \(not a zip archive\)$"):
         Fmu(broken, DT_S)
+
+
+GOOD = {"mass": 2.0, "spring": 80.0, "damper": 3.0}
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        ({"spring": 600.0}, "the process of the FMU ended with -6"),
+        ({"spring": 0.5}, "the process of the FMU did not answer within 1 s"),
+        ({"mass": 0.05}, "the FMU reports: .*fmi2DoStep"),
+    ],
+)
+def test_an_fmu_that_misbehaves_ends_a_trial_and_nothing_else(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    values: dict,
+    complaint: str,
+) -> None:
+    """It aborts, hangs, or returns an error, and it prints; the next trial is as if nothing had been."""
+    monkeypatch.setattr("diagnosis.machine.fmu_plant._LONGEST_S", 1.0)
+    before = unpacked()
+    fmu = Fmu(compiled(tmp_path, "-DMISBEHAVES"), DT_S)
+    force = np.ones((40, 1))
+    first = fmu(GOOD, {}, force)
+    with pytest.raises(ArithmeticError, match=complaint):
+        fmu({**GOOD, **values}, {}, force)
+    np.testing.assert_array_equal(fmu(GOOD, {}, force), first)
+    del fmu
+    gc.collect()
+    assert unpacked() == before
+    assert capfd.readouterr() == ("", "")
+
+
+def test_files_of_an_fmu_leave_with_a_command_that_is_killed(carriage: Path) -> None:
+    before = unpacked()
+    program = (
+        "import sys, numpy\nfrom pathlib import Path\nfrom diagnosis.machine.fmu_plant import Fmu\n"
+        f"fmu = Fmu(Path({str(carriage)!r}), {DT_S})\n"
+        "fmu(fmu.parameters, {}, numpy.ones((5, 1)))\nprint('ready', flush=True)\nsys.stdin.read()\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=HERE.parents[2]
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"ready\n"
+    assert len(unpacked() - before) == 1
+    process.kill()
+    process.communicate()
+    for _ in range(100):
+        if unpacked() == before:
+            break
+        time.sleep(0.05)
+    assert unpacked() == before

@@ -1,5 +1,6 @@
 /* A carriage on a spring with a damper, as FMI 2.0 for co-simulation: force in, position out.
    Value references: 0 force, 1 position, 2 mass, 3 spring, 4 damper, 5 drag (against v |v|). */
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -36,6 +37,12 @@ int fmi2GetReal(void *c, const unsigned r[], size_t n, double v[]) {
 int fmi2DoStep(void *c, double time, double step, int keep) {
     Carriage *s = c;
     double *x = s->value, h = step / 20;
+#ifdef MISBEHAVES
+    puts("a library that talks");
+    if (x[3] > 500) abort();
+    if (x[3] < 1) for (;;) {}
+    if (x[2] < 0.1) return 3;
+#endif
     for (int i = 0; i < 20; i++) {
         double v = s->speed, drag = x[5] * v * (v < 0 ? -v : v);
         double a = (x[0] - x[3] * x[1] - x[4] * v - drag) / x[2];
