@@ -245,7 +245,7 @@ def _draw(axes: Axes, study: StudyView, plot: ParetoPlot, front: list[int]) -> N
     number = np.array([row.number for row in study.rows])
     good, on = np.array([row.good for row in study.rows]), np.isin(number, front)
     for kind, label, look in (
-        (~good, "not certified", _HOLLOW),
+        (~good, "not certified, or does not settle", _HOLLOW),
         (good & ~on, "certified, dominated", _DOMINATED),
         (on, "certified, on the front", _FRONT),
     ):
