@@ -228,7 +228,7 @@ def test_picture_tells_certified_from_uncertified():
     axes = figure.axes[0]
     by_label = {line.get_label(): line for line in axes.lines}
     assert to_hex(by_label["certified, on the front"].get_color()) == PREDICTED.lower()
-    assert by_label["not certified"].get_markerfacecolor() == "none"
+    assert by_label["not certified, or does not settle"].get_markerfacecolor() == "none"
     assert list(by_label["certified, dominated"].get_xdata()) == [1.0]
     texts = [text.get_text() for text in axes.texts]
     assert "1" in texts
