@@ -35,6 +35,14 @@ class Row:
 
 
 SECTIONS = {
+    "Logs": (
+        Row(
+            "Generated logs of all kinds, contents known to who wrote them: misread without a word",
+            "log_oracle",
+            r"^(\d+) logs\nright +(\d+) .*?^asked +(\d+) (?!.*without a word)",
+            "0 of {}; {} read right, {} asked",
+        ),
+    ),
     "Identification": (
         Row(
             "Error of the response, 1 to 100 rad/s, arm with a double integrator, nothing known (median)",
@@ -87,6 +95,12 @@ SECTIONS = {
             "random_designs",
             r"designs (\d+), met (\d+), .*?unstable (\d+),",
             "{2} of {1} certified ({0} designs)",
+        ),
+        Row(
+            "Numbers of certificates of controllers made by hand, against eigenvalues: false",
+            "controllers_by_hand",
+            r"^(\d+) controllers.*?; (\d+) numbers checked\nfalse: (\d+);",
+            "{2} of {1} ({0} controllers)",
         ),
         Row(
             "Peak of the sensitivity on the nonlinear arm against the prediction",
