@@ -13,10 +13,13 @@ from ident.data.table import Table
 from ident.data.units import TIME_UNITS, ends_with_time, says_time
 
 _INPUT = re.compile(
-    r"(u|v|input|command|cmd|drive|voltage|spannung|current|strom|torque|moment|force)(?![a-z])", re.I
+    r"(u|v|input|command|cmd|drive|voltage|spannung|current|strom|torque|moment|force|pwm|duty)(?![a-z])",
+    re.I,
 )
 _OUTPUT = re.compile(
-    r"(y|output|angle|winkel|position|pos|theta|phi|alpha|q|tip|speed|velocity|encoder|hub)(?![a-z])", re.I
+    r"(y|output|angle|winkel|position|pos|theta|phi|alpha|q|tip|speed|velocity|drehzahl|encoder|counts|hub)"
+    r"(?![a-z])",
+    re.I,
 )
 # What the motion should be: the command of a control loop, neither its drive nor what a sensor read.
 _WISHED = re.compile(
@@ -25,7 +28,7 @@ _WISHED = re.compile(
 # Of a PLC's variable, its type: rVoltage, lrAngle.
 _PREFIX = re.compile(r"^(l?r|f|n|i|di|ui|w)(?=[A-Z])")
 _DRIVEN = re.compile(r"[mkµμ]?(V|A|N|Nm)")
-_MOVED = re.compile(r"[mµμ]?(rad|deg|m)((/|_)s2?|/s\^2|/s²)?|°|[cm]m|rpm|counts?|ticks?", re.I)
+_MOVED = re.compile(r"[mµμ]?(rad|deg|m)((/|_)s2?|/s\^2|/s²)?|°|grad|[cm]m|rpm|u/min|counts?|ticks?", re.I)
 
 
 @dataclass(frozen=True)
