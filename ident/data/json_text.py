@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 from typing import Any
 
+MOST_LEVELS = 40
+"""Of nesting: what looks at a value level by level, or prints it, would meet Python's own limit."""
+
 
 def json_value(text: str) -> Any:
-    """The value of a JSON text. Raises ValueError: syntax, nesting without end, a name twice in one object
-    (one would be lost)."""
+    """The value of a JSON text. Raises ValueError: syntax, more than `MOST_LEVELS` levels, a name twice in
+    one object (one would be lost)."""
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         found = dict(pairs)
@@ -18,7 +21,15 @@ def json_value(text: str) -> Any:
             raise ValueError(f"'{twice[:80]}' is there twice in one object; expected each name once")
         return found
 
+    too_deep = f"nested deeper than {MOST_LEVELS} levels"
     try:
-        return json.loads(text, object_pairs_hook=once)
+        value = json.loads(text, object_pairs_hook=once)
     except RecursionError:
-        raise ValueError("nested too deeply") from None
+        raise ValueError(too_deep) from None
+    level = [value] if isinstance(value, (dict, list)) else []
+    for _ in range(MOST_LEVELS + 1):
+        inner = (item.values() if isinstance(item, dict) else item for item in level)
+        level = [part for parts in inner for part in parts if isinstance(part, (dict, list))]
+        if not level:
+            return value
+    raise ValueError(too_deep)

@@ -223,7 +223,7 @@ def test_json_in_rows_columns_and_lines(tmp_path, form):
         ('{"t_s": 0.02, "u_V": NaN, "y_rad": 1}', "index 2: column 'u_V' is nan; expected a finite number"),
         ('{"t_s": 0.02, "y_rad": 1}', "index 2: column 'u_V' is nan; expected a finite number"),
         ('{"t_s": 0.02, "u_V": 1, "y_rad": 1', "line 3: not valid JSON"),
-        ("[" * 100_000, "line 3: nested too deeply"),
+        ("[" * 100_000, "line 3: nested deeper than 40 levels"),
         (
             '{"t_s": 0.02, "u_V": ' + "9" * 400 + ', "y_rad": 1}',
             "column 'u_V' is inf; expected a finite number",

@@ -155,14 +155,14 @@ def test_amplitudes_cost_what_the_design_for_the_arm_behind_its_friction_gains(r
     assert nothing.design.gamma == run.design.gamma
     assert nothing.behind == nothing.carried_over == run.certify.certificate
     assert nothing.left_by_unit[0] == nothing.left_by_unit[1]
-    assert "costs 10 %" in said("amplitude_cost", nothing, 1.1 * run.design.gamma)
+    assert "by 10 %" in said("amplitude_cost", nothing, 1.1 * run.design.gamma)
     # An arm of which less is known leaves less to gain; its controller is looked at on both.
     larger = cost(
         replace(found.posterior, covariance_factor=40 * np.asarray(found.posterior.covariance_factor))
     )
     assert larger.design.gamma > 1.01 * run.design.gamma
     assert larger.behind.gamma > 1.01 * larger.carried_over.gamma
-    assert "costs nothing" in said("amplitude_cost", larger, run.design.gamma)
+    assert "does not raise" in said("amplitude_cost", larger, run.design.gamma)
 
 
 def found_options(config, **uncertainty):

@@ -9,12 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ident.data.json_text import json_value
+from ident.data.json_text import MOST_LEVELS, json_value
 from workflow.engine.errors import InputError, cannot, shortened
 
 MOST_BYTES = 32 * 2**20
 MOST_TOML_BYTES = 2**20
-MOST_LEVELS = 40
 LARGEST_INTEGER = 2**63 - 1
 # The parser's time grows with the square of a dotted key's length.
 _LONGEST_TOML_LINE = 20_000
