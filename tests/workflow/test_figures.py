@@ -374,8 +374,8 @@ def test_stabilisation_marks_say_what_the_record_says():
         for line in right.lines
         if not line.get_label().startswith("_")
     }
-    assert marks["stays, and the data need it"] == int(np.count_nonzero(plot.stable & plot.needed))
-    assert marks["stays, but the data would not miss it"] == int(np.count_nonzero(plot.stable & ~plot.needed))
+    assert marks["stable and significant"] == int(np.count_nonzero(plot.stable & plot.needed))
+    assert marks["stable, not significant"] == int(np.count_nonzero(plot.stable & ~plot.needed))
     columns = [line.get_xdata()[0] for line in right.lines if line.get_label().startswith("_")]
     np.testing.assert_allclose(columns, [mode.omega_rad_s for mode in plot.columns()])
 

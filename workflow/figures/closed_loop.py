@@ -284,7 +284,7 @@ def draw_friction(run: RunView) -> Figure | None:
     if np.isfinite(found.certified_peak):
         peaks.axhline(found.certified_peak, **style.LIMIT_LINE, label="certified")
     if found.sticking_step > 0:
-        peaks.axvline(found.sticking_step, **style.REFERENCE_LINE, label="a step of this size sticks")
+        peaks.axvline(found.sticking_step, **style.REFERENCE_LINE, label="smaller steps do not move the arm")
     peaks.set(xscale="log", title="Peak of |S| by size of the reference", ylabel="|S| [1]")
     peaks.set_xlabel(f"rms of the reference [{style.plain(unit, 12)}]")
     time_s = np.asarray(np.arange(sine.without.size) * run.plant.dt_s, dtype=np.float64)
@@ -295,7 +295,7 @@ def draw_friction(run: RunView) -> Figure | None:
         errors.plot(*outline(time_s, error, 400), **look, label=words)
     for sign in (-1, 1):
         errors.axhline(
-            sign * found.error_at_rest, **style.LIMIT_LINE, label="most that friction leaves at rest"
+            sign * found.error_at_rest, **style.LIMIT_LINE, label="largest error that friction holds"
         )
     errors.set(xlabel="time [s]", title="Error on a slow sine")
     errors.set_xlim(0.0, float(time_s[-1]))

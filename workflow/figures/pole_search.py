@@ -176,11 +176,11 @@ def _stabilisation(axes: Axes, plot: Stabilisation, response: FrequencyUncertain
     for mode in plot.columns():
         axes.axvline(mode.omega_rad_s, color=style.PREDICTED, lw=0.9, alpha=0.5)
     kinds = (
-        (stable & plot.needed, "o", style.PREDICTED, style.PREDICTED, 6.5, "stays, and the data need it"),
-        (stable & ~plot.needed, "o", "white", style.MEASURED, 5.5, "stays, but the data would not miss it"),
+        (stable & plot.needed, "o", style.PREDICTED, style.PREDICTED, 6.5, "stable and significant"),
+        (stable & ~plot.needed, "o", "white", style.MEASURED, 5.5, "stable, not significant"),
         (same & ~stable, "^", "white", style.HIGHLIGHT, 5.5, "same frequency, other damping"),
-        (~same & plot.needed, "D", "white", style.PREDICTED, 5.0, "new, and needed"),
-        (~same & ~plot.needed, "x", style.MEASURED, style.MEASURED, 5.0, "new, not needed"),
+        (~same & plot.needed, "D", "white", style.PREDICTED, 5.0, "new, significant"),
+        (~same & ~plot.needed, "x", style.MEASURED, style.MEASURED, 5.0, "new, not significant"),
     )
     for here, marker, face, edge, size, label in kinds:
         if here.any():
