@@ -177,6 +177,13 @@ def test_an_uncertified_run_says_what_is_missed(undrawn, tmp_path):
     assert not any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
 
 
+def test_an_unstable_loop_has_no_margins(undrawn, tmp_path):
+    stable, unstable = (page_for(tmp_path / str(gain), example.config(), gain=gain) for gain in (4.0, 400.0))
+    assert "gain may rise by" in stable.text
+    assert "gain may rise by" not in unstable.text
+    assert re.search(r"the nominal loop is unstable \(largest pole radius [1-9][\d.]*\)", unstable.text)
+
+
 def test_what_is_not_proved_of_an_unstable_loop_is_a_line_of_its_own(tmp_path):
     run = example.build_run(tmp_path / "run", example.config(), gain=400.0)
     standing = environment().get_template("certificate.j2").module
