@@ -73,13 +73,13 @@ SECTIONS = {
         Row(
             "First mode under dry friction, as recorded: largest error, and 95 % interval holds the truth",
             "readme_identify",
-            r"promise: as recorded.*?largest error: ([\d.]+) %.*?holds the mode: \[(\d+), \d+\] of (\d+)",
+            r"response: as recorded.*?largest error: ([\d.]+) %.*?holds the mode: \[(\d+), \d+\] of (\d+)",
             "{} %, but {} of {}: friction is not in these intervals",
         ),
         Row(
             "The same with the friction identified",
             "readme_identify",
-            r"promise: without friction.*?largest error: ([\d.]+) %.*?the mode: \[(\d+), \d+\] of (\d+)",
+            r"response: without friction.*?largest error: ([\d.]+) %.*?the mode: \[(\d+), \d+\] of (\d+)",
             "{} %, {} of {}",
         ),
         Row(

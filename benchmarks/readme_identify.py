@@ -3,7 +3,7 @@
 Eight records of the default arm (4 and 8 V rms), one integrator, one sample of delay, one real pole and two
 pairs stated. Right: both modes within 3 % of those of the linear arm, and no further pair called a mode. The
 share within 1 % of both, and how often each 95 % interval holds its mode, beside it: of the response as
-recorded, friction included, which has other modes than the linear arm, and promised without friction. CPU per
+recorded, friction included, which has other modes than the linear arm, and the one without friction. CPU per
 identification, uncertainty included.
 """
 
@@ -23,12 +23,12 @@ from workflow.tasks.simulated_rig import simulate_record, truth_of
 
 
 def run(out: Print, *, seeds: int = 50) -> None:
-    for promise in ("as recorded", "without friction"):
-        out(f"\npromise: {promise}")
-        _promised(out, UncertaintyOptions(promise=promise), seeds)
+    for response in ("as recorded", "without friction"):
+        out(f"\nresponse: {response}")
+        _described(out, UncertaintyOptions(response=response), seeds)
 
 
-def _promised(out: Print, promised: UncertaintyOptions, seeds: int) -> None:
+def _described(out: Print, described: UncertaintyOptions, seeds: int) -> None:
     source = built_in_config()[0].source
     assert isinstance(source, SimulatedSource)
     entries = [entry for entry in source.records if "V rms" in entry.name]
@@ -41,7 +41,7 @@ def _promised(out: Print, promised: UncertaintyOptions, seeds: int) -> None:
             simulate_record(source, entry, seed).siso("voltage_V", "hub_angle_rad") for entry in entries
         ]
         result, spent = timed(
-            partial(identify_records, records, (), options, promised=promised, with_plot=False)
+            partial(identify_records, records, (), options, described=described, with_plot=False)
         )
         cpu.append(spent)
         modes = [mode.frequency_Hz for mode in result.about.modes if result.about.is_mode(mode)]

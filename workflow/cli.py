@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from workflow.config.renamed_keys import RenamedKeyWarning
+from workflow.config.renamed_keys import RenamedKeyWarning, current_options
 from workflow.engine import interrupts
 from workflow.engine.errors import (
     EXIT_BAD_INPUT,
@@ -334,12 +334,12 @@ def identify(
         ),
     ] = None,
     level: Annotated[float, typer.Option(help="Confidence of each ellipse, between 0.5 and 1.")] = 0.95,
-    promise: Annotated[
+    response: Annotated[
         str,
         typer.Option(
-            help="What the ellipses are about: 'as recorded' (all that is not linear is noise); or, the "
-            "output being the position of a shaft with dry friction: 'without friction', 'this amplitude', "
-            "'amplitudes from 2 to 8' (rms of the input)."
+            help="Which response the ellipses describe: 'as recorded' (all that is not linear is noise); or, "
+            "where the output is the position of a shaft with dry friction: 'without friction', "
+            "'this amplitude', 'amplitudes from 2 to 8' (rms of the input)."
         ),
     ] = "as recorded",
     band: Annotated[
@@ -399,7 +399,7 @@ def identify(
     chosen |= {} if delay is None else {"input_delay_samples": delay}
     options = check(IdentOptions, chosen, source="options")
     with _watched(quiet) as progress:
-        promised = check(UncertaintyOptions, {"level": level, "promise": promise}, source="options")
+        described = check(UncertaintyOptions, {"level": level, "response": response}, source="options")
         written = [("--out", out), ("--report", report_page), ("--export", export)]
         # A log given twice would count its noise twice as well known, or validate what it was fitted to.
         refuse_in_the_way([*log, *(validation or [])], [(name, path) for name, path in written if path])
@@ -447,7 +447,7 @@ def identify(
         summary = identify_logs(
             logs,
             options=options,
-            promised=promised,
+            described=described,
             band_rad_s=band,
             noise_order=noise_order,
             out=out,
@@ -756,6 +756,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if argv is None:
             interrupts.watch()
         interrupts.check()
+        arguments = current_options(arguments)
         _plug_in(arguments)
         code = int(app(arguments, standalone_mode=False) or EXIT_OK)
         sys.stdout.flush()

@@ -73,7 +73,7 @@ def refuse_unrecorded(records: Sequence[Record], amplitudes: tuple[float, float]
     low, high = amplitudes or (smallest, largest)
     if not smallest * (1 - _SAME) <= low <= high <= largest * (1 + _SAME):
         raise ValueError(
-            f"amplitudes from {low:.4g} to {high:.4g} cannot be promised: the inputs of the records have an "
+            f"amplitudes from {low:.4g} to {high:.4g} cannot be described: the inputs of the records have an "
             f"rms from {smallest:.4g} to {largest:.4g}"
         )
 

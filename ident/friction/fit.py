@@ -52,7 +52,7 @@ _MOSTLY_NOISE = 0.9
 # a point beyond the first mode is opposite.
 _MOST_DEG = 135.0
 _LIGHT = 0.3
-_UNSEEN, _ANYWAY = "the friction of the shaft cannot be told: ", "; promise = 'as recorded' needs none"
+_UNSEEN, _ANYWAY = "the friction of the shaft cannot be told: ", "; response = 'as recorded' needs none"
 
 
 def fit_friction(

@@ -410,7 +410,7 @@ def test_a_shaft_that_the_records_do_not_show_is_refused(
     refuse_unseen_shaft(found, records)
     steps = np.ptp(records[0].output) / 8
     coarse = [replace(record, output=steps * np.round(record.output / steps)) for record in records]
-    with pytest.raises(ValueError, match=r"takes 9 different values only.*promise = 'as recorded'"):
+    with pytest.raises(ValueError, match=r"takes 9 different values only.*response = 'as recorded'"):
         refuse_unseen_shaft(found, coarse)
     stuck = [
         replace(record, input=record.input / 1000, output=record.output - found.motion(record)[0][:, None])

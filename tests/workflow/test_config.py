@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import tomllib
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.workflow.command import FAST_ARM, ROOT
-from workflow.config.renamed_keys import RenamedKeyWarning
+from workflow.config.renamed_keys import RenamedKeyWarning, current_key, with_current_keys
 from workflow.config.rig_settings import BangBang, Doublet, LogChirp, Multisine, Prbs
 from workflow.config.run_config import FileSource, RunConfig, SimulatedSource, built_in_config, load_config
 from workflow.config.settings import check
@@ -134,37 +135,39 @@ def test_every_excitation_gives_its_samples_and_its_size(table):
         ("uncertainty = {{ {0} }}\nincrements = true", "records as measured"),
         ("uncertainty = {{ {0} }}\nband_rad_s = [1.0, 20.0]", "records as measured"),
         ("uncertainty = {{ {0} }}\nidentification = {{ integrators = 2 }}", "at most one integrator"),
-        ("uncertainty = {{ promise = 'amplitudes from 8 to 2' }}", "must be positive and smaller"),
-        ("uncertainty = {{ promise = 'amplitudes 2..8' }}", "promise"),
+        ("uncertainty = {{ response = 'amplitudes from 8 to 2' }}", "must be positive and smaller"),
+        ("uncertainty = {{ response = 'amplitudes 2..8' }}", "response"),
     ],
 )
-def test_a_promise_that_cannot_be_kept_is_refused(tmp_path, channel, complaint):
-    asked = channel.format("promise = 'without friction'")
+def test_a_response_that_cannot_be_described_is_refused(tmp_path, channel, complaint):
+    asked = channel.format("response = 'without friction'")
     with pytest.raises(InputError, match=complaint):
         minimal(tmp_path, MINIMAL.replace("[[channels]]", f"[[channels]]\n{asked}"))
 
 
-def test_a_specification_over_amplitudes_is_the_promise_of_every_channel(tmp_path):
+def test_a_specification_over_amplitudes_is_the_response_of_every_channel(tmp_path):
     asked = MINIMAL.replace("[specification]", "[specification]\namplitudes = [0.5, 8.0]")
     tip = '[[channels]]\ninput = "voltage_V"\noutput = "tip_m"\n%s\n[specification]'
     config = minimal(tmp_path, asked.replace("[specification]", tip % ""))
     assert [channel.uncertainty.amplitudes for channel in config.channels] == [(0.5, 8.0)] * 2
     assert RunConfig.from_document(config.to_document(), source="document") == config
-    other = tip % "uncertainty = { promise = 'without friction' }"
-    with pytest.raises(InputError, match=r"0.5, 8\], but channel 'tip_m' says promise = 'without friction'"):
+    other = tip % "uncertainty = { response = 'without friction' }"
+    with pytest.raises(InputError, match=r"0.5, 8\], but channel 'tip_m' says response = 'without friction'"):
         minimal(tmp_path, asked.replace("[specification]", other))
     # Without a range in the specification the channels still have to agree on the one there is.
-    promised = MINIMAL.replace("[[channels]]", "[[channels]]\nuncertainty = { promise = 'this amplitude' }")
-    with pytest.raises(InputError, match="promise 'this amplitude' and 'without friction'"):
-        minimal(tmp_path, promised.replace("[specification]", other))
+    described = MINIMAL.replace("[[channels]]", "[[channels]]\nuncertainty = { response = 'this amplitude' }")
+    with pytest.raises(InputError, match="describe 'this amplitude' and 'without friction'"):
+        minimal(tmp_path, described.replace("[specification]", other))
 
 
 def test_friction_is_fed_forward_only_where_it_is_identified(tmp_path):
     asked = "[closed_loop]\nfriction_feedforward = true\n"
     with pytest.raises(InputError, match="friction_feedforward = true needs an identified friction"):
         minimal(tmp_path, MINIMAL + asked)
-    promised = MINIMAL.replace("[[channels]]", "[[channels]]\nuncertainty = { promise = 'without friction' }")
-    assert minimal(tmp_path, promised + asked).closed_loop.friction_feedforward
+    described = MINIMAL.replace(
+        "[[channels]]", "[[channels]]\nuncertainty = { response = 'without friction' }"
+    )
+    assert minimal(tmp_path, described + asked).closed_loop.friction_feedforward
 
 
 def test_packaged_default_is_the_example():
@@ -244,6 +247,27 @@ def test_earlier_names_of_keys_are_read_and_the_new_one_is_told(tmp_path):
     path.write_text(path.read_text() + "[achievable_performance]\ncompute = true\n")
     with pytest.raises(InputError, match="yardstick is the earlier name of achievable_performance"):
         load_config(path)
+
+
+def test_an_earlier_name_is_read_inside_tables_in_studies_and_of_stored_runs(tmp_path):
+    text = MINIMAL.replace("[[channels]]", "[[channels]]\nuncertainty = {{ {} = 'without friction' }}", 1)
+    with pytest.warns(RenamedKeyWarning, match=r"channels\.uncertainty\.promise is now called response"):
+        config = minimal(tmp_path, text.format("promise"))
+    assert config == minimal(tmp_path, text.format("response"))
+    assert config.channels[0].uncertainty.response == "without friction"
+    with pytest.raises(InputError, match=r"channels\.uncertainty\.promise is the earlier name of response"):
+        minimal(tmp_path, text.format("response = 'as recorded', promise"))
+    stored = config.to_document()
+    first = stored["channels"][0]["uncertainty"]
+    first["promise"] = first.pop("response")
+    with pytest.warns(RenamedKeyWarning, match=r"stored: channels\.uncertainty\.promise"):
+        assert RunConfig.from_document(stored, source="stored") == config
+    assert "promise" in first, "the caller's document is changed"
+    with pytest.warns(RenamedKeyWarning, match="key: promise is now called response"):
+        assert current_key("channels[0].uncertainty.promise") == "channels[0].uncertainty.response"
+    assert current_key("notes.promise") == "notes.promise"
+    for odd in ({"channels": 3}, {"channels": [3, {"uncertainty": "promise"}]}):
+        assert with_current_keys(copy.deepcopy(odd), "odd") == odd
 
 
 def test_a_plan_is_its_records(tmp_path):

@@ -193,7 +193,7 @@ def test_hints_of_a_command_name_its_own_options(command):
     assert named <= options_of(command)
     # Every option that the table knows is really an option, and the sentences reach most of them.
     assert {text.split()[0] for text in OPTIONS[command].values()} <= options_of(command)
-    assert {"--delay", "--feedthrough", "--noise-order", "--zeta-max", "--promise"} <= named
+    assert {"--delay", "--feedthrough", "--noise-order", "--zeta-max", "--response"} <= named
     for sentence in sentences:
         rest = elsewhere.sub("", sentence)
         assert not {key for key in KEYS if "_" in key} & set(re.findall(r"\w+", rest)), sentence

@@ -15,6 +15,7 @@ from tests.workflow.page_shape import shape_faults
 from tests.workflow.test_report import ATTACK, Page, is_one_file
 from workflow.commands.identify import identify_logs
 from workflow.commands.logs import read_logs
+from workflow.config.renamed_keys import RenamedKeyWarning
 from workflow.engine.errors import InputError
 from workflow.tasks.exports import read_model
 from workflow.text.formats import interval
@@ -273,20 +274,21 @@ def test_friction_is_identified_from_logs_where_that_is_asked_for(flexlink, undr
     command = (*command, "--output", "hub_angle_rad", "--integrators", 1, "--delay", 1, "--json")
     command = (*command, "--real", 1, "--pairs", 2, "--omega-min", 30, "--noise", "white")
     told = {}
-    for promise in ("as recorded", "without friction", "this amplitude"):
+    for response in ("as recorded", "without friction", "this amplitude"):
         page = tmp_path / "page.html"
-        answer = flexlink(*command, "--promise", promise, "--report", page)
+        answer = flexlink(*command, "--response", response, "--report", page)
         document = answer.document()
-        told[promise] = {row["label"]: row["value"] for row in document["table"]}
+        told[response] = {row["label"]: row["value"] for row in document["table"]}
         text = Page(page.read_text(encoding="utf-8")).text
-        assert ("Coulomb" in text) == (promise != "as recorded")
-        assert ("best linear approximation" in text) == (promise == "this amplitude")
-    unexplained = {promise: 100 - float(row["fit, validation"].split()[0]) for promise, row in told.items()}
+        assert ("Coulomb" in text) == (response != "as recorded")
+        assert ("best linear approximation" in text) == (response == "this amplitude")
+    unexplained = {response: 100 - float(row["fit, validation"].split()[0]) for response, row in told.items()}
     assert unexplained["without friction"] < unexplained["as recorded"] / 2
     assert unexplained["this amplitude"] == unexplained["without friction"]  # of the same model
-    answer = flexlink(*command, "--promise", "amplitudes from 1 to 8")
+    with pytest.warns(RenamedKeyWarning, match="option: --promise is now called --response"):
+        answer = flexlink(*command, "--promise", "amplitudes from 1 to 8")
     assert answer.code == 2
-    assert "cannot be promised: the inputs of the records have an rms from" in answer.err
+    assert "cannot be described: the inputs of the records have an rms from" in answer.err
 
 
 def test_a_log_in_milliseconds_gives_the_poles_of_the_same_log_in_seconds(flexlink, undrawn, tmp_path):
@@ -346,8 +348,8 @@ def test_integers_called_seconds_are_doubted(flexlink, tmp_path):
         (("--reference", "r"), "no column 'r'"),
         (("--input-limit", "0"), "log.csv: the limit of the input must be positive; got 0"),
         (("--level", "0.2"), "level: input should be greater than 0.5"),
-        (("--promise", "amplitude 2"), "expected 'as recorded', 'without friction', 'this amplitude' or"),
-        (("--promise", "this amplitude", "--band", "10", "20"), "logs as measured, in open loop: no band"),
+        (("--response", "amplitude 2"), "expected 'as recorded', 'without friction', 'this amplitude' or"),
+        (("--response", "this amplitude", "--band", "10", "20"), "logs as measured, in open loop: no band"),
         (("--band", "50", "20"), "lower below upper"),
         (("--band", "50", "2000"), "the band must lie in (0, 628"),
         (("--pairs", "12", "--report", "{out}/page.html"), "too few"),

@@ -141,7 +141,7 @@ def test_every_design_is_compared_with_any_order_and_sampled_whole(run):
 
 def test_amplitudes_cost_what_the_design_for_the_arm_behind_its_friction_gains(run, tmp_path):
     config, found = config_of(run.run), run.uncertainty.channels[0]
-    options = found_options(config, promise="this amplitude")
+    options = found_options(config, response="this amplitude")
     shutil.copytree(run.run.path, tmp_path / "run")
 
     def cost(posterior):

@@ -29,7 +29,7 @@ def identify_logs(
     logs: Logs,
     *,
     options: IdentOptions | None = None,
-    promised: UncertaintyOptions | None = None,
+    described: UncertaintyOptions | None = None,
     band_rad_s: tuple[float, float] | None = None,
     noise_order: int | None = None,
     out: Path | None = None,
@@ -40,12 +40,12 @@ def identify_logs(
     """Identify one channel from logs (tangent uncertainty) and write what is asked for.
 
     out: npz with model and posterior, for `flexlink design`; report: HTML page; export: the model as .json
-    or .mat. Every file is written when everything is known, and whole. band_rad_s, promised: as of
+    or .mat. Every file is written when everything is known, and whole. band_rad_s, described: as of
     `identify_records`; where friction is identified the output is the position of the shaft it acts on.
     noise_order: largest order of the noise model behind the ellipses; none given: 8, or 32 where that leaves
     coloured residuals. Raises InputError.
     """
-    progress, promised = progress or Progress(), promised or UncertaintyOptions()
+    progress, described = progress or Progress(), described or UncertaintyOptions()
     if export is not None and export.suffix.lower() not in MODEL_SUFFIXES:
         raise InputError(f"--export {export}: the ending must be {' or '.join(MODEL_SUFFIXES)}")
     progress.plan((("identify", 2.0), ("uncertainty", 1.0), *((("report", 4.0),) if report else ())))
@@ -57,7 +57,7 @@ def identify_logs(
         common[: len(logs.measured)],
         common[len(logs.measured) :],
         options,
-        promised=promised,
+        described=described,
         band_rad_s=band_rad_s,
         noise_order=noise_order,
         with_plot=report is not None,
@@ -74,7 +74,7 @@ def identify_logs(
             with speaking("identify"):
                 written[report] = identify_page(result, inputs, update).encode()
     if out is not None:
-        plant = IdentifiedPlant(result.spread.nominal, result.spread.posterior, promised.level)
+        plant = IdentifiedPlant(result.spread.nominal, result.spread.posterior, described.level)
         written[out] = storage.npz_bytes(codec.to_arrays(plant))
     if export is not None:
         written[export] = model_bytes(export, ModelFile(result.about.model, result.spread.frequency))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from importlib import resources
@@ -18,6 +19,7 @@ from control_design.synthesis.synthesis_options import SynthesisOptions
 from ident.basis.options import IdentOptions
 from plant.experiment_plan import ExperimentPlan
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
+from workflow.config.renamed_keys import with_current_keys
 from workflow.config.rig_settings import EffectTable, Excitation, Multisine, RigChoice
 from workflow.config.settings import InputPath, Section, check, read_toml, repeated
 from workflow.config.uncertainty_options import UncertaintyOptions
@@ -239,7 +241,7 @@ class Channel(Section):
             raise ValueError("bounds_band_rad_s goes with band_rad_s, the band of the fit")
         if self.uncertainty.friction_identified and (self.increments or self.band_rad_s):
             raise ValueError(
-                f"promise = {self.uncertainty.promise!r} takes records as measured: no increments, no band"
+                f"response = {self.uncertainty.response!r} takes records as measured: no increments, no band"
             )
         return self
 
@@ -248,16 +250,16 @@ class Channel(Section):
         return self.name or self.output
 
     def over_amplitudes(self, low: float, high: float) -> Channel:
-        """The same over a range of amplitudes. Raises ValueError where it promises another response."""
+        """The same over a range of amplitudes. Raises ValueError where it states another response."""
         options = self.uncertainty
-        if "promise" in options.model_fields_set and options.amplitudes != (low, high):
+        if "response" in options.model_fields_set and options.amplitudes != (low, high):
             raise ValueError(
-                f"specification.amplitudes = [{low:g}, {high:g}], but channel {self.label!r} says promise = "
-                f"{options.promise!r}: leave that out"
+                f"specification.amplitudes = [{low:g}, {high:g}], but channel {self.label!r} says response = "
+                f"{options.response!r}: leave that out"
             )
         ends = [np.format_float_positional(end, trim="-") for end in (low, high)]
-        promised = {**dict(options), "promise": f"amplitudes from {ends[0]} to {ends[1]}"}
-        return Channel(**{**dict(self), "uncertainty": UncertaintyOptions(**promised)})
+        described = {**dict(options), "response": f"amplitudes from {ends[0]} to {ends[1]}"}
+        return Channel(**{**dict(self), "uncertainty": UncertaintyOptions(**described)})
 
 
 class RunSpecification(Specification):
@@ -266,7 +268,7 @@ class RunSpecification(Specification):
     amplitudes: tuple[float, float] | None = Field(
         None,
         description="smallest and largest rms of the input, in its unit: the specification holds "
-        "between them, for the arm with friction. Sets the model class (promise) of every "
+        "between them, for the arm with friction. Sets `response` of every "
         "channel; default: as in the channels",
     )
 
@@ -313,7 +315,7 @@ class ClosedLoopOptions(Section):
     friction_feedforward: bool = Field(
         False,
         description="add the identified dry friction at the reference speed to the command; needs "
-        "promise = 'without friction'",
+        "response = 'without friction'",
     )
     sensitivity: bool = Field(
         True, description="on the simulated arm: measure S and compare with the prediction"
@@ -364,11 +366,11 @@ class RunConfig(Section):
         if asked is not None:
             channels = tuple(channel.over_amplitudes(*asked) for channel in self.channels)
             object.__setattr__(self, "channels", channels)
-        promises = [channel.uncertainty for channel in self.channels]
-        if any(one.about_amplitudes for one in promises) and len({one.promise for one in promises}) > 1:
+        described = [channel.uncertainty for channel in self.channels]
+        if any(one.about_amplitudes for one in described) and len({one.response for one in described}) > 1:
             raise ValueError(
-                "a certificate holds at one amplitude or over one range: the channels promise "
-                + " and ".join(dict.fromkeys(repr(one.promise) for one in promises))
+                "a certificate holds at one amplitude or over one range: the channels describe "
+                + " and ".join(dict.fromkeys(repr(one.response) for one in described))
             )
         return self
 
@@ -395,7 +397,7 @@ class RunConfig(Section):
             raise ValueError("closed_loop.effects act on the simulated arm only")
         if self.closed_loop.friction_feedforward and not self.friction_identified:
             raise ValueError(
-                "closed_loop.friction_feedforward = true needs an identified friction: promise = "
+                "closed_loop.friction_feedforward = true needs an identified friction: response = "
                 "'without friction' in [channels.uncertainty] of a channel"
             )
         if self.friction_identified:
@@ -443,7 +445,7 @@ class RunConfig(Section):
 
     @property
     def friction_identified(self) -> bool:
-        """The dry friction of the shaft is identified: the promise of some channel needs it."""
+        """The dry friction of the shaft is identified: the uncertainty of some channel needs it."""
         return any(channel.uncertainty.friction_identified for channel in self.channels)
 
     @property
@@ -483,6 +485,7 @@ class RunConfig(Section):
     @classmethod
     def from_document(cls, document: Mapping[str, Any], *, source: str) -> RunConfig:
         """Inverse of `to_document`; input files may have moved away since (a report needs them no more)."""
+        document = with_current_keys(copy.deepcopy(dict(document)), source)
         return check(cls, document, source=source, context={"may_be_gone": True})
 
 

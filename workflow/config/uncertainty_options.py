@@ -24,9 +24,9 @@ class UncertaintyOptions(EmbeddingOptions):
         "comparison",
     )
     level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse taken alone")
-    promise: str = Field(
+    response: str = Field(
         "as recorded",
-        description="model class of the uncertainty. as recorded: linear dynamics, everything else "
+        description="which response the ellipses describe. as recorded: linear dynamics, everything else "
         "counts as noise. The others identify the dry friction of the control channel, "
         "whose output must be the shaft's position. without friction: linear dynamics "
         "without friction; this amplitude: best linear approximation with friction, at "
@@ -34,36 +34,40 @@ class UncertaintyOptions(EmbeddingOptions):
         "the input between these, in its unit",
     )
 
-    @field_validator("promise")
+    @field_validator("response")
     @classmethod
-    def _known(cls, promise: str) -> str:
-        if not re.fullmatch(f"as recorded|without friction|this amplitude|{_RANGE}", promise):
+    def _known(cls, response: str) -> str:
+        if not re.fullmatch(f"as recorded|without friction|this amplitude|{_RANGE}", response):
             raise ValueError(
                 "expected 'as recorded', 'without friction', 'this amplitude' or 'amplitudes from 2 to 8', "
-                f"got {promise!r}"
+                f"got {response!r}"
             )
-        return promise
+        return response
 
     @property
     def friction_identified(self) -> bool:
         """The dry friction of the shaft is identified with the arm."""
-        return self.promise != "as recorded"
+        return self.response != "as recorded"
 
     @property
     def about_amplitudes(self) -> bool:
         """The ellipses hold at an amplitude, or over a range of them."""
-        return self.promise not in ("as recorded", "without friction")
+        return self.response not in ("as recorded", "without friction")
 
     @property
     def amplitudes(self) -> tuple[float, float] | None:
-        """Smallest and largest rms of the input, where a range is promised."""
-        ends = re.fullmatch(_RANGE, self.promise)
+        """Smallest and largest rms of the input, where a range is described."""
+        ends = re.fullmatch(_RANGE, self.response)
         return None if ends is None else (float(ends[1]), float(ends[2]))
 
     @model_validator(mode="after")
     def _friction_by_tangent(self) -> Self:
         if self.friction_identified and self.method != "tangent":
-            raise ValueError(f"promise = {self.promise!r} goes with method = 'tangent', not {self.method!r}")
+            raise ValueError(
+                f"response = {self.response!r} goes with method = 'tangent', not {self.method!r}"
+            )
         if self.amplitudes is not None and not 0 < self.amplitudes[0] < self.amplitudes[1]:
-            raise ValueError(f"promise = {self.promise!r}: the first amplitude must be positive and smaller")
+            raise ValueError(
+                f"response = {self.response!r}: the first amplitude must be positive and smaller"
+            )
         return self

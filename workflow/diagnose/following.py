@@ -30,7 +30,7 @@ class Following:
 
     advice: look at the machine for the unlisted cause (confirm); repeat the worst experiment, or all of them,
     to see what an unknown cause follows; nothing (none); the proposal, which separates the competing ones;
-    a look at the machine for every cause left (look), where no simulation can promise to separate them, or
+    a look at the machine for every cause left (look), where no simulation can show that they separate, or
     where one is likely though an unknown cause is likelier.
     repeat : of one's own machine, the record that separates the competing ones.
     """

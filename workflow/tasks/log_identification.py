@@ -35,8 +35,8 @@ from workflow.tasks.results import IdentifiedChannel, Tests, UncertainChannel
 from workflow.tasks.simulated_rig import TrueMode
 from workflow.tasks.uncertainty import (
     N_BANDS,
+    described_response,
     display_grid,
-    promised_response,
     residual_tests,
     uncertain_channel,
 )
@@ -52,7 +52,7 @@ class LogIdentification:
     `measured` are the records as read, `used` the same as the fit saw them (inside the band; with the input
     that the reference explains, where the logs come from a closed loop). `about` and `spread` are results as
     of a run's stages; `careful` says what to look at. The stabilisation plot is None where nobody asked for
-    it. `true_modes`: beside each mode of `about` the true one, known of simulated logs. `promised`: what the
+    it. `true_modes`: beside each mode of `about` the true one, known of simulated logs. `described`: what the
     ellipses are about; friction: identified, where that asks for it; equivalent: the viscous friction that
     acts like it, where it asks for amplitudes. input_limit: that the amplifier gives, where it was stated.
     """
@@ -63,7 +63,7 @@ class LogIdentification:
     about: IdentifiedChannel
     spread: UncertainChannel
     careful: tuple[Finding, ...]
-    promised: UncertaintyOptions
+    described: UncertaintyOptions
     friction: FrictionFit | None = None
     equivalent: EquivalentFriction | None = None
     true_modes: tuple[TrueMode | None, ...] = ()
@@ -75,7 +75,7 @@ def identify_records(
     fresh_records: Sequence[Record] = (),
     options: IdentOptions | None = None,
     *,
-    promised: UncertaintyOptions | None = None,
+    described: UncertaintyOptions | None = None,
     band_rad_s: tuple[float, float] | None = None,
     noise_order: int | None = None,
     with_plot: bool = True,
@@ -84,19 +84,19 @@ def identify_records(
     """Identify one channel from records (tangent uncertainty); nothing is written.
 
     The noise is modelled where the residuals are not white. Records with a reference are taken as made in
-    closed loop. promised: what the ellipses are about, and their level. Raises InputError.
+    closed loop. described: what the ellipses are about, and their level. Raises InputError.
     """
     options, progress = options or IdentOptions(), progress or Progress()
-    promised = promised or UncertaintyOptions()
+    described = described or UncertaintyOptions()
     friction, opened, logs_to_validate = None, None, fresh_records
     with naming("identify"), progress.stage("identify") as update:
         used = list(measured)
-        if promised.friction_identified:
+        if described.friction_identified:
             if band_rad_s is not None or any(record.reference is not None for record in measured):
                 raise ValueError(
-                    f"'{promised.promise}' takes logs as measured, in open loop: no band, no reference"
+                    f"'{described.response}' takes logs as measured, in open loop: no band, no reference"
                 )
-            refuse_unrecorded(used, promised.amplitudes)
+            refuse_unrecorded(used, described.amplitudes)
             friction = fit_friction(used, options, progress=update)
             refuse_unseen_shaft(friction, used)
             used, fresh_records = (
@@ -143,8 +143,8 @@ def identify_records(
             behind = behind_friction(measured, friction, found.model, bounds.model_copy(update=coloured))
             linear = behind.response
             tests = residual_tests(linear, measured, behind.friction)
-            posterior, poles, equivalent = promised_response(
-                behind, poles, friction, measured, promised, np.random.default_rng(0)
+            posterior, poles, equivalent = described_response(
+                behind, poles, friction, measured, described, np.random.default_rng(0)
             )
         omega = display_grid(found.model, used)
         if band_rad_s is not None:
@@ -154,7 +154,15 @@ def identify_records(
                     f"the band {band_rad_s[0]:g} to {band_rad_s[1]:g} rad/s is too narrow to show"
                 )
         spread = uncertain_channel(
-            "tangent", promised.level, posterior, about, omega, omega, poles=poles, linear=linear, tests=tests
+            "tangent",
+            described.level,
+            posterior,
+            about,
+            omega,
+            omega,
+            poles=poles,
+            linear=linear,
+            tests=tests,
         )
     return LogIdentification(
         measured=tuple(measured),
@@ -180,7 +188,7 @@ def identify_records(
             ),
             *(opened.warnings(omega) if opened else ()),
         ),
-        promised=promised,
+        described=described,
         friction=friction,
         equivalent=equivalent,
     )

@@ -364,7 +364,7 @@ class CertifyResult:
 
 @dataclass(frozen=True, eq=False)
 class AmplitudeCost:
-    """The same specification for the arm behind its friction; empty where no amplitudes are promised.
+    """The same specification for the friction-free dynamics; empty where no amplitudes are described.
 
     design, behind: controller and certificate for that arm; carried_over: certificate of the same controller
     over the amplitudes. left_by_unit: output that a unit of constant disturbance at the plant's input leaves,

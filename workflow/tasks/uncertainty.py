@@ -87,7 +87,7 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
                 linear = behind.response
                 if k == control:
                     tests = residual_tests(linear, measured, behind.friction)
-                posterior, poles, equivalent = promised_response(
+                posterior, poles, equivalent = described_response(
                     behind,
                     poles,
                     friction,
@@ -112,12 +112,12 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
     return UncertaintyResult(tuple(channels[k] for k in sorted(channels)), equivalent)
 
 
-def promised_response(
+def described_response(
     behind: BehindFriction,
     poles: Poles,
     friction: FrictionFit,
     measured: Sequence[Record],
-    promised: UncertaintyOptions,
+    described: UncertaintyOptions,
     rng: np.random.Generator,
     equivalent: EquivalentFriction | None = None,
 ) -> tuple[ResponsePosterior, Poles, EquivalentFriction | None]:
@@ -127,11 +127,11 @@ def promised_response(
     friction: as it was fitted to the measured records, from which equivalent follows where it is not known of
     another output.
     """
-    if not promised.about_amplitudes:
+    if not described.about_amplitudes:
         return behind.response, poles, equivalent
     if equivalent is None:
-        equivalent = equivalent_friction(friction, measured, rng, promised.amplitudes)
-    return (*at_amplitudes(behind, equivalent, rng, promised.level), equivalent)
+        equivalent = equivalent_friction(friction, measured, rng, described.amplitudes)
+    return (*at_amplitudes(behind, equivalent, rng, described.level), equivalent)
 
 
 def uncertain_channel(
