@@ -149,7 +149,7 @@ WORKSHOP = {
     workshop_series.WHOLE: "verdict and set of effects right",
     "top-1, every single effect": "a single effect named",
     "two effects, exact set": "both of two effects named",
-    workshop_series.NAMED: "an effect named where there is none",
+    workshop_series.NAMED: "an effect named though nothing was wrong",
     "unknown: precision": '"none of the candidate effects" said rightly',
     "95 % intervals cover": "95 % intervals that hold the parameter",
     "confident and wrong (p > 0.8)": "wrong with more than 80 %",

@@ -62,7 +62,7 @@ Jobs = Annotated[
     int | None, typer.Option(min=1, help="Processes on this machine [default: one per processor]")
 ]
 Resume = Annotated[
-    bool, typer.Option("--resume", help="Continue what is in --out; what is finished there is taken up.")
+    bool, typer.Option("--resume", help="Continue what is in --out; what is finished there is kept.")
 ]
 Replace = Annotated[bool, typer.Option("--replace", help="Delete what an earlier call left in --out first.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")]
@@ -298,7 +298,7 @@ def identify(
         Path | None,
         typer.Option(
             "--report",
-            help="Write a one-page report here (HTML, one file): findings in words, then the pictures.",
+            help="Write a one-page report here (HTML, one file): findings first, then the pictures.",
         ),
     ] = None,
     validation: Annotated[
@@ -520,7 +520,7 @@ def design(
     _leave(summary)
 
 
-@app.command(short_help="Write report.html of a run anew.")
+@app.command(short_help="Write report.html of a run again.")
 def report(
     directory: Annotated[Path, typer.Argument(help="Run directory.")],
     pictures: Annotated[
@@ -531,7 +531,7 @@ def report(
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Write report.html of a run directory anew and print its table."""
+    """Write report.html of a run directory again and print its table."""
     with _watched(quiet) as progress:
         from workflow.commands.run import rebuild_report
         from workflow.engine.run_directory import RunDirectory

@@ -133,7 +133,7 @@ class TerminalProgress(progress.Progress):
         self._done_s += self._expected.get(stage, 0.0)
         self._worked_s = self._done_s
         if not self._bar.disable:
-            words = "taken up from the earlier run" if taken_up else f"{seconds:.1f} s"
+            words = "kept from the earlier run" if taken_up else f"{seconds:.1f} s"
             self._bar.console.print(f"  {escape(stage):<12} {words}", highlight=False)
 
 

@@ -276,7 +276,7 @@ def _drawn(channel: Channel) -> Draw:
     if isinstance(uncertainty, FirstOrderUncertainty):
         return partial(_linear_responses, uncertainty, channel.dt_s)
     raise ValueError(
-        "joint coverage needs draws of whole responses: the uncertainty must be a ResponsePosterior or "
+        "joint coverage needs posterior samples: the uncertainty must be a ResponsePosterior or "
         f"have a method draw(rng, draws); got {type(uncertainty).__name__}"
     )
 

@@ -393,7 +393,7 @@ def _refuse_frequencies(spec: Specification, plant: UncertainPlant) -> None:
         )
     if spec.integrator and np.any(np.abs(plant.zeros - 1.0) < 1e-6):
         raise SpecificationError(
-            f"integrator asked for, but plant {plant.name!r} has a zero at z = 1: the two would cancel"
+            f"integrator = true, but plant {plant.name!r} has a zero at z = 1: the two would cancel"
         )
 
 

@@ -18,11 +18,12 @@ class Outcome(Enum):
 
 class SynthesisError(Exception):
     """The synthesis did not meet the specification; `result` holds the best point found, which the message
-    tells: gamma, and what blocks it where."""
+    tells: gamma, and the active constraint."""
 
     def __init__(self, message: str, result: SynthesisResult) -> None:
         worst = "".join(
-            f"; {b.weight} of {b.plant!r} at {b.omega_rad_s:.4g} rad/s blocks" for b in result.blocking[:1]
+            f"; active constraint: {b.weight} of {b.plant!r} at {b.omega_rad_s:.4g} rad/s"
+            for b in result.blocking[:1]
         )
         super().__init__(f"{message} (gamma {result.gamma:.4g}){worst}")
         self.result = result

@@ -5,7 +5,7 @@ response to a short pulse of force follows a continuous linear system; beside it
 parts of a sample, dry friction exactly (a body sticks, slips, turns round inside a part), then simulated with
 the mean of that force over each sample; where the simulation is not linear, what it says beside the linear
 system is the start of the next round (Newton's method over a waveform, with one linear system for all times).
-A response that is none of a few poles is used as it is, sample by sample.
+A response that is not one of a few poles is used as it is, sample by sample.
 
 Neglected: what is simulated beside the linear system is a cubic between samples. Outputs other than the
 body's own feel mean and moment of a force over each sample, no more. Without poles: friction acts as its mean
@@ -258,7 +258,7 @@ class PulseResponse:
         # An oscillation has fewer than six samples per period.
         if few or (self.speed[k + 1] < 0 if self.of_speed else self.position[k + 2] < self.position[k]):
             return "turns back within two samples"
-        return "" if self.linear else f"is none of {_ORDERS[-1]} poles or fewer"
+        return "" if self.linear else f"is not one of {_ORDERS[-1]} poles or fewer"
 
     def answer(
         self, simulated: Real, force: Real, command: Real, forces: BodyForces

@@ -127,7 +127,7 @@ def _read(document: Mapping[str, Any], source: str) -> ModelFile:
             if not np.all(off <= _STATE_TOLERANCE * scale):
                 raise ValueError(
                     f"'{name}' is not the state matrix of these poles and coefficients; change the poles and "
-                    "coefficients, and write the file anew"
+                    "coefficients, and write the file again"
                 )
         ellipses = document.get("ellipses")
         return ModelFile(model, None if ellipses is None else _read_ellipses(ellipses, model.dt_s))

@@ -70,7 +70,7 @@ def refuse_unusable(records: Sequence[Record], data: Regression, order: int) -> 
     if least_independence(data) <= _SAME_INPUT:
         raise ValueError(
             f"{records[0].label}: the inputs {list(names)} are linearly dependent, so their channels cannot "
-            "be told apart; expected independent signals"
+            "be distinguished; expected independent signals"
         )
     needed = data.n_parameters(order)
     if not data.n_samples > needed:

@@ -102,7 +102,7 @@ class _File:
     def _integers(self, element: tuple[int, memoryview], wanted: int) -> list[int]:
         kind, data = element
         if kind != wanted or len(data) % 4:
-            raise ValueError("damaged: the description of a variable is none")
+            raise ValueError("damaged: a variable has no readable description")
         return [int(n) for n in np.frombuffer(data, f"{self._order}{_NUMBERS[kind]}")]
 
     def _matrix(self, data: memoryview, depth: int) -> tuple[str, Any]:
@@ -111,7 +111,7 @@ class _File:
         if not parts:
             return "", np.zeros((0, 0))
         if len(parts) < 3 or depth > _DEEPEST:
-            raise ValueError("damaged: the description of a variable is none, or nested too deeply")
+            raise ValueError("damaged: a variable has no readable description, or is nested too deeply")
         flags = self._integers(parts[0], _UINT32)
         if len(flags) != 2:
             raise ValueError("damaged: the flags of a variable are none")

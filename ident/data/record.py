@@ -164,7 +164,7 @@ class Record:
         """Samples start <= k < stop, 0 <= start < stop <= T; the new record's time starts at 0 again."""
         if not 0 <= start < stop <= self.n_samples:
             raise ValueError(
-                f"{self.label}: samples {start} to {stop} asked for; expected 0 <= start < stop <= "
+                f"{self.label}: samples {start} to {stop}: expected 0 <= start < stop <= "
                 f"{self.n_samples}, the number there are"
             )
         return self.each(lambda signal: signal[start:stop])
@@ -224,16 +224,12 @@ class Record:
                 )
         wanted = [*inputs, *outputs, *references]
         if time in wanted:
-            raise ValueError(
-                f"{table.path}: column {time!r} is asked for as time and as a signal; expected two"
-            )
+            raise ValueError(f"{table.path}: column {time!r} is named as time and as a signal; expected two")
         if time is None and time_unit is not None:
             raise ValueError(f"{table.path}: time_unit = '{time_unit}' without a time column; name it (time)")
         both = [item for item in inputs if item in outputs]
         if both:
-            raise ValueError(
-                f"{table.path}: column {both[0]!r} is asked for as input and output; expected two"
-            )
+            raise ValueError(f"{table.path}: column {both[0]!r} is named as input and output; expected two")
         if table.sparse and time is None:
             raise ValueError(
                 f"{table.path}: columns have rows of their own (other cells are empty); name the time column "

@@ -20,6 +20,12 @@ def test_few_sentences_are_long(name):
     assert len(long) <= LIMITS.get(name, PAGES if name == "templates" else DOCUMENTS) * len(found), long
 
 
+def test_no_words_of_our_own():
+    found = {path.name: prose.OWN.findall(" ".join(prose.sentences(path))) for path in prose.files()}
+    assert not any(found.values()), found
+    assert prose.OWN.search("Nothing is promised of the arm behind its friction")
+
+
 def test_a_document_without_full_stops_is_long(tmp_path):
     path = tmp_path / "page.md"
     path.write_text(

@@ -128,7 +128,7 @@ def test_what_cannot_be_drawn_from_is_refused():
     measured = RelativeDisc(hub_arm(), 0.02, 60.0).at(np.geomspace(0.5, 200.0, 200), 0.95)
     plant = UncertainPlant("frf", hub_arm(), measured)
     lag = uncertain_lag(0.1)
-    with pytest.raises(ValueError, match="draws of whole responses"):
+    with pytest.raises(ValueError, match="needs posterior samples"):
         joint_coverage(gain(0.3), [plant], Specification(), rng=rng)
     with pytest.raises(ValueError, match=r"must lie in \(0, 1\)"):
         joint_coverage(gain(0.3), [lag], Specification(), rng=rng, coverage=95.0)

@@ -114,7 +114,7 @@ def test_verdict_of_a_missed_specification_says_whether_a_higher_order_helps():
     assert words.startswith("specification not met: gamma 1.2; controller_order = 3 may be too low")
     assert verdict_of(design, *rest, AchievablePerformance(), 3) == "specification not met: gamma 1.2"
     lost = replace(design, synthesis=SimpleNamespace(gamma=float("inf")))
-    assert "does not prove that there is none" in verdict_of(lost, *rest, achievable(0.8), 3)
+    assert "does not prove that none exists" in verdict_of(lost, *rest, achievable(0.8), 3)
 
 
 def test_achievable_performance_not_asked_for_or_impossible_says_why():

@@ -356,7 +356,7 @@ def test_sources_that_do_not_go_together_are_refused(refused, wish, tmp_path):
     spec = wish("[uncertainty]\nmultiplicative = 0.1\n")
     assert "brings its own ellipses" in refused("design", tmp_path / "model.json", "--spec", spec)
     assert "is a source" in refused("design", both[0], "--spec", spec, "--out", both[0])
-    assert "the ending is none of" in refused("design", spec, "--spec", spec)
+    assert "the ending is not one of" in refused("design", spec, "--spec", spec)
     assert "no such file" in refused("design", tmp_path / "absent.json", "--spec", spec)
     (tmp_path / "broken.mat").write_bytes(b"nothing")
     assert "not a MATLAB .mat file" in refused("design", tmp_path / "broken.mat", "--spec", spec)

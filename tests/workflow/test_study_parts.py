@@ -396,7 +396,7 @@ def test_tables_show_what_was_asked_for_and_no_empty_column():
         "settled_draws": 1,
         "draws": 2,
     }
-    row = PointRow(1, "a", {axis.key: 1.0}, "does not come to rest", "why", numbers)
+    row = PointRow(1, "a", {axis.key: 1.0}, "keeps moving", "why", numbers)
     search = SimpleNamespace(method="grid")
     config: Any = SimpleNamespace(axes=(axis,), pareto=(), search=search)
     view = StudyView("a study", config, "[study]", "the arm", [row], {})
@@ -406,8 +406,8 @@ def test_tables_show_what_was_asked_for_and_no_empty_column():
     rows = [re.findall(r"<td[^>]*>(.*?)</td>", body) for _, body in tables]
     assert heads[0] == ["point", "asked", "worst-case gamma", "gamma of any order", "state"]
     point = '<a href="points/a/">1</a>'
-    assert rows[0] == [point, "1", "0.9", "0.8", "does not come to rest"]
-    assert heads[1] == ["point", "asked", "peak of S, predicted", "peak of S, measured", "come to rest"]
+    assert rows[0] == [point, "1", "0.9", "0.8", "keeps moving"]
+    assert heads[1] == ["point", "asked", "peak of S, predicted", "peak of S, measured", "stop moving"]
     assert rows[1] == [point, "1", "1.4", "1.42", "1 of 2"]
     assert all('<tr class="no">' in body for _, body in tables)
 

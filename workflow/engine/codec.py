@@ -300,7 +300,7 @@ def _member(union: Any, document: Any, at: str) -> Any:
     elif len(rest) > 1:
         rest = [m for m in rest if isinstance(m, type) and isinstance(document, m)] or rest
     if not rest:
-        raise CodecError(f"{at}: {shown(document.get(_TYPE))} is none of {union}")
+        raise CodecError(f"{at}: {shown(document.get(_TYPE))} is not one of {union}")
     return rest[0]
 
 

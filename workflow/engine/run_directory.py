@@ -270,7 +270,7 @@ def _stage_content(path: Path) -> tuple[str, dict[str, Any]]:
     content = storage.read_npz(path) if path.suffix == ".npz" else documents.read_json(path)
     recorded = str(content.pop(_DIGEST, None))
     if _INPUT_HASH not in content or recorded != _digest(content):
-        raise InputError(f"{path}: changed since it was written; flexlink run --resume makes it anew")
+        raise InputError(f"{path}: changed since it was written; flexlink run --resume computes it again")
     return str(content[_INPUT_HASH]), content
 
 

@@ -155,7 +155,7 @@ def draw_controller_check(
     figure, grid = style.panels(4.6, 2, 2, sharex=True, sharey="row", height_ratios=[1.6, 1.0])
     for column, design in enumerate(("nominal parameters", "repaired rig")):
         above, below = grid[:, column]
-        above.plot(time_s, 1e3 * reference_m, **style.REFERENCE_LINE, label="asked for")
+        above.plot(time_s, 1e3 * reference_m, **style.REFERENCE_LINE, label="reference")
         for run, (look, label) in enumerate(looks, 2 * column):
             above.plot(time_s, 1e3 * tips_m[run], **look, label=label)
             below.step(time_s, commands_V[run], where="post", **look)

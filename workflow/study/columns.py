@@ -43,7 +43,7 @@ _ALL = (
     Column("overshoot_percent", "overshoot", "%", "smaller"),
     Column("peak_command", "peak command", "", "smaller"),
     Column("disturbance_peak", "disturbance peak", "", "smaller"),
-    Column("settled_draws", "runs that come to rest"),
+    Column("settled_draws", "runs that stop moving"),
     Column("draws", "runs"),
     Column("design_gamma", "gamma of the design", "", "smaller"),
     Column("any_order_gamma", "gamma of any order", "", "smaller"),

@@ -24,9 +24,7 @@ from workflow.tasks.results import RunResults
 from workflow.tasks.summary import RunSummary, verdict_of
 from workflow.text.templates import render_text, rows_of, said
 
-State = Literal[
-    "certified", "does not settle", "does not come to rest", "not certified", "impossible", "failed"
-]
+State = Literal["certified", "does not settle", "keeps moving", "not certified", "impossible", "failed"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +37,7 @@ class PointRow(Combination):
 
     @property
     def good(self) -> bool:
-        """Certified, and every run in closed loop comes to rest at its reference."""
+        """Certified, and every run in closed loop stops at its reference."""
         return self.state == "certified"
 
 
@@ -53,7 +51,7 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
     elif not certify.certified:
         state = "not certified"
     elif loop.check is None or loop.check.settled_draws != loop.check.draws:
-        state = "does not come to rest"
+        state = "keeps moving"
     elif loop.check.tracking and loop.check.spread_of("settling_time_s")[-1] is None:
         state = "does not settle"  # at rest beside the reference
     else:

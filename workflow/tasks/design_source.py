@@ -138,7 +138,7 @@ def _read_document(path: Path) -> dict[str, Any]:
         return documents.read_json(path)
     if suffix != ".mat":
         known = ", ".join((*_DOCUMENTS, *(ending for ending in READERS if ending not in _DOCUMENTS)))
-        raise InputError(f"{path}: not a run directory, and the ending is none of {known}")
+        raise InputError(f"{path}: not a run directory, and the ending is not one of {known}")
     with naming(str(path)):
         return mat_variables(content_of(path), path)
 
