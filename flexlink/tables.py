@@ -70,11 +70,16 @@ def _run(run: LoopRun) -> pd.DataFrame:
 def _model(model: GobfModel) -> pd.DataFrame:
     """zeta and omega of a pair are those of the continuous pole that samples to it; a real pole has the rate
     at which it decays."""
-    poles, dt_s = model.poles, model.dt_s
+    poles, dt_s = model.stable_poles, model.dt_s
     omega = poles.omega_rad_s(dt_s)
     modes = pd.DataFrame({"kind": "mode", "omega_rad_s": omega, "zeta": poles.zeta()})
     decays = pd.DataFrame({"kind": "real pole", "decay_per_s": poles.decay_per_s(dt_s)})
-    rows = pd.concat([part for part in (modes, decays) if len(part)] or [modes], ignore_index=True)
+    outside = np.log(model.unstable_poles) / dt_s
+    unstable = pd.DataFrame(
+        {"kind": "unstable pole", "omega_rad_s": np.abs(outside.imag), "decay_per_s": -outside.real}
+    )
+    parts = [part for part in (modes, decays, unstable) if len(part)]
+    rows = pd.concat(parts or [modes], ignore_index=True)
     rows = rows.reindex(columns=["kind", "omega_rad_s", "frequency_Hz", "zeta", "decay_per_s"])
     return rows.assign(frequency_Hz=rows["omega_rad_s"] / (2 * np.pi))
 

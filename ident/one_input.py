@@ -236,7 +236,8 @@ def fitted_on_all(records: Sequence[Record], outcome: Outcome) -> tuple[Fitted, 
             verdicts.append(outcome.from_rest.finding)
             continue
         present = getattr(here.data.structure, key)
-        other = restructured(records, here.data, replace(here.data.structure, **{key: not present}))
+        changed: dict[str, Any] = {key: not present}
+        other = restructured(records, here.data, replace(here.data.structure, **changed))
         needed = other.n_parameters(here.poles.order)
         # With integrators the polynomials that they leave free contain the offset.
         if needed == here.data.n_parameters(here.poles.order) or not other.n_samples > needed:
@@ -345,6 +346,7 @@ def description(
         output_name=records[0].output_names[0],
         integrators=options.integrators,
         input_delay_samples=options.input_delay_samples,
+        unstable=data.structure.unstable,
     )
     residuals = tuple(linear.residual[here] for here in data.segments)
     spread = [np.linalg.norm(data.y[here] - data.y[here].mean()) for here in data.segments]

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
+from operator import add
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -19,6 +20,7 @@ from control_design.plants.ellipses import Complex, Real, quotient, radius_of
 from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
 from control_design.plants.plant_set import Channel, UncertainPlant
 from ident.basis.functions import block_parameters
+from ident.basis.poles import Poles
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 
 
@@ -113,12 +115,16 @@ def posterior_expansion(
     # 1/(1 - z^-1)^i z^-d = z^(i - d)/(z - 1)^i
     common = intervals.shift(posterior.integrators - posterior.input_delay_samples)
     common = common.times(intervals.cleared(cleared - posterior.integrators))
+    # 1/B = prod (z - a)/(1 - conj(a) z)
+    for a in posterior.unstable.values.tolist():
+        outside = 1 / a.conjugate()
+        common = common.times(intervals.zero(a - 1.0)).times(intervals.pole(outside - 1.0).scaled(-outside))
     return common.times(centre), common.times(spread)
 
 
 def _columns(posterior: ResponsePosterior, intervals: Intervals) -> tuple[Complex, Complex, Real]:
     """Value, slope and remainder (F, P) of the columns of `ResponsePosterior.frequency_rows`, without
-    integrators and delay."""
+    integrators, delay and all-pass."""
     columns: list[FirstOrder] = []
     all_pass = intervals.constant(1.0)
     parameters = block_parameters(posterior.poles).tolist()
@@ -137,11 +143,30 @@ def _columns(posterior: ResponsePosterior, intervals: Intervals) -> tuple[Comple
     if posterior.has_feedthrough:
         columns.append(intervals.constant(1.0))
     columns += [intervals.shift(-lag) for lag in range(1, posterior.fir_length + 1)]
+    if posterior.unstable.order:
+        scaled = zip(columns, posterior.mean.tolist(), strict=False)
+        against = reduce(add, (column.scaled(-each) for column, each in scaled))
+        columns += [against.times(slope) for slope in _log_all_pass_slopes(posterior.unstable, intervals)]
     return (
         np.stack([column.value for column in columns], axis=1),
         np.stack([column.slope for column in columns], axis=1),
         np.stack([column.remainder for column in columns], axis=1),
     )
+
+
+def _log_all_pass_slopes(unstable: Poles, intervals: Intervals) -> list[FirstOrder]:
+    """`ident.basis.functions.log_all_pass_slopes` as expansions."""
+
+    def slope(p: complex) -> FirstOrder:
+        # -z / (1 - p z) = 1/p + 1/p^2 / (z - 1/p)
+        beyond = intervals.constant(1 / p) + intervals.pole(1 / p - 1.0).scaled(1 / p**2)
+        return intervals.pole(p - 1.0) + beyond
+
+    found = [slope(complex(a)) for a in unstable.real.tolist()]
+    for p in unstable.pairs.tolist():
+        upper, lower = slope(p), slope(p.conjugate())
+        found += [upper + lower, (upper + lower.scaled(-1.0)).scaled(1j)]
+    return found
 
 
 def _reflected_zero(p: complex, intervals: Intervals) -> FirstOrder:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from scipy.signal import lfilter
 
 from ident.basis.poles import Poles
 from ident.data.arrays import ComplexArray, RealArray
@@ -96,6 +97,12 @@ def basis_state_space(poles: Poles) -> LosslessCascade:
     return LosslessCascade(A, B, C, D)
 
 
+def inverse_all_pass(poles: Poles) -> tuple[RealArray, RealArray, RealArray, RealArray]:
+    """State space (A, B, C, D) of 1/B, whose poles lie outside the circle; no pole may be zero."""
+    A, B, C, D = basis_state_space(poles)
+    return A - B @ C / D, B / D, -C / D, 1 / D
+
+
 def basis_response(poles: Poles, z: ComplexArray) -> ComplexArray:
     """Values (F, B) of the basis functions at the points z (F,); z must not be a pole."""
     return _response_and_all_pass(poles, z)[0]
@@ -131,6 +138,42 @@ def _response_and_all_pass(poles: Poles, z: ComplexArray) -> tuple[ComplexArray,
         columns[:, n_real + 2 * i + 1] = sg * sb * driven
         all_pass = (1 - p.conjugate() * z) * (1 - p * z) * driven
     return columns, all_pass
+
+
+def log_all_pass_slopes(poles: Poles, z: ComplexArray) -> ComplexArray:
+    """d log B / d pole at the points z (F,), (F, B): by each real pole, then by real and imaginary part of
+    each pair."""
+
+    def slope(p: ComplexArray) -> ComplexArray:
+        return np.asarray(1 / (z[:, None] - p) - z[:, None] / (1 - p * z[:, None]))
+
+    upper, lower = slope(poles.pairs), slope(poles.pairs.conj())
+    pairs = np.stack([upper + lower, 1j * (upper - lower)], axis=2).reshape(z.size, -1)
+    return np.hstack([slope(poles.real.astype(np.complex128)), pairs])
+
+
+def all_pass_slopes(poles: Poles, y: RealArray) -> RealArray:
+    """(dB / d pole)(q) y for y (T,), from rest, (T, B): columns as in `log_all_pass_slopes`."""
+    blocks, columns = poles.blocks(), list[RealArray]()
+    for i, block in enumerate(blocks):
+        entering = y
+        for other in (*blocks[:i], *blocks[i + 1 :]):
+            entering = all_pass_signal(other, entering)
+        p = block.values[0]
+        slopes: tuple[tuple[list[float], list[float]], ...]
+        if block.real.size:
+            denominator, slopes = [1.0, -p.real], (([-1.0, 0.0], [0.0, -1.0]),)
+        else:
+            re, im = p.real, p.imag
+            denominator = [1.0, -2 * re, re**2 + im**2]
+            slopes = ([2 * re, -2.0, 0.0], [0.0, -2.0, 2 * re]), ([2 * im, 0.0, 0.0], [0.0, 0.0, 2 * im])
+        # B = N / D: N' / D - (D' / D) B.
+        through = all_pass_signal(block, entering)
+        columns += [
+            lfilter(above, denominator, entering) - lfilter(below, denominator, through)
+            for above, below in slopes
+        ]
+    return np.column_stack(columns) if columns else np.zeros((y.size, 0))
 
 
 def regressor(poles: Poles, u: RealArray) -> RealArray:

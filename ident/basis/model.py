@@ -3,15 +3,21 @@ same poles."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from math import comb
 from typing import Any
 
 import numpy as np
 import scipy.linalg
 
-from ident.basis.functions import basis_response, basis_state_space, regressor
-from ident.basis.poles import Poles
+from ident.basis.functions import (
+    all_pass_response,
+    basis_response,
+    basis_state_space,
+    inverse_all_pass,
+    regressor,
+)
+from ident.basis.poles import NO_POLES, Poles
 from ident.basis.structure import filter_input
 from ident.data.arrays import ComplexArray, RealArray, lock
 
@@ -30,6 +36,9 @@ class GobfModel:
     feedthrough : float. Direct term of the part in brackets.
     integrators, input_delay_samples : int
     input_name, output_name : str
+    unstable : Poles
+        Mirror images 1 / conj(p) of poles p outside the circle, each among the poles: G is the above divided
+        by their all-pass B(z), which puts p in the place of its image.
 
     Raises ValueError if the shapes do not fit, a number is not finite or dt_s is not positive.
     """
@@ -42,6 +51,7 @@ class GobfModel:
     input_delay_samples: int = 0
     input_name: str = "u"
     output_name: str = "y"
+    unstable: Poles = field(default=NO_POLES, metadata={"since": 2})
 
     def __post_init__(self) -> None:
         lock(self, "coefficients")
@@ -59,11 +69,27 @@ class GobfModel:
                 f"integrators and input_delay_samples must not be negative, nor above {_MOST_STAGES}; "
                 f"got {self.integrators} and {self.input_delay_samples}"
             )
+        self.poles.without(self.unstable)
 
     @property
     def order(self) -> int:
         """Number of basis functions (integrators and delay not counted)."""
         return self.poles.order
+
+    @property
+    def stable_poles(self) -> Poles:
+        """Poles of G inside the circle."""
+        return self.poles.without(self.unstable)
+
+    @property
+    def stable_part(self) -> GobfModel:
+        """B G, without the unstable poles."""
+        return replace(self, unstable=NO_POLES)
+
+    @property
+    def unstable_poles(self) -> ComplexArray:
+        """Poles of G outside the circle, (n,)."""
+        return np.asarray(1 / self.unstable.values.conj())
 
     def frequency_response(self, omega_rad_s: RealArray) -> ComplexArray:
         """omega (F,) in rad/s, |omega| <= pi/dt (and not 0 with integrators) -> G (F,)."""
@@ -77,6 +103,7 @@ class GobfModel:
         # 1 - 1/z without cancellation at low frequency: 2j sin(w dt/2) exp(-j w dt/2).
         half = omega * self.dt_s / 2
         difference = 2j * np.sin(half) * np.exp(-1j * half)
+        inner = inner / all_pass_response(self.unstable, z)
         return np.asarray(
             inner * difference ** (-self.integrators) * z ** (-self.input_delay_samples), dtype=np.complex128
         )
@@ -109,7 +136,7 @@ class GobfModel:
         B[here] = basis.B @ signal_d
         C = self.feedthrough * signal_c
         C[0, here] += self.coefficients
-        return A, B, C, self.feedthrough * signal_d
+        return _unmirrored(A, B, C, self.feedthrough * signal_d, self.unstable)
 
     def zeros(self) -> ComplexArray:
         """Finite zeros (Z,) of the basis part, by magnitude; those of delay and integrators are at 0 and left
@@ -134,7 +161,9 @@ class GobfModel:
         return _as_control(self, [self.input_name])
 
     def simulate(self, u: RealArray) -> RealArray:
-        """Output (T,) for the input u (T,), from rest."""
+        """Output (T,) for the input u (T,), from rest. Raises ValueError for an unstable model, whose output
+        has no bound."""
+        refuse_unstable(self.unstable)
         filtered = filter_input(u, self.integrators, self.input_delay_samples)
         return np.asarray(regressor(self.poles, filtered) @ self.coefficients + self.feedthrough * filtered)
 
@@ -150,6 +179,7 @@ class MisoModel:
     input_names : tuple of str. U distinct names.
     output_name : str
     integrators, input_delay_samples : int
+    unstable : Poles. As in `GobfModel`.
 
     Raises ValueError if the shapes do not fit, names repeat, a number is not finite or dt_s is not positive.
     """
@@ -162,6 +192,7 @@ class MisoModel:
     output_name: str = "y"
     integrators: int = 0
     input_delay_samples: int = 0
+    unstable: Poles = field(default=NO_POLES, metadata={"since": 2})
 
     def __post_init__(self) -> None:
         lock(self, "coefficients", "feedthrough")
@@ -199,6 +230,7 @@ class MisoModel:
             input_delay_samples=self.input_delay_samples,
             input_name=self.input_names[index],
             output_name=self.output_name,
+            unstable=self.unstable,
         )
 
     def frequency_response(self, omega_rad_s: RealArray) -> ComplexArray:
@@ -243,11 +275,35 @@ class MisoModel:
             A = np.block([[A, np.zeros((A.shape[0], 1))], [C, np.zeros((1, 1))]])
             B, C = np.vstack([B, D]), np.hstack([np.zeros_like(C), np.ones((1, 1))])
             D = np.zeros_like(D)
-        return A, B, C, D
+        return _unmirrored(A, B, C, D, self.unstable)
 
     def to_control(self) -> Any:
         """The same model as a `control.StateSpace` with dt = dt_s, U inputs and one output."""
         return _as_control(self, list(self.input_names))
+
+
+def refuse_unstable(unstable: Poles) -> None:
+    """Raises ValueError where there are unstable poles."""
+    if unstable.order:
+        raise ValueError("an unstable model has no free run: simulate it in a loop (to_control)")
+
+
+def _unmirrored(
+    A: RealArray, B: RealArray, C: RealArray, D: RealArray, unstable: Poles
+) -> tuple[RealArray, RealArray, RealArray, RealArray]:
+    """The state space behind 1/B of the all-pass, without the states of the mirrored poles.
+
+    These are eigenvectors that the output of 1/B does not see: the states are taken orthogonally to them.
+    """
+    for block in unstable.blocks():
+        a, b, c, d = inverse_all_pass(block)
+        A = np.block([[A, np.zeros((len(A), block.order))], [b @ C, a]])
+        B, C, D = np.vstack([B, b @ D]), np.hstack([d @ C, c]), d @ D
+        first = A - block.values[0] * np.eye(len(A))
+        mirrored = first.real if block.real.size else (first @ first.conj()).real
+        kept = np.linalg.svd(mirrored)[2][: len(A) - block.order]
+        A, B, C = kept @ A @ kept.T, kept @ B, C @ kept.T
+    return A, B, C, D
 
 
 def _as_control(model: GobfModel | MisoModel, inputs: list[str]) -> Any:

@@ -19,7 +19,7 @@ import numpy as np
 import scipy.io
 
 from ident.basis.model import GobfModel
-from ident.basis.poles import Poles
+from ident.basis.poles import NO_POLES, Poles
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.json_text import json_value
 from ident.data.mat_files import mat_variables
@@ -53,6 +53,8 @@ class ModelFile:
         names = ("input_name", "output_name", "dt_s", "integrators", "input_delay_samples", "feedthrough")
         document |= {name: getattr(model, name) for name in names}
         document |= {"poles_real": model.poles.real, "poles_pairs": model.poles.pairs}
+        if model.unstable.order:
+            document |= {"unstable_real": model.unstable.real, "unstable_pairs": model.unstable.pairs}
         document |= {"coefficients": model.coefficients}
         document |= zip("ABCD", model.state_space(), strict=True)
         if self.ellipses is not None:
@@ -117,7 +119,10 @@ def _read(document: Mapping[str, Any], source: str) -> ModelFile:
     try:
         fields = {name: read(document, name) for name, read in _MODEL.items()}
         poles = Poles(fields.pop("poles_real"), fields.pop("poles_pairs"))
-        model = GobfModel(poles=poles, **fields)
+        unstable = NO_POLES
+        if "unstable_real" in document:
+            unstable = Poles(_vector(document, "unstable_real"), _complex_vector(document, "unstable_pairs"))
+        model = GobfModel(poles=poles, unstable=unstable, **fields)
         for name, computed in zip("ABCD", model.state_space(), strict=True):
             stated = np.asarray(_array(document, name), dtype=np.float64)
             scale = 1.0 + np.abs(computed).max(initial=0.0)

@@ -45,6 +45,10 @@ class IdentOptions(BaseModel):
         description="known poles in the z plane, each as real part, imaginary part >= 0; not changed",
     )
 
+    unstable_poles: tuple[tuple[float, float], ...] = Field(
+        (),
+        description="known poles outside the unit circle, each as real part, imaginary part >= 0",
+    )
     integrators: int = Field(0, ge=0, le=3, description="known poles at z = 1, as exact input filters")
     feedthrough: bool = Field(
         False, description="direct term from the input to the output of the same sample"
@@ -135,14 +139,26 @@ class IdentOptions(BaseModel):
                 )
 
     def fixed(self) -> Poles:
-        """The fixed poles; ValueError if one is not inside the unit circle.
+        """The fixed poles, mirror images of unstable ones last; ValueError if one is not inside the circle.
 
         Each integrator adds a pole at z = 0. Its filter z/(z - 1) puts a zero there; with the pole the
         numerator is as free as with the integrator among the poles.
         """
         real = [0.0] * self.integrators + [re for re, im in self.fixed_poles if im == 0]
         pairs = [complex(re, im) for re, im in self.fixed_poles if im != 0]
+        return Poles(real, pairs).appended(self.unstable())  # type: ignore[arg-type]
+
+    def unstable(self) -> Poles:
+        """Mirror images of the unstable poles; ValueError if one is not outside the circle."""
+        real = [1 / re for re, im in self.unstable_poles if im == 0]
+        pairs = [1 / complex(re, -im) for re, im in self.unstable_poles if im != 0]
         return Poles(real, pairs)  # type: ignore[arg-type]
+
+    def with_unstable(self, mirrored: Poles) -> IdentOptions:
+        """The same with these unstable poles, given by their mirror images."""
+        poles = [*mirrored.real, *mirrored.pairs]
+        outside = tuple((float((1 / p).real), -float((1 / p).imag)) for p in poles)
+        return self.model_copy(update={"unstable_poles": outside})
 
     @property
     def delay_left_to_data(self) -> bool:
@@ -161,6 +177,7 @@ class IdentOptions(BaseModel):
             feedthrough=self.feedthrough,
             estimate_offset=bool(self.estimate_offset),
             estimate_initial_state=self.estimate_initial_state is True,
+            unstable=self.unstable(),
         )
 
 

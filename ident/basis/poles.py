@@ -112,6 +112,24 @@ class Poles:
         kept = zip((self.real, self.pairs), n_fixed, strict=True)
         return Poles(*(np.concatenate([part[:n], np.repeat(part[n:], 2)]) for part, n in kept))
 
+    def without(self, others: Poles) -> Poles:
+        """These poles, each of the others taken away once. Raises ValueError if one is not among them."""
+        kept = []
+        for own, theirs in ((self.real, others.real), (self.pairs, others.pairs)):
+            left = own.tolist()
+            for pole in theirs.tolist():
+                if pole not in left:
+                    raise ValueError(f"{pole:.6g} is not among the poles")
+                left.remove(pole)
+            kept.append(left)
+        return Poles(*kept)
+
+    def moved(self, changes: RealArray) -> Poles:
+        """These poles after changes (order,): of each real pole, then of real and imaginary part of each
+        pair. Raises ValueError if one leaves the circle, or a pair the upper half."""
+        n = self.real.size
+        return Poles(self.real + changes[:n], self.pairs + changes[n:].reshape(-1, 2) @ (1, 1j))
+
     def appended(self, other: Poles) -> Poles:
         """These poles and then the other's, real before pairs."""
         return Poles(np.concatenate([self.real, other.real]), np.concatenate([self.pairs, other.pairs]))

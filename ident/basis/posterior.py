@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
-from ident.basis.functions import basis_response, regressor
-from ident.basis.poles import Poles
+from ident.basis.functions import all_pass_response, basis_response, log_all_pass_slopes, regressor
+from ident.basis.model import refuse_unstable
+from ident.basis.poles import NO_POLES, Poles
 from ident.basis.structure import filter_input, front_response
 from ident.data.arrays import ComplexArray, RealArray, lock
 from ident.data.ellipses import ellipse_distance, spread_covariance
@@ -54,6 +55,10 @@ class ResponsePosterior:
     poles are those of the basis functions L_i (the doubled ones for the tangent method); has_feedthrough says
     whether d is among the coefficients; fir_length = L. mean (P,) and covariance_factor S (P,P') with
     P = poles.order + has_feedthrough + L, in the order a, d, h_1 .. h_L; the covariance is S S^T.
+
+    unstable: mirror images of the poles outside the circle, as in `GobfModel`; G is then divided by their
+    all-pass. How far each image is off (real; real and imaginary part of a pair) are further coefficients,
+    P = .. + unstable.order, to first order in the response.
     """
 
     poles: Poles
@@ -67,11 +72,12 @@ class ResponsePosterior:
     input_name: str = "u"
     output_name: str = "y"
     report: EmbeddingReport | None = None
+    unstable: Poles = field(default=NO_POLES, metadata={"since": 2})
 
     def __post_init__(self) -> None:
         lock(self, "mean", "covariance_factor")
         mean, factor = self.mean, self.covariance_factor
-        size = self.poles.order + int(self.has_feedthrough) + self.fir_length
+        size = self.poles.order + int(self.has_feedthrough) + self.fir_length + self.unstable.order
         if mean.shape != (size,) or factor.ndim != 2 or factor.shape[0] != size:
             raise ValueError(
                 f"need mean ({size},) and covariance_factor ({size}, P'); got {mean.shape}, {factor.shape}"
@@ -100,7 +106,11 @@ class ResponsePosterior:
             parts.append(np.ones((omega.size, 1), dtype=np.complex128))
         parts.append(np.exp(-1j * self.dt_s * np.outer(omega, np.arange(1, self.fir_length + 1))))
         common = front_response(omega, self.dt_s, self.integrators, self.input_delay_samples)
-        return np.asarray(common[:, None] * np.hstack(parts))
+        rows = np.asarray((common / all_pass_response(self.unstable, z))[:, None] * np.hstack(parts))
+        if not self.unstable.order:
+            return rows
+        response = rows @ self.mean[: rows.shape[1]]
+        return np.hstack([rows, -response[:, None] * log_all_pass_slopes(self.unstable, z)])
 
     def at(self, omega_rad_s: npt.ArrayLike, level: float = 0.95) -> FrequencyUncertainty:
         """Centre and 2x2 covariances at any strictly increasing omega (F,) [rad/s]."""
@@ -125,7 +135,9 @@ class ResponsePosterior:
         return np.asarray(draws @ self.frequency_rows(omega_rad_s).T)
 
     def simulate(self, u: RealArray, coefficients: RealArray | None = None) -> RealArray:
-        """Output (T,) from rest for the input u (T,), with the mean coefficients or a draw (P,)."""
+        """Output (T,) from rest for the input u (T,), with the mean coefficients or a draw (P,). Raises
+        ValueError for an unstable plant."""
+        refuse_unstable(self.unstable)
         values = self.mean if coefficients is None else np.asarray(coefficients, dtype=np.float64)
         if values.shape != self.mean.shape:
             raise ValueError(f"need coefficients {self.mean.shape}; got {values.shape}")
@@ -136,6 +148,14 @@ class ResponsePosterior:
             taps[0] = values[n_poles]
         return np.asarray(
             regressor(self.poles, filtered) @ values[:n_poles] + lfilter(taps, np.ones(1), filtered)
+        )
+
+    @property
+    def stable_part(self) -> ResponsePosterior:
+        """B G, without the unstable poles."""
+        kept = slice(self.mean.size - self.unstable.order)
+        return replace(
+            self, mean=self.mean[kept], covariance_factor=self.covariance_factor[kept], unstable=NO_POLES
         )
 
     def joint_level(

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ident.basis.functions import all_pass_signal
+from ident.basis.poles import NO_POLES, Poles
 from ident.data.arrays import ComplexArray, RealArray
 
 
@@ -18,7 +20,8 @@ class Structure:
     `estimate_initial_state` the free responses of all poles together with the polynomials that the
     integrators leave free (1, k, ... up to k^(integrators - 1)). `relative_degree` is that of the
     continuous-time plant behind the hold: 1 asks for nothing beyond the absence of a direct term, more are
-    linear conditions on the coefficients (`ident.basis.relative_degree`).
+    linear conditions on the coefficients (`ident.basis.relative_degree`). `unstable` are the poles outside
+    the circle, mirrored: the fit is to B(q) y, see `stabilised`.
     """
 
     integrators: int = 0
@@ -27,6 +30,7 @@ class Structure:
     estimate_offset: bool = False
     estimate_initial_state: bool = False
     relative_degree: int = 1
+    unstable: Poles = NO_POLES
 
     def __post_init__(self) -> None:
         if not (self.integrators >= 0 and self.input_delay_samples >= 0):
@@ -34,10 +38,11 @@ class Structure:
                 "integrators and input_delay_samples must not be negative; "
                 f"got {self.integrators} and {self.input_delay_samples}"
             )
-        if not self.relative_degree >= 1 or (self.feedthrough and self.relative_degree > 1):
+        more = self.feedthrough or self.unstable.order
+        if not self.relative_degree >= 1 or (more and self.relative_degree > 1):
             raise ValueError(
-                "relative_degree must be at least 1, and 1 with a direct term; got "
-                f"{self.relative_degree} and feedthrough = {self.feedthrough}"
+                "relative_degree must be at least 1, and 1 with a direct term or unstable poles; got "
+                f"{self.relative_degree}, feedthrough = {self.feedthrough}, {self.unstable.order} unstable"
             )
 
     @property
@@ -66,6 +71,17 @@ def answered(signal: RealArray, delay_samples: int) -> RealArray:
     if not len(signal) > delay_samples:
         raise ValueError(f"{len(signal)} samples, not more than the input delay {delay_samples}")
     return signal[delay_samples:]
+
+
+def stabilised(y: RealArray, unstable: Poles) -> RealArray:
+    """B(q) y (T,), from rest, B the all-pass whose zeros are the unstable poles and whose poles are these,
+    their mirror images 1 / conj(p).
+
+    B G is stable, |B| = 1 on the circle, and B v is white if v is. Where a loop is closed around an unstable
+    plant, B v is even independent of past inputs (the predictor of output-error models of unstable plants;
+    Forssell and Ljung, Automatica 36(1), 2000). What y did before the record is a free response of B.
+    """
+    return all_pass_signal(unstable, y) if unstable.order else y
 
 
 def driving_input(u: RealArray, integrators: int, delay_samples: int) -> RealArray:

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from ident.basis.functions import nuisance_columns
+from ident.basis.functions import basis_state_space, nuisance_columns
 from ident.basis.model import GobfModel
 from ident.basis.posterior import ResponsePosterior
-from ident.basis.structure import answered, level_before
+from ident.basis.structure import answered, level_before, stabilised
 from ident.data.arrays import BoolArray, RealArray, lock, real_rows
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
@@ -47,20 +47,24 @@ def fit_on_fresh_data(
     """Free-run simulation of a SISO record, no output fed back.
 
     With estimate_initial_state the free response of the model's poles (and integrators) at the start is
-    fitted to the record, with estimate_offset a constant; neither touches the response to the input. Raises
+    fitted to the record, with estimate_offset a constant; neither touches the response to the input. Of an
+    unstable model the free run is that of B G to B y (`ident.basis.structure.stabilised`), and simulated what
+    it predicts of the output from sample to sample. Raises
     ValueError for another sampling time, more than one channel, or a constant output.
     """
     record.refuse_several(model.dt_s)
+    unstable, delay = model.unstable, model.input_delay_samples
     try:
-        y = answered(record.output[:, 0], model.input_delay_samples)
+        measured = answered(record.output[:, 0], delay)
     except ValueError as error:
         raise ValueError(f"{record.label}: {error}") from None
-    spread = float(np.linalg.norm(y - y.mean()))
+    y = answered(stabilised(record.output[:, 0], unstable), delay)
+    spread = float(np.linalg.norm(measured - measured.mean()))
     if spread == 0:
         raise ValueError(f"{record.label}: the output is constant")
     unknown = estimate_offset and estimate_initial_state and not model.integrators
     level = level_before(record.input[:, 0]) if unknown else 0.0
-    simulated = answered(model.simulate(record.input[:, 0] - level), model.input_delay_samples)
+    simulated = answered(model.stable_part.simulate(record.input[:, 0] - level), delay)
     without = y
     degrees = max(int(estimate_offset), model.integrators if estimate_initial_state else 0)
     nuisance = nuisance_columns(model.poles, y.size, degrees, estimate_initial_state)
@@ -72,6 +76,11 @@ def fit_on_fresh_data(
     residual = y - simulated
     left = float(np.linalg.norm(residual))
     answers = left < float(np.linalg.norm(without))
+    if unstable.order:
+        # B over its direct term answers to y with y itself and what it was before: a prediction's error.
+        direct = float(basis_state_space(unstable).D[0, 0])
+        residual, left = residual / direct, left / abs(direct)
+        simulated = measured - residual
     return FreshFit(record.name, 100 * (1 - left / spread), simulated, residual, answers)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.basis.structure import Structure, answered, driving_input
+from ident.basis.structure import Structure, answered, driving_input, stabilised
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.fit.least_squares import Regression
@@ -53,7 +53,7 @@ def prepare_inputs(records: Sequence[Record], structure: Structure) -> Regressio
                 f"{record.label}: {record.n_samples} samples, not more than the input delay {delay}"
             )
         inputs.append([driving_input(u, structure.integrators, delay) for u in record.input.T])
-        outputs.append(answered(record.output[:, 0], delay))
+        outputs.append(answered(stabilised(record.output[:, 0], structure.unstable), delay))
         starts.append(starts[-1] + record.n_samples - delay)
         polynomials.append(_legendre(record.n_samples - delay, structure.n_polynomials))
     return Regression(

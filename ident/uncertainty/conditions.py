@@ -108,7 +108,8 @@ def _linear_rows(
     assert posterior.report is not None
     rows = tangent_rows([record], model, options.model_copy(update={"fir_length": posterior.fir_length}))
     (block,) = replace(rows, whitening=np.array([1.0, *posterior.report.ar_coefficients])).blocks()
-    both = np.column_stack([block.regressors, block.kernel[:], block.output])
+    basis, off = np.split(block.regressors, [block.regressors.shape[1] - model.unstable.order], axis=1)
+    both = np.column_stack([basis, block.kernel[:], off, block.output])
     nuisance = nuisance_basis(block.nuisance)
     both = both - nuisance @ (nuisance.T @ both)
     return both[:, :-1], both[:, -1]
@@ -144,8 +145,8 @@ def combine_posteriors(
     first = posteriors[0]
     for other in posteriors[1:]:
         same = (
-            np.array_equal(first.poles.real, other.poles.real)
-            and np.array_equal(first.poles.pairs, other.poles.pairs)
+            np.array_equal(first.poles.values, other.poles.values)
+            and np.array_equal(first.unstable.values, other.unstable.values)
             and all(
                 getattr(first, name) == getattr(other, name)
                 for name in ("dt_s", "fir_length", "has_feedthrough", "integrators", "input_delay_samples")

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ident.basis.functions import all_pass_slopes
 from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions
 from ident.basis.poles import Poles
@@ -145,7 +146,10 @@ def _embed(
     beside: Sequence[Beside] = (),
     n_known: int = 0,
 ) -> tuple[ResponsePosterior, RealArray, RealArray]:
-    rows = replace(_rows(records, model, poles, options), beside=tuple(beside), n_known=n_known)
+    rows, n_off = (
+        replace(_rows(records, model, poles, options, beside), n_known=n_known),
+        model.unstable.order,
+    )
     if n_known:
         rows = replace(rows, known_std=_noise_std(rows))
     solve = _solve_classical if classical_recipe else _solve
@@ -168,12 +172,14 @@ def _embed(
         poles = Poles(poles.real, np.concatenate([poles.pairs, missed.poles]))
     # The columns beside the basis functions are no part of the response.
     after = solved.rows.poles.order + int(rows.structure.feedthrough)
-    joint, beside_rows = joint_factor(reduced, kernel), slice(after, after + rows.n_beside)
-    mean, factor = (np.delete(part, beside_rows, axis=0) for part in joint)
+    joint, beside_rows = joint_factor(reduced, kernel), slice(after + n_off, after + rows.n_beside)
+    mean, factor = (np.delete(part, slice(after, after + rows.n_beside), axis=0) for part in joint)
     if missed is not None and missed.poles.size:
         mean, factor = (
             _pairs_after_poles(part, solved.rows.poles.order, missed.poles) for part in (mean, factor)
         )
+    off = slice(after, after + n_off)
+    mean, factor = np.concatenate([mean, joint[0][off]]), np.concatenate([factor, joint[1][off]])
     report = embedding_report(
         "classical embedding" if classical_recipe else "tangent embedding",
         reduced,
@@ -249,6 +255,7 @@ def _posterior(
         input_name=model.input_name,
         output_name=model.output_name,
         report=report,
+        unstable=model.unstable,
     )
 
 
@@ -263,7 +270,11 @@ def _noise_std(rows: EmbeddingRows) -> float:
 
 
 def _rows(
-    records: Sequence[Record], model: GobfModel, poles: Poles, options: EmbeddingOptions
+    records: Sequence[Record],
+    model: GobfModel,
+    poles: Poles,
+    options: EmbeddingOptions,
+    beside: Sequence[Beside] = (),
 ) -> EmbeddingRows:
     if not records:
         raise ValueError("need at least one record")
@@ -275,9 +286,16 @@ def _rows(
         feedthrough=model.feedthrough != 0 if options.feedthrough is None else options.feedthrough,
         estimate_offset=options.estimate_offset,
         estimate_initial_state=options.estimate_initial_state,
+        unstable=model.unstable,
     )
     length = common_fir_length(records, poles, options)
-    return EmbeddingRows(tuple(records), structure, poles, length, np.ones(1))
+    if model.unstable.order:
+        # A change of the unstable poles changes B(q) y: dB y on the other side, before the other columns.
+        own = [-all_pass_slopes(model.unstable, record.output[:, 0]) for record in records]
+        others = beside or [Beside(part[:, :0], part[:, :0]) for part in own]
+        both = zip(others, own, strict=True)
+        beside = [replace(other, columns=np.hstack([part, other.columns])) for other, part in both]
+    return EmbeddingRows(tuple(records), structure, poles, length, np.ones(1), tuple(beside))
 
 
 @dataclass(frozen=True, eq=False)

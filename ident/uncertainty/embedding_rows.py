@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from ident.basis.functions import all_pass_signal, nuisance_columns, regressor
 from ident.basis.poles import Poles
-from ident.basis.structure import Structure, answered, driving_input, level_before
+from ident.basis.structure import Structure, answered, driving_input, level_before, stabilised
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.uncertainty.autoregression import Absorbed, first_rows, whitened
@@ -134,7 +134,7 @@ class EmbeddingRows:
         return Rows(
             nuisance=whitened(known, whitening),
             regressors=regressors,
-            output=whitened(answered(record.output[:, 0], delay), whitening),
+            output=whitened(answered(stabilised(record.output[:, 0], structure.unstable), delay), whitening),
             input=u,
             head=head,
             first=first,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ident.basis.functions import basis_response
+from ident.basis.functions import all_pass_response, basis_response
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
@@ -31,10 +31,12 @@ def nominal_near(posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.Ar
     n_coefficients = poles.order + int(direct)
     if 2 * omega.size < n_coefficients:
         raise ValueError(f"{omega.size} frequencies do not determine {n_coefficients} coefficients")
-    columns = basis_response(poles, np.exp(1j * omega * posterior.dt_s))
+    z = np.exp(1j * omega * posterior.dt_s)
+    columns = basis_response(poles, z)
     if direct:
         columns = np.column_stack([columns, np.ones(omega.size)])
     common = front_response(omega, posterior.dt_s, posterior.integrators, posterior.input_delay_samples)
+    common = common / all_pass_response(posterior.unstable, z)
     s1, s2, u1 = standard_axes(uncertainty.covariance)
     floor = _THINNEST * np.abs(uncertainty.centre)
     aligned = (common * u1.conj())[:, None] * columns
@@ -53,4 +55,5 @@ def nominal_near(posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.Ar
         input_delay_samples=posterior.input_delay_samples,
         input_name=posterior.input_name,
         output_name=posterior.output_name,
+        unstable=posterior.unstable,
     )

@@ -77,6 +77,21 @@ def pole_intervals(posterior: ResponsePosterior, poles: Poles, level: float = 0.
     return PoleIntervals(level, ends_omega, np.minimum(ends_zeta, 1.0), ends_decay)
 
 
+def growth_intervals(posterior: ResponsePosterior, level: float = 0.95) -> RealArray:
+    """(U, 2) ends of the growth rate log|p| / dt_s, 1/s, of each unstable pole, real ones before pairs."""
+    unstable, n = posterior.unstable, posterior.unstable.real.size
+    poles = np.array([*unstable.real, *unstable.pairs], dtype=np.complex128)
+    # log|p| = -log|a|, a the mirror image.
+    slopes = np.zeros((poles.size, unstable.order))
+    slopes[np.arange(n), np.arange(n)] = -1 / unstable.real
+    for i, pole in enumerate(unstable.pairs):
+        slopes[n + i, n + 2 * i : n + 2 * i + 2] = -np.array([pole.real, pole.imag]) / abs(pole) ** 2
+    own = slice(posterior.mean.size - unstable.order, None)
+    centre = -np.log(np.abs(poles)) + slopes @ posterior.mean[own]
+    half = norm.ppf(0.5 + level / 2) * np.linalg.norm(slopes @ posterior.covariance_factor[own], axis=1)
+    return np.column_stack([centre - half, centre + half]) / posterior.dt_s
+
+
 def _pole_rows(posterior: ResponsePosterior, pole: complex, everything: ComplexArray) -> ComplexArray:
     """Deviation of the pole as a complex row (P',) on the columns of the covariance factor."""
     away = np.abs(everything - pole)

@@ -123,18 +123,22 @@ def test_damping_of_the_mode_is_bounded_for_both_channels(separate):
     assert found <= item.bound <= 1.005 * item.achieved
 
 
-def _random_posterior(rng: np.random.Generator) -> ResponsePosterior:
+def _random_posterior(rng: np.random.Generator, unstable: Poles) -> ResponsePosterior:
     mode = np.exp(_DT * 15 * rng.uniform(0.3, 4) * (-rng.uniform(0.005, 0.1) + 1j))
-    poles = Poles(np.array([rng.uniform(0.9, 0.999)]), np.array([mode, mode]))
-    size = poles.order + 5
+    poles = Poles(np.array([rng.uniform(0.9, 0.999)]), np.array([mode, mode])).appended(unstable)
+    size = poles.order + 5 + unstable.order
     root = rng.standard_normal((size, size)) * rng.uniform(0.01, 0.1)
-    return ResponsePosterior(poles, 0.3 * rng.standard_normal(size), root, _DT, fir_length=5)
+    mean = np.r_[0.3 * rng.standard_normal(size - unstable.order), np.zeros(unstable.order)]
+    return ResponsePosterior(poles, mean, root, _DT, fir_length=5, unstable=unstable)
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_posterior_loops_never_exceed_their_bounds(seed):
+@pytest.mark.parametrize(
+    "unstable", [Poles(), Poles([1 / 1.03]), Poles([1 / 1.2], [0.95 + 0.1j])], ids=["stable", "one", "three"]
+)
+def test_posterior_loops_never_exceed_their_bounds(seed, unstable):
     rng = np.random.default_rng(seed)
-    posterior = _random_posterior(rng)
+    posterior = _random_posterior(rng, unstable)
     system = random_stable(rng, 2, _DT)  # poles of the loop for the count: any stable system will do
     plant = UncertainPlant("posterior", system, posterior)
     raw = Controller([[0.9]], [[1.0]], [[rng.standard_normal()]], [[3 * rng.standard_normal()]], _DT)

@@ -216,12 +216,18 @@ def _unpack_dataclass(kind: Any, document: Any, arrays: Mapping[str, AnyArray], 
     _expect(isinstance(document, dict), document, at, f"an object with the fields of {kind.__name__}")
     fields = stored_fields(kind)
     strange = sorted(set(document) - set(fields) - {_TYPE})
-    missing = sorted(set(fields) - set(document))
+    # A field that earlier versions did not have comes back as its default.
+    later = {f.name for f in dataclasses.fields(kind) if "since" in f.metadata}
+    missing = sorted(set(fields) - set(document) - later)
     if strange or missing or document.get(_TYPE, kind.__name__) != kind.__name__:
         wrong = [f"unknown field '{shown(name)}'" for name in strange]
         wrong += [f"missing field {name!r}" for name in missing] or ["is"]
         raise CodecError(f"{at}: {wrong[0]} ({shown(document.get(_TYPE))}, expected {kind.__name__})")
-    values = {name: _unpack(hint, document[name], arrays, f"{at}.{name}") for name, hint in fields.items()}
+    values = {
+        name: _unpack(hint, document[name], arrays, f"{at}.{name}")
+        for name, hint in fields.items()
+        if name in document
+    }
     try:
         return kind(**values)
     except ValueError as error:

@@ -24,7 +24,7 @@ def draw_poles(
 
     zeros (k,): the model's, drawn as circles where given.
     """
-    poles = model.poles.values
+    poles = np.concatenate([model.stable_poles.values, model.unstable_poles])
     figure, (whole, near) = style.panels(5.6, 1, 2)
     for axes in (whole, near):
         _damping_lines(axes)

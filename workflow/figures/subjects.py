@@ -128,7 +128,7 @@ class ChannelView:
     @property
     def searched(self) -> tuple[int, int]:
         """Real poles and pole pairs that were found, those given as known left out."""
-        fixed = self.options.fixed()
+        fixed = self.options.fixed().without(self.options.unstable())
         return len(self.found.real_poles_z) - fixed.real.size, len(self.found.modes) - fixed.pairs.size
 
     @property

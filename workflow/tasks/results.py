@@ -6,7 +6,7 @@ closed loop (R, T); responses (F,) over frequencies.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Generic, Literal, TypeVar
 
@@ -142,7 +142,7 @@ class IdentifiedChannel:
     @property
     def modes(self) -> tuple[ModelMode, ...]:
         """Ascending in frequency."""
-        poles = self.model.poles
+        poles = self.model.stable_poles
         pairs = zip(poles.omega_rad_s(self.model.dt_s).tolist(), poles.zeta().tolist(), strict=True)
         return tuple(ModelMode(omega, zeta) for omega, zeta in sorted(pairs))
 
@@ -158,12 +158,18 @@ class IdentifiedChannel:
     @property
     def real_poles_per_s(self) -> tuple[float, ...]:
         """Decay rates, slowest first; a pole at or left of z = 0 has none."""
-        real = self.model.poles.real
+        real = self.model.stable_poles.real
         return tuple(sorted((-np.log(real[real > 0]) / self.model.dt_s).tolist()))
 
     @property
     def real_poles_z(self) -> tuple[float, ...]:
-        return tuple(sorted(self.model.poles.real.tolist(), reverse=True))
+        return tuple(sorted(self.model.stable_poles.real.tolist(), reverse=True))
+
+    @property
+    def unstable_poles(self) -> tuple[tuple[float, float], ...]:
+        """Growth rate, 1/s, and frequency, rad/s (0 for a real one), of each pole outside the circle."""
+        outside = np.log(self.model.unstable_poles) / self.model.dt_s
+        return tuple((float(s.real), float(s.imag)) for s in outside if s.imag >= 0)
 
     @property
     def fit_percent(self) -> dict[Role, dict[str, float]]:
@@ -214,11 +220,12 @@ class ModeInterval:
 
 @dataclass(frozen=True)
 class Intervals:
-    """Of the modes by frequency, of the decay rates slowest first."""
+    """Of the modes by frequency, of the decay rates slowest first, of the growth rates of unstable poles."""
 
     level: float
     modes: tuple[ModeInterval, ...]
     real_poles_per_s: tuple[Interval, ...]
+    growth_per_s: tuple[Interval, ...] = field(default=(), metadata={"since": 2})
 
 
 @dataclass(frozen=True)

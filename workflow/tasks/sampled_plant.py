@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from control_design.analysis.closed_loop import ClosedLoopTrajectory, LinearMachine, SampledMachine, simulate
 from control_design.controllers.controller import Controller
+from ident.basis.functions import inverse_all_pass
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.uncertainty import ResponsePosterior
@@ -26,14 +27,19 @@ def realise(posterior: ResponsePosterior, coefficients: Real) -> control.StateSp
     """One draw of coefficients (P,): poles and kernel in parallel.
 
     A kernel of L taps is the basis of L poles at zero, a shift register; both parts carry their own
-    integrators and delay, which doubles those states and changes nothing in the response from rest.
+    integrators and delay, which doubles those states and changes nothing in the response from rest. Unstable
+    poles are those of the draw, behind the sum: once, or what rounding leaves between two would grow.
     """
     n, direct = posterior.poles.order, int(posterior.has_feedthrough)
     parts = [_part(posterior, posterior.poles, coefficients[:n], float(coefficients[n]) if direct else 0.0)]
-    if posterior.fir_length:
-        shift = Poles(np.zeros(posterior.fir_length), np.zeros(0, dtype=np.complex128))
-        parts.append(_part(posterior, shift, coefficients[n + direct :], 0.0))
-    return reduce(add, parts)
+    if taps := posterior.fir_length:
+        shift = Poles(np.zeros(taps), np.zeros(0, dtype=np.complex128))
+        parts.append(_part(posterior, shift, coefficients[n + direct :][:taps], 0.0))
+    stable = reduce(add, parts)
+    if not posterior.unstable.order:
+        return stable
+    drawn = inverse_all_pass(posterior.unstable.moved(coefficients[n + direct + taps :]))
+    return control.ss(*drawn, stable.dt, remove_useless_states=False) * stable
 
 
 def _part(

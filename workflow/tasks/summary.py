@@ -107,6 +107,9 @@ def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
         "feedthrough": identification.structure.feedthrough,
         "real_poles_per_s": codec.plain(found.real_poles_per_s),
         "real_poles_z": codec.plain(found.real_poles_z),
+        "unstable_poles": [
+            {"growth_per_s": growth, "omega_rad_s": omega} for growth, omega in found.unstable_poles
+        ],
         "order_table": codec.plain(identification.order_table),
         "band_rad_s": codec.plain(found.band_rad_s),
         **{f"fit_{role}_percent": fits for role, fits in found.fit_percent.items()},

@@ -35,7 +35,7 @@ from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.conditions import combine_posteriors, group_posteriors, repeat_posteriors
 from ident.uncertainty.embedding import classical, tangent
 from ident.uncertainty.nominal import nominal_near
-from ident.uncertainty.pole_intervals import pole_intervals
+from ident.uncertainty.pole_intervals import growth_intervals, pole_intervals
 from workflow.config.run_config import Channel
 from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.engine.errors import naming
@@ -174,7 +174,7 @@ def uncertain_channel(
         tests=residual_tests(linear, result.bounded) if tests is None else tests,
         agreement=agreement_of(posterior.at(nominal_omega, level), nominal.frequency_response),
         behind_friction=behind,
-        intervals=intervals_of(linear, model.poles, level),
+        intervals=intervals_of(linear, model.stable_poles, level),
         repeat_scatter=repeat_scatter,
     )
 
@@ -314,6 +314,7 @@ def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> In
         level,
         tuple(ModeInterval(_interval(found.omega_rad_s[i]), _interval(found.zeta[i])) for i in by_frequency),
         tuple(_interval(found.decay_per_s[i]) for i in slowest_first),
+        tuple(_interval(ends) for ends in growth_intervals(posterior, level)),
     )
 
 
