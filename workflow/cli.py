@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import re
 import shlex
 import sys
 import traceback
@@ -17,9 +18,11 @@ from contextlib import suppress
 from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
+from typer.core import TyperCommand
 
 from workflow.config.renamed_keys import RenamedKeyWarning, current_options
 from workflow.engine import interrupts
@@ -41,6 +44,9 @@ from workflow.engine.errors import (
 from workflow.engine.threads import one_thread
 
 if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
+
+    from workflow.config.settings import ModelT
     from workflow.console import TerminalProgress
     from workflow.tasks.summary import RunSummary
 
@@ -57,6 +63,36 @@ app = typer.Typer(
     "SIGTERM, SIGHUP. Example: flexlink run --out "
     "runs/first",
 )
+
+# Settings whose fields are set by options; such an option has one of these in place of its help.
+_IDENT = "ident.basis.options:IdentOptions"
+_ELLIPSES = "workflow.config.uncertainty_options:UncertaintyOptions"
+_LOGS, _CHANNEL = "workflow.config.run_config:FileSource", "workflow.config.run_config:Channel"
+_PLAN = "plant.experiment_plan:ExperimentPlan"
+_LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
+
+
+class _OfSettings(TyperCommand):
+    """Options say what the fields they set say. For the help alone: settings are slow to load."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        for option in self.params:
+            if (place := getattr(option, "help", None)) in (_IDENT, _ELLIPSES, _LOGS, _CHANNEL, _PLAN):
+                field = resolve_name(place).model_fields[option.name]
+                option.help = _described(field, option.default)  # type: ignore[attr-defined]
+        super().format_options(ctx, formatter)
+
+
+def _described(field: FieldInfo, own_default: object) -> str:
+    """Description, choices, range and, where the option has none of its own, default of a field."""
+    said = str(field.description)
+    choices = [get_args(kind) for kind in (field.annotation, *get_args(field.annotation))]
+    more = [", ".join(some) for some in choices if len(some) > 1 and isinstance(some[0], str)]
+    more += [f"{_LIMITS[k]} {getattr(m, k):g}" for m in field.metadata for k in _LIMITS if hasattr(m, k)]
+    if own_default is None and field.default is not None and "default:" not in said:
+        more.append(f"default: {field.default}")
+    return said[0].upper() + said[1:] + (f" [{'; '.join(more)}]" if more else ".")
+
 
 Jobs = Annotated[
     int | None, typer.Option(min=1, help="Processes on this machine [default: one per processor]")
@@ -172,7 +208,7 @@ def simulate(
     _show_files(simulate_to_csv(config, out), as_json)
 
 
-@app.command(short_help="Plan an experiment: voltages as CSV, plan, page.")
+@app.command(cls=_OfSettings, short_help="Plan an experiment: voltages as CSV, plan, page.")
 def excite(
     out: Annotated[Path, typer.Option(help="Directory for the files; new or empty.")],
     band: Annotated[tuple[float, float], typer.Option(help="Frequencies to excite [Hz], low and high.")],
@@ -195,8 +231,8 @@ def excite(
     noise_std: Annotated[
         float | None, typer.Option(help="Sensor noise of the hub angle [rad]: predicts radii.")
     ] = None,
-    realisations: Annotated[int, typer.Option(min=1, help="Records at each amplitude.")] = 4,
-    periods: Annotated[int, typer.Option(min=1, help="Whole periods of a record.")] = 2,
+    realisations: Annotated[int | None, typer.Option(help=_PLAN)] = None,
+    periods: Annotated[int | None, typer.Option(help=_PLAN)] = None,
     lead_in: Annotated[float, typer.Option(min=0, help="From rest to steady state [s].")] = 1.0,
     seed: Annotated[int, typer.Option(min=0, help="Root of the random phases and lines.")] = 2006,
     time_limit: TimeLimit = None,
@@ -218,22 +254,20 @@ def excite(
         rig=None if rig is None else rig_called(rig),
         noise_std_rad=noise_std,
     )
-    files = write_experiment(
-        limits, out, seed=seed, realisations=realisations, periods=periods, lead_in_s=lead_in
-    )
+    stated = {"realisations": realisations, "periods": periods}
+    given = {key: value for key, value in stated.items() if value is not None}
+    files = write_experiment(limits, out, seed=seed, lead_in_s=lead_in, **given)
     _show_files(files, as_json)
 
 
-@app.command(short_help="What a log holds: columns, units, sampling, ranges.")
+@app.command(cls=_OfSettings, short_help="What a log holds: columns, units, sampling, ranges.")
 def look(
     log: Annotated[Path, typer.Argument(help="CSV or other tables, npz, MAT, ... (docs/logs.md).")],
     time: Annotated[
         str | None, typer.Option(help="Name of the time column [default: what looks like it]")
     ] = None,
-    time_unit: Annotated[str | None, typer.Option(help="Unit of the time column, as in identify.")] = None,
-    decimal: Annotated[
-        str | None, typer.Option(help="What separates decimals in text: point or comma.")
-    ] = None,
+    time_unit: Annotated[str | None, typer.Option(help=_LOGS)] = None,
+    decimal: Annotated[str | None, typer.Option(help=_LOGS)] = None,
     out: Annotated[Path | None, typer.Option(help="Write a page here (HTML, one file).")] = None,
     time_limit: TimeLimit = None,
     as_json: Json = False,
@@ -245,7 +279,7 @@ def look(
     _show(look_at_log(log, time=time, time_unit=time_unit, decimal=decimal, out=out), as_json)
 
 
-@app.command(short_help="Identify one channel from log files; one-page report.")
+@app.command(cls=_OfSettings, short_help="Identify one channel from log files; one-page report.")
 def identify(
     log: Annotated[
         list[Path],
@@ -259,13 +293,7 @@ def identify(
     ] = None,
     output_name: Annotated[str | None, typer.Option("--output", help="Name of the output column.")] = None,
     time: Annotated[str | None, typer.Option(help="Name of the time column; this or --dt-s.")] = None,
-    time_unit: Annotated[
-        str | None,
-        typer.Option(
-            help="Unit of the time column: s, ms, us, ns, min, h, d [default: as in its name ('t_ms', "
-            "'Zeit [ms]'), else s]"
-        ),
-    ] = None,
+    time_unit: Annotated[str | None, typer.Option(help=_LOGS)] = None,
     dt_s: Annotated[
         float | None,
         typer.Option(help="Sampling period [s], if there is no --time; beside it, the exact one within 1 %."),
@@ -276,24 +304,13 @@ def identify(
     ] = None,
     offset: Annotated[list[str] | None, typer.Option(help="COLUMN=VALUE, added after scaling.")] = None,
     unit: Annotated[list[str] | None, typer.Option(help="COLUMN=UNIT of that quantity.")] = None,
-    repair: Annotated[
-        bool,
-        typer.Option(
-            "--repair", help="Put time stamps that jitter, and single missing rows, on a uniform grid."
-        ),
-    ] = False,
-    resample_s: Annotated[
-        float | None,
-        typer.Option(help="Put all rows on a coarser grid of this step [s], where stamps keep to none."),
-    ] = None,
+    repair: Annotated[bool, typer.Option("--repair", help=_LOGS)] = False,
+    resample_s: Annotated[float | None, typer.Option(help=_LOGS)] = None,
     unwrap: Annotated[
         list[str] | None,
         typer.Option(help="COLUMN=PERIOD of a column that wraps: encoder=4096, angle_deg=360 (repeatable)."),
     ] = None,
-    decimal: Annotated[
-        str | None,
-        typer.Option(help="What separates decimals in text: point or comma [default: as the numbers say]"),
-    ] = None,
+    decimal: Annotated[str | None, typer.Option(help=_LOGS)] = None,
     report_page: Annotated[
         Path | None,
         typer.Option(
@@ -308,65 +325,22 @@ def identify(
         str | None,
         typer.Option(help="Reference column of logs made in closed loop: identified in two stages."),
     ] = None,
-    input_limit: Annotated[
-        float | None,
-        typer.Option(
-            help="What the amplifier gives at most, in the input's unit: larger commands are taken as that."
-        ),
-    ] = None,
-    pairs: Annotated[
-        int | None, typer.Option(min=0, max=12, help="Pole pairs [default: from the data]")
-    ] = None,
-    real: Annotated[
-        int | None, typer.Option(min=0, max=8, help="Real poles [default: from the data]")
-    ] = None,
-    integrators: Annotated[int, typer.Option(min=0, max=3, help="Known poles at z = 1.")] = 0,
-    delay: Annotated[
-        int | None,
-        typer.Option(min=0, help="Known delay of the input [samples] [default: sought in the data]"),
-    ] = None,
-    feedthrough: Annotated[bool, typer.Option("--feedthrough", help="Fit a direct term.")] = False,
-    relative_degree: Annotated[
-        str | None,
-        typer.Option(
-            help="Known excess of poles over zeros of the continuous plant, 1 to 6, or 'auto': the largest "
-            "of 1 to 3 that the data do not refuse."
-        ),
-    ] = None,
-    level: Annotated[float, typer.Option(help="Confidence of each ellipse, between 0.5 and 1.")] = 0.95,
-    response: Annotated[
-        str,
-        typer.Option(
-            help="Which response the ellipses describe: 'as recorded' (all that is not linear is noise); or, "
-            "where the output is the position of a shaft with dry friction: 'without friction', "
-            "'this amplitude', 'amplitudes from 2 to 8' (rms of the input)."
-        ),
-    ] = "as recorded",
-    band: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            help="Fit inside this band only [rad/s, low and high]: leaves out drift and friction below."
-        ),
-    ] = None,
-    noise: Annotated[
-        str,
-        typer.Option(
-            help="'auto': where residuals are coloured (dry friction, drift) the poles are sought behind a "
-            "noise model; 'white': plain least squares."
-        ),
-    ] = "auto",
-    noise_order: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            max=100,
-            help="Largest order of the noise model behind the ellipses [default: 8, or 32 where needed]",
-        ),
-    ] = None,
-    omega_min: Annotated[float | None, typer.Option(help="No pole pair below [rad/s].")] = None,
-    omega_max: Annotated[float | None, typer.Option(help="No pole pair above [rad/s].")] = None,
-    zeta_min: Annotated[float | None, typer.Option(help="Least damping ratio of a pole pair.")] = None,
-    zeta_max: Annotated[float | None, typer.Option(help="Largest damping ratio of a pole pair.")] = None,
+    input_limit: Annotated[float | None, typer.Option(help=_LOGS)] = None,
+    n_pairs: Annotated[int | None, typer.Option("--pairs", help=_IDENT)] = None,
+    n_real: Annotated[int | None, typer.Option("--real", help=_IDENT)] = None,
+    integrators: Annotated[int | None, typer.Option(help=_IDENT)] = None,
+    input_delay_samples: Annotated[int | None, typer.Option("--delay", help=_IDENT)] = None,
+    feedthrough: Annotated[bool, typer.Option("--feedthrough", help=_IDENT)] = False,
+    relative_degree: Annotated[str | None, typer.Option(help=_IDENT)] = None,
+    level: Annotated[float | None, typer.Option(help=_ELLIPSES)] = None,
+    response: Annotated[str | None, typer.Option(help=_ELLIPSES)] = None,
+    band_rad_s: Annotated[tuple[float, float] | None, typer.Option("--band", help=_CHANNEL)] = None,
+    noise: Annotated[str, typer.Option(help=_IDENT)] = "auto",
+    max_ar_order: Annotated[int | None, typer.Option("--noise-order", help=_ELLIPSES)] = None,
+    omega_min_rad_s: Annotated[float | None, typer.Option("--omega-min", help=_IDENT)] = None,
+    omega_max_rad_s: Annotated[float | None, typer.Option("--omega-max", help=_IDENT)] = None,
+    zeta_min: Annotated[float | None, typer.Option(help=_IDENT)] = None,
+    zeta_max: Annotated[float | None, typer.Option(help=_IDENT)] = None,
     export: Annotated[
         Path | None,
         typer.Option(
@@ -385,21 +359,13 @@ def identify(
     need(*log, *(validation or []))
     from ident.basis.options import IdentOptions
     from workflow.commands.logs import are_responses, read_logs
-    from workflow.config.settings import check
     from workflow.config.uncertainty_options import UncertaintyOptions
     from workflow.engine.storage import refuse_in_the_way
 
-    chosen: dict[str, Any] = {"n_pairs": pairs, "n_real": real, "integrators": integrators, "noise": noise}
-    chosen |= {"omega_min_rad_s": omega_min, "omega_max_rad_s": omega_max}
-    chosen |= {"zeta_min": zeta_min, "zeta_max": zeta_max}
-    chosen |= {
-        "feedthrough": feedthrough,
-        "relative_degree": _degree(relative_degree),
-    }
-    chosen |= {} if delay is None else {"input_delay_samples": delay}
-    options = check(IdentOptions, chosen, source="options")
+    given = locals() | {"relative_degree": _degree(relative_degree)}
+    options = _settings(IdentOptions, given)
     with _watched(quiet) as progress:
-        described = check(UncertaintyOptions, {"level": level, "response": response}, source="options")
+        described = _settings(UncertaintyOptions, given)
         written = [("--out", out), ("--report", report_page), ("--export", export)]
         # A log given twice would count its noise twice as well known, or validate what it was fitted to.
         refuse_in_the_way([*log, *(validation or [])], [(name, path) for name, path in written if path])
@@ -407,14 +373,15 @@ def identify(
             from workflow.commands.identify_response import identify_response
 
             of_logs = {
-                "--report": report_page, "--validation": validation, "--reference": reference, "--band": band,
-                "--input-limit": input_limit, "--noise-order": noise_order, "--time-unit": time_unit,
-                "--scale": scale, "--offset": offset, "--unit": unit, "--repair": repair,
+                "--report": report_page, "--validation": validation, "--reference": reference,
+                "--band": band_rad_s, "--input-limit": input_limit, "--noise-order": max_ar_order,
+                "--time-unit": time_unit, "--scale": scale, "--offset": offset, "--unit": unit,
+                "--repair": repair,
             }  # fmt: skip
             summary = identify_response(
                 log,
                 dt_s,
-                level=level,
+                level=described.level,
                 options=options,
                 out=out,
                 export=export,
@@ -448,8 +415,8 @@ def identify(
             logs,
             options=options,
             described=described,
-            band_rad_s=band,
-            noise_order=noise_order,
+            band_rad_s=band_rad_s,
+            noise_order=max_ar_order,
             out=out,
             report=report_page,
             export=export,
@@ -700,6 +667,21 @@ def _number(option: str, text: str) -> float:
     if not isfinite(number) or (number == 0 and option == "--scale"):
         raise InputError(f"{option} {text}: expected a finite number{', not 0' * (option == '--scale')}")
     return number
+
+
+def _settings(model: type[ModelT], given: Mapping[str, Any]) -> ModelT:
+    """The settings that options state; a complaint has the option's name."""
+    from workflow.config.settings import check
+    from workflow.text.options import OPTIONS
+
+    names = OPTIONS["identify"]
+    try:
+        stated = {key: given[key] for key in model.model_fields if given.get(key) is not None}
+        return check(model, stated, source="options")
+    except InputError as error:
+        raise InputError(
+            re.sub(r"^options: (\w+)(?=:)", lambda m: names.get(m[1], m[0]), str(error))
+        ) from error
 
 
 def _degree(text: str | None) -> int | str | None:

@@ -56,12 +56,12 @@ class IdentOptions(BaseModel):
     input_delay_samples: int = Field(
         0,
         ge=0,
-        description="known delay of the input in whole samples; left out: sought in the data of one input",
+        description="known delay of the input [samples]; default: sought in the data of one input",
     )
     relative_degree: Annotated[int, Field(ge=1, le=6)] | Literal["auto"] | None = Field(
         None,
-        description="known relative degree of the continuous-time plant behind a zero-order hold "
-        "(torque to angle: 2); tested and kept. auto: the largest of 1 to 3 that the data "
+        description="known relative degree (1 to 6) of the continuous-time plant behind a "
+        "zero-order hold (torque to angle: 2); tested and kept. auto: the largest of 1 to 3 that the data "
         "allow",
     )
     estimate_offset: bool | Literal["auto"] = Field(
@@ -73,8 +73,8 @@ class IdentOptions(BaseModel):
 
     noise: Literal["white", "auto"] = Field(
         "white",
-        description="white: plain least squares; auto: a noise model where the residuals are not "
-        "white (dry friction, drift)",
+        description="model of the noise. white: plain least squares; auto: another one where the "
+        "residuals are not white (dry friction, drift)",
     )
 
     algorithm: Algorithm = Field("GN_DIRECT_L", description="NLopt's variants of DIRECT")
@@ -96,8 +96,12 @@ class IdentOptions(BaseModel):
         description="points of a global search that are refined; five times as many if the first disagree",
     )
 
-    omega_min_rad_s: float | None = Field(None, gt=0, description="lowest natural frequency of a pair")
-    omega_max_rad_s: float | None = Field(None, gt=0, description="highest natural frequency of a pair")
+    omega_min_rad_s: float | None = Field(
+        None, gt=0, description="lowest natural frequency of a pair [rad/s]"
+    )
+    omega_max_rad_s: float | None = Field(
+        None, gt=0, description="highest natural frequency of a pair [rad/s]"
+    )
     zeta_min: float | None = Field(None, gt=0, lt=0.98, description="smallest damping ratio of a pair")
     zeta_max: float | None = Field(None, gt=0, le=0.98, description="largest damping ratio of a pair")
     decay_min_per_s: float | None = Field(None, gt=0, description="slowest decay of a real pole, 1/s")
@@ -216,7 +220,13 @@ class EmbeddingOptions(BaseModel):
     coloured_noise: bool = Field(
         default=False, description="whiten with an AR model of the residuals, three rounds"
     )
-    max_ar_order: int = Field(default=8, ge=1, le=100, description="largest AR order that BIC may choose")
+    max_ar_order: int = Field(
+        default=8,
+        ge=1,
+        le=100,
+        description="largest AR order of the noise model that BIC may choose; default: 8 "
+        "(flexlink identify: 32 where 8 is not enough)",
+    )
     order_given: bool | None = Field(
         default=None,
         description="the order was given, not chosen from these data; default: as in the "

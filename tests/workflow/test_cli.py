@@ -15,9 +15,13 @@ import numpy as np
 import pytest
 import scipy.io
 
+from ident.basis.options import IdentOptions
+from plant.experiment_plan import ExperimentPlan
 from tests.workflow.command import FAST_ARM, ROOT, start_flexlink
 from workflow import cli
 from workflow.cli import main
+from workflow.config.run_config import FileSource
+from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.engine import interrupts
 
 FILES_CONFIG = """
@@ -404,6 +408,25 @@ def test_help_keeps_what_stands_in_brackets(flexlink, command, words):
     shown = " ".join(flexlink(command, "--help").out.split())
     for word in words:
         assert word in shown
+
+
+@pytest.mark.parametrize(
+    ("command", "settings", "option", "key", "more"),
+    [
+        ("identify", IdentOptions, "--pairs", "n_pairs", "[at least 0; at most 12]"),
+        ("identify", IdentOptions, "--integrators", "integrators", "[at least 0; at most 3; default: 0]"),
+        ("identify", UncertaintyOptions, "--level", "level", "[above 0.5; below 1; default: 0.95]"),
+        ("identify", IdentOptions, "--noise", "noise", "[white, auto] [default: auto]"),
+        ("identify", IdentOptions, "--feedthrough", "feedthrough", "."),
+        ("look", FileSource, "--decimal", "decimal", "[point, comma]"),
+        ("excite", ExperimentPlan, "--periods", "periods", "[at least 1; at most 1000; default: 2]"),
+    ],
+)
+def test_an_option_says_what_the_field_it_sets_says(flexlink, command, settings, option, key, more):
+    shown = " ".join(flexlink(command, "--help").out.split())
+    said = settings.model_fields[key].description
+    said = re.escape(said[:1].upper() + said[1:])
+    assert re.search(rf"{option} (<\w+> )?{said} ?{re.escape(more)} --", shown), shown
 
 
 @pytest.mark.parametrize("command", [[], ["run"], ["identify"], ["diagnose"], ["report"], ["blind"]])

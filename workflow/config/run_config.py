@@ -215,8 +215,8 @@ class Channel(Section):
     )
     band_rad_s: Band | None = Field(
         None,
-        description="fit inside this band: the same filter on input and output keeps the response and "
-        "removes drift, friction and noise outside the band",
+        description="fit inside this band only [rad/s, low and high]: the same filter on input and "
+        "output keeps the response and removes drift, friction and noise outside the band",
     )
     bounds_band_rad_s: Band | None = Field(
         None, description="band of the data for the ellipses, if wider than that of the poles"

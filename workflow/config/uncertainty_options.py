@@ -27,8 +27,8 @@ class UncertaintyOptions(EmbeddingOptions):
     response: str = Field(
         "as recorded",
         description="which response the ellipses describe. as recorded: linear dynamics, everything else "
-        "counts as noise. The others identify the dry friction of the control channel, "
-        "whose output must be the shaft's position. without friction: linear dynamics "
+        "counts as noise. The others identify dry friction as well: the output (of the control "
+        "channel) must be the shaft's position. without friction: linear dynamics "
         "without friction; this amplitude: best linear approximation with friction, at "
         "the rms of the recorded inputs; amplitudes from 2 to 8: the same at any rms of "
         "the input between these, in its unit",

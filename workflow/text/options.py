@@ -28,6 +28,7 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "noise": "--noise",
         "max_ar_order": "--noise-order",
         "coloured_noise": "--noise-order 8",
+        "level": "--level",
         "response": "--response",
         "band_rad_s": "--band",
         "time_unit": "--time-unit",
