@@ -58,7 +58,8 @@ def main(
     seeds: in words, where they are not the options `seeds` (0 to seeds - 1) or `seed`; may name options in
     braces.
     """
-    module = Path(inspect.getfile(run)).stem
+    file = Path(inspect.getfile(run))
+    module = file.parent.name if file.stem == "__main__" else file.stem  # a package is named by its folder
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     defaults = {
         name: parameter.default

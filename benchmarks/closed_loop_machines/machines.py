@@ -1,0 +1,193 @@
+"""Ten kinds of machine and the controllers that people give them, drawn from a seed.
+
+Everything is drawn before friction: friction is a share of the command, which the recorded motion decides
+(`logs.machine`). Belt drive, seed 0 of series 1, is the log reported by a user.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.closed_loop_machines.simulator import Law, Plant, response
+
+TAU = 2 * np.pi
+# Inertia of the motor side in 1e-3 kg m^2 (logarithmic), load over motor inertia, antiresonance Hz, damping
+# of the resonance, torque per unit of input, bandwidth over antiresonance, rms motion in rad, share of the
+# friction on the motor side, columns that occur (see below).
+_NAMES = ("inertia", "ratio", "anti", "zeta", "torque", "bandwidth", "motion", "share", "columns")
+_ROWS = {
+    "belt": ((0.5, 5), (1, 5), (4, 15), (0.02, 0.06), (0.1, 1), (0.15, 0.35), (0.03, 0.3), 1.0, "ra da rv"),
+    "joint": ((100, 500), (0.5, 3), (5, 15), (0.02, 0.08), (4, 20), (0.15, 0.35), (0.02, 0.2), 0.8, "dt ra"),
+    "link": ((2, 20), (1, 5), (2, 5), (0.005, 0.02), (0.1, 1), (0.2, 0.4), (0.03, 0.3), 1.0, "ra rv dt"),
+    "pendulum": ((1, 30), (3, 10), (8, 20), (0.02, 0.05), (0.1, 1), (2.5, 4), (0.02, 0.1), 1.0, "ra dt rt"),
+    "screw": ((0.05, 0.5), (0.3, 2), (25, 60), (0.02, 0.05), (0.1, 1), (0.08, 0.2), (0.5, 4), 0.5, "ma mt"),
+    "wheel": ((2, 10), (4, 12), (3, 7), (0.06, 0.15), (0.1, 1), (0.15, 0.35), (0.2, 2), 0.2, "ra rv dt"),
+    "play": ((0.5, 5), (1, 4), (6, 20), (0.02, 0.06), (0.1, 1), (0.15, 0.35), (0.03, 0.2), 0.7, "ra da rt"),
+    "slow": ((0.5, 5), (1, 4), (15, 30), (0.01, 0.04), (0.1, 1), (0.03, 0.06), (0.05, 0.5), 0.8, "ra rt"),
+    "fast": ((0.5, 5), (0.5, 3), (6, 15), (0.02, 0.06), (0.1, 1), (0.5, 0.9), (0.02, 0.1), 0.8, "ra da dt"),
+    "saturation": ((0.5, 5), (1, 4), (5, 15), (0.02, 0.06), (0.1, 1), (0.2, 0.4), (0.05, 0.3), 0.8, "ra rv"),
+}  # fmt: skip
+KINDS = tuple(_ROWS)
+# Output unit per rad (None: millimetres of a screw), column of time, reference, input by its letter, output.
+_OUTPUTS = {
+    "r": (1.0, "t_ms", "ref_rad", "enc_rad"),
+    "d": (360 / TAU, "time_s", "pos_ref_deg", "pos_deg"),
+    "m": (None, "time_s", "x_ref_mm", "x_mm"),
+}
+_INPUTS = {"a": "i_cmd_A", "t": "torque_cmd_Nm", "v": "u_V"}
+_COUNTS = (4096, 8192, 16384, 40_000, 65_536, 262_144, 1_000_000)
+_RATES_HZ = (250, 500, 1000, 2000, 4000)
+
+
+class Draft(NamedTuple):
+    """A machine before its friction."""
+
+    kind: str
+    plant: Plant
+    law: Law
+    q_operating: float  # rad; the linear plant is taken here
+    motion_rad: float  # rms
+    share: float  # of the friction, on the motor side
+    columns: tuple[str, str, str, str]  # time, reference, input, output
+    bandwidth_hz: float
+    mode_hz: float  # lowest mode, friction-free
+    noise_counts: float
+
+
+def draft(kind: str, seed: int, rng: np.random.Generator) -> Draft:
+    """Plant, controller and habits of one machine; no friction, no limit."""
+    one: dict[str, Any] = dict(zip(_NAMES, _ROWS[kind], strict=True))
+    u = rng.uniform
+    reported = kind == "belt" and rng.bit_generator.seed_seq.entropy == [1, 0, 0]  # type: ignore[attr-defined]
+    motor, ratio = 1e-3 * float(np.exp(u(*np.log(one["inertia"])))), float(u(*one["ratio"]))
+    anti, zeta = float(u(*one["anti"])), float(u(*one["zeta"]))
+    letters = str(rng.choice(one["columns"].split()))
+    per_rad, time, reference, output = _OUTPUTS[letters[0]]
+    columns = (time, reference, _INPUTS[letters[1]], output)
+    gear = float(rng.choice([50, 80, 100])) if kind == "joint" else 1.0
+    torque = float(np.exp(u(*np.log(one["torque"])))) if letters[1] != "t" else gear
+    load, counts = motor * ratio, int(rng.choice(_COUNTS))
+    rates = [
+        rate for rate in _RATES_HZ if rate >= max(12 * anti * np.sqrt(1 + ratio), 1000 * (kind == "screw"))
+    ]
+    rate, delay = float(rng.choice(rates[:3])), int(rng.random() < 0.5)
+    if reported:
+        motor, load, anti, zeta, torque, per_rad, counts = 2e-3, 5e-3, 5.0, 0.0374, 0.6, 1.0, 16384
+        columns, rate, delay = ("t_ms", "ref_rad", "i_cmd_A", "enc_rad"), 1000.0, 1
+    total = motor + load
+    # A coasting time of seconds; back-EMF, where the input is a voltage, brakes faster.
+    viscous = np.array([total / u(1, 5) if letters[1] != "v" else total / u(0.3, 1.5), 0.0])
+    inertia, gravity, springs = np.array([motor, load]), np.zeros(2), _spring(motor, load, anti, zeta)
+    if reported:
+        viscous[0] = 4e-3
+    if kind == "play":
+        springs[0, 4] = 0.5e-4
+    if kind == "link":  # a clamped beam: share of the inertia and frequency of its first three modes
+        shares, times = np.array([0.9707, 0.0247, 0.0032]), np.array([1, 6.267, 17.55])
+        inertia = np.concatenate([[motor + load * (1 - shares.sum())], load * shares])
+        rows = [
+            _spring(motor, m, anti * t, zeta, j + 1)
+            for j, (m, t) in enumerate(zip(inertia[1:], times, strict=True))
+        ]
+        springs, viscous, gravity = np.concatenate(rows), np.append(viscous[:1], np.zeros(3)), np.zeros(4)
+    q_operating = 0.0
+    if kind == "pendulum":  # odd seeds: an arm held above the horizontal
+        gravity[1] = load * 9.81 / u(0.2, 0.8)
+        q_operating = float(u(0.5, 1.1) * rng.choice([-1, 1])) if seed % 2 else 0.0
+    scale = per_rad or float(rng.choice([5, 10, 20])) / TAU
+    ripple = np.array(
+        [{"joint": 1.0, "belt": 0.3}.get(kind, 0.0), 2 * gear if kind == "joint" else 12.0, u(0, TAU)]
+    )
+    size = inertia.size
+    plant = Plant(
+        inertia, viscous, gravity, springs, np.tile([0, 0, 1.0, 0, 0], (size, 1)), ripple, torque,
+        int(kind == "screw" and seed % 2), scale, 1 / rate, delay, TAU * scale / (counts * gear), np.inf,
+    )  # fmt: skip
+    poles = plant.linear(q_operating)[3]
+    bandwidth = u(*one["bandwidth"]) * TAU * anti
+    if kind == "pendulum":
+        bandwidth = u(*one["bandwidth"]) * max(np.max(poles.real), 3.0)
+    law, bandwidth = _design(plant, q_operating, float(bandwidth), rng)
+    if reported:
+        law = _pid(1.5, 0.06, 0.0, 1e-6, 0.0, 1e-3, False, 0.0)
+    motion = float(np.exp(u(*np.log(one["motion"]))))
+    motion = 0.22 if reported else max(motion, 20 * plant.count / scale)
+    noisy = float(u(0.5, 2)) if counts >= 200_000 else 0.0
+    mode = float(np.min(np.abs(poles[poles.imag > 1e-6]))) / TAU
+    return Draft(kind, plant, law, q_operating, motion, one["share"], columns, bandwidth / TAU, mode, noisy)
+
+
+def _spring(motor: float, load: float, anti_hz: float, zeta: float, to: int = 1) -> Any:
+    """Row of `springs` from inertia 0: antiresonance of the load alone, damping of the mode of both."""
+    stiffness = load * (TAU * anti_hz) ** 2
+    mode = np.sqrt(stiffness * (1 / motor + 1 / load))
+    return np.array([[0, to, stiffness, 2 * zeta * stiffness / mode, 0.0]])
+
+
+def _pid(
+    kp: float,
+    kd: float,
+    ki: float,
+    filter_s: float,
+    low_pass_s: float,
+    dt_s: float,
+    on_output: bool,
+    bias: float,
+) -> Law:
+    """P, filtered derivative (of the error, or of the output only), I with back-calculation, low-pass."""
+    keep, soft = np.exp(-dt_s / filter_s), np.exp(-dt_s / low_pass_s) if low_pass_s else 0.0
+    slope, error = np.array([0.0, -1.0]) if on_output else np.array([1.0, -1.0]), np.array([1.0, -1.0])
+    steep = kd * (1 - keep) / dt_s  # a backward difference where the filter is faster than the sampling
+    c, d = np.array([-steep, 1.0, 0.0]), kp * error + steep * slope
+    a = np.diag([keep, 1.0, soft]) + np.outer([0, 0, 1 - soft], c)
+    b = np.array([(1 - keep) * slope, ki * dt_s * error, (1 - soft) * d])
+    wind = np.array([0.0, ki * dt_s / kp, 0.0])
+    return Law(a, b, (1 - soft) * c + np.array([0, 0, soft]), (1 - soft) * d, wind, bias)
+
+
+def loop_radius(plant: Plant, q_operating: float, law: Law) -> float:
+    """Largest pole modulus of the loop of the friction-free plant; a pole that the controller never feels
+    (the integrator of a PD) is left out."""
+    a, b, c = plant.sampled(q_operating)
+    felt = np.flatnonzero(np.abs(law.C) + np.abs(law.B).sum(axis=1) > 0)
+    felt = felt[[bool(np.any(law.B[i])) or i == 2 for i in felt]]
+    top = np.hstack([a + b * law.D[1] @ c, b @ law.C[None, felt]])
+    low = np.hstack([law.B[felt][:, 1:] @ c, law.A[np.ix_(felt, felt)]])
+    return float(np.max(np.abs(np.linalg.eigvals(np.vstack([top, low])))))
+
+
+def loop_gain(plant: Plant, q_operating: float, law: Law, omega_rad_s: Any) -> Any:
+    """L with y = -L y in the open loop, (F,)."""
+    g = response(*plant.sampled(q_operating), omega_rad_s, plant.dt_s)
+    return -g * (response(law.A, law.B[:, 1:], law.C[None, :], omega_rad_s, plant.dt_s) + law.D[1])
+
+
+def _design(
+    plant: Plant, q_operating: float, bandwidth: float, rng: np.random.Generator
+) -> tuple[Law, float]:
+    """PD, PID or PID with a low-pass that keeps |S| under 2.8; slower by a tenth until it does."""
+    u = rng.uniform
+    kind, zeta, times, on_output = int(rng.integers(3)), u(0.5, 1.0), u(5, 15), bool(rng.random() < 0.4)
+    low, slow, held = (
+        u(6, 12),
+        u(4, 10),
+        -np.sum(plant.gravity) * np.sin(q_operating) / plant.torque_per_u * u(0.9, 1.1),
+    )
+    gain = plant.torque_per_u * plant.scale / plant.inertia.sum()
+    lift = max(np.sum(plant.gravity) * np.cos(q_operating) / plant.inertia.sum(), 0.0)
+    theta = np.geomspace(1e-4, np.pi, 2000)
+    for _ in range(40):
+        natural = bandwidth / 1.5
+        kp, kd = (natural**2 + lift) / gain, 2 * zeta * natural / gain
+        ki = kp * natural / slow if kind else 0.0
+        soft = 1 / (low * bandwidth) if kind == 2 else 0.0
+        law = _pid(kp, kd, ki, 1 / (times * bandwidth), soft, plant.dt_s, on_output, float(held))
+        nearest = np.min(np.abs(1 + loop_gain(plant, q_operating, law, theta / plant.dt_s)))
+        if loop_radius(plant, q_operating, law) < 1 and nearest > 1 / 2.8:
+            return law, bandwidth
+        bandwidth *= 0.9
+        if lift and bandwidth < 2 * np.sqrt(lift):  # an unstable plant needs speed: give up filters instead
+            bandwidth, kind, times, low = 4 * np.sqrt(lift), min(kind, 1), 2 * times, 2 * low
+    raise RuntimeError(f"no PID holds {plant}")

@@ -1,0 +1,172 @@
+"""Inertias, springs with play, gravity and dry friction under a sampled controller; numpy and numba only.
+
+m_i q_i'' = torques of springs + g_i sin(q_i) - c_i q_i' - dry friction, the motor on inertia 0. Fixed fine
+step, second order: half a drift, a kick by all torques in the middle, half a drift (position Verlet). Dry
+friction is solved inside the kick (an inertia sticks exactly, at zero speed), or is a LuGre bristle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import scipy.linalg
+
+Array = Any
+
+
+class Law(NamedTuple):
+    """x+ = A x + B [r, y] + L (clipped u - u), u = bias + C x + D [r, y]."""
+
+    A: Array  # (n, n)
+    B: Array  # (n, 2)
+    C: Array  # (n,)
+    D: Array  # (2,)
+    L: Array  # (n,), anti-windup
+    bias: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """SI units; the output is scale q[out], the input u with torque_per_u u on inertia 0."""
+
+    inertia: Array  # (N,)
+    viscous: Array  # (N,)
+    gravity: Array  # (N,), N m: + g sin(q), zero is upright
+    springs: Array  # (S, 5): from, to, stiffness, damping, half of the play in rad
+    friction: Array  # (N, 5): sliding N m, breakaway N m, Stribeck speed, bristle N m/rad or 0, its damping
+    ripple: Array  # (3,): N m, periods per rad, phase
+    torque_per_u: float
+    out: int
+    scale: float
+    dt_s: float
+    delay: int  # 0 or 1 samples of computation
+    count: float  # of the encoder, in output units
+    limit: float  # of the input
+
+    def linear(self, q_operating: float = 0.0) -> tuple[Array, Array, Array, Array]:
+        """A, B, C of the friction-free continuous plant from u to y, play closed, and its poles in 1/s."""
+        n = self.inertia.size
+        stiff, damp = -np.diag(self.gravity * np.cos(q_operating)), np.diag(self.viscous)
+        for i, j, k, d, _ in self.springs:
+            across = np.zeros(n)
+            across[int(i)], across[int(j)] = 1, -1
+            stiff, damp = stiff + k * np.outer(across, across), damp + d * np.outer(across, across)
+        a = np.block(
+            [[np.zeros((n, n)), np.eye(n)], [-stiff / self.inertia[:, None], -damp / self.inertia[:, None]]]
+        )
+        b, c = np.zeros((2 * n, 1)), np.zeros((1, 2 * n))
+        b[n, 0], c[0, self.out] = self.torque_per_u / self.inertia[0], self.scale
+        return a, b, c, np.linalg.eigvals(a)
+
+    def sampled(self, q_operating: float = 0.0) -> tuple[Array, Array, Array]:
+        """A, B, C of the friction-free plant at the sampling instants: zero-order hold, delay included."""
+        a, b, c, _ = self.linear(q_operating)
+        n = a.shape[0]
+        both = scipy.linalg.expm(np.block([[a, b], [np.zeros((1, n + 1))]]) * self.dt_s)
+        if not self.delay:
+            return both[:n, :n], both[:n, n:], c
+        both[n, n] = 0.0  # the command waits one sample in the last state
+        return both, np.eye(n + 1)[:, n:], np.append(c, [[0.0]], 1)
+
+    def step_s(self) -> float:
+        """Fine step: a hundredth of a radian of the fastest mode, a twentieth of the stiffest bristle."""
+        fastest = np.max(np.abs(self.linear()[3]))
+        bristle = np.sqrt(np.max(self.friction[:, 3] / self.inertia))
+        return float(min(2e-5, 0.01 / max(fastest, 1e-9), 0.05 / max(bristle, 1e-9)))
+
+    def run(
+        self, law: Law, reference: Array, q_start: float, noise: Array, count_from: int = 0
+    ) -> dict[str, Array]:
+        """The loop from rest at q_start. reference (T,), noise (T,) in output units.
+
+        y: encoder; u: command; applied: after the limit; true: output without encoder; speed: of inertia 0
+        at the samples, rad/s; friction_Nm: friction work over path from sample `count_from` on, all inertias.
+        """
+        sub = int(np.ceil(self.dt_s / self.step_s()))
+        names = ("y", "u", "applied", "true", "speed", "work", "path")
+        one = [np.ascontiguousarray(each, float) for each in law[:5]]
+        p = self
+        parts = p.inertia, p.viscous, p.gravity, p.springs, p.friction, p.ripple, p.torque_per_u
+        sensor = p.out, p.scale, p.delay, p.count, p.limit
+        signals = np.ascontiguousarray(reference, float), float(q_start), np.ascontiguousarray(noise, float)
+        every = _run(sub, p.dt_s / sub, *parts, *sensor, *one, float(law.bias), *signals, count_from)
+        got = dict(zip(names, every, strict=True))
+        got["friction_Nm"] = np.sum(got.pop("work") / np.maximum(got.pop("path"), 1e-12))
+        return got
+
+
+def response(a: Array, b: Array, c: Array, omega_rad_s: Array, dt_s: float) -> Array:
+    """C (z - A)^-1 B at z = exp(j omega dt), (F,)."""
+    z = np.exp(1j * np.asarray(omega_rad_s) * dt_s)
+    states = np.linalg.solve(
+        z[:, None, None] * np.eye(a.shape[0]) - a, np.broadcast_to(b + 0j, (z.size, *b.shape))
+    )
+    return (c @ states)[:, 0, 0]
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _run(sub, h, m, c, g, springs, friction, ripple, kt, out, scale, delay, count, limit, A, B, C, D, L, bias,
+         r, q_start, noise, count_from):  # fmt: skip
+    n, size, states = r.size, m.size, A.shape[0]
+    y, u, applied, true, speed = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    q, v, acc, z, f = np.full(size, q_start), np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
+    work, path = np.zeros(size), np.zeros(size)
+    x, new = np.zeros(states), np.zeros(states)
+    waiting = bias
+    for t in range(n):
+        true[t], speed[t] = q[out] * scale, v[0]
+        y[t] = true[t] + noise[t]
+        if count > 0:
+            y[t] = np.round(y[t] / count) * count
+        command = bias + D[0] * r[t] + D[1] * y[t]
+        for i in range(states):
+            command += C[i] * x[i]
+        clipped = min(max(command, -limit), limit)
+        for i in range(states):
+            new[i] = B[i, 0] * r[t] + B[i, 1] * y[t] + L[i] * (clipped - command)
+            for j in range(states):
+                new[i] += A[i, j] * x[j]
+        x[:] = new
+        u[t] = command
+        applied[t] = waiting if delay else clipped
+        waiting = clipped
+        for _ in range(sub):
+            for i in range(size):
+                q[i] += 0.5 * h * v[i]
+                f[i] = g[i] * np.sin(q[i])
+            f[0] += kt * applied[t] + ripple[0] * np.sin(ripple[1] * q[0] + ripple[2])
+            for s in range(springs.shape[0]):
+                i, j = int(springs[s, 0]), int(springs[s, 1])
+                twist, play = q[i] - q[j], springs[s, 4]
+                if abs(twist) > play:  # without play: always, but for a point
+                    twist -= np.sign(twist) * play
+                    # Speeds of the middle of the step, from the last acceleration.
+                    rate = v[i] - v[j] + 0.5 * h * (acc[i] - acc[j])
+                    torque = springs[s, 2] * twist + springs[s, 3] * rate
+                    f[i] -= torque
+                    f[j] += torque
+            for i in range(size):
+                before = v[i]
+                low, high, slow = friction[i, 0], friction[i, 1], friction[i, 2]
+                level = low + (high - low) * np.exp(-((before / slow) ** 2))
+                if friction[i, 3] > 0:
+                    grown = (z[i] + h * before) / (1 + h * friction[i, 3] * abs(before) / level)
+                    force = friction[i, 3] * grown
+                    # Damped where it creeps only, or the bristle would add energy at speed.
+                    force += friction[i, 4] * np.exp(-((before / slow) ** 2)) * (grown - z[i]) / h
+                    z[i] = grown
+                    v[i] = ((m[i] - 0.5 * h * c[i]) * before + h * (f[i] - force)) / (m[i] + 0.5 * h * c[i])
+                else:
+                    free = (m[i] - 0.5 * h * c[i]) * before + h * f[i]
+                    kept = max(abs(free) - h * level, 0.0)
+                    force = (free - np.sign(free) * kept) / h
+                    v[i] = np.sign(free) * kept / (m[i] + 0.5 * h * c[i])
+                acc[i] = (v[i] - before) / h
+                q[i] += 0.5 * h * v[i]
+                if t >= count_from:
+                    work[i] += force * v[i] * h
+                    path[i] += abs(v[i]) * h
+    return y, u, applied, true, speed, work, path
