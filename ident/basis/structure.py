@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident.basis.functions import all_pass_signal
 from ident.basis.poles import NO_POLES, Poles
 from ident.data.arrays import ComplexArray, RealArray
 
@@ -81,7 +80,11 @@ def stabilised(y: RealArray, unstable: Poles) -> RealArray:
     plant, B v is even independent of past inputs (the predictor of output-error models of unstable plants;
     Forssell and Ljung, Automatica 36(1), 2000). What y did before the record is a free response of B.
     """
-    return all_pass_signal(unstable, y) if unstable.order else y
+    if not unstable.order:
+        return y
+    from ident.basis.functions import all_pass_signal  # its compiled code is slow to load; options are not
+
+    return all_pass_signal(unstable, y)
 
 
 def driving_input(u: RealArray, integrators: int, delay_samples: int) -> RealArray:
