@@ -433,7 +433,7 @@ def beyond_the_trial(reference, output) -> tuple[SensitivityCheck, tuple[Conditi
     loop = controller().response(omega) * plant().channel.nominal_response(omega)
     size = 1 / np.abs(1 + loop)
     peak, at = float(size.max()), float(omega[np.argmax(size)])
-    names = ("arm as identified", "arm as identified, a tenth of the size")
+    names = ("arm as identified", "arm as identified, reference ten times smaller")
     rows = [
         MeasuredPeak(
             name=name,

@@ -293,7 +293,7 @@ def test_simulate_identify_design_hand_over_files(flexlink, tmp_path):
     )
     assert true["frequency_Hz"] == pytest.approx(mode["frequency_Hz"], rel=0.03)
     (row,) = [row["value"] for row in found.document()["table"] if row["label"] == "mode"]
-    assert f"true of the linear arm {true['frequency_Hz']:.3g} Hz" in row
+    assert f"true (linear arm): {true['frequency_Hz']:.3g} Hz" in row
     assert min(numbers["fit_validation_percent"].values()) > 98
     specification = tmp_path / "specification.toml"
     specification.write_text("bandwidth_rad_s = 1.5\neffort_limit = 60.0\ncontroller_order = 2\n")

@@ -222,7 +222,7 @@ def test_without_validation_data_the_page_warns(undrawn, tmp_path):
     [
         ({}, "Structures tried; the smallest criterion wins."),
         ({"n_real": 1}, "n_real = 1 was specified, the smallest criterion decides the rest."),
-        ({"n_real": 1, "n_pairs": 2}, "n_real = 1 and n_pairs = 2 was specified; the criterion"),
+        ({"n_real": 1, "n_pairs": 2}, "n_real = 1 and n_pairs = 2 were specified; the criterion"),
     ],
 )
 def test_the_page_says_who_chose_the_order(undrawn, tmp_path, chosen, words):
@@ -351,7 +351,7 @@ def test_page_tells_of_any_order_whole_responses_and_reference_filter(tmp_path, 
     # Made up: the bound for any order, and a worst case of the ellipses that holds for 990 of 1000 draws.
     assert f"Order 1 reaches γ = {at_most(gamma)} (needed: 1 or less); a higher order" in text
     assert "(lower bound for any order: 0.798)" in text
-    assert "any order 0.8 such a controller is known" in text
+    assert "any order 0.8 such a controller was found" in text
     assert "Of 1000 models drawn from the posterior, 99 % stay within the worst case" in text
     assert "99 % (98.17 % to 99.46 %)" in text
     assert "All frequencies together: checked on models drawn from the posterior" in text

@@ -223,7 +223,7 @@ def test_sensitivity_measured_on_the_arm_is_the_predicted_one(run):
     found = run.closed_loop.check.sensitivity
     assert [row.name for row in found.measured] == [
         "arm as identified",
-        "arm as identified, a tenth of the size",
+        "arm as identified, reference ten times smaller",
     ]
     assert abs(found.measured[0].off_nominal_percent) < 5
     assert found.nominal_peak <= found.certified_peak * (1 + 1e-6)

@@ -45,7 +45,7 @@ def test_a_pair_that_is_no_mode_says_so_and_has_no_truth():
     assert matched == (None, true[0], None, None)
     none = "slow or overdamped pair"
     assert [said("pair_kind", found, mode) for mode in found.modes] == [none, "mode", "mode", none]
-    assert said("true_mode", matched, 1) == "true of the linear arm 7.6 Hz, damping 0.01"
+    assert said("true_mode", matched, 1) == "true (linear arm): 7.6 Hz, damping 0.01"
     assert said("true_mode", matched, 2) == said("true_mode", (), 0) == ""
 
 

@@ -51,7 +51,7 @@ def draw_simulation(results: PaperResults) -> Figure:
     ours = shown.models["GOBF"].frequency_response(omega)
     curves: Curves = {
         "simulated plant": (shown.truth, TRUTH_LINE),
-        "GOBF, DIRECT alone in the raw box": (results.recipe.frequency_response(omega), RECIPE_LINE),
+        "GOBF, DIRECT alone in (x, beta, gamma)": (results.recipe.frequency_response(omega), RECIPE_LINE),
         "GOBF, this project": (ours, METHOD_LINES["GOBF"]),
     }
     return _bode(shown, curves, "Simulation: plant and GOBF model of order 4")

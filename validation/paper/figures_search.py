@@ -55,7 +55,11 @@ def _surface(figure: Figure, axes: Axes, study: SurfaceStudy) -> None:
     inside = [(i, j) for i, j in minima if 0 < i < last[0] and 0 < j < last[1]]
     border = [point for point in minima if point not in inside]
     marks: tuple[tuple[list[tuple[int, int]], str, dict[str, Any]], ...] = (
-        (border, "lowest points at the border", {"marker": "v", "ms": 7, "mfc": "white", "mec": "black"}),
+        (
+            border,
+            "border points lower than their neighbours",
+            {"marker": "v", "ms": 7, "mfc": "white", "mec": "black"},
+        ),
         (inside, "minima inside", {"marker": "*", "ms": 15, "mfc": style.HIGHLIGHT, "mec": "black"}),
     )
     for points, label, marker in marks:
@@ -91,7 +95,12 @@ def _counts(axes: Axes, counts: tuple[MinimaCount, ...]) -> None:
     place = np.arange(len(counts))
     for offset, values, colour, label in (
         (-0.2, [count.inside for count in counts], style.HIGHLIGHT, "grid minima inside the window"),
-        (0.2, [count.border for count in counts], style.MEASURED, "lowest points at its border"),
+        (
+            0.2,
+            [count.border for count in counts],
+            style.MEASURED,
+            "border points lower than their neighbours",
+        ),
     ):
         axes.bar(place + offset, values, width=0.36, color=colour, label=label)
         for x, value in zip(place + offset, values, strict=True):

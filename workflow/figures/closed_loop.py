@@ -295,7 +295,7 @@ def draw_friction(run: RunView) -> Figure | None:
         errors.plot(*outline(time_s, error, 400), **look, label=words)
     for sign in (-1, 1):
         errors.axhline(
-            sign * found.error_at_rest, **style.LIMIT_LINE, label="largest error that friction holds"
+            sign * found.error_at_rest, **style.LIMIT_LINE, label="largest error that friction can hold"
         )
     errors.set(xlabel="time [s]", title="Error on a slow sine")
     errors.set_xlim(0.0, float(time_s[-1]))

@@ -209,6 +209,6 @@ def _faint(axes: Axes, response: FrequencyUncertainty) -> None:
         color=style.MEASURED,
         lw=0.8,
         alpha=0.4,
-        label="gain straight from the records (own log scale)",
+        label="gain computed from the records (own log scale)",
     )
     axes.set_xlim(omega[0], omega[-1])

@@ -97,7 +97,7 @@ def sensitivity_on_arm(stage: StageInput, controller: Controller, transient_samp
     certified = certificate.plants[0].worst_peak_sensitivity
     arms: list[tuple[str, tuple[dict[str, Any], ...], float]] = [
         ("arm as identified", (), 1.0),
-        ("arm as identified, a tenth of the size", (), SMALL),
+        ("arm as identified, reference ten times smaller", (), SMALL),
     ]
     if options.effects:
         arms.append(("arm of the closed-loop check", options.effects, 1.0))
