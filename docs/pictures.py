@@ -1,4 +1,4 @@
-"""The pictures of README and of the first page of the site: `python docs/pictures.py` draws them anew."""
+"""The pictures of README and of the first page of the site: `python docs/pictures.py` draws them again."""
 
 from __future__ import annotations
 

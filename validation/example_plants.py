@@ -106,7 +106,7 @@ class LinkUncertainty:
         return centre, stacked([*columns, disc, disc.scaled(1j)])
 
     def draw(self, rng: np.random.Generator, draws: int) -> Callable[[Real], Complex]:
-        """Whole responses: the seven parameters normal with their spreads (drawn again while not positive),
+        """Posterior samples: the seven parameters normal with their spreads (drawn again while not positive),
         put into the formula of G, plus the isotropic part.
 
         The isotropic part is |G_nominal| c sqrt(1 + (omega/20)^4) n(omega) with n complex of unit variance in

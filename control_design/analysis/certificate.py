@@ -71,8 +71,8 @@ class Certificate:
     -1, and every item of the specification is met: for all frequencies on plants where
     `PlantVerdict.all_frequencies` is possible, else on the dense grid or the plant's own. gamma: largest
     weighted worst case on the dense grid (<= 1 met). gamma_bound: upper bound of it for all frequencies, or
-    None where some plant allows no proof. joint: calibration of the ellipses to whole responses, where asked
-    for; the ellipses checked are then those of the calibrated level where it is above the given one.
+    None where some plant allows no proof. joint: calibration of the ellipses to posterior samples, where
+    specified; the ellipses checked are then those of the calibrated level where it is above the given one.
     resonances: pole pairs of the controller with a damping ratio below `LIGHT_CONTROLLER_POLES`.
     """
 

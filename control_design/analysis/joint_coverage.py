@@ -1,4 +1,4 @@
-"""Joint coverage: the ellipse level at which the certified worst case holds for whole responses.
+"""Joint coverage: the ellipse level at which the certified worst case holds for posterior samples.
 
 Ellipses at 95 % per frequency do not hold a whole response with 95 %, and a band that does (simultaneous
 coverage) is wider than the worst case needs: a response may leave its ellipses where nothing is at stake.
@@ -40,7 +40,7 @@ class ResponseDraws(Protocol):
     """What an uncertainty of one's own offers to have its joint coverage calibrated."""
 
     def draw(self, rng: np.random.Generator, draws: int) -> Responses:
-        """Function of omega (F,) that gives the same `draws` whole responses (draws, F) at every call."""
+        """Function of omega (F,) that gives the same `draws` posterior samples (draws, F) at every call."""
         ...
 
 
@@ -144,7 +144,7 @@ class SampledGamma:
 
 
 class SampledLoop:
-    """One plant and controller on one grid, to draw whole responses for.
+    """One plant and controller on one grid, to draw posterior samples for.
 
     Raises ValueError if an uncertainty cannot be drawn from.
     """
@@ -209,7 +209,7 @@ class SampledLoop:
         return stable
 
     def gamma(self, rng: np.random.Generator, draws: int) -> SampledGamma:
-        """Draw whole responses and evaluate them (a Monte Carlo check)."""
+        """Draw posterior samples and evaluate them (a Monte Carlo check)."""
         other = None if self.plant.performance is None else _drawn(self.plant.performance)
         asked = any(each.channel is not None and np.any(each.own > 0) for each in self.data.weightings)
         gamma, stable, distance = np.zeros(draws), np.zeros(draws, dtype=bool), np.zeros(draws)
@@ -263,7 +263,7 @@ def _chunks(draws: int) -> Iterator[tuple[slice, int]]:
 
 
 def _drawn(channel: Channel) -> Draw:
-    """How whole responses of a channel are drawn; ValueError where they cannot be."""
+    """How posterior samples of a channel are drawn; ValueError where they cannot be."""
     uncertainty: Any = channel.uncertainty
     if uncertainty is None:
         return lambda rng, draws: (

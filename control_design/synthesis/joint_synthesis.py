@@ -1,4 +1,4 @@
-"""Synthesis where a joint coverage is asked: design, draw whole responses, guard against unstable ones,
+"""Synthesis where a joint coverage is asked: design, draw posterior samples, guard against unstable ones,
 again.
 
 The weighted worst case is that of the ellipses at their level (say 95 %); stability is asked of nearly all

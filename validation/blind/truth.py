@@ -1,6 +1,6 @@
 """The machine that makes the records of the blind protocol: a rig, effects of the list, and some beyond it.
 
-Equations as in the case format's description, written anew: nothing is taken from `plant`.
+Equations as in the case format's description, written independently: nothing is taken from `plant`.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ def run_from_files(
 def rebuild_report(
     run: RunDirectory, also: Iterable[str] = (), progress: Progress | None = None
 ) -> RunSummary:
-    """Write report.html anew from the stages of a finished run. Raises InputError when a stage is missing.
+    """Write report.html again from the stages of a finished run. Raises InputError when a stage is missing.
 
     also: kinds of file for its pictures beside SVG, pdf or png.
     """

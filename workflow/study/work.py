@@ -126,7 +126,7 @@ class _Work:
                 raise InputError(f"the base cannot be identified: {reason}")
 
     def compute(self, points: Sequence[Point | Contradiction]) -> list[PointRow]:
-        """The rows of a batch: what is finished is taken up, what shares a controller goes together."""
+        """The rows of a batch: what is finished is kept, what shares a controller goes together."""
         rows = {
             point.name: row_without_run(point, "impossible", point.refusal)
             for point in points
@@ -186,7 +186,7 @@ class _Work:
             self.finished += 1
             self.good += row.good
         message = f"{self.finished} of {self.count}, {self.good} certified"
-        # The time left follows from the points computed now; those taken up took none.
+        # The time left follows from the points computed now; those kept took none.
         share = (self.finished - self.taken_up) / max(self.count - self.taken_up, 1)
         self.progress.update("points", min(share, 1.0), message)
 

@@ -1,4 +1,4 @@
-"""The design, its certificate, for how many whole responses of the posterior the worst case holds, what a
+"""The design, its certificate, for how many posterior samples the worst case holds, what a
 controller of any order could reach, and the reference filter (u = K (F r - y)), designed after K."""
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def certify_asked(
 
 
 def undrawable(plants: Sequence[UncertainPlant]) -> str | None:
-    """Why whole responses of these plants cannot be drawn; None where they can."""
+    """Why posterior samples of these plants cannot be drawn; None where they can."""
     drawn = False
     for plant in plants:
         for channel in (plant.channel, plant.performance):

@@ -42,7 +42,7 @@ def run_pipeline(
 
     `config_text` is kept as config.toml (the file as the user wrote it; `called` in complaints); `resume`
     takes up a run that is there, `replace` starts it afresh; `page` is the stage that comes last and writes
-    the page; `c_code` are the fields of `Dialect` that are stated, kept with the run for when it is taken up.
+    the page; `c_code` are the fields of `Dialect` that are stated, kept with the run for when it is resumed.
     A result that is not certified is no error: the page is written all the same and `RunSummary.certified`
     says so.
 
@@ -92,7 +92,7 @@ def run_pipeline(
 
 
 def rebuild_page(run: RunDirectory, page: Stage, progress: Progress | None = None) -> RunSummary:
-    """Perform the last stage anew on a finished run. Raises InputError when a stage is missing."""
+    """Perform the last stage again on a finished run. Raises InputError when a stage is missing."""
     given = StageInput(config_of(run), RunResults(run), progress or Progress())
     given.progress.plan([(page.name, page.expected_s)])
     with run.locked():

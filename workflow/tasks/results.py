@@ -282,8 +282,8 @@ class UncertaintyResult:
     equivalent: EquivalentFriction | None = None
 
     def plant(self, config: RunConfig, *, behind_friction: bool = False) -> UncertainPlant:
-        """What the controller is designed for: control channel and first performance channel; or the linear
-        arm behind its friction, where the ellipses are about amplitudes."""
+        """What the controller is designed for: control channel and first performance channel; or the
+        friction-free dynamics, where the ellipses are about amplitudes."""
         key = config.control_index, config.performance_index, behind_friction
         if key not in self._plants:
             control = self.channels[key[0]].in_plant(behind_friction)

@@ -77,7 +77,7 @@ def design_filter(stage: StageInput) -> ReferenceFilterResult:
 
 
 def find_amplitude_cost(stage: StageInput) -> AmplitudeCost:
-    """A design for the arm behind its friction, certified there and over the amplitudes; empty where none are
+    """A design for the friction-free dynamics, certified there and over the amplitudes; empty where none are
     described, or the run itself has no controller."""
     config, own = stage.config, stage.results.design.controller
     if not config.control_channel.uncertainty.about_amplitudes or own is None:
