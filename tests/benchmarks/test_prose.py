@@ -21,8 +21,8 @@ def test_few_sentences_are_long(name):
 
 
 def test_no_words_of_our_own():
-    found = {path.name: prose.OWN.findall(" ".join(prose.sentences(path))) for path in prose.files()}
-    assert not any(found.values()), found
+    found = [sentence for path in prose.files() for sentence in prose.sentences(path)]
+    assert not [sentence for sentence in found if prose.OWN.search(sentence)]
     assert prose.OWN.search("Nothing is promised of the arm behind its friction")
 
 
