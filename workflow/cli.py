@@ -279,6 +279,64 @@ def look(
     _show(look_at_log(log, time=time, time_unit=time_unit, decimal=decimal, out=out), as_json)
 
 
+@app.command(cls=_OfSettings, short_help="Write a configuration that runs, from logs.")
+def init(
+    log: Annotated[
+        list[Path],
+        typer.Argument(help="CSV or other tables, npz, MAT, ... (docs/logs.md); the last one validates."),
+    ],
+    out: Annotated[Path, typer.Option(help="Write the configuration here (TOML), for `flexlink run`.")],
+    input_name: Annotated[
+        str | None,
+        typer.Option("--input", help="Name of the input column [default: as names and units say]"),
+    ] = None,
+    output_name: Annotated[str | None, typer.Option("--output", help="Name of the output column.")] = None,
+    reference: Annotated[
+        str | None, typer.Option(help="Name of the reference column of logs made in closed loop.")
+    ] = None,
+    time: Annotated[str | None, typer.Option(help="Name of the time column.")] = None,
+    time_unit: Annotated[str | None, typer.Option(help=_LOGS)] = None,
+    dt_s: Annotated[float | None, typer.Option(help="Sampling period [s], without a time column.")] = None,
+    scale: Annotated[
+        list[str] | None, typer.Option(help="COLUMN=FACTOR (repeatable).", metavar="TEXT")
+    ] = None,
+    unit: Annotated[
+        list[str] | None, typer.Option(help="COLUMN=UNIT of the scaled quantity (repeatable).")
+    ] = None,
+    unwrap: Annotated[
+        list[str] | None, typer.Option(help="COLUMN=PERIOD of a column that wraps [default: as it shows]")
+    ] = None,
+    decimal: Annotated[str | None, typer.Option(help=_LOGS)] = None,
+    input_limit: Annotated[float | None, typer.Option(help=_LOGS)] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Write over what is at --out.")] = False,
+    time_limit: TimeLimit = None,
+    as_json: Json = False,
+) -> None:
+    """Look at logs and write a configuration that runs: columns, roles, structure and a specification."""
+    need(*log)
+    from workflow.commands.init import init as write_configuration
+
+    _show(
+        write_configuration(
+            log,
+            out,
+            input_name=input_name,
+            output_name=output_name,
+            reference=reference,
+            time=time,
+            time_unit=time_unit,
+            dt_s=dt_s,
+            scale={name: _number("--scale", text) for name, text in _named("--scale", scale).items()},
+            units=_named("--unit", unit),
+            unwrap={name: _number("--unwrap", text) for name, text in _named("--unwrap", unwrap).items()},
+            decimal=decimal,
+            input_limit=input_limit,
+            replace_file=replace,
+        ),
+        as_json,
+    )
+
+
 @app.command(cls=_OfSettings, short_help="Identify one channel from log files; one-page report.")
 def identify(
     log: Annotated[

@@ -1,10 +1,10 @@
-"""Which column of a log is time, input and output, where names and units leave no doubt."""
+"""Which column of a log is time, input, output and reference, where names and units leave no doubt."""
 
 from __future__ import annotations
 
 import re
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,31 +17,43 @@ _INPUT = re.compile(
     re.I,
 )
 _OUTPUT = re.compile(
-    r"(y|output|angle|winkel|position|pos|theta|phi|alpha|q|tip|speed|velocity|drehzahl|encoder|counts|hub)"
+    r"(y|output|angle|winkel|position|pos|theta|phi|alpha|q|tip|speed|velocity|drehzahl|encoder|enc|counts|hub)"
     r"(?![a-z])",
     re.I,
 )
 # What the motion should be: the command of a control loop, neither its drive nor what a sensor read.
 _WISHED = re.compile(
-    r"(^|[^a-z])(ref|reference|setpoint|set_point|desired|target|soll|sollwert|des)(?![a-z])", re.I
+    r"(^|[^a-z])(ref|reference|setpoint|set_point|desired|target|soll|sollwert|des|demand|goal)(?![a-z])|"
+    r"(^|[^a-z])(cmd|command|commanded)_?(pos|position|angle|theta|q|speed|vel|velocity)(?![a-z])|"
+    r"(^|[^a-z])(pos|position|angle|theta|q|speed|vel|velocity)_?(cmd|command|commanded)(?![a-z])",
+    re.I,
 )
+# A column of nothing but this name and a unit is the reference of textbooks.
+_TEXTBOOK = re.compile(r"r", re.I)
+# The difference of two other columns.
+_ERROR = re.compile(r"(^|[^a-z])(e|err|error|fehler|abweichung|regelabweichung|residual)(?![a-z])", re.I)
 # Of a PLC's variable, its type: rVoltage, lrAngle.
 _PREFIX = re.compile(r"^(l?r|f|n|i|di|ui|w)(?=[A-Z])")
 _DRIVEN = re.compile(r"[mkµμ]?(V|A|N|Nm)")
 _MOVED = re.compile(r"[mµμ]?(rad|deg|m)((/|_)s2?|/s\^2|/s²)?|°|grad|[cm]m|rpm|u/min|counts?|ticks?", re.I)
+# Of what changes per time.
+_RATE = re.compile(r"/s|_s|rpm|u/min|/min|hz", re.I)
+_RATE_NAME = re.compile(r"(^|[^a-z])(speed|velocity|vel|drehzahl|omega|accel\w*|acc|rate|rpm)(?![a-z])", re.I)
 
 
 @dataclass(frozen=True)
 class Roles:
-    """Names of the columns; time is None where no column looks like it."""
+    """Names of the columns; time and reference are None where no column looks like it."""
 
     time: str | None
     input: str
     output: str
+    reference: str | None = None
 
 
-def roles_of(table: Table, log: str, **stated: str | None) -> Roles:
+def roles_of(table: Table, log: str, command: str = "identify", **stated: str | None) -> Roles:
     """The columns of one channel. stated: input, output, time and reference as far as the user named them.
+    log, command: of the command line that a complaint offers.
 
     Raises ValueError where a role has no column or several, or where a reference beside them may mean a
     closed loop: it lists all columns, and says what to type.
@@ -49,9 +61,10 @@ def roles_of(table: Table, log: str, **stated: str | None) -> Roles:
     moving = [name for name in table.names if _is_signal(table, name)]
     time = stated.get("time") or time_of(table)
     rest = [name for name in moving if name not in (time, *stated.values())]
-    wished = [name for name in rest if _WISHED.search(name)]
+    wished = [name for name in rest if _is_wished(table, name)]
     inputs = _not_in(wished, [name for name in rest if _says(table, name, _DRIVEN, _INPUT)])
     outputs = _not_in(wished, [name for name in rest if _says(table, name, _MOVED, _OUTPUT)])
+    outputs = _not_in([name for name in outputs if _ERROR.search(name)], outputs)
     input_, output = stated.get("input") or _only(inputs), stated.get("output") or _only(outputs)
     named = stated.get("input") and stated.get("output")
     wished = (
@@ -63,7 +76,7 @@ def roles_of(table: Table, log: str, **stated: str | None) -> Roles:
     if outputs and not inputs and not stated.get("input") and set(rest) <= {*outputs, *wished}:
         raise ValueError(
             f"{table.path}: no column looks like an input; it has {listed}. A model needs what drives the "
-            f"machine (in V, A, N or Nm): record it too, or name it: flexlink identify {log} --input NAME"
+            f"machine (in V, A, N or Nm): record it too, or name it: flexlink {command} {log} --input NAME"
         )
     # Of several that fit, two different ones.
     first = input_ or next((name for name in inputs if name != output), "NAME")
@@ -73,8 +86,46 @@ def roles_of(table: Table, log: str, **stated: str | None) -> Roles:
     options += [("--reference", reference)] if reference else []
     times = [] if time else times_in(table)
     options += [("--time", time or times[0])] if time or times else [("--dt-s", "SECONDS")]
-    command = " ".join(f"{option} {shlex.quote(shown(value, 30))}" for option, value in options)
-    raise ValueError(f"{table.path}: which columns? It has {listed}; type: flexlink identify {log} {command}")
+    typed = " ".join(f"{option} {shlex.quote(shown(value, 30))}" for option, value in options)
+    raise ValueError(f"{table.path}: which columns? It has {listed}; type: flexlink {command} {log} {typed}")
+
+
+def roles_with_reference(table: Table, log: str, command: str, **stated: str | None) -> Roles:
+    """As `roles_of`, a reference column found as well: what is wished for the output, in its unit.
+
+    Raises ValueError as there, and where several columns may be the reference: it names them.
+    """
+    if stated.get("reference"):
+        return replace(roles_of(table, log, command, **stated), reference=stated["reference"])
+    moving = [name for name in table.names if _is_signal(table, name) and name not in stated.values()]
+    wished = [name for name in moving if _is_wished(table, name) and not _DRIVEN.fullmatch(table.unit(name))]
+    drives = [name for name in moving if _says(table, name, _DRIVEN, _INPUT)]
+    if not (stated.get("input") or set(drives) - set(wished)):
+        wished = [name for name in wished if name not in drives]
+    output = stated.get("output")
+    if output is None and wished:
+        # Of a position and a speed the one that something is wished for.
+        like = {table.unit(name) for name in wished} - {""}
+        moved = [name for name in moving if name not in wished and _says(table, name, _MOVED, _OUTPUT)]
+        moved = _not_in([name for name in moved if _ERROR.search(name)], moved)
+        output = _only([name for name in moved if table.unit(name) in like]) or _only(moved)
+    roles = roles_of(
+        table, log, command, **{**stated, "output": output, "reference": wished[0] if wished else None}
+    )
+    units = {"", table.unit(roles.output)}
+    fitting = [
+        name
+        for name in wished
+        if name not in (roles.input, roles.output)
+        and (table.unit(name) in units or not table.unit(roles.output))
+    ]
+    if len(fitting) > 1:
+        listed = shown(" and ".join(shown(name, 30) for name in fitting), 90)
+        raise ValueError(
+            f"{table.path}: {listed} may be the reference of '{shown(roles.output, 30)}'; type: flexlink "
+            f"{command} {log} --reference {shlex.quote(shown(fitting[0], 30))}"
+        )
+    return replace(roles, reference=_only(fitting))
 
 
 def _not_in(wished: list[str], names: list[str]) -> list[str]:
@@ -121,6 +172,18 @@ def _is_signal(table: Table, name: str) -> bool:
         return bool(np.ptp(table.columns([name])[name]) > 0)
     except ValueError:
         return True  # not left out for another one in silence: who takes it is told what is wrong with it
+
+
+def is_position(name: str, unit: str) -> bool:
+    """Whether an output is a position by its unit, else by its name; not its speed or acceleration."""
+    if unit:
+        return _RATE.search(unit) is None
+    return _RATE_NAME.search(name) is None
+
+
+def _is_wished(table: Table, name: str) -> bool:
+    bare = re.sub(r"[\W_]*$", "", name.removesuffix(table.unit(name).replace("/", "_")))
+    return _WISHED.search(name) is not None or _TEXTBOOK.fullmatch(bare) is not None
 
 
 def _says(table: Table, name: str, unit: re.Pattern[str], word: re.Pattern[str]) -> bool:

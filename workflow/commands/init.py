@@ -1,0 +1,249 @@
+"""`flexlink init`: a configuration that runs, drafted from logs, with the evidence beside each line."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+from markupsafe import Markup
+
+from ident.data.record import Record
+from ident.data.record_files import read_table
+from ident.data.response_columns import has_response
+from ident.data.roles import Roles, is_position, roles_with_reference
+from ident.data.table import Table
+from ident.data.time_grid import option_for
+from ident.data.wrapping import wraps_at
+from workflow.config.run_config import RunConfig
+from workflow.config.settings import check
+from workflow.engine import codec, storage
+from workflow.engine.errors import InputError, naming
+from workflow.tasks.draft import Draft, draft_of
+from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
+from workflow.tasks.summary import RunSummary
+from workflow.text.templates import environment, rows_of
+
+_SHORT = 60  # letters of a log's name
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A log, or a part of it, in the configuration."""
+
+    path: str
+    validates: bool
+    name: str = ""
+    start: int | None = None
+    stop: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What the template of the configuration shows."""
+
+    logs: tuple[Path, ...]
+    file_name: str
+    roles: Roles
+    reference_stated: bool
+    time_unit: str
+    time_unit_stated: bool
+    repair: bool
+    resample_s: float | None
+    decimal: str | None
+    unwrap: Mapping[str, float]
+    scale: Mapping[str, float]
+    units: Mapping[str, str]
+    input_unit: str
+    output_unit: str
+    limit_stated: bool
+    draft: Draft
+
+    @property
+    def counts(self) -> bool:
+        """Whether the output is in steps of a converter, whose size nobody told."""
+        return self.output_unit.lower() in ("counts", "count", "ticks", "tick", "inc")
+
+
+def init(
+    logs: Sequence[Path],
+    out: Path,
+    *,
+    input_name: str | None = None,
+    output_name: str | None = None,
+    reference: str | None = None,
+    time: str | None = None,
+    time_unit: str | None = None,
+    dt_s: float | None = None,
+    scale: Mapping[str, float] | None = None,
+    units: Mapping[str, str] | None = None,
+    unwrap: Mapping[str, float] | None = None,
+    decimal: str | None = None,
+    input_limit: float | None = None,
+    replace_file: bool = False,
+) -> RunSummary:
+    """Write the configuration of one channel of these logs. Raises InputError, one line."""
+    storage.refuse_in_the_way(logs, [("--out", out)])
+    if out.exists() and not replace_file:
+        raise InputError(f"{out} exists: take another --out, or --replace to write over it")
+    tables = list[Table]()
+    for path in logs:
+        with naming(str(path)):
+            tables.append(read_table(path).with_decimal(decimal))
+            if has_response(tables[-1]):
+                raise ValueError("a frequency response, no log: flexlink design takes it")
+    # The options are what has to be seen of a line that may be cut.
+    typed = shlex.quote(str(logs[0])) if len(logs) == 1 and len(str(logs[0])) < _SHORT else "LOG..."
+    with naming(str(logs[0])):
+        roles = roles_with_reference(
+            tables[0], typed, "init", input=input_name, output=output_name, time=time, reference=reference
+        )
+        if dt_s is not None and time is None:
+            roles = replace(roles, time=None)
+        if roles.time is None and dt_s is None:
+            raise ValueError(
+                f"no column looks like time: type flexlink init {typed} --dt-s SECONDS, or --time NAME"
+            )
+    options = [_stamps(table, roles, time_unit) for table in tables]
+    steps = [float(text.split()[1]) for text in options if text.startswith("--resample-s")]
+    how: dict[str, Any] = {
+        "time": roles.time,
+        "dt_s": dt_s,
+        "time_unit": time_unit if roles.time else None,
+        "references": [roles.reference] if roles.reference else [],
+        "scale": scale,
+        "units": units,
+        "repair": "--repair" in options and not steps,
+        "resample_s": max(steps, default=None),
+        "unwrap": dict(unwrap or {}) or _wrapping(tables, roles.output),
+    }
+    records = []
+    for table in tables:
+        with naming(str(table.path)):
+            record = Record.from_file(table, [roles.input], [roles.output], **how)
+            records.append(record if input_limit is None else record.limited(input_limit))
+    for record in records:
+        refuse_constant_input(record)
+    records = with_common_sampling_time(records)
+    unit_of = {
+        name: (units or {}).get(name, "" if name in (scale or {}) else tables[0].unit(name))
+        for name in (roles.input, roles.output)
+    }
+    with naming("init"):
+        draft = draft_of(
+            records, position=is_position(roles.output, unit_of[roles.output]), limit=input_limit
+        )
+    scaled, stated = dict(scale or {}), dict(units or {})
+    if draft.look.turned:
+        scaled[roles.input] = -scaled.get(roles.input, 1.0)
+        stated |= {roles.input: unit_of[roles.input]} if unit_of[roles.input] else {}
+    column = records[0].time_column
+    found = Found(
+        tuple(logs),
+        shlex.quote(out.name),
+        roles,
+        reference is not None,
+        "s" if column is None else column.unit,
+        time_unit is not None and roles.time is not None,
+        how["repair"],
+        how["resample_s"],
+        decimal,
+        how["unwrap"],
+        scaled,
+        stated,
+        unit_of[roles.input],
+        unit_of[roles.output],
+        input_limit is not None,
+        draft,
+    )
+    text = configuration(found, _entries(logs, out, draft))
+    config = check(RunConfig, tomllib.loads(text), source=str(out), context={"base": out.absolute().parent})
+    storage.write_text(out, text)
+    return RunSummary(
+        title=str(out),
+        sections=rows_of("summary/init.j2", found=found, config=config),
+        numbers={"configuration": config.to_document(), "seen": _numbers(found)},
+        verdict=f"flexlink run --config {shlex.quote(str(out))}",
+    )
+
+
+def configuration(found: Found, records: Sequence[Entry]) -> str:
+    """The TOML text."""
+    filters = (
+        ("toml", _toml),
+        ("toml_key", _toml_key),
+        ("three", lambda value: _toml(float(f"{value:.3g}"))),
+    )
+    template = environment(*filters).get_template("init.toml.j2")
+    return Markup(template.render(found=found, records=records)).unescape() + "\n"
+
+
+def _toml(value: Any) -> str:
+    plain = value.item() if isinstance(value, np.generic) else value
+    return tomlkit.item(plain).as_string()
+
+
+def _toml_key(name: str) -> str:
+    return tomlkit.key(name).as_string()
+
+
+def _stamps(table: Table, roles: Roles, time_unit: str | None) -> str:
+    """The option that takes a log's time stamps, as `option_for`."""
+    if roles.time is None:
+        return ""
+    with naming(str(table.path)):
+        wanted = [roles.time, roles.output] if table.sparse else [roles.time]
+        columns = table.columns(wanted, roles.output if table.sparse else None)
+        stamps, _ = table.seconds(roles.time, columns[roles.time], time_unit)
+        table.increasing(stamps, roles.time)
+        return option_for(stamps)
+
+
+def _wrapping(tables: Sequence[Table], output: str) -> dict[str, float]:
+    """The period at which the output wraps in one of the logs, if it does."""
+    for table in tables:
+        with naming(str(table.path)):
+            period = wraps_at(table.columns([output])[output])
+        if period:
+            return {output: float(period)}
+    return {}
+
+
+def _entries(logs: Sequence[Path], out: Path, draft: Draft) -> list[Entry]:
+    """The last log validates; of one the last part, where it is split."""
+    base = out.absolute().parent
+    paths = [Path(os.path.relpath(path.absolute(), base)).as_posix() for path in logs]
+    if len(logs) == 1:
+        if draft.split_sample is None:
+            return [Entry(paths[0], False)]
+        stem = logs[0].stem
+        return [
+            Entry(paths[0], False, f"{stem}, first part", stop=draft.split_sample),
+            Entry(paths[0], True, f"{stem}, last part", start=draft.split_sample),
+        ]
+    alike = len({path.stem for path in logs}) < len(logs)
+    return [
+        Entry(path, k == len(paths) - 1, f"{k + 1}: {logs[k].stem}" if alike else "")
+        for k, path in enumerate(paths)
+    ]
+
+
+def _numbers(found: Found) -> dict[str, Any]:
+    draft, look = found.draft, found.draft.look
+    return {
+        "roles": codec.plain(found.roles),
+        "told_rad_s": codec.plain(look.told_rad_s),
+        "first_mode": codec.plain(look.mode),
+        "motion": codec.plain(look.motion),
+        "delay_samples": look.delay,
+        "turned": look.turned,
+        "friction": draft.friction,
+        "unstable_per_s": draft.unstable_per_s,
+        "gamma_of_the_quick_model": draft.gamma,
+    }

@@ -1,0 +1,343 @@
+"""What records show within a second: the band they tell, first mode, sign, spring and dry friction."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
+
+from ident.basis.model import GobfModel
+from ident.basis.options import IdentOptions
+from ident.data.arrays import RealArray
+from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.nonparametric import empirical_frf, spectra_of
+from ident.data.record import Record
+from ident.frequency_fit import FrfIdentification, identify_frf
+
+# A response is told where its standard deviation is below this share of it ...
+_TOLD = 0.3
+# ... at this share of the lines just below, and at so many in all: those in between may not be excited.
+_OF_LINES, _FEWEST = 0.2, 3
+# A pole or zero that swings: less damped ones show as a peak or a notch.
+_SWINGS = 0.3
+# Of the rigid motion: well below a notch or peak, with two more derivatives for what bends there, as far up
+# as it explains this share of the command's power.
+_RIGID, _EXPLAINED = 0.5, 0.97
+# A pole pair that the nearest zeros leave less of than this factor is no mode.
+_PROMINENT = 1.5
+# A line with less of the instrument's largest, or of the output's at its highest frequencies, is not excited.
+_EXCITED, _ABOVE_FLOOR = 1e-6, 10.0
+# A term of the motion is there with so many standard deviations, and this share of the rms command below; a
+# spring with a larger one, as slow drift and the sensor's own errors look like a weak one.
+_SURE, _WORTH, _SPRING = 5.0, 0.01, 0.04
+# Least damping that the fit is allowed; a pair that stays there is none that the response shows.
+_LEAST_DAMPING = 1e-3
+# Chi-square by which another delay has to be worse: 3 standard deviations of one unknown.
+_WORSE, _FAR_WORSE = 9.0, 50.0
+_MOST_LINES = 300  # of the fit: more take longer and tell the same structure
+_SLOWEST = 0.1
+_DELAYS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
+
+
+@dataclass(frozen=True)
+class Term:
+    """A coefficient of the rigid motion and whether the records show it: sure, and worth its share of the
+    command."""
+
+    value: float
+    deviation: float
+    share: float
+
+    @property
+    def shown(self) -> bool:
+        return abs(self.value) > _SURE * self.deviation and self.share > _WORTH
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """u = inertia y'' + viscous y' + friction sign(y') + stiffness y + constant, below the first mode; of a
+    speed y the same with one derivative less, without stiffness. In units of the input and the output."""
+
+    inertia: Term
+    viscous: Term
+    friction: Term
+    stiffness: Term | None
+    below_rad_s: float
+    explained: float
+
+    @property
+    def sprung(self) -> bool:
+        """Whether a spring or weight holds the position, or throws it over."""
+        return (
+            self.stiffness is not None
+            and self.stiffness.shown
+            and self.stiffness.share > _SPRING
+            and self.explained > _EXPLAINED
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FirstLook:
+    """told_rad_s: lowest and highest frequency at which the response is told. model: None where nothing
+    explains it. mode: natural frequency [rad/s] and damping ratio of the first. delay: fewest samples that
+    the response allows. turned: the output falls when the command is positive; records and model have the
+    command with its sign changed then."""
+
+    records: tuple[Record, ...]
+    told_rad_s: tuple[float, float] | None = None
+    model: GobfModel | None = None
+    motion: RigidMotion | None = None
+    mode: tuple[float, float] | None = None
+    delay: int = 0
+    turned: bool = False
+
+
+def first_look(records: Sequence[Record], *, position: bool) -> FirstLook:
+    """Of SISO records of one sampling time; by the reference where all have one. position: of the output,
+    else its speed or acceleration."""
+    shortest = min(record.n_samples for record in records)
+    cut = tuple(record.slice(0, shortest) for record in records)
+    response = told_response(cut)
+    if response is None:
+        return FirstLook(cut)
+    told = float(response.omega_rad_s[0]), float(response.omega_rad_s[-1])
+    found = _fitted(response, int(position))
+    motion = _rigid(cut, found, told, position)
+    turned = motion is not None and motion.inertia.shown and motion.inertia.value < 0
+    if turned:
+        cut = tuple(replace(record, input=-record.input) for record in cut)
+        motion = None if motion is None else _turned(motion)
+    if motion is not None and motion.friction.shown and motion.friction.value > 0:
+        # Once more with the friction off the command: it bends the response below and damps the modes.
+        less = [_less_friction(record, motion.friction.value, told[1], position) for record in cut]
+        response = told_response(less) or response
+    elif turned:
+        response = replace(response, centre=-response.centre)
+    sprung = motion is not None and motion.sprung
+    integrators = int(position and not sprung)
+    bounds: dict[str, float] = {}
+    if motion is not None and motion.explained > _EXPLAINED and not sprung:
+        # No mode below, and no pole that is slower than the logs tell.
+        bounds = {"omega_min_rad_s": motion.below_rad_s, "decay_min_per_s": _SLOWEST * told[0], "max_real": 1}
+    found, delay = _delayed(response, _fitted(response, integrators, **bounds), integrators, bounds)
+    model = None if found is None else found.model
+    mode = _first_mode(model, told, 0.0 if motion is None else motion.below_rad_s)
+    return FirstLook(cut, told, model, motion, mode, delay, turned)
+
+
+def _less_friction(record: Record, level: float, below_rad_s: float, position: bool) -> Record:
+    low = butter(3, min(below_rad_s * record.dt_s / np.pi, 0.6), output="sos")
+    sign = _sign(_speed(record, low, position))
+    return replace(record, input=record.input - level * sign[:, None])
+
+
+def _speed(record: Record, low: RealArray, position: bool) -> RealArray:
+    smooth = sosfiltfilt(low, record.output[:, 0] - record.output[:, 0].mean())
+    return np.gradient(smooth, record.dt_s) if position else smooth
+
+
+def _sign(speed: RealArray) -> RealArray:
+    """Its sign, a fiftieth of the usual speed counting as part of the turn."""
+    return np.tanh(speed / max(0.02 * float(np.std(speed)), 1e-300))
+
+
+def told_response(records: Sequence[Record]) -> FrequencyUncertainty | None:
+    """The response at the frequencies where it is told; None where it is not. By the reference, or by the
+    command where that tells nothing."""
+    found = _told_by(records)
+    if found is None and any(record.reference is not None for record in records):
+        found = _told_by([replace(one, reference=None, reference_names=()) for one in records])
+    return found
+
+
+def _told_by(records: Sequence[Record]) -> FrequencyUncertainty | None:
+    half = 1 if len(records) > 2 else 2
+    response, spectra = empirical_frf(records, half_width_lines=half), spectra_of(records, periodic=False)
+    omega = response.omega_rad_s
+    spread = np.sqrt(np.trace(response.covariance, axis1=1, axis2=2))
+    width = 2 * half + 1
+    instrument, output = (
+        np.sum(
+            np.abs(part[:, : omega.size * width].reshape(len(records), omega.size, width)) ** 2, axis=(0, 2)
+        )
+        for part in (spectra.instrument, spectra.output)
+    )
+    floor = float(np.median(output[-max(1, omega.size // 5) :]))
+    told = (spread < _TOLD * np.abs(response.centre)) & (instrument > _EXCITED * instrument.max())
+    told &= output > _ABOVE_FLOOR * floor
+    before = np.concatenate([[0], np.cumsum(told)])
+    first = np.searchsorted(omega, omega / 1.5)
+    k = np.arange(omega.size)
+    dense = (before[k + 1] - before[first]) >= _OF_LINES * (k + 1 - first)
+    last = np.flatnonzero(told & dense)
+    told[last[-1] + 1 if last.size else 0 :] = False
+    if np.count_nonzero(told) < _FEWEST:
+        return None
+    return replace(
+        response, omega_rad_s=omega[told], centre=response.centre[told], covariance=response.covariance[told]
+    )
+
+
+def _fitted(response: FrequencyUncertainty, integrators: int, **known: float) -> FrfIdentification | None:
+    options = {
+        "integrators": integrators,
+        "max_real": 2,
+        "max_pairs": 3,
+        "evaluations": 100,
+        "starts": 2,
+    } | known
+    keep = slice(None, None, -(-response.omega_rad_s.size // _MOST_LINES))
+    response = replace(
+        response,
+        omega_rad_s=response.omega_rad_s[keep],
+        centre=response.centre[keep],
+        covariance=response.covariance[keep],
+    )
+    try:
+        return identify_frf(response, IdentOptions.model_validate(options))
+    except ValueError:  # too few frequencies for the order
+        return None
+
+
+def _delayed(
+    response: FrequencyUncertainty,
+    found: FrfIdentification | None,
+    integrators: int,
+    bounds: Mapping[str, float],
+) -> tuple[FrfIdentification | None, int]:
+    """The fit with the fewest samples of delay that no longer delay beats."""
+    if found is None:
+        return None, 0
+    poles = found.model.poles
+    n_real, n_pairs = poles.real.size - integrators, poles.pairs.size
+    fits = {0: found}
+    for delay in _DELAYS:
+        known = {**bounds, "input_delay_samples": delay, "n_real": n_real, "n_pairs": n_pairs}
+        fit = _fitted(response, integrators, **known)
+        least = min(fits.values(), key=lambda one: one.rss)
+        if fit is None or fit.rss - least.rss > _FAR_WORSE * max(1.0, least.dispersion):
+            break
+        fits[delay] = fit
+    scale = max(1.0, min(one.dispersion for one in fits.values()))
+    best = min(one.rss for one in fits.values())
+    delay = next(delay for delay, one in fits.items() if one.rss - best <= _WORSE * scale)
+    return fits[delay], delay
+
+
+def _swinging(model: GobfModel) -> RealArray:
+    """Natural frequencies [rad/s] of lightly damped poles and zeros, ascending."""
+    zeros = np.asarray(model.zeros())
+    s = np.log(zeros[(np.imag(zeros) > 0) & (np.abs(zeros) > 0)]) / model.dt_s
+    notches = np.abs(s)[np.abs(np.real(s)) < _SWINGS * np.abs(s)]
+    peaks = model.poles.omega_rad_s(model.dt_s)[model.poles.zeta() < _SWINGS]
+    return np.sort(np.concatenate([notches, peaks]))
+
+
+def _first_mode(
+    model: GobfModel | None, told: tuple[float, float], rigid_rad_s: float
+) -> tuple[float, float] | None:
+    """The slowest pair that swings, shows, and is no motion of the rigid machine on a spring."""
+    if model is None:
+        return None
+    z, zeros = model.poles.pairs, np.asarray(model.zeros())
+    omega, zeta = model.poles.omega_rad_s(model.dt_s), model.poles.zeta()
+    found = None
+    for k in np.argsort(omega)[::-1]:
+        # What the pair and the zeros nearest to it make of a unit gain at the pair's frequency.
+        at = np.exp(1j * omega[k] * model.dt_s)
+        nearest = min(np.abs(zeros - z[k]), default=np.inf) if zeros.size else np.inf
+        left = min(nearest, abs(z[k] - z[k].conj())) / abs(at - z[k])
+        inside = max(told[0], rigid_rad_s) < omega[k] < 1.2 * told[1]
+        if 1.05 * _LEAST_DAMPING < zeta[k] < _SWINGS and inside and left > _PROMINENT:
+            found = float(omega[k]), float(zeta[k])
+    return found
+
+
+def _rigid(
+    records: Sequence[Record], found: FrfIdentification | None, told: tuple[float, float], position: bool
+) -> RigidMotion | None:
+    """The rigid motion as far up as it explains the command, else below the first notch or peak."""
+    swinging = np.zeros(0) if found is None else _swinging(found.model)
+    ends = [told[1], *swinging[(swinging > 2 * told[0]) & (swinging < told[1])][::-1]]
+    tried = [rigid_motion(records, _RIGID * float(end), told[1], position=position) for end in ends]
+    motions = [motion for motion in tried if motion is not None]
+    explaining = [motion for motion in motions if motion.explained > _EXPLAINED]
+    return next(iter(explaining or motions[::-1]), None)
+
+
+def rigid_motion(
+    records: Sequence[Record], below_rad_s: float, speed_rad_s: float, *, position: bool
+) -> RigidMotion | None:
+    """Least squares of the command on the motion, both low-passed below a frequency, over all records.
+
+    speed_rad_s: below it the speed whose sign friction has. Two more derivatives stand for what bends below
+    the first mode, a constant in each record for weight and offset. The standard deviations count as many
+    samples as the band holds. None where it holds too few. Neglected: noise in the output's derivatives.
+    """
+    dt_s = records[0].dt_s
+    low, high = (
+        butter(3, min(omega * dt_s / np.pi, 0.6), output="sos")
+        for omega in (below_rad_s, max(speed_rad_s, below_rad_s))
+    )
+    trim = int(np.ceil(2 * np.pi / (below_rad_s * dt_s)))
+    rows, targets = [], []
+    for k, record in enumerate(records):
+        if record.n_samples < max(4 * trim, 100):
+            return None
+        y, u = record.output[:, 0] - record.output[:, 0].mean(), sosfiltfilt(low, record.input[:, 0])
+
+        def derivative(signal: RealArray, times: int) -> RealArray:
+            for _ in range(times):
+                signal = np.gradient(signal, dt_s)
+            return signal
+
+        more, smooth = int(position), sosfiltfilt(low, y)
+        sign = sosfiltfilt(low, _sign(_speed(record, high, position)))
+        of_record = np.zeros((record.n_samples, len(records)))
+        of_record[:, k] = 1.0
+        columns = [derivative(smooth, times + more) for times in (1, 0, 2, 3)]
+        columns += [sign, *([smooth] if position else [])]
+        rows.append(np.column_stack([*columns, of_record])[trim:-trim])
+        targets.append(u[trim:-trim])
+    matrix, target = np.concatenate(rows), np.concatenate(targets)
+    scale = np.sqrt(np.mean(matrix**2, axis=0))
+    if not np.all(scale > 0):
+        return None
+    q, r = np.linalg.qr(matrix / scale)
+    solution = np.linalg.lstsq(r, q.T @ target, rcond=1e-12)[0]
+    independent = target.size * min(1.0, below_rad_s * dt_s / np.pi)
+    if independent < 4 * matrix.shape[1]:
+        return None
+    rss = float(np.sum((target - q @ (r @ solution)) ** 2))
+    noise = rss / (independent - matrix.shape[1]) * independent / target.size
+    spread = np.sqrt(noise * np.sum(np.linalg.pinv(r) ** 2, axis=1) * target.size / independent)
+    total = float(np.std(target))
+
+    def term(k: int) -> Term:
+        return Term(
+            float(solution[k] / scale[k]), float(spread[k] / scale[k]), float(abs(solution[k])) / total
+        )
+
+    return RigidMotion(
+        term(0),
+        term(1),
+        term(4),
+        term(5) if position else None,
+        below_rad_s,
+        1 - rss / total**2 / target.size,
+    )
+
+
+def _turned(motion: RigidMotion) -> RigidMotion:
+    def turn(term: Term) -> Term:
+        return replace(term, value=-term.value)
+
+    return replace(
+        motion,
+        inertia=turn(motion.inertia),
+        viscous=turn(motion.viscous),
+        friction=turn(motion.friction),
+        stiffness=None if motion.stiffness is None else turn(motion.stiffness),
+    )
