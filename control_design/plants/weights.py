@@ -10,7 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from control_design.plants.ellipses import Complex
 
-_INTEGRAL_SHARE = 0.05  # of the corner: where the controller's integrator takes over on an integrating plant
+# Of the corner. SIMC, at its fastest: a quarter of the crossover (Skogestad, J. Process Control 13, 2003).
+_INTEGRAL_SHARE = 0.2
 _ROLLOFF_END = 40.0  # the effort weight flattens this far above its corner, so that it stays proper
 
 
@@ -47,12 +48,12 @@ class RationalWeight(BaseModel):
 def bandwidth_weight(
     bandwidth_rad_s: float, modulus_margin: float, floor: float, *, integral_factors: int = 0
 ) -> RationalWeight:
-    """W1 = (m s + wc)/(s + wc r) times ((s + wc/20)/s)^n, wc = bandwidth sqrt(2 - m^2).
+    """W1 = (m s + wc)/(s + wc r) times ((s + wc/5)/s)^n, wc = bandwidth sqrt(2 - m^2).
 
     |W1| is at least sqrt 2 up to the bandwidth, m = modulus_margin far above it and 1/r at zero frequency, r
     = floor (0: integral). n = integral_factors: a plant that integrates by itself meets a weight of slope one
     without any action of the controller's own integrator, which the optimiser would then make arbitrarily
-    slow; each factor asks for integral action by a twentieth of the corner.
+    slow; each factor asks for integral action by a fifth of the corner, near which the slowest pole then is.
     """
     corner = bandwidth_rad_s * np.sqrt(2.0 - modulus_margin**2)
     numerator, denominator = np.array([modulus_margin, corner]), np.array([1.0, corner * floor])

@@ -124,7 +124,7 @@ def test_weights_are_the_formulas_of_their_words(integrators):
         bandwidth_rad_s=3.0, integrator=True, modulus_margin=0.4, effort_limit=5.0, effort_rolloff_rad_s=40.0
     )
     corner = 3.0 * np.sqrt(2 - 0.4**2)
-    expected = (0.4 * s + corner) / s * ((s + corner / 20) / s) ** integrators
+    expected = (0.4 * s + corner) / s * ((s + corner / 5) / s) ** integrators
     np.testing.assert_allclose(spec.tracking_weight(integrators).at(s), expected, rtol=1e-12)
     limit = spec.limit_weight()
     assert limit is not None

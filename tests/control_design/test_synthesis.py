@@ -88,6 +88,10 @@ def test_integrating_arms_with_integral_action_are_certified(integrators):
     assert certificate.certified, certificate.items
     assert certificate.plants[0].nyquist.required == (integrators + 1) / 2
     assert result.controller.input_limit == 10.0
+    # Asked for by a fifth of the corner; a disturbance is gone within a few times the rise time.
+    corner = 2.0 * np.sqrt(2 - 0.45**2)
+    radius = certificate.plants[0].pole_radius
+    assert -np.log(radius) / plant.dt_s > corner / 10
 
 
 def test_active_damping_through_the_tip_without_tracking():
