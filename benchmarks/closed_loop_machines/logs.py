@@ -163,7 +163,7 @@ def write(one: Machine, folder: Path, truth: Path) -> list[Path]:
     where.mkdir(parents=True, exist_ok=True)
     truth.mkdir(parents=True, exist_ok=True)
     time, reference, command, output = one.draft.columns
-    levels, paths, dt = [], [], one.plant.dt_s
+    levels, paths, moved, dt = [], [], [], one.plant.dt_s
     for log in range(len(one.classes)):
         rng = one.rng(log)
         got, begin = one.record(log, rng)
@@ -182,8 +182,10 @@ def write(one: Machine, folder: Path, truth: Path) -> list[Path]:
         rows = [",".join(table), *map(",".join, zip(*table.values(), strict=True))]
         paths.append(where / f"run{log + 1}.csv.gz")
         paths[-1].write_bytes(gzip.compress(("\n".join(rows) + "\n").encode(), mtime=0))
+        moved.append(got["true"][begin:])
         levels.append(float(got["friction_Nm"]) / one.plant.torque_per_u)
-    (truth / f"{one.name}.json").write_text(json.dumps(facts(one, levels), indent=1) + "\n")
+    known = facts(one, levels) | {"output_range": list(np.percentile(np.concatenate(moved), [5, 95]))}
+    (truth / f"{one.name}.json").write_text(json.dumps(known, indent=1) + "\n")
     return paths
 
 

@@ -141,21 +141,17 @@ def _pid(
     slope, error = np.array([0.0, -1.0]) if on_output else np.array([1.0, -1.0]), np.array([1.0, -1.0])
     steep = kd * (1 - keep) / dt_s  # a backward difference where the filter is faster than the sampling
     c, d = np.array([-steep, 1.0, 0.0]), kp * error + steep * slope
-    a = np.diag([keep, 1.0, soft]) + np.outer([0, 0, 1 - soft], c)
+    a = np.diag([keep, float(ki > 0), soft]) + np.outer([0, 0, 1 - soft], c)
     b = np.array([(1 - keep) * slope, ki * dt_s * error, (1 - soft) * d])
     wind = np.array([0.0, ki * dt_s / kp, 0.0])
     return Law(a, b, (1 - soft) * c + np.array([0, 0, soft]), (1 - soft) * d, wind, bias)
 
 
 def loop_radius(plant: Plant, q_operating: float, law: Law) -> float:
-    """Largest pole modulus of the loop of the friction-free plant; a pole that the controller never feels
-    (the integrator of a PD) is left out."""
+    """Largest pole modulus of the loop of the friction-free plant."""
     a, b, c = plant.sampled(q_operating)
-    felt = np.flatnonzero(np.abs(law.C) + np.abs(law.B).sum(axis=1) > 0)
-    felt = felt[[bool(np.any(law.B[i])) or i == 2 for i in felt]]
-    top = np.hstack([a + b * law.D[1] @ c, b @ law.C[None, felt]])
-    low = np.hstack([law.B[felt][:, 1:] @ c, law.A[np.ix_(felt, felt)]])
-    return float(np.max(np.abs(np.linalg.eigvals(np.vstack([top, low])))))
+    loop = np.block([[a + b * law.D[1] @ c, b @ law.C[None, :]], [law.B[:, 1:] @ c, law.A]])
+    return float(np.max(np.abs(np.linalg.eigvals(loop))))
 
 
 def loop_gain(plant: Plant, q_operating: float, law: Law, omega_rad_s: Any) -> Any:

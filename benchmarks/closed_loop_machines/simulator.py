@@ -42,7 +42,7 @@ class Plant:
     out: int
     scale: float
     dt_s: float
-    delay: int  # 0 or 1 samples of computation
+    delay: int  # samples of computation
     count: float  # of the encoder, in output units
     limit: float  # of the input
 
@@ -66,10 +66,12 @@ class Plant:
         a, b, c, _ = self.linear(q_operating)
         n = a.shape[0]
         both = scipy.linalg.expm(np.block([[a, b], [np.zeros((1, n + 1))]]) * self.dt_s)
-        if not self.delay:
-            return both[:n, :n], both[:n, n:], c
-        both[n, n] = 0.0  # the command waits one sample in the last state
-        return both, np.eye(n + 1)[:, n:], np.append(c, [[0.0]], 1)
+        a, b = both[:n, :n], both[:n, n:]
+        for _ in range(self.delay):  # the command waits one sample in each further state
+            n = a.shape[0]
+            a, c = np.block([[a, b], [np.zeros((1, n + 1))]]), np.append(c, [[0.0]], 1)
+            b = np.eye(n + 1)[:, n:]
+        return a, b, c
 
     def step_s(self) -> float:
         """Fine step: a hundredth of a radian of the fastest mode, a twentieth of the stiffest bristle."""
@@ -115,7 +117,7 @@ def _run(sub, h, m, c, g, springs, friction, ripple, kt, out, scale, delay, coun
     q, v, acc, z, f = np.full(size, q_start), np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
     work, path = np.zeros(size), np.zeros(size)
     x, new = np.zeros(states), np.zeros(states)
-    waiting = bias
+    waiting = np.full(max(delay, 1), bias)
     for t in range(n):
         true[t], speed[t] = q[out] * scale, v[0]
         y[t] = true[t] + noise[t]
@@ -131,8 +133,8 @@ def _run(sub, h, m, c, g, springs, friction, ripple, kt, out, scale, delay, coun
                 new[i] += A[i, j] * x[j]
         x[:] = new
         u[t] = command
-        applied[t] = waiting if delay else clipped
-        waiting = clipped
+        applied[t] = waiting[t % delay] if delay else clipped
+        waiting[t % max(delay, 1)] = clipped
         for _ in range(sub):
             for i in range(size):
                 q[i] += 0.5 * h * v[i]

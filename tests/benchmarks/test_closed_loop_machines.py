@@ -1,5 +1,6 @@
-"""The independent machines: linear response, energy, sticking and sliding as solved between events."""
+"""The independent machines and their judge: response, energy, sticking, violations, settling."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from benchmarks.closed_loop_machines import machines
+from benchmarks.closed_loop_machines.judge import read_law, settles, violations
 from benchmarks.closed_loop_machines.logs import machine
 from benchmarks.closed_loop_machines.simulator import Law, Plant, response
 
@@ -118,3 +120,50 @@ def test_the_reported_belt_is_seed_0_of_series_1():
     assert one.plant.friction[:, 0].sum() / one.plant.torque_per_u == pytest.approx(0.05)
     run, begin = one.record(0, one.rng(0))
     assert 0.4 < np.std(run["u"][begin:]) < 0.6
+
+
+def controller_file(folder, gain=1.0):
+    """A lead of the reported loop's stiffness as a run stores it."""
+    law = machines._pid(1.5 * gain, 0.06 * gain, 0.0, 0.003, 0.0, 1e-3, False, 0.0)
+    file = {"A": law.A.tolist(), "B": law.B[:, :1].tolist(), "C": [law.C.tolist()], "D": [[law.D[0]]]}
+    file |= {"anti_windup_gain": [[0.0]] * 3, "computational_delay_samples": 0, "input_limit": None}
+    (folder / "controller.json").write_text(json.dumps(file))
+    return read_law(folder / "controller.json")[0]
+
+
+def stated(plant, law):
+    """The margins that the true loop has, as a certificate would state them."""
+    theta = np.geomspace(1e-4, np.pi, 100_000)
+    loop = machines.loop_gain(plant, 0.0, law, theta / plant.dt_s)
+    one = np.flatnonzero(np.diff(np.sign(np.abs(loop) - 1)))
+    phase = np.angle(-loop[one])
+    low = np.flatnonzero(np.abs(1 + loop) >= np.sqrt(0.5))
+    margins = {"modulus": np.min(np.abs(1 + loop)), "phase_rad": np.min(np.abs(phase)), "gain_down": 0.0}
+    margins |= {"gain_up": 1.05, "delay_s": np.min(np.mod(phase, 2 * np.pi) / theta[one]) * plant.dt_s}
+    bandwidth = theta[np.flatnonzero(np.abs(1 + loop[low]) < np.sqrt(2))[0]] / plant.dt_s
+    return {"worst_margins": margins, "bandwidth_rad_s": bandwidth}
+
+
+def test_what_the_true_loop_keeps_is_no_violation_and_what_it_does_not_keep_is(tmp_path):
+    one = machine("belt", 0)
+    law = controller_file(tmp_path)
+    verdict = stated(one.plant, law)
+    assert violations(one.plant, 0.0, law, verdict) == []
+    for name in ("modulus", "phase_rad", "delay_s"):
+        better = verdict["worst_margins"] | {name: 1.05 * verdict["worst_margins"][name]}
+        (found,) = violations(one.plant, 0.0, law, verdict | {"worst_margins": better})
+        assert found.startswith(name.split("_")[0])
+    (found,) = violations(one.plant, 0.0, law, verdict | {"bandwidth_rad_s": 2 * verdict["bandwidth_rad_s"]})
+    assert found.startswith("bandwidth")
+    far = verdict["worst_margins"] | {"gain_up": 1e3}
+    assert violations(one.plant, 0.0, law, verdict | {"worst_margins": far})[0].startswith("gain")
+    assert violations(one.plant, 0.0, controller_file(tmp_path, -1.0), verdict)[0].startswith("unstable")
+
+
+def test_a_loop_that_stands_settles_and_one_that_swings_does_not(tmp_path):
+    one = machine("belt", 0)
+    truth = {"output_range": [-0.5, 0.5]}
+    for gain, settled in ((1.0, True), (40.0, False)):
+        law = controller_file(tmp_path, gain)
+        runs = [settles(one, truth, one.plant, law, tmp_path, 5.0, k) for k in range(3)]
+        assert runs == [settled] * 3

@@ -1,0 +1,264 @@
+"""What came out for one machine, against its truth. Nothing of the product computes here; it is only read.
+
+Ran: `flexlink init LOGS --out my.toml` and `flexlink run --config my.toml --json`, no edit.
+
+Settles, 20 runs on the nonlinear machine: from rest at a start between the 5th and 95th percentile of the
+recorded output, half a second later a step of 10 to 50 % of that range into it (through the reference filter
+of the run, if any), friction of the machine x .8 to 1.2, inertia and weight of the load x .95 to 1.05. The
+command begins at what holds the nominal machine at the start. The loop has the machine's delay and, in
+every other run, the delay that controller.json states on top (who puts the controller in the place of the
+old one has none). Horizon: 40 over the certified bandwidth, 4 to 30 s. A run settles if
+- it stays within three steps (and the tolerance) of the set point,
+- less than 1 % of the commands of the second half are at the limit,
+- in the last quarter |reference - output| and half the peak-to-peak stay within the largest of 5 % of the
+  step, three counts of the encoder, and breakaway friction over the stiffness |K| at the certified bandwidth.
+A feed-forward of friction is left out: a step gets next to nothing of it.
+
+Violates: the loop with the true friction-free response is unstable, or its modulus margin, gain, phase or
+delay margin or bandwidth is more than 1 % worse than the worst case that the certificate states.
+
+Ellipses: share of frequencies of the run's grid, and per half-decade, at which the 95 % ellipse holds the
+true friction-free response, where the recorded command has more than 1e-3 of its largest power density. With
+`bla` realisations also the response at the recorded amplitude, E[Y R*] / E[U R*], by simulation; what these
+leave open is added to the covariance.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import resource
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.signal
+
+from benchmarks.closed_loop_machines.logs import Machine, write
+from benchmarks.closed_loop_machines.machines import TAU, loop_gain, loop_radius
+from benchmarks.closed_loop_machines.simulator import Array, Law, Plant, response
+
+_RADIUS_2 = -2 * np.log(0.05)  # chi-square of two degrees of freedom, 95 %
+_STEP = re.compile(
+    r"flexlink \w+|--[a-z]|[a-z]+_[a-z_]+ = |integrators? = |\[\w+\]"
+)  # command, option, setting
+
+
+def judged(one: Machine, folder: Path, bla: int = 0) -> dict[str, Any]:
+    """Everything the table needs; also written to FOLDER/NAME/judged.json."""
+    logs = write(one, folder / "logs", folder / "truth")
+    truth = json.loads((folder / "truth" / f"{one.name}.json").read_text())
+    work = folder / one.name
+    work.mkdir(parents=True, exist_ok=True)
+    config, run = work / "my.toml", work / "run"
+    begin = _cpu_s()
+    code, _, lines = _flexlink("init", *map(str, logs), "--out", str(config), "--replace")
+    document: dict[str, Any] = {}
+    if code == 0:
+        code, text, lines = _flexlink(
+            "run", "--config", str(config), "--out", str(run), "--replace", "--json"
+        )
+        document = json.loads(text) if text.lstrip().startswith("{") else {}
+    found: dict[str, Any] = {"kind": one.kind, "seed": one.seed, "code": code, "cpu_s": _cpu_s() - begin}
+    found["line"] = document.get("verdict") or " | ".join(lines[-3:])
+    found["certified"] = code == 0 and bool(document.get("certified"))
+    found["next_step"] = (bool(document) or len(lines) == 1) and bool(_STEP.search(found["line"]))
+    found |= _model(one, truth, run, document, bla)
+    if found["certified"]:
+        law, delay = read_law(run / "controller.json")
+        plant = replace(one.plant, delay=one.plant.delay + delay)
+        verdict = document["numbers"]["certificate"]["plants"][0]
+        found["violations"] = violations(plant, one.draft.q_operating, law, verdict)
+        bad = [
+            k
+            for k in range(20)
+            if not settles(one, truth, (one.plant, plant)[k % 2], law, run, verdict["bandwidth_rad_s"], k)
+        ]
+        found["settled"], found["bad_runs"] = 20 - len(bad), bad
+    (work / "judged.json").write_text(json.dumps(found, indent=1, default=float) + "\n")
+    return found
+
+
+def _cpu_s() -> float:
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+
+
+def _flexlink(*words: str) -> tuple[int, str, list[str]]:
+    """Exit code, standard output, lines said (on standard error where there are any)."""
+    ended = subprocess.run(
+        [sys.executable, "-m", "flexlink", *words], capture_output=True, text=True, check=False
+    )
+    said = [line.strip() for line in (ended.stderr or ended.stdout).splitlines() if line.strip()]
+    return ended.returncode, ended.stdout, said or ["(nothing said)"]
+
+
+def read_law(path: Path) -> tuple[Law, int]:
+    """u = K (reference - measurement) of controller.json, and the delay that it states."""
+    file = json.loads(path.read_text())
+    n = len(file["A"])
+    a, b, c, m = (np.array(file[k], float) for k in ("A", "B", "C", "anti_windup_gain"))
+    d = float(np.array(file["D"]).item())
+    column = b.reshape(n, 1)
+    law = Law(a.reshape(n, n), np.hstack([column, -column]), c.reshape(n), np.array([d, -d]), m.reshape(n))
+    return law, int(file["computational_delay_samples"])
+
+
+def violations(plant: Plant, q_operating: float, law: Law, verdict: dict[str, Any]) -> list[str]:
+    """Numbers of a certificate's verdict on a plant that the true friction-free loop does not keep."""
+
+    def radius(gain: float) -> float:
+        return loop_radius(plant, q_operating, law._replace(C=gain * law.C, D=gain * law.D))
+
+    if not radius(1.0) < 1:
+        return [f"unstable: pole radius {radius(1.0):.6f}"]
+    worst = verdict["worst_margins"]
+    theta = np.unique(np.concatenate([np.geomspace(1e-5, np.pi, 20_000), np.linspace(1e-3, np.pi, 20_000)]))
+    gain = loop_gain(plant, q_operating, law, theta / plant.dt_s)
+    nearest, found = float(np.min(np.abs(1 + gain))), []
+    if nearest < 0.99 * worst["modulus"]:
+        found.append(f"modulus {nearest:.4f}, stated {worst['modulus']:.4f}")
+    up, down = min(worst["gain_up"] or np.inf, 1e3), worst["gain_down"] or 0.0
+    gains = [
+        *np.geomspace(1, 1 + 0.99 * (up - 1), 20),
+        *np.geomspace(1, max(1 - 0.99 * (1 - down), 1e-3), 20),
+    ]
+    found += [f"gain {g:.4f} unstable, stated {down:.4f} to {up:.4f}" for g in gains if radius(g) >= 1][:1]
+    one = np.flatnonzero(np.diff(np.sign(np.abs(gain) - 1)))  # crossings of the unit circle
+    phase = np.abs(np.angle(-gain[one]))
+    if np.min(phase, initial=np.pi) < 0.99 * min(worst["phase_rad"], np.pi):
+        found.append(f"phase {np.min(phase):.4f} rad, stated {worst['phase_rad']:.4f}")
+    delay = np.min(np.mod(np.angle(-gain[one]), TAU) / theta[one], initial=np.inf) * plant.dt_s
+    if delay < 0.99 * (worst["delay_s"] or np.inf) and np.isfinite(worst["delay_s"] or np.inf):
+        found.append(f"delay {delay:.4g} s, stated {worst['delay_s']:.4g}")
+    within = theta < 0.99 * verdict["bandwidth_rad_s"] * plant.dt_s
+    if np.any(within) and np.min(np.abs(1 + gain[within])) < 0.99 * np.sqrt(2):
+        found.append(f"bandwidth, stated {verdict['bandwidth_rad_s']:.4g} rad/s")
+    return found
+
+
+def settles(
+    one: Machine, truth: dict[str, Any], plant: Plant, law: Law, run: Path, bandwidth_rad_s: float, k: int
+) -> bool:
+    """Run k of the docstring's 20."""
+    rng, dt = one.rng(1000 + k), plant.dt_s
+    low, high = truth["output_range"]
+    start, size = rng.uniform(low, high), rng.uniform(0.1, 0.5) * (high - low)
+    step = size if start + size < high else -size
+    friction = plant.friction.copy()
+    friction[:, [0, 1, 3]] *= rng.uniform(0.8, 1.2)
+    load = np.ones(plant.inertia.size)
+    load[1:] = rng.uniform(0.95, 1.05)
+    varied = replace(plant, friction=friction, inertia=plant.inertia * load, gravity=plant.gravity * load)
+    limit = json.loads((run / "controller.json").read_text())["input_limit"]
+    varied = replace(varied, limit=min(plant.limit, limit or np.inf))
+    n, at = round(float(np.clip(40 / max(bandwidth_rad_s, 1e-3), 4, 30)) / dt), round(0.5 / dt)
+    moved = np.where(np.arange(n) < at, 0.0, step)
+    smoother = run / "controller_reference_filter.json"
+    if smoother.exists():
+        f = json.loads(smoother.read_text())
+        moved = scipy.signal.dlsim((*(np.array(f[x]) for x in "ABCD"), dt), moved[:, None])[1][:, 0]
+    held = -np.sum(plant.gravity * np.sin(start / plant.scale)) / plant.torque_per_u
+    noise = one.draft.noise_counts * plant.count * rng.standard_normal(n)
+    got = varied.run(law._replace(bias=float(held)), start + moved, start / plant.scale, noise)
+    stiffness = abs(
+        response(law.A, law.B[:, :1], law.C[None, :], np.array([bandwidth_rad_s]), dt)[0] + law.D[0]
+    )
+    holding = friction[:, 1].sum() / plant.torque_per_u / max(stiffness, 1e-12)
+    tolerance = max(0.05 * size, 3 * plant.count, float(holding))
+    away, last = np.abs(start + step - got["true"]), got["true"][-n // 4 :]
+    return bool(
+        np.all(away < 3 * size + tolerance)
+        and np.mean(np.abs(got["u"][n // 2 :]) >= varied.limit) < 0.01
+        and np.max(away[-n // 4 :]) <= tolerance
+        and np.ptp(last) <= 2 * tolerance
+    )
+
+
+def _model(
+    one: Machine, truth: dict[str, Any], run: Path, document: dict[str, Any], bla: int
+) -> dict[str, Any]:
+    """Mode, friction, unstable pole and ellipses of the stages that are there, against the truth."""
+    from workflow.engine.run_directory import RunDirectory
+    from workflow.tasks.results import RunResults
+
+    found: dict[str, Any] = {}
+    try:
+        results = RunResults(RunDirectory.open(run))
+        identify, spread = results.identify, results.uncertainty.channels[0]
+    except (OSError, ValueError, KeyError):  # refused before there was a model
+        return found
+    channel, intervals = identify.channels[0], spread.intervals
+    rows = [mode for mode in channel.modes if channel.is_mode(mode)]
+    if rows:
+        near = min(rows, key=lambda mode: abs(np.log(mode.frequency_Hz / truth["modes_hz"][0])))
+        at = channel.modes.index(near)
+        found["frequency_error"] = near.frequency_Hz / truth["modes_hz"][0] - 1
+        found["damping"], found["damping_true"] = near.damping, truth["dampings"][0]
+        if intervals is not None and at < len(intervals.modes):
+            known = intervals.modes[at]
+            found["frequency_inside"] = bool(
+                known.frequency_Hz[0] <= truth["modes_hz"][0] <= known.frequency_Hz[1]
+            )
+            found["damping_inside"] = bool(known.damping[0] <= truth["dampings"][0] <= known.damping[1])
+    if identify.friction is not None:
+        law, level = identify.friction.law, identify.friction.level
+        used = truth["friction_as_recorded_in_input_units"][:-1]
+        true = truth["coulomb_in_input_units"] if law.excess > 0 else float(np.mean(used))
+        found["friction_error"] = level / true - 1
+        found["friction_inside"] = bool(abs(level - true) <= 1.96 * identify.friction.level_std)
+    if truth["unstable_1_s"]:
+        growth = [pole for pole, _ in channel.unstable_poles]
+        found["unstable_error"] = growth[0] / truth["unstable_1_s"][0] - 1 if len(growth) == 1 else None
+    about = spread.behind_friction.posterior if spread.behind_friction else spread.posterior
+    omega = spread.frequency.omega_rad_s
+    ellipses = about.at(omega, spread.level)
+    a, b, c = (np.array(truth[k]) for k in "ABC")
+    excited = _excited(one, omega)
+    inside = _holds(ellipses, response(a, b, c, omega, one.plant.dt_s), 0.0)
+    found["ellipses"] = float(np.mean(inside[excited])) if np.any(excited) else None
+    band = np.floor(2 * np.log10(omega)).astype(int)
+    found["by_half_decade"] = {
+        f"{10 ** (k / 2):.3g} rad/s": float(np.mean(inside[excited & (band == k)]))
+        for k in np.unique(band[excited])
+    }
+    if bla:
+        centre, variance = _amplitude_response(one, omega, bla)
+        found["ellipses_bla"] = float(np.mean(_holds(spread.frequency, centre, variance)[excited]))
+    return found
+
+
+def _holds(ellipses: Any, g: Array, variance: Array | float) -> Array:
+    """Whether the 95 % ellipse (of response plus a further variance per part) holds g, (F,)."""
+    apart = np.stack([(g - ellipses.centre).real, (g - ellipses.centre).imag], axis=1)
+    covariance = ellipses.covariance + np.asarray(variance).reshape(-1, 1, 1) * np.eye(2)
+    return np.einsum("fi,fij,fj->f", apart, np.linalg.pinv(covariance), apart) <= _RADIUS_2
+
+
+def _excited(one: Machine, omega: Array) -> Array:
+    """Where the recorded command (estimation logs) has more than 1e-3 of its largest power density."""
+    power = 0.0
+    for log in range(len(one.classes) - 1):
+        got, begin = one.record(log, one.rng(log))
+        u = np.clip(got["u"][begin:], -one.plant.limit, one.plant.limit)
+        f, own = scipy.signal.welch(u, 1 / one.plant.dt_s, nperseg=min(u.size, round(4 / one.plant.dt_s)))
+        power = power + own
+    return np.interp(omega, TAU * f, power) > 1e-3 * np.max(power)
+
+
+def _amplitude_response(one: Machine, omega: Array, realisations: int) -> tuple[Array, Array]:
+    """E[Y R*] / E[U R*] over fresh references of the first log's class, and its variance per part, (F,)."""
+    products = []
+    for k in range(realisations):
+        got, begin = one.record(0, one.rng(2000 + k))
+        window = np.hanning(got["r"].size - begin)
+        r, u, y = (np.fft.rfft(window * (got[x][begin:] - got[x][begin:].mean())) for x in ("r", "u", "y"))
+        products.append((y * r.conj(), u * r.conj()))
+    f = TAU * np.fft.rfftfreq(window.size, one.plant.dt_s)
+    y_r, u_r = (np.array(part) for part in zip(*products, strict=True))
+    g = y_r.mean(axis=0) / u_r.mean(axis=0)
+    left = np.abs((y_r - g * u_r) / u_r.mean(axis=0)) ** 2
+    variance = left.sum(axis=0) / (realisations - 1) / realisations / 2
+    return np.interp(omega, f, g.real) + 1j * np.interp(omega, f, g.imag), np.interp(omega, f, variance)
