@@ -212,9 +212,30 @@ def simulate(
 def excite(
     out: Annotated[Path, typer.Option(help="Directory for the files; new or empty.")],
     band: Annotated[tuple[float, float], typer.Option(help="Frequencies to excite [Hz], low and high.")],
-    dt_s: Annotated[float, typer.Option(help="Sampling period [s].")],
     duration: Annotated[float, typer.Option(help="Time allowed for all records together [s].")],
-    voltage: Annotated[float, typer.Option(help="Largest voltage allowed [V].")],
+    log: Annotated[
+        list[Path] | None, typer.Argument(help="With --closed-loop: logs of the loop that is there.")
+    ] = None,
+    closed_loop: Annotated[
+        bool, typer.Option("--closed-loop", help="Plan a reference for the loop that made the logs.")
+    ] = False,
+    dt_s: Annotated[float | None, typer.Option(help="Sampling period [s]; of logs their own.")] = None,
+    voltage: Annotated[
+        float | None,
+        typer.Option(
+            help="Largest voltage allowed [V]; with --closed-loop the largest command, in its unit [default "
+            "there: 80 % of the logs' largest]"
+        ),
+    ] = None,
+    motion: Annotated[
+        float | None,
+        typer.Option(
+            help="With --closed-loop: largest motion, in the output's unit [default: the logs' largest]"
+        ),
+    ] = None,
+    input_name: Annotated[str | None, typer.Option("--input", help="Name of the command's column.")] = None,
+    output_name: Annotated[str | None, typer.Option("--output", help="Name of the output's column.")] = None,
+    reference: Annotated[str | None, typer.Option(help="Name of the reference's column.")] = None,
     rms: Annotated[
         list[float] | None,
         typer.Option(help="Root mean square [V] (repeatable) [default: the highest allowed, and half of it]"),
@@ -239,6 +260,29 @@ def excite(
     as_json: Json = False,
 ) -> None:
     """Plan random-phase multisines that tell response, noise and nonlinear distortion apart."""
+    stated = {"realisations": realisations, "periods": periods}
+    given: dict[str, Any] = {key: value for key, value in stated.items() if value is not None}
+    if closed_loop != bool(log):
+        raise InputError("--closed-loop goes with logs of the loop: flexlink excite --closed-loop LOG... ...")
+    if log:
+        need(*log)
+        from workflow.commands.excite import write_reference
+
+        columns = {"input_name": input_name, "output_name": output_name, "reference": reference}
+        given |= {"band_Hz": band, "duration_s": duration, "seed": seed, "lead_in_s": lead_in}
+        summary = write_reference(
+            log,
+            out,
+            columns={**columns, "dt_s": dt_s},
+            largest_command=voltage,
+            largest_motion=motion,
+            rms=rms[0] if rms else None,
+            **given,
+        )
+        _show(summary, as_json)
+        return
+    if dt_s is None or voltage is None:
+        raise InputError("an experiment in open loop needs --dt-s SECONDS and --voltage LARGEST")
     from workflow.commands.excite import write_experiment
     from workflow.config.rig_settings import rig_called
     from workflow.tasks.experiment import Limits
@@ -254,8 +298,6 @@ def excite(
         rig=None if rig is None else rig_called(rig),
         noise_std_rad=noise_std,
     )
-    stated = {"realisations": realisations, "periods": periods}
-    given = {key: value for key, value in stated.items() if value is not None}
     files = write_experiment(limits, out, seed=seed, lead_in_s=lead_in, **given)
     _show_files(files, as_json)
 

@@ -37,11 +37,21 @@ def multisine(rng, n, rms, low_Hz=0.3, high_Hz=30.0):
     return np.tile(rms * signal / signal.std(), 2)
 
 
-def recorded(seed, *, rms, gravity=0.0, limit=np.inf, coulomb=COULOMB, closed=True, gain=(2.0, 0.06)):
+def recorded(
+    seed,
+    *,
+    rms=0.0,
+    reference=None,
+    gravity=0.0,
+    limit=np.inf,
+    coulomb=COULOMB,
+    closed=True,
+    gain=(2.0, 0.06),
+):
     """time [s], reference [rad], command [A], encoder [rad] of the motor under a PD controller, or in open
     loop under the reference as the command."""
     rng = np.random.default_rng(seed)
-    reference = multisine(rng, 4000, rms)
+    reference = multisine(rng, 4000, rms) if reference is None else reference
     q, v, last, rows = np.zeros(2), np.zeros(2), 0.0, []
     step = DT_S / STEPS
     for r in reference:
@@ -250,3 +260,41 @@ def test_the_reported_log(flexlink, tmp_path):
     config = load_config(out)[0]
     assert config.source.references == ("ref_rad",)
     assert config.closed_loop.measurement_step == pytest.approx(2 * np.pi / 16384, rel=1e-6)
+
+
+def test_a_reference_planned_for_the_loop_keeps_its_limits_on_the_machine(flexlink, tmp_path, signals):
+    """Played on the machine that made the logs: within 15 % of what is expected, as friction bends it."""
+    logs = write(tmp_path, signals, ("t_s", "ref_rad", "u_A", "y_rad"))
+    out = tmp_path / "plan"
+    answer = flexlink(
+        "excite", "--closed-loop", *logs, "--out", out, "--band", 0.5, 20, "--duration", 60,
+        "--realisations", 2, "--voltage", 1.5, "--json",
+    )  # fmt: skip
+    numbers = answer.document()["numbers"]
+    assert numbers["told"] == 1.0
+    assert numbers["friction"] == pytest.approx(COULOMB, rel=0.2)
+    files = sorted(out.glob("*.csv"))
+    assert len(files) == 4
+    for file, level, k in zip(files, (0, 0, 1, 1), (0, 1, 0, 1), strict=True):
+        assert file.read_text().startswith("time_s,ref_rad\n")
+        played = np.loadtxt(file, delimiter=",", skiprows=1)[:, 1]
+        _, _, command, motion = recorded(0, reference=played)
+        period = numbers["plan"]["period_samples"]
+        assert np.abs(command[-period:]).max() == pytest.approx(numbers["command_peak"][level][k], rel=0.15)
+        assert np.abs(motion[-period:]).max() <= 1.15 * numbers["motion_peak"][level][k] + 0.01
+        assert np.abs(command).max() < 1.15 * 1.5
+    motion = np.max(numbers["motion_peak"]) / numbers["largest_motion"]
+    assert max(np.max(numbers["command_peak"]) / 1.5, motion) == pytest.approx(1.0)
+
+
+def test_a_reference_cannot_be_planned_without_knowing_the_loop(refused, flexlink, tmp_path, signals):
+    logs = write(tmp_path, signals, ("t_s", "", "u_A", "y_rad"))
+    wanted = ("--out", tmp_path / "plan", "--band", 0.5, 20, "--duration", 60)
+    line = refused("excite", "--closed-loop", *logs, *wanted)
+    assert "no reference is recorded" in line
+    assert "--rms" in line
+    assert "--closed-loop" in refused("excite", *logs, *wanted)
+    assert "--dt-s" in refused("excite", *wanted)
+    assert not (tmp_path / "plan").exists()
+    answer = flexlink("excite", "--closed-loop", *logs, *wanted, "--rms", 0.05, "--json")
+    assert answer.document()["numbers"]["rms"] == [pytest.approx(0.05), pytest.approx(0.025)]

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ident.data.roles import is_position
+from workflow.commands.init import read_channel
 from workflow.engine import codec, storage
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.experiment import Limits, PlannedExperiment, plan_experiment
+from workflow.tasks.reference_plan import plan_reference
+from workflow.tasks.summary import RunSummary
+from workflow.text.templates import rows_of
 
 PLAN_FILE, PAGE_FILE = "plan.json", "plan.html"
 
@@ -48,3 +55,43 @@ def _document(found: PlannedExperiment) -> dict[str, object]:
         "expected_radius_rad_per_V": found.radii,
         "records": found.records,
     }
+
+
+def write_reference(
+    logs: Sequence[Path],
+    out: Path,
+    *,
+    columns: Mapping[str, Any],
+    largest_command: float | None,
+    largest_motion: float | None,
+    **wanted: Any,
+) -> RunSummary:
+    """Plan a reference for the loop that made these logs; one CSV (time_s and the reference) per record, and
+    the plan. columns: names as stated; wanted: as `plan_reference`. Raises InputError."""
+    RunDirectory(out).refuse_unless_free()
+    read = read_channel("excite --closed-loop", logs, **columns)
+    roles = read.roles
+    found = plan_reference(
+        read.records,
+        position=is_position(roles.output, read.unit_of[roles.output]),
+        largest_command=largest_command,
+        largest_motion=largest_motion,
+        **wanted,
+    )
+    column, time = roles.reference or "reference", np.arange(found.plan.n_samples) * found.dt_s
+    texts = {
+        f"{found.plan.realisations * level + k + 1:02d}_level_{level + 1}_realisation_{k + 1}.csv": (
+            storage.csv_text({"time_s": time, column: found.offset + signal})
+        )
+        for level, signals in enumerate(found.references)
+        for k, signal in enumerate(signals)
+    }
+    numbers = {key: value for key, value in vars(found).items() if key != "references"}
+    texts[PLAN_FILE] = codec.plain_text({"files": sorted(texts), "reference": column, **numbers})
+    storage.write_new_directory(out, texts)
+    return RunSummary(
+        title=str(out),
+        sections=rows_of("summary/reference.j2", found=found, roles=roles, unit_of=read.unit_of),
+        numbers=codec.plain(numbers),
+        verdict=f"play {column} of each file; log {column}, {roles.input} and {roles.output} from its start",
+    )

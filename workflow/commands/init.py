@@ -92,49 +92,22 @@ def init(
     storage.refuse_in_the_way(logs, [("--out", out)])
     if out.exists() and not replace_file:
         raise InputError(f"{out} exists: take another --out, or --replace to write over it")
-    tables = list[Table]()
-    for path in logs:
-        with naming(str(path)):
-            tables.append(read_table(path).with_decimal(decimal))
-            if has_response(tables[-1]):
-                raise ValueError("a frequency response, no log: flexlink design takes it")
-    # The options are what has to be seen of a line that may be cut.
-    typed = shlex.quote(str(logs[0])) if len(logs) == 1 and len(str(logs[0])) < _SHORT else "LOG..."
-    with naming(str(logs[0])):
-        roles = roles_with_reference(
-            tables[0], typed, "init", input=input_name, output=output_name, time=time, reference=reference
-        )
-        if dt_s is not None and time is None:
-            roles = replace(roles, time=None)
-        if roles.time is None and dt_s is None:
-            raise ValueError(
-                f"no column looks like time: type flexlink init {typed} --dt-s SECONDS, or --time NAME"
-            )
-    options = [_stamps(table, roles, time_unit) for table in tables]
-    steps = [float(text.split()[1]) for text in options if text.startswith("--resample-s")]
-    how: dict[str, Any] = {
-        "time": roles.time,
-        "dt_s": dt_s,
-        "time_unit": time_unit if roles.time else None,
-        "references": [roles.reference] if roles.reference else [],
-        "scale": scale,
-        "units": units,
-        "repair": "--repair" in options and not steps,
-        "resample_s": max(steps, default=None),
-        "unwrap": dict(unwrap or {}) or _wrapping(tables, roles.output),
-    }
-    records = []
-    for table in tables:
-        with naming(str(table.path)):
-            record = Record.from_file(table, [roles.input], [roles.output], **how)
-            records.append(record if input_limit is None else record.limited(input_limit))
-    for record in records:
-        refuse_constant_input(record)
-    records = with_common_sampling_time(records)
-    unit_of = {
-        name: (units or {}).get(name, "" if name in (scale or {}) else tables[0].unit(name))
-        for name in (roles.input, roles.output)
-    }
+    read = read_channel(
+        "init",
+        logs,
+        input_name=input_name,
+        output_name=output_name,
+        reference=reference,
+        time=time,
+        time_unit=time_unit,
+        dt_s=dt_s,
+        scale=scale,
+        units=units,
+        unwrap=unwrap,
+        decimal=decimal,
+        input_limit=input_limit,
+    )
+    roles, how, unit_of, records = read.roles, read.how, read.unit_of, read.records
     with naming("init"):
         draft = draft_of(
             records, position=is_position(roles.output, unit_of[roles.output]), limit=input_limit
@@ -171,6 +144,80 @@ def init(
         numbers={"configuration": config.to_document(), "seen": _numbers(found)},
         verdict=f"flexlink run --config {shlex.quote(str(out))}",
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """One channel of logs as read. how: the settings of `Record.from_file`; unit_of: input and output."""
+
+    roles: Roles
+    how: dict[str, Any]
+    unit_of: dict[str, str]
+    records: list[Record]
+
+
+def read_channel(
+    command: str,
+    logs: Sequence[Path],
+    *,
+    input_name: str | None = None,
+    output_name: str | None = None,
+    reference: str | None = None,
+    time: str | None = None,
+    time_unit: str | None = None,
+    dt_s: float | None = None,
+    scale: Mapping[str, float] | None = None,
+    units: Mapping[str, str] | None = None,
+    unwrap: Mapping[str, float] | None = None,
+    decimal: str | None = None,
+    input_limit: float | None = None,
+) -> Channel:
+    """Columns as names and units tell them, a reference among them, repaired and unwrapped where they need
+    it. command: what a complaint says to type again. Raises InputError."""
+    tables = list[Table]()
+    for path in logs:
+        with naming(str(path)):
+            tables.append(read_table(path).with_decimal(decimal))
+            if has_response(tables[-1]):
+                raise ValueError("a frequency response, no log: flexlink design takes it")
+    # The options are what has to be seen of a line that may be cut.
+    typed = shlex.quote(str(logs[0])) if len(logs) == 1 and len(str(logs[0])) < _SHORT else "LOG..."
+    with naming(str(logs[0])):
+        roles = roles_with_reference(
+            tables[0], typed, command, input=input_name, output=output_name, time=time, reference=reference
+        )
+        if dt_s is not None and time is None:
+            roles = replace(roles, time=None)
+        if roles.time is None and dt_s is None:
+            raise ValueError(
+                f"no column looks like time: type flexlink {command} {typed} --dt-s SECONDS, or --time NAME"
+            )
+    options = [_stamps(table, roles, time_unit) for table in tables]
+    steps = [float(text.split()[1]) for text in options if text.startswith("--resample-s")]
+    how: dict[str, Any] = {
+        "time": roles.time,
+        "dt_s": dt_s,
+        "time_unit": time_unit if roles.time else None,
+        "references": [roles.reference] if roles.reference else [],
+        "scale": scale,
+        "units": units,
+        "repair": "--repair" in options and not steps,
+        "resample_s": max(steps, default=None),
+        "unwrap": dict(unwrap or {}) or _wrapping(tables, roles.output),
+    }
+    records = []
+    for table in tables:
+        with naming(str(table.path)):
+            record = Record.from_file(table, [roles.input], [roles.output], **how)
+            records.append(record if input_limit is None else record.limited(input_limit))
+    for record in records:
+        refuse_constant_input(record)
+    records = with_common_sampling_time(records)
+    unit_of = {
+        name: (units or {}).get(name, "" if name in (scale or {}) else tables[0].unit(name))
+        for name in (roles.input, roles.output)
+    }
+    return Channel(roles, how, unit_of, records)
 
 
 def configuration(found: Found, records: Sequence[Entry]) -> str:

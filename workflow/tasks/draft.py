@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from control_design.synthesis.synthesis_options import SynthesisOptions
 from diagnosis.machine.quantisation_grid import grid_step
 from ident.checks.input_checks import clipped_share
 from ident.data.record import Record
-from workflow.tasks.first_look import FirstLook, first_look, told_response
+from workflow.tasks.first_look import FirstLook, first_look, from_reference, told_response
 from workflow.tasks.loop_sensitivity import rms_of
 
 # Bandwidths that are tried, as parts of the first mode, or of the highest frequency that the logs tell.
@@ -105,21 +105,7 @@ def recorded_effort(records: Sequence[Record]) -> float:
     """Largest |K S| of the recorded loop, from the reference to the command where that is told; without a
     reference, rms of the command over that of the output."""
     if all(record.reference is not None for record in records):
-        loop = [
-            replace(
-                record,
-                input=np.asarray(record.reference),
-                output=record.input,
-                reference=None,
-                input_names=record.reference_names,
-                output_names=record.input_names,
-                reference_names=(),
-                input_units=(),
-                output_units=(),
-            )
-            for record in records
-        ]
-        response = told_response(loop)
+        response = told_response(from_reference(records, "input"))
         if response is not None:
             return float(np.quantile(np.abs(response.centre), 0.95))
     spread = rms_of([record.output[:, 0] for record in records])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
@@ -141,6 +142,21 @@ def _speed(record: Record, low: RealArray, position: bool) -> RealArray:
 def _sign(speed: RealArray) -> RealArray:
     """Its sign, a fiftieth of the usual speed counting as part of the turn."""
     return np.tanh(speed / max(0.02 * float(np.std(speed)), 1e-300))
+
+
+def from_reference(records: Sequence[Record], of: Literal["input", "output"]) -> list[Record]:
+    """Records of the loop: its reference as the input, and the command or the motion as the output."""
+    return [
+        Record(
+            record.name,
+            np.asarray(record.reference),
+            getattr(record, of),
+            record.dt_s,
+            record.reference_names,
+            record.input_names if of == "input" else record.output_names,
+        )
+        for record in records
+    ]
 
 
 def told_response(records: Sequence[Record]) -> FrequencyUncertainty | None:
