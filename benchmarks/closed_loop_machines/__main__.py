@@ -32,9 +32,11 @@ def run(
     jobs: int = 2,
     bla: int = 0,
     keep: str = "",
+    judge_only: bool = False,
     make_only: str = "",
 ) -> None:
-    """A line per machine and the table by kind; KEEP: where logs, runs and judged.json stay."""
+    """A line per machine and the table by kind; KEEP: where logs, runs and judged.json stay, to be judged
+    again with --judge-only."""
     first, last = map(int, seeds.split(":"))
     cases = [(kind, seed) for kind in kinds.split(",") for seed in range(first, last)]
     if make_only:
@@ -43,7 +45,7 @@ def run(
         return
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as scratch, ProcessPoolExecutor(jobs) as pool:
-        one = partial(_one, series=series, folder=Path(keep or scratch), bla=bla)
+        one = partial(_one, series=series, folder=Path(keep or scratch), bla=bla, judge_only=judge_only)
         found = []
         for row in pool.map(one, cases):
             out(_line(row))
@@ -55,8 +57,8 @@ def run(
     out(_table_row("all", found))
 
 
-def _one(case: tuple[str, int], series: int, folder: Path, bla: int) -> dict[str, Any]:
-    return judged(machine(*case, series), folder, bla)
+def _one(case: tuple[str, int], series: int, **options: Any) -> dict[str, Any]:
+    return judged(machine(*case, series), **options)
 
 
 def _line(row: dict[str, Any]) -> str:

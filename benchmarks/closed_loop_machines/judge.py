@@ -47,39 +47,43 @@ _STEP = re.compile(
 )  # command, option, setting
 
 
-def judged(one: Machine, folder: Path, bla: int = 0) -> dict[str, Any]:
-    """Everything the table needs; also written to FOLDER/NAME/judged.json."""
-    logs = write(one, folder / "logs", folder / "truth")
-    truth = json.loads((folder / "truth" / f"{one.name}.json").read_text())
+def judged(one: Machine, folder: Path, bla: int = 0, judge_only: bool = False) -> dict[str, Any]:
+    """Everything the table needs, also written to FOLDER/NAME/judged.json. judge_only: runs are there."""
     work = folder / one.name
-    work.mkdir(parents=True, exist_ok=True)
-    config, run = work / "my.toml", work / "run"
-    begin = _cpu_s()
-    code, _, lines = _flexlink("init", *map(str, logs), "--out", str(config), "--replace")
-    document: dict[str, Any] = {}
-    if code == 0:
-        code, text, lines = _flexlink(
-            "run", "--config", str(config), "--out", str(run), "--replace", "--json"
-        )
-        document = json.loads(text) if text.lstrip().startswith("{") else {}
-    found: dict[str, Any] = {"kind": one.kind, "seed": one.seed, "code": code, "cpu_s": _cpu_s() - begin}
-    found["line"] = document.get("verdict") or " | ".join(lines[-3:])
-    found["certified"] = code == 0 and bool(document.get("certified"))
-    found["next_step"] = (bool(document) or len(lines) == 1) and bool(_STEP.search(found["line"]))
-    found |= _model(one, truth, run, document, bla)
+    config, run, told = work / "my.toml", work / "run", work / "told.json"
+    if not judge_only:
+        logs = write(one, folder / "logs", folder / "truth")
+        work.mkdir(parents=True, exist_ok=True)
+        begin = _cpu_s()
+        code, text, lines = _flexlink("init", *map(str, logs), "--out", str(config), "--replace")
+        if code == 0:
+            words = "--config", str(config), "--out", str(run), "--replace", "--json"
+            code, text, lines = _flexlink("run", *words)
+        answer = json.loads(text) if text.lstrip().startswith("{") else {}
+        line = answer.get("verdict") or " | ".join(lines[-3:])
+        row = {"kind": one.kind, "seed": one.seed, "code": code, "cpu_s": _cpu_s() - begin, "line": line}
+        row["certified"] = code == 0 and bool(answer.get("certified"))
+        row["next_step"] = (bool(answer) or len(lines) == 1) and bool(_STEP.search(line))
+        told.write_text(json.dumps(row, indent=1) + "\n")
+    found = json.loads(told.read_text())
+    truth = json.loads((folder / "truth" / f"{one.name}.json").read_text())
+    found |= _model(one, truth, run, bla)
     if found["certified"]:
-        law, delay = read_law(run / "controller.json")
-        plant = replace(one.plant, delay=one.plant.delay + delay)
-        verdict = document["numbers"]["certificate"]["plants"][0]
-        found["violations"] = violations(plant, one.draft.q_operating, law, verdict)
-        bad = [
-            k
-            for k in range(20)
-            if not settles(one, truth, (one.plant, plant)[k % 2], law, run, verdict["bandwidth_rad_s"], k)
-        ]
-        found["settled"], found["bad_runs"] = 20 - len(bad), bad
+        found |= controller_on_machine(one, truth, run)
     (work / "judged.json").write_text(json.dumps(found, indent=1, default=float) + "\n")
     return found
+
+
+def controller_on_machine(one: Machine, truth: dict[str, Any], run: Path) -> dict[str, Any]:
+    """What the certificate of a run says falsely, and how many of 20 runs settle."""
+    law, delay = read_law(run / "controller.json")
+    plant = replace(one.plant, delay=one.plant.delay + delay)
+    certificate = json.loads((run / "stages" / "certify.json").read_text())["result"]["certificate"]
+    (verdict,) = certificate["plants"]
+    both = one.plant, plant
+    good = [settles(one, truth, both[k % 2], law, run, verdict["bandwidth_rad_s"], k) for k in range(20)]
+    false = violations(plant, one.draft.q_operating, law, verdict)
+    return {"violations": false, "settled": sum(good), "bad_runs": [k for k in range(20) if not good[k]]}
 
 
 def _cpu_s() -> float:
@@ -114,13 +118,18 @@ def violations(plant: Plant, q_operating: float, law: Law, verdict: dict[str, An
 
     if not radius(1.0) < 1:
         return [f"unstable: pole radius {radius(1.0):.6f}"]
-    worst = verdict["worst_margins"]
+    # Stored as {"$float": "inf"} where there is no limit.
+    worst = {
+        name: float(v["$float"] if isinstance(v, dict) else v)
+        for name, v in verdict["worst_margins"].items()
+        if name != "$type"
+    }
     theta = np.unique(np.concatenate([np.geomspace(1e-5, np.pi, 20_000), np.linspace(1e-3, np.pi, 20_000)]))
     gain = loop_gain(plant, q_operating, law, theta / plant.dt_s)
     nearest, found = float(np.min(np.abs(1 + gain))), []
     if nearest < 0.99 * worst["modulus"]:
         found.append(f"modulus {nearest:.4f}, stated {worst['modulus']:.4f}")
-    up, down = min(worst["gain_up"] or np.inf, 1e3), worst["gain_down"] or 0.0
+    up, down = min(worst["gain_up"], 1e3), worst["gain_down"]
     gains = [
         *np.geomspace(1, 1 + 0.99 * (up - 1), 20),
         *np.geomspace(1, max(1 - 0.99 * (1 - down), 1e-3), 20),
@@ -131,7 +140,7 @@ def violations(plant: Plant, q_operating: float, law: Law, verdict: dict[str, An
     if np.min(phase, initial=np.pi) < 0.99 * min(worst["phase_rad"], np.pi):
         found.append(f"phase {np.min(phase):.4f} rad, stated {worst['phase_rad']:.4f}")
     delay = np.min(np.mod(np.angle(-gain[one]), TAU) / theta[one], initial=np.inf) * plant.dt_s
-    if delay < 0.99 * (worst["delay_s"] or np.inf) and np.isfinite(worst["delay_s"] or np.inf):
+    if delay < 0.99 * worst["delay_s"]:
         found.append(f"delay {delay:.4g} s, stated {worst['delay_s']:.4g}")
     within = theta < 0.99 * verdict["bandwidth_rad_s"] * plant.dt_s
     if np.any(within) and np.min(np.abs(1 + gain[within])) < 0.99 * np.sqrt(2):
@@ -177,9 +186,7 @@ def settles(
     )
 
 
-def _model(
-    one: Machine, truth: dict[str, Any], run: Path, document: dict[str, Any], bla: int
-) -> dict[str, Any]:
+def _model(one: Machine, truth: dict[str, Any], run: Path, bla: int) -> dict[str, Any]:
     """Mode, friction, unstable pole and ellipses of the stages that are there, against the truth."""
     from workflow.engine.run_directory import RunDirectory
     from workflow.tasks.results import RunResults
