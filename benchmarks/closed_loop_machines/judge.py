@@ -41,10 +41,10 @@ from benchmarks.closed_loop_machines.logs import Machine, write
 from benchmarks.closed_loop_machines.machines import TAU, loop_gain, loop_radius
 from benchmarks.closed_loop_machines.simulator import Array, Law, Plant, response
 
+_LONGEST_S = 900
 _RADIUS_2 = -2 * np.log(0.05)  # chi-square of two degrees of freedom, 95 %
-_STEP = re.compile(
-    r"flexlink \w+|--[a-z]|[a-z]+_[a-z_]+ = |integrators? = |\[\w+\]"
-)  # command, option, setting
+# A next step names a command, an option or a setting.
+_STEP = re.compile(r"flexlink \w+|--[a-z]|[a-z]+_[a-z_]+ = |integrators? = |\[\w+\]")
 
 
 def judged(one: Machine, folder: Path, bla: int = 0, judge_only: bool = False) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def controller_on_machine(one: Machine, truth: dict[str, Any], run: Path) -> dic
     law, delay = read_law(run / "controller.json")
     plant = replace(one.plant, delay=one.plant.delay + delay)
     certificate = json.loads((run / "stages" / "certify.json").read_text())["result"]["certificate"]
-    (verdict,) = certificate["plants"]
+    verdict = certificate["plants"][0]
     both = one.plant, plant
     good = [settles(one, truth, both[k % 2], law, run, verdict["bandwidth_rad_s"], k) for k in range(20)]
     false = violations(plant, one.draft.q_operating, law, verdict)
@@ -92,9 +92,11 @@ def _cpu_s() -> float:
 
 def _flexlink(*words: str) -> tuple[int, str, list[str]]:
     """Exit code, standard output, lines said (on standard error where there are any)."""
-    ended = subprocess.run(
-        [sys.executable, "-m", "flexlink", *words], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-m", "flexlink", *words]
+    try:
+        ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_LONGEST_S)
+    except subprocess.TimeoutExpired:
+        return -1, "", [f"no answer in {_LONGEST_S} s"]
     said = [line.strip() for line in (ended.stderr or ended.stdout).splitlines() if line.strip()]
     return ended.returncode, ended.stdout, said or ["(nothing said)"]
 
@@ -110,6 +112,10 @@ def read_law(path: Path) -> tuple[Law, int]:
     return law, int(file["computational_delay_samples"])
 
 
+def _number(stored: Any) -> float:
+    return float(stored["$float"] if isinstance(stored, dict) else stored)  # infinities are tagged
+
+
 def violations(plant: Plant, q_operating: float, law: Law, verdict: dict[str, Any]) -> list[str]:
     """Numbers of a certificate's verdict on a plant that the true friction-free loop does not keep."""
 
@@ -118,22 +124,15 @@ def violations(plant: Plant, q_operating: float, law: Law, verdict: dict[str, An
 
     if not radius(1.0) < 1:
         return [f"unstable: pole radius {radius(1.0):.6f}"]
-    # Stored as {"$float": "inf"} where there is no limit.
-    worst = {
-        name: float(v["$float"] if isinstance(v, dict) else v)
-        for name, v in verdict["worst_margins"].items()
-        if name != "$type"
-    }
+    worst = {name: _number(value) for name, value in verdict["worst_margins"].items() if name != "$type"}
     theta = np.unique(np.concatenate([np.geomspace(1e-5, np.pi, 20_000), np.linspace(1e-3, np.pi, 20_000)]))
     gain = loop_gain(plant, q_operating, law, theta / plant.dt_s)
     nearest, found = float(np.min(np.abs(1 + gain))), []
     if nearest < 0.99 * worst["modulus"]:
         found.append(f"modulus {nearest:.4f}, stated {worst['modulus']:.4f}")
     up, down = min(worst["gain_up"], 1e3), worst["gain_down"]
-    gains = [
-        *np.geomspace(1, 1 + 0.99 * (up - 1), 20),
-        *np.geomspace(1, max(1 - 0.99 * (1 - down), 1e-3), 20),
-    ]
+    ends = 1 + 0.99 * (up - 1), max(1 - 0.99 * (1 - down), 1e-3)
+    gains = np.concatenate([np.geomspace(1, end, 20) for end in ends])
     found += [f"gain {g:.4f} unstable, stated {down:.4f} to {up:.4f}" for g in gains if radius(g) >= 1][:1]
     one = np.flatnonzero(np.diff(np.sign(np.abs(gain) - 1)))  # crossings of the unit circle
     phase = np.abs(np.angle(-gain[one]))
@@ -172,9 +171,8 @@ def settles(
     held = -np.sum(plant.gravity * np.sin(start / plant.scale)) / plant.torque_per_u
     noise = one.draft.noise_counts * plant.count * rng.standard_normal(n)
     got = varied.run(law._replace(bias=float(held)), start + moved, start / plant.scale, noise)
-    stiffness = abs(
-        response(law.A, law.B[:, :1], law.C[None, :], np.array([bandwidth_rad_s]), dt)[0] + law.D[0]
-    )
+    at_bandwidth = response(law.A, law.B[:, :1], law.C[None, :], [bandwidth_rad_s], dt)
+    stiffness = abs(at_bandwidth[0] + law.D[0])
     holding = friction[:, 1].sum() / plant.torque_per_u / max(stiffness, 1e-12)
     tolerance = max(0.05 * size, 3 * plant.count, float(holding))
     away, last = np.abs(start + step - got["true"]), got["true"][-n // 4 :]
@@ -205,11 +203,9 @@ def _model(one: Machine, truth: dict[str, Any], run: Path, bla: int) -> dict[str
         found["frequency_error"] = near.frequency_Hz / truth["modes_hz"][0] - 1
         found["damping"], found["damping_true"] = near.damping, truth["dampings"][0]
         if intervals is not None and at < len(intervals.modes):
-            known = intervals.modes[at]
-            found["frequency_inside"] = bool(
-                known.frequency_Hz[0] <= truth["modes_hz"][0] <= known.frequency_Hz[1]
-            )
-            found["damping_inside"] = bool(known.damping[0] <= truth["dampings"][0] <= known.damping[1])
+            (low, high), (least, most) = intervals.modes[at].frequency_Hz, intervals.modes[at].damping
+            found["frequency_inside"] = bool(low <= truth["modes_hz"][0] <= high)
+            found["damping_inside"] = bool(least <= truth["dampings"][0] <= most)
     if identify.friction is not None:
         law, level = identify.friction.law, identify.friction.level
         used = truth["friction_as_recorded_in_input_units"][:-1]
@@ -227,10 +223,8 @@ def _model(one: Machine, truth: dict[str, Any], run: Path, bla: int) -> dict[str
     inside = _holds(ellipses, response(a, b, c, omega, one.plant.dt_s), 0.0)
     found["ellipses"] = float(np.mean(inside[excited])) if np.any(excited) else None
     band = np.floor(2 * np.log10(omega)).astype(int)
-    found["by_half_decade"] = {
-        f"{10 ** (k / 2):.3g} rad/s": float(np.mean(inside[excited & (band == k)]))
-        for k in np.unique(band[excited])
-    }
+    shares = {k: float(np.mean(inside[excited & (band == k)])) for k in np.unique(band[excited])}
+    found["by_half_decade"] = {f"{10 ** (k / 2):.3g} rad/s": share for k, share in shares.items()}
     if bla:
         centre, variance = _amplitude_response(one, omega, bla)
         found["ellipses_bla"] = float(np.mean(_holds(spread.frequency, centre, variance)[excited]))

@@ -6,7 +6,6 @@ import gzip
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.signal
@@ -104,9 +103,8 @@ def machine(kind: str, seed: int, series: int = 1) -> Machine:
     waves = d.plant.ripple * [ripple * min(rms) * d.plant.torque_per_u, 1, 1]
     plant = replace(plant, ripple=waves * (0.0 if reported else 1.0))
     rough = replace(bare, plant=plant)
-    peaks = np.concatenate(
-        [np.abs(one["u"][begin:]) for one, begin in (rough.record(k, rough.rng(k)) for k in range(logs))]
-    )
+    ran = [rough.record(log, rough.rng(log)) for log in range(logs)]
+    peaks = np.concatenate([np.abs(one["u"][begin:]) for one, begin in ran])
     if not np.all(np.isfinite(peaks)):
         raise RuntimeError(f"{bare.name} of series {series} does not hold")
     limit = float(np.quantile(peaks, clip)) if kind == "saturation" else 2.5 * float(np.max(peaks))
@@ -130,7 +128,7 @@ def _shape(name: str, n: int, before: int, dt: float, d: Draft, rng: np.random.G
         hold = max(round(1 / (u(2, 4) * d.mode_hz) / dt), 1)
         levels = np.repeat(rng.choice([-1.0, 1.0], total // hold + 1), hold)[:total]
         keep = np.exp(-TAU * min(d.mode_hz * u(0.5, 1.5), nyquist) * dt)
-        return _low_pass(_low_pass(levels, keep), keep)
+        return scipy.signal.lfilter([(1 - keep) ** 2], [1, -2 * keep, keep**2], levels)
     if name == "chirp":
         first, last = u(0.1, 0.3), min(2 * d.mode_hz, 0.4 / dt)
         rate = np.log(last / first) / (n * dt)
@@ -141,20 +139,13 @@ def _shape(name: str, n: int, before: int, dt: float, d: Draft, rng: np.random.G
         there, moving = u(-2, 2), max(round(u(0.8, 3) / (TAU * d.bandwidth_hz) / dt), 8)
         s = np.clip(np.arange(moving + round(u(0.2, 0.8) / dt)) / moving, 0, 1)
         ramp = u(0.15, 0.3)
-        up = np.where(
-            s < ramp,
-            s**2 / (2 * ramp),
-            np.where(s > 1 - ramp, 1 - ramp - (1 - s) ** 2 / (2 * ramp), s - ramp / 2),
-        )
+        up = np.where(s > 1 - ramp, 1 - ramp - (1 - s) ** 2 / (2 * ramp), s - ramp / 2)
+        up = np.where(s < ramp, s**2 / (2 * ramp), up)
         part = last + (there - last) * up / (1 - ramp)
         last = float(part[-1])
         shape[at : at + s.size] = part[: total - at]
         at += s.size
     return shape
-
-
-def _low_pass(x: Array, keep: float) -> Array:
-    return scipy.signal.lfilter([1 - keep], [1, -keep], x)
 
 
 def write(one: Machine, folder: Path, truth: Path) -> list[Path]:
@@ -175,39 +166,32 @@ def write(one: Machine, folder: Path, truth: Path) -> list[Path]:
         table = {time: [f"{t * 1e3:.6g}" for t in clock] if time == "t_ms" else [f"{t:.5f}" for t in clock]}
         if one.kept:
             table[reference] = [f"{v:.{places}f}" for v in got["r"][begin:]]
-        table |= {
-            command: [f"{v:.{digits}f}" for v in u],
-            output: [f"{v:.{places}f}" for v in got["y"][begin:]],
-        }
+        table[command] = [f"{v:.{digits}f}" for v in u]
+        table[output] = [f"{v:.{places}f}" for v in got["y"][begin:]]
         rows = [",".join(table), *map(",".join, zip(*table.values(), strict=True))]
         paths.append(where / f"run{log + 1}.csv.gz")
         paths[-1].write_bytes(gzip.compress(("\n".join(rows) + "\n").encode(), mtime=0))
         moved.append(got["true"][begin:])
         levels.append(float(got["friction_Nm"]) / one.plant.torque_per_u)
-    known = facts(one, levels) | {"output_range": list(np.percentile(np.concatenate(moved), [5, 95]))}
-    (truth / f"{one.name}.json").write_text(json.dumps(known, indent=1) + "\n")
-    return paths
-
-
-def facts(one: Machine, recorded: list[float]) -> dict[str, Any]:
-    """The truth beside the logs. G: friction-free sampled response from u to y in the log's units."""
     p, d = one.plant, one.draft
     a, b, c = p.sampled(d.q_operating)
     poles = p.linear(d.q_operating)[3]
     modes = sorted((poles[poles.imag > 1e-6]), key=abs)
-    return {
-        "kind": one.kind, "seed": one.seed, "series": one.series, "dt_s": p.dt_s, "delay_samples": p.delay,
-        "A": a.tolist(), "B": b.tolist(), "C": c.tolist(),
+    known = {
+        "kind": one.kind, "seed": one.seed, "series": one.series, "dt_s": dt, "delay_samples": p.delay,
+        "A": a.tolist(), "B": b.tolist(), "C": c.tolist(),  # friction-free, sampled, in the log's units
         "modes_hz": [abs(m) / TAU for m in modes], "dampings": [-m.real / abs(m) for m in modes],
         "unstable_1_s": [float(m.real) for m in poles if m.real > 1e-6],
         "coulomb_in_input_units": float(p.friction[:, 0].sum() / p.torque_per_u),
         "breakaway_in_input_units": float(p.friction[:, 1].sum() / p.torque_per_u),
-        "friction_as_recorded_in_input_units": recorded,  # work over path, per log
+        "friction_as_recorded_in_input_units": levels,  # work over path, per log
         "bristle": bool(np.any(p.friction[:, 3])), "play_rad": float(2 * p.springs[0, 4]),
         "limit_in_input_units": p.limit, "count_in_output_units": p.count, "bandwidth_hz": d.bandwidth_hz,
         "controller": {k: np.asarray(v).tolist() for k, v in d.law._asdict().items()},
         "classes": one.classes, "levels": one.levels, "at_rest": one.at_rest,
-        "reference_recorded": one.kept,
-        "operating_point": d.q_operating * p.scale, "columns": d.columns,
-        "command_before_limit": one.as_commanded,
+        "reference_recorded": one.kept, "command_before_limit": one.as_commanded,
+        "operating_point": d.q_operating * p.scale,
+        "output_range": list(np.percentile(np.concatenate(moved), [5, 95])),
     }  # fmt: skip
+    (truth / f"{one.name}.json").write_text(json.dumps(known, indent=1) + "\n")
+    return paths

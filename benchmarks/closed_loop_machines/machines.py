@@ -69,9 +69,8 @@ def draft(kind: str, seed: int, rng: np.random.Generator) -> Draft:
     gear = float(rng.choice([50, 80, 100])) if kind == "joint" else 1.0
     torque = float(np.exp(u(*np.log(one["torque"])))) if letters[1] != "t" else gear
     load, counts = motor * ratio, int(rng.choice(_COUNTS))
-    rates = [
-        rate for rate in _RATES_HZ if rate >= max(12 * anti * np.sqrt(1 + ratio), 1000 * (kind == "screw"))
-    ]
+    least = max(12 * anti * np.sqrt(1 + ratio), 1000 * (kind == "screw"))
+    rates = [rate for rate in _RATES_HZ if rate >= least]
     rate, delay = float(rng.choice(rates[:3])), int(rng.random() < 0.5)
     if reported:
         motor, load, anti, zeta, torque, per_rad, counts = 2e-3, 5e-3, 5.0, 0.0374, 0.6, 1.0, 16384
@@ -87,19 +86,15 @@ def draft(kind: str, seed: int, rng: np.random.Generator) -> Draft:
     if kind == "link":  # a clamped beam: share of the inertia and frequency of its first three modes
         shares, times = np.array([0.9707, 0.0247, 0.0032]), np.array([1, 6.267, 17.55])
         inertia = np.concatenate([[motor + load * (1 - shares.sum())], load * shares])
-        rows = [
-            _spring(motor, m, anti * t, zeta, j + 1)
-            for j, (m, t) in enumerate(zip(inertia[1:], times, strict=True))
-        ]
+        rows = [_spring(motor, inertia[j], anti * times[j - 1], zeta, j) for j in (1, 2, 3)]
         springs, viscous, gravity = np.concatenate(rows), np.append(viscous[:1], np.zeros(3)), np.zeros(4)
     q_operating = 0.0
     if kind == "pendulum":  # odd seeds: an arm held above the horizontal
         gravity[1] = load * 9.81 / u(0.2, 0.8)
         q_operating = float(u(0.5, 1.1) * rng.choice([-1, 1])) if seed % 2 else 0.0
     scale = per_rad or float(rng.choice([5, 10, 20])) / TAU
-    ripple = np.array(
-        [{"joint": 1.0, "belt": 0.3}.get(kind, 0.0), 2 * gear if kind == "joint" else 12.0, u(0, TAU)]
-    )
+    waves = {"joint": (1.0, 2 * gear), "belt": (0.3, 12.0)}.get(kind, (0.0, 12.0))
+    ripple = np.array([*waves, u(0, TAU)])
     size = inertia.size
     plant = Plant(
         inertia, viscous, gravity, springs, np.tile([0, 0, 1.0, 0, 0], (size, 1)), ripple, torque,
@@ -111,7 +106,7 @@ def draft(kind: str, seed: int, rng: np.random.Generator) -> Draft:
         bandwidth = u(*one["bandwidth"]) * max(np.max(poles.real), 3.0)
     law, bandwidth = _design(plant, q_operating, float(bandwidth), rng)
     if reported:
-        law = _pid(1.5, 0.06, 0.0, 1e-6, 0.0, 1e-3, False, 0.0)
+        law = _pid((1.5, 0.06, 0.0), 1e-6, 0.0, 1e-3, False, 0.0)
     motion = float(np.exp(u(*np.log(one["motion"]))))
     motion = 0.22 if reported else max(motion, 20 * plant.count / scale)
     noisy = float(u(0.5, 2)) if counts >= 200_000 else 0.0
@@ -126,17 +121,9 @@ def _spring(motor: float, load: float, anti_hz: float, zeta: float, to: int = 1)
     return np.array([[0, to, stiffness, 2 * zeta * stiffness / mode, 0.0]])
 
 
-def _pid(
-    kp: float,
-    kd: float,
-    ki: float,
-    filter_s: float,
-    low_pass_s: float,
-    dt_s: float,
-    on_output: bool,
-    bias: float,
-) -> Law:
-    """P, filtered derivative (of the error, or of the output only), I with back-calculation, low-pass."""
+def _pid(gains: Any, filter_s: float, low_pass_s: float, dt_s: float, on_output: bool, bias: float) -> Law:
+    """P, filtered D (of the error or of the output), I with back-calculation, low-pass; gains P, D, I."""
+    kp, kd, ki = gains
     keep, soft = np.exp(-dt_s / filter_s), np.exp(-dt_s / low_pass_s) if low_pass_s else 0.0
     slope, error = np.array([0.0, -1.0]) if on_output else np.array([1.0, -1.0]), np.array([1.0, -1.0])
     steep = kd * (1 - keep) / dt_s  # a backward difference where the filter is faster than the sampling
@@ -160,17 +147,12 @@ def loop_gain(plant: Plant, q_operating: float, law: Law, omega_rad_s: Any) -> A
     return -g * (response(law.A, law.B[:, 1:], law.C[None, :], omega_rad_s, plant.dt_s) + law.D[1])
 
 
-def _design(
-    plant: Plant, q_operating: float, bandwidth: float, rng: np.random.Generator
-) -> tuple[Law, float]:
+def _design(plant: Plant, q_operating: float, bandwidth: float, rng: Any) -> tuple[Law, float]:
     """PD, PID or PID with a low-pass that keeps |S| under 2.8; slower by a tenth until it does."""
     u = rng.uniform
     kind, zeta, times, on_output = int(rng.integers(3)), u(0.5, 1.0), u(5, 15), bool(rng.random() < 0.4)
-    low, slow, held = (
-        u(6, 12),
-        u(4, 10),
-        -np.sum(plant.gravity) * np.sin(q_operating) / plant.torque_per_u * u(0.9, 1.1),
-    )
+    low, slow = u(6, 12), u(4, 10)
+    held = -np.sum(plant.gravity) * np.sin(q_operating) / plant.torque_per_u * u(0.9, 1.1)
     gain = plant.torque_per_u * plant.scale / plant.inertia.sum()
     lift = max(np.sum(plant.gravity) * np.cos(q_operating) / plant.inertia.sum(), 0.0)
     theta = np.geomspace(1e-4, np.pi, 2000)
@@ -179,7 +161,7 @@ def _design(
         kp, kd = (natural**2 + lift) / gain, 2 * zeta * natural / gain
         ki = kp * natural / slow if kind else 0.0
         soft = 1 / (low * bandwidth) if kind == 2 else 0.0
-        law = _pid(kp, kd, ki, 1 / (times * bandwidth), soft, plant.dt_s, on_output, float(held))
+        law = _pid((kp, kd, ki), 1 / (times * bandwidth), soft, plant.dt_s, on_output, float(held))
         nearest = np.min(np.abs(1 + loop_gain(plant, q_operating, law, theta / plant.dt_s)))
         if loop_radius(plant, q_operating, law) < 1 and nearest > 1 / 2.8:
             return law, bandwidth

@@ -54,9 +54,8 @@ class Plant:
             across = np.zeros(n)
             across[int(i)], across[int(j)] = 1, -1
             stiff, damp = stiff + k * np.outer(across, across), damp + d * np.outer(across, across)
-        a = np.block(
-            [[np.zeros((n, n)), np.eye(n)], [-stiff / self.inertia[:, None], -damp / self.inertia[:, None]]]
-        )
+        forces = -np.hstack([stiff, damp]) / self.inertia[:, None]
+        a = np.vstack([np.eye(2 * n)[n:], forces])
         b, c = np.zeros((2 * n, 1)), np.zeros((1, 2 * n))
         b[n, 0], c[0, self.out] = self.torque_per_u / self.inertia[0], self.scale
         return a, b, c, np.linalg.eigvals(a)
@@ -79,9 +78,7 @@ class Plant:
         bristle = np.sqrt(np.max(self.friction[:, 3] / self.inertia))
         return float(min(2e-5, 0.01 / max(fastest, 1e-9), 0.05 / max(bristle, 1e-9)))
 
-    def run(
-        self, law: Law, reference: Array, q_start: float, noise: Array, count_from: int = 0
-    ) -> dict[str, Array]:
+    def run(self, law: Law, reference: Array, q_start: float, noise: Array, count_from: int = 0) -> Any:
         """The loop from rest at q_start. reference (T,), noise (T,) in output units.
 
         y: encoder; u: command; applied: after the limit; true: output without encoder; speed: of inertia 0
@@ -103,9 +100,8 @@ class Plant:
 def response(a: Array, b: Array, c: Array, omega_rad_s: Array, dt_s: float) -> Array:
     """C (z - A)^-1 B at z = exp(j omega dt), (F,)."""
     z = np.exp(1j * np.asarray(omega_rad_s) * dt_s)
-    states = np.linalg.solve(
-        z[:, None, None] * np.eye(a.shape[0]) - a, np.broadcast_to(b + 0j, (z.size, *b.shape))
-    )
+    every = np.broadcast_to(b + 0j, (z.size, *b.shape))
+    states = np.linalg.solve(z[:, None, None] * np.eye(a.shape[0]) - a, every)
     return (c @ states)[:, 0, 0]
 
 

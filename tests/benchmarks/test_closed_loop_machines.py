@@ -124,7 +124,7 @@ def test_the_reported_belt_is_seed_0_of_series_1():
 
 def controller_file(folder, gain=1.0):
     """A lead of the reported loop's stiffness as a run stores it."""
-    law = machines._pid(1.5 * gain, 0.06 * gain, 0.0, 0.003, 0.0, 1e-3, False, 0.0)
+    law = machines._pid((1.5 * gain, 0.06 * gain, 0.0), 0.003, 0.0, 1e-3, False, 0.0)
     file = {"A": law.A.tolist(), "B": law.B[:, :1].tolist(), "C": [law.C.tolist()], "D": [[law.D[0]]]}
     file |= {"anti_windup_gain": [[0.0]] * 3, "computational_delay_samples": 0, "input_limit": None}
     (folder / "controller.json").write_text(json.dumps(file))
