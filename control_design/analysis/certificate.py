@@ -12,7 +12,14 @@ import numpy as np
 from control_design.analysis.between_grid_points import AllFrequencies, Obstacle, bound_all_frequencies
 from control_design.analysis.joint_coverage import JointCoverage, at_level, joint_coverage as calibrate
 from control_design.analysis.margins import Margins, ellipse_margins, nominal_margins
-from control_design.analysis.stability import NyquistCount, closed_loop_poles, loop_integrators, nyquist_count
+from control_design.analysis.stability import (
+    ModeChange,
+    NyquistCount,
+    closed_loop_poles,
+    loop_integrators,
+    mode_changes,
+    nyquist_count,
+)
 from control_design.analysis.worst_case import worst_case
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Ellipses, Real
@@ -27,7 +34,8 @@ from control_design.specification.requirement import Findings, SpecificationItem
 class PlantVerdict:
     """Everything checked on one plant.
 
-    closed_loop_modes: oscillatory pairs of the nominal closed loop. worst_tracking etc.: largest weighted
+    closed_loop_modes: oscillatory pairs of the nominal closed loop. mode_changes: what becomes of the lightly
+    damped modes of the nominal plant. worst_tracking etc.: largest weighted
     value over the ellipses (<= 1 met, 0 = not asked). bandwidth_rad_s: up to here
     every member has |S| below -3 dB. own_grid_rad_s: range of a user's own frequency grid, None if the
     uncertainty is known everywhere; assumed_linear: between its points the response was assumed on a straight
@@ -40,6 +48,7 @@ class PlantVerdict:
     stable: bool
     pole_radius: float
     closed_loop_modes: tuple[Mode, ...]
+    mode_changes: tuple[ModeChange, ...]
     nyquist: NyquistCount
     nominal_margins: Margins
     worst_margins: Margins
@@ -239,6 +248,7 @@ def _check_plant(
         stable=stable,
         pole_radius=radius,
         closed_loop_modes=tuple(m for m in loop_modes if m.zeta < 1.0),
+        mode_changes=mode_changes(controller, plant),
         nyquist=count,
         nominal_margins=nominal,
         worst_margins=margins,

@@ -5,12 +5,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Boolean, Complex, Real
-from control_design.plants.plant_set import UncertainPlant, count_integrators, delayed
+from control_design.plants.plant_set import Mode, UncertainPlant, count_integrators, delayed, modes_of
+
+_GAINS = 16  # steps of the root locus; halved up to _HALVINGS times where poles come near one another
+_HALVINGS = 6
+_NEAR = 1.2  # ratio of frequencies within which a lighter pole of the loop is heard as the mode
+_LOST = 0.02  # share of its damping; two digits show no less
 
 
 class NominalLoop:
@@ -55,6 +62,62 @@ def closed_loop_poles(controller: Controller, plant: UncertainPlant) -> Complex:
     if not np.all(np.isfinite(poles)):
         raise ValueError(f"plant {plant.name!r}: algebraic loop, 1 + D_K D_G = 0")
     return poles
+
+
+@dataclass(frozen=True)
+class ModeChange:
+    """A lightly damped mode of the plant, and what becomes of it in the nominal loop (zeta 1: no swing)."""
+
+    open_loop: Mode
+    closed_loop: Mode
+
+    @property
+    def loses_damping(self) -> bool:
+        """By a share that two digits can show."""
+        return self.closed_loop.zeta < (1 - _LOST) * self.open_loop.zeta
+
+
+def mode_changes(controller: Controller, plant: UncertainPlant) -> tuple[ModeChange, ...]:
+    """Every stable mode of the plant in closed loop, ascending in frequency.
+
+    A mode is followed along the root locus, gain of the controller from 0 to 1. Of closed-loop modes that no
+    mode of the plant has become and that are within a fifth of its frequency, a lighter one takes its place:
+    where poles of plant and controller meet, the lighter branch is what rings. Only the nominal plant.
+    """
+    modes = [mode for mode in plant.modes if mode.zeta > 0]
+    loop = NominalLoop(plant, controller.computational_delay_samples)
+
+    def poles_at(gain: float) -> Complex:
+        found = loop.poles(controller.A, controller.B, gain * controller.C, gain * controller.D)
+        return found[(found.imag >= 0) & np.isfinite(found)]
+
+    def follow(from_: Complex, low: float, high: float, halvings: int) -> Complex:
+        near = poles_at(high)
+        away = np.abs(from_[:, None] - near[None])
+        own = linear_sum_assignment(away)[1]
+        others = away.copy()
+        others[np.arange(from_.size), own] = np.inf
+        if halvings and np.any(away.min(axis=1) > 0.3 * others.min(axis=1, initial=np.inf)):
+            middle = 0.5 * (low + high)
+            return follow(follow(from_, low, middle, halvings - 1), middle, high, halvings - 1)
+        return near[own]
+
+    s = [mode.omega_rad_s * (-mode.zeta + 1j * np.sqrt(1 - mode.zeta**2)) for mode in modes]
+    followed = np.exp(np.array(s, dtype=np.complex128) * plant.dt_s)
+    gains = np.linspace(0.0, 1.0, _GAINS + 1)
+    if modes:
+        for low, high in pairwise(gains.tolist()):
+            followed = follow(followed, low, high, _HALVINGS)
+    every = poles_at(1.0)
+    rest = modes_of(every[~np.isin(every, followed)], plant.dt_s, zeta_below=1.0)
+    changes = []
+    for mode, pole in zip(modes, followed, strict=True):
+        became = modes_of(np.array([pole]), plant.dt_s, zeta_below=1.0) or (
+            Mode(float(abs(np.log(pole)) / plant.dt_s) if pole else np.inf, 1.0),
+        )
+        near = [m for m in rest if 1 / _NEAR < m.omega_rad_s / mode.omega_rad_s < _NEAR]
+        changes.append(ModeChange(mode, min((*became, *near), key=lambda found: found.zeta)))
+    return tuple(changes)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,12 @@ import pytest
 
 from control_design import Controller, Ellipses, UncertainPlant
 from control_design.analysis.margins import ellipse_margins, nominal_margins
-from control_design.analysis.stability import closed_loop_poles, loop_integrators, nyquist_count
+from control_design.analysis.stability import (
+    closed_loop_poles,
+    loop_integrators,
+    mode_changes,
+    nyquist_count,
+)
 from control_design.plants.ellipses import distance_to_minus_one
 from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import frequency_response
@@ -161,3 +166,59 @@ def _same(exact: float, sampled: float) -> None:
     """Sampling may only miss what is thinner than its steps: close where it finds anything."""
     if np.isfinite(sampled) and sampled != 0:
         assert exact == pytest.approx(sampled, rel=2e-3, abs=2e-3)
+
+
+_DT = 0.005
+
+
+def _link(*modes: tuple[float, float]) -> UncertainPlant:
+    """Sum of modes (rad/s, damping ratio) of unit static gain, each."""
+    parts = [control.tf([w * w], [1.0, 2 * zeta * w, w * w]) for w, zeta in modes]
+    return UncertainPlant("link", control.ss(sum(parts[1:], parts[0])).sample(_DT))
+
+
+def _lead(gain: float, corner: float = 400.0, delay: int = 0) -> Controller:
+    """gain s / (s/corner + 1): damping by the speed of the output; late, it takes damping away."""
+    return _controller(control.ss(control.tf([gain, 0.0], [1 / corner, 1.0])).sample(_DT, "tustin"), delay)
+
+
+def test_modes_move_in_closed_loop_as_perturbation_theory_has_it():
+    """For a small gain a pole p of G moves by -K(p) times its residue, whichever other pole it passes."""
+    plant = _link((30.0, 0.05), (33.0, 0.01), (150.0, 0.02))
+    controller = _lead(1e-5, delay=2)
+    g, k = control.tf(plant.nominal), controller
+    num, den = np.squeeze(g.num[0][0]), np.squeeze(g.den[0][0])
+    found = mode_changes(controller, plant)
+    assert [round(change.open_loop.omega_rad_s) for change in found] == [30, 33, 150]
+    for change in found:
+        w, zeta = change.open_loop.omega_rad_s, change.open_loop.zeta
+        pole = np.exp(w * (-zeta + 1j * np.sqrt(1 - zeta**2)) * _DT)
+        residue = np.polyval(num, pole) / np.polyval(np.polyder(den), pole)
+        law = k.C @ np.linalg.solve(pole * np.eye(k.order) - k.A, k.B) + k.D
+        s = np.log(pole - residue * law[0, 0] * pole**-2) / _DT
+        assert change.closed_loop.zeta - zeta == pytest.approx(-s.real / abs(s) - zeta, rel=2e-2)
+
+
+@pytest.mark.parametrize("delay", [0, 12])
+def test_a_loop_that_is_late_takes_damping_from_the_modes_it_is_late_for(delay):
+    """A quarter period of the mode at 60 rad/s is 5 samples: 12 samples turn damping into the reverse there,
+    and leave a mode at 10 rad/s damped."""
+    plant = _link((10.0, 0.05), (60.0, 0.05))
+    slow, fast = mode_changes(_lead(2e-4, delay=delay), plant)
+    assert not slow.loses_damping
+    assert slow.closed_loop.zeta > slow.open_loop.zeta
+    assert fast.loses_damping == (delay > 0)
+
+
+def test_a_pole_of_the_controller_that_rings_beside_a_mode_counts_as_the_mode():
+    plant = _link((20.0, 0.1))
+    resonance = control.ss(control.tf([1e-3 * 400.0], [1.0, 2 * 0.01 * 21.0, 441.0])).sample(_DT)
+    (change,) = mode_changes(_controller(resonance, 0), plant)
+    assert change.loses_damping
+    assert change.closed_loop.zeta < 0.02
+
+
+def test_a_mode_that_swings_no_more_has_not_lost_damping():
+    (change,) = mode_changes(_lead(0.2, corner=2000.0), _link((20.0, 0.3)))
+    assert change.closed_loop.zeta > 0.9
+    assert not change.loses_damping

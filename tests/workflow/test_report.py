@@ -10,15 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from control_design.analysis.stability import ModeChange
 from control_design.convex.reference_filter import ReferenceFilter
+from control_design.plants.plant_set import Mode
 from tests.workflow import report_examples as example
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import drawings
 from workflow.report.pages import write_report
 from workflow.tasks.results import ClosedLoopResult, ReferenceFilterResult, RunResults
+from workflow.tasks.summary import summarise
 from workflow.text.formats import at_least, at_most, bound
-from workflow.text.templates import environment, words
+from workflow.text.templates import environment, said, words
 
 ATTACK = "<script>alert(1)</script>"
 
@@ -161,7 +164,8 @@ def test_numbers_on_the_page_are_the_stages_numbers(undrawn, tmp_path):
 
 def test_a_certified_run_says_so_and_why(undrawn, tmp_path):
     page = page_for(tmp_path, example.config())
-    assert "Certified: all 2 requirements are met" in page.text
+    assert "Certified, but the loop takes damping from a mode" in page.text
+    assert "The mode at 2.23 Hz loses damping: 0.05 in open loop, 0.037 in closed loop" in page.text
     assert "All 3 runs on the simulated arm settle" in page.text
     assert "The certificate covers linear dynamics at the recorded amplitudes: the 95 % ellipses" in page.text
     assert any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
@@ -264,6 +268,30 @@ def test_an_error_that_stays_is_told(undrawn, tmp_path):
         text = text_of(run, settings)
         assert ("leaves 40 % of the reference step as error" in text) == told
         assert ("integrator = true" in text) == told
+
+
+def test_a_design_that_takes_damping_from_a_mode_says_so(undrawn, tmp_path):
+    settings = example.config()
+    run = example.build_run(tmp_path / "run", settings)
+    results = RunResults(run)
+    for before, after, told in ((0.02, 0.011, True), (0.02, 0.0199, False), (0.02, 0.4, False)):
+        certificate = results.certify.certificate
+        change = ModeChange(Mode(2 * np.pi * 33.0, before), Mode(2 * np.pi * 34.0, after))
+        plant = replace(
+            certificate.plants[0], mode_changes=(ModeChange(Mode(9.0, 0.1), Mode(9.0, 0.3)), change)
+        )
+        changed = replace(results.certify, certificate=replace(certificate, plants=(plant,)))
+        run.save_stage("certify", changed, "x")
+        lost = "mode at 33 Hz loses damping: 0.02 in open loop, 0.011 in closed loop"
+        text, summary = text_of(run, settings), summarise(RunResults(run), settings)
+        assert (f"The {lost}" in text) == ("the loop takes damping from a mode" in text) == told
+        assert ("Certified: all 2 requirements are met" in text) == (not told)
+        assert ("0.02 → 0.011" in text) == told
+        assert (lost in summary.verdict) == told
+        changes = summary.numbers["certificate"]["plants"][0]["mode_changes"]
+        assert changes[1]["closed_loop"]["zeta"] == after
+        design = said("design_verdict", results.design, changed.certificate, "")
+        assert (lost in design) == told
 
 
 def test_one_channel_alone(undrawn, tmp_path):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from control_design.analysis.certificate import Certificate
-from control_design.analysis.stability import closed_loop_poles
+from control_design.analysis.stability import ModeChange, closed_loop_poles
 from control_design.controllers.controller import Controller
 from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
@@ -295,23 +295,13 @@ class RunView:
         return self.lasting_error / loop.reference_step
 
     @property
-    def damped_mode(self) -> tuple[ModelMode, Mode | None] | None:
-        """The slowest lightly damped mode that is fed back, and what the loop makes of it.
-
-        Of the nominal closed-loop modes within a fifth of its frequency the least damped one, else the
-        nearest within an octave. None where there is none: the list ends at a damping ratio of 0.4.
-        """
-        light = [mode for _, mode in self.control.light]
-        if not light or self.certificate is None:
-            return None
-        mode = min(light, key=lambda found: found.omega_rad_s)
-        loops = [p.closed_loop_modes for p in self.certificate.plants if p.plant == self.plant.name]
-        octaves = {found: abs(np.log2(found.omega_rad_s / mode.omega_rad_s)) for found in sum(loops, ())}
-        near = [found for found, away in octaves.items() if away < np.log2(1.2)]
-        within = [found for found, away in octaves.items() if away < 1]
-        if near:
-            return mode, min(near, key=lambda found: found.zeta)
-        return mode, min(within, key=lambda found: octaves[found], default=None)
+    def damped_mode(self) -> ModeChange | None:
+        """The mode of the nominal that the loop takes most damping from, else the slowest; None without."""
+        plants = () if self.certificate is None else self.certificate.plants
+        changes = [change for p in plants if p.plant == self.plant.name for change in p.mode_changes]
+        lost = [change for change in changes if change.loses_damping]
+        ratio = {change: change.closed_loop.zeta / change.open_loop.zeta for change in lost}
+        return min(lost, key=ratio.__getitem__, default=next(iter(changes), None))
 
     @cached_property
     def loop_grid(self) -> Real:
