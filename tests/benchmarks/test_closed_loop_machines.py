@@ -1,13 +1,15 @@
 """The independent machines and their judge: response, energy, sticking, violations, settling."""
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from benchmarks.closed_loop_machines import machines
+from benchmarks.closed_loop_machines import judge, logs, machines, simulator
 from benchmarks.closed_loop_machines.judge import read_law, settles, violations
 from benchmarks.closed_loop_machines.logs import machine
 from benchmarks.closed_loop_machines.simulator import Law, Plant, response
@@ -167,3 +169,24 @@ def test_a_loop_that_stands_settles_and_one_that_swings_does_not(tmp_path):
         law = controller_file(tmp_path, gain)
         runs = [settles(one, truth, one.plant, law, tmp_path, 5.0, k) for k in range(3)]
         assert runs == [settled] * 3
+
+
+def test_the_truth_shares_no_code_with_what_it_judges():
+    for module in (simulator, machines, logs):
+        found = re.findall(r"^\s*(?:from|import) (\w+)", Path(module.__file__).read_text(), re.M)
+        plain = "__future__ dataclasses gzip json pathlib typing numba numpy scipy benchmarks"
+        assert set(found) <= set(plain.split())
+
+
+def test_a_refusal_is_one_line_and_a_next_step_is_recognised(tmp_path):
+    code, text, lines = judge._flexlink(
+        "init", str(tmp_path / "none.csv"), "--out", str(tmp_path / "my.toml")
+    )
+    assert (code, text, len(lines)) == (2, "", 1)
+    for line in (
+        "set integrators = 2",
+        "record it: flexlink excite --closed-loop my.toml",
+        "lower bandwidth_rad_s = 3",
+    ):
+        assert judge._STEP.search(line)
+    assert not judge._STEP.search("the loop misses the requirement (γ = 1.7, at most 1 is needed)")
