@@ -13,7 +13,7 @@ from ident.data.table import Table
 from ident.data.units import TIME_UNITS, ends_with_time, says_time
 
 _INPUT = re.compile(
-    r"(u|v|input|command|cmd|drive|voltage|spannung|current|strom|torque|moment|force|pwm|duty)(?![a-z])",
+    r"(u|v|input|command|commanded|cmd|drive|voltage|spannung|current|strom|torque|moment|force|pwm|duty)(?![a-z])",
     re.I,
 )
 _OUTPUT = re.compile(
@@ -121,9 +121,11 @@ def roles_with_reference(table: Table, log: str, command: str, **stated: str | N
     ]
     if len(fitting) > 1:
         listed = shown(" and ".join(shown(name, 30) for name in fitting), 90)
+        named = [("--" + role, name) for role, name in stated.items() if name] + [("--reference", fitting[0])]
+        typed = " ".join(f"{option} {shlex.quote(shown(name, 30))}" for option, name in named)
         raise ValueError(
             f"{table.path}: {listed} may be the reference of '{shown(roles.output, 30)}'; type: flexlink "
-            f"{command} {log} --reference {shlex.quote(shown(fitting[0], 30))}"
+            f"{command} {log} {typed}"
         )
     return replace(roles, reference=_only(fitting))
 

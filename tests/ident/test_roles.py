@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident.data.roles import Roles, roles_of
+from ident.data.roles import Roles, is_position, roles_of, roles_with_reference
 from ident.data.table import Table
 
 
@@ -83,3 +83,47 @@ def test_the_last_word_of_a_path_counts(input_, output):
     k = np.arange(50.0)
     table = Table("a.npz", {"t": 0.01 * k, input_: np.sin(k), output: np.cos(k), "bus.count": k})
     assert roles_of(table, "a.npz") == Roles("t", input_, output)
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        (("t_ms", "ref_rad", "i_cmd_A", "enc_rad"), ("i_cmd_A", "enc_rad", "ref_rad")),
+        (("t_s", "cmd_pos", "torque_Nm", "pos_mm"), ("torque_Nm", "pos_mm", "cmd_pos")),
+        (("t_s", "u_ref_rad", "v_drive_counts", "theta_rad"), ("v_drive_counts", "theta_rad", "u_ref_rad")),
+        (("t_s", "r", "u", "y", "e"), ("u", "y", "r")),
+        (("t_s", "q_des_rad", "q_rad", "err_rad", "tau_Nm"), ("tau_Nm", "q_rad", "q_des_rad")),
+        (("t_s", "pos_ref_rad", "pos_rad", "vel_rad_s", "u_V"), ("u_V", "pos_rad", "pos_ref_rad")),
+        (("t_s", "u_ref_V", "hub_rad"), ("u_ref_V", "hub_rad", None)),
+        (("t_s", "Commanded_PWM", "Motor_Speed(RPM)"), ("Commanded_PWM", "Motor_Speed(RPM)", None)),
+    ],
+)
+def test_a_reference_is_recognised_by_its_name_in_the_unit_of_the_output(names, found):
+    got = roles_with_reference(table(*names), "a.csv", "init")
+    assert (got.input, got.output, got.reference) == found
+
+
+def test_two_references_are_asked_for_with_all_that_was_said():
+    two = table("t_s", "i_A", "a_ref_rad", "b_ref_rad", "a_rad", "b_rad")
+    with pytest.raises(
+        ValueError, match=r"a_ref_rad and b_ref_rad may be .* --output a_rad --reference a_ref_rad$"
+    ):
+        roles_with_reference(two, "a.csv", "init", output="a_rad")
+    assert (
+        roles_with_reference(two, "a.csv", "init", output="a_rad", reference="b_ref_rad").reference
+        == "b_ref_rad"
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "position"),
+    [
+        ("q", "rad", True),
+        ("q", "rad/s", False),
+        ("speed", "", False),
+        ("angle", "", True),
+        ("n", "rpm", False),
+    ],
+)
+def test_speeds_are_no_positions(name, unit, position):
+    assert is_position(name, unit) == position

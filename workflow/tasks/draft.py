@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.signal import butter, sosfiltfilt
 
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification, SpecificationError
@@ -82,7 +83,7 @@ def draft_of(records: Sequence[Record], *, position: bool, limit: float | None =
     highest = max(float(np.max(np.abs(record.input))) for record in records)
     at_limit = _limit(records)
     reached = limit or at_limit or highest
-    spread = rms_of([record.output[:, 0] for record in fitted])
+    spread = _moved(fitted, look)
     # A step of half the spread may ask for the largest command, and the loop for more than the recorded one.
     effort = max(reached / (0.5 * spread) if spread > 0 else 1.0, _MORE * recorded_effort(look.records))
     unstable = _unstable_per_s(look)
@@ -110,6 +111,15 @@ def recorded_effort(records: Sequence[Record]) -> float:
             return float(np.quantile(np.abs(response.centre), 0.95))
     spread = rms_of([record.output[:, 0] for record in records])
     return rms_of([record.input[:, 0] for record in records]) / spread if spread > 0 else 0.0
+
+
+def _moved(records: Sequence[Record], look: FirstLook) -> float:
+    """Rms of the output in the band that the logs tell: an integrating machine in open loop walks away."""
+    signals = [record.output[:, 0] for record in records]
+    if look.told_rad_s is None:
+        return rms_of(signals)
+    high = butter(2, look.told_rad_s[0] * records[0].dt_s / np.pi, "highpass", output="sos")
+    return rms_of([np.asarray(sosfiltfilt(high, signal - signal.mean())) for signal in signals])
 
 
 def _limit(records: Sequence[Record]) -> float | None:

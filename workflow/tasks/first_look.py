@@ -33,6 +33,9 @@ _EXCITED, _ABOVE_FLOOR = 1e-6, 10.0
 # A term of the motion is there with so many standard deviations, and this share of the rms command below; a
 # spring with a larger one, as slow drift and the sensor's own errors look like a weak one.
 _SURE, _WORTH, _SPRING = 5.0, 0.01, 0.04
+# Distance from one of the response times the force that the rigid motion takes, in the median: dry friction
+# makes up to this of it where it is as large as that force.
+_AGREES = 0.8
 # Least damping that the fit is allowed; a pair that stays there is none that the response shows.
 _LEAST_DAMPING = 1e-3
 # Chi-square by which another delay has to be worse: 3 standard deviations of one unknown.
@@ -67,6 +70,26 @@ class RigidMotion:
     stiffness: Term | None
     below_rad_s: float
     explained: float
+
+    @property
+    def order(self) -> int:
+        """Derivatives of the output that the inertia stands before."""
+        return 1 if self.stiffness is None else 2
+
+    def agrees(self, response: FrequencyUncertainty) -> bool:
+        """Whether the response says the same, as far as friction lets it: a direct fit of records that the
+        feedback made may show the controller instead."""
+        s = 1j * response.omega_rad_s[response.omega_rad_s <= self.below_rad_s]
+        stiffness = 0.0 if self.stiffness is None else self.stiffness.value
+        force = s ** (self.order - 1) * (self.inertia.value * s + self.viscous.value) + stiffness
+        off = np.abs(1 - response.centre[: s.size] * force)
+        return bool(s.size == 0 or np.median(off) < _AGREES)
+
+    @property
+    def turned(self) -> bool:
+        """Whether the machine is pushed against the command; nothing that the records contradict."""
+        against = self.inertia.shown and self.inertia.value < 0 and self.explained > _EXPLAINED
+        return against and not (self.viscous.shown and self.viscous.value > 0)
 
     @property
     def sprung(self) -> bool:
@@ -105,8 +128,8 @@ def first_look(records: Sequence[Record], *, position: bool) -> FirstLook:
         return FirstLook(cut)
     told = float(response.omega_rad_s[0]), float(response.omega_rad_s[-1])
     found = _fitted(response, int(position))
-    motion = _rigid(cut, found, told, position)
-    turned = motion is not None and motion.inertia.shown and motion.inertia.value < 0
+    motion = _rigid(cut, found, response, position)
+    turned = motion is not None and motion.turned
     if turned:
         cut = tuple(replace(record, input=-record.input) for record in cut)
         motion = None if motion is None else _turned(motion)
@@ -272,15 +295,20 @@ def _first_mode(
 
 
 def _rigid(
-    records: Sequence[Record], found: FrfIdentification | None, told: tuple[float, float], position: bool
+    records: Sequence[Record],
+    found: FrfIdentification | None,
+    response: FrequencyUncertainty,
+    position: bool,
 ) -> RigidMotion | None:
     """The rigid motion as far up as it explains the command, else below the first notch or peak."""
+    told = response.omega_rad_s[[0, -1]].tolist()
     swinging = np.zeros(0) if found is None else _swinging(found.model)
     ends = [told[1], *swinging[(swinging > 2 * told[0]) & (swinging < told[1])][::-1]]
     tried = [rigid_motion(records, _RIGID * float(end), told[1], position=position) for end in ends]
     motions = [motion for motion in tried if motion is not None]
     explaining = [motion for motion in motions if motion.explained > _EXPLAINED]
-    return next(iter(explaining or motions[::-1]), None)
+    agreeing = [motion for motion in explaining or motions[::-1] if motion.agrees(response)]
+    return next(iter(agreeing), None)
 
 
 def rigid_motion(
