@@ -30,13 +30,13 @@ def run(
     kinds: str = ",".join(KINDS),
     series: int = 1,
     jobs: int = 2,
-    bla: int = 0,
+    bla: int = 16,
     keep: str = "",
     judge_only: bool = False,
     make_only: str = "",
 ) -> None:
-    """A line per machine and the table by kind; KEEP: where logs, runs and judged.json stay, to be judged
-    again with --judge-only."""
+    """A line per machine and the table by kind. bla: realisations, 0 for none; keep: where logs, runs and
+    judged.json stay, to be judged again with judge_only."""
     first, last = map(int, seeds.split(":"))
     cases = [(kind, seed) for kind in kinds.split(",") for seed in range(first, last)]
     if make_only:

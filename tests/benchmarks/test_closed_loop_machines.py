@@ -190,3 +190,17 @@ def test_a_refusal_is_one_line_and_a_next_step_is_recognised(tmp_path):
     ):
         assert judge._STEP.search(line)
     assert not judge._STEP.search("the loop misses the requirement (γ = 1.7, at most 1 is needed)")
+
+
+def test_response_at_the_recorded_amplitude_is_the_friction_free_one_where_friction_vanishes():
+    one = machine("belt", 0)
+    omega = np.geomspace(5, 100, 30)
+    g = response(*one.plant.sampled(), omega, one.plant.dt_s)
+    weak = replace(one, plant=replace(one.plant, friction=one.plant.friction * [1e-4, 1e-4, 1, 0, 0]))
+    found, variance = judge._amplitude_response(weak, omega, 3)
+    assert np.max(np.abs(found / g - 1)) < 5e-3  # what the counts of the encoder leave, measured: 1.5e-3
+    found, variance = judge._amplitude_response(one, omega, 6)
+    # 0.05 A of friction in 0.5 A of command: damping of the mode up by half, little between 2 and 4 Hz.
+    apart = np.abs(found / g - 1)
+    assert np.max(apart) > 0.2 > 0.05 > np.max(apart[(omega > 13) & (omega < 25)])
+    assert np.median(np.sqrt(variance) / np.abs(g)) < 0.05
