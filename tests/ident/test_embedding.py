@@ -203,17 +203,6 @@ def test_initial_state_and_offset_do_not_disturb_the_estimate():
     assert without.at(OMEGA).contains(arm.truth).mean() < 0.5
 
 
-def test_several_records_shrink_the_ellipses():
-    rng = np.random.default_rng(7)
-    arm = random_arm(rng, n_samples=4000)
-    model = arm.model()
-    halves = [arm.record.slice(0, 2000), arm.record.slice(2000, 4000)]
-    one = tangent(halves[:1], model).at(OMEGA).enclosing_radius()
-    both = tangent(halves, model).at(OMEGA).enclosing_radius()
-    # Twice the data: sqrt(2), give or take what the two inputs happen to excite.
-    assert 1.1 < np.median(one / both) < 2.0
-
-
 def test_bad_input_is_refused():
     arm = random_arm(np.random.default_rng(8), n_samples=300)
     model = arm.model()

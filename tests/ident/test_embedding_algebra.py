@@ -101,20 +101,6 @@ def test_reduced_posterior_and_likelihood_equal_the_dense_ones(shape, lam):
     assert difference == pytest.approx(dense - free, abs=1e-9)
 
 
-def test_one_block_or_two_halves_give_the_same_reduction():
-    block = problem(2, 1)[0]
-    bare = np.zeros((N, 0))
-    whole = reduce_regression([RegressionBlock(bare, block.regressors, block.kernel, block.output)])
-    halves = reduce_regression(
-        RegressionBlock(bare[s], block.regressors[s], block.kernel[s], block.output[s])
-        for s in (slice(0, 7), slice(7, N))  # the first part alone has fewer rows than columns
-    )
-    for name in ("r11", "r22"):
-        a, b = getattr(whole, name), getattr(halves, name)
-        np.testing.assert_allclose(a.T @ a, b.T @ b, rtol=1e-10, atol=1e-10 * np.abs(a.T @ a).max())
-    assert whole.rest == pytest.approx(halves.rest, rel=1e-12)
-
-
 def test_averaging_two_kernels_gives_the_moments_of_the_mixture():
     reduced = reduce_regression(problem(3))
     spectra = [kernel_spectrum(reduced, lam, tc_factor(lam, L)) for lam in (0.5, 0.9)]
@@ -164,14 +150,6 @@ def test_classical_posterior_keeps_the_prior_of_the_kernel():
     expected = prior.noise_variance * prior.alpha * prior.lam ** np.arange(1, L + 1)
     np.testing.assert_allclose(np.diag(prior.kernel_factor @ prior.kernel_factor.T), expected, rtol=1e-12)
     assert np.all(prior.kernel_mean == 0)
-
-
-def test_tc_kernel_entries():
-    lam = 0.83
-    index = np.arange(1, L + 1)
-    np.testing.assert_allclose(
-        tc_factor(lam, L) @ tc_factor(lam, L).T, lam ** np.maximum.outer(index, index), rtol=1e-12
-    )
 
 
 def test_nuisance_basis_drops_repeated_and_zero_columns():

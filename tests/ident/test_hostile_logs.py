@@ -61,30 +61,12 @@ def damaged(name, folder, count) -> Tally:
     return tally(attempt, count, 40)
 
 
-def fuzz(name, tmp_path, count):
-    assert damaged(name, tmp_path, count).wrong == []
-
-
-@pytest.mark.parametrize("name", IN_PROCESS)
-def test_damaged_bytes(name, tmp_path):
-    fuzz(name, tmp_path, 100)
-
-
-@pytest.mark.parametrize("name", IN_A_CHILD)
-def test_damaged_bytes_for_a_child(name, tmp_path):
-    fuzz(name, tmp_path, 2)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", IN_PROCESS)
-def test_many_damaged_bytes(name, tmp_path):
-    fuzz(name, tmp_path, 2000)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", IN_A_CHILD)
-def test_many_damaged_bytes_for_a_child(name, tmp_path):
-    fuzz(name, tmp_path, 50)  # twice as many in benchmarks/damaged_files.py: each takes a process
+# Those that a child reads are fewer, and twice as many in benchmarks/damaged_files.py: each takes a process.
+@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", IN_PROCESS + IN_A_CHILD)
+def test_damaged_bytes(name, many, tmp_path):
+    few, often = (2, 50) if name in IN_A_CHILD else (100, 2000)
+    assert damaged(name, tmp_path, often if many else few).wrong == []
 
 
 def test_a_child_that_dies_or_hangs_is_a_refusal(tmp_path, monkeypatch):

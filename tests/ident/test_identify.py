@@ -66,15 +66,6 @@ def test_p1_monte_carlo():
     assert np.median(validation) <= 0.006
 
 
-def test_p1_with_integrators_known():
-    truth = p1(0)
-    result = identify([truth.record], IdentOptions(integrators=2, n_real=0, n_pairs=1))
-    assert relative_error(truth, result.model) < 0.06
-    fresh = max_length_sequence(77, 1000)
-    y = run(truth.system, fresh)
-    assert np.linalg.norm(y - result.model.simulate(fresh)) < 0.01 * np.linalg.norm(y - y.mean())
-
-
 def test_p2_all_modes_are_found_without_being_told(p2_fit):
     truth, result = p2_fit
     poles = result.model.poles
@@ -137,17 +128,6 @@ def test_unknown_initial_states_and_offsets_are_taken_care_of():
     # residual.
     assert np.min(np.abs(result.model.poles.omega_rad_s(0.005) / 2 / np.pi - 2.5)) < 0.01
     assert result.noise_std == pytest.approx(truth.noise_std, rel=0.065)
-
-
-def test_records_are_fitted_together():
-    """Two records halve the variance: the joint fit is nearer to the truth than the worse of the single
-    fits."""
-    options = IdentOptions(n_real=2, n_pairs=3)
-    truths = [p2(seed, 1000) for seed in (7, 8)]
-    omega = np.geomspace(1, 100, 60)
-    single = [relative_error(truth, identify([truth.record], options).model, omega) for truth in truths]
-    joint = relative_error(truths[0], identify([truth.record for truth in truths], options).model, omega)
-    assert joint < max(single)
 
 
 def test_long_records_are_searched_on_a_part_and_polished_on_all():

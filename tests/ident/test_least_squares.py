@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.linalg import lstsq, qr
+from numpy.linalg import lstsq
 
 from ident.basis.functions import free_response, regressor
 from ident.basis.options import IdentOptions
@@ -123,29 +123,6 @@ def test_gradient_is_the_difference_quotient(structure):
         assert -2 * slope[i] == pytest.approx(quotient, rel=1e-5, abs=1e-3)
 
 
-def test_tangent_space_is_the_doubled_basis():
-    """span{Phi, d(Phi theta)/dx} = span Phi2: difference quotients of the fitted output lie in it, and fill
-    it."""
-    u = records()[0].input[:, 0]
-    theta = np.array([0.3, -0.5, 0.8, 0.4])
-    q2, _ = qr(regressor(POLES.doubled(), u))
-    columns = [regressor(POLES, u)]
-    for i in range(4):
-        step = np.zeros(4)
-        step[i] = 1e-6
-
-        def output(sign, step=step):
-            moved = Poles(POLES.real + sign * step[:2], POLES.pairs + sign * (step[2] + 1j * step[3]))
-            return regressor(moved, u) @ theta
-
-        columns.append((output(1) - output(-1))[:, None] / 2e-6)
-    together = np.column_stack(columns)
-    outside = together - q2 @ (q2.T @ together)
-    # The quotient is off by rounding 1e-16/1e-6 times the size of the output (about 20).
-    assert np.abs(outside).max() < 1e-8
-    assert np.linalg.matrix_rank(together, tol=1e-6) == 8
-
-
 def test_certificate_is_the_projection_on_the_doubled_basis():
     """For records from rest the reported optimality is |Phi2^T r|/|r| with orthonormal Phi2."""
     data = prepare(records(), Structure(estimate_offset=True))
@@ -155,16 +132,6 @@ def test_certificate_is_the_projection_on_the_doubled_basis():
     bounds = Bounds.from_options(IdentOptions(), 150, 0.005)
     assert free_optimality(here, POLES, bounds) == pytest.approx(tangent / np.sqrt(here.rss), rel=1e-8)
     assert tangent / np.sqrt(here.rss) > 0.05  # so that the comparison says something
-
-
-def test_refinement_finds_the_poles_of_noise_free_data():
-    truth = Poles([0.7, 0.98], [0.95 * np.exp(0.4j)])
-    u = records()[0].input[:, 0]
-    data = prepare([as_record(u, regressor(truth, u) @ np.array([1.0, 0.5, -0.7, 0.3]))], Structure())
-    start = Poles([0.6, 0.97], [0.93 * np.exp(0.43j)])
-    end = refine(data, start, Bounds.from_options(IdentOptions(), u.size, 0.005), tolerance=1e-14)
-    np.testing.assert_allclose(np.sort(end.poles.real), truth.real, atol=1e-9)
-    np.testing.assert_allclose(end.poles.pairs, truth.pairs, atol=1e-9)
 
 
 def test_refinement_leaves_fixed_poles_alone_and_keeps_bounds():

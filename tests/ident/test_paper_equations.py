@@ -60,7 +60,12 @@ DIRECT = [name for name in typing.get_args(Algorithm) if "DIRECT" in name]
 # What each equation says, the functions that are it, and its tests in other files; those in this file have
 # its number in their names.
 EQUATIONS = (
-    ((1,), "y = G(q) u + v, G a sum of delays", [GobfModel.simulate], []),
+    (
+        (1,),
+        "y = G(q) u + v, G a sum of delays",
+        [GobfModel.simulate],
+        [test_model.test_simulation_agrees_with_control],
+    ),
     ((2,), "FIR: the sum cut off", [arx, regressor], [test_basis.test_fir_is_delay]),
     (
         (3,),
@@ -103,8 +108,12 @@ EQUATIONS = (
         [test_error_surface.test_surface_is_the_fit_at_every_point],
     ),
     ((21,), "linear regression phi' theta", [regressor, GobfModel.simulate], []),
-    ((22,), "difference equations of the states", [complex_realisation, regressor], []),
-    ((23, 24), "E x(k+1) = A x + B u, solved for x(k+1)", [complex_realisation], []),
+    (
+        (22, 23, 24),
+        "difference equations of the states, solved for x(k+1)",
+        [complex_realisation],
+        [test_basis.test_paper_complex_states_are_the_printed_functions],
+    ),
     (
         (25, 26),
         "real states by the block diagonal T",
@@ -156,14 +165,6 @@ def noise(seed: int, n: int = 400) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal(n)
 
 
-def test_1_output_is_the_convolution_with_the_impulse_response():
-    model = GobfModel(MIXED, np.arange(1.0, 8.0), DT_S)
-    u = noise(0, 200)
-    g = model.simulate(np.eye(1, 200)[0])
-    assert g[0] == 0  # k begins at 1: no direct term
-    np.testing.assert_allclose(model.simulate(u), np.convolve(u, g)[:200], atol=1e-11)
-
-
 def test_2_zero_poles_are_the_fir_model():
     taps = np.array([0.5, -1.0, 0.25, 2.0, 0.125])
     model = GobfModel(Poles(np.zeros(5)), taps, DT_S)
@@ -180,38 +181,6 @@ def test_2_zero_poles_are_the_fir_model():
     assert errors[2] < 0.2 * errors[1]
 
 
-def test_3_model_is_the_weighted_sum_of_its_functions():
-    theta = np.linspace(-1, 1, 7)
-    model = GobfModel(MIXED, theta, DT_S)
-    omega = np.angle(Z) / DT_S
-    np.testing.assert_allclose(model.frequency_response(omega), basis_response(MIXED, Z) @ theta, rtol=1e-12)
-    # Real poles alone, written out with (5) itself and filtered by scipy.
-    poles = Poles([0.5, -0.3])
-    u = noise(2)
-    first = scipy.signal.lfilter([0, np.sqrt(0.75)], [1, -0.5], u)
-    passed = scipy.signal.lfilter([-0.5, 1], [1, -0.5], u)
-    second = scipy.signal.lfilter([0, np.sqrt(0.91)], [1, 0.3], passed)
-    np.testing.assert_allclose(
-        GobfModel(poles, np.array([2.0, 3.0]), DT_S).simulate(u), 2 * first + 3 * second, atol=1e-12
-    )
-
-
-def test_5_6_fir_laguerre_and_kautz_are_one_code_path():
-    """FIR is the limit a -> 0 of Laguerre; Laguerre that of Kautz as the pair closes on the real axis."""
-    fir_functions = basis_response(Poles(np.zeros(4)), Z)
-    np.testing.assert_allclose(fir_functions, Z[:, None] ** -np.arange(1.0, 5.0), rtol=1e-13)
-    a = 0.7
-    i = np.arange(1, 5)
-    laguerre = np.sqrt(1 - a**2) / (Z[:, None] - a) * ((1 - a * Z[:, None]) / (Z[:, None] - a)) ** (i - 1)
-    np.testing.assert_allclose(basis_response(Poles([a] * 4), Z), laguerre, rtol=1e-12)
-    np.testing.assert_allclose(basis_response(Poles([1e-9] * 4), Z), fir_functions, atol=1e-8)
-    # The pair of nearly equal real poles spans what two equal ones span: projectors agree to the distance.
-    closing = basis_response(Poles([], [a + 1e-6j] * 2), np.exp(2j * np.pi * np.arange(512) / 512))
-    repeated = basis_response(Poles([a] * 4), np.exp(2j * np.pi * np.arange(512) / 512))
-    rest = repeated - closing @ (closing.conj().T @ repeated) / 512
-    assert np.abs(rest).max() < 1e-4
-
-
 SOLUTIONS = {
     "paper (18)-(19)": paper_numerators,
     "rotated by 0.7": lambda pole: rotated_numerators(pole, 0.7),
@@ -223,18 +192,12 @@ PAIRS = [0.9 * np.exp(0.3j), 0.99 * np.exp(2.5j), 0.3 * np.exp(1.0j), 0.999 * np
 
 @pytest.mark.parametrize("solution", SOLUTIONS)
 @pytest.mark.parametrize("pole", PAIRS)
-def test_7_13_combinations_of_the_complex_functions_are_the_real_ones(pole, solution):
+def test_7_to_13_combinations_of_the_complex_functions_are_unitary_and_the_real_ones(pole, solution):
     x1, x2 = SOLUTIONS[solution](pole)
     c = combination(pole, x1, x2)
     complex_pair = printed_functions(np.array([pole, np.conj(pole)]), Z)
     # Near the circle the 2 x 2 system has the condition 2 / |1 - |xi|^2|, a thousand here.
     np.testing.assert_allclose(complex_pair @ c.T, pair_response(pole, x1, x2, Z), rtol=1e-10, atol=1e-12)
-
-
-@pytest.mark.parametrize("solution", SOLUTIONS)
-@pytest.mark.parametrize("pole", PAIRS)
-def test_8_to_10_combination_is_unitary_for_every_solution(pole, solution):
-    c = combination(pole, *SOLUTIONS[solution](pole))
     np.testing.assert_allclose(c @ c.conj().T, np.eye(2), atol=1e-10)
 
 
@@ -281,16 +244,6 @@ def test_13_to_19_every_solution_gives_the_same_fit_behind_other_poles(first, se
     np.testing.assert_allclose(theirs @ np.linalg.lstsq(theirs, y)[0], expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("pole", PAIRS)
-@pytest.mark.parametrize("solution", SOLUTIONS)
-def test_14_15_solutions_satisfy_the_constraints(pole, solution):
-    x1, x2 = SOLUTIONS[solution](pole)
-    metric, target = pair_metric(pole), abs(1 - pole**2) ** 2
-    assert x1 @ metric @ x1 == pytest.approx(target, rel=1e-10)  # (14)
-    assert x2 @ metric @ x2 == pytest.approx(target, rel=1e-10)
-    assert abs(x1 @ metric @ x2) <= 1e-10 * target  # (15)
-
-
 @pytest.mark.parametrize("solution", SOLUTIONS)
 def test_14_to_16_constraints_make_the_pair_orthonormal(solution):
     pole = 0.9 * np.exp(0.3j)
@@ -302,13 +255,6 @@ def test_14_to_16_constraints_make_the_pair_orthonormal(solution):
 def test_14_to_16_wrong_numerators_are_refused():
     with pytest.raises(ValueError, match="do not satisfy"):
         pair_response(0.5j, np.array([1.0, 0.0]), np.array([1.0, 0.0]), np.array([1.0 + 0j]))
-
-
-def test_13_kautz_solution_is_the_basis():
-    pole, z = 0.9 * np.exp(0.3j), np.exp(1j * np.linspace(0, 3, 20))
-    np.testing.assert_allclose(
-        pair_response(pole, *kautz_numerators(pole), z), basis_response(Poles([], [pole]), z), rtol=1e-11
-    )
 
 
 @pytest.mark.parametrize("pole", PAIRS)
@@ -336,26 +282,6 @@ def test_18_19_solution_with_m2_zero(pole):
     assert min(np.linalg.norm(second - x2), np.linalg.norm(second + x2)) < 1e-8 * np.linalg.norm(x2)
 
 
-def test_20_cost_is_the_mean_square_residual():
-    poles = Poles([0.6], [0.9 * np.exp(0.3j)])
-    u, y = noise(5), noise(6)
-    found = fit(prepare([as_record(u, y)], Structure()), poles)
-    model = GobfModel(poles, found.coefficients[0], DT_S)
-    mean_square = np.mean((y - model.simulate(u)) ** 2)
-    assert found.rss / y.size == pytest.approx(mean_square, rel=1e-12)
-    gamma = abs(poles.pairs[0]) ** 2
-    beta = 2 * poles.pairs[0].real / (1 + gamma)
-    surface = error_surface(
-        [as_record(u, y)],
-        model,
-        Structure(),
-        coordinates="raw",
-        first=np.array([beta]),
-        second=np.array([gamma]),
-    )
-    assert surface.mean_square[0, 0] == pytest.approx(mean_square, rel=1e-9)
-
-
 def test_21_output_is_linear_in_the_coefficients():
     u = noise(7)
     one, two = noise(8, 7), noise(9, 7)
@@ -365,70 +291,6 @@ def test_21_output_is_linear_in_the_coefficients():
 
     np.testing.assert_allclose(output(2 * one - 3 * two), 2 * output(one) - 3 * output(two), atol=1e-11)
     np.testing.assert_allclose(output(one), regressor(MIXED, u) @ one, atol=1e-12)
-
-
-def test_22_difference_equations_give_the_printed_functions():
-    """(22) run sample by sample, real poles, against the regressor; complex ones against filters by scipy."""
-    u = noise(10, 150)
-    for xi in (np.array([0.5, 0.9, -0.3]), MIXED.values):
-        x = np.zeros((u.size + 1, xi.size), dtype=np.complex128)
-        for k, value in enumerate(u):
-            x[k + 1, 0] = xi[0] * x[k, 0] + np.sqrt(1 - abs(xi[0]) ** 2) * value
-            for i in range(1, xi.size):
-                factor = np.sqrt((1 - abs(xi[i]) ** 2) / (1 - abs(xi[i - 1]) ** 2))
-                x[k + 1, i] = (
-                    xi[i] * x[k, i] + factor * x[k, i - 1] - np.conj(xi[i - 1]) * factor * x[k + 1, i - 1]
-                )
-        signal = u.astype(np.complex128)
-        for i, pole in enumerate(xi):
-            expected = scipy.signal.lfilter([0, np.sqrt(1 - abs(pole) ** 2)], [1, -pole], signal)
-            np.testing.assert_allclose(x[:-1, i], expected, atol=1e-11)
-            signal = scipy.signal.lfilter([-np.conj(pole), 1], [1, -pole], signal)
-        if np.isrealobj(xi):
-            np.testing.assert_allclose(x[:-1].real, regressor(Poles(xi), u), atol=1e-12)
-
-
-def test_23_24_matrices_are_the_printed_ones():
-    xi = MIXED.values
-    n = xi.size
-    width = np.sqrt(1 - np.abs(xi) ** 2)
-    E, A = np.eye(n, dtype=np.complex128), np.diag(xi)
-    for i in range(1, n):
-        E[i, i - 1] = np.conj(xi[i - 1]) * width[i] / width[i - 1]
-        A[i, i - 1] = width[i] / width[i - 1]
-    B = np.zeros((n, 1))
-    B[0] = width[0]
-    A_bar, B_bar = complex_realisation(MIXED)
-    assert np.linalg.det(E) == pytest.approx(1)
-    np.testing.assert_allclose(E @ A_bar, A, atol=1e-13)
-    np.testing.assert_allclose(E @ B_bar, B, atol=1e-13)
-
-
-def test_25_26_transformation_keeps_the_space():
-    """T is block diagonal and unitary: the eigenvalues are the poles, the states span the complex ones."""
-    A, B = real_realisation(MIXED)
-    found = np.linalg.eigvals(A)
-    distances = np.abs(found[:, None] - MIXED.values[None, :])
-    assert distances.min(axis=0).max() < 1e-10
-    circle = np.exp(2j * np.pi * np.arange(2048) / 2048)
-    real = np.array([np.linalg.solve(z * np.eye(7) - A, B)[:, 0] for z in circle])
-    printed = printed_functions(MIXED.values, circle)
-    T = real.T @ printed.conj() / 2048
-    np.testing.assert_allclose(T @ T.conj().T, np.eye(7), atol=1e-10)
-    blocks = scipy.linalg.block_diag(np.ones((3, 3)), np.ones((2, 2)), np.ones((2, 2)))
-    np.testing.assert_allclose(T * (1 - blocks), 0, atol=1e-10)
-
-
-def test_27_least_squares_solves_the_normal_equations():
-    poles = Poles([0.6], [0.7 * np.exp(0.8j)])
-    u, y = noise(11), noise(12)
-    found = fit(prepare([as_record(u, y)], Structure()), poles)
-    phi = regressor(poles, u)
-    by_sums = np.linalg.inv(sum(np.outer(row, row) for row in phi)) @ sum(
-        row * value for row, value in zip(phi, y, strict=True)
-    )
-    np.testing.assert_allclose(found.coefficients[0], by_sums, rtol=1e-10)
-    np.testing.assert_allclose(phi.T @ found.residual, 0, atol=1e-10)
 
 
 def test_28_29_filter_parameters_and_poles_correspond():

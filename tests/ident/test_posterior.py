@@ -92,12 +92,6 @@ def test_joint_level_holds_whole_responses_together():
     assert abs(inside - 0.9) < 0.033
 
 
-def test_single_frequency_joint_level_is_the_level():
-    p = posterior(8, integrators=0)
-    level = p.joint_level(np.array([1.0]), 0.95, np.random.default_rng(9), n_draws=20_000)
-    assert level == pytest.approx(0.95, abs=0.007)
-
-
 def test_integrator_is_accurate_close_to_zero_frequency():
     p = posterior(10, integrators=2, delay=0)
     omega = 1e-7

@@ -116,11 +116,6 @@ def test_a_faulty_log_is_one_line_with_file_and_place(tmp_path, fault):
         assert word in message
 
 
-def test_bad_numbers_in_columns_nobody_asked_for_do_no_harm(tmp_path):
-    path = write(tmp_path / "log.csv", [f"{T},{U},{Y},note", *(f"{row},hello" for row in rows())])
-    assert read(path).n_samples == 6
-
-
 def test_missing_column_lists_those_there(good):
     with pytest.raises(ValueError, match="no column 'w'; the file has t_s, u_V, y_rad"):
         Record.from_file(good, ["w"], [Y], time=T)
@@ -131,22 +126,6 @@ def test_one_column_is_not_two_things(good):
         Record.from_file(good, [U], [U], time=T)
     with pytest.raises(ValueError, match="as time and as a signal"):
         Record.from_file(good, [T], [Y], time=T)
-
-
-def test_what_to_do_about_time_stamps_is_said(tmp_path):
-    def said_of(stamps):
-        lines = [f"{t:.6f},{k % 3},{k % 5}" for k, t in enumerate(stamps)]
-        return complaint(write(tmp_path / "log.csv", [f"{T},{U},{Y}", *lines]))
-
-    even = np.arange(200) * 0.01
-    assert "take the repeated row out" in said_of(np.insert(even, 50, even[50]))
-    assert "split the file there" in said_of(np.concatenate([even, even]))
-    lost = said_of(np.delete(even, [70, 71]))
-    assert "line 72" in lost
-    assert "rows missing: 2 of 200: --repair" in lost
-    jitter = said_of(even + 0.001 * np.random.default_rng(0).normal(size=200))
-    assert "the stamps keep to no grid" in jitter
-    assert "--resample-s 0.03 (resample_s = 0.03)" in jitter
 
 
 def test_paths_that_are_not_there(tmp_path):

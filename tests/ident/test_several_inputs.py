@@ -12,7 +12,7 @@ from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.data.finding import FindingKind
 from ident.data.record import Record
-from ident.fit.least_squares import fit, pole_sensitivities, project
+from ident.fit.least_squares import fit
 from ident.fit.regression import prepare_inputs
 from ident.one_input import identify, identify_miso
 from ident.uncertainty.miso_uncertainty import response_uncertainty
@@ -164,29 +164,6 @@ def test_gradient_is_that_of_the_joint_cost(initial_state):
     numerical = (cost(0.95 + step) - cost(0.95 - step)) / (2 * step)
     # State of the first block is b/(z - a) y_hat, and dJ/da = -2 r^T y_hat/(z - a).
     assert -2 * here.gradient[0] / np.sqrt(1 - 0.95**2) == pytest.approx(numerical, rel=1e-6)
-
-
-def test_tangent_identity():
-    """Modulo the columns, moving a pole changes the fitted output along the block states driven by it."""
-    data = prepare_inputs([record(1, n=400)], IdentOptions(estimate_offset=False).structure())
-    poles = Poles(np.array([0.95]), np.array([0.95 + 0.25j]))
-    theta = fit(data, poles).coefficients
-    projection = project(data, poles)
-    states = pole_sensitivities(data, poles, projection)
-
-    def output(pair):
-        model = MisoModel(Poles(poles.real, np.array([pair])), theta, np.zeros(2), DT_S, ("a", "b"))
-        return model.simulate(data.u.T)
-
-    step = 1e-6
-    for direction in (1.0, 1j):
-        change = (output(poles.pairs[0] + step * direction) - output(poles.pairs[0] - step * direction)) / (
-            2 * step
-        )
-        change -= projection.shared_q.T @ (projection.shared_q @ change)
-        left = change - states.T @ np.linalg.lstsq(states.T, change, rcond=None)[0]
-        # Central differences: step^2 times the third derivative, and rounding over the step.
-        assert np.linalg.norm(left) < 1e-6 * np.linalg.norm(change)
 
 
 @pytest.mark.parametrize(("integrators", "zeros"), [(0, 0), (1, 1), (2, 2), (3, 3), (2, 0)])
@@ -341,24 +318,6 @@ def test_uncertainty_is_that_of_all_unknowns_together():
         # The residual is orthogonal to the tangent space only to the tolerance of the descent; differences
         # carry 1e-9 or so.
         np.testing.assert_allclose(band.covariance / scale, expected[i] / scale, rtol=0, atol=1e-5)
-
-
-def test_nothing_but_noise_has_no_poles():
-    rng = np.random.default_rng(0)
-    item = Record("noise", rng.normal(size=(800, 2)), rng.normal(size=(800, 1)), DT_S, ("a", "b"), ("y",))
-    result = identify_miso([item])
-    assert result.model.order == 0
-    assert FindingKind.NO_POLE in kinds(result.warnings)
-    assert np.all(result.model.frequency_response(OMEGA) == 0)
-
-
-def test_nlopt_and_long_records_lead_to_the_same_poles(fitted):
-    for options in (
-        IdentOptions(algorithm="GN_DIRECT_L", n_real=1, n_pairs=2),
-        IdentOptions(search_samples=1500, n_real=1, n_pairs=2),
-    ):
-        poles = identify_miso([record(0)], options).model.poles
-        np.testing.assert_allclose(poles.values, fitted.model.poles.values, rtol=0, atol=1e-6)
 
 
 def test_advice_on_alike_inputs_and_coloured_residuals():

@@ -9,7 +9,7 @@ import pytest
 
 from ident import IdentOptions, identify
 from ident.stabilisation import DAMPING_TOLERANCE, FREQUENCY_TOLERANCE, stabilisation
-from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, p1, p2
+from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, p2
 
 
 @pytest.fixture(scope="module")
@@ -36,13 +36,6 @@ def test_spurious_pairs_may_stay_but_are_not_needed(p2_plot):
     # This is why staying alone does not make a mode here.
     assert (p2_plot.stable & spurious).any()
     assert len(p2_plot.columns()) == 3
-
-
-def test_one_mode_and_integrators():
-    record = p1(1).record
-    plot = stabilisation([record], identify([record]))
-    (mode,) = plot.columns()
-    assert mode.omega_rad_s == pytest.approx(15.0, rel=0.005)
 
 
 def test_fits_are_nested_and_marks_follow_the_definition(p2_plot):

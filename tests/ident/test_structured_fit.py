@@ -8,16 +8,14 @@ import scipy.linalg
 import scipy.optimize
 import scipy.signal
 
-from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.basis.relative_degree import conditions
 from ident.basis.structure import Structure
 from ident.fit.least_squares import fit
 from ident.fit.refinement import Bounds, pole_system
 from ident.fit.regression import prepare
 from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
-from tests.ident.benchmark_plants import DT_S, as_record, p1, p1_friction, p2
+from tests.ident.benchmark_plants import DT_S, p1, p1_friction, p2
 
 OMEGA = np.geomspace(0.1, 600, 400)
 BOUNDS = Bounds.from_options(IdentOptions(), 1000, DT_S)
@@ -117,24 +115,6 @@ def test_relative_degree_one_is_the_plain_fit():
     plain, structured = fit(data, poles), structured_fit(data, poles, 1)
     assert structured.rss == pytest.approx(plain.rss, rel=1e-12)
     np.testing.assert_allclose(structured.coefficients, plain.coefficients, rtol=1e-8)
-
-
-@pytest.mark.parametrize("k", [0, 2])
-def test_noise_free_data_give_the_plant_back(k):
-    truth = p1(0)
-    data = prepare([as_record(truth.record.input[:, 0], truth.clean)], Structure(integrators=k))
-    start = Poles([0.0, 0.0] if k else [0.9995, 0.99], [0.97 * np.exp(0.09j)])
-    end = UnderRelativeDegree(data, 2, Poles([0.0] * k)).refine(start, BOUNDS)
-    linear = structured_fit(data, end.poles, 2)
-    model = GobfModel(end.poles, linear.coefficients[0], DT_S, integrators=k)
-    error = np.abs(model.frequency_response(OMEGA) / truth.response(OMEGA) - 1)
-    # The free poles end at their bound 1e-6 from z = 1: 1e-6/(0.1 rad/s 5 ms) at the lowest frequency.
-    assert error.max() < (1e-6 if k else 1e-2)
-    # The fit without the conditions satisfies them by itself.
-    if k:
-        plain = fit(data, end.poles).coefficients[0]
-        rows = conditions(end.poles, k, 2)
-        assert np.abs(rows @ plain) < 1e-6 * (np.abs(rows) @ np.abs(plain))
 
 
 def test_descent_ends_where_scipys_optimiser_does():

@@ -16,7 +16,6 @@ from ident.data.record import Record
 from ident.data.record_files import read_table
 from ident.data.roles import roles_of, time_of
 from ident.data.units import UnitEvidence
-from ident.data.wrapping import wraps_at
 
 N, DT_S = 80, 0.005
 K = np.arange(N)
@@ -34,6 +33,7 @@ T_S, U, Y = DT_S * K, 1.5 * (-1.0) ** (K // 3), 0.125 * K
         *[(name, "", "us") for name in ("TimeUS", "us since boot", "host_time_us", "t μs", "time_micros")],
         *[(name, "", "ns") for name in ("timeNs", "nanos", "stamp_ns", "time (nsec)")],
         *[(name, "", "s") for name in ("timeSeconds", "in s", "t, s", "Zeit in Sekunden", "elapsed sec")],
+        *[("t/ms", "", "ms"), ("time msec", "", "ms"), ("t [min]", "", "min"), ("Time (Sec)", "", "s")],
         *[(name, "", "") for name in ("t", "time", "__time", "t[0]", "Time (UTC)", "time_stamp", "Uhrzeit")],
         *[("Time", "Second", "s"), ("t", "[ms]", "ms"), ("t_ms", "ms", "ms"), ("Time [d]", "", "d")],
     ],
@@ -378,53 +378,3 @@ def test_outputs_alone_are_said_to_be(tmp_path):
     path = written(tmp_path, ",", ["t_s", "hub_rad", "tip_m"])
     with pytest.raises(ValueError, match="no column looks like an input"):
         roles_of(read_table(path), "a.csv")
-
-
-def swing(speed: float, rng: np.random.Generator, n: int = 2000):
-    """A motion through several turns, its longest step `speed` of a turn."""
-    steps = np.convolve(rng.standard_normal(n), np.hanning(15), "same")
-    return np.cumsum(speed * steps / np.max(np.abs(steps)))
-
-
-@pytest.mark.parametrize("period", [4096, 65536, 256, 2000, 360, 2 * np.pi, 3600])
-@pytest.mark.parametrize("low", [0.0, -0.5])
-@pytest.mark.parametrize("speed", [0.03, 0.3])
-def test_readings_that_wrap(period, low, speed):
-    """Counts of an encoder, degrees, radians, counters with a sign: the period is found, and unwrapped."""
-    motion = period * swing(speed, np.random.default_rng(int(period)))
-    motion = np.round(motion) if period > 300 and period != 360 else motion
-    read = (motion - low * period) % period + low * period
-    assert wraps_at(motion) == 0
-    assert wraps_at(read) == pytest.approx(period, rel=1e-12)
-    assert wraps_at(np.unwrap(read, period=wraps_at(read))) == 0
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        U + 0.01 * np.sin(K),
-        np.sin(2.9 * K),
-        np.sin(0.1 * K),
-        np.random.default_rng(1).uniform(-1, 1, 500),
-        np.repeat(np.random.default_rng(2).uniform(-1, 1, 90), 7),
-        np.where(K == 40, 1000.0, Y),
-        np.r_[np.zeros(40), np.ones(40)] + 0.01 * np.cos(K),
-        np.sign(np.sin(0.2 * K)) * (1 - np.exp(-((0.2 * K) % np.pi))),
-    ],
-)
-def test_signals_that_do_not_wrap(values):
-    assert wraps_at(values) == 0
-
-
-def test_a_record_tells_wraps_and_unwraps_on_request(tmp_path):
-    turns = swing(0.1, np.random.default_rng(5), N)
-    lines = rows(",", y=np.round(4096 * turns) % 4096)
-    path = written(tmp_path, ",", ["t_s", "u_V", "counts"], lines=lines)
-    (note,) = Record.from_file(path, ["u_V"], ["counts"], time="t_s").doubts
-    assert (note.kind, note.values["period"]) == (FindingKind.WRAPS, 4096)
-    record = Record.from_file(
-        path, ["u_V"], ["counts"], time="t_s", unwrap={"counts": 4096}, scale={"counts": 1 / 4096}
-    )
-    assert record.doubts == ()
-    moved = record.output[:, 0] - record.output[0, 0]
-    np.testing.assert_allclose(moved, turns - turns[0], rtol=0, atol=1 / 4096)

@@ -17,25 +17,6 @@ PER_SECOND = {"s": 1, "ms": 1000, "us": 10**6, "ns": 10**9, "min": Fraction(1, 6
 @pytest.mark.parametrize(
     ("header", "unit"),
     [
-        *[("Zeit [ms]", "ms"), ("time (us)", "us"), ("t_ms", "ms"), ("time_s", "s"), ("Time (Sec)", "s")],
-        *[
-            ("Zeit in Sekunden", "s"),
-            ("t [\N{MICRO SIGN}s]", "us"),
-            ("t/ms", "ms"),
-            ("ms", "ms"),
-            ("t [min]", "min"),
-        ],
-        *[("time msec", "ms"), ("timestamp_ns", "ns"), ("t", ""), ("time_stamp", ""), ("t[0]", "")],
-    ],
-)
-def test_units_of_time_are_read_from_the_header(header, unit):
-    column = TimeColumn.of(header)
-    assert (column.in_header, column.unit) == (unit, unit or "s")
-
-
-@pytest.mark.parametrize(
-    ("header", "unit"),
-    [
         *[("Angle [deg]", "deg"), ("voltage_mV", "mV"), ("u in mV", "mV"), ("hub_angle_rad", "rad")],
         *[
             ("acc_m_s2", "m/s2"),

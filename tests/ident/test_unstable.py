@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import control
 import numpy as np
 import pytest
 from scipy import signal
@@ -307,9 +306,3 @@ def test_an_identified_pendulum_is_certified_between_all_frequencies():
     # Without feedback it falls.
     loose = Controller([[0.5]], [[0.5]], [[-0.04]], [[0.05]], DT, computational_delay_samples=0)
     assert not certify(loose, [plant], specification).certified
-
-
-def test_the_state_space_is_one_a_loop_can_be_closed_around():
-    plant = model(REAL, integrators=0, delay=1, feedthrough=0.0).to_control()
-    gain = control.dlqr(plant.A, plant.B, np.eye(plant.nstates), 1.0)[0]
-    assert np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ gain))) < 1

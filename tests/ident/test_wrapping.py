@@ -53,11 +53,13 @@ def test_the_period_is_found_and_the_motion_comes_back(sensor, turns):
 
 NO_WRAP = {
     "a sine": np.sin(0.01 * K),
+    "a fast sine": np.sin(2.9 * K),
     "a square wave": np.sign(np.sin(0.01 * K)),
     "a noisy square wave of 0 and 4000": 4000.0 * (np.sin(0.01 * K) > 0)
     + np.round(5 * np.abs(np.random.default_rng(1).standard_normal(K.size))),
     "a binary random input": np.random.default_rng(2).choice([-3.0, 3.0], K.size),
     "random levels": np.random.default_rng(3).uniform(-180, 180, K.size),
+    "levels held": np.repeat(np.random.default_rng(5).uniform(-1, 1, 600), 7),
     "white noise": np.random.default_rng(4).standard_normal(K.size),
     "steps of a lightly damped arm": np.convolve(
         180 * np.sign(np.sin(0.005 * K)), 0.05 * np.exp(-0.01 * K) * np.sin(0.2 * K)

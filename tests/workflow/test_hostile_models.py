@@ -67,19 +67,10 @@ def damaged(name, folder, count) -> Tally:
     return tally(attempt, count, 15)
 
 
-def fuzzed(name, tmp_path, count):
+@pytest.mark.parametrize("count", [150, pytest.param(3000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", WHOLE)
+def test_damaged_bytes(name, count, tmp_path):
     assert damaged(name, tmp_path, count).wrong == []
-
-
-@pytest.mark.parametrize("name", WHOLE)
-def test_damaged_bytes(name, tmp_path):
-    fuzzed(name, tmp_path, 150)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", WHOLE)
-def test_many_damaged_bytes(name, tmp_path):
-    fuzzed(name, tmp_path, 3000)
 
 
 STRANGE_VALUES = (
@@ -109,7 +100,7 @@ STRANGE_ARRAYS = (
         lambda a: 3 * a,
         lambda a: a[None],
         lambda a: a.ravel()[:0],
-        lambda a: a.ravel()[0],
+        lambda a: a.sum(),
     ),
     *(lambda a: np.array([{}], dtype=object), lambda a: np.zeros(3, dtype=[("a", "f8")])),
     *(lambda a: np.r_[a.ravel(), a.ravel()], lambda a: np.zeros(a.shape, dtype="M8[s]")),
