@@ -15,15 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.harness import Print, main, reading, timed
-from benchmarks.offset_disc import offset_disc_radius
 from benchmarks.p2_plants import Setting, draw
 from ident import GobfModel, IdentOptions, identify
 from ident.basis.functions import regressor
 from ident.basis.options import EmbeddingOptions
 from ident.basis.posterior import ResponsePosterior
-from ident.uncertainty import FrequencyUncertainty
 from ident.uncertainty.embedding import classical, tangent
-from ident.uncertainty.nominal import nominal_near
 from tests.ident.benchmark_plants import DT_S, Truth
 
 OMEGA = np.geomspace(0.3, 300.0, 150)
@@ -121,14 +118,6 @@ def judge(
     return replace(found, joint=everywhere, joint_radius2=float(-2 * np.log1p(-level)))
 
 
-def disc_outcome(nominal: np.ndarray, ellipses: FrequencyUncertainty, truth: np.ndarray) -> Outcome:
-    """The offset disc around the order-4 nominal: |G - G_nom| <= rho."""
-    rho = offset_disc_radius(ellipses.centre - nominal, ellipses.covariance, ellipses.level)
-    error = np.abs(truth - nominal)
-    relative = rho / np.abs(truth)
-    return Outcome(error <= rho, relative, relative, np.stack([rho / error] * 3))
-
-
 def one_run(name: str, seed: int) -> RunOutcome:
     """Draw, identify, embed, judge; everything from one seed."""
     case = CASES[name]
@@ -143,11 +132,7 @@ def one_run(name: str, seed: int) -> RunOutcome:
         other, cpu_s = timed(lambda: tangent([run.record], model, alone))
         found["no missed mode"] = judge(other, truth, cpu_s, seed)
     if case.is_main:
-        ellipses = posterior.at(OMEGA, LEVEL)
         low = identify([run.record], IdentOptions(n_real=2, n_pairs=1)).model
-        for name, nominal in (("", low), (", placed", nominal_near(posterior, low.poles, OMEGA))):
-            response = nominal.frequency_response(OMEGA)
-            found[f"order-4 nominal{name}"] = disc_outcome(response, ellipses, truth)
         found["classical, n = 4"] = judge(classical([run.record], low), truth)
         found["covariance, n = 4"] = judge(covariance_alone(run, low), truth)
     return RunOutcome(model.poles.pairs.size, cpu_identify_s, found)
@@ -183,28 +168,23 @@ def report(out: Print, case: Case, runs: Sequence[RunOutcome]) -> None:
         found = [run.by_method[method] for run in runs]
         inside = np.array([item.inside for item in found])
         coverage = per_band(100 * inside, np.mean)
-        disc = method.startswith("order-4 nominal")
-        judged = disc or method == "tangent"
-        bounds = (90.0, 98.5) if disc else case.coverage
-        tail = ""
-        if judged and bounds is not None:
+        own, bounds, tail = method == "tangent", case.coverage, ""
+        if own and bounds is not None:
             ok = all(bounds[0] <= value <= bounds[1] for value in coverage)
             tail = f"reach {bounds[0]:g}-{bounds[1]:g} in every band: {verdict(ok)}"
         out(f"  {method}")
         out(row("coverage", coverage, tail))
         radii = per_band(100 * np.array([item.major for item in found]), np.median)
-        if case.is_main and method == "tangent":
+        if case.is_main and own:
             wanted = [RADIUS_REACH.get(band) for band in BANDS]
             ok = all(limit is None or r <= limit for limit, r in zip(wanted, radii, strict=True))
             out(row("radius", radii, f"reach below: {verdict(ok)}"))
             out("    " + f"{'  at most':<22}" + "".join(f"{'' if w is None else w:>8}" for w in wanted))
         else:
             out(row("radius", radii))
-        if not disc:
-            out(row("mean radius", per_band(100 * np.array([item.mean for item in found]), np.median)))
+        out(row("mean radius", per_band(100 * np.array([item.mean for item in found]), np.median)))
         overall, worst = 100 * float(inside.mean()), 100 * float(inside.mean(axis=0).min())
         ratios = np.median(np.array([item.ratios for item in found]), axis=(0, 2))
-        own = method == "tangent"
         asked = f" (reach 1.8-2.4: {verdict(bool(1.8 <= ratios[0] <= 2.4))})" if case.is_main and own else ""
         out(
             f"    overall {overall:.1f}{at_least(overall, case.overall if own else None)}"

@@ -1,5 +1,6 @@
 """Files of every kind spoilt at random, by the loops of the tests: each is read, or refused in one line of at
-most 300 characters that names the file, within 60 s.
+most 300 characters that names the file, within 60 s. Damaged logs go to `look` and `identify`, too: cut,
+spliced, under another format's name, zip archives in each other, numbers of any size, NaN.
 
 What would compute is cut off where it begins: this is about files. Binary files have bits turned and bytes
 replaced, doubled or taken out; texts values, names, lines and characters changed. Formats that a compiled
@@ -15,7 +16,7 @@ import pytest
 
 from benchmarks.harness import Print, main
 from tests.ident import test_hostile_logs as logs
-from tests.ident.mutations import Tally
+from tests.ident.mutations import DAMAGE, Tally
 from tests.workflow import test_hostile_models as models, test_nothing_breaks_it as texts
 from tests.workflow.command import FAST_ARM, draw_nothing
 from workflow.commands.run import run_from_files
@@ -29,6 +30,7 @@ def run(
     tampered: int = 300,
     binary: int = 600,
     child: int = 100,
+    commands: int = 420,
 ) -> None:
     out(f"{'':52}{'tried':>7}{'refused':>9}{'wrong':>7}   longest line   slowest refusal, CPU s")
     total = Tally()
@@ -65,6 +67,8 @@ def run(
                         texts.tampered(output, folder, tampered, number),
                     )
             texts.cut_computations_off(patch)
+            for damage in DAMAGE:
+                told(f"log given to a command: {damage}", texts.damaged_logs(damage, folder, commands))
             (folder / "good").mkdir()
             good = texts.good_files(folder / "good")
             for number, kind in enumerate(texts.KINDS):

@@ -19,12 +19,9 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
-
-import numpy as np
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -143,24 +140,3 @@ def timed(call: Callable[[], R]) -> tuple[R, float]:
     begin = time.process_time()
     found = call()
     return found, time.process_time() - begin
-
-
-def median_s(call: Callable[[], object], repeats: int, at_once: int = 1) -> float:
-    """Median CPU seconds of a call, after one to warm up; `at_once` calls between readings of the clock,
-    which takes a microsecond itself."""
-    call()
-    times = [timed(lambda: [call() for _ in range(at_once)])[1] / at_once for _ in range(repeats)]
-    return float(np.median(times))
-
-
-def taking_turns(methods: Mapping[str, Callable[[C], object]], cases: Iterable[C]) -> dict[str, list[float]]:
-    """CPU seconds of every method on every case, after one call each on the first case to warm up. The
-    methods take turns, so that what else the machine does falls on all alike."""
-    cases = list(cases)
-    for method in methods.values():
-        method(cases[0])
-    times: dict[str, list[float]] = {name: [] for name in methods}
-    for case in cases:
-        for name, method in methods.items():
-            times[name].append(timed(partial(method, case))[1])
-    return times

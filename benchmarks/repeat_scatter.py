@@ -13,8 +13,7 @@ free response leave of the half held out, and of the sum of both halves, which i
 Both whitened by the noise model, so that its strong bands do not leak into the others.
 
 Kyoto (quanser_rfl_frf): 100 frequencies on four dates (10, 2, 12 and 2 runs), closed loop with gain 1.65,
-opened point by point. Predicted from one date: one more run; held against the runs of the other dates. Models
-fitted to one date and judged on another: `benchmarks.frequency_fit`.
+opened point by point. Predicted from one date: one more run; held against the runs of the other dates.
 """
 
 from __future__ import annotations

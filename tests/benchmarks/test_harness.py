@@ -70,22 +70,6 @@ def test_seeds_in_words(options, words):
     assert harness._seeds(options) == words
 
 
-def test_methods_take_turns_after_one_call_each_to_warm_up():
-    calls = []
-    times = harness.taking_turns(
-        {"one": lambda case: calls.append(("one", case)), "two": lambda case: calls.append(("two", case))},
-        [1, 2],
-    )
-    assert calls == [(name, case) for case in (1, 1, 2) for name in ("one", "two")]
-    assert {name: len(each) for name, each in times.items()} == {"one": 2, "two": 2}
-
-
-def test_median_is_per_call():
-    count = []
-    assert harness.median_s(lambda: count.append(sum(range(10_000))), repeats=3, at_once=4) > 0
-    assert len(count) == 1 + 3 * 4
-
-
 def test_missing_data_ends_the_program_in_one_line(monkeypatch, tmp_path):
     monkeypatch.setenv("FLEXLINK_DATA", str(tmp_path))
     with pytest.raises(SystemExit, match="set FLEXLINK_DATA to the folder that holds emps"):

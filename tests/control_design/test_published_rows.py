@@ -2,7 +2,7 @@
 
 The others have their tests beside their subject: order 5 in test_synthesis, joint coverage in
 test_joint_coverage and test_joint_synthesis, certificate in test_between_grid_points and test_random_designs,
-two masses and the transmission with three loads in test_two_mass and test_landau_score.
+the transmission with three loads in test_landau_score.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ def robot_arm_options(n_pairs):
 
 
 # Second half predicted with its own initial state, and run through from rest over both halves. Measured
-# 96.444/96.900/97.124/97.458 and 94.16/94.88/94.59/94.47 (benchmarks/daisy_arm.py). The second half is the
+# 96.444/96.900/97.124/97.458 and 94.16/94.88/94.59/94.47. The second half is the
 # mirrored first half, so this is no independent validation.
 @pytest.mark.parametrize(("n_pairs", "reach"), [(2, 96.4), (3, 96.89), (4, 97.1), (5, 97.4)])
 def test_robot_arm_fitted_on_the_first_half_predicts_the_second(robot_arm, n_pairs, reach):

@@ -397,7 +397,7 @@ def test_tampered_studies_and_diagnoses(replayed, tmp_path, monkeypatch, amount)
 @pytest.mark.parametrize("damage", DAMAGE)
 @pytest.mark.usefixtures("cut_off")
 def test_damaged_logs(tmp_path, damage):
-    """420 of each in benchmarks/damaged_logs.py."""
+    """420 of each in benchmarks/damaged_files.py."""
     assert damaged_logs(damage, tmp_path, 5, binary=0.2).wrong == []
 
 
