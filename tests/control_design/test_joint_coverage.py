@@ -15,8 +15,6 @@ from validation.example_plants import ResponseRecord, flexible_link, flexible_li
 
 from .plants import RelativeDisc, gain, hub_arm, tip_acceleration, uncertain_lag
 
-_DT = 0.005
-
 
 @pytest.mark.parametrize("coverage", [0.8, 0.95])
 def test_one_uncertain_gain_gives_the_one_sided_normal_quantile(coverage):

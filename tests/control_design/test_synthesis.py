@@ -37,6 +37,7 @@ def test_link_scenario_a_at_order_5_reaches_the_published_worst_case():
         progress=lambda fraction, message: messages.append((fraction, message)),
     )
     certificate = certify(result.controller_or_raise(), [plant], specification)
+    assert result.outcome is Outcome.MET_ON_GRID
     assert certificate.certified
     assert 0.931 <= certificate.gamma <= 0.94
     # The dense check of the synthesis and the certificate's own refined grid agree.
@@ -48,13 +49,13 @@ def test_link_scenario_a_at_order_5_reaches_the_published_worst_case():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scenario", "limit"), [("A", 0.94), ("B", 1.09), ("C", 1.34)])
+@pytest.mark.parametrize(("scenario", "limit"), [("B", 1.09), ("C", 1.34)])
 def test_link_scenarios_at_order_5_with_the_default_search(scenario, limit):
     plant, specification = flexible_link(scenario), flexible_link_specification(5)
     result = synthesise([plant], specification, rng=np.random.default_rng(1))
     certificate = certify(result.controller, [plant], specification)
-    assert result.outcome is (Outcome.MET_ON_GRID if scenario == "A" else Outcome.NOT_MET)
-    assert certificate.certified == (scenario == "A")
+    assert result.outcome is Outcome.NOT_MET
+    assert not certificate.certified
     assert certificate.plants[0].stable
     assert certificate.plants[0].nyquist.matches
     assert certificate.gamma <= limit
@@ -174,19 +175,6 @@ def test_contradictions_are_refused_before_any_optimisation():
             progress=lambda fraction, message: messages.append(message),
         )
     assert messages == []
-
-
-@pytest.mark.slow
-def test_damping_of_the_measured_output_over_ellipses():
-    """Scenario A, published weights, mode peak halved: certified at a few per cent more gamma than 0.931."""
-    plant = flexible_link("A")
-    specification = flexible_link_specification(6).model_copy(update={"mode_peak_ratio": 0.5})
-    result = synthesise([plant], specification, rng=np.random.default_rng(0))
-    certificate = certify(result.controller_or_raise(), [plant], specification)
-    assert certificate.certified
-    assert certificate.gamma < 0.97
-    mode = min(certificate.plants[0].closed_loop_modes, key=lambda m: abs(m.omega_rad_s - 15))
-    assert mode.zeta > 0.05  # open loop 0.015
 
 
 def test_controller_keeps_the_damping_of_its_own_poles_that_was_asked_for():

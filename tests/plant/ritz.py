@@ -1,6 +1,6 @@
 """An arm written down independently of the package, for comparison.
 
-Polynomial Ritz functions instead of eigenfunctions, the extra angles of compliance, base and backlash as
+Polynomial Ritz functions instead of eigenfunctions, the extra angles of compliance and base as
 coordinates relative to the hub, the energies of the rig description by quadrature, and general-purpose
 integrators. Shares no code with `plant` but the record of nominal parameters.
 """
@@ -11,11 +11,10 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.polynomial.legendre import leggauss
 from scipy.integrate import solve_ivp
-from scipy.linalg import expm
 
 
 class RitzArm:
-    """States: coordinates (hub, base, backlash, twist, q_1..q_P), speeds, voltage lag, sensor lag."""
+    """States: coordinates (hub, base, twist, q_1..q_P), speeds, voltage lag, sensor lag."""
 
     def __init__(
         self,
@@ -23,7 +22,6 @@ class RitzArm:
         n=7,
         joint=None,
         base=None,
-        backlash=False,
         ripple=None,
         cubic=0.0,
         drag=0.0,
@@ -44,11 +42,11 @@ class RitzArm:
             * np.polynomial.Legendre.basis(k).convert(kind=Polynomial)(Polynomial([-1, 2 / length]))
             for k in range(n)
         ]
-        self.n = 4 + n
-        hub_, base_, backlash_, twist_ = np.eye(self.n)[:4]
+        self.n = 3 + n
+        hub_, base_, twist_ = np.eye(self.n)[:3]
 
         def displacement(at):
-            return np.concatenate([[r + at, 0, 0, r + at], [s(at) for s in shapes]])
+            return np.concatenate([[r + at, 0, r + at], [s(at) for s in shapes]])
 
         def field(order):
             return np.array([[s.deriv(order)(at) for s in shapes] for at in x])
@@ -56,20 +54,17 @@ class RitzArm:
         at_nodes = np.array([displacement(at) for at in x])
         self.tip = displacement(length)
         mass = m * (at_nodes.T * w) @ at_nodes + mp * np.outer(self.tip, self.tip)
-        motor_side = 0.3 if backlash else 0.0
-        inertia = hub.inertia_kg_m2
-        mass += inertia * (1 - motor_side) * np.outer(hub_, hub_)
-        mass += inertia * motor_side * np.outer(hub_ + backlash_, hub_ + backlash_)
+        mass += hub.inertia_kg_m2 * np.outer(hub_, hub_)
         curvature = np.zeros((x.size, self.n))
-        curvature[:, 4:] = field(2)
+        curvature[:, 3:] = field(2)
         bending = stiffness * (curvature.T * w) @ curvature
         stiff, damp = bending.copy(), link.kelvin_voigt_s * bending
-        self.shaft = hub_ + (backlash_ if backlash else 0) - (base_ if base else 0)
+        self.shaft = hub_ - (base_ if base else 0)
         self.gain = motor.gear_ratio * motor.torque_constant_Nm_A / motor.resistance_ohm
         damp += (hub.viscous_friction_Nms + self.gain * motor.gear_ratio * motor.back_emf_Vs_rad) * np.outer(
             self.shaft, self.shaft
         )
-        keep = [True, bool(base), backlash, bool(joint)] + [True] * n
+        keep = [True, bool(base), bool(joint)] + [True] * n
         if joint:
             stiff, damp = (
                 stiff + joint[0] * np.outer(twist_, twist_),
@@ -80,10 +75,7 @@ class RitzArm:
             mass += base[2] * np.outer(base_, base_)
         pick = np.eye(self.n)[:, keep]
         self.mass, self.damp, self.stiff = (pick.T @ a @ pick for a in (mass, damp, stiff))
-        self.tip, self.shaft, self.hub, self.backlash = (
-            a @ pick for a in (self.tip, self.shaft, hub_, backlash_)
-        )
-        self.encoder = (hub_ - (base_ if base else 0)) @ pick
+        self.tip, self.shaft, self.hub = (a @ pick for a in (self.tip, self.shaft, hub_))
         self.root = (hub_ + twist_) @ pick
         self.n = pick.shape[1]
         self.inverse = np.linalg.inv(self.mass)
@@ -93,12 +85,12 @@ class RitzArm:
         self.drag = drag
         self.moment = m * w @ (r + x) + mp * (r + length)
         moments = np.zeros(pick.shape[0])
-        moments[4:] = [m * w @ s(x) + mp * s(length) for s in shapes]
+        moments[3:] = [m * w @ s(x) + mp * s(length) for s in shapes]
         shortening = np.zeros((pick.shape[0],) * 2)
         for at, weight in [*zip(x, m * w, strict=True), (length, mp)]:
             inner = (at / length) * x
             slope = np.array([s.deriv()(inner) for s in shapes])
-            shortening[4:, 4:] += weight * 0.5 * (slope * (at / length) * w) @ slope.T
+            shortening[3:, 3:] += weight * 0.5 * (slope * (at / length) * w) @ slope.T
         self.moments, self.shortening = moments @ pick, pick.T @ shortening @ pick
         self.voltage_lag, self.sensor_lag = voltage_lag, sensor_lag
 
@@ -131,7 +123,7 @@ class RitzArm:
     def outputs(self, s):
         c = s[: self.n]
         return np.array(
-            [self.encoder @ c, self.tip @ c, s[2 * self.n + 1] if self.sensor_lag else self.tip @ c]
+            [self.shaft @ c, self.tip @ c, s[2 * self.n + 1] if self.sensor_lag else self.tip @ c]
         )
 
     def records(self, voltage, dt, delay=0.0, hub_torque=None, tip_force=None, rtol=1e-9):
@@ -158,26 +150,4 @@ class RitzArm:
                 )
                 assert solution.success
                 s = solution.y[:, -1]
-        return np.array(out)
-
-    def fine_records(self, voltage, dt, step, law):
-        """(T, 2) outputs with a force law advanced in tiny steps, exact between them.
-
-        law(coordinates, speeds) -> generalised force held over the step; it may keep a memory of its own.
-        """
-        n = self.n
-        a = np.zeros((2 * n, 2 * n))
-        a[:n, n:] = np.eye(n)
-        a[n:, :n], a[n:, n:] = -self.inverse @ self.stiff, -self.inverse @ self.damp
-        block = np.zeros((3 * n, 3 * n))
-        block[: 2 * n, : 2 * n] = a
-        block[n : 2 * n, 2 * n :] = self.inverse
-        transition = expm(block * step)[: 2 * n]
-        s, out = np.zeros(2 * n), []
-        per_sample = round(dt / step)
-        for held in voltage:
-            out.append([self.encoder @ s[:n], self.tip @ s[:n]])
-            drive = self.shaft * self.gain * held
-            for _ in range(per_sample):
-                s = transition @ np.concatenate([s, drive + law(s[:n], s[n:])])
         return np.array(out)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from plant import Rig, paper_link, parse_effect, parse_effects, simulate
+from plant import Rig, paper_link, parse_effects, simulate
 from plant.effects import LOOK_ALIKES
 from tests.plant.ritz import RitzArm
 
@@ -78,81 +78,3 @@ def test_outside_torque_and_tip_force_agree_with_an_independent_arm():
     rng = np.random.default_rng(3)
     inputs = {"hub_torque": rng.normal(size=VOLTAGE.size), "tip_force": 0.5 * rng.normal(size=VOLTAGE.size)}
     assert _compare({}, (), **inputs) < 1e-6
-
-
-class ElasticSlider:
-    """Dry friction as a spring whose stretch is clipped: the law as it is stated, in small steps."""
-
-    def __init__(self, arm, static, coulomb, velocity):
-        self.arm, self.static, self.excess, self.velocity = arm, static, static - coulomb, velocity
-        self.stiffness, self.stretch, self.angle = static / 1e-5, 0.0, 0.0
-
-    def __call__(self, coordinates, speeds):
-        angle, speed = self.arm.shaft @ coordinates, self.arm.shaft @ speeds
-        level = self.static - self.excess * -np.expm1(-abs(speed) / self.velocity)
-        limit = level / self.stiffness
-        self.stretch = np.clip(self.stretch + angle - self.angle, -limit, limit)
-        self.angle = angle
-        return -self.arm.shaft * self.stiffness * self.stretch
-
-
-class Contact:
-    """Backlash with a damped contact spring that only pushes."""
-
-    def __init__(self, arm, gap, inertia):
-        self.arm, self.gap = arm, gap
-        self.stiffness = 0.21 * inertia * (2 * np.pi * 180) ** 2
-        self.damping = 0.8 * np.sqrt(0.3 * inertia * self.stiffness)
-
-    def __call__(self, coordinates, speeds):
-        angle, speed = self.arm.backlash @ coordinates, self.arm.backlash @ speeds
-        side = np.sign(angle)
-        depth = abs(angle) - self.gap / 2
-        push = max(self.stiffness * depth + self.damping * side * speed, 0.0) if depth > 0 else 0.0
-        return -self.arm.backlash * side * push
-
-
-REVERSALS = np.array([2, 2, -2, -2, -2, 0.5, 0.5, 3, -1, 0, 0, 0], dtype=float)
-
-
-@pytest.mark.parametrize(
-    "effect",
-    [
-        {"name": "coulomb_friction", "torque_Nm": 0.3},
-        {
-            "name": "stribeck_friction",
-            "static_torque_Nm": 0.45,
-            "coulomb_torque_Nm": 0.25,
-            "stribeck_velocity_rad_s": 0.08,
-        },
-    ],
-    ids=lambda e: e["name"],
-)
-def test_dry_friction_follows_the_stated_law(effect):
-    rig = _rig()
-    arm = RitzArm(rig, n=7)
-    static = effect.get("static_torque_Nm", effect.get("torque_Nm"))
-    slider = ElasticSlider(
-        arm, static, effect.get("coulomb_torque_Nm", static), effect.get("stribeck_velocity_rad_s", 1)
-    )
-    expected = arm.fine_records(REVERSALS, DT_S, 1e-5, slider)
-    got = simulate(rig, REVERSALS, [parse_effect(effect)], dt_s=DT_S, n_modes=8).output
-    # The comparison is the coarse one: the held force lags by half of its 10 us step, which is worth
-    # 1e-5 s * 3 rad/s = 3e-5 rad of path at the most.
-    np.testing.assert_allclose(got, expected, atol=3e-5)
-    without = simulate(rig, REVERSALS, dt_s=DT_S, n_modes=8).output
-    assert np.max(np.abs(without - expected)) > 0.03
-
-
-def test_backlash_follows_the_stated_law():
-    rig = _rig()
-    arm = RitzArm(rig, n=7, backlash=True)
-    expected = arm.fine_records(REVERSALS, DT_S, 1e-5, Contact(arm, 0.05, rig.hub.inertia_kg_m2))
-    got = simulate(
-        rig, REVERSALS, [parse_effect({"name": "backlash", "gap_rad": 0.05})], dt_s=DT_S, n_modes=8
-    ).output
-    # Bounces amplify the half step by which the comparison's contact force lags (contact damping is 0.4 of
-    # critical).
-    np.testing.assert_allclose(got, expected, atol=2e-4)
-    without = simulate(rig, REVERSALS, dt_s=DT_S, n_modes=8).output
-    assert np.max(np.abs(without - expected)) > 0.01

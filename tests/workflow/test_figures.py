@@ -28,7 +28,6 @@ from workflow.figures.bode import draw_bode, draw_distortion
 from workflow.figures.closed_loop import draw_closed_loop
 from workflow.figures.gap_answer import draw_waterfall
 from workflow.figures.gap_records import draw_residual_spectra
-from workflow.figures.nyquist import uncertain_loop
 from workflow.figures.poles import draw_poles
 from workflow.figures.records import draw_excitation, draw_records
 from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
@@ -286,18 +285,6 @@ def test_envelope_covers_every_signal(samples):
     assert (t[0], t[-1]) == (time[0], time[-1])
     assert low.min() == signals.min()
     assert high.max() == signals.max()
-
-
-def test_nearest_ellipse_is_the_one_a_sampling_finds():
-    found = frequency()
-    gain = example.controller().response(OMEGA)
-    loop = uncertain_loop(found, gain)
-    ellipse = found.ellipse()
-    sampled = np.abs(1 + gain[:, None] * (found.centre[:, None] + ellipse.boundary(400))).min(axis=1)
-    # 400 boundary points overestimate the distance by the sagitta of their chords at most.
-    sagitta = np.abs(gain) * ellipse.semi_major * (np.pi / 400) * 2
-    assert np.all(loop.distance <= sampled + 1e-12)
-    assert np.all(sampled <= loop.distance + sagitta + 1e-9)
 
 
 def test_sensitivity_curves_bound_every_member():

@@ -92,13 +92,8 @@ def test_killed_run_resumes_with_identical_numbers(reference, tmp_path, appears,
     assert RunDirectory.open(out).manifest()["status"].startswith("complete")
 
 
-def test_two_threads_give_the_same_bytes(reference, tmp_path):
-    out = tmp_path / "run"
-    finish(start_flexlink("run", "--config", FAST_ARM, "--out", out, threads=2))
-    assert_same_run(reference, out)
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+# SIGTERM comes while a command loads, SIGALRM at its time limit: below.
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_interrupted_run_ends_at_once_and_says_how_to_go_on(tmp_path, number):
     out = tmp_path / "run"
     process = start_flexlink("run", "--config", FAST_ARM, "--out", out)

@@ -100,19 +100,6 @@ def test_ellipses_hold_the_true_response(run):
     np.testing.assert_allclose(frequency.centre[inside], truth[inside], rtol=0.2)
 
 
-def test_posterior_and_display_grid_agree(run):
-    frequency, posterior = run.uncertainty.channels[0].frequency, run.uncertainty.channels[0].posterior
-    again = posterior.at(frequency.omega_rad_s, frequency.level)
-    np.testing.assert_array_equal(again.centre, frequency.centre)
-    np.testing.assert_array_equal(again.covariance, frequency.covariance)
-
-
-def test_empirical_response_is_there(run):
-    empirical = run.uncertainty.channels[0].empirical
-    assert empirical is not None
-    assert empirical.omega_rad_s.size > 10
-
-
 def test_identification_comes_back_whole(run):
     found = run.identify.channels[0]
     assert found.fit_percent["estimation"] == {"prbs": pytest.approx(found.identification.fit_percent[0])}
