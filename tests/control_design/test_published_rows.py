@@ -11,9 +11,9 @@ import control
 import numpy as np
 import pytest
 
-from benchmarks.reference_filter import MODEL
 from control_design import (
     LoopFunction,
+    RationalWeight,
     ReferenceFilterOptions,
     SynthesisOptions,
     UncertainPlant,
@@ -27,6 +27,7 @@ pytestmark = pytest.mark.slow
 
 # Damping of the mode, and max(|W1 S|, |W3 K S|) of the full-order controllers that were published.
 PUBLISHED = ((0.015, 0.965), (0.028, 1.137), (0.050, 1.40))
+MODEL = RationalWeight(numerator=(1.0,), denominator=(0.25, 1.0, 1.0))
 
 
 @pytest.mark.parametrize(("scenario", "youla"), [("A", 0.931), ("B", 1.065), ("C", 1.268)])

@@ -305,23 +305,9 @@ def test_recorded_sensor_drift_is_a_drift_of_the_tip_sensor(gap_cases):
     assert tip.notable
 
 
-def test_recorded_case_without_effect_has_no_place(gap_cases):
-    found = _recorded(gap_cases, "none")
-    assert not found.is_gap
-
-
 def test_recorded_saturation_shows_in_the_one_experiment_that_saturates(gap_cases):
     found = _recorded(gap_cases, "actuator_saturation")
     assert [x.experiment for x in found.experiments if x.gap.found] == ["experiments/03_multisine.csv"]
-
-
-@pytest.mark.parametrize(
-    ("name", "route", "axis"), [("gravity", "hub_torque", "angle"), ("sensor_drift", "tip", "time")]
-)
-def test_recorded_gap_is_read_as_a_function_of_its_own_variable(gap_cases, name, route, axis):
-    curve = _recorded(gap_cases, name).best_curve
-    assert (curve.route, curve.axis) == (route, axis)
-    assert curve.share > 0.95
 
 
 def test_recorded_dry_friction_turns_round_with_the_speed(gap_cases):
@@ -343,12 +329,6 @@ def test_recorded_linear_causes_are_called_linear(gap_cases, name, linear):
     found = _recorded(gap_cases, name)
     assert (found.linear.share > 0.9) == linear
     assert (found.linear.share < 0.6) == (not linear)
-
-
-def test_recorded_disturbance_comes_with_the_clock(gap_cases):
-    found = _recorded(gap_cases, "periodic_disturbance")
-    assert all(c.found for c in found.common)
-    assert len(found.common_found) == 2
 
 
 def test_beside_a_model_error_sizes_are_over_what_a_model_may_miss():

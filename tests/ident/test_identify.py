@@ -12,7 +12,17 @@ from ident.basis.options import IdentOptions
 from ident.data.finding import FindingKind
 from ident.fit.problem import residual_colour
 from ident.one_input import identify
-from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, max_length_sequence, p1, p2, run
+from tests.ident.benchmark_plants import (
+    P2_HZ,
+    P2_ZETA,
+    P3_MODES,
+    as_record,
+    max_length_sequence,
+    p1,
+    p2,
+    p3,
+    run,
+)
 from tests.ident.findings import kinds
 from tests.workflow.test_codec import same
 
@@ -64,6 +74,16 @@ def test_p1_monte_carlo():
     assert np.median(errors) <= 0.042
     assert np.quantile(errors, 0.9) <= 0.09
     assert np.median(validation) <= 0.006
+
+
+@pytest.mark.parametrize("n_modes", P3_MODES)
+def test_p3_the_global_optimum_is_found(n_modes):
+    """Three and five modes beside 1/(s^2 + 0.3 s): within 2 % of the variance of the noise."""
+    for snr_db in (30, 50):
+        for seed in range(3):
+            truth = p3(n_modes, seed, snr_db)
+            found = identify([truth.record], IdentOptions(n_real=2, n_pairs=n_modes))
+            assert found.rss <= 1.02 * truth.clean.size * truth.noise_std**2
 
 
 def test_p2_all_modes_are_found_without_being_told(p2_fit):
