@@ -118,7 +118,7 @@ def test_a_diagnosis_goes_on(tmp_path, monkeypatch, continued):
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("name", ["page.html", "model.npz", "model.json"])
+@pytest.mark.parametrize("name", ["page.html", "model.json"])  # the first and the last
 def test_files_of_an_identification_are_all_there_or_none(name, tmp_path, monkeypatch, refused):
     log = p2_log(tmp_path / "log.csv", 1)
     out = tmp_path / "out"

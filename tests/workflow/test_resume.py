@@ -200,20 +200,6 @@ def plain_page(monkeypatch):
     monkeypatch.setattr(pages, "write_report", write)
 
 
-def test_resume_from_every_stage_boundary(fast_run, tmp_path, plain_page):
-    """The same without processes: every prefix of finished stages leads to the same end."""
-    for count in range(1, len(NAMES)):
-        out = tmp_path / f"after-{count}"
-        shutil.copytree(fast_run[0], out)
-        for name in NAMES[count:]:
-            RunDirectory(out).stage_file(name).unlink()
-        (out / "report.html").unlink()
-        watch = Watch()
-        run_from_files(FAST_ARM, out, resume=True, progress=watch)
-        assert watch.taken_up == NAMES[:count]
-        assert_same_run(fast_run[0], out)
-
-
 class Watch(Progress):
     """Remembers which stages were taken up."""
 
