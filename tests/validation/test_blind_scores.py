@@ -155,26 +155,6 @@ def test_phases_are_compared_the_short_way_round():
     assert rows["parameter error"]["p90"] < 0.05
 
 
-def test_intervals_of_a_calibrated_answer_cover_as_often_as_they_say():
-    rng = np.random.default_rng(4)
-    said, true = [], []
-    for k in range(400):
-        off = rng.standard_normal()
-        document = _said(
-            str(k), "effect", [("gravity", 1.0)], parameters={"gravity": {"acceleration_m_s2": 1}}
-        )
-        document["effects"][0]["parameters"]["acceleration_m_s2"] = 1 + 0.01 * off
-        document["effects"][0]["intervals"]["acceleration_m_s2"] = [
-            1 + 0.01 * (off - 1.96),
-            1 + 0.01 * (off + 1.96),
-        ]
-        said.append(document)
-        true.append(_true(str(k), "effect", [GRAVITY]))
-    share = scores(said, true)["table"]["all"]["95 % intervals cover"]["share"]
-    # Binomial: standard deviation 1.1 %; four of them.
-    assert abs(share - 0.95) < 0.044
-
-
 def test_a_calibrated_answer_has_little_calibration_error():
     rng = np.random.default_rng(5)
     said, true = [], []

@@ -1,1 +1,1 @@
-"""What identification is compared with: ARX, OE, ARMAX, subspace."""
+"""What identification is compared with: ARX, OE, ARMAX."""
