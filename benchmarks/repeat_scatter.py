@@ -65,7 +65,7 @@ def slfr(source: FileSource, channel: Channel, say: Print) -> None:
     band, options, bounds = channel.band_rad_s, channel.identification, channel.uncertainty
     sweeps = [entry for entry in source.records if entry.role == "estimation"]
     measured = [read_record(source, entry, (channel,)) for entry in sweeps]
-    stage = two_stage([band_limited(one, *channel.bounds_band_rad_s) for one in measured], options, bounds)
+    stage = two_stage([band_limited(one, *channel.bounds_band_rad_s) for one in measured], options)
     model = identify([band_limited(record, *band) for record in stage.records], options).model
     posteriors = record_posteriors(stage.records, model, bounds)
     by_others = repeat_posteriors([stage.records[:3], stage.records[3:]], model, bounds)

@@ -1,4 +1,15 @@
-"""Logs taken in closed loop with a known reference: two-stage identification."""
+"""Logs taken in closed loop with a known reference: two-stage identification, its output corrected.
+
+Stage one fits r -> u; u_hat, its fit, is what the reference makes of the input, free of the noise v that the
+loop feeds back. With any model G0 of the plant
+
+    y - G0 (u - u_hat) = G u_hat + (G - G0) (u - u_hat) + v,
+
+so the record with input u_hat and this output is one of an open loop: u_hat is independent of all the rest
+(an instrumental variable; Gilson and Van den Hof, Automatica 41(2), 2005). Its noise is v itself, and an
+error of u_hat counts only times that of G0, so that ellipses of the second stage hold it to first order. With
+G0 = 0 it is the method of Van den Hof and Schrama (Automatica 29(6), 1993), where it counts in full.
+"""
 
 from __future__ import annotations
 
@@ -7,29 +18,32 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ident.basis.functions import all_pass_signal
+from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions, IdentOptions
-from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.one_input import identify
 from ident.uncertainty.embedding import tangent
+from ident.unstable import quick_poles
 
 # A first stage that explains less of the input than this has gone wrong.
 _EXPLAINED_PERCENT = 50.0
+_FIRST_STAGE = EmbeddingOptions(coloured_noise=True, prior_missed_mode=0.0, fir_length=1)
 
 
 @dataclass(frozen=True, eq=False)
 class TwoStage:
     """Open-loop records made from closed-loop ones, and how good the first stage is.
 
-    records: as given, but with the noise-free input u_hat = S_hat r (the reference dropped: it has done its
-    work); sensitivities: posterior of S, r -> u, one per record; fit_percent (per record) of u by u_hat.
+    records: input u_hat, output y - G0 (u - u_hat), no reference (it has done its work). fit_percent (per
+    record) of u by u_hat. plant: G0.
     """
 
     records: tuple[Record, ...]
-    sensitivities: tuple[ResponsePosterior, ...]
     fit_percent: tuple[float, ...]
+    plant: GobfModel
 
     @property
     def finding(self) -> Finding:
@@ -37,57 +51,61 @@ class TwoStage:
             FindingKind.TWO_STAGE, least_percent=min(self.fit_percent), most_percent=max(self.fit_percent)
         )
 
-    def warnings(self, omega_rad_s: RealArray) -> tuple[Finding, ...]:
-        """What the ellipses of a second stage do not hold, in the median over omega (F,)."""
+    @property
+    def warnings(self) -> tuple[Finding, ...]:
         explained = min(self.fit_percent)
         lost = finding(FindingKind.UNEXPLAINED_INPUT, explained_percent=explained)
-        error = float(np.median(self.relative_error(omega_rad_s)))
-        return (
-            *([lost] if explained < _EXPLAINED_PERCENT else []),
-            finding(FindingKind.FIRST_STAGE_ERROR, relative_std=error),
-        )
-
-    def relative_error(self, omega_rad_s: RealArray) -> RealArray:
-        """(F,) standard deviation of S_hat over |S_hat|, RMS over the records.
-
-        The bounds of a second stage do not see it: to first order the same relative error is in G.
-        """
-        total = np.zeros(np.shape(omega_rad_s))
-        for sensitivity in self.sensitivities:
-            estimate = sensitivity.at(omega_rad_s)
-            variance = estimate.covariance[:, 0, 0] + estimate.covariance[:, 1, 1]
-            total += variance / np.abs(estimate.centre) ** 2
-        return np.asarray(np.sqrt(total / len(self.sensitivities)))
+        return (lost,) if explained < _EXPLAINED_PERCENT else ()
 
 
 def two_stage(
-    records: Sequence[Record],
-    options: IdentOptions | None = None,
-    embedding: EmbeddingOptions | None = None,
+    records: Sequence[Record], options: IdentOptions | None = None, plant: GobfModel | None = None
 ) -> TwoStage:
-    """Van den Hof and Schrama (Automatica 29(6), 1993): turn r -> u -> y into an open-loop problem.
+    """Turn r -> u -> y into an open-loop problem for `identify` and `tangent` with the same options.
 
-    The sensitivity r -> u is identified first (direct term on, no integrators or delay, whatever `options`
-    say about the plant), the records' inputs are replaced by its simulation from rest, which the noise does
-    not touch. Each record gets its own sensitivity on common poles: the error of S_hat then differs between
-    records and shows in their scatter, so `combine_posteriors` over the records accounts for it; no bound of
-    a single second stage does (`relative_error`). Raises ValueError when a record has not exactly one
-    reference and input.
+    r -> u is fitted with a direct term and as many poles as the data ask for, whatever `options` say about
+    the plant; on common poles, by each record for itself, so that controllers may differ. plant: G0; default:
+    that of a second stage on the direct fit. Raises ValueError when a record has not exactly one reference
+    and input.
+
+    Noise at the plant's input reaches the output through G, far from white where G integrates: the ellipses
+    then need a noise model of high order (`EmbeddingOptions.max_ar_order`).
     """
-    plant_options = options or IdentOptions()
-    stage = plant_options.model_copy(
-        update={"feedthrough": True, "integrators": 0, "input_delay_samples": 0, "fixed_poles": ()}
-    )
-    closed = [_reference_to_input(record) for record in records]
-    first = identify(closed, stage)
-    sensitivities = [tangent([record], first.model, embedding) for record in closed]
-    opened, fits = [], []
-    for record, sensitivity in zip(records, sensitivities, strict=True):
-        u, u_hat = record.input[:, 0], sensitivity.simulate(_reference(record))
-        spread = float(np.linalg.norm(u - u.mean()))
-        fits.append(100 * (1 - float(np.linalg.norm(u - u_hat)) / spread))
-        opened.append(replace(record, input=u_hat[:, None], reference=None, reference_names=()))
-    return TwoStage(tuple(opened), tuple(sensitivities), tuple(fits))
+    options = options or IdentOptions()
+    closed, fixed = [_reference_to_input(record) for record in records], options.fixed()
+    poles = quick_poles(closed, options)
+    first = GobfModel(poles, np.zeros(poles.order), records[0].dt_s, feedthrough=1.0)
+    # Behind a noise model: what noise of high frequency moved at a low one would pass for excitation there.
+    loops = [tangent([loop], first, _FIRST_STAGE) for loop in closed]
+    rests = [
+        record.input[:, 0] - loop.simulate(_reference(record))
+        for record, loop in zip(records, loops, strict=True)
+    ]
+    if plant is None:
+        options = options.with_delay_stated()
+        plant = identify(records, options).model
+        # What feedback does to the direct fit would be noise of the second stage.
+        n_real, n_pairs = (own - given for own, given in zip(plant.poles.counts, fixed.counts, strict=True))
+        again = options.model_copy(update={"n_real": n_real, "n_pairs": n_pairs})
+        plant = identify(_opened(records, rests, plant), again).model
+    moved = [record.input[:, 0] - record.input.mean() for record in records]
+    fits = [
+        100 * (1 - float(np.linalg.norm(rest) / np.linalg.norm(u)))
+        for rest, u in zip(rests, moved, strict=True)
+    ]
+    return TwoStage(tuple(_opened(records, rests, plant)), tuple(fits), plant)
+
+
+def _opened(records: Sequence[Record], rests: Sequence[RealArray], plant: GobfModel) -> list[Record]:
+    """Records without the rests (T,) of their inputs, and without what the plant makes of them."""
+    opened = []
+    for record, rest in zip(records, rests, strict=True):
+        answer = plant.stable_part.simulate(rest)
+        # 1/B backwards in time: the bounded answer of an unstable plant to what a loop keeps bounded.
+        answer = all_pass_signal(plant.unstable, answer[::-1])[::-1]
+        input_, output = record.input - rest[:, None], record.output - answer[:, None]
+        opened.append(replace(record, input=input_, output=output, reference=None, reference_names=()))
+    return opened
 
 
 def _reference(record: Record) -> RealArray:

@@ -21,7 +21,8 @@ from ident.basis.structure import Structure, filter_input
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
 from ident.fit.least_squares import Regression, project
-from ident.fit.regression import prepare_inputs, thinned
+from ident.fit.regression import prepare, prepare_inputs, thinned
+from ident.search.order_selection import OrderSelection
 from ident.search.pole_search import PoleSearch
 
 # Numbers of real poles and pairs that are tried; the criterion of the order chooses.
@@ -46,22 +47,38 @@ def find_unstable(records: Sequence[Record], options: IdentOptions | None = None
     """
     options = options or IdentOptions()
     both = [_with_output(record, options.input_delay_samples) for record in records]
-    part = _prepared(thinned(both, options.search_samples)[0])
-    starts = [_mirrored_often(part, n_real, n_pairs) for n_real, n_pairs in _STRUCTURES]
-    ends = [PoleSearch(part, IdentOptions()).descend(poles, "predictor", _ROUGH) for poles in starts]
-    worth = part.n_samples
-    best = min(
-        ends, key=lambda end: worth * np.log(end.rss) + part.n_parameters(end.poles.order) * np.log(worth)
-    )
+    poles = _predictor_poles(_prepared(thinned(both, options.search_samples)[0]))
     data = _prepared(both)
-    return _significant(data, PoleSearch(data, IdentOptions()).descend(best.poles, "predictor", _ROUGH).poles)
+    return _significant(data, PoleSearch(data, IdentOptions()).descend(poles, "predictor", _ROUGH).poles)
+
+
+def quick_poles(records: Sequence[Record], options: IdentOptions | None = None) -> Poles:
+    """Poles between a stable input and output with a direct term, without a search: zeros of 1 - M, those
+    taken out again that the criterion of the order does not mind."""
+    part = thinned(records, (options or IdentOptions()).search_samples)[0]
+    data = _prepared([_with_output(record, -1) for record in part])
+    start = _inside(_predictor(data, _predictor_poles(data))[0].zeros())
+    structure = Structure(feedthrough=True, estimate_offset=True, estimate_initial_state=True)
+    search = PoleSearch(prepare(part, structure), IdentOptions(feedthrough=True))
+    return OrderSelection(search).pruned(search.descend(start, "loop", _ROUGH)).poles
+
+
+def _predictor_poles(data: Regression) -> Poles:
+    """Poles of the basis: of the structure that the criterion of the order chooses."""
+    starts = [_mirrored_often(data, n_real, n_pairs) for n_real, n_pairs in _STRUCTURES]
+    ends = [PoleSearch(data, IdentOptions()).descend(poles, "predictor", _ROUGH) for poles in starts]
+    worth = float(np.log(data.n_samples))
+    return min(
+        ends, key=lambda end: data.n_samples * np.log(end.rss) + data.n_parameters(end.poles.order) * worth
+    ).poles
 
 
 def _with_output(record: Record, delay_samples: int) -> Record:
-    """The record with its delayed input, and its output as a second one."""
+    """The record with its delayed input (or the next one, -1), and its output as another."""
     record.refuse_several()
-    signals = np.column_stack([filter_input(record.input[:, 0], 0, delay_samples), record.output[:, 0]])
-    return replace(record, input=signals, input_names=("input", "output"), input_units=())
+    u, y = record.input[:, 0], record.output[:, 0]
+    u = np.append(u[1:], u[-1]) if delay_samples < 0 else filter_input(u, 0, delay_samples)
+    return replace(record, input=np.column_stack([y, u]), input_names=("output", "input"), input_units=())
 
 
 def _prepared(records: Sequence[Record]) -> Regression:
@@ -71,7 +88,7 @@ def _prepared(records: Sequence[Record]) -> Regression:
 def _predictor(data: Regression, poles: Poles) -> tuple[GobfModel, RealArray, float]:
     """1 - M and the coefficients of N at the best fit on these poles, and its residual sum of squares."""
     fitted = project(data, poles)
-    n, m = np.split(fitted.coefficients(data.y), [poles.order])
+    m, n = fitted.coefficients(data.y)[: 2 * poles.order].reshape(2, -1)
     return GobfModel(poles, -m, data.dt_s, 1.0), n, float(fitted.residual @ fitted.residual)
 
 
@@ -88,12 +105,16 @@ def _mirrored_often(data: Regression, n_real: int, n_pairs: int) -> Poles:
     for _ in range(_ROUNDS):
         denominator, _, rss = _predictor(data, poles)
         best = min(best, (rss, poles), key=lambda pair: pair[0])
-        zeros = denominator.zeros()
-        size = np.maximum(np.abs(zeros), np.finfo(np.float64).tiny)
-        mirrored = zeros / size * np.minimum(np.minimum(size, 1 / size), _ON_CIRCLE)
+        mirrored = _inside(denominator.zeros())
         # A zero at infinity was left out.
-        poles = _poles(np.append(mirrored, np.zeros(poles.order - zeros.size)))
+        poles = mirrored.appended(Poles(np.zeros(poles.order - mirrored.order)))
     return best[1]
+
+
+def _inside(zeros: ComplexArray) -> Poles:
+    """Those outside the circle mirrored into it."""
+    size = np.maximum(np.abs(zeros), np.finfo(np.float64).tiny)
+    return _poles(zeros / size * np.minimum(np.minimum(size, 1 / size), _ON_CIRCLE))
 
 
 def _poles(values: ComplexArray) -> Poles:
@@ -114,7 +135,7 @@ def _significant(data: Regression, poles: Poles) -> Poles:
     if not worth > 0:
         return NO_POLES
     inverse = np.linalg.pinv(fitted.triangle, rcond=1e-12) * np.sqrt(rss / worth)
-    of_n, of_m = inverse[: double.order], inverse[double.order :]
+    of_m, of_n = inverse[: double.order], inverse[double.order : 2 * double.order]
     kept = []
     for zero in zeros[(np.abs(zeros) > 1) & (zeros.imag >= 0)]:
         # Value, first and second derivative from differences: analytic outside the circle.

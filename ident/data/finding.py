@@ -74,7 +74,6 @@ class FindingKind(Enum):
     # Records made in closed loop.
     TWO_STAGE = auto()
     UNEXPLAINED_INPUT = auto()
-    FIRST_STAGE_ERROR = auto()
     # Noise and nonlinear distortion.
     LINEAR = auto()
     DISTORTED = auto()

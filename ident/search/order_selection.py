@@ -74,7 +74,7 @@ class OrderSelection:
             order = best.poles.order
             grown = self._grow_pairs(best, most_pairs)
             best = self._grow_real(grown) if options.n_real is None else grown
-            best = self._prune(best)
+            best = self.pruned(best)
             # From where no pair was to be added, none will be: a second look would end the same.
             if best is grown or best.poles.order == order:
                 break
@@ -134,7 +134,7 @@ class OrderSelection:
             best = trial
         return best
 
-    def _prune(self, best: Refined) -> Refined:
+    def pruned(self, best: Refined) -> Refined:
         """Take out poles whose loss the criterion does not mind, the least needed first."""
         free_real, free_pairs = self.options.n_real is None, self.options.n_pairs is None
         while trials := self._one_less(best.poles, free_real, free_pairs):

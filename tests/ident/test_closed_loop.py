@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import signal
@@ -10,8 +12,9 @@ from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.closed_loop import two_stage
 from ident.data.record import Record
 from ident.one_input import identify
-from ident.uncertainty.conditions import combine_posteriors, record_posteriors
 from ident.uncertainty.embedding import tangent
+from ident.unstable import find_unstable
+from tests.ident.test_unstable import looped, sampled
 
 DT = 0.01
 B, A, GAIN = [0.0, 0.06, 0.05], [1.0, -1.62, 0.72], 1.5
@@ -35,7 +38,7 @@ def log(rng, noise=0.3, n=3000):
 
 def test_two_stage_is_free_of_the_direct_method_s_bias():
     records = [log(np.random.default_rng([1, seed])) for seed in range(4)]
-    stage = two_stage(records, OPTIONS, BOUNDS)
+    stage = two_stage(records, OPTIONS)
     assert all(record.reference is None for record in stage.records)
     # The noise-free input itself is known here: S r with S = A / (A + g B).
     closed = np.polyadd(A, GAIN * np.asarray(B))
@@ -48,30 +51,54 @@ def test_two_stage_is_free_of_the_direct_method_s_bias():
         options = BOUNDS.model_copy(update={"coloured_noise": coloured_noise})
         return tangent(used, identify(used, OPTIONS).model, options).at(OMEGA)
 
-    weak = np.abs(TRUTH) < 0.3
     # The direct method without a noise model; a true noise model would free it of its bias, too.
     opened, direct = bounds(stage.records, True), bounds(records, False)
-    assert np.abs(opened.centre - TRUTH)[weak].mean() < 0.5 * np.abs(direct.centre - TRUTH)[weak].mean()
-    assert opened.contains(TRUTH)[weak].mean() > 0.8
+    assert np.median(np.abs(opened.centre - TRUTH)) < 0.5 * np.median(np.abs(direct.centre - TRUTH))
+    assert opened.contains(TRUTH).mean() > 0.8
     assert direct.contains(TRUTH).mean() < 0.5
-    # Every record has its own estimate of S, and each holds the truth.
-    truth = signal.freqz(A, closed, worN=OMEGA * DT)[1]
-    assert not np.array_equal(stage.sensitivities[0].mean, stage.sensitivities[1].mean)
-    assert np.mean([one.at(OMEGA).contains(truth) for one in stage.sensitivities]) > 0.8
 
 
-def test_bounds_of_combined_records_cover_where_the_loop_gain_is_large():
-    combined_hits = []
-    for seed in range(6):
-        records = [log(np.random.default_rng([5, seed, i]), n=1500) for i in range(5)]
-        stage = two_stage(records, OPTIONS, BOUNDS)
-        model = identify(stage.records, OPTIONS).model
-        combined = combine_posteriors(
-            record_posteriors(stage.records, model, BOUNDS), small_sample_level=0.95
-        )
-        combined_hits.append(combined.at(OMEGA).contains(TRUTH))
-    # Few independent frequencies in a smooth response: 6 runs tell coverage to about 10 %.
-    assert np.mean(combined_hits) > 0.85
+def test_any_model_of_the_plant_will_do_and_a_good_one_does_better():
+    """G0 = 0 is the plain two-stage method: unbiased, with the error of u_hat."""
+    record = log(np.random.default_rng(8), noise=0.05)
+    good = two_stage([record], OPTIONS)
+    nothing = replace(good.plant, coefficients=np.zeros(2))
+    poor = two_stage([record], OPTIONS, replace(good.plant, coefficients=0.7 * good.plant.coefficients))
+    plain = two_stage([record], OPTIONS, nothing)
+    np.testing.assert_array_equal(plain.records[0].output, record.output)
+    found = [identify(stage.records, OPTIONS) for stage in (good, poor, plain)]
+    errors = [np.median(np.abs(one.model.frequency_response(OMEGA) / TRUTH - 1)) for one in found]
+    assert max(errors) < 0.05
+    assert errors[0] < errors[2]
+    # Sensor noise of standard deviation .05 / sqrt(1 - .7^2).
+    assert found[0].noise_std == pytest.approx(0.07, rel=0.1)
+
+
+PLANTS = {
+    "stable": (sampled([40.0], [1.0, 1.5, 9.0]), IdentOptions(n_real=0, n_pairs=1)),
+    "integrating": (sampled([40.0], [1.0, 1.5, 0.0]), IdentOptions(n_real=1, n_pairs=0, integrators=1)),
+    "unstable": (sampled([40.0], [1.0, 1.5, -9.0]), IdentOptions(n_real=1, n_pairs=0)),
+}
+
+
+@pytest.mark.parametrize("kind", PLANTS)
+def test_ellipses_hold_the_plant_in_a_loop_with_noise(kind):
+    """Two records with different controllers, a tenth of the motion is noise; 60 runs."""
+    (num, den), options = PLANTS[kind]
+    omega = np.geomspace(0.5, 300.0, 60)
+    truth = signal.freqz(np.r_[0.0, num], den, worN=omega * DT)[1]
+    held, bounds = [], EmbeddingOptions(fir_length=20, prior_missed_mode=0.0)
+    for seed in range(60):
+        records = [
+            looped((num, den), [900 + seed, k], n=1000, noise=0.02, gains=gains)
+            for k, gains in enumerate([(1.2, 0.08), (0.8, 0.12)])
+        ]
+        asked = options.with_unstable(find_unstable(records))
+        stage = two_stage(records, asked)
+        posterior = tangent(stage.records, identify(stage.records, asked).model, bounds)
+        held.append(posterior.at(omega).contains(truth).mean())
+    # Of a smooth response few frequencies are independent: the mean of 60 runs has a standard error of 2 %.
+    assert 0.95 - 3 * 0.02 <= np.mean(held) <= 0.99
 
 
 def test_records_without_reference_are_refused():

@@ -92,8 +92,10 @@ def identify_records(
     with naming("identify"), progress.stage("identify") as update:
         used = list(measured)
         if described.friction_identified:
-            if band_rad_s is not None:
-                raise ValueError(f"'{described.response}' takes logs as measured: no band")
+            if band_rad_s is not None or any(record.reference is not None for record in measured):
+                raise ValueError(
+                    f"'{described.response}' takes logs as measured, in open loop: no band, no reference"
+                )
             refuse_unrecorded(used, described.amplitudes)
             friction = fit_friction(used, options, progress=update)
             refuse_unseen_shaft(friction, used)
@@ -108,14 +110,8 @@ def identify_records(
         if friction is not None or any(record.reference is not None for record in measured):
             # The arm with friction was fitted without delay, and a closed loop looks like one.
             options = options.with_delay_stated()
-        if friction is None and any(record.reference is not None for record in measured):
-            # The first stage runs its model from rest, so it has to be fitted as from rest: free responses
-            # that it estimated would be missing in the input it makes.
-            opened = two_stage(
-                used,
-                options.model_copy(update={"estimate_initial_state": False, "noise": "white"}),
-                EmbeddingOptions(estimate_initial_state=False),
-            )
+        if any(record.reference is not None for record in measured):
+            opened = two_stage(used, options)
             used = list(opened.records)
         about = identified_channel(
             used[0].output_names[0],
@@ -125,7 +121,6 @@ def identify_records(
             update,
             with_plot=with_plot,
             two_stage=None if opened is None else opened.finding,
-            friction=friction,
         )
         if friction is not None:
             about = clipped_as_measured(about, measured)
@@ -185,7 +180,7 @@ def identify_records(
                 if band_rad_s
                 else ()
             ),
-            *(opened.warnings(omega) if opened else ()),
+            *(opened.warnings if opened else ()),
         ),
         described=described,
         friction=friction,
