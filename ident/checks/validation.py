@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -16,6 +17,9 @@ from ident.basis.structure import answered, level_before, stabilised
 from ident.data.arrays import BoolArray, RealArray, lock, real_rows
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
+
+# Windows of a log of an arm that drifts, and samples per unknown of its start at least.
+_WINDOWS, _SHORTEST = 16, 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +86,36 @@ def fit_on_fresh_data(
         residual, left = residual / direct, left / abs(direct)
         simulated = measured - residual
     return FreshFit(record.name, 100 * (1 - left / spread), simulated, residual, answers)
+
+
+def fit_in_windows(model: GobfModel | ResponsePosterior, record: Record) -> FreshFit:
+    """`fit_on_fresh_data` over windows one after the other, each from its own start: for arms that drift,
+    of which a free run over a whole log says nothing.
+
+    Spread and residual are those of the windows; one in which the output stands still counts as simulated.
+    """
+    delay, shortest = model.input_delay_samples, _SHORTEST * (model.poles.order + 1)
+    count = min(_WINDOWS, max(1, (record.n_samples - delay) // max(shortest, 1)))
+    edges = np.linspace(delay, record.n_samples, count + 1).astype(int)
+    fits, spread = [], 0.0
+    for low, high in pairwise(edges.tolist()):
+        part = record.slice(low - delay, high)
+        y = part.output[delay:, 0]
+        if np.ptp(y) > 0:
+            fits.append(fit_on_fresh_data(model, part))
+            spread += float(np.sum((y - y.mean()) ** 2))
+        else:
+            fits.append(FreshFit(record.name, 100.0, y, np.zeros_like(y)))
+    if not spread > 0:
+        raise ValueError(f"{record.label}: the output is constant")
+    left = np.concatenate([fit.residual for fit in fits])
+    return FreshFit(
+        record.name,
+        100 * (1 - float(np.linalg.norm(left)) / np.sqrt(spread)),
+        np.concatenate([fit.simulated for fit in fits]),
+        left,
+        sum(fit.answers for fit in fits) > len(fits) / 2,
+    )
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from ident.friction.amplitude import EquivalentFriction, at_amplitudes, equivale
 from ident.friction.arm import FrictionLaw
 from ident.friction.fit import fit_friction, refuse_unseen_shaft
 from ident.friction.gauss_newton import FrictionFit
+from ident.friction.in_loop import identify_behind
 from ident.friction.posterior import BehindFriction, other_output_without_friction, without_friction
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "at_amplitudes",
     "equivalent_friction",
     "fit_friction",
+    "identify_behind",
     "other_output_without_friction",
     "refuse_unrecorded",
     "refuse_unseen_shaft",

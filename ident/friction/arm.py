@@ -45,6 +45,11 @@ class FrictionLaw:
         return self.level + self.excess
 
     @property
+    def n_logs(self) -> int:
+        """Parameters that are estimated as their logarithms: deflection, and speed of a Stribeck excess."""
+        return 1 + int(np.isfinite(self.fall))
+
+    @property
     def array(self) -> RealArray:
         """(4,) for the kernel."""
         return np.array([self.level, self.presliding, self.excess, self.fall])
@@ -102,9 +107,15 @@ class SteppedArm:
         return cls(poles, structure, dt_s, rates, chain, weights)
 
     def run(
-        self, coefficients: RealArray, voltage: RealArray, law: FrictionLaw
+        self,
+        coefficients: RealArray,
+        voltage: RealArray,
+        law: FrictionLaw,
+        measured: RealArray | None = None,
+        correction: ComplexArray | None = None,
     ) -> tuple[RealArray, RealArray]:
-        """Position (T,) and friction held over each sample (T,), in units of the input (T,), from rest."""
+        """Position (T,) and friction held over each sample (T,), in units of the input (T,), from rest; with
+        a correction (N,) that of an observer of the measured position (T,): the one it predicts."""
         weights = self.weights @ coefficients
         position, friction = np.empty(voltage.size), np.empty(voltage.size)
         step_through(
@@ -114,6 +125,8 @@ class SteppedArm:
             weights,
             self.dt_s,
             law.array,
+            kernel_array(voltage if measured is None else measured),
+            np.zeros(0, np.complex128) if correction is None else correction,
             position,
             friction,
         )

@@ -33,6 +33,7 @@ from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import PRESLIDING, FrictionLaw, less_friction
 from ident.friction.gauss_newton import WORTH, FrictionFit, descended, equations, least_squares, started
+from ident.friction.in_loop import fit_friction_in_loop, recorded_in_loop
 from ident.one_input import untested_model
 
 # Speeds over which friction may fall, in units of the rms speed, and the first guess of what it falls by.
@@ -64,14 +65,17 @@ def fit_friction(
 ) -> FrictionFit:
     """Law of the friction and the arm behind it.
 
-    records: one input, and the position of the shaft that the friction acts on as the one output; at rest at
-    their first sample. options: of the search for the arm's poles; integrators at most 1. presliding: what is
-    expected, in output units, within a factor of twenty.
+    records: one input, and the position of the shaft that the friction acts on as the one output. At rest at
+    their first sample, unless they were made in a loop (`ident.friction.in_loop`). options: of the search for
+    the arm's poles; integrators at most 1. presliding: what is expected, in output units, within a factor of
+    twenty; in a loop it is a share of the motion.
 
     Raises ValueError where the shaft does not move, there is more than one integrator or a direct term, or
     `identify` refuses the records.
     """
     options = _swinging(options or IdentOptions())
+    if recorded_in_loop(records):
+        return fit_friction_in_loop(records, options, progress=progress)
     report = progress or (lambda fraction, message: None)
     for record in records:
         if not np.ptp(record.output[:, 0]) > 0:

@@ -16,7 +16,7 @@ from ident.basis.functions import basis_response, regressor
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure, answered, filter_input
-from ident.data.arrays import RealArray, real_rows
+from ident.data.arrays import ComplexArray, RealArray, real_rows
 from ident.data.record import Record
 from ident.friction.arm import FrictionLaw, SteppedArm, less_friction
 from ident.uncertainty.embedding_algebra import triangle_of
@@ -52,6 +52,14 @@ class FrictionFit:
     covariance_factor: RealArray
     noise_std: float
     between: float
+    correction: ComplexArray | None = None
+    bias: float = 0.0
+    ratio: float = 0.0
+
+    @property
+    def in_loop(self) -> bool:
+        """Fitted to logs of a loop, which an observer follows (`ident.friction.in_loop`)."""
+        return self.correction is not None
 
     @property
     def level(self) -> float:
@@ -66,7 +74,7 @@ class FrictionFit:
     def moved(self, change: RealArray) -> tuple[RealArray, FrictionLaw]:
         """Coefficients and law after a change (P + Q,), no parameter below zero."""
         n = self.coefficients.size
-        return self.coefficients + change[:n], _law_of(_parameters(self.law) + change[n:])
+        return self.coefficients + change[:n], law_of(parameters_of(self.law) + change[n:])
 
     @property
     def significant(self) -> bool:
@@ -75,7 +83,17 @@ class FrictionFit:
 
     def motion(self, record: Record) -> tuple[RealArray, RealArray]:
         """Simulated position (T,) and friction in units of the input (T,), held over each sample."""
-        return self.arm.run(self.coefficients, record.input[:, 0], self.law)
+        return self._run(record, self.law)
+
+    def friction_of(self, record: Record, law: FrictionLaw) -> RealArray:
+        """(T,) friction of the same motion under another law."""
+        return self._run(record, law)[1]
+
+    def _run(self, record: Record, law: FrictionLaw) -> tuple[RealArray, RealArray]:
+        measured, driving = record.output[:, 0], record.input[:, 0] - self.bias
+        if self.correction is not None:
+            measured = measured - measured[0]
+        return self.arm.run(self.coefficients, driving, law, measured, self.correction)
 
     def residual(self, record: Record) -> RealArray:
         """(T - delay,) what the simulation leaves of the position, less its mean, in the rows that answer to
@@ -85,7 +103,8 @@ class FrictionFit:
 
     def taken_off(self, record: Record) -> Record:
         """The record (one input; any outputs) as if its input had been smaller by the friction."""
-        return less_friction(record, self.motion(record)[1], self.arm.structure.input_delay_samples)
+        delay = self.arm.structure.input_delay_samples
+        return less_friction(record, self.motion(record)[1] + self.bias, delay)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,14 +122,14 @@ class Linearised:
     friction_by: RealArray
 
 
-def _parameters(law: FrictionLaw) -> RealArray:
+def parameters_of(law: FrictionLaw) -> RealArray:
     """(Q,) level and logarithm of the pre-sliding deflection; with Stribeck friction its excess and the
     logarithm of the speed that it falls over."""
     plain = [law.level, np.log(law.presliding)]
     return np.array([*plain, law.excess, np.log(law.fall)] if np.isfinite(law.fall) else plain)
 
 
-def _law_of(parameters: RealArray) -> FrictionLaw:
+def law_of(parameters: RealArray) -> FrictionLaw:
     level, presliding, *falling = parameters.tolist()
     law = FrictionLaw(max(level, 0.0), float(np.exp(presliding)))
     return replace(law, excess=max(falling[0], 0.0), fall=float(np.exp(falling[1]))) if falling else law
@@ -123,7 +142,7 @@ def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: Re
     effort = filter_input(u, 0, structure.input_delay_samples) - friction
     columns = regressor(arm.poles.doubled(), filter_input(effort, structure.integrators, 0))
     speed = float(np.std(np.diff(position)))
-    parameters = _parameters(law)
+    parameters = parameters_of(law)
     by = np.empty((u.size, columns.shape[1] + parameters.size))
     friction_by = np.empty_like(by)
     for j, column in enumerate(columns.T):
@@ -136,9 +155,9 @@ def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: Re
         change = np.zeros(parameters.size)
         # An excess has no size of its own before it is known, and cannot be negative.
         change[k] = size = _CHANGE_OF_LOG if k % 2 else _CHANGE_OF_LEVEL * law.level
-        below = _law_of(parameters - change)
-        size += float((parameters - _parameters(below))[k])
-        ends = [arm.run(coefficients, u, one) for one in (_law_of(parameters + change), below)]
+        below = law_of(parameters - change)
+        size += float((parameters - parameters_of(below))[k])
+        ends = [arm.run(coefficients, u, one) for one in (law_of(parameters + change), below)]
         j = columns.shape[1] + k
         by[:, j], friction_by[:, j] = ((a - b) / size for a, b in zip(*ends, strict=True))
     n = columns.shape[1]
@@ -159,11 +178,26 @@ def equations(found: FrictionFit, records: Sequence[Record]) -> tuple[list[RealA
     )
 
 
+def driven_by_law(found: FrictionFit, record: Record) -> RealArray:
+    """(T, Q) derivatives of the arm's position with respect to the parameters of the law, and to the bias of
+    an integrating arm, where an observer tells the friction of a record."""
+    arm = replace(found.model, input_delay_samples=0)
+    friction, parameters = found.motion(record)[1], parameters_of(found.law)
+    columns = []
+    for k in range(parameters.size):
+        change = np.zeros(parameters.size)
+        change[k] = size = _CHANGE_OF_LOG if k % 2 else _CHANGE_OF_LEVEL * found.level
+        columns.append((found.friction_of(record, law_of(parameters + change)) - friction) / size)
+    if found.arm.structure.integrators:
+        columns.append(np.ones(friction.size))
+    return np.column_stack([-arm.simulate(column) for column in columns])
+
+
 def started(model: GobfModel, structure: Structure, law: FrictionLaw) -> FrictionFit:
     """Where Gauss-Newton steps on the poles of a model begin; nothing is known of the noise yet."""
     arm = SteppedArm.of(model.poles, structure, model.dt_s)
     coefficients = _on_doubled(arm.poles, model)
-    nothing = np.zeros((coefficients.size + _parameters(law).size, 1))
+    nothing = np.zeros((coefficients.size + parameters_of(law).size, 1))
     return FrictionFit(law, model, arm, coefficients, nothing, 0.0, 0.0)
 
 
@@ -176,7 +210,7 @@ def descended(
     them. Otherwise the pre-sliding deflection is expected near presliding, a Stribeck speed where it begins.
     """
     n = sum(found.residual(record).size for record in records)
-    expected = _parameters(found.law if held else replace(found.law, presliding=presliding))
+    expected = parameters_of(found.law if held else replace(found.law, presliding=presliding))
     p, q = found.coefficients.size, expected.size
     logs, trust = np.arange(1, q, 2), _HELD if held else 1 / STD_LOG
     noise = np.sqrt(_simulated_rss(found, records) / n)
@@ -185,7 +219,7 @@ def descended(
         # What is expected of a logarithm is one more measurement of it.
         known = np.zeros((logs.size, p + q + 1))
         known[:, p + logs] = np.eye(logs.size)
-        known[:, -1] = (expected - _parameters(found.law))[logs]
+        known[:, -1] = (expected - parameters_of(found.law))[logs]
         change, _, rss, rest = least_squares(blocks, targets, trust * noise * known)
         noise = np.sqrt(rest / n)
         for length in _LENGTHS if left else ():
@@ -194,16 +228,16 @@ def descended(
             step[p + logs] = np.clip(step[p + logs], -1, 1)
             coefficients, law = found.moved(step)
             there = replace(found, coefficients=coefficients, law=law)
-            off = trust * noise * (_parameters(law) - expected)[logs]
+            off = trust * noise * (parameters_of(law) - expected)[logs]
             if _simulated_rss(there, records) + off @ off < rss - WORTH * noise**2:
                 found = there
                 break
         else:
             break
-    return _with_covariance(found, blocks, targets, float(noise))
+    return with_covariance(found, blocks, targets, float(noise))
 
 
-def _with_covariance(
+def with_covariance(
     found: FrictionFit, blocks: Sequence[RealArray], targets: Sequence[RealArray], noise: float
 ) -> FrictionFit:
     """The fit with what its equations (`equations`) and a noise of this size leave open.
@@ -212,13 +246,13 @@ def _with_covariance(
     beforehand, as further measurements.
     """
     count, n = len(blocks), sum(target.size for target in targets)
-    p, q = found.coefficients.size, _parameters(found.law).size
+    p, q = found.coefficients.size, parameters_of(found.law).size
     logs = np.arange(1, q, 2)
     between = _between_records(blocks, targets, p, _REPEATS * found.level)
     own = [np.outer(between * block[:, p], np.arange(count) == k) for k, block in enumerate(blocks)]
-    known = np.zeros((logs.size + count, p + q + count + 1))
+    known = np.zeros((logs.size + count, blocks[0].shape[1] + count + 1))
     known[: logs.size, p + logs] = noise / STD_LOG * np.eye(logs.size)
-    known[logs.size :, p + q : -1] = noise * np.eye(count)
+    known[logs.size :, -count - 1 : -1] = noise * np.eye(count)
     _, triangle, rss, rest = least_squares(
         [np.hstack(pair) for pair in zip(blocks, own, strict=True)], targets, known
     )

@@ -140,15 +140,26 @@ def step_through(
     weights: Any,
     dt_s: float,
     law: Any,
+    measured: Any,
+    correction: Any,
     position: Any,
     friction: Any,
 ) -> None:
-    """Fill position (T,) and the friction (T,), held over every sample, for a drive (T,) held over each."""
+    """Fill position (T,) and the friction (T,), held over every sample, for a drive (T,) held over each.
+
+    At every sample the states take correction (N,) times what the measured (T,) position is off the one
+    predicted, which is the one that is told; correction of size 0: a free run.
+    """
     moments = np.empty(drive.size)
     moves = transitions(rates, chain, dt_s)
     state, shaft = np.zeros(rates.size, dtype=np.complex128), np.zeros(3)
     for k in range(drive.size):
         position[k] = shaft[0]
+        if correction.size:
+            off = measured[k] - shaft[0]
+            for j in range(rates.size):
+                state[j] += correction[j] * off
+                shaft[0] += (weights[j] * correction[j]).real * off
         friction[k], moments[k] = advance(drive[k], state, shaft, moves, rates, chain, weights, dt_s, law)
     for k in range(1, drive.size - 1):
         friction[k] += 0.5 * (moments[k - 1] - moments[k + 1])

@@ -19,9 +19,12 @@ from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
-from ident.friction.gauss_newton import STD_LOG, FrictionFit, linearised
+from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, linearised
+from ident.friction.in_loop import heterogeneity
 from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
+
+_NOISE_ORDER = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +55,8 @@ def without_friction(
     posterior is to be made around; none: that of the fit. The level of the friction is estimated anew with
     the response, so that what either does not know widens the other. Raises ValueError as `tangent`.
     """
+    if found.correction is not None:
+        return _behind_observed(records, found, model or found.model, options)
     if model is not None:
         found = moved_to(found, records, model)
     corrected, beside = [], []
@@ -69,6 +74,30 @@ def without_friction(
     n_known = logs.shape[1] + len(records)
     response, change, factor = tangent_beside(corrected, found.model, beside, options, n_known=n_known)
     return BehindFriction(response, response, found.level + float(change[0]), factor[0], found)
+
+
+def _behind_observed(
+    records: Sequence[Record], found: FrictionFit, model: GobfModel, options: EmbeddingOptions | None
+) -> BehindFriction:
+    """The same where an observer tells the friction from the measured motion: it does not depend on the arm,
+    to first order."""
+    less, beside, options = list[Record](), list[Beside](), options or EmbeddingOptions()
+    for k, record in enumerate(records):
+        by_law = driven_by_law(found, record)
+        logs = STD_LOG * by_law[:, 1::2][:, : found.law.n_logs]
+        plain = np.delete(by_law, 1 + 2 * np.arange(found.law.n_logs), axis=1)
+        own = np.outer(found.between * plain[:, 0], np.arange(len(records)) == k)
+        beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([plain, logs, own])))
+        less.append(found.taken_off(record))
+    known = found.law.n_logs + len(records)
+    # What drives an arm away from its simulation is never white, and needs a long noise model.
+    coloured = {"coloured_noise": True, "max_ar_order": max(options.max_ar_order, _NOISE_ORDER)}
+    options = options.model_copy(update=coloured)
+    response, change, factor = tangent_beside(less, model, beside, options, n_known=known)
+    whitening = np.array([1.0, *(response.report.ar_coefficients if response.report else ())])
+    wider = np.sqrt(heterogeneity(found, records, whitening))
+    response = replace(response, covariance_factor=wider * response.covariance_factor)
+    return BehindFriction(response, response, found.level + float(change[0]), wider * factor[0], found)
 
 
 def other_output_without_friction(

@@ -158,7 +158,8 @@ def gls_residuals(
     scale = np.linalg.norm(reduced.r11, axis=0)
     residuals, absorbed = [], []
     drops = rows.whitening.size > 1 and not np.any(first_rows(rows.whitening))
-    for block in replace(rows, whitening=np.ones(1)).blocks():
+    # What is known beforehand is no record and leaves nothing.
+    for block in replace(rows, whitening=np.ones(1), known_std=None).blocks():
         rest = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
         shared = block.regressors[:, reduced.kept] / scale
         local = np.zeros((rest.size, 0))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from ident.checks.validation import ScatterRow, fit_on_fresh_data
+from ident.checks.validation import FreshFit, ScatterRow
 from workflow.figures import style
 from workflow.figures.bands import liveliest, outline
 from workflow.figures.subjects import ChannelView
@@ -31,7 +31,9 @@ def draw_validation(channel: ChannelView) -> Figure:
     found, shown = channel.found, channel.shown_fresh
     if shown is None:
         record, role = found.used[0], "estimation"
-        fit = fit_on_fresh_data(found.model, record)
+        residual = found.identification.residuals[0]
+        simulated = record.output[record.n_samples - residual.size :, 0] - residual
+        fit = FreshFit(record.name, float(found.identification.fit_percent[0]), simulated, residual)
     else:
         record, role, fit = channel.fresh_records[shown], found.fresh_roles[shown], found.fresh[shown]
     answering = slice(record.n_samples - fit.residual.size, None)  # a delayed answer begins later

@@ -8,12 +8,18 @@ from dataclasses import replace
 from ident.basis.options import IdentOptions
 from ident.checks.distortion_findings import amplitude_effects
 from ident.checks.input_checks import clipped
-from ident.checks.validation import fit_on_fresh_data
+from ident.checks.validation import fit_in_windows, fit_on_fresh_data
 from ident.closed_loop import two_stage
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, increments
-from ident.friction import FrictionFit, fit_friction, refuse_unrecorded, refuse_unseen_shaft
+from ident.friction import (
+    FrictionFit,
+    fit_friction,
+    identify_behind,
+    refuse_unrecorded,
+    refuse_unseen_shaft,
+)
 from ident.one_input import identify
 from ident.stabilisation import stabilisation
 from workflow.config.run_config import Channel, Role
@@ -77,6 +83,7 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
                 options,
                 report,
                 two_stage=finding,
+                friction=known,
             )
             as_measured = records.fitted(channel)
             if known is not None:
@@ -133,11 +140,26 @@ def identified_channel(
     *,
     with_plot: bool = True,
     two_stage: Finding | None = None,
+    friction: FrictionFit | None = None,
 ) -> IdentifiedChannel:
-    """Model of SISO records as the fit is to see them, with free runs on the records it does not see."""
-    share = _OF_THE_FIT if with_plot else 1.0
-    found = identify(used, options, progress=lambda done, what: report(share * done, what))
-    fits = tuple(fit_on_fresh_data(found.model, record) for record, _ in fresh)
+    """Model of SISO records as the fit is to see them, with free runs on the records it does not see.
+
+    friction: taken off these records; of logs made in a loop, everything is over windows and behind its
+    observer, because the arm drifts.
+    """
+    share, in_loop = _OF_THE_FIT if with_plot else 1.0, friction is not None and friction.in_loop
+
+    def part(done: float, what: str) -> None:
+        report(share * done, what)
+
+    if friction is not None and in_loop:
+        found = identify_behind(friction, used, options, part)
+        known = found.model.input_delay_samples
+        options = options.model_copy(update={"input_delay_samples": known})
+    else:
+        found = identify(used, options, progress=part)
+    again = fit_in_windows if in_loop else fit_on_fresh_data
+    fits = tuple(again(found.model, record) for record, _ in fresh)
     unseen = [
         finding(FindingKind.NO_ANSWER_THERE, record=record.label, fit_percent=fit.fit_percent)
         for fit, (record, _) in zip(fits, fresh, strict=True)

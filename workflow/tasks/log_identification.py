@@ -92,10 +92,8 @@ def identify_records(
     with naming("identify"), progress.stage("identify") as update:
         used = list(measured)
         if described.friction_identified:
-            if band_rad_s is not None or any(record.reference is not None for record in measured):
-                raise ValueError(
-                    f"'{described.response}' takes logs as measured, in open loop: no band, no reference"
-                )
+            if band_rad_s is not None:
+                raise ValueError(f"'{described.response}' takes logs as measured: no band")
             refuse_unrecorded(used, described.amplitudes)
             friction = fit_friction(used, options, progress=update)
             refuse_unseen_shaft(friction, used)
@@ -110,7 +108,7 @@ def identify_records(
         if friction is not None or any(record.reference is not None for record in measured):
             # The arm with friction was fitted without delay, and a closed loop looks like one.
             options = options.with_delay_stated()
-        if any(record.reference is not None for record in measured):
+        if friction is None and any(record.reference is not None for record in measured):
             opened = two_stage(used, options)
             used = list(opened.records)
         about = identified_channel(
@@ -121,6 +119,7 @@ def identify_records(
             update,
             with_plot=with_plot,
             two_stage=None if opened is None else opened.finding,
+            friction=friction,
         )
         if friction is not None:
             about = clipped_as_measured(about, measured)

@@ -290,7 +290,10 @@ def residual_tests(
     the friction between the samples, too. Where the bounds have a noise model, whiteness is that of the
     residuals behind it: they rest on those.
     """
-    colour = () if posterior.report is None else posterior.report.ar_coefficients
+    in_loop = (
+        friction is not None and friction.in_loop
+    )  # an observer's prediction errors are white as they are
+    colour = () if posterior.report is None or in_loop else posterior.report.ar_coefficients
     filter_of_noise = np.array([1.0, *colour])
     residuals = [
         fit_on_fresh_data(posterior, record).residual if friction is None else friction.residual(record)

@@ -1,0 +1,369 @@
+"""Dry friction and the arm behind it from logs of a loop: any start, and arms that drift.
+
+The arm cannot run freely from its recorded input here: it started in motion, and over a long log the smallest
+error of the friction adds up to a drift. An observer follows the log instead (`ident.friction.observer`). The
+friction f of this motion is known then, and
+
+    y = G (u - f - bias) + v
+
+is linear in the arm with the recorded input. v is coloured, and the observer whitens it (the direct method,
+Ljung, System Identification, 2nd ed., section 13.4: no bias in a loop as long as the noise model is right).
+Arm and friction in turns, first with the fewest poles, until neither moves.
+
+Neglected: a level that depends on position or load; what the sensor's noise does to the friction itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import lfilter
+from scipy.stats import f as f_distribution
+
+from ident.basis.functions import nuisance_columns, regressor
+from ident.basis.options import IdentOptions
+from ident.basis.structure import answered, driving_input
+from ident.checks.plausible_modes import LARGEST_DAMPING
+from ident.checks.validation import fit_in_windows
+from ident.coloured_noise import long_arx_filter, prewhitened
+from ident.data.arrays import RealArray
+from ident.data.record import Record
+from ident.fit.least_squares import fit as linear_fit
+from ident.fit.regression import prepare
+from ident.friction.arm import FrictionLaw, less_friction
+from ident.friction.gauss_newton import (
+    STD_LOG,
+    FrictionFit,
+    driven_by_law,
+    law_of,
+    least_squares,
+    parameters_of,
+    started,
+    with_covariance,
+)
+from ident.friction.inverse_dynamics import direction_of, highest_Hz, level_of, smoothed
+from ident.friction.observer import ObserverFilter, observed, prediction_errors
+from ident.identification import Identification
+from ident.one_input import identify, untested_model
+from ident.search.pole_search import PoleSearch
+from ident.uncertainty.autoregression import fit_autoregression
+
+Report = Callable[[float, str], None]
+_ROUNDS, _FEW_ROUNDS, _LONGEST_DELAY = 12, 3, 20
+# A level that moves by less than the first share stays; by more than the second, the order is chosen anew.
+_STAYS, _MOVES = 5e-3, 0.05
+# Lags by which a command follows a position; a residual this small is rounding; one log in a million is
+# taken for a loop by chance.
+_CAUSES, _NOTHING, _BY_CHANCE = 8, 1e-5, 1e-6
+# Largest step of the level, as a share of it; parts of a step that are tried.
+_LARGEST_STEP, _LENGTHS = 0.3, (1.0, 0.5, 0.25, 0.1)
+# Deflection before slipping, as a share of the rms motion, expected within a factor of twenty; the start,
+# which sees a smoothed motion, takes more.
+_PRESLIDING, _COARSE = 1e-5, 10.0
+# Lowest further pair, as a share of the first mode: friction that is left over looks like slow poles.
+_LOWEST_PAIR, _ABOVE_NOISE = 0.4, 1.2
+# Stribeck friction begins with this excess and one of these speeds, in units of the rms speed.
+_FALLS, _EXCESS, _STRIBECK_STEPS = (0.03, 0.1, 0.3), 0.1, 6
+# Directions of a start (columns of unit length) below this are left out; as few of the parameters.
+_NUISANCE_RANK, _RANK = 1e-10, 1e-9
+_NOISE_ORDER = 32
+
+
+def recorded_in_loop(records: Sequence[Record]) -> bool:
+    """Whether the command follows the position: a reference was recorded, or the command's prediction from
+    its own past becomes better with that of the position (Granger, Econometrica 37(3), 1969) in every
+    record."""
+    if any(record.reference is not None for record in records):
+        return True
+    return all(_follows(record.input[:, 0], record.output[:, 0]) for record in records)
+
+
+def _follows(u: RealArray, y: RealArray) -> bool:
+    """Whether the position's past tells more of a command than as much again of the command's own past, which
+    in a sum of sines tells the rest as well."""
+    n = _CAUSES
+    rows, lags = np.arange(3 * n, u.size)[:, None], np.arange(1, n + 1)
+    own, wanted = u[rows - np.arange(1, 3 * n + 1)], u[3 * n :]
+    left = list[float]()
+    for columns in (own, np.hstack([own[:, : 2 * n], y[rows - lags + 1] - y.mean()])):
+        columns = np.column_stack([np.ones(rows.size), columns])
+        size = np.linalg.norm(columns, axis=0)
+        columns = columns / np.where(size > 0, size, 1.0)
+        rest = wanted - columns @ np.linalg.lstsq(columns, wanted, rcond=1e-10)[0]
+        left.append(max(float(rest @ rest), float((_NOTHING * np.std(u)) ** 2 * rest.size)))
+    free = rows.size - 3 * n - 1
+    return bool(free > 0 and f_distribution.sf((left[0] / left[1] - 1) * free / n, n, free) < _BY_CHANCE)
+
+
+@dataclass(frozen=True, eq=False)
+class _Logs:
+    """What is fitted: records without their references; presliding: expected deflection before slipping, in
+    units of the position; least: smallest level, rms: of the input."""
+
+    records: tuple[Record, ...]
+    presliding: float
+    least: float
+    rms: float
+
+    @classmethod
+    def of(cls, records: Sequence[Record]) -> _Logs:
+        motion = float(np.sqrt(np.mean([np.var(record.output) for record in records])))
+        rms = float(np.sqrt(np.mean([np.mean(record.input**2) for record in records])))
+        plain = tuple(replace(record, reference=None, reference_names=()) for record in records)
+        return cls(plain, _PRESLIDING * motion, 1e-6 * rms, rms)
+
+    @property
+    def criterion(self) -> float:
+        """Share by which one more parameter has to lower the errors."""
+        n = sum(record.n_samples for record in self.records)
+        return float(2 * np.log(n) / n)
+
+    def errors(self, found: FrictionFit) -> float:
+        return prediction_errors(found, self.records)
+
+
+def fit_friction_in_loop(
+    records: Sequence[Record], options: IdentOptions, *, progress: Report | None = None
+) -> FrictionFit:
+    """Law of the friction and the arm behind it from logs of a loop.
+
+    records: one input, and the position of the shaft that the friction acts on as the one output. options: of
+    the search for the arm's poles; a delay that is not stated is sought. Raises ValueError as `identify`, and
+    where no observer follows the logs.
+    """
+    report = progress or (lambda fraction, message: None)
+    logs = _Logs.of(records)
+    report(0.0, "friction: start")
+    ways = [direction_of(smoothed(r.output[:, 0]), _COARSE * logs.presliding) for r in logs.records]
+    law = FrictionLaw(
+        max(level_of(logs.records, ways, stiff=not options.integrators), logs.least), logs.presliding
+    )
+    options = _above_noise(logs.records, options)
+    few = _simplest(options)
+    used = [
+        less_friction(record, law.level * way, options.input_delay_samples)
+        for record, way in zip(logs.records, ways, strict=True)
+    ]
+    model = untested_model([prewhitened(record, long_arx_filter(used, few)) for record in used], _moving(few))
+    report(0.1, "friction: level and a simple arm in turns")
+    found = _in_turns(logs, started(model, few.structure(), law), few)
+    if found.significant:
+        report(0.4, "friction: falling with speed")
+        found = _with_stribeck(logs, found)
+    if options.delay_left_to_data:
+        report(0.5, "friction: dead time")
+        found = _behind_dead_time(logs, found, few)
+        options = options.model_copy(update={"input_delay_samples": found.arm.structure.input_delay_samples})
+    if few != options:
+        report(0.6, "friction: level and arm in turns")
+        more = _in_turns(logs, found, _beyond(found, options))
+        extra = more.model.order - found.model.order
+        if logs.errors(more) < logs.errors(found) * (1 - extra * logs.criterion):
+            found = more
+    report(1.0, "friction identified")
+    return found
+
+
+def _simplest(options: IdentOptions) -> IdentOptions:
+    """One real pole and one pair, unless numbers are given: with more, a wrong level is taken for poles."""
+    given = (("n_real", options.n_real, options.max_real), ("n_pairs", options.n_pairs, options.max_pairs))
+    return options.model_copy(
+        update={key: min(1, most) if known is None else known for key, known, most in given}
+    )
+
+
+def _moving(options: IdentOptions) -> IdentOptions:
+    """For records that were cut by a filter: they start in motion."""
+    return options.model_copy(update={"estimate_initial_state": True})
+
+
+def _above_noise(records: Sequence[Record], options: IdentOptions) -> IdentOptions:
+    """Pairs no higher than where the position rises above its noise, real poles no slower than a record tells
+    from the integrator; noise is whitened here."""
+    longest_s = max(record.n_samples * record.dt_s for record in records)
+    highest_rad_s = 2 * np.pi * _ABOVE_NOISE * highest_Hz(records)
+    told = {"omega_max_rad_s": highest_rad_s, "decay_min_per_s": 1 / longest_s}
+    left_open = {key: value for key, value in told.items() if getattr(options, key) is None}
+    return options.model_copy(update={"noise": "white", **left_open})
+
+
+def _beyond(found: FrictionFit, options: IdentOptions) -> IdentOptions:
+    """No pair far below the first mode, and few real poles: what is left of friction looks like slow ones."""
+    poles, update = found.model.poles, {"max_real": min(options.max_real, 2 + options.integrators)}
+    modes = poles.omega_rad_s(found.model.dt_s)[poles.zeta() < LARGEST_DAMPING]
+    lowest = {"omega_min_rad_s": _LOWEST_PAIR * float(modes.min())} if modes.size else {}
+    return options.model_copy(update=update | (lowest if options.omega_min_rad_s is None else {}))
+
+
+def _behind_dead_time(logs: _Logs, found: FrictionFit, options: IdentOptions) -> FrictionFit:
+    """The same behind as many samples of delay of the command as lower the prediction errors."""
+    for delay in range(1, _LONGEST_DELAY + 1):
+        there = options.model_copy(update={"input_delay_samples": delay})
+        arm = replace(found.arm, structure=there.structure())
+        tried = _in_turns(logs, replace(found, arm=arm), there, _FEW_ROUNDS)
+        if not logs.errors(tried) < logs.errors(found):
+            break
+        found = tried
+    return found
+
+
+def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: int = _ROUNDS) -> FrictionFit:
+    """Arm and law in turns; the poles are searched for once more where the level has moved."""
+    search, inside = True, _moving(options)
+    for k in range(rounds):
+        found = observed(found, logs.records)
+        whiten = ObserverFilter.of(found)
+        white = [whiten.filtered(found.taken_off(record)) for record in logs.records]
+        models = [untested_model(white, inside)] if search else []
+        if k or found.model.poles.counts == (options.n_real, options.n_pairs):
+            there = PoleSearch(prepare(white, inside.structure()), inside)
+            linear = linear_fit(there.data, poles := there.descend(found.model.poles, "friction").poles)
+            models.append(replace(found.model, poles=poles, coefficients=np.ravel(linear.coefficients)))
+        tried = []
+        for model in models:
+            anew = replace(started(model, options.structure(), found.law), bias=found.bias)
+            if not search:
+                anew = replace(anew, correction=found.correction, ratio=found.ratio)
+            tried.append(observed(anew, logs.records))
+        found = min(tried, key=logs.errors)
+        level, found = found.level, _stepped(logs, found)
+        moved = abs(found.level - level) / max(found.level, level)
+        if search and k and moved < _STAYS:
+            break
+        search = moved > _MOVES or (not search and moved < _STAYS)
+    return found
+
+
+def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
+    """One Gauss-Newton step in arm, law and bias, or in the last two alone, as much of it as lowers the
+    prediction errors."""
+    errors = logs.errors(found)
+    blocks, targets = _equations(found, logs.records, ObserverFilter.of(found))
+    p, theta = found.coefficients.size, parameters_of(found.law)
+    q = theta.size
+    noise = float(np.sqrt(sum(t @ t for t in targets) / sum(t.size for t in targets)))
+    expected = parameters_of(replace(found.law, presliding=logs.presliding))
+    known = np.zeros((q // 2 + 1, blocks[0].shape[1] + 1))
+    for i, at in enumerate(range(1, q, 2)):
+        known[i, p + at], known[i, -1] = noise / STD_LOG, noise / STD_LOG * (expected - theta)[at]
+    if blocks[0].shape[1] > p + q:
+        known[-1, p + q], known[-1, -1] = noise / logs.rms, -noise / logs.rms * found.bias
+    change = least_squares(blocks, targets, known)[0]
+    step = change[p:]
+    step[1:q:2] = np.clip(step[1:q:2], -1, 1)
+    largest = max(_LARGEST_STEP * found.level, 10 * logs.least)
+    step[0] = np.clip(step[0], -largest, largest)
+    for arm, length in ((arm, length) for arm in (1.0, 0.0) for length in _LENGTHS):
+        law = law_of(theta + length * step[:q])
+        tried = replace(
+            found,
+            law=replace(law, level=max(law.level, logs.least)),
+            bias=found.bias + length * float(step[q:].sum()),
+            coefficients=found.coefficients + arm * length * change[:p],
+        )
+        if logs.errors(tried) < errors:
+            found = tried
+            break
+    return with_covariance(found, blocks, targets, noise)
+
+
+def _with_stribeck(logs: _Logs, found: FrictionFit) -> FrictionFit:
+    """The same with friction that falls with speed, where that is worth its two parameters."""
+    moved = [np.mean(np.diff(smoothed(record.output[:, 0])) ** 2) for record in logs.records]
+    speed, excess = float(np.sqrt(np.mean(moved))) / found.arm.dt_s, _EXCESS * found.level
+    laws = [replace(found.law, level=found.level - excess, excess=excess, fall=f * speed) for f in _FALLS]
+    best = min((replace(found, law=law) for law in laws), key=logs.errors)
+    for _ in range(_STRIBECK_STEPS):
+        best = _stepped(logs, best)
+    better = logs.errors(best) < logs.errors(found) * (1 - 2 * logs.criterion)
+    return best if best.law.excess > 0 and better else found
+
+
+def identify_behind(
+    found: FrictionFit,
+    records: Sequence[Record],
+    options: IdentOptions | None = None,
+    progress: Report | None = None,
+) -> Identification:
+    """The arm behind the friction of logs of a loop, with everything needed to judge it: poles of the number
+    that the fit of the friction has, on records whitened by its observer.
+
+    records: those of the fit, with the friction taken off (`FrictionFit.taken_off`). Residuals and fit are
+    those of simulations over windows (`fit_in_windows`).
+    """
+    options = _above_noise(records, options or IdentOptions())
+    n_real, n_pairs = (
+        all_ - known for all_, known in zip(found.model.poles.counts, options.fixed().counts, strict=True)
+    )
+    delay = found.arm.structure.input_delay_samples
+    known = {"n_real": n_real, "n_pairs": n_pairs, "input_delay_samples": delay}
+    options, whiten = _beyond(found, _moving(options)).model_copy(update=known), ObserverFilter.of(found)
+    behind = identify([whiten.filtered(record) for record in records], options, progress=progress)
+    fits = [fit_in_windows(behind.model, record) for record in records]
+    residuals = tuple(fit.residual for fit in fits)
+    rss = float(sum(residual @ residual for residual in residuals))
+    return replace(
+        behind,
+        residuals=residuals,
+        fit_percent=np.array([fit.fit_percent for fit in fits]),
+        rss=rss,
+        noise_std=float(np.sqrt(rss / sum(residual.size for residual in residuals))),
+        noise_filter=fit_autoregression(residuals, _NOISE_ORDER),
+    )
+
+
+def _equations(
+    found: FrictionFit, records: Sequence[Record], whiten: Callable[[RealArray], RealArray]
+) -> tuple[list[RealArray], list[RealArray]]:
+    """Of every record the derivatives of y - G (u - f - bias), whitened, with respect to the coefficients of
+    the doubled poles, the law and the bias of an integrating arm; and what it leaves. What the start of the
+    record may be (free responses, an offset) is taken off both."""
+    blocks, targets, structure = [], [], found.arm.structure
+    for record in records:
+        less = found.taken_off(record)
+        driven = driving_input(less.input[:, 0], structure.integrators, structure.input_delay_samples)
+        basis = regressor(found.arm.poles.doubled(), driven)
+        position = answered(record.output[:, 0], structure.input_delay_samples)
+        by_law = answered(driven_by_law(found, record), structure.input_delay_samples)
+        rows = whiten(np.column_stack([basis, by_law, position - basis @ found.coefficients]))
+        nuisance = whiten(
+            nuisance_columns(found.model.poles, driven.size, max(1, structure.integrators), True)
+        )
+        length = np.linalg.norm(nuisance, axis=0)
+        u, d, _ = np.linalg.svd(nuisance[:, length > 0] / length[length > 0], full_matrices=False)
+        u = u[:, d > _NUISANCE_RANK * d[0]]
+        rows = rows - u @ (u.T @ rows)
+        blocks.append(rows[:, :-1])
+        targets.append(rows[:, -1])
+    return blocks, targets
+
+
+def heterogeneity(found: FrictionFit, records: Sequence[Record], noise_filter: RealArray) -> float:
+    """How much more the parts of the records differ in arm and friction than their noise makes them (Chow's
+    F, Econometrica 28(3), 1960; not below 1): halves of records, whitened by an autoregression."""
+    parts = [half for record in records for half in _halves(record)]
+    n = noise_filter.size - 1
+
+    def whiten(signal: RealArray) -> RealArray:
+        return np.asarray(lfilter(noise_filter, np.ones(1), signal, axis=0)[n:])
+
+    blocks, targets = _equations(found, parts, whiten)
+    nothing = np.zeros((0, blocks[0].shape[1] + 1))
+    together = least_squares(blocks, targets, nothing)
+    alone = [least_squares([b], [t], nothing) for b, t in zip(blocks, targets, strict=True)]
+    rank = [_rank(one[1]) for one in (together, *alone)]
+    left = sum(one[3] for one in alone)
+    freedom = max(sum(rank[1:]) - rank[0], 1), sum(t.size for t in targets) - sum(rank[1:])
+    return max(1.0, float((together[3] - left) / freedom[0] / (left / freedom[1])))
+
+
+def _rank(triangle: RealArray) -> int:
+    size = np.linalg.norm(triangle, axis=0)
+    return int(np.linalg.matrix_rank(triangle / np.where(size > 0, size, 1.0), tol=_RANK))
+
+
+def _halves(record: Record) -> tuple[Record, Record]:
+    half = record.n_samples // 2
+    return record.slice(0, half), record.slice(half, record.n_samples)

@@ -1,0 +1,123 @@
+"""An observer that follows the log of an arm with friction, and what it makes of signals of the arm.
+
+At every sample the states of the simulated arm (`ident.friction.arm`) are corrected by what the measured
+position is off the predicted one: a steady Kalman filter (Anderson and Moore, Optimal Filtering, section 4.4)
+for a white force at the input beside white noise of the position. The size of the force is the one whose
+prediction errors are least. A linear arm's prediction errors are H^-1 (y - G u), H^-1 the same filter for all
+signals of its position: the whitening filter of everything that is fitted behind the friction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag, solve_discrete_are
+from scipy.signal import sosfilt, zpk2sos
+
+from ident.data.arrays import ComplexArray, RealArray
+from ident.data.record import Record
+from ident.friction.arm import SteppedArm
+from ident.friction.gauss_newton import FrictionFit
+from ident.friction.inverse_dynamics import noise_of
+
+# Force that an observer expects in a sample, in units of the input's rms over the noise of the position: from
+# an observer slower than the arm to one that takes the last two samples for its state.
+_RATIOS = np.geomspace(1e-4, 10, 11)
+_NEARBY = np.array([0.5, 1.0, 2.0])
+# Share of the force that each state takes by itself, so that equal poles have a filter, too.
+_OWN = 1e-9
+# An observer that has forgotten its start to this has settled.
+_FORGOTTEN = 1e-3
+# Prediction errors count behind this part of a record, where the observer has found the state.
+_START = 20
+
+
+def correction_of(arm: SteppedArm, coefficients: RealArray, ratio: float) -> ComplexArray:
+    """(N,) gain of the steady Kalman filter for white noise of unit variance on the position and a white
+    force of standard deviation `ratio` at the input. Raises ValueError or LinAlgError where there is none."""
+    a, b, c = _real_form(arm, coefficients)
+    size = np.maximum(np.abs(b), 1e-12 * np.abs(b).max())
+    a, b, c = a * (size / size[:, None]), b / size, c * size
+    noise = ratio**2 * (np.outer(b, b) + _OWN * np.eye(b.size))
+    p = solve_discrete_are(a.T, c[:, None], noise, np.ones((1, 1)))
+    gain = iter((size * (p @ c) / (c @ p @ c + 1)).tolist())
+    found = np.zeros(arm.rates.size, np.complex128)
+    for j in np.flatnonzero(~arm.chain):
+        found[j] = next(gain) if arm.rates[j].imag == 0 else next(gain) + 1j * next(gain)
+    return found
+
+
+def _real_form(arm: SteppedArm, coefficients: RealArray) -> tuple[RealArray, RealArray, RealArray]:
+    """A, B, C of the sampled arm with each pole once and real states."""
+    weights, decay = arm.weights @ coefficients, np.exp(arm.rates * arm.dt_s)
+    still = arm.rates == 0
+    onto = np.where(still, arm.dt_s, (decay - 1) / np.where(still, 1, arm.rates))
+    blocks, into, out = list[RealArray](), list[float](), list[float]()
+    for j in np.flatnonzero(~arm.chain):
+        p, b, w = decay[j], onto[j], weights[j]
+        single = arm.rates[j].imag == 0
+        blocks.append(np.array([[p.real]] if single else [[p.real, -p.imag], [p.imag, p.real]]))
+        into += [b.real] if single else [b.real, b.imag]
+        out += [w.real] if single else [w.real, -w.imag]
+    return np.asarray(block_diag(*blocks)), np.array(into), np.array(out)
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverFilter:
+    """H^-1 of y = G u + H e in second-order sections, and samples after which it has forgotten its start."""
+
+    sections: RealArray
+    settled: int
+
+    @classmethod
+    def of(cls, found: FrictionFit) -> ObserverFilter:
+        """That of a fit with an observer."""
+        assert found.correction is not None
+        arm = found.arm
+        a, _, c = _real_form(arm, found.coefficients)
+        states = [(z, arm.rates[j].imag) for j, z in enumerate(found.correction) if not arm.chain[j]]
+        gain = np.concatenate([[z.real, z.imag] if swings else [z.real] for z, swings in states])
+        inner = np.linalg.eigvals(a - np.outer(a @ gain, c)).astype(np.complex128)
+        zeros = np.linalg.eigvals(a).astype(np.complex128)
+        slowest = min(float(np.max(np.abs(inner))), 1 - 1e-9)
+        return cls(np.asarray(zpk2sos(zeros, inner, 1.0)), int(np.ceil(np.log(_FORGOTTEN) / np.log(slowest))))  # type: ignore[arg-type]
+
+    def __call__(self, signal: RealArray) -> RealArray:
+        """A signal of the position (T, ...) through the filter, without the rows in which it settles, at most
+        half."""
+        filtered = sosfilt(self.sections, signal - signal[:1], axis=0)
+        return np.asarray(filtered[min(self.settled, len(signal) // 2) :])
+
+    def filtered(self, record: Record) -> Record:
+        """Input and output through the filter."""
+        return replace(
+            record, input=self(record.input), output=self(record.output), reference=None, reference_names=()
+        )
+
+
+def prediction_errors(found: FrictionFit, records: Sequence[Record]) -> float:
+    """Sum of squares of the observer's prediction errors, without the start of each record."""
+    return sum(float(np.sum(part[part.size // _START :] ** 2)) for part in map(found.residual, records))
+
+
+def observed(found: FrictionFit, records: Sequence[Record]) -> FrictionFit:
+    """The fit with the observer whose predictions of the records are best; near the one it has, if any.
+
+    Raises ValueError where no observer follows them.
+    """
+    noise = np.sqrt(np.mean([noise_of(record.output[:, 0]) ** 2 for record in records]))
+    rms = np.sqrt(np.mean([np.mean(record.input**2) for record in records]))
+    tried = list[tuple[float, FrictionFit]]()
+    for ratio in _RATIOS * rms / noise if found.correction is None else found.ratio * _NEARBY:
+        with suppress(ValueError, np.linalg.LinAlgError):
+            correction = correction_of(found.arm, found.coefficients, float(ratio))
+            one = replace(found, correction=correction, ratio=float(ratio))
+            tried.append((prediction_errors(one, records), one))
+    if not tried:
+        raise ValueError(
+            "no observer of the arm follows the logs: state the number of poles (n_real, n_pairs)"
+        )
+    return min(tried, key=lambda one: one[0])[1]
