@@ -19,6 +19,7 @@ from ident.basis.structure import Structure, answered, filter_input
 from ident.data.arrays import ComplexArray, RealArray, real_rows
 from ident.data.record import Record
 from ident.friction.arm import FrictionLaw, SteppedArm, less_friction
+from ident.friction.spring import Spring
 from ident.uncertainty.embedding_algebra import triangle_of
 
 # Standard deviation of the logarithms in the law (pre-sliding deflection, Stribeck speed), a priori.
@@ -43,6 +44,11 @@ class FrictionFit:
     fitted. covariance_factor (P + Q, .): of the coefficients and the Q parameters of the law (level,
     logarithm of the deflection; excess, logarithm of its speed). noise_std: of the residual, in output
     units. between: standard deviation of the level from record to record.
+
+    Of logs of a loop: correction (N,), the observer's (`step_through`) for a force of `ratio` at the input
+    (in its unit per unit of the noise); the constant force, bias, and the level of friction beyond the
+    first spring, which reaches the shaft through it (`spring`), both in units of the input. The covariance
+    has a row for the bias of an integrating arm and one for the level beyond the spring, too.
     """
 
     law: FrictionLaw
@@ -53,8 +59,10 @@ class FrictionFit:
     noise_std: float
     between: float
     correction: ComplexArray | None = None
-    bias: float = 0.0
     ratio: float = 0.0
+    bias: float = 0.0
+    spring: Spring | None = None
+    beyond: float = 0.0
 
     @property
     def in_loop(self) -> bool:
@@ -63,13 +71,14 @@ class FrictionFit:
 
     @property
     def level(self) -> float:
-        """Coulomb friction in units of the input."""
-        return self.law.level
+        """Coulomb friction in units of the input, on both sides of a spring."""
+        return self.law.level + self.beyond
 
     @property
     def level_std(self) -> float:
         """Standard deviation of the level that the records have in common."""
-        return float(np.linalg.norm(self.covariance_factor[self.coefficients.size]))
+        rows = [self.coefficients.size, *([-1] if self.spring is not None else [])]
+        return float(np.linalg.norm(self.covariance_factor[rows].sum(axis=0)))
 
     def moved(self, change: RealArray) -> tuple[RealArray, FrictionLaw]:
         """Coefficients and law after a change (P + Q,), no parameter below zero."""
@@ -90,10 +99,21 @@ class FrictionFit:
         return self._run(record, law)[1]
 
     def _run(self, record: Record, law: FrictionLaw) -> tuple[RealArray, RealArray]:
-        measured, driving = record.output[:, 0], record.input[:, 0] - self.bias
-        if self.correction is not None:
-            measured = measured - measured[0]
-        return self.arm.run(self.coefficients, driving, law, measured, self.correction)
+        if self.correction is None:
+            return self.arm.run(self.coefficients, record.input[:, 0], law)
+        delay, position = self.arm.structure.input_delay_samples, record.output[:, 0]
+        driving = less_friction(record, self.steady(record), delay).input[:, 0]
+        return self.arm.run(self.coefficients, driving, law, position - position[0], self.correction)
+
+    def steady(self, record: Record) -> RealArray:
+        """(T,) bias and friction beyond the spring, at the shaft: what the observer need not simulate."""
+        force = np.full(record.n_samples, self.bias)
+        return force + self.beyond * self.force_beyond(record) if self.spring is not None else force
+
+    def force_beyond(self, record: Record) -> RealArray:
+        """(T,) friction of unit level beyond the spring, as it acts at the shaft."""
+        assert self.spring is not None
+        return self.spring.force(record.output[:, 0], self.law.presliding)
 
     def residual(self, record: Record) -> RealArray:
         """(T - delay,) what the simulation leaves of the position, less its mean, in the rows that answer to
@@ -104,7 +124,8 @@ class FrictionFit:
     def taken_off(self, record: Record) -> Record:
         """The record (one input; any outputs) as if its input had been smaller by the friction."""
         delay = self.arm.structure.input_delay_samples
-        return less_friction(record, self.motion(record)[1] + self.bias, delay)
+        friction = self.motion(record)[1]
+        return less_friction(record, friction + self.steady(record) if self.in_loop else friction, delay)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +211,26 @@ def driven_by_law(found: FrictionFit, record: Record) -> RealArray:
         columns.append((found.friction_of(record, law_of(parameters + change)) - friction) / size)
     if found.arm.structure.integrators:
         columns.append(np.ones(friction.size))
+    if found.spring is not None:
+        columns.append(found.force_beyond(record))
     return np.column_stack([-arm.simulate(column) for column in columns])
+
+
+def driven_by_shape(found: FrictionFit, record: Record, speed: float) -> RealArray:
+    """(T, S) changes of the arm's position per unit of what a friction may have that was not found: an excess
+    that falls with a tenth of this speed, a share beyond the first spring; where an observer tells the
+    friction of a record."""
+    arm = replace(found.model, input_delay_samples=0)
+    friction, columns = found.motion(record)[1], []
+    if not np.isfinite(found.law.fall):
+        excess = _CHANGE_OF_LEVEL * found.law.level
+        law = replace(found.law, excess=excess, fall=0.1 * speed)
+        columns.append((found.friction_of(record, law) - friction) / excess)
+    spring = Spring.of(found.model) if found.spring is None else None
+    if spring is not None:
+        there = spring.force(record.output[:, 0], found.law.presliding)
+        columns.append(there - friction / found.law.level)
+    return np.column_stack([np.zeros((friction.size, 0)), *(-arm.simulate(column) for column in columns)])
 
 
 def started(model: GobfModel, structure: Structure, law: FrictionLaw) -> FrictionFit:
@@ -259,7 +299,7 @@ def with_covariance(
     scale = np.linalg.norm(triangle, axis=0)
     # The covariance is that of the noise, not of a residual that another step would still lower.
     factor = np.sqrt(rest / n) * solve_triangular(triangle / scale, np.eye(scale.size)) / scale[:, None]
-    factor = np.asarray(np.linalg.qr(factor[: p + q].T, mode="r")).T
+    factor = np.asarray(np.linalg.qr(factor[: blocks[0].shape[1]].T, mode="r")).T
     return replace(found, covariance_factor=factor, noise_std=float(np.sqrt(rss / n)), between=between)
 
 

@@ -43,8 +43,9 @@ from ident.friction.gauss_newton import (
     started,
     with_covariance,
 )
-from ident.friction.inverse_dynamics import direction_of, highest_Hz, level_of, smoothed
+from ident.friction.inverse_dynamics import direction_of, highest_Hz, level_of, rms_speed, smoothed
 from ident.friction.observer import ObserverFilter, observed, prediction_errors
+from ident.friction.spring import Spring
 from ident.identification import Identification
 from ident.one_input import identify, untested_model
 from ident.search.pole_search import PoleSearch
@@ -150,8 +151,8 @@ def fit_friction_in_loop(
     report(0.1, "friction: level and a simple arm in turns")
     found = _in_turns(logs, started(model, few.structure(), law), few)
     if found.significant:
-        report(0.4, "friction: falling with speed")
-        found = _with_stribeck(logs, found)
+        report(0.4, "friction: falling with speed, beyond a spring")
+        found = _with_stribeck(logs, _with_friction_beyond(logs, found))
     if options.delay_left_to_data:
         report(0.5, "friction: dead time")
         found = _behind_dead_time(logs, found, few)
@@ -163,7 +164,8 @@ def fit_friction_in_loop(
         if logs.errors(more) < logs.errors(found) * (1 - extra * logs.criterion):
             found = more
     report(1.0, "friction identified")
-    return found
+    wider = np.sqrt(heterogeneity(found, logs.records, ObserverFilter.of(found)))
+    return replace(found, covariance_factor=wider * found.covariance_factor)
 
 
 def _simplest(options: IdentOptions) -> IdentOptions:
@@ -190,8 +192,8 @@ def _above_noise(records: Sequence[Record], options: IdentOptions) -> IdentOptio
 
 
 def _beyond(found: FrictionFit, options: IdentOptions) -> IdentOptions:
-    """No pair far below the first mode, and few real poles: what is left of friction looks like slow ones."""
-    poles, update = found.model.poles, {"max_real": min(options.max_real, 2 + options.integrators)}
+    """No pair far below the first mode, and one real pole: what is left of friction looks like slow ones."""
+    poles, update = found.model.poles, {"max_real": min(options.max_real, 1)}
     modes = poles.omega_rad_s(found.model.dt_s)[poles.zeta() < LARGEST_DAMPING]
     lowest = {"omega_min_rad_s": _LOWEST_PAIR * float(modes.min())} if modes.size else {}
     return options.model_copy(update=update | (lowest if options.omega_min_rad_s is None else {}))
@@ -223,7 +225,8 @@ def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: in
             models.append(replace(found.model, poles=poles, coefficients=np.ravel(linear.coefficients)))
         tried = []
         for model in models:
-            anew = replace(started(model, options.structure(), found.law), bias=found.bias)
+            anew = started(model, options.structure(), found.law)
+            anew = replace(anew, bias=found.bias, spring=found.spring, beyond=found.beyond)
             if not search:
                 anew = replace(anew, correction=found.correction, ratio=found.ratio)
             tried.append(observed(anew, logs.records))
@@ -248,7 +251,8 @@ def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
     known = np.zeros((q // 2 + 1, blocks[0].shape[1] + 1))
     for i, at in enumerate(range(1, q, 2)):
         known[i, p + at], known[i, -1] = noise / STD_LOG, noise / STD_LOG * (expected - theta)[at]
-    if blocks[0].shape[1] > p + q:
+    integrating = found.arm.structure.integrators > 0
+    if integrating:
         known[-1, p + q], known[-1, -1] = noise / logs.rms, -noise / logs.rms * found.bias
     change = least_squares(blocks, targets, known)[0]
     step = change[p:]
@@ -260,7 +264,8 @@ def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
         tried = replace(
             found,
             law=replace(law, level=max(law.level, logs.least)),
-            bias=found.bias + length * float(step[q:].sum()),
+            bias=found.bias + length * float(step[q]) if integrating else 0.0,
+            beyond=max(found.beyond + length * float(step[-1]), 0.0) if found.spring else 0.0,
             coefficients=found.coefficients + arm * length * change[:p],
         )
         if logs.errors(tried) < errors:
@@ -271,14 +276,26 @@ def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
 
 def _with_stribeck(logs: _Logs, found: FrictionFit) -> FrictionFit:
     """The same with friction that falls with speed, where that is worth its two parameters."""
-    moved = [np.mean(np.diff(smoothed(record.output[:, 0])) ** 2) for record in logs.records]
-    speed, excess = float(np.sqrt(np.mean(moved))) / found.arm.dt_s, _EXCESS * found.level
-    laws = [replace(found.law, level=found.level - excess, excess=excess, fall=f * speed) for f in _FALLS]
+    speed, excess = rms_speed(logs.records), _EXCESS * found.law.level
+    laws = [replace(found.law, level=found.law.level - excess, excess=excess, fall=f * speed) for f in _FALLS]
     best = min((replace(found, law=law) for law in laws), key=logs.errors)
     for _ in range(_STRIBECK_STEPS):
         best = _stepped(logs, best)
     better = logs.errors(best) < logs.errors(found) * (1 - 2 * logs.criterion)
     return best if best.law.excess > 0 and better else found
+
+
+def _with_friction_beyond(logs: _Logs, found: FrictionFit) -> FrictionFit:
+    """The same with friction on the other side of the first spring, where that is worth its parameter."""
+    spring = Spring.of(found.model)
+    if spring is None:
+        return found
+    half = 0.5 * found.law.level
+    best = replace(found, spring=spring, beyond=half, law=replace(found.law, level=half))
+    for _ in range(_STRIBECK_STEPS):
+        best = _stepped(logs, best)
+    better = logs.errors(best) < logs.errors(found) * (1 - logs.criterion)
+    return best if best.beyond > 0 and better else found
 
 
 def identify_behind(
@@ -333,22 +350,25 @@ def _equations(
         )
         length = np.linalg.norm(nuisance, axis=0)
         u, d, _ = np.linalg.svd(nuisance[:, length > 0] / length[length > 0], full_matrices=False)
-        u = u[:, d > _NUISANCE_RANK * d[0]]
+        u = u[:, d > _NUISANCE_RANK * d.max(initial=0.0)]
         rows = rows - u @ (u.T @ rows)
         blocks.append(rows[:, :-1])
         targets.append(rows[:, -1])
     return blocks, targets
 
 
-def heterogeneity(found: FrictionFit, records: Sequence[Record], noise_filter: RealArray) -> float:
-    """How much more the parts of the records differ in arm and friction than their noise makes them (Chow's
-    F, Econometrica 28(3), 1960; not below 1): halves of records, whitened by an autoregression."""
-    parts = [half for record in records for half in _halves(record)]
+def autoregressive(noise_filter: RealArray) -> Callable[[RealArray], RealArray]:
+    """Signals (T, ...) through A(q), without the first rows."""
     n = noise_filter.size - 1
+    return lambda signal: np.asarray(lfilter(noise_filter, np.ones(1), signal, axis=0)[n:])
 
-    def whiten(signal: RealArray) -> RealArray:
-        return np.asarray(lfilter(noise_filter, np.ones(1), signal, axis=0)[n:])
 
+def heterogeneity(
+    found: FrictionFit, records: Sequence[Record], whiten: Callable[[RealArray], RealArray]
+) -> float:
+    """How much more the parts of the records differ in arm and friction than their noise makes them (Chow's
+    F, Econometrica 28(3), 1960; not below 1): halves of records, whitened."""
+    parts = [half for record in records for half in _halves(record)]
     blocks, targets = _equations(found, parts, whiten)
     nothing = np.zeros((0, blocks[0].shape[1] + 1))
     together = least_squares(blocks, targets, nothing)

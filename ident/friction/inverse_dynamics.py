@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 
 from ident.data.arrays import ComplexArray, RealArray
@@ -57,6 +58,12 @@ def noise_of(y: RealArray) -> float:
     return float(max(white, _LEAST_NOISE * np.std(y)))
 
 
+def rms_speed(records: Sequence[Record]) -> float:
+    """Root mean square speed of the position, its noise taken off, in its units per second."""
+    moved = [np.mean(np.diff(smoothed(record.output[:, 0])) ** 2) for record in records]
+    return float(np.sqrt(np.mean(moved))) / records[0].dt_s
+
+
 def highest_Hz(records: Sequence[Record]) -> float:
     """Highest frequency at which the position is well above its noise in some record."""
     found = []
@@ -71,11 +78,18 @@ def highest_Hz(records: Sequence[Record]) -> float:
 def direction_of(position: RealArray, presliding: float) -> RealArray:
     """(T,) friction of unit level that a motion (T,) makes, held over each sample: an elastic element that
     slips after a deflection."""
-    state, found = 0.0, np.empty(position.size)
-    for k, moved in enumerate((np.diff(position, prepend=position[0]) / presliding).tolist()):
-        state = min(max(state + moved, -1.0), 1.0)
-        found[k] = state
+    found = np.diff(position, prepend=position[0]) / presliding
+    _slip(found)
     return np.asarray(0.5 * (found + np.append(found[1:], found[-1])))
+
+
+@numba.njit(cache=True)
+def _slip(moved: Any) -> None:
+    """Sum of moved (T,), in place, that never leaves -1 .. 1."""
+    state = 0.0
+    for k in range(moved.size):
+        state = min(max(state + moved[k], -1.0), 1.0)
+        moved[k] = state
 
 
 def level_of(records: Sequence[Record], directions: Sequence[RealArray], *, stiff: bool) -> float:

@@ -19,12 +19,15 @@ from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
-from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, linearised
-from ident.friction.in_loop import heterogeneity
+from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, driven_by_shape, linearised
+from ident.friction.in_loop import autoregressive, heterogeneity
+from ident.friction.inverse_dynamics import rms_speed
 from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
 
 _NOISE_ORDER = 32
+# A law of friction that was not found in a log may still be there to this share of the level.
+_SHAPE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,22 +85,26 @@ def _behind_observed(
     """The same where an observer tells the friction from the measured motion: it does not depend on the arm,
     to first order."""
     less, beside, options = list[Record](), list[Beside](), options or EmbeddingOptions()
+    speed = rms_speed(records)
     for k, record in enumerate(records):
         by_law = driven_by_law(found, record)
+        shape = _SHAPE * found.level * driven_by_shape(found, record, speed)
         logs = STD_LOG * by_law[:, 1::2][:, : found.law.n_logs]
         plain = np.delete(by_law, 1 + 2 * np.arange(found.law.n_logs), axis=1)
         own = np.outer(found.between * plain[:, 0], np.arange(len(records)) == k)
-        beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([plain, logs, own])))
+        beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([plain, shape, logs, own])))
         less.append(found.taken_off(record))
-    known = found.law.n_logs + len(records)
+    known = shape.shape[1] + found.law.n_logs + len(records)
     # What drives an arm away from its simulation is never white, and needs a long noise model.
     coloured = {"coloured_noise": True, "max_ar_order": max(options.max_ar_order, _NOISE_ORDER)}
     options = options.model_copy(update=coloured)
     response, change, factor = tangent_beside(less, model, beside, options, n_known=known)
     whitening = np.array([1.0, *(response.report.ar_coefficients if response.report else ())])
-    wider = np.sqrt(heterogeneity(found, records, whitening))
+    wider = np.sqrt(heterogeneity(found, records, autoregressive(whitening)))
     response = replace(response, covariance_factor=wider * response.covariance_factor)
-    return BehindFriction(response, response, found.level + float(change[0]), wider * factor[0], found)
+    both = [0, *([plain.shape[1] - 1] if found.spring is not None else [])]
+    level, spread = found.level + float(change[both].sum()), wider * factor[both].sum(axis=0)
+    return BehindFriction(response, response, level, spread, found)
 
 
 def other_output_without_friction(

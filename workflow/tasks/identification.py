@@ -63,6 +63,11 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
 
         with naming(f"channel {channel.label!r}"):
             known = friction if channel.uncertainty.friction_identified else None
+            if known is not None and known.in_loop and k != config.control_index:
+                raise ValueError(
+                    "the friction of logs made in a loop is known behind the output that is fed back only: "
+                    "leave this channel out, or give it response = 'as recorded'"
+                )
             bounded, finding = [as_bounded(record, channel, known) for record in measured], None
             used = [as_fitted(record, channel, known) for record in measured]
             if config.closed_loop_data.method == "two_stage":
