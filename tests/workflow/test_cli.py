@@ -235,15 +235,6 @@ def test_run_json_is_only_json(flexlink, fast_run):
     assert document["numbers"]["channels"][0]["modes"][0]["frequency_Hz"] == pytest.approx(7.6, rel=0.03)
 
 
-def test_report_draws_the_page_anew(flexlink, fast_run, tmp_path):
-    run = tmp_path / "run"
-    shutil.copytree(fast_run[0], run)
-    (run / "report.html").unlink()
-    answer = flexlink("report", run)
-    assert answer.code == 0, answer.err
-    assert (run / "report.html").is_file()
-
-
 def test_report_of_an_unfinished_run_says_what_is_missing(refused, fast_run, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(fast_run[0], run)

@@ -84,11 +84,6 @@ def panels(figure: Figure) -> list:
     return [axes for axes in figure.axes if axes.get_visible() and not hasattr(axes, "_colorbar")]
 
 
-def test_figures_have_titles_units_and_a_legend():
-    for figure in pictures().values():
-        has_titles_units_and_a_legend(figure)
-
-
 def has_titles_units_and_a_legend(figure: Figure) -> None:
     assert any(axes.get_title(loc="left") for axes in panels(figure))
     labels = [label for axes in panels(figure) for label in (axes.get_xlabel(), axes.get_ylabel()) if label]
@@ -120,8 +115,9 @@ def test_pictures_of_a_planned_experiment():
 
 
 @pytest.mark.parametrize("names", [(), (HOSTILE, HOSTILE)], ids=["plain", "hostile"])
-def test_nothing_is_cut_off_and_nothing_overlaps(names):
+def test_titles_units_and_a_legend_nothing_cut_off_and_nothing_overlapping(names):
     for figure in pictures(*names).values():
+        has_titles_units_and_a_legend(figure)
         is_whole(figure)
 
 

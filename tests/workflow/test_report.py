@@ -110,26 +110,18 @@ def test_page_is_one_file_that_fetches_nothing(drawn):
 
 
 def test_same_bytes_twice(drawn):
+    """Pictures of an earlier report go."""
     first = drawn.report_path.read_bytes()
     pictures = {path.name: path.read_bytes() for path in drawn.figures_path.iterdir()}
+    (drawn.figures_path / "old-3-gone.svg").write_text("<svg/>")
     write_report(RunResults(drawn), example.config())
     assert drawn.report_path.read_bytes() == first
     assert {path.name: path.read_bytes() for path in drawn.figures_path.iterdir()} == pictures
 
 
-def test_pictures_of_an_earlier_report_go(drawn, undrawn, tmp_path):
-    settings = example.config()
-    run = example.build_run(tmp_path / "run", settings)
-    (run.figures_path / "old-3-gone.svg").write_text("<svg/>")
-    write_report(RunResults(run), settings)
-    assert not (run.figures_path / "old-3-gone.svg").exists()
-
-
-def test_numbers_on_the_page_are_the_stages_numbers(undrawn, tmp_path):
-    settings = example.config()
-    run = example.build_run(tmp_path / "run", settings)
-    text = text_of(run, settings)
-    results = RunResults(run)
+def test_numbers_on_the_page_are_the_stages_numbers(drawn):
+    text = Page(drawn.report_path.read_text(encoding="utf-8")).text
+    results = RunResults(drawn)
     for channel in results.identify.channels:
         for mode in channel.modes:
             assert f"{mode.frequency_Hz:.4g} {mode.omega_rad_s:.4g} {mode.damping:.3g}" in text
@@ -156,14 +148,14 @@ def test_numbers_on_the_page_are_the_stages_numbers(undrawn, tmp_path):
     loop = results.closed_loop.check
     assert f"{loop.predicted.rise_time_s:.3g}" in text
     assert f"{loop.achieved[0].overshoot_percent:.3g}" in text
-    manifest = run.manifest()
+    manifest = drawn.manifest()
     assert "ab" * 32 in text
     assert manifest["versions"]["numpy"] in text
     assert "# as given" in text
 
 
-def test_a_certified_run_says_so_and_why(undrawn, tmp_path):
-    page = page_for(tmp_path, example.config())
+def test_a_certified_run_says_so_and_why(drawn):
+    page = Page(drawn.report_path.read_text(encoding="utf-8"))
     assert "Certified, but the loop takes damping from a mode" in page.text
     assert "The mode at 2.23 Hz loses damping: 0.05 in open loop, 0.037 in closed loop" in page.text
     assert "All 3 runs on the simulated arm settle" in page.text
@@ -178,18 +170,15 @@ def test_an_uncertified_run_says_what_is_missed(undrawn, tmp_path):
         r"modulus margin, worst case: 0\.\d+ against 0\.5 at [\d.]+ rad/s \([\d.]+ Hz\): NOT met", page.text
     )
     assert "is the active constraint" in page.text
+    assert "gain may rise by" in page.text
     assert not any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
 
 
-def test_an_unstable_loop_has_no_margins(undrawn, tmp_path):
-    stable, unstable = (page_for(tmp_path / str(gain), example.config(), gain=gain) for gain in (4.0, 400.0))
-    assert "gain may rise by" in stable.text
-    assert "gain may rise by" not in unstable.text
-    assert re.search(r"the nominal loop is unstable \(largest pole radius [1-9][\d.]*\)", unstable.text)
-
-
-def test_what_is_not_proved_of_an_unstable_loop_is_a_line_of_its_own(tmp_path):
+def test_an_unstable_loop_has_no_margins_and_a_line_of_its_own_for_what_is_not_proved(undrawn, tmp_path):
     run = example.build_run(tmp_path / "run", example.config(), gain=400.0)
+    text = text_of(run, example.config())
+    assert "gain may rise by" not in text
+    assert re.search(r"the nominal loop is unstable \(largest pole radius [1-9][\d.]*\)", text)
     standing = environment().get_template("certificate.j2").module
     opened = standing.not_checked(RunResults(run).certify.certificate).splitlines()
     assert opened[0].endswith("not proved: the loop is not robustly stable on the dense grid")
@@ -242,30 +231,17 @@ def change_loop(run, **changes):
     run.save_stage("closed_loop", ClosedLoopResult(check=replace(loop, **changes)), "x")
 
 
-def change_prediction(run, **changes):
-    """The same for numbers of the prediction."""
-    predicted = RunResults(run).closed_loop.check.predicted
-    change_loop(run, predicted=replace(predicted, **changes))
-
-
-def test_a_command_beyond_the_records_is_told(undrawn, tmp_path):
+def test_a_command_beyond_the_records_and_an_error_that_stays_are_told(undrawn, tmp_path):
     settings = example.config()
     run = example.build_run(tmp_path / "run", settings)
     records = RunResults(run).records.of_role("estimation")
     seen = max(float(np.max(np.abs(item.record.input))) for item in records)
     words = "times the largest input in the records of the fit"
-    for factor, told in ((1.4, False), (7.0, True)):
-        change_prediction(run, peak_command=factor * seen)
+    predicted = RunResults(run).closed_loop.check.predicted
+    for factor, left, told in ((1.4, 0.01, False), (7.0, -0.2, True)):
+        change_loop(run, predicted=replace(predicted, peak_command=factor * seen, disturbance_left=left))
         text = text_of(run, settings)
         assert (f"{factor:.2g} {words}" in text) == told
-
-
-def test_an_error_that_stays_is_told(undrawn, tmp_path):
-    settings = example.config()
-    run = example.build_run(tmp_path / "run", settings)
-    for left, told in ((0.01, False), (-0.2, True)):
-        change_prediction(run, disturbance_left=left)
-        text = text_of(run, settings)
         assert ("leaves 40 % of the reference step as error" in text) == told
         assert ("integrator = true" in text) == told
 

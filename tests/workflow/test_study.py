@@ -136,13 +136,31 @@ def test_resuming_computes_only_what_is_missing(small_study, tmp_path):
         assert (out / "points" / name / "stages/design.npz").stat().st_mtime_ns == before
 
 
+class Watch(Progress):
+    """Remembers what was said."""
+
+    def __init__(self) -> None:
+        self.messages: list[str] = []
+        self.planned: list[str] = []
+
+    def plan(self, stages):
+        self.planned = [name for name, _ in stages]
+
+    def update(self, stage, fraction, message=""):
+        assert 0 <= fraction <= 1
+        self.messages.append(message)
+
+
 def test_a_finished_study_is_taken_up_and_can_be_extended(small_study, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(small_study[0], out)
     before = point_bytes(out)
     more = SMALL_STUDY.replace("1e5", "1e5, 2e5")
-    run_study(load_study(write_study(tmp_path, more)), out, resume=True, jobs=1)
+    watch = Watch()
+    run_study(load_study(write_study(tmp_path, more)), out, resume=True, jobs=1, progress=watch)
     assert len(rows_of(out)) == 8
+    assert watch.planned == ["plant", "points", "page"]
+    assert watch.messages[-1].startswith("8 of 8, ")
     after = point_bytes(out)
     assert {name: after[name] for name in before} == before
 
@@ -162,23 +180,7 @@ def test_the_first_screen_of_a_study(small_study, browser):
     assert shape_faults(browser, small_study[0] / "study.html", screens=3) == []
 
 
-def test_a_run_directory_is_a_base(fast_run, tmp_path):
-    text = SMALL_STUDY.replace(str(FAST_ARM), str(fast_run[0])).replace(
-        "values = [1.0, 1.5, 1e5]", "values = [1.5]"
-    )
-    out = tmp_path / "out"
-    run_study(load_study(write_study(tmp_path, text)), out, jobs=1)
-    for row in rows_of(out):
-        for name in ("identify.npz", "uncertainty.npz"):
-            mine = (out / "points" / row["name"] / "stages" / name).read_bytes()
-            assert mine == (fast_run[0] / "stages" / name).read_bytes()
-    # The base's own specification: the design of the run again.
-    design = RunResults(RunDirectory(out / "points" / rows_of(out)[0]["name"])).design
-    again = RunResults(RunDirectory(fast_run[0])).design
-    assert codec.plain(design) == codec.plain(again)
-
-
-def test_other_ellipses_are_made_once_and_shared(fast_run, tmp_path):
+def test_a_run_directory_is_a_base_and_other_ellipses_are_made_once(fast_run, tmp_path):
     text = f"""
 [study]
 base = "{fast_run[0]}"
@@ -205,6 +207,11 @@ values = [1, 2]
     np.testing.assert_array_equal(radii[0], radii[1])
     # chi-square of two degrees of freedom: the squared radius is -2 log(1 - level).
     np.testing.assert_allclose(np.array(radii[2]) / radii[0], np.sqrt(np.log(0.05) / np.log(0.4)), rtol=1e-6)
+    # The base's own level and specification: the run again.
+    own = RunDirectory(out / "points" / rows[2]["name"])
+    for name in ("identify.npz", "uncertainty.npz"):
+        assert (own.path / "stages" / name).read_bytes() == (fast_run[0] / "stages" / name).read_bytes()
+    assert codec.plain(RunResults(own).design) == codec.plain(RunResults(RunDirectory(fast_run[0])).design)
 
 
 def test_contradictions_between_axes_are_points_without_a_run(tmp_path):
@@ -260,29 +267,6 @@ def test_a_base_that_cannot_be_identified_is_refused(refused, tmp_path):
     line = refused("study", "--config", study, "--out", tmp_path / "out", "--jobs", 1)
     assert "the base cannot be identified" in line
     assert not (tmp_path / "out").exists()
-
-
-class Watch(Progress):
-    """Remembers what was said."""
-
-    def __init__(self) -> None:
-        self.messages: list[str] = []
-        self.planned: list[str] = []
-
-    def plan(self, stages):
-        self.planned = [name for name, _ in stages]
-
-    def update(self, stage, fraction, message=""):
-        assert 0 <= fraction <= 1
-        self.messages.append(message)
-
-
-def test_progress_counts_points(small_study, tmp_path):
-    watch = Watch()
-    shutil.copytree(small_study[0], tmp_path / "out")
-    run_study(load_study(write_study(tmp_path)), tmp_path / "out", resume=True, progress=watch)
-    assert watch.planned == ["plant", "points", "page"]
-    assert watch.messages[-1].startswith("6 of 6, ")
 
 
 def children_of(pid: int) -> list[int]:
