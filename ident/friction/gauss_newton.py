@@ -81,9 +81,9 @@ class FrictionFit:
         return float(np.linalg.norm(self.covariance_factor[rows].sum(axis=0)))
 
     def moved(self, change: RealArray) -> tuple[RealArray, FrictionLaw]:
-        """Coefficients and law after a change (P + Q,), no parameter below zero."""
-        n = self.coefficients.size
-        return self.coefficients + change[:n], law_of(parameters_of(self.law) + change[n:])
+        """Coefficients and law after a change (P + Q, or more), no parameter below zero."""
+        n, parameters = self.coefficients.size, parameters_of(self.law)
+        return self.coefficients + change[:n], law_of(parameters + change[n : n + parameters.size])
 
     @property
     def significant(self) -> bool:

@@ -153,16 +153,17 @@ def fit_friction_in_loop(
     if found.significant:
         report(0.4, "friction: falling with speed, beyond a spring")
         found = _with_stribeck(logs, _with_friction_beyond(logs, found))
-    if options.delay_left_to_data:
-        report(0.5, "friction: dead time")
-        found = _behind_dead_time(logs, found, few)
-        options = options.model_copy(update={"input_delay_samples": found.arm.structure.input_delay_samples})
-    if few != options:
-        report(0.6, "friction: level and arm in turns")
-        more = _in_turns(logs, found, _beyond(found, options))
-        extra = more.model.order - found.model.order
-        if logs.errors(more) < logs.errors(found) * (1 - extra * logs.criterion):
-            found = more
+    report(0.5, "friction: level and arm in turns")
+    simple, found = found, _with_more_poles(logs, found, options)
+    for delay in range(1, _LONGEST_DELAY + 1) if options.delay_left_to_data else ():
+        report(0.5 + 0.1 * min(delay, 4), "friction: dead time")
+        late = {"input_delay_samples": delay}
+        arm = replace(simple.arm, structure=options.model_copy(update=late).structure())
+        simple = _in_turns(logs, replace(simple, arm=arm), few.model_copy(update=late), _FEW_ROUNDS)
+        tried = _with_more_poles(logs, simple, options.model_copy(update=late))
+        if not logs.errors(tried) < logs.errors(found):
+            break
+        found = tried
     report(1.0, "friction identified")
     wider = np.sqrt(heterogeneity(found, logs.records, ObserverFilter.of(found)))
     return replace(found, covariance_factor=wider * found.covariance_factor)
@@ -199,16 +200,13 @@ def _beyond(found: FrictionFit, options: IdentOptions) -> IdentOptions:
     return options.model_copy(update=update | (lowest if options.omega_min_rad_s is None else {}))
 
 
-def _behind_dead_time(logs: _Logs, found: FrictionFit, options: IdentOptions) -> FrictionFit:
-    """The same behind as many samples of delay of the command as lower the prediction errors."""
-    for delay in range(1, _LONGEST_DELAY + 1):
-        there = options.model_copy(update={"input_delay_samples": delay})
-        arm = replace(found.arm, structure=there.structure())
-        tried = _in_turns(logs, replace(found, arm=arm), there, _FEW_ROUNDS)
-        if not logs.errors(tried) < logs.errors(found):
-            break
-        found = tried
-    return found
+def _with_more_poles(logs: _Logs, found: FrictionFit, options: IdentOptions) -> FrictionFit:
+    """The same with as many poles as the data ask for, where they are worth it."""
+    if options == _simplest(options):
+        return found
+    more = _in_turns(logs, found, _beyond(found, options))
+    extra = more.model.order - found.model.order
+    return more if logs.errors(more) < logs.errors(found) * (1 - extra * logs.criterion) else found
 
 
 def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: int = _ROUNDS) -> FrictionFit:
