@@ -335,7 +335,7 @@ def test_integers_called_seconds_are_doubted(flexlink, tmp_path):
         (("--level", "0.2"), "flexlink: --level: input should be greater than 0.5"),
         (("--pairs", "13"), "flexlink: --pairs: input should be less than or equal to 12, got 13"),
         (("--response", "amplitude 2"), "expected 'as recorded', 'without friction', 'this amplitude' or"),
-        (("--response", "this amplitude", "--band", "10", "20"), "logs as measured, in open loop: no band"),
+        (("--response", "this amplitude", "--band", "10", "20"), "takes logs as measured: no band"),
         (("--band", "50", "20"), "lower below upper"),
         (("--band", "50", "2000"), "the band must lie in (0, 628"),
         (("--pairs", "12", "--report", "{out}/page.html"), "too few"),
