@@ -184,7 +184,7 @@ def test_smooth_forces_where_a_response_has_no_poles(name, motion, monkeypatch):
         dt_s = 2 * np.pi / np.sqrt(40) / samples
         force, simulation = np.random.default_rng(3).uniform(-6, 6, 300), _Counted("on a spring", dt_s)
         truth = rubbing(_acceleration("on a spring", more), force, dt_s, lambda v: 1e-12)
-        with pytest.warns(UserWarning, match="is none of 6 poles or fewer"):
+        with pytest.warns(UserWarning, match="is not one of 6 poles or fewer"):
             plant = _wrapped(simulation, force, [name], dt_s, motion)
         found = plant.simulated([Change(name, values)])(force[:, None])
         missed.append(_missed(found, truth, simulation({}, {}, force[:, None])))
