@@ -164,16 +164,23 @@ def test_tutorials_run_and_show_what_they_find(tmp_path):
         assert all(cell["execution_count"] for cell in cells if cell["cell_type"] == "code")
 
 
-def test_the_site_is_built_whole_and_asks_no_network(tmp_path):
-    build(tmp_path / "site", run=False)
-    made = {str(page.relative_to(tmp_path / "site")) for page in (tmp_path / "site").rglob("*.html")}
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, its notebooks not run."""
+    folder = tmp_path_factory.mktemp("site")
+    build(folder, run=False)
+    return folder
+
+
+def test_the_site_is_built_whole_and_asks_no_network(site):
+    made = {str(page.relative_to(site)) for page in site.rglob("*.html")}
     assert {
         "index.html",
         "tutorials/engineer.html",
         "reference/python.html",
         "reference/configuration.html",
     } <= made
-    for page in (tmp_path / "site").rglob("*.html"):
+    for page in site.rglob("*.html"):
         if "pages" in page.parts:
             continue  # drawn by flexlink, tested with it
         text = page.read_text(encoding="utf-8")
@@ -183,9 +190,8 @@ def test_the_site_is_built_whole_and_asks_no_network(tmp_path):
         assert fetched == [], page.name
 
 
-def test_the_search_works_in_pages_that_are_opened_as_files(tmp_path, browser):
-    build(tmp_path / "site", run=False)
-    browser.open(tmp_path / "site" / "theory" / "arm.html")
+def test_the_search_works_in_pages_that_are_opened_as_files(site, browser):
+    browser.open(site / "theory" / "arm.html")
     browser.ask("document.querySelector('#__search').click()")
     browser.ask("document.querySelector('[data-md-component=search-query]').focus()")
     for letter in "quantisation":
@@ -193,5 +199,5 @@ def test_the_search_works_in_pages_that_are_opened_as_files(tmp_path, browser):
     found = "[...document.querySelectorAll('.md-search-result__link')].map(link => link.href).join()"
     look = f"const look = () => {found} ? done({found}) : setTimeout(look, 50)"
     until = f"new Promise(done => {{ {look}; look() }})"
-    assert (tmp_path / "site" / "glossary.html").as_uri() in browser.ask(until)
+    assert (site / "glossary.html").as_uri() in browser.ask(until)
     assert browser.complaints() == []

@@ -1,4 +1,4 @@
-"""The harness: options from the signature, a results file from whole runs only, medians, methods in turn."""
+"""The harness: options from the signature, a results file from whole runs only."""
 
 import re
 import subprocess

@@ -69,7 +69,7 @@ def reference(whole):
         pytest.param("manifest.json", 0.0, marks=pytest.mark.slow),
         pytest.param("stages/records.npz", 0.02, marks=pytest.mark.slow),
         ("stages/uncertainty.npz", 0.2),
-        ("stages/certify.json", 0.0),
+        pytest.param("stages/certify.json", 0.0, marks=pytest.mark.slow),
     ],
 )
 def test_killed_run_resumes_with_identical_numbers(reference, tmp_path, appears, pause_s):
