@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.basis.functions import basis_response
+from ident.basis.functions import all_pass_response, basis_response
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure, filter_input, front_response
 from ident.data.arrays import BoolArray, ComplexArray, RealArray, kernel_array, real_rows
@@ -81,10 +81,12 @@ class SteppedArm:
         # Taken twice, a pole moved that little still spans the same responses to a few parts in a million.
         real = np.maximum(poles.real, FASTEST_POLE).astype(np.complex128)
         single = np.concatenate([np.log(real), np.log(poles.pairs)]) / dt_s
-        rates = np.concatenate([np.zeros(structure.integrators, np.complex128), np.repeat(single, 2)])
-        chain = np.concatenate(
-            [np.zeros(structure.integrators, np.bool_), np.tile([False, True], single.size)]
-        )
+        # Of the mirror image of an unstable pole one is that pole itself.
+        images = np.isin(np.concatenate([poles.real, poles.pairs]), _upper(structure.unstable))
+        both = np.column_stack([np.where(images, -single.conj(), single), single]).ravel()
+        rates = np.concatenate([np.zeros(structure.integrators, np.complex128), both])
+        second = np.column_stack([np.zeros(single.size, np.bool_), ~images]).ravel()
+        chain = np.concatenate([np.zeros(structure.integrators, np.bool_), second])
         # Coefficients of both forms agree where their responses do: least squares over frequency, exact
         # because they span the same space.
         omega = np.concatenate([np.geomspace(1e-4, 0.05, 60), np.linspace(0.05, 3.1, 300)]) / dt_s
@@ -94,10 +96,9 @@ class SteppedArm:
         mirrored = _state_responses(z, rates.conj(), chain, dt_s)
         twofold = np.abs(rates.imag) > 0
         columns = np.hstack([(states + mirrored) / 2, 1j * (states - mirrored)[:, twofold] / 2])
-        basis = (
-            basis_response(poles.doubled(), z)
-            * front_response(omega, dt_s, structure.integrators, 0)[:, None]
-        )
+        front = front_response(omega, dt_s, structure.integrators, 0)
+        front = front / all_pass_response(structure.unstable, z)
+        basis = basis_response(poles.doubled(), z) * front[:, None]
         scale = 1 / np.linalg.norm(basis, axis=1)[:, None]
         a, b = (real_rows(scale * part) for part in (columns, basis))
         length = np.linalg.norm(a, axis=0)
@@ -131,6 +132,11 @@ class SteppedArm:
             friction,
         )
         return position, friction
+
+
+def _upper(poles: Poles) -> ComplexArray:
+    """Real poles, and of each pair the upper one."""
+    return np.concatenate([poles.real.astype(np.complex128), poles.pairs])
 
 
 def less_friction(record: Record, friction: RealArray, delay_samples: int) -> Record:

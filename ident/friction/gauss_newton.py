@@ -202,7 +202,7 @@ def equations(found: FrictionFit, records: Sequence[Record]) -> tuple[list[RealA
 def driven_by_law(found: FrictionFit, record: Record) -> RealArray:
     """(T, Q) derivatives of the arm's position with respect to the parameters of the law, and to the bias of
     an integrating arm, where an observer tells the friction of a record."""
-    arm = replace(found.model, input_delay_samples=0)
+    arm = replace(found.model.stable_part, input_delay_samples=0)
     friction, parameters = found.motion(record)[1], parameters_of(found.law)
     columns = []
     for k in range(parameters.size):
@@ -220,7 +220,7 @@ def driven_by_shape(found: FrictionFit, record: Record, speed: float) -> RealArr
     """(T, S) changes of the arm's position per unit of what a friction may have that was not found: an excess
     that falls with a tenth of this speed, a share beyond the first spring; where an observer tells the
     friction of a record."""
-    arm = replace(found.model, input_delay_samples=0)
+    arm = replace(found.model.stable_part, input_delay_samples=0)
     friction, columns = found.motion(record)[1], []
     if not np.isfinite(found.law.fall):
         excess = _CHANGE_OF_LEVEL * found.law.level

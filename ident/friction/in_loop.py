@@ -24,7 +24,7 @@ from scipy.stats import f as f_distribution
 
 from ident.basis.functions import nuisance_columns, regressor
 from ident.basis.options import IdentOptions
-from ident.basis.structure import answered, driving_input
+from ident.basis.structure import answered, driving_input, stabilised
 from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.checks.validation import fit_in_windows
 from ident.coloured_noise import long_arx_filter, prewhitened
@@ -50,6 +50,7 @@ from ident.identification import Identification
 from ident.one_input import identify, untested_model
 from ident.search.pole_search import PoleSearch
 from ident.uncertainty.autoregression import fit_autoregression
+from ident.unstable import find_unstable
 
 Report = Callable[[float, str], None]
 _ROUNDS, _FEW_ROUNDS, _LONGEST_DELAY = 12, 3, 20
@@ -142,14 +143,22 @@ def fit_friction_in_loop(
         max(level_of(logs.records, ways, stiff=not options.integrators), logs.least), logs.presliding
     )
     options = _above_noise(logs.records, options)
-    few = _simplest(options)
     used = [
         less_friction(record, law.level * way, options.input_delay_samples)
         for record, way in zip(logs.records, ways, strict=True)
     ]
+    sought = not (options.integrators or options.unstable_poles)
+    if sought:
+        options = options.with_unstable(find_unstable(used, options))
+    few = _simplest(options)
     model = untested_model([prewhitened(record, long_arx_filter(used, few)) for record in used], _moving(few))
     report(0.1, "friction: level and a simple arm in turns")
     found = _in_turns(logs, started(model, few.structure(), law), few)
+    if sought and options.unstable_poles:
+        # Once more with a better friction, which the growth depends on.
+        options = options.with_unstable(find_unstable([found.taken_off(r) for r in logs.records], options))
+        few = _simplest(options)
+        found = _in_turns(logs, found, few)
     if found.significant:
         report(0.4, "friction: falling with speed, beyond a spring")
         found = _with_stribeck(logs, _with_friction_beyond(logs, found))
@@ -309,6 +318,8 @@ def identify_behind(
     those of simulations over windows (`fit_in_windows`).
     """
     options = _above_noise(records, options or IdentOptions())
+    if found.arm.structure.unstable.order:
+        options = options.with_unstable(found.arm.structure.unstable)
     n_real, n_pairs = (
         all_ - known for all_, known in zip(found.model.poles.counts, options.fixed().counts, strict=True)
     )
@@ -340,7 +351,9 @@ def _equations(
         less = found.taken_off(record)
         driven = driving_input(less.input[:, 0], structure.integrators, structure.input_delay_samples)
         basis = regressor(found.arm.poles.doubled(), driven)
-        position = answered(record.output[:, 0], structure.input_delay_samples)
+        position = answered(
+            stabilised(record.output[:, 0], structure.unstable), structure.input_delay_samples
+        )
         by_law = answered(driven_by_law(found, record), structure.input_delay_samples)
         rows = whiten(np.column_stack([basis, by_law, position - basis @ found.coefficients]))
         nuisance = whiten(

@@ -99,8 +99,12 @@ class ObserverFilter:
 
 
 def prediction_errors(found: FrictionFit, records: Sequence[Record]) -> float:
-    """Sum of squares of the observer's prediction errors, without the start of each record."""
-    return sum(float(np.sum(part[part.size // _START :] ** 2)) for part in map(found.residual, records))
+    """Sum of squares of the observer's prediction errors, without the start of each record; infinite where it
+    loses the log."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        parts = [found.residual(record) for record in records]
+        total = sum(float(np.sum(part[part.size // _START :] ** 2)) for part in parts)
+    return total if np.isfinite(total) else np.inf
 
 
 def observed(found: FrictionFit, records: Sequence[Record]) -> FrictionFit:

@@ -1,0 +1,156 @@
+"""Friction and arm from logs of a loop, made by machines that share no code with the product."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.closed_loop_machines.logs import Machine, machine
+from benchmarks.closed_loop_machines.simulator import Law, response
+from ident.basis.model import GobfModel
+from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
+from ident.checks.validation import fit_in_windows, fit_on_fresh_data
+from ident.data.record import Record
+from ident.friction import FrictionFit, fit_friction, identify_behind, without_friction
+from ident.friction.in_loop import recorded_in_loop
+from ident.friction.inverse_dynamics import direction_of, level_of, smoothed
+from ident.friction.spring import Spring
+
+
+def logged(one: Machine, log: int, *, reference: bool = True) -> Record:
+    got, begin = one.record(log, one.rng(log))
+    signals = got["u"][begin:, None], got["y"][begin:, None]
+    kept = {"reference": got["r"][begin:, None], "reference_names": ("r",)} if reference else {}
+    return Record(f"log {log}", *signals, one.plant.dt_s, ("u",), ("y",), **kept)
+
+
+def levels_of(one: Machine) -> float:
+    """Coulomb friction in units of the input."""
+    return float(one.plant.friction[:, 0].sum() / one.plant.torque_per_u)
+
+
+def modes_of(one: Machine) -> list[complex]:
+    poles = one.plant.linear(one.draft.q_operating)[3]
+    return sorted(poles[poles.imag > 1e-6], key=abs)
+
+
+@pytest.fixture(scope="module")
+def belt() -> tuple[Machine, list[Record], FrictionFit]:
+    """The kind of log that was reported: a belt under its PD controller."""
+    one = machine("belt", 0)
+    records = [logged(one, log) for log in (0, 2)]
+    return one, records, fit_friction(records, IdentOptions(integrators=1))
+
+
+def test_level_and_dead_time_of_a_belt_are_found(belt: tuple[Machine, list[Record], FrictionFit]) -> None:
+    one, _, found = belt
+    assert found.in_loop
+    assert found.significant
+    assert found.level == pytest.approx(levels_of(one), rel=0.02)
+    assert abs(found.level - levels_of(one)) < 4 * found.level_std
+    assert found.arm.structure.input_delay_samples == one.plant.delay
+    assert found.law.excess == 0
+    assert found.beyond == 0
+
+
+def test_ellipses_and_mode_of_a_belt_are_those_without_friction(
+    belt: tuple[Machine, list[Record], FrictionFit],
+) -> None:
+    one, records, found = belt
+    mode, omega = modes_of(one)[0], np.geomspace(1.0, 200.0, 80)
+    about = identify_behind(
+        found, [found.taken_off(record) for record in records], IdentOptions(integrators=1)
+    )
+    k = int(np.argmin(np.abs(about.model.poles.omega_rad_s(one.plant.dt_s) - abs(mode))))
+    assert about.model.poles.omega_rad_s(one.plant.dt_s)[k] == pytest.approx(abs(mode), rel=1e-3)
+    assert about.model.poles.zeta()[k] == pytest.approx(-mode.real / abs(mode), rel=0.02)
+    assert np.all(about.fit_percent > 95)
+    true = response(*one.plant.sampled(0.0), omega, one.plant.dt_s)
+    ellipses = without_friction(records, found, about.model).response.at(omega)
+    assert np.mean(ellipses.contains(true)) > 0.9
+    assert np.median(np.abs(ellipses.centre / true - 1)) < 0.005
+
+
+@pytest.mark.parametrize("kind", ["belt", "link", "screw", "pendulum", "fast"])
+def test_a_loop_is_told_by_its_reference_or_by_its_command(kind: str) -> None:
+    one = machine(kind, 1)
+    assert recorded_in_loop([logged(one, 0)])
+    assert recorded_in_loop([logged(one, 0, reference=False)])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_command_that_nobody_closes_a_loop_around_is_none(seed: int) -> None:
+    """Binary and sinusoidal commands of a belt drive that turns as it likes."""
+    one, rng = machine("belt", seed), np.random.default_rng(seed)
+    open_loop = Law(np.zeros((1, 1)), np.zeros((1, 2)), np.zeros(1), np.array([1.0, 0.0]), np.zeros(1))
+    size = 5 * levels_of(one)
+    binary = size * np.repeat(np.sign(rng.standard_normal(400)), 10)
+    times = np.arange(4000) * one.plant.dt_s
+    phases, lines = rng.uniform(0, 2 * np.pi, 60), np.arange(1, 61)
+    sines = size * np.cos(2 * np.pi * lines * times[:, None] / 2 + phases).sum(axis=1) / np.sqrt(30)
+    noise = rng.standard_normal(4000)
+    for command in (binary, sines + 1e-3 * size * noise):
+        got = one.plant.run(open_loop, command, 0.0, np.zeros(command.size))
+        record = Record("open", command[:, None], got["y"][:, None], one.plant.dt_s, ("u",), ("y",))
+        assert not recorded_in_loop([record])
+
+
+@pytest.mark.parametrize("kind", ["belt", "slow", "pendulum", "link"])
+def test_inverse_dynamics_give_a_start_of_the_level(kind: str) -> None:
+    """Within a third, which is what the fit takes: it never moves by more at once."""
+    one = machine(kind, 0)
+    records = [logged(one, log) for log in (0, 1)]
+    size = float(np.std(records[0].output))
+    ways = [direction_of(smoothed(record.output[:, 0]), 1e-4 * size) for record in records]
+    assert level_of(records, ways, stiff=kind == "pendulum") == pytest.approx(levels_of(one), rel=1 / 3)
+
+
+@pytest.mark.slow
+def test_unstable_pole_behind_friction() -> None:
+    one = machine("pendulum", 0)
+    records = [logged(one, log) for log in (0, 1)]
+    found = fit_friction(records, IdentOptions())
+    growth = max(one.plant.linear(one.draft.q_operating)[3].real)
+    (unstable,) = found.model.unstable_poles
+    assert np.log(unstable.real) / one.plant.dt_s == pytest.approx(growth, rel=0.05)
+    assert found.level == pytest.approx(levels_of(one), rel=0.1)
+
+
+def test_an_arm_that_drifts_is_judged_in_windows() -> None:
+    """A random walk of force beside the command: a free run over 40 s explains nothing, windows of 2.5 s most."""
+    rng, poles = np.random.default_rng(2), Poles.from_continuous(decay_per_s=[5.0], dt_s=0.01)
+    model = GobfModel(poles, np.array([0.1]), 0.01, integrators=1)
+    command = np.sign(rng.standard_normal(400)).repeat(10)
+    walk = 0.002 * np.cumsum(rng.standard_normal(4000))
+    record = Record("drifts", command[:, None], model.simulate(command + walk)[:, None], 0.01, ("u",), ("y",))
+    assert fit_on_fresh_data(model, record).fit_percent < 20
+    windows = fit_in_windows(model, record)
+    assert windows.fit_percent > 60
+    assert windows.residual.size == record.n_samples
+    assert windows.answers
+
+
+def test_the_load_of_a_belt_is_the_lowest_zero_of_the_motor() -> None:
+    """Two inertias of 2 and 5 g m^2 on a spring of 4.935 N m/rad: the load alone swings at 5 Hz."""
+    motor, load, spring, dt_s = 2e-3, 5e-3, 5e-3 * (10 * np.pi) ** 2, 1e-3
+    omega = np.sqrt(spring * (1 / motor + 1 / load))
+    poles = Poles.from_continuous(omega_rad_s=[omega], zeta=[0.02], decay_per_s=[0.5], dt_s=dt_s)
+    w = np.geomspace(5.0, 400.0, 300)
+    s = 1j * w
+    wanted = (
+        (load * s**2 + 0.1 * s + spring)
+        / (s**2 + 0.04 * omega * s + omega**2)
+        / (s * (s + 0.5))
+        / (motor * load)
+    )
+    basis = [GobfModel(poles, row, dt_s, integrators=1).frequency_response(w) for row in np.eye(poles.order)]
+    a = np.stack(basis, axis=1) / np.abs(wanted)[:, None]
+    b = wanted / np.abs(wanted)
+    fitted = np.linalg.lstsq(np.vstack([a.real, a.imag]), np.concatenate([b.real, b.imag]), rcond=None)[0]
+    found = Spring.of(GobfModel(poles, fitted, dt_s, integrators=1))
+    assert found is not None
+    assert found.omega_rad_s == pytest.approx(10 * np.pi, rel=0.02)
+    # A steady motion meets the whole of the load's friction.
+    ramp = np.linspace(0.0, 1.0, 5000)
+    assert found.force(ramp, 1e-6)[-1] == pytest.approx(1.0, abs=0.01)
