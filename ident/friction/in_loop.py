@@ -44,7 +44,7 @@ from ident.friction.gauss_newton import (
     with_covariance,
 )
 from ident.friction.inverse_dynamics import direction_of, highest_Hz, level_of, rms_speed, smoothed
-from ident.friction.observer import ObserverFilter, observed, prediction_errors
+from ident.friction.observer import LOST, ObserverFilter, observed, prediction_errors
 from ident.friction.spring import Spring
 from ident.identification import Identification
 from ident.one_input import identify, untested_model
@@ -363,6 +363,8 @@ def _equations(
         u, d, _ = np.linalg.svd(nuisance[:, length > 0] / length[length > 0], full_matrices=False)
         u = u[:, d > _NUISANCE_RANK * d.max(initial=0.0)]
         rows = rows - u @ (u.T @ rows)
+        if not np.all(np.isfinite(rows)):
+            raise ValueError(LOST)
         blocks.append(rows[:, :-1])
         targets.append(rows[:, -1])
     return blocks, targets

@@ -23,6 +23,10 @@ from ident.friction.arm import SteppedArm
 from ident.friction.gauss_newton import FrictionFit
 from ident.friction.inverse_dynamics import noise_of
 
+LOST = (
+    "no model of the arm with dry friction follows the logs; response = 'as recorded' needs none, n_real and "
+    "n_pairs state the number of poles"
+)
 # Force that an observer expects in a sample, in units of the input's rms over the noise of the position: from
 # an observer slower than the arm to one that takes the last two samples for its state.
 _RATIOS = np.geomspace(1e-4, 10, 11)
@@ -121,7 +125,5 @@ def observed(found: FrictionFit, records: Sequence[Record]) -> FrictionFit:
             one = replace(found, correction=correction, ratio=float(ratio))
             tried.append((prediction_errors(one, records), one))
     if not tried:
-        raise ValueError(
-            "no observer of the arm follows the logs: state the number of poles (n_real, n_pairs)"
-        )
+        raise ValueError(LOST)
     return min(tried, key=lambda one: one[0])[1]
