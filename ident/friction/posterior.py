@@ -95,7 +95,7 @@ def _behind_observed(
         beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([plain, shape, logs, own])))
         less.append(found.taken_off(record))
     known = shape.shape[1] + found.law.n_logs + len(records)
-    # What drives an arm away from its simulation is never white, and needs a long noise model; taken for missed
+    # What drives an arm away from its simulation is never white, and needs a long noise model. As missed
     # modes, five slow ones were added where friction of another law was left over.
     order = max(options.max_ar_order, _NOISE_ORDER)
     coloured = {"coloured_noise": True, "max_ar_order": order, "prior_missed_mode": 0.0}

@@ -28,7 +28,7 @@ _LEAD_IN = 0.05  # share of the record before the step, so that the picture show
 # A run counts as settled when, at the end of either half, it moves by less than this share of the step and,
 # where tracking is asked for, has arrived within it.
 _SETTLED = 0.1
-_SHORTEST, _LONGEST = 200, 6000
+_SHORTEST, _LONGEST = 200, 60_000
 
 
 @dataclass(frozen=True, eq=False)
