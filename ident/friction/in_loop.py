@@ -71,8 +71,8 @@ _FALLS, _EXCESS, _STRIBECK_STEPS = (0.03, 0.1, 0.3), 0.1, 6
 # Directions of a start (columns of unit length) below this are left out; as few of the parameters.
 _NUISANCE_RANK, _RANK = 1e-10, 1e-9
 _NOISE_ORDER = 32
-# Variance between parts of the logs over that of their noise. On machines of ten kinds fits that were right had
-# 1 to 9, one that was wrong 35 000.
+# Variance between parts of the logs over that of their noise: fits of machines of ten kinds that were right
+# had 1 to 9, one that was wrong 35 000.
 _CONTRADICTORY = 100.0
 
 
@@ -180,9 +180,9 @@ def fit_friction_in_loop(
     spread = heterogeneity(found, logs.records, ObserverFilter.of(found))
     if spread > _CONTRADICTORY:
         raise ValueError(
-            f"no arm with dry friction explains these logs: parts of them differ {spread:.3g} times as much as "
-            f"their noise (at most {_CONTRADICTORY:g}); look for what changes between or within them (position, "
-            "load, temperature), or use response = 'as recorded'"
+            f"no arm with dry friction explains these logs: parts of them differ {spread:.3g} times as much "
+            f"as their noise (at most {_CONTRADICTORY:g}); look for what changes between or within them "
+            "(position, load, temperature), or use response = 'as recorded'"
         )
     return replace(found, covariance_factor=np.sqrt(spread) * found.covariance_factor)
 
