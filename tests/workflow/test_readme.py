@@ -20,6 +20,7 @@ from plant import linear_arm
 from plant.presets import paper_link
 from tests.golden import margins
 from tests.workflow.command import ROOT
+from workflow.config.run_config import load_config
 from workflow.tasks.exports import read_model
 
 README, COMMANDS_PAGE, MAKEFILE = (
@@ -39,7 +40,8 @@ TRUE_HZ = sorted(abs(pole) / (2 * np.pi) for pole in linear_arm(paper_link()).po
 
 def test_the_readme_has_the_commands_that_are_tested():
     names = [command[0] for command in COMMANDS]
-    assert names == ["simulate", "look", "identify", "excite", "run", "study", "diagnose", "blind", "paper"]
+    first = ["simulate", "look", "init", "identify", "excite"]
+    assert names == [*first, "run", "study", "diagnose", "blind", "paper"]
     of_readme = commands_of(README, r"\.venv/bin/flexlink")
     assert [command[0] for command in of_readme] == ["simulate", "run", "diagnose", "paper"]
     assert all(command in COMMANDS for command in of_readme)
@@ -90,6 +92,8 @@ def test_commands_of_the_readme_give_the_right_answer(call):
     assert len(found) == 2
     assert read_model(Path("hub.mat")).model.output_name == "hub_angle_rad"
     assert Path("hub.html").is_file()
+    drafted = call("init")
+    assert load_config(Path("my.toml"))[0].control_channel.output == "hub_angle_rad", drafted
     call("excite")
     planned = [np.loadtxt(path, delimiter=",", skiprows=1) for path in sorted(glob.glob("voltages/*.csv"))]
     assert len(planned) == 8
