@@ -16,6 +16,8 @@ import pytest
 
 from workflow.config.run_config import RunConfig, load_config
 from workflow.config.settings import check
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.results import RunResults
 
 DT_S, STEPS = 0.002, 20
 MOTOR, LOAD, SPRING, DAMPER, VISCOUS, COULOMB = 0.002, 0.004, 4.0, 0.004, 0.01, 0.03
@@ -260,6 +262,24 @@ def test_the_reported_log(flexlink, tmp_path):
     config = load_config(out)[0]
     assert config.source.references == ("ref_rad",)
     assert config.closed_loop.measurement_step == pytest.approx(2 * np.pi / 16384, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_the_reported_log_becomes_a_controller_without_an_edit(flexlink, tmp_path):
+    if not REPORTED.is_dir():
+        pytest.skip("the reported logs are not there: shared/reported/closed_loop_friction")
+    logs = [REPORTED / f"run{k}.csv.gz" for k in (1, 3, 4, 2)]
+    assert flexlink("init", *logs, "--out", tmp_path / "my.toml").code == 0
+    answer = flexlink("run", "--config", tmp_path / "my.toml", "--out", tmp_path / "out", "--json")
+    assert answer.code == 0
+    assert answer.document()["certified"]
+    results = RunResults(RunDirectory.open(tmp_path / "out"))
+    friction, (channel,) = results.identify.friction, results.uncertainty.channels
+    assert friction.level == pytest.approx(0.05, rel=0.01)
+    (mode,) = channel.intervals.modes
+    # The README states four digits.
+    assert mode.frequency_Hz[0] - 5e-4 < 9.353 < mode.frequency_Hz[1] + 5e-4
+    assert mode.damping[0] - 5e-5 < 0.0496 < mode.damping[1] + 5e-5
 
 
 def test_a_reference_planned_for_the_loop_keeps_its_limits_on_the_machine(flexlink, tmp_path, signals):
