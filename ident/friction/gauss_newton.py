@@ -200,8 +200,11 @@ def equations(found: FrictionFit, records: Sequence[Record]) -> tuple[list[RealA
 
 
 def driven_by_law(found: FrictionFit, record: Record) -> RealArray:
-    """(T, Q) derivatives of the arm's position with respect to the parameters of the law, and to the bias of
-    an integrating arm, where an observer tells the friction of a record."""
+    """(T, Q) derivatives of the arm's position with respect to the parameters of the law, to the bias of an
+    integrating arm and to the level beyond a spring, where an observer tells the friction of a record.
+
+    Of an unstable arm those of its stabilised position (`ident.basis.structure.stabilised`).
+    """
     arm = replace(found.model.stable_part, input_delay_samples=0)
     friction, parameters = found.motion(record)[1], parameters_of(found.law)
     columns = []
