@@ -26,7 +26,9 @@ from diagnosis.evidence.confirmation import confronted
 from diagnosis.evidence.hypotheses import DISAGREEMENT, Hypothesis, Probabilities, probabilities
 from diagnosis.evidence.look_alikes import look_alikes
 from diagnosis.evidence.search import Progress, search
-from diagnosis.fit.fit import Fit, fit, parameter_intervals
+from diagnosis.fit.coordinates import parameter_intervals
+from diagnosis.fit.descent import Descent, descend
+from diagnosis.fit.levels import quietest
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.imperfect.answered import (
     beside_imperfections,
@@ -35,7 +37,6 @@ from diagnosis.imperfect.answered import (
     reaches_noise,
     searched,
 )
-from diagnosis.imperfect.levels import quietest
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine
 from diagnosis.machine.own_plant import PlantCase
@@ -57,7 +58,7 @@ _TOO_LOUD, _LEAST = 0.5, 1e-3
 _MOST_COMPETING = 3
 # Difference of the cost that the records do not tell apart (chi-square, 95 %, two parameters).
 _AS_GOOD = 6.0
-_LAST_ITERATIONS = 30
+_LAST_ITERATIONS, _LAST_TOLERANCE = 40, 0.01
 _DRAWS = 4000
 
 
@@ -210,14 +211,24 @@ def _accepted(hypotheses: Sequence[Hypothesis], answer: str) -> Hypothesis:
     return max((h for h in hypotheses if h.names[:1] == names), key=lambda h: h.log_weight)
 
 
-def _refined(model: ResidualModel, end: Fit) -> Fit:
+def _refined(model: ResidualModel, end: Descent) -> Descent:
     if not end.candidates and not end.deviations.size:
         return end
-    last = fit(model, end.candidates, end.coordinates, end.deviations, iterations=_LAST_ITERATIONS)
-    return last if last.cost <= end.cost else end
+    last = descend(
+        model,
+        end.candidates,
+        end.deviations,
+        end.coordinates,
+        model.start,
+        iterations=_LAST_ITERATIONS,
+        tolerance=_LAST_TOLERANCE,
+    )
+    return last if last.loss <= end.loss else end
 
 
-def _detail(verdict: Verdict, weighed: Probabilities, competing: Sequence[str], last: Fit) -> DetailVerdict:
+def _detail(
+    verdict: Verdict, weighed: Probabilities, competing: Sequence[str], last: Descent
+) -> DetailVerdict:
     if not last.converged:
         return "not_converged"
     if verdict == "unknown":
@@ -258,14 +269,14 @@ def _named(
     hypotheses: Sequence[Hypothesis],
     weighed: Probabilities,
     together: Sequence[str],
-    last: Fit,
+    last: Descent,
     rounding: Rounding | None,
     rng: np.random.Generator,
 ) -> tuple[NamedEffect, ...]:
     case = model.case
     samples = float(np.mean([len(record.output) for record in case.estimation]))
 
-    def gap_of(end: Fit) -> float:
+    def gap_of(end: Descent) -> float:
         return held_out_gap(case, model.by_experiment(end.deviations, end.effects, case.held_out))
 
     entries = []
@@ -277,7 +288,7 @@ def _named(
         if holding:
             end = last if name in last.names else max(holding, key=lambda h: h.log_weight).fit
             k = end.names.index(name)
-            parameters = end.candidates[k].parameters(end.coordinates[k])
+            parameters = end.candidates[k].parameters(end.coordinates_of(k))
             intervals = _intervals(end, k, samples, rng)
             gap = gap_of(end)
         elif rounding is not None and name == rounding.name:
@@ -294,7 +305,7 @@ def _named(
 
 
 def _intervals(
-    end: Fit, k: int, samples_per_record: float, rng: np.random.Generator
+    end: Descent, k: int, samples_per_record: float, rng: np.random.Generator
 ) -> dict[str, tuple[float, float]]:
     """95 % intervals of the parameters of the k-th candidate, from Gaussian draws of its coordinates.
 
@@ -304,12 +315,14 @@ def _intervals(
     at = end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])
     rows = slice(at, at + len(candidate.axes))
     covariance = (
-        end.covariance()[rows, rows] * max(1.0, end.rms**2) * _solver_variance(end, samples_per_record)
+        np.asarray(np.linalg.pinv(end.hessian, hermitian=True), dtype=np.float64)[rows, rows]
+        * max(1.0, end.rms**2)
+        * _solver_variance(end, samples_per_record)
     )
-    return parameter_intervals(candidate, end.coordinates[k], covariance, rng, _DRAWS)
+    return parameter_intervals(candidate, end.coordinates_of(k), covariance, rng, _DRAWS)
 
 
-def _solver_variance(end: Fit, samples_per_record: float) -> float:
+def _solver_variance(end: Descent, samples_per_record: float) -> float:
     """Variance of fitted values in units of what white noise gives, where contacts switch.
 
     Two correct solvers of backlash drift apart once a contact falls differently, and stay apart to the end of

@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diagnosis.evidence.hypotheses import STILL_POSSIBLE, Hypothesis, disagreement_gain
+from diagnosis.fit.coordinates import box, effects_at, quotients
+from diagnosis.fit.descent import Descent, steps_of
 from diagnosis.fit.discrepancy import Discrepancy, discrepancy
-from diagnosis.fit.fit import Fit, box, difference_quotients
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import solver_spread, without_drift
 from diagnosis.machine.machine_protocol import Real
@@ -95,10 +96,10 @@ class _Prediction:
         return self.log_density + self.allowed_gain
 
 
-def _prediction(model: ResidualModel, end: Fit) -> _Prediction:
+def _prediction(model: ResidualModel, end: Descent) -> _Prediction:
     case = model.case
     outputs = case.noise.size
-    fitted, _ = without_drift(end.residuals, solver_spread(model, end))
+    fitted, _ = without_drift(end.left, solver_spread(model, end))
     e, log_density = _unpredicted(model, end)
     segments = [len(record.output) for record in case.estimation]
     both = [*segments, *(len(record.output) for record in case.held_out)]
@@ -108,11 +109,11 @@ def _prediction(model: ResidualModel, end: Fit) -> _Prediction:
     return _Prediction(log_density, allowed, _odds(end, after) - _odds(end, before))
 
 
-def _odds(end: Fit, left: Discrepancy) -> float:
+def _odds(end: Descent, left: Discrepancy) -> float:
     return left.log_gain_some - disagreement_gain(end, left)
 
 
-def _unpredicted(model: ResidualModel, end: Fit) -> tuple[Real, float]:
+def _unpredicted(model: ResidualModel, end: Descent) -> tuple[Real, float]:
     """Held-out residuals (N,) without what the fitted values' uncertainty may do to them; log density.
 
     The most probable shift of the values given both kinds of records, linearised at the fit. Where contacts
@@ -122,7 +123,24 @@ def _unpredicted(model: ResidualModel, end: Fit) -> tuple[Real, float]:
     e = model.of(end.deviations, end.effects, case.held_out)
     if not end.jacobian.shape[1]:
         return e, -0.5 * float(e @ e)
-    J = difference_quotients(model, end, e, case.held_out)
+    at, held, by = end.coordinates, case.held_out, steps_of(end.candidates)
+    J = np.hstack(
+        [
+            quotients(
+                lambda d: model.of(d, end.effects, held),
+                end.deviations,
+                e,
+                np.full(end.deviations.size, by[0]),
+            ),
+            quotients(
+                lambda x: model.of(end.deviations, effects_at(end.candidates, x), held),
+                at,
+                e,
+                by[1],
+                box(end.candidates)[1],
+            ),
+        ]
+    )
     spread = solver_spread(model, end, case.held_out)
     narrow, drift = without_drift(e, spread)
     density = drift.log_gain + 0.5 * float(narrow @ narrow - e @ e)
@@ -144,9 +162,9 @@ def _unpredicted(model: ResidualModel, end: Fit) -> tuple[Real, float]:
     return np.asarray(e + J @ step), density - 0.5 * (cost + float(determinants))
 
 
-def _inside(end: Fit, step: Real) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _inside(end: Descent, step: Real) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Which of (d, x) stay in their ranges after a step (P + A,)."""
     P = end.deviations.size
-    x = np.concatenate([np.zeros(0), *end.coordinates]) + step[P:]
+    x = end.coordinates + step[P:]
     low, high = box(end.candidates)
     return np.concatenate([np.ones(P, dtype=bool), (low <= x) & (x <= high)])

@@ -11,9 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import log_ndtr
 
+from diagnosis.fit.descent import Descent
 from diagnosis.fit.discrepancy import Discrepancy
-from diagnosis.fit.fit import Fit, log_evidence
 from diagnosis.fit.solver_spread import NO_DRIFT, Drift
 from plant.effects import EFFECTS
 
@@ -50,11 +51,13 @@ class Hypothesis:
     log_weight : exactly these effects, with the disagreement their solvers are allowed; -inf for a cause
         beyond the list, which is no answer by itself but part of what is unknown.
     unknown_weight : these effects, none of them perhaps, and something else that no effect describes.
+    listed : effects that are looked for.
     """
 
-    fit: Fit
+    fit: Descent
     log_weight: float
     unknown_weight: float
+    listed: tuple[str, ...] = tuple(EFFECTS)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -75,19 +78,25 @@ class Hypothesis:
         return self.log_weight if self.is_answer else self.unknown_weight
 
     @classmethod
-    def of(cls, fit: Fit, left: Discrepancy, drift: Drift = NO_DRIFT) -> Hypothesis:
+    def of(
+        cls,
+        fit: Descent,
+        left: Discrepancy,
+        drift: Drift = NO_DRIFT,
+        listed: tuple[str, ...] = tuple(EFFECTS),
+    ) -> Hypothesis:
         """left: what the fit leaves over, of residuals without the drift of correct solvers."""
         beside = len(fit.names) - 1
         allowed = BESIDE_NON_SMOOTH * beside if fit.non_smooth else 0.0
         further = sum(len(candidate.axes) - 1 for candidate in fit.candidates)
-        prior = log_prior(fit.names, len(fit.weighing.listed)) - _PER_PARAMETER * further
+        prior = log_prior(fit.names, len(listed)) - _PER_PARAMETER * further
         evidence = log_evidence(fit) + drift.log_gain
         exactly = evidence + disagreement_gain(fit, left) + prior - allowed
         besides = evidence + left.log_gain_some + prior - allowed + _UNKNOWN_BESIDE
-        if any(c.at_edge(x) for c, x in zip(fit.candidates, fit.coordinates, strict=True)):
+        if any(c.at_edge(fit.coordinates_of(k)) for k, c in enumerate(fit.candidates)):
             # Something is described well, but not by what the effect is.
-            return cls(fit, exactly - _AT_EDGE, max(besides, exactly + _UNKNOWN_BESIDE))
-        return cls(fit, exactly, besides)
+            return cls(fit, exactly - _AT_EDGE, max(besides, exactly + _UNKNOWN_BESIDE), listed)
+        return cls(fit, exactly, besides, listed)
 
 
 def log_prior(names: Sequence[str], n: int | None = None) -> float:
@@ -100,7 +109,7 @@ def log_prior(names: Sequence[str], n: int | None = None) -> float:
     return float(np.log(_PRIOR_COUNT.get(count, 1e-3)) - np.log(sets))
 
 
-def disagreement_gain(fit: Fit, left: Discrepancy) -> float:
+def disagreement_gain(fit: Descent, left: Discrepancy) -> float:
     """log evidence gained by the disagreement that two correct solvers of these effects may have.
 
     Its size has a half-normal prior, cut off beyond three deviations: more than that is no disagreement.
@@ -170,7 +179,7 @@ def probabilities(hypotheses: Sequence[Hypothesis]) -> Probabilities:
     weight = np.exp(logs - np.max(logs))
     weight /= weight.sum()
     sets = {key: float(p) for key, p in zip(keys, weight, strict=True)}
-    listed = hypotheses[0].fit.weighing.listed
+    listed = hypotheses[0].listed
     cause = {"none": sets.get((), 0.0), **dict.fromkeys(listed, 0.0), "unknown": sets[_UNKNOWN]}
     presence = dict.fromkeys(listed, 0.0)
     for key, hypothesis in best.items():
@@ -179,3 +188,50 @@ def probabilities(hypotheses: Sequence[Hypothesis]) -> Probabilities:
         for name in key:
             presence[name] += sets[key]
     return Probabilities(cause, sets, presence)
+
+
+def log_evidence(fit: Descent) -> float:
+    """log of the integral of exp(-(|e|^2 + |d|^2)/2) over d (standard normal) and x (`Axis.log_density`).
+
+    Laplace's approximation, cut off at the boxes: along every coordinate that ends at or near a bound, the
+    Gaussian (or the slope down from the bound) is integrated over the inside only, given the others at their
+    best. Constants common to all hypotheses of a case are left out.
+    """
+    P = fit.deviations.size
+    H = fit.hessian
+    scale = np.sqrt(np.maximum(np.diag(H), 1e-12))
+    scaled = H / np.outer(scale, scale) + 1e-10 * np.eye(scale.size)
+    _, logdet = np.linalg.slogdet(scaled)
+    logdet += 2 * float(np.sum(np.log(scale)))
+    A = H.shape[0] - P
+    value = -0.5 * fit.cost - 0.5 * logdet + 0.5 * A * np.log(2 * np.pi)
+    if not A:
+        return float(value)
+    # Of the same matrix as the determinant: a coordinate that nothing depends on integrates to its range.
+    spread = (np.sqrt(np.diag(np.linalg.inv(scaled))) / scale)[P:]
+    gradient = (fit.jacobian.T @ fit.left)[P:]
+    at = 0
+    for k, candidate in enumerate(fit.candidates):
+        x = fit.coordinates_of(k)
+        value += candidate.log_density(x)
+        low, high = candidate.box
+        for i in range(x.size):
+            value += _inside(x[i], gradient[at], spread[at], low[i], high[i])
+            at += 1
+    return float(value)
+
+
+def _inside(x: float, slope: float, spread: float, low: float, high: float) -> float:
+    """log of the integral of exp(-slope t - t^2/(2 spread^2)) inside the box, over spread sqrt(2 pi)."""
+    if not np.isfinite(low):
+        return min(0.0, float(np.log(2 * np.pi / (spread * np.sqrt(2 * np.pi)))))
+    # Complete the square only where a bound holds the coordinate; elsewhere the slope is rounding, or a jump.
+    held = (x <= low and slope > 0) or (x >= high and slope < 0)
+    centre = x - slope * spread**2 if held else x
+    shift = 0.5 * (slope * spread) ** 2 if held else 0.0
+    a, b = (low - centre) / spread, (high - centre) / spread
+    # log(Phi(b) - Phi(a)), from the tail that keeps digits.
+    if a > 0:
+        a, b = -b, -a
+    upper, lower = log_ndtr(b), log_ndtr(a)
+    return float(shift + upper + np.log1p(-np.exp(min(lower - upper, -1e-300))))

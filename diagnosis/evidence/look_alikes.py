@@ -12,19 +12,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from diagnosis.evidence.hypotheses import PRIOR_UNKNOWN, STILL_POSSIBLE, Hypothesis, log_prior
-from diagnosis.evidence.screening import Screening
-from diagnosis.evidence.search import weighed
-from diagnosis.fit.fit import Fit, fit
+from diagnosis.evidence.search import fitted_to, weighed
+from diagnosis.fit.descent import Descent, best_following
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.machine.case import Case
 from plant.effects import LOOK_ALIKES, Effect
 
 # Of unknown causes this share is a look-alike of an effect: a third as probable as the effect itself.
 _SHARE = 0.06
-_ITERATIONS = 15
 
 
-def look_alikes(model: ResidualModel, hypotheses: Sequence[Hypothesis], base: Fit) -> tuple[Hypothesis, ...]:
+def look_alikes(
+    model: ResidualModel, hypotheses: Sequence[Hypothesis], base: Descent
+) -> tuple[Hypothesis, ...]:
     """Hypotheses with a look-alike in place of an effect, wherever that effect may be an answer.
 
     They are no answers themselves (their log weight is -inf) but part of what is unknown. Only a flexible
@@ -45,19 +45,15 @@ def look_alikes(model: ResidualModel, hypotheses: Sequence[Hypothesis], base: Fi
     return tuple(found)
 
 
-def _with(model: ResidualModel, end: Fit, name: str, kind: type[Effect]) -> Fit:
+def _with(model: ResidualModel, end: Descent, name: str, kind: type[Effect]) -> Descent:
     """The fit with the look-alike in place of the effect of this name, from the best of its starts."""
     k = end.names.index(name)
     other = kind.in_place_of(
-        end.candidates[k], end.coordinates[k], model.nominal.at(end.deviations).description
+        end.candidates[k], end.coordinates_of(k), model.nominal.at(end.deviations).description
     )
-    screening, trials = Screening(model, end), []
-    for start in other.starts:
-        x = (*end.coordinates[:k], np.array(start), *end.coordinates[k + 1 :])
-        effects = list(end.effects)
-        effects[k] = other.effect_at(x[k])
-        cost, step = screening.follow(model.of(end.deviations, effects))
-        trials.append((cost, end.deviations + step, x))
-    _, deviations, x = min(trials, key=lambda trial: trial[0])
+    first = sum(len(c.axes) for c in end.candidates[:k])
+    rest = end.coordinates[:first], end.coordinates[first + len(end.candidates[k].axes) :]
     candidates = (*end.candidates[:k], other, *end.candidates[k + 1 :])
-    return fit(model, candidates, x, model.nominal.within(deviations), iterations=_ITERATIONS)
+    trials = [np.concatenate([rest[0], start, rest[1]]) for start in other.starts]
+    _, deviations, x = best_following(model, end, candidates, trials)
+    return fitted_to(model, candidates, x, deviations)

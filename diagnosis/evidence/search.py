@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from diagnosis.evidence.hypotheses import BESIDE_NON_SMOOTH, DISAGREEMENT, Hypothesis
-from diagnosis.evidence.screening import Screening, Start, smallest_size
+from diagnosis.fit.coordinates import effects_at, non_smooth
+from diagnosis.fit.descent import Descent, descend, loss_at, refined
 from diagnosis.fit.discrepancy import discrepancy
-from diagnosis.fit.fit import Fit, cost_at, fit, non_smooth, refined
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
+from diagnosis.fit.starts import Point, beside, point_at, points_of, superposed
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from plant.effects import Effect
 from plant.effects.search_space import Candidate
@@ -29,7 +30,7 @@ _CLOSE = 60.0
 _LEAST_GAIN = 10.0
 # The same before a fit, by its linear estimate, which is a little low.
 _PROMISE = 5.0
-_ROUGH_ITERATIONS, _FINE_ITERATIONS = 8, 15
+_ROUGH_ITERATIONS, _FINE_ITERATIONS, _FINE_TOLERANCE = 8, 40, 0.02
 _MOST_EFFECTS = 3
 # Where two effects leave more than this share of the gap, a third would only follow something unknown.
 _HOPELESS = 0.1
@@ -51,7 +52,7 @@ _NEAR, _NEAR_FLOOR = 0.25, 0.3
 class Search:
     """Everything that was fitted: the nominal alone, then every hypothesis, most probable first."""
 
-    base: Fit
+    base: Descent
     hypotheses: tuple[Hypothesis, ...]
     simulations: int
 
@@ -64,21 +65,20 @@ def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
     """Fit the nominal, every effect alone, and sets of effects as long as they gain."""
     report = progress or (lambda fraction, message: None)
     model = ResidualModel(case)
-    base = fit(model, (), (), np.zeros(model.nominal.count))
-    screening = Screening(model, base)
-    N = base.residuals.size
+    base = fitted_to(model, (), np.zeros(0), np.zeros(model.nominal.count))
+    N = base.left.size
     first: list[_Trial] = []
-    listed: list[tuple[Candidate, list[Start]]] = []
+    listed: list[tuple[Candidate, list[Point]]] = []
     spaces = case.machine.candidates(case.experiments)
     for k, candidate in enumerate(spaces):
         report(0.05 + 0.3 * k / len(spaces), f"looking at {candidate.effect}")
-        starts = screening.starts(candidate)
+        starts = points_of(model, base, candidate)
         alone = smallest_size(candidate, starts, SMALLEST_SIZE_RATIO) if starts else None
         beside = smallest_size(candidate, starts, SMALLEST_SIZE_BESIDE) if starts else None
         if alone is None or beside is None:
             continue
         if candidate.dependence == "non-smooth" and starts[0].cost - N < 0.5 * (base.cost - N):
-            starts = screening.zoomed(candidate, starts)
+            starts = zoomed(model, base, candidate, starts)
         first.append(_Trial(base, candidate.from_size(alone), starts))
         listed.append((candidate.from_size(beside), starts))
     first += _pulled(model, base, [trial.candidate for trial in first])
@@ -92,7 +92,7 @@ def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
         hopeless = _beyond_noise(parents[0]) > _HOPELESS * _beyond_noise(base)
         if count > 1 and (hopeless or _as_solvers_differ(model, parents[0])):
             break
-        further = _further(screening, parents, listed, explained=_explained(found))
+        further = _further(model, parents, listed, explained=_explained(found))
         found += _fitted(model, base, further, _part(report, 0.6 + 0.1 * count, 0.1))
         found += _reduced(model, base, found, [candidate for candidate, _ in listed])
     found.sort(key=lambda h: -h.log_weight)
@@ -104,9 +104,9 @@ def search(case: CaseOfMachine, progress: Progress | None = None) -> Search:
 class _Trial:
     """One effect more than a fit holds."""
 
-    around: Fit
+    around: Descent
     candidate: Candidate
-    starts: list[Start]
+    starts: list[Point]
 
     @property
     def effects(self) -> frozenset[str]:
@@ -118,7 +118,7 @@ def _explained(found: Sequence[Hypothesis]) -> bool:
     return max(h.log_weight for h in found) >= max(h.unknown_weight for h in found)
 
 
-def _parents(found: Sequence[Hypothesis], count: int) -> list[Fit]:
+def _parents(found: Sequence[Hypothesis], count: int) -> list[Descent]:
     """Sets of so many effects to which one more is added, best first.
 
     The best one as soon as a set explains everything. Before, what is left over says little about which
@@ -128,7 +128,7 @@ def _parents(found: Sequence[Hypothesis], count: int) -> list[Fit]:
     if _explained(found):
         best = max(found, key=lambda h: h.log_weight)
         return [best.fit] if len(best.names) == count else []
-    parents: dict[frozenset[str], Fit] = {}
+    parents: dict[frozenset[str], Descent] = {}
     for h in sorted(found, key=lambda h: -h.unknown_weight):
         if len(h.names) == count:
             parents.setdefault(frozenset(h.names), h.fit)
@@ -136,24 +136,21 @@ def _parents(found: Sequence[Hypothesis], count: int) -> list[Fit]:
 
 
 def _further(
-    screening: Screening,
-    parents: Sequence[Fit],
-    listed: Sequence[tuple[Candidate, list[Start]]],
+    model: ResidualModel,
+    parents: Sequence[Descent],
+    listed: Sequence[tuple[Candidate, list[Point]]],
     *,
     explained: bool,
 ) -> list[_Trial]:
     """The most promising effects beside the parents, every set and side of an effect once."""
-    model = screening.model
     trials = []
     for parent in parents:
-        anew = Screening(model, parent)
         for candidate, starts in listed:
             if candidate.effect not in parent.names:
                 # Phases and amplitudes found without the parent are of no use beside it.
-                beside = (
-                    anew.starts(candidate) if candidate.kind.harmonic else screening.beside(parent, starts)
-                )
-                trials.append(_Trial(parent, candidate, beside))
+                anew = candidate.kind.harmonic is not None
+                near = points_of(model, parent, candidate) if anew else superposed(model, parent, starts)
+                trials.append(_Trial(parent, candidate, near))
     chosen: dict[tuple[frozenset[str], int], _Trial] = {}
     for trial in sorted(trials, key=lambda trial: trial.starts[0].cost):
         chosen.setdefault((trial.effects, trial.candidate.sign), trial)
@@ -162,15 +159,15 @@ def _further(
         # Nothing is left over; what linear estimates do not even promise is not fitted.
         promising = [t for t in promising if t.around.cost - t.starts[0].cost > _least_promise(t.around)]
     pulled = [p for parent in parents for p in _pulled(model, parent, [candidate for candidate, _ in listed])]
-    return [_simulated(screening, trial) for trial in promising] + pulled
+    return [_simulated(model, trial) for trial in promising] + pulled
 
 
-def _least_promise(parent: Fit) -> float:
+def _least_promise(parent: Descent) -> float:
     """Beside backlash a further effect has to gain more (in log weight; half of that in linear estimates)."""
     return _PROMISE + (BESIDE_NON_SMOOTH if parent.non_smooth else 0.0)
 
 
-def _pulled(model: ResidualModel, parent: Fit, listed: Sequence[Candidate]) -> list[_Trial]:
+def _pulled(model: ResidualModel, parent: Descent, listed: Sequence[Candidate]) -> list[_Trial]:
     """Effects that multiply a nominal parameter, in place of that value pulled beyond belief."""
     trials = []
     factors = model.nominal.factors(parent.deviations)
@@ -180,9 +177,7 @@ def _pulled(model: ResidualModel, parent: Fit, listed: Sequence[Candidate]) -> l
             continue
         d = parent.deviations.copy()
         d[k] = 0.0
-        trials.append(
-            _Trial(parent, found[0], [Start(parent.cost, found[1], d, 1.0, np.zeros(1, np.float32))])
-        )
+        trials.append(_Trial(parent, found[0], [Point(parent.loss, found[1], d, model.start)]))
     return trials
 
 
@@ -195,55 +190,58 @@ def in_place_of(key: str, factor: float, listed: Sequence[Candidate]) -> tuple[C
     return None
 
 
-def _simulated(screening: Screening, trial: _Trial) -> _Trial:
+def _simulated(model: ResidualModel, trial: _Trial) -> _Trial:
     """The trial with its best starts judged by simulation."""
     if trial.candidate.kind.harmonic:
         return trial
     best = trial.starts[: _NON_SMOOTH_TO_SIMULATE if non_smooth([trial.candidate]) else _STARTS_TO_SIMULATE]
-    starts = screening.simulated_beside(trial.around, trial.candidate, best)
+    starts = beside(model, trial.around, trial.candidate, best)
     return replace(trial, starts=starts) if starts else trial
 
 
-def _beyond_noise(end: Fit) -> float:
+def _beyond_noise(end: Descent) -> float:
     return max(end.rms**2 - 1.0, 0.0)
 
 
-def _as_solvers_differ(model: ResidualModel, end: Fit) -> bool:
+def _as_solvers_differ(model: ResidualModel, end: Descent) -> bool:
     """Whether backlash is in the set and what is left is no more than correct solvers of it may differ by."""
     if not end.non_smooth:
         return False
-    e, drift = without_drift(end.residuals, solver_spread(model, end))
+    e, drift = without_drift(end.left, solver_spread(model, end))
     return float(np.mean(e**2)) - 1.0 < max(DISAGREEMENT["non-smooth"], drift.size) ** 2
 
 
-def weighed(model: ResidualModel, end: Fit, base: Fit) -> Hypothesis:
+def weighed(model: ResidualModel, end: Descent, base: Descent) -> Hypothesis:
     """A fit with its log weights; base: the fit without any effect."""
     segments = [len(experiment.output) for experiment in model.case.estimation]
-    e, drift = end.residuals, NO_DRIFT
+    e, drift = end.left, NO_DRIFT
     if _near(end, base):
         e, drift = without_drift(e, solver_spread(model, end))
-    return Hypothesis.of(end, discrepancy(e, segments, model.case.noise.size), drift)
+    left = discrepancy(e, segments, model.case.noise.size)
+    return Hypothesis.of(end, left, drift, model.case.machine.weighing.listed)
 
 
 def _part(report: Progress, begin: float, share: float) -> Progress:
     return lambda fraction, message: report(begin + share * fraction, message)
 
 
-def _fitted(model: ResidualModel, base: Fit, trials: Sequence[_Trial], report: Progress) -> list[Hypothesis]:
+def _fitted(
+    model: ResidualModel, base: Descent, trials: Sequence[_Trial], report: Progress
+) -> list[Hypothesis]:
     """Hypotheses with one effect more: rough fits of all, the best finished."""
-    rough: list[tuple[Fit, Fit]] = []
+    rough: list[tuple[Descent, Descent]] = []
     for k, trial in enumerate(trials):
         around, candidate = trial.around, trial.candidate
         report(0.6 * k / len(trials), f"fitting {candidate.effect}")
         ends = [
-            fit(
+            descend(
                 model,
                 (*around.candidates, candidate),
-                (*around.coordinates, start.coordinates),
                 model.nominal.within(start.deviations),
+                np.concatenate([around.coordinates, start.coordinates]),
+                model.start,
                 nominal_jacobian=around.jacobian[:, : around.deviations.size],
                 iterations=_ROUGH_ITERATIONS,
-                tolerance=0.5,
             )
             for start in _apart(trial.starts, around.cost, most=4 if candidate.dependence == "smooth" else 2)
         ]
@@ -261,30 +259,58 @@ def _fitted(model: ResidualModel, base: Fit, trials: Sequence[_Trial], report: P
         # A backlash that only looks like something else takes as long as everything besides.
         costly = item.non_smooth and not _near(item, base)
         if (promising or k < (1 if around.candidates else 3)) and (k == 0 or not costly):
-            fine = fit(model, item.candidates, item.coordinates, item.deviations, iterations=_FINE_ITERATIONS)
+            fine = fitted_to(model, item.candidates, item.coordinates, item.deviations)
             item = _refined(model, fine if fine.cost <= item.cost else item, base)
         finished.append(weighed(model, item, base))
     return finished
 
 
-def _refined(model: ResidualModel, end: Fit, base: Fit) -> Fit:
+def fitted_to(
+    model: ResidualModel, candidates: Sequence[Candidate], coordinates: Real, deviations: Real
+) -> Descent:
+    """To its end."""
+    return descend(
+        model,
+        candidates,
+        deviations,
+        coordinates,
+        model.start,
+        iterations=_FINE_ITERATIONS,
+        tolerance=_FINE_TOLERANCE,
+    )
+
+
+def zoomed(model: ResidualModel, around: Descent, candidate: Candidate, starts: list[Point]) -> list[Point]:
+    """Two finer grids around the best points of a non-smooth cost, one size coordinate; best first."""
+    found = list(starts)
+    for points, reach in ((24, 0.25), (16, 0.02)):
+        centre = min(found, key=lambda start: start.loss).coordinates
+        for shift in np.linspace(-reach, reach, points):
+            x = np.clip(centre + np.concatenate([[shift], np.zeros(centre.size - 1)]), *candidate.box)
+            start = point_at(model, around, candidate, x, model.start)
+            if start is not None:
+                found.append(start)
+    return sorted(found, key=lambda start: start.loss)
+
+
+def _refined(model: ResidualModel, end: Descent, base: Descent) -> Descent:
     """`refined` where backlash or the like may be the answer; beside much of a gap jumps do not matter."""
     return refined(model, end) if _near(end, base) else end
 
 
-def _near(end: Fit, base: Fit) -> bool:
+def _near(end: Descent, base: Descent) -> bool:
     return _beyond_noise(end) < max(_NEAR * _beyond_noise(base), _NEAR_FLOOR)
 
 
 def _reduced(
-    model: ResidualModel, base: Fit, found: Sequence[Hypothesis], listed: Sequence[Candidate]
+    model: ResidualModel, base: Descent, found: Sequence[Hypothesis], listed: Sequence[Candidate]
 ) -> list[Hypothesis]:
     """The best sets of effects made simpler, fitted from where the set has ended.
 
     A set often finds its way where a member alone has stuck; what it found there is no merit of the further
     effect, so the simpler set is given the same start.
     """
-    known: dict[tuple[str, ...], Fit] = {}
+    known: dict[tuple[str, ...], Descent] = {}
     for hypothesis in found:
         key = tuple(sorted(hypothesis.names))
         if key not in known or hypothesis.fit.cost < known[key].cost:
@@ -296,29 +322,30 @@ def _reduced(
             continue
         for rest, x in _simpler(whole, listed) if len(whole.candidates) > 1 else ():
             before = known.get(tuple(sorted(c.effect for c in rest)))
-            start = cost_at(model, rest, x, whole.deviations)
+            e = model.of(whole.deviations, effects_at(rest, x))
+            start = 2 * loss_at(model, e, whole.deviations, model.start)[0]
             # From one contact sequence to the next the cost jumps: there a bad start says nothing.
             if before is not None and start > before.cost + _CLOSE and not non_smooth(rest):
                 continue
-            end = _refined(model, fit(model, rest, x, whole.deviations, iterations=_FINE_ITERATIONS), base)
+            end = _refined(model, fitted_to(model, rest, x, whole.deviations), base)
             if before is None or end.cost < before.cost:
                 tried.append(weighed(model, end, base))
     return tried
 
 
-def _simpler(
-    whole: Fit, listed: Sequence[Candidate]
-) -> Iterator[tuple[tuple[Candidate, ...], tuple[Real, ...]]]:
+def _simpler(whole: Descent, listed: Sequence[Candidate]) -> Iterator[tuple[tuple[Candidate, ...], Real]]:
     """Candidates and coordinates with one member left out, or with Coulomb friction for Stribeck's."""
-    for k, (candidate, x) in enumerate(zip(whole.candidates, whole.coordinates, strict=True)):
+    for k, candidate in enumerate(whole.candidates):
         before, after = slice(None, k), slice(k + 1, None)
-        others = whole.candidates[before] + whole.candidates[after]
-        yield others, whole.coordinates[before] + whole.coordinates[after]
+        others, x = whole.candidates[before] + whole.candidates[after], whole.coordinates_of(k)
+        first = sum(len(c.axes) for c in whole.candidates[before])
+        begin, end = whole.coordinates[:first], whole.coordinates[first + x.size :]
+        yield others, np.concatenate([begin, end])
         simple = _without_extras(candidate.effect_at(x), listed)
         if simple is not None and simple[0].effect not in {c.effect for c in others}:
             yield (
                 (*whole.candidates[before], simple[0], *whole.candidates[after]),
-                (*whole.coordinates[before], simple[1], *whole.coordinates[after]),
+                np.concatenate([begin, simple[1], end]),
             )
 
 
@@ -332,7 +359,7 @@ def _without_extras(effect: Any, listed: Sequence[Candidate]) -> tuple[Candidate
     return None
 
 
-def _apart(starts: list[Start], without: float, *, most: int) -> list[Start]:
+def _apart(starts: list[Point], without: float, *, most: int) -> list[Point]:
     """The best start, and others that are elsewhere and not much worse."""
     best = starts[0]
     enough = best.cost + 0.5 * abs(without - best.cost) + 20
@@ -347,3 +374,33 @@ def _apart(starts: list[Start], without: float, *, most: int) -> list[Start]:
 
 def _distance(a: Real, b: Real) -> float:
     return float(np.max(np.abs(a - b)))
+
+
+def smallest_size(candidate: Candidate, starts: list[Point], ratio: float) -> float | None:
+    """Coordinate of the size at which the effect changes the model by `ratio` noise deviations.
+
+    From the grid: interpolated between points in log-log, extrapolated in proportion; over several points of
+    equal size the largest change counts. None if the grid never changes anything.
+    """
+    sizes: dict[float, float] = {}
+    for start in starts:
+        key = float(start.coordinates[0])
+        sizes[key] = max(sizes.get(key, 0.0), start.size)
+    x = np.array(sorted(sizes))
+    change = np.array([sizes[v] for v in x])
+    if not np.any(change > 0):
+        return None
+    change = np.log(np.maximum(change, 1e-9))
+    if not candidate.grows:
+        x, change = -x[::-1], change[::-1]
+    change = np.maximum.accumulate(change)
+    target = np.log(ratio)
+    if target <= change[0]:
+        found = x[0] + (target - change[0])
+    elif target >= change[-1]:
+        found = x[-1] + (target - change[-1])
+    else:
+        i = int(np.searchsorted(change, target))
+        share = (target - change[i - 1]) / (change[i] - change[i - 1])
+        found = x[i - 1] + share * (x[i] - x[i - 1])
+    return float(found if candidate.grows else -found)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from diagnosis.machine.machine_protocol import Machine, Real
 
-# A nominal parameter that would have to be wrong by more tolerances than this is not believed.
-LARGEST_DEVIATION = 8.0
 # Up to so many tolerances the prior is Gaussian. Beyond them it falls faster: a value that far off gets
 # noticed before it gets stated.
 _EDGE, _STIFFNESS = 2.0, 15.0
@@ -41,6 +40,8 @@ class NominalParameters:
     """
 
     stated: Machine
+    # A value that would have to be wrong by more tolerances than this is not believed.
+    farthest: ClassVar[float] = 8.0
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -65,11 +66,14 @@ class NominalParameters:
         }
 
     def within(self, deviations: Real) -> Real:
-        return np.clip(deviations, -LARGEST_DEVIATION, LARGEST_DEVIATION)
+        return np.clip(deviations, -self.farthest, self.farthest)
 
 
 class LogNormalParameters(NominalParameters):
     """true = stated exp(t d): up and down alike, and no value grows without bound."""
+
+    # Beside a model error a value that is farther off is a finding.
+    farthest: ClassVar[float] = 5.0
 
     def factors(self, deviations: Real) -> dict[str, float]:
         pairs = zip(self.stated.tolerances.items(), deviations, strict=True)

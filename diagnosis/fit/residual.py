@@ -1,30 +1,25 @@
-"""Measured minus model over the noise: the one thing every fit and every verdict looks at."""
+"""Measured minus model over the noise, of a machine whose simulation is as good as its sensors."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from diagnosis.fit.likelihood import White
 from diagnosis.fit.nominal import NominalParameters
+from diagnosis.fit.records import RecordsToFit
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
-from diagnosis.machine.quantisation_grid import cell_residual
-
-Simulator = Callable[[Real], Real]
 
 
-class ResidualModel:
-    """Whitened residuals of a case for any deviations of its nominal parameters and any effects.
-
-    Counts its simulations, which is what a diagnosis spends its time on.
-    """
+class ResidualModel(RecordsToFit):
+    """The estimation records of a case under white noise."""
 
     def __init__(self, case: CaseOfMachine) -> None:
-        self.case = case
-        self.nominal = NominalParameters(case.machine)
-        self.simulations = 0
-        self.steps = case.steps
+        noise = White(case.noise, case.steps)
+        super().__init__(case, case.estimation, noise, NominalParameters(case.machine))
+        self.start = self.at_rest()
 
     def of(
         self, deviations: Real, effects: Sequence[Any], experiments: Sequence[RecordOfMachine] | None = None
@@ -33,9 +28,10 @@ class ResidualModel:
 
         Rounded outputs enter by the chance of their cells (`diagnosis.machine.quantisation_grid`).
         """
-        experiments = self.case.estimation if experiments is None else experiments
-        simulator = self.nominal.at(deviations).simulator(effects)
-        return np.concatenate([self._weighed(simulator, experiment).ravel() for experiment in experiments])
+        if experiments is None:
+            return self.coefficients(deviations, effects, self.start)
+        left = self.by_experiment(deviations, effects, experiments)
+        return np.concatenate([self.likelihood.seen(e * self.case.noise) for e in left.values()])
 
     def by_experiment(
         self, deviations: Real, effects: Sequence[Any], experiments: Sequence[RecordOfMachine] | None = None
@@ -44,19 +40,8 @@ class ResidualModel:
         fit."""
         simulator = self.nominal.at(deviations).simulator(effects)
         experiments = self.case.experiments if experiments is None else experiments
-        return {e.name: self._one(simulator, e) for e in experiments}
-
-    def _weighed(self, simulator: Simulator, experiment: RecordOfMachine) -> Real:
-        e = self._one(simulator, experiment)
-        for k in np.flatnonzero(self.steps):
-            noise = float(self.case.noise[k])
-            e[:, k] = cell_residual(e[:, k] * noise, np.zeros(len(e)), float(self.steps[k]), noise)
-        return e
-
-    def _one(self, simulator: Simulator, experiment: RecordOfMachine) -> Real:
-        self.simulations += 1
-        model = simulator(experiment.input)
-        return np.asarray((experiment.output - model) / self.case.noise)
+        self.simulations += len(experiments)
+        return {e.name: np.asarray((e.output - simulator(e.input)) / self.case.noise) for e in experiments}
 
 
 def pooled_rms(residuals: Real) -> float:

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from diagnosis.fit.fit import Fit
+from diagnosis.fit.coordinates import effects_at
+from diagnosis.fit.descent import Descent
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.machine.machine_protocol import Real, RecordOfMachine
 
@@ -29,7 +30,7 @@ _MOST_LEFT = 0.75
 
 
 def solver_spread(
-    model: ResidualModel, end: Fit, experiments: Sequence[RecordOfMachine] | None = None
+    model: ResidualModel, end: Descent, experiments: Sequence[RecordOfMachine] | None = None
 ) -> Real:
     """Variance (N,) in units of the noise's that correct solvers may add to the residuals of a fit.
 
@@ -45,11 +46,11 @@ def solver_spread(
         return total
     here = model.of(end.deviations, end.effects, records)
     for k in non_smooth:
-        candidate = end.candidates[k]
+        at = sum(len(c.axes) for c in end.candidates[:k])
         for change in _CHANGES:
-            x = [part.copy() for part in end.coordinates]
-            x[k][0] += change * candidate.axes[0].step
-            effects = [c.effect_at(part) for c, part in zip(end.candidates, x, strict=True)]
+            x = end.coordinates.copy()
+            x[at] += change * end.candidates[k].axes[0].step
+            effects = effects_at(end.candidates, x)
             total += (model.of(end.deviations, effects, records) - here) ** 2 / len(_CHANGES)
     parts = np.split(total, np.cumsum(sizes)[:-1])
     smooth = [uniform_filter1d(part.reshape(-1, outputs), _WINDOW, axis=0).ravel() for part in parts]

@@ -20,10 +20,10 @@ from diagnosis.answer import (
     held_out_gap,
     share_closed,
 )
-from diagnosis.fit.fit import parameter_intervals
+from diagnosis.fit.coordinates import parameter_intervals
+from diagnosis.fit.descent import Descent
 from diagnosis.imperfect import verdict as judging
 from diagnosis.imperfect.carried import closed_by, shares_of
-from diagnosis.imperfect.descent import Descent
 from diagnosis.imperfect.search import Explanation, Progress, Search, best_of_sets
 from diagnosis.machine.case import Case
 from diagnosis.machine.flexible_arm import FlexibleArm

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diagnosis.imperfect.records import Records
+from diagnosis.fit.records import Records
 from diagnosis.machine.machine_protocol import Real
 
 _PERIODS, _SAMPLES_PER_STATE = 3.0, 4

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.signal import find_peaks
 
-from diagnosis.imperfect.descent import Descent, best_following, descend, loss_at, occam, refined, scanned
-from diagnosis.imperfect.records import Records, Start, share_left
+from diagnosis.fit.descent import Descent, best_following, descend, loss_at, occam, refined, scanned
+from diagnosis.fit.records import Records, Start, share_left
+from diagnosis.fit.starts import Point, beside, points_of
 from diagnosis.imperfect.settled import settled
-from diagnosis.imperfect.starts import Point, beside, points_of
 from diagnosis.imperfect.windows import in_windows
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
@@ -564,7 +564,17 @@ class Search:
         stated = np.zeros(end.deviations.size)
         start, e = settled(self.records, stated, (), self._beginning(self.records, end.start))
         loss, prior = loss_at(self.records, e, stated, start)
-        return self._explanation(replace(end, deviations=stated, start=start, left=e, loss=loss, prior=prior))
+        return self._explanation(
+            replace(
+                end,
+                deviations=stated,
+                start=start,
+                left=e,
+                weights=self.records.levels.weights(e),
+                loss=loss,
+                prior=prior,
+            )
+        )
 
     def left_by(self, other: Explanation) -> Real:
         """(2, Y) shares that the same effects leave here, descended on from where another search ended."""

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from diagnosis.fit.fit import quotients, solved
-from diagnosis.imperfect.levels import Levels
-from diagnosis.imperfect.records import Records, Start, later
+from diagnosis.fit.coordinates import quotients, solved
+from diagnosis.fit.levels import Levels
+from diagnosis.fit.records import Records, Start, later
 from diagnosis.machine.machine_protocol import Real
 
 _ITERATIONS, _STILL = 30, 1e-7

@@ -21,7 +21,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from diagnosis.evidence.hypotheses import Hypothesis, best_of_sets
-from diagnosis.fit.fit import Fit, box, effects_at, quotients
+from diagnosis.fit.coordinates import box, effects_at, quotients
+from diagnosis.fit.descent import Descent
 from diagnosis.fit.nominal import NominalParameters
 from diagnosis.machine.case import Case
 from diagnosis.machine.flexible_arm import FlexibleArm
@@ -109,11 +110,12 @@ def competing_hypotheses(
     return tuple(competing_hypothesis(case, best[key].fit, sets.get(key, 0.0)) for key in kept)
 
 
-def competing_hypothesis(case: Case, fit: Fit, probability: float) -> CompetingHypothesis:
+def competing_hypothesis(case: Case, fit: Descent, probability: float) -> CompetingHypothesis:
     """A fit as a hypothesis: rig and effects, its free parameters (d, x) and their Gauss-Newton precision."""
-    x = np.concatenate([np.zeros(0), *fit.coordinates])
     nominal = NominalParameters(case.machine)
-    return fitted_hypothesis(nominal, fit.candidates, fit.deviations, x, fit.hessian, probability, case.noise)
+    return fitted_hypothesis(
+        nominal, fit.candidates, fit.deviations, fit.coordinates, fit.hessian, probability, case.noise
+    )
 
 
 def fitted_hypothesis(

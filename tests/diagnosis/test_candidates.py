@@ -11,9 +11,9 @@ from scipy.integrate import quad
 from diagnosis.evidence.hypotheses import Hypothesis
 from diagnosis.evidence.search import in_place_of
 from diagnosis.fit.discrepancy import discrepancy
-from diagnosis.fit.fit import Fit
 from diagnosis.machine.case import Case, Experiment
 from plant.presets import paper_link
+from tests.diagnosis.recorded import end_of_fit
 
 TOLERANCE = 0.05
 
@@ -79,7 +79,7 @@ def _ripple(listed, cycles_per_rev):
     x = np.array([0.0, cycles_per_rev, 0.0])
     e = np.random.default_rng(5).standard_normal(200)
     jacobian = np.random.default_rng(6).standard_normal((200, 3))
-    end = Fit((ripple,), np.zeros(0), (x,), e, jacobian, float(e @ e), True)
+    end = end_of_fit((ripple,), [x], e, jacobian)
     return Hypothesis.of(end, discrepancy(e, [100], 2))
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from diagnosis.evidence.hypotheses import Hypothesis, log_prior, probabilities
+from diagnosis.evidence.hypotheses import Hypothesis, log_evidence, log_prior, probabilities
 from diagnosis.fit.discrepancy import discrepancy
-from diagnosis.fit.fit import Fit, log_evidence
 from plant import EFFECTS
 from plant.effects.search_space import Axis, Candidate
+from tests.diagnosis.recorded import end_of_fit
 
 SLOPE = np.array([0.5, -1.2, 0.8, 2.0])
 
@@ -25,7 +25,7 @@ def _linear_fit(target, low, high):
     """Least squares of e = SLOPE x - target inside the box, one coordinate and no nominal parameter."""
     x = float(np.clip(SLOPE @ target / (SLOPE @ SLOPE), low, high))
     e = SLOPE * x - target
-    return Fit((_candidate(low, high),), np.zeros(0), (np.array([x]),), e, SLOPE[:, None], float(e @ e), True)
+    return end_of_fit((_candidate(low, high),), [[x]], e, SLOPE[:, None])
 
 
 @pytest.mark.parametrize(
@@ -51,9 +51,7 @@ def test_evidence_of_a_linear_model_is_its_integral(optimum, low, high):
 @pytest.mark.parametrize("at", [0.0, 0.3, 1.0])
 def test_a_coordinate_that_nothing_depends_on_neither_adds_nor_takes(at):
     e = np.array([1.2, 0.5, 0.0, 0.0])
-    fit = Fit(
-        (_candidate(0.0, 1.0),), np.zeros(0), (np.array([at]),), e, np.zeros((4, 1)), float(e @ e), True
-    )
+    fit = end_of_fit((_candidate(0.0, 1.0),), [[at]], e, np.zeros((4, 1)))
     # Its share of a Gaussian 1e11 wide is 4e-12 and keeps four digits.
     assert log_evidence(fit) == pytest.approx(-0.5 * float(e @ e), abs=1e-4)
 
@@ -64,7 +62,7 @@ def test_evidence_integrates_the_deviations_of_the_nominal():
     A = J.T @ J + np.eye(2)
     d = -np.linalg.solve(A, J.T @ e0)
     e = e0 + J @ d
-    fit = Fit((), d, (), e, J, float(e @ e + d @ d), True)
+    fit = end_of_fit((), (), e, J, d)
     # Marginal of e0 = -J d + noise: normal with covariance I + J J^T, without the constant of the noise.
     covariance = np.eye(12) + J @ J.T
     expected = -0.5 * e0 @ np.linalg.solve(covariance, e0) - 0.5 * np.linalg.slogdet(covariance)[1]
@@ -82,9 +80,7 @@ def test_probabilities_sum_to_one_and_prefer_what_explains_the_records():
     noise = rng.standard_normal(5000)  # 2500 samples of two outputs
     good = _weighed(_fit_with(noise, "tip_payload"))
     bad = _weighed(_fit_with(1.5 * noise, "input_delay"))
-    nothing = _weighed(
-        Fit((), np.zeros(0), (), 2 * noise, np.zeros((5000, 0)), float(4 * noise @ noise), True)
-    )
+    nothing = _weighed(end_of_fit((), (), 2 * noise, np.zeros((5000, 0))))
     weighed = probabilities([good, bad, nothing])
     total, sets = weighed.cause, weighed.sets
     assert sum(total.values()) == pytest.approx(1.0)
@@ -99,10 +95,8 @@ def _fit_with(residuals, effect):
     axis = Axis("mass_kg" if effect == "tip_payload" else "delay_s", "log", 1e-3, 1.0, 1e-5)
     candidate = Candidate(EFFECTS[effect], (axis,), ())
     J = np.full((residuals.size, 1), 0.1)
-    return Fit(
-        (candidate,), np.zeros(0), (np.array([-3.0]),), residuals, J, float(residuals @ residuals), True
-    )
+    return end_of_fit((candidate,), [[-3.0]], residuals, J)
 
 
 def _weighed(fit):
-    return Hypothesis.of(fit, discrepancy(fit.residuals, [1000, 1500]))
+    return Hypothesis.of(fit, discrepancy(fit.left, [1000, 1500]))

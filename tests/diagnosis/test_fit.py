@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diagnosis.evidence import screening as screening_module
-from diagnosis.evidence.screening import Screening
-from diagnosis.fit.fit import fit
+from diagnosis.evidence.search import fitted_to
+from diagnosis.fit import starts as starts_module
 from diagnosis.fit.residual import ResidualModel
+from diagnosis.fit.starts import points_of
 from tests.diagnosis.recorded import simulated_case
 from validation.blind.rigs import draw_rig, draw_tolerances, stated
 
@@ -35,15 +35,12 @@ def compliant(tmp_path_factory):
 def ends(compliant):
     """Where the best starts of the screening end, as in a search."""
     model = ResidualModel(compliant)
-    base = fit(model, (), (), np.zeros(model.nominal.count))
+    base = fitted_to(model, (), np.zeros(0), np.zeros(model.nominal.count))
     (space,) = [
         c for c in compliant.machine.candidates(compliant.experiments) if c.effect == "joint_compliance"
     ]
-    starts = Screening(model, base).starts(space)[:12]
-    return [
-        fit(model, (space,), (s.coordinates,), model.nominal.within(s.deviations), iterations=40)
-        for s in starts
-    ]
+    starts = points_of(model, base, space)[:12]
+    return [fitted_to(model, (space,), s.coordinates, s.deviations) for s in starts]
 
 
 def test_most_starts_end_in_one_minimum_although_it_lies_in_a_flat_valley(ends):
@@ -57,7 +54,7 @@ def test_most_starts_end_in_one_minimum_although_it_lies_in_a_flat_valley(ends):
 
 def test_the_minimum_leaves_white_noise(ends):
     best = min(ends, key=lambda end: end.cost)
-    n = best.residuals.size
+    n = best.left.size
     assert best.converged
     # White noise leaves n +- sqrt(2 n), three of them; ten fitted values take ten.
     assert abs(best.cost - (n - 10)) < 3 * np.sqrt(2 * n) + 10
@@ -72,13 +69,13 @@ def test_few_of_many_frequencies_have_the_best_among_them(tmp_path, monkeypatch,
     records = [(role, [sine, friction], 8, 0.25) for role in ("estimation", "held_out")]
     case = simulated_case(tmp_path, draw_rig(rng), records, rng)
     model = ResidualModel(case)
-    screening = Screening(model, fit(model, (), (), np.zeros(model.nominal.count)))
+    base = fitted_to(model, (), np.zeros(0), np.zeros(model.nominal.count))
     (space,) = [c for c in case.machine.candidates(case.experiments) if c.effect == sine["name"]]
-    everywhere = screening.starts(space)
+    everywhere = points_of(model, base, space)
     for name, few in (("MOST_LINES", 10), ("BEST_LINES", 40), ("SLOW_LINES", 10)):
-        monkeypatch.setattr(screening_module, name, few)
+        monkeypatch.setattr(starts_module, name, few)
     assert len(everywhere) > 200
-    best, *others = screening.starts(space)
+    best, *others = points_of(model, base, space)
     assert len(others) == 39
     assert (best.cost, best.coordinates[1]) == (everywhere[0].cost, everywhere[0].coordinates[1])
 
@@ -94,7 +91,9 @@ def test_a_disturbance_beside_backlash_is_found_from_a_fifth_off(tmp_path, seed)
     case = simulated_case(tmp_path, table, records, np.random.default_rng(seed))
     listed = {c.effect: c for c in case.machine.candidates(case.experiments)}
     sets = [listed["backlash"], listed["periodic_disturbance"]]
-    starts = [np.log([0.0295]), np.array([np.log(0.036), 0.56, 4.6])]
-    end = fit(ResidualModel(case), sets, starts, np.zeros(0))
-    assert end.cost < end.residuals.size + 4 * np.sqrt(2 * end.residuals.size)
-    assert end.candidates[1].parameters(end.coordinates[1])["amplitude_Nm"] == pytest.approx(0.03, rel=0.01)
+    start = np.array([np.log(0.0295), np.log(0.036), 0.56, 4.6])
+    end = fitted_to(ResidualModel(case), sets, start, np.zeros(0))
+    assert end.cost < end.left.size + 4 * np.sqrt(2 * end.left.size)
+    assert end.candidates[1].parameters(end.coordinates_of(1))["amplitude_Nm"] == pytest.approx(
+        0.03, rel=0.01
+    )

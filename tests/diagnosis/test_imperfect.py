@@ -20,6 +20,10 @@ from diagnosis import (
     PlantExperiment,
     diagnose,
 )
+from diagnosis.fit.descent import Descent, descend, occam, refined, scanned
+from diagnosis.fit.levels import Levels, coefficients, quietest
+from diagnosis.fit.records import Records, Start, StartColumns
+from diagnosis.fit.starts import Point, points_of
 from diagnosis.imperfect.answered import (
     _in_part,
     beside_imperfections,
@@ -27,12 +31,8 @@ from diagnosis.imperfect.answered import (
     searched,
 )
 from diagnosis.imperfect.carried import shares_of
-from diagnosis.imperfect.descent import Descent, descend, occam, refined, scanned
-from diagnosis.imperfect.levels import Levels, coefficients, quietest
-from diagnosis.imperfect.records import Records, Start, StartColumns
 from diagnosis.imperfect.search import Explanation, Search
 from diagnosis.imperfect.settled import best_move, settled
-from diagnosis.imperfect.starts import Point, points_of
 from diagnosis.imperfect.verdict import TEMPER, _enough, _weights, is_silent, judged
 from diagnosis.imperfect.windows import in_windows
 from diagnosis.machine.flexible_arm import FlexibleArm
@@ -620,7 +620,7 @@ def test_a_disturbance_is_found_by_its_frequency_whatever_is_computed_at_once(mo
     longest_s = max(len(e.output) for e in search.case.estimation) * RIG.sampling.dt_s
     assert frequency == pytest.approx(true["frequency_Hz"], abs=0.2 / longest_s)  # half a step of the grid
     assert np.exp(amplitude) == pytest.approx(true["amplitude_Nm"], rel=0.1)
-    monkeypatch.setattr("diagnosis.imperfect.starts._LINES_AT_ONCE", 1)
+    monkeypatch.setattr("diagnosis.fit.starts._LINES_AT_ONCE", 1)
     np.testing.assert_allclose(together, points()[1], rtol=1e-6, atol=1e-6)
 
 
@@ -815,7 +815,9 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0, first_hal
             Start(np.zeros((1, 0)), nothing),
             StartColumns(np.zeros((0, 0)), (), np.zeros((0, 0))),
         )
-        end = Descent(chosen, nothing, x, start, nothing, np.zeros((0, 0)), columns, -gain, 0.0, True)
+        end = Descent(
+            chosen, nothing, x, start, nothing, nothing, np.zeros((0, 0)), columns, -gain, 0.0, True
+        )
         shares = np.array([[left, left], [held_out, held_out]])
         left_held_out = (np.full((400, 2), held_out),)
         return Explanation(end, np.array([gain]), 0.0, 0.0, (), left_held_out, shares)

@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 
 from diagnosis import Plant, PlantCase, PlantEffect, PlantExperiment, ResidualModel
 from diagnosis.evidence.hypotheses import Hypothesis
-from diagnosis.fit.fit import Fit, fit
+from diagnosis.evidence.search import fitted_to
 from diagnosis.fit.nominal import LogNormalParameters
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.plant_effect import Change, EffectParameter
@@ -28,6 +28,7 @@ from plant import prbs, simulate
 from plant.effects.actuator import ActuatorLag, ActuatorSaturation, InputDelay
 from plant.effects.joint import CoulombFriction, ViscousFriction
 from plant.effects.link import TipPayload
+from tests.diagnosis.recorded import end_of_fit
 from tests.diagnosis.synthetic_residuals import DT, NOISE, RIG, inputs, made, white
 
 TOLERANT = RIG.model_copy(update={"tolerances": {"hub.inertia_kg_m2": 0.05, "motor.resistance_ohm": 0.03}})
@@ -53,7 +54,7 @@ def _vague(*effects, rig=RIG):
         candidate = _candidate(effect.id)
         x = np.array([axis.coordinate(effect.parameters()[axis.parameter]) for axis in candidate.axes])
         known = np.hstack([np.zeros((x.size, P)), np.eye(x.size)])
-        end = Fit((candidate,), np.zeros(P), (x,), np.zeros(x.size), known, 0.0, True)
+        end = end_of_fit((candidate,), [x], np.zeros(x.size), known, np.zeros(P))
         found.append(competing_hypothesis(case, end, 1 / len(effects)))
     return tuple(found)
 
@@ -184,7 +185,7 @@ def test_records_sharpen_the_separation():
     for name in ("input_delay", "actuator_lag"):
         candidate = _candidate(name, case)
         start = np.array([candidate.axes[0].coordinate(0.006)])
-        fits.append(fit(ResidualModel(case), (candidate,), (start,), np.zeros(0)))
+        fits.append(fitted_to(ResidualModel(case), (candidate,), start, np.zeros(0)))
     known = [competing_hypothesis(case, f, 0.5) for f in fits]
     vague = [replace(one, precision=np.eye(1)) for one in known]
     voltage = prbs(9, 4, Limits.of_records(case).voltage_V / 2, 700)
@@ -198,8 +199,8 @@ def test_sets_that_name_the_same_cause_do_not_compete():
     found = []
     for names, p in sets.items():
         candidates = [_candidate(name) for name in names]
-        start = [np.array([c.axes[0].coordinate(0.004)]) for c in candidates]
-        end = fit(ResidualModel(CASE), candidates, start, np.zeros(0), iterations=1)
+        start = np.array([c.axes[0].coordinate(0.004) for c in candidates])
+        end = fitted_to(ResidualModel(CASE), candidates, start, np.zeros(0))
         found.append(Hypothesis(end, np.log(p), -np.inf))
     competing = competing_hypotheses(CASE, found, sets)
     assert competing[0].name == "input_delay"

@@ -17,8 +17,8 @@ from numba import njit
 
 from benchmarks import emps_axis
 from diagnosis import Plant, PlantCase, PlantExperiment, diagnose, with_effects
+from diagnosis.fit.descent import descend
 from diagnosis.imperfect.answered import beside_imperfections, searched
-from diagnosis.imperfect.descent import descend
 from diagnosis.imperfect.search import Search
 from tests.diagnosis.machines import rubbing
 

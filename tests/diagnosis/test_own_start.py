@@ -7,8 +7,8 @@ from numba import njit
 from scipy.integrate import solve_ivp
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose
-from diagnosis.imperfect.descent import descend
-from diagnosis.imperfect.records import Records, Start
+from diagnosis.fit.descent import descend
+from diagnosis.fit.records import Records, Start
 from diagnosis.imperfect.search import Search
 from diagnosis.imperfect.settled import settled
 

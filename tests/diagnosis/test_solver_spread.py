@@ -7,10 +7,9 @@ import pytest
 
 from diagnosis.evidence.hypotheses import disagreement_gain
 from diagnosis.fit.discrepancy import Discrepancy
-from diagnosis.fit.fit import Fit
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
-from tests.diagnosis.recorded import simulated_case
+from tests.diagnosis.recorded import end_of_fit, simulated_case
 from validation.blind.rigs import draw_rig
 
 
@@ -25,7 +24,7 @@ def _near_the_truth(folder, effect, values, *, seed, off=1.0):
     model = ResidualModel(case)
     e = model.of(np.zeros(0), (candidate.effect_at(x),), case.experiments)
     none = np.zeros((e.size, 0))
-    return model, Fit((candidate,), np.zeros(0), (x,), e, none, float(e @ e), True)
+    return model, end_of_fit((candidate,), [x], e, none)
 
 
 # Of eight rigs those whose contacts amplify most.
@@ -34,13 +33,13 @@ def _near_the_truth(folder, effect, values, *, seed, off=1.0):
 def test_a_machine_that_is_off_by_a_hair_leaves_no_more(tmp_path, seed, off):
     model, end = _near_the_truth(tmp_path, "backlash", {"gap_rad": 0.03}, seed=seed, off=off)
     spread = solver_spread(model, end, model.case.experiments)
-    e, drift = without_drift(end.residuals, spread)
+    e, drift = without_drift(end.left, spread)
     chance = 4 * np.sqrt(2 / e.size)
-    assert np.mean(end.residuals**2) - 1 < np.mean(spread) + chance
+    assert np.mean(end.left**2) - 1 < np.mean(spread) + chance
     assert 0.8 < np.mean(e**2) < 1 + chance
     if seed == 0:
         # Here a thousandth of the gap makes a gap of a third of the noise: not to be called a cause.
-        assert np.mean(end.residuals**2) > 1.1
+        assert np.mean(end.left**2) > 1.1
         assert drift.log_gain > 100
 
 

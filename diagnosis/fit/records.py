@@ -8,11 +8,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.fft import idct
 
-from diagnosis.fit.fit import quotients
-from diagnosis.fit.nominal import LogNormalParameters
-from diagnosis.imperfect.levels import Levels, coefficients, disturbance, octave_energies
+from diagnosis.fit.coordinates import quotients
+from diagnosis.fit.levels import Levels, coefficients, disturbance, octave_energies
+from diagnosis.fit.likelihood import Likelihood
+from diagnosis.fit.nominal import LogNormalParameters, NominalParameters
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
 from diagnosis.machine.rounding import rounding_effect
 
@@ -59,20 +59,18 @@ class StartColumns:
         return Start(turned.states + step[Z:].reshape(start.states.shape), turned.zeros)
 
 
-class Records:
-    """Some records of a case as coefficients (N,); counts its simulations."""
+class RecordsToFit:
+    """Some records of a case as coefficients (N,) that a likelihood sees; counts its simulations."""
 
     def __init__(
-        self, case: CaseOfMachine, experiments: Sequence[RecordOfMachine], *, at_inputs: bool = False
+        self,
+        case: CaseOfMachine,
+        experiments: Sequence[RecordOfMachine],
+        likelihood: Likelihood,
+        nominal: NominalParameters,
     ) -> None:
         self.case, self.experiments = case, tuple(experiments)
-        self.nominal = LogNormalParameters(case.machine)
-        amplified = [self._amplified(e) for e in experiments] if at_inputs else []
-        rounding = rounding_effect(case)
-        rounded = np.zeros(case.noise.size) if rounding is None else rounding.variances
-        self.levels = Levels.of(
-            experiments, case.noise, case.machine.weighing.model_error, amplified, rounded
-        )
+        self.likelihood, self.nominal = likelihood, nominal
         self.simulations = 0
         ends = np.cumsum([e.output.size for e in experiments])
         self.parts = [slice(int(b - e.output.size), int(b)) for b, e in zip(ends, experiments, strict=True)]
@@ -92,18 +90,6 @@ class Records:
         known = np.isfinite(self.state_spread)
         self.state_steps = np.where(known, _STATE_STEP * self.state_spread, _ANGLE_STEP_RAD)
 
-    def _amplified(self, experiment: RecordOfMachine) -> Real:
-        """(octaves, Y) energies of what disturbances as large as its inputs do to the outputs, of the stated
-        machine from rest; to first order."""
-        simulate, rng = self.case.machine.simulator(()), np.random.default_rng(0)
-        u, small = experiment.input, self.case.machine.weighing.model_error
-        undisturbed = simulate(u)
-        added = [
-            simulate(u + small * column * disturbance(u @ column, rng)[:, None]) - undisturbed
-            for column in np.tile(np.eye(u.shape[1]), (_DISTURBANCES, 1))
-        ]
-        return np.asarray(sum(octave_energies(part / small) for part in added) / _DISTURBANCES)
-
     def at_rest(self) -> Start:
         """Starts as the first samples say, sensors at their zeros."""
         guess = self.case.machine.unknown_start.guess
@@ -118,7 +104,8 @@ class Records:
         """measured - model (T, Y) of the r-th record."""
         experiment, far = self.experiments[r], self._far[r]
         self.simulations += 1
-        e = experiment.output - simulate(experiment.input, state, zeros, **later(experiment))
+        begun = (state, zeros) if state.size or zeros.size else ()
+        e = experiment.output - simulate(experiment.input, *begun, **later(experiment))
         missing, kept = self._missing[r]
         if missing:
             for column in e.T:
@@ -130,18 +117,24 @@ class Records:
     def of_each(self, deviations: Real, effects: Sequence[Any], zeros: Real) -> Callable[[int, Real], Real]:
         """Coefficients (T Y,) of the r-th record by r and the state at its start."""
         simulate = self.nominal.at(deviations).simulator(effects)
-        return lambda r, state: coefficients(self._left(simulate, r, state, zeros))
+        return lambda r, state: self.likelihood.seen(self._left(simulate, r, state, zeros))
 
     def coefficients(self, deviations: Real, effects: Sequence[Any], start: Start) -> Real:
-        return np.concatenate([coefficients(e) for e in self.residuals(deviations, effects, start)])
+        return np.concatenate([self.likelihood.seen(e) for e in self.residuals(deviations, effects, start)])
+
+    def size_of(self, change: Real) -> float:
+        """Largest RMS, over records and outputs, of a change of the coefficients (N,)."""
+        outputs = self.case.noise.size
+        return float(
+            max(
+                np.sqrt(np.max(np.mean(change[part].reshape(-1, outputs) ** 2, axis=0)))
+                for part in self.parts
+            )
+        )
 
     def residuals_of(self, e: Real) -> tuple[Real, ...]:
         """measured - model (T, Y) of every record from their coefficients (N,)."""
-        shapes = [experiment.output.shape for experiment in self.experiments]
-        return tuple(
-            np.asarray(idct(e[part].reshape(shape), axis=0, norm="ortho"))
-            for part, shape in zip(self.parts, shapes, strict=True)
-        )
+        return tuple(self.likelihood.unseen(e[part], self.case.noise.size) for part in self.parts)
 
     def start_columns(
         self, deviations: Real, effects: Sequence[Any], start: Start, *, touching: bool = False
@@ -156,7 +149,7 @@ class Records:
         else:
             whole = responses(effects, longest)
             states = [
-                -np.array([coefficients(response[: len(e.output)]) for response in whole])
+                -np.array([self.likelihood.changed(response[: len(e.output)]) for response in whole])
                 .reshape(-1, e.output.size)
                 .T
                 for e in self.experiments
@@ -165,7 +158,7 @@ class Records:
         for e in self.experiments:
             T = len(e.output)
             shapes = self.case.machine.unknown_start.zero_outputs
-            constant = [coefficients(np.broadcast_to(shape, (T, outputs))) for shape in shapes]
+            constant = [self.likelihood.changed(np.broadcast_to(shape, (T, outputs))) for shape in shapes]
             zeros.append(-np.array(constant).reshape(-1, T * outputs).T)
         return StartColumns.of(np.concatenate(zeros), states, self.case.machine.unknown_start.state_per_zero)
 
@@ -191,15 +184,32 @@ class Records:
         before = np.concatenate([own @ columns.per_zero for own in columns.states])
         return StartColumns.of(columns.zeros - before, states, columns.per_zero)
 
-    def losses(self, e: Real) -> Real:
-        """(R,) -log likelihood of every record, from coefficients (N,)."""
-        return np.array([self.levels.within(part).loss(e[part]) for part in self.parts])
-
     def prior_cost(self, start: Start) -> float:
         """-2 log prior density of a start."""
         return float(
             np.sum((start.states / self.state_spread) ** 2) + np.sum((start.zeros / self.zero_spread) ** 2)
         )
+
+
+class Records(RecordsToFit):
+    """Records beside a model error, their levels unknown."""
+
+    levels: Levels
+
+    def __init__(
+        self, case: CaseOfMachine, experiments: Sequence[RecordOfMachine], *, at_inputs: bool = False
+    ) -> None:
+        amplified = [_amplified(case, e) for e in experiments] if at_inputs else []
+        rounding = rounding_effect(case)
+        rounded = np.zeros(case.noise.size) if rounding is None else rounding.variances
+        self.levels = Levels.of(
+            experiments, case.noise, case.machine.weighing.model_error, amplified, rounded
+        )
+        super().__init__(case, experiments, self.levels, LogNormalParameters(case.machine))
+
+    def losses(self, e: Real) -> Real:
+        """(R,) -log likelihood of every record, from coefficients (N,)."""
+        return np.array([self.levels.within(part).loss(e[part]) for part in self.parts])
 
     def shares(self, residuals: Sequence[Real]) -> Real:
         """(Y,) RMS left beyond what sensors may have over the RMS of the motion (about the mean), all
@@ -213,6 +223,19 @@ class Records:
         beyond = levels.felt * (energy - levels.noise)
         left = np.maximum(np.bincount(levels.belongs, beyond), 0.0)
         return np.array([left, levels.motion]).reshape(2, -1, Y)
+
+
+def _amplified(case: CaseOfMachine, experiment: RecordOfMachine) -> Real:
+    """(octaves, Y) energies of what disturbances as large as its inputs do to the outputs, of the stated
+    machine from rest; to first order."""
+    simulate, rng = case.machine.simulator(()), np.random.default_rng(0)
+    u, small = experiment.input, case.machine.weighing.model_error
+    undisturbed = simulate(u)
+    added = [
+        simulate(u + small * column * disturbance(u @ column, rng)[:, None]) - undisturbed
+        for column in np.tile(np.eye(u.shape[1]), (_DISTURBANCES, 1))
+    ]
+    return np.asarray(sum(octave_energies(part / small) for part in added) / _DISTURBANCES)
 
 
 def later(experiment: RecordOfMachine) -> dict[str, int]:

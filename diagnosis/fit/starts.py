@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.fft import dct, irfft, next_fast_len, rfft
+import numpy.typing as npt
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.linalg import cho_factor, cho_solve
+from scipy.signal import czt
 
-from diagnosis.imperfect.descent import Descent, follow
-from diagnosis.imperfect.records import Records, Start
+from diagnosis.fit.descent import Descent, follow
+from diagnosis.fit.records import RecordsToFit, Start
 from diagnosis.machine.machine_protocol import Real
 from plant.effects.search_space import Candidate
 
@@ -19,16 +21,29 @@ _ZEROS_AROUND = 6
 _CYCLES = np.concatenate([np.arange(1.0, 12, 0.25), np.arange(12, 80.5, 1.0)])
 _HIGHEST_HZ, _LINES_PER_PERIOD, _LINES_AT_ONCE = 60.0, 0.4, 16
 _APART = 0.3
+# Frequencies of long records, of which there are as many as samples: how many of them are fitted, the lowest
+# in any case.
+MOST_LINES, BEST_LINES, SLOW_LINES = 6000, 1000, 200
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """To descend from beside a fit: loss once all else has followed, coordinates, deviations, start."""
+    """To descend from beside a fit: loss once all else has followed, coordinates, deviations, start.
+
+    size: largest RMS, over records and outputs, of what the effect changes of their coefficients;
+    change (N,): this itself, or nothing where it is found anew beside others.
+    """
 
     loss: float
     coordinates: Real
     deviations: Real
     start: Start
+    size: float = 0.0
+    change: npt.NDArray[np.float32] | None = None
+
+    @property
+    def cost(self) -> float:
+        return 2 * self.loss
 
     def far_from(self, other: Point) -> bool:
         moved = np.max(np.abs(self.coordinates - other.coordinates))
@@ -36,7 +51,7 @@ class Point:
         return bool(moved > _APART or turned > _APART)
 
 
-def points_of(records: Records, around: Descent, candidate: Candidate, every: int = 1) -> list[Point]:
+def points_of(records: RecordsToFit, around: Descent, candidate: Candidate, every: int = 1) -> list[Point]:
     """Every start of a candidate beside a fit, or one in several of its grid, best first."""
     found = _harmonic(records, around, candidate) if candidate.kind.harmonic else []
     if not found:
@@ -49,7 +64,9 @@ def points_of(records: Records, around: Descent, candidate: Candidate, every: in
     return sorted(found, key=lambda point: point.loss)
 
 
-def beside(records: Records, around: Descent, candidate: Candidate, points: Sequence[Point]) -> list[Point]:
+def beside(
+    records: RecordsToFit, around: Descent, candidate: Candidate, points: Sequence[Point]
+) -> list[Point]:
     """The same points beside the effects of another fit, best first."""
     found = []
     for point in points:
@@ -62,16 +79,30 @@ def beside(records: Records, around: Descent, candidate: Candidate, points: Sequ
     return sorted(found, key=lambda point: point.loss)
 
 
-def point_at(records: Records, around: Descent, candidate: Candidate, x: Real, start: Start) -> Point | None:
+def point_at(
+    records: RecordsToFit, around: Descent, candidate: Candidate, x: Real, start: Start
+) -> Point | None:
     effects = (*around.effects, candidate.effect_at(x))
     e = records.coefficients(around.deviations, effects, start)
     if not np.all(np.isfinite(e)):
         return None
     loss, deviations = follow(records, around, e, start)
-    return Point(loss, x, deviations, start)
+    change = e - around.left
+    return Point(loss, x, deviations, start, records.size_of(change), change.astype(np.float32))
 
 
-def _turned(records: Records, start: Start, candidate: Candidate) -> list[Start]:
+def superposed(records: RecordsToFit, parent: Descent, points: Sequence[Point]) -> list[Point]:
+    """The same points beside the effects of another fit, changes simply added, best first: no simulation. A
+    second effect large enough for superposition to fail shows all the same."""
+    found = []
+    for point in points:
+        if point.change is not None:
+            loss, deviations = follow(records, parent, parent.left + point.change, parent.start)
+            found.append(replace(point, loss=loss, deviations=deviations))
+    return sorted(found, key=lambda point: point.loss)
+
+
+def _turned(records: RecordsToFit, start: Start, candidate: Candidate) -> list[Start]:
     if records.case.machine.unknown_start.zero_seen or not candidate.kind.absolute_angle:
         return [start]
     turns = np.arange(_ZEROS_AROUND) * 2 * np.pi / _ZEROS_AROUND - np.pi
@@ -79,11 +110,11 @@ def _turned(records: Records, start: Start, candidate: Candidate) -> list[Start]
     return [_with_zeros(records, start, start.zeros + turn * first) for turn in turns]
 
 
-def _with_zeros(records: Records, start: Start, zeros: Real) -> Start:
+def _with_zeros(records: RecordsToFit, start: Start, zeros: Real) -> Start:
     return start.with_zeros(zeros, records.case.machine.unknown_start.state_per_zero)
 
 
-def _harmonic(records: Records, around: Descent, candidate: Candidate) -> list[Point]:
+def _harmonic(records: RecordsToFit, around: Descent, candidate: Candidate) -> list[Point]:
     """Amplitude and phase by linear least squares at each frequency: the torque acts on a linear arm."""
     machine = records.nominal.at(around.deviations)
     periodic = candidate.kind.harmonic == "time"
@@ -95,7 +126,7 @@ def _harmonic(records: Records, around: Descent, candidate: Candidate) -> list[P
     size = next_fast_len(2 * longest, real=True)
     # For points to descend from single precision will do, and takes half the time.
     transfer = rfft(response.astype(np.float32), size, axis=0)
-    weights = records.levels.weights(around.left)
+    weights = around.weights
     normal = around.normal(records)
     H, g = normal.hessian, normal.gradient(around.start, around.left)
     factor = cho_factor(H + np.diag(1e-9 * np.diag(H) + 1e-12))
@@ -116,10 +147,13 @@ def _harmonic(records: Records, around: Descent, candidate: Candidate) -> list[P
         return np.asarray(irfft(rfft(torque, size)[..., None] * transfer, size, axis=2))
 
     def columns_of(moved: Real) -> Real:
-        return -dct(moved, axis=2, norm="ortho").reshape(2 * len(moved), -1).T.astype(np.float64)
+        columns = records.likelihood.changed(moved).reshape(2 * len(moved), -1)
+        return -columns.T.astype(np.float64)
 
     found = []
     lines = lines[(lines >= low) & (lines <= high)]
+    if periodic and lines.size > MOST_LINES:
+        lines = _loudest(records, around, lines, response, dt_s)
     for first in range(0, lines.size, _LINES_AT_ONCE):
         some = lines[first : first + _LINES_AT_ONCE]
         if periodic:
@@ -144,12 +178,33 @@ def _harmonic(records: Records, around: Descent, candidate: Candidate) -> list[P
         amplitudes = np.clip(np.hypot(*ab.T), candidate.axes[0].low, candidate.axes[0].high)
         coordinates = np.column_stack([np.log(amplitudes), some, np.arctan2(ab[:, 1], ab[:, 0])])
         losses = around.loss + 0.5 * np.sum(slopes * ab, axis=1)
-        for loss, x in zip(losses, coordinates, strict=True):
-            found.append(Point(float(loss), x, around.deviations, around.start))
+        changes = np.einsum("nlk,lk->ln", columns.reshape(len(columns), -1, 2), ab)
+        for loss, x, change in zip(losses, coordinates, changes, strict=True):
+            found.append(Point(float(loss), x, around.deviations, around.start, records.size_of(change)))
     return found
+
+
+def _loudest(records: RecordsToFit, around: Descent, lines: Real, response: Real, dt_s: float) -> Real:
+    """Those of evenly spaced frequencies [Hz] at which a torque would take most from what is left, its
+    response (T, Y to a pulse) taken to be settled, and the lowest, at which it is not."""
+    T, noise = len(response), records.case.noise
+    size = next_fast_len(2 * T, real=True)
+    transfer = rfft(response / noise, size, axis=0)
+    correlation = np.zeros(T)
+    for part in records.residuals_of(around.left):
+        e = rfft(part / noise, size, axis=0)
+        correlation += irfft(np.sum(e * transfer.conj(), axis=1), size)[:T]
+    turn = 2j * np.pi * dt_s
+    found = np.abs(
+        czt(correlation, len(lines), np.exp(-turn * (lines[1] - lines[0])), np.exp(turn * lines[0]))
+    )
+    power = np.interp(lines, np.fft.rfftfreq(size, dt_s), np.sum(np.abs(transfer) ** 2, axis=1))
+    gain = found**2 / power
+    gain[:SLOW_LINES] = np.inf
+    return np.asarray(lines[np.sort(np.argsort(gain)[-BEST_LINES:])])
 
 
 def _of_pairs(one: Real, other: Real) -> Real:
     """(L, 2, 2) products of the columns (N, 2 L) of each line."""
-    pairs, others = (part.T.reshape(-1, 2, len(part)) for part in (one, other))
+    pairs, others = (part.T.reshape(part.shape[1] // 2, 2, len(part)) for part in (one, other))
     return np.asarray(pairs @ others.transpose(0, 2, 1))

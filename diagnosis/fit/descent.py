@@ -14,14 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from diagnosis.fit.fit import box, effects_at, non_smooth, quotients, solved
+from diagnosis.fit.coordinates import box, effects_at, non_smooth, quotients, solved
 from diagnosis.fit.nominal import prior_cost, prior_curvature, prior_slope
-from diagnosis.imperfect.records import Records, Start, StartColumns
+from diagnosis.fit.records import RecordsToFit, Start, StartColumns
 from diagnosis.machine.machine_protocol import Real
 from plant.effects.search_space import Candidate
 
-# A nominal value is never believed to be off by more tolerances than this: it then is a finding.
-FARTHEST = 5.0
 _DEVIATION_STEP, _SMALLEST_STEP = 1e-3, 1e-4
 # The same where contacts switch, deviations as logarithms: the loss is jagged below it, and how one contact
 # fell says nothing of where the others lead.
@@ -32,14 +30,16 @@ _REACHES, _POINTS = (0.1, 0.03), 9
 _FAR = np.array([-3.0, -2.0, -1.2, -0.6, -0.25, -0.08, 0.08, 0.25, 0.6, 1.2, 2.0, 3.0])
 # Above the loss of an end, that of a start which leads to no better one.
 _HOPELESS = 5.0
-_AGAIN = (2, 5, 8, 11)
+# The Jacobian by the deviations, of the nominal or of a point nearby, is renewed at every third iteration.
+_AGAIN = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Descent:
     """End of a fit: deviations (P,), coordinates (A,) of the candidates, start, coefficients (N,) left.
 
-    jacobian (N, P + A). loss: -log posterior density; prior: the part of it that deviations and start pay.
+    jacobian (N, P + A), weights (N,) of the coefficients. loss: -log posterior density; prior: the part of it
+    that deviations and start pay.
     """
 
     candidates: tuple[Candidate, ...]
@@ -47,6 +47,7 @@ class Descent:
     coordinates: Real
     start: Start
     left: Real
+    weights: Real
     jacobian: Real
     columns: StartColumns
     loss: float
@@ -66,16 +67,33 @@ class Descent:
         """Whether contacts switch."""
         return non_smooth(self.candidates)
 
+    @property
+    def cost(self) -> float:
+        """Twice the loss: under white noise |e|^2 + |d|^2."""
+        return 2 * self.loss
+
+    @property
+    def rms(self) -> float:
+        """Of what is left, in noise deviations where the noise is known."""
+        return float(np.sqrt(np.mean(self.left**2)))
+
+    @property
+    def hessian(self) -> Real:
+        """(P + A, P + A) Gauss-Newton, of deviations and coordinates, starts and zeros held."""
+        H, P = self.jacobian.T @ (self.weights[:, None] * self.jacobian), self.deviations.size
+        H[range(P), range(P)] += prior_curvature(self.deviations)
+        return np.asarray(H)
+
     def coordinates_of(self, k: int) -> Real:
         """Those of the k-th candidate."""
         first = sum(len(c.axes) for c in self.candidates[:k])
         return self.coordinates[first : first + len(self.candidates[k].axes)]
 
-    def normal(self, records: Records) -> NormalEquations:
+    def normal(self, records: RecordsToFit) -> NormalEquations:
         """Of its linearisation."""
         return _normal_at(self, records)
 
-    def precision(self, records: Records) -> Real:
+    def precision(self, records: RecordsToFit) -> Real:
         """(P + A, P + A) of deviations and coordinates, whatever the starts and zeros are."""
         H, n = self.normal(records).hessian, self.jacobian.shape[1]
         rest = np.linalg.pinv(H[n:, n:], hermitian=True)
@@ -89,14 +107,14 @@ class NormalEquations:
     weighted : (N, P + A + Z) and (T Y, S) of every record, columns times the weights.
     """
 
-    records: Records
+    records: RecordsToFit
     deviations: Real
     weighted: tuple[Real, tuple[Real, ...]]
     hessian: Real
 
     @classmethod
     def of(
-        cls, records: Records, weights: Real, jacobian: Real, columns: StartColumns, deviations: Real
+        cls, records: RecordsToFit, weights: Real, jacobian: Real, columns: StartColumns, deviations: Real
     ) -> NormalEquations:
         shared = np.column_stack([jacobian, columns.zeros])
         P, k, S = deviations.size, shared.shape[1], records.state_spread.size
@@ -129,20 +147,19 @@ class NormalEquations:
 
 
 @lru_cache(maxsize=2)
-def _normal_at(end: Descent, records: Records) -> NormalEquations:
+def _normal_at(end: Descent, records: RecordsToFit) -> NormalEquations:
     """Once for all that is tried beside a fit."""
-    weights = records.levels.weights(end.left)
-    return NormalEquations.of(records, weights, end.jacobian, end.columns, end.deviations)
+    return NormalEquations.of(records, end.weights, end.jacobian, end.columns, end.deviations)
 
 
-def loss_at(records: Records, e: Real, deviations: Real, start: Start) -> tuple[float, float]:
+def loss_at(records: RecordsToFit, e: Real, deviations: Real, start: Start) -> tuple[float, float]:
     """-log posterior density of a point, and the part of it that the prior of deviations and start is."""
     prior = 0.5 * (prior_cost(deviations) + records.prior_cost(start))
-    return records.levels.loss(e) + prior, prior
+    return records.likelihood.loss(e) + prior, prior
 
 
 def descend(
-    records: Records,
+    records: RecordsToFit,
     candidates: Sequence[Candidate],
     deviations: Real,
     coordinates: Real,
@@ -159,10 +176,7 @@ def descend(
     P, A = deviations.size, coordinates.size
     low, high = box(candidates)
     d, x = deviations.copy(), np.clip(coordinates, low, high)
-    coarse = _COARSE_STEP if non_smooth(candidates) else {}
-    steps = np.array(
-        [max(axis.step, coarse.get(axis.scale, _SMALLEST_STEP)) for c in candidates for axis in c.axes]
-    )
+    deviation_step, steps = steps_of(candidates)
 
     def left(d: Real, x: Real, start: Start) -> Real:
         return records.coefficients(d, effects_at(candidates, x), start)
@@ -172,16 +186,16 @@ def descend(
     damping, converged = 1e-3, False
     by_effects = np.zeros((e.size, A))
     for iteration in range(iterations):
-        if nominal_jacobian is None or iteration in _AGAIN:
-            step = np.full(P, coarse.get("log", _DEVIATION_STEP))
+        if nominal_jacobian is None or iteration % _AGAIN == _AGAIN - 1:
+            step = np.full(P, deviation_step)
             nominal_jacobian = quotients(lambda d: left(d, x, start), d, e, step)  # noqa: B023
-        if columns is None or iteration == _AGAIN[0]:
+        if columns is None or iteration == _AGAIN - 1:
             columns = records.start_columns(d, effects_at(candidates, x), start, touching=touching)
         if columns.zeros.shape[1] and any(c.kind.absolute_angle for c in candidates):
             columns = records.with_true_angles(columns, d, effects_at(candidates, x), start, e)
         by_effects = quotients(lambda x: left(d, x, start), x, e, steps, high)  # noqa: B023
         jacobian = np.column_stack([nominal_jacobian, by_effects])
-        normal = NormalEquations.of(records, records.levels.weights(e), jacobian, columns, d)
+        normal = NormalEquations.of(records, records.likelihood.weights(e), jacobian, columns, d)
         H, g = normal.hessian, normal.gradient(start, e)
         held = ((x <= low) & (g[P : P + A] > 0)) | ((x >= high) & (g[P : P + A] < 0))
         free = np.setdiff1d(np.arange(g.size), P + np.flatnonzero(held))
@@ -191,7 +205,7 @@ def descend(
             damped[range(P, P + A), range(P, P + A)] += 1e2 * damping
             step = np.zeros(g.size)
             step[free] = -solved(damped[np.ix_(free, free)], g[free])
-            d2 = np.clip(d + np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP), -FARTHEST, FARTHEST)
+            d2 = records.nominal.within(d + np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP))
             x2 = np.clip(x + np.clip(step[P : P + A], -_LARGEST_MOVE, _LARGEST_MOVE), low, high)
             start2 = columns.moved(start, step[P + A :])
             e2 = left(d2, x2, start2)
@@ -212,10 +226,18 @@ def descend(
     assert nominal_jacobian is not None
     assert columns is not None
     jacobian = np.column_stack([nominal_jacobian, by_effects])
-    return Descent(tuple(candidates), d, x, start, e, jacobian, columns, loss, prior, converged)
+    weights = records.likelihood.weights(e)
+    return Descent(tuple(candidates), d, x, start, e, weights, jacobian, columns, loss, prior, converged)
 
 
-def refined(records: Records, end: Descent) -> Descent:
+def steps_of(candidates: Sequence[Candidate]) -> tuple[float, Real]:
+    """Of difference quotients: by every deviation, and along all coordinates (A,)."""
+    coarse = _COARSE_STEP if non_smooth(candidates) else {}
+    steps = [max(axis.step, coarse.get(axis.scale, _SMALLEST_STEP)) for c in candidates for axis in c.axes]
+    return coarse.get("log", _DEVIATION_STEP), np.array(steps)
+
+
+def refined(records: RecordsToFit, end: Descent) -> Descent:
     """The end with the sizes on which the loss does not depend smoothly sought on grids around it, all else
     following, and descended from the best of each."""
     first = 0
@@ -226,7 +248,7 @@ def refined(records: Records, end: Descent) -> Descent:
     return end
 
 
-def scanned(records: Records, end: Descent) -> Descent:
+def scanned(records: RecordsToFit, end: Descent) -> Descent:
     """The same over far values of all parameters on logarithmic scales: where contacts switch, the loss
     along any of them is jagged, and slopes lead no further than the next tooth."""
     for k, axis in enumerate(axis for c in end.candidates for axis in c.axes):
@@ -235,7 +257,7 @@ def scanned(records: Records, end: Descent) -> Descent:
     return end
 
 
-def _sought(records: Records, end: Descent, k: int, shifts: Real) -> Descent:
+def _sought(records: RecordsToFit, end: Descent, k: int, shifts: Real) -> Descent:
     """The best of the end and what is descended to from the best of some shifts of its k-th coordinate."""
     low, high = box(end.candidates)
     trials = []
@@ -260,7 +282,7 @@ def _sought(records: Records, end: Descent, k: int, shifts: Real) -> Descent:
 
 
 def best_following(
-    records: Records, around: Descent, candidates: Sequence[Candidate], trials: Sequence[Real]
+    records: RecordsToFit, around: Descent, candidates: Sequence[Candidate], trials: Sequence[Real]
 ) -> tuple[float, Real, Real]:
     """The best of some coordinates of the candidates once all else has followed (`follow`): loss,
     deviations, coordinates."""
@@ -271,7 +293,7 @@ def best_following(
     return min(followed, key=lambda trial: trial[0])
 
 
-def follow(records: Records, around: Descent, e: Real, start: Start) -> tuple[float, Real]:
+def follow(records: RecordsToFit, around: Descent, e: Real, start: Start) -> tuple[float, Real]:
     """What the loss of coefficients e (N,) becomes, and where the deviations go, once everything that
     `around` holds has followed linearly."""
     P = around.deviations.size
@@ -286,10 +308,10 @@ def follow(records: Records, around: Descent, e: Real, start: Start) -> tuple[fl
     for r, (part, own) in enumerate(zip(records.parts, around.columns.states, strict=True)):
         moved[part] += own @ step[first + r * S : first + (r + 1) * S]
     loss, _ = loss_at(records, moved, d, start2)
-    return loss, np.clip(d, -FARTHEST, FARTHEST)
+    return loss, records.nominal.within(d)
 
 
-def occam(records: Records, end: Descent) -> float:
+def occam(records: RecordsToFit, end: Descent) -> float:
     """log of the prior density of the effects' coordinates times the volume that the records leave them and
     the deviations, whatever the starts and zeros are.
 

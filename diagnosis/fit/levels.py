@@ -134,6 +134,16 @@ class Levels:
             first += octaves * Y
         return cls(*(np.concatenate(column) for column in zip(*rows, strict=True)))
 
+    def seen(self, residuals: Real) -> Real:
+        """See `diagnosis.fit.likelihood.Likelihood`."""
+        return coefficients(residuals)
+
+    def unseen(self, e: Real, outputs: int) -> Real:
+        return np.asarray(idct(e.reshape(-1, outputs), axis=0, norm="ortho"))
+
+    def changed(self, outputs: Real) -> Real:
+        return np.asarray(dct(outputs, axis=-2, norm="ortho"))
+
     def energy(self, e: Real) -> Real:
         return np.asarray(np.bincount(self.band, e * e, minlength=self.floor.size), dtype=np.float64)
 

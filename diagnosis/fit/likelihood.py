@@ -1,0 +1,63 @@
+"""What residuals cost: white noise of known size here, levels that nobody knows in `diagnosis.fit.levels`.
+
+A fit sees residuals as coefficients e (N,), record after record; all the rest of it is the same for both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.quantisation_grid import cell_residual
+
+
+class Likelihood(Protocol):
+    """Of coefficients e (N,) of all records together."""
+
+    def seen(self, residuals: Real) -> Real:
+        """measured - model (T, Y) of one record, in the outputs' units -> its coefficients (T Y,)."""
+
+    def unseen(self, e: Real, outputs: int) -> Real:
+        """The inverse, (T Y,) -> (T, Y); rounded outputs by the chance of their cells."""
+
+    def changed(self, outputs: Real) -> Real:
+        """Changes of outputs (..., T, Y) -> those of coefficients, the same shape, to first order."""
+
+    def loss(self, e: Real) -> float:
+        """-log likelihood, up to a constant of the records."""
+
+    def weights(self, e: Real) -> Real:
+        """(N,) w with grad(loss) = w e."""
+
+
+@dataclass(frozen=True, eq=False)
+class White:
+    """White noise of the stated size; outputs on a quantisation grid by the chance of their cells.
+
+    noise : (Y,) standard deviations. steps : (Y,) of the grids, 0 for none.
+    """
+
+    noise: Real
+    steps: Real
+
+    def seen(self, residuals: Real) -> Real:
+        e = residuals / self.noise
+        for k in np.flatnonzero(self.steps):
+            noise = float(self.noise[k])
+            e[:, k] = cell_residual(residuals[:, k], np.zeros(len(e)), float(self.steps[k]), noise)
+        return np.asarray(e.ravel())
+
+    def unseen(self, e: Real, outputs: int) -> Real:
+        return np.asarray(e.reshape(-1, outputs) * self.noise)
+
+    def changed(self, outputs: Real) -> Real:
+        return np.asarray(outputs / self.noise)
+
+    def loss(self, e: Real) -> float:
+        return 0.5 * float(e @ e)
+
+    def weights(self, e: Real) -> Real:
+        return np.ones(e.size)
