@@ -24,8 +24,7 @@ from diagnosis.answer import (
 )
 from diagnosis.evidence.confirmation import confronted
 from diagnosis.evidence.hypotheses import DISAGREEMENT, Hypothesis, Probabilities, probabilities
-from diagnosis.evidence.look_alikes import look_alikes
-from diagnosis.evidence.search import Progress, search
+from diagnosis.evidence.search import WhiteSearch
 from diagnosis.fit.coordinates import parameter_intervals
 from diagnosis.fit.descent import Descent, descend
 from diagnosis.fit.levels import quietest
@@ -46,6 +45,7 @@ from diagnosis.next_experiment.discrimination import (
     competing_hypotheses,
     competing_hypothesis,
 )
+from diagnosis.search.loop import Progress
 from plant.effects import LOOK_ALIKES
 from plant.effects.search_space import Candidate
 
@@ -128,10 +128,10 @@ def _answered(
 
 def _without_error(case: CaseOfMachine, progress: Progress, rng: np.random.Generator) -> Diagnosis:
     """Of a machine whose simulation, with the right effects, is as good as the sensors."""
-    found = search(case, progress)
-    model = ResidualModel(case)
-    every: Sequence[Hypothesis]
-    every = (*found.hypotheses, *look_alikes(model, found.hypotheses, found.base))
+    search = WhiteSearch(case, progress)
+    search.run()
+    model, base = search.records, search.base.end
+    every: Sequence[Hypothesis] = search.found
     weighed = probabilities(every)
     accepted = _accepted(every, weighed.answer)
     unknown = weighed.answer == "unknown"
@@ -146,7 +146,7 @@ def _without_error(case: CaseOfMachine, progress: Progress, rng: np.random.Gener
     likeliest = max(every, key=lambda h: h.unknown_weight)
     last = _refined(model, accepted.fit)
     before = model.by_experiment(np.zeros(model.nominal.count), ())
-    refit = model.by_experiment(found.base.deviations, ())
+    refit = model.by_experiment(base.deviations, ())
     after = model.by_experiment(last.deviations, last.effects)
     rounding = rounding_effect(case)
     if rounding is not None:
@@ -175,13 +175,13 @@ def _without_error(case: CaseOfMachine, progress: Progress, rng: np.random.Gener
         gap_closed=closed,
         gap_closed_interval=interval,
         deviations=dict(zip(model.nominal.keys, map(float, last.deviations), strict=True)),
-        deviations_refit=dict(zip(model.nominal.keys, map(float, found.base.deviations), strict=True)),
+        deviations_refit=dict(zip(model.nominal.keys, map(float, base.deviations), strict=True)),
         rig=model.nominal.at(last.deviations).description,
         repair=last.effects if rounding is None else (*last.effects, rounding.effect),
         residuals_before=before,
         residuals_refit=refit,
         residuals_after=after,
-        simulations=found.simulations + model.simulations,
+        simulations=model.simulations,
         held_out_decided=seen is not None,
         unlisted=likeliest.fit.effects if verdict == "unknown" and not likeliest.is_answer else (),
         competing=_to_part(case, hypotheses, weighed, alike) if isinstance(case, Case) else (),

@@ -42,11 +42,11 @@ def confronted(
     confirmed = leading.is_answer and first.unknown_gain < _CONFIRMED
     if confirmed and not _contradicted(model, hypotheses, leading, first):
         return None
-    best = max(h.largest_weight for h in hypotheses)
+    best = max(h.evidence for h in hypotheses)
     seen = {
         k: first if h is leading else _prediction(model, h.fit)
         for k, h in enumerate(hypotheses)
-        if h.largest_weight > best - STILL_POSSIBLE
+        if h.evidence > best - STILL_POSSIBLE
     }
     # All others stay behind the best prediction by what they were behind before.
     least = _Prediction(max(p.gain for p in seen.values()), 0.0, 0.0)

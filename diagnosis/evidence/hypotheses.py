@@ -64,11 +64,19 @@ class Hypothesis:
         return self.fit.names
 
     @property
+    def end(self) -> Descent:
+        return self.fit
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        return tuple(sorted(self.names))
+
+    @property
     def is_answer(self) -> bool:
         return self.log_weight > -np.inf
 
     @property
-    def largest_weight(self) -> float:
+    def evidence(self) -> float:
         """Log weight of these effects, alone or with something unknown besides."""
         return max(self.log_weight, self.unknown_weight)
 

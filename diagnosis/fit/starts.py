@@ -51,6 +51,10 @@ class Point:
         return bool(moved > _APART or turned > _APART)
 
 
+def point_of(end: Descent) -> Point:
+    return Point(end.loss, end.coordinates, end.deviations, end.start)
+
+
 def points_of(records: RecordsToFit, around: Descent, candidate: Candidate, every: int = 1) -> list[Point]:
     """Every start of a candidate beside a fit, or one in several of its grid, best first."""
     found = _harmonic(records, around, candidate) if candidate.kind.harmonic else []

@@ -24,12 +24,14 @@ from diagnosis.fit.coordinates import parameter_intervals
 from diagnosis.fit.descent import Descent
 from diagnosis.imperfect import verdict as judging
 from diagnosis.imperfect.carried import closed_by, shares_of
-from diagnosis.imperfect.search import Explanation, Progress, Search, best_of_sets
 from diagnosis.machine.case import Case
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.machine.rounding import rounding_effect
 from diagnosis.next_experiment.discrimination import CompetingHypothesis, fitted_hypothesis
+from diagnosis.search.explanation import Explanation, best_of_sets
+from diagnosis.search.loop import Progress
+from diagnosis.search.search import Search
 from plant.effects.search_space import Candidate
 
 _DRAWS, _MOST_COMPETING = 1000, 3

@@ -11,10 +11,11 @@ import numpy as np
 
 from diagnosis.answer import Shares
 from diagnosis.imperfect.horizon import horizon_samples, shares_over_horizon
-from diagnosis.imperfect.search import Explanation, Search
 from diagnosis.imperfect.verdict import is_silent
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.rounding import rounding_effect
+from diagnosis.search.explanation import Explanation
+from diagnosis.search.search import Search
 
 # Blocks of the bootstrap [samples]; draws; partial answers that are told.
 _BLOCK, _DRAWS, _MOST_TOLD = 50, 1000, 5

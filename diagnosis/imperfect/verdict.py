@@ -16,9 +16,10 @@ import numpy as np
 from scipy.special import expit, softmax
 
 from diagnosis.evidence.hypotheses import Probabilities
-from diagnosis.imperfect.search import Explanation, Search, best_of_sets
 from diagnosis.machine.machine_protocol import Real, Weighing
 from diagnosis.machine.rounding import Rounding, rounding_effect
+from diagnosis.search.explanation import Explanation, best_of_sets
+from diagnosis.search.search import Search
 from plant.effects import EFFECTS, LOOK_ALIKES
 
 # Log likelihoods count this much less than independent coefficients would (calibrated on generated cases:

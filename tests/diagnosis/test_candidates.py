@@ -9,9 +9,9 @@ import pytest
 from scipy.integrate import quad
 
 from diagnosis.evidence.hypotheses import Hypothesis
-from diagnosis.evidence.search import in_place_of
 from diagnosis.fit.discrepancy import discrepancy
 from diagnosis.machine.case import Case, Experiment
+from diagnosis.search.moves import in_place_of
 from plant.presets import paper_link
 from tests.diagnosis.recorded import end_of_fit
 

@@ -31,12 +31,14 @@ from diagnosis.imperfect.answered import (
     searched,
 )
 from diagnosis.imperfect.carried import shares_of
-from diagnosis.imperfect.search import Explanation, Search
-from diagnosis.imperfect.settled import best_move, settled
 from diagnosis.imperfect.verdict import TEMPER, _enough, _weights, is_silent, judged
-from diagnosis.imperfect.windows import in_windows
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Weighing
+from diagnosis.search.explanation import Explanation
+from diagnosis.search.moves import Beside, InWindows, LookAlike, descended
+from diagnosis.search.search import Search
+from diagnosis.search.settled import best_move, settled
+from diagnosis.search.windows import in_windows
 from plant.effects import LOOK_ALIKES, parse_effect
 from plant.presets import paper_link
 from plant.simulation import Simulator
@@ -526,7 +528,7 @@ def test_an_answer_leaves_no_more_of_held_out_records_than_the_stated_values():
 @pytest.mark.parametrize(
     ("left", "further"), [(0.1, [("input_delay", True), ("viscous_friction", True)]), (0.04, [])]
 )
-def test_friction_and_tilt_are_fitted_beside_what_they_come_before(monkeypatch, left, further):
+def test_friction_and_tilt_are_fitted_beside_what_they_come_before(left, further):
     # The likeliest three are all of what every machine has some of; what is sought stands behind them.
     search, kinds = _hub_only(2)
     nothing, start = np.zeros(search.records.nominal.count), search.records.at_rest()
@@ -535,11 +537,7 @@ def test_friction_and_tilt_are_fitted_beside_what_they_come_before(monkeypatch, 
         x = np.array([np.mean(axis.box) for axis in kinds[name].axes])
         end = descend(search.records, (kinds[name],), nothing, x, start, iterations=1)
         search.found.append(Explanation(end, np.array([-float(k)]), 0.0, 0.0, (), (), np.full((2, 1), left)))
-    asked = []
-    monkeypatch.setattr(
-        search, "_beside", lambda end, most, everywhere=False: asked.append((*end.names, everywhere))
-    )
-    search._together(2)
+    asked = [(*move.parent.names, move.everywhere) for move in Beside.proposed(search, 2)]
     # Only where the likeliest leaves more than the model error.
     assert asked == [*((name, False) for name in names[:3]), *further]
 
@@ -634,8 +632,8 @@ def test_beside_others_a_frequency_is_tried_as_simulated_not_as_a_linear_arm_wou
         for loss, cycles in ((2 * base.loss, 9.0), (base.loss, 50.0))
     )
     search.points = [(ripple, [wrong])]
-    monkeypatch.setattr("diagnosis.imperfect.search.points_of", lambda *told, **more: [right])
-    search._beside(base, 2)
+    monkeypatch.setattr("diagnosis.search.moves.points_of", lambda *told, **more: [right])
+    Beside(base, 2).apply(search)
     end = search.found[-1].end
     assert end.loss < 0.1 * base.loss
     found = ripple.parameters(end.coordinates)
@@ -669,7 +667,7 @@ def test_every_likely_set_of_an_effect_and_the_effect_alone_are_also_fitted_with
         candidates = [kinds[name] for name in names]
         x = np.log([0.3, *[2e-3] * (len(names) - 1)])
         search.add(descend(search.records, candidates, nothing, x, start, iterations=2))
-    search._look_alikes()
+    search.tried(LookAlike.proposed(search), 0.9)
     fitted = {e.key for e in search.found}
     for names in (alone, *several):
         assert tuple(sorted({"ground_spring", *names} - {"gravity"})) in fitted
@@ -741,8 +739,8 @@ def test_a_strong_ripple_is_found_from_windows(seed, amplitude_Nm, left):
     base = search.add(descend(search.records, (), nothing, np.zeros(0), start, iterations=12)).end
     points = points_of(search.records, base, kinds["torque_ripple"])
     search.points = [(kinds["torque_ripple"], points)]
-    free = search.add(search._descended(base, kinds["torque_ripple"], points, base.jacobian))
-    search._from_windows()
+    free = search.add(descended(search, base, kinds["torque_ripple"], points, base.jacobian))
+    search.tried(InWindows.proposed(search), 0.9)
     best = min(search.found, key=lambda e: e.end.loss)
     found = best.end.effects[0]
     assert (found.amplitude_Nm, found.cycles_per_rev) == pytest.approx((amplitude_Nm, 11.0), rel=0.02)

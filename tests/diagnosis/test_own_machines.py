@@ -19,7 +19,8 @@ from benchmarks import emps_axis
 from diagnosis import Plant, PlantCase, PlantExperiment, diagnose, with_effects
 from diagnosis.fit.descent import descend
 from diagnosis.imperfect.answered import beside_imperfections, searched
-from diagnosis.imperfect.search import Search
+from diagnosis.search.moves import Alone, Beside, Enlarge, FromContacts, Scan
+from diagnosis.search.search import Search
 from tests.diagnosis.machines import rubbing
 
 DT_S, SAMPLES = 0.01, 700
@@ -294,10 +295,13 @@ def test_larger_sets_are_sought_while_the_last_size_was_worth_it(gained, sizes, 
         search.found.append(replace(likeliest, end=end, log_prior=log_prior, shares=np.ones((2, 1))))
         tried.append(count)
 
-    monkeypatch.setattr(Search, "_alone", lambda search: together(search, 1))
-    monkeypatch.setattr(Search, "_together", together)
-    for later in ("_containing", "_scanned", "_from_contacts"):
-        monkeypatch.setattr(Search, later, lambda search, *sets: None)
+    def moved(count):
+        return [SimpleNamespace(what="", apply=lambda search: together(search, count))]
+
+    monkeypatch.setattr(Alone, "proposed", lambda search: moved(1))
+    monkeypatch.setattr(Beside, "proposed", lambda search, count: moved(count))
+    for later in (Enlarge, Scan, FromContacts):
+        monkeypatch.setattr(later, "proposed", lambda search, *sets: [])
     search.run()
     assert tried[1:] == sizes
 

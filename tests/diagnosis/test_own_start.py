@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose
 from diagnosis.fit.descent import descend
 from diagnosis.fit.records import Records, Start
-from diagnosis.imperfect.search import Search
-from diagnosis.imperfect.settled import settled
+from diagnosis.search.search import Search
+from diagnosis.search.settled import settled
 
 DT_S, SAMPLES, NOISE_RAD = 0.02, 500, 1e-3
 
@@ -138,8 +138,8 @@ def test_a_set_is_descended_on_from_starts_sought_with_its_effects():
     held = Start(np.array([[0.05, 0.0], [-0.6, -4.0]]), np.zeros(0))
     stuck = descend(search.records, (dry,), np.zeros(0), np.log([0.1]), held, iterations=3)
     assert abs(stuck.start.states[0, 0] - 1.1) > 0.5
-    again = search._begun(stuck)
+    again = search.begun(stuck)
     np.testing.assert_allclose(again.start.states, begun, atol=0.01)
     assert again.loss < 0.1 * stuck.loss
     # Nothing to gain: the same.
-    assert search._begun(again) is again
+    assert search.begun(again) is again

@@ -1,0 +1,78 @@
+"""A fitted set of effects and what it leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from diagnosis.fit.descent import Descent
+from diagnosis.machine.machine_protocol import Real
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A fitted set of effects and what it leaves.
+
+    log_likelihoods : (R,) of every record, estimation and held-out.
+    log_prior, log_volume : of deviations, start and effects; what the records leave of them.
+    left, left_held_out : experiment residuals (T, Y) in the outputs' units.
+    shares : (2, Y) RMS left over the motion: estimation records, held-out records.
+    """
+
+    end: Descent
+    log_likelihoods: Real
+    log_prior: float
+    log_volume: float
+    left: tuple[Real, ...]
+    left_held_out: tuple[Real, ...]
+    shares: Real
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.end.names
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        return tuple(sorted(self.names))
+
+    def pooled_held_out(self, noise: Real) -> float:
+        """Energy left of the held-out records, in noise deviations (Y,)."""
+        return float(sum(np.sum((part / noise) ** 2) for part in self.left_held_out))
+
+    @property
+    def log_likelihood(self) -> float:
+        return float(np.sum(self.log_likelihoods))
+
+    @property
+    def evidence(self) -> float:
+        return self.log_likelihood + self.log_prior + self.log_volume
+
+
+class Weighed(Protocol):
+    """What a search asks of an end that was weighed."""
+
+    @property
+    def end(self) -> Descent: ...
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def key(self) -> tuple[str, ...]: ...
+
+    @property
+    def evidence(self) -> float: ...
+
+
+E = TypeVar("E", bound=Weighed)
+
+
+def best_of_sets(found: Iterable[E]) -> dict[tuple[str, ...], E]:
+    """The best by each set of effects, the likeliest first."""
+    best: dict[tuple[str, ...], E] = {}
+    for explanation in sorted(found, key=lambda e: -e.evidence):
+        best.setdefault(explanation.key, explanation)
+    return best

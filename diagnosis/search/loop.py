@@ -1,0 +1,211 @@
+"""The loop over moves that every search is, and the moves that a judge asks for."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Generic
+
+import numpy as np
+
+from diagnosis.fit.descent import Descent, best_following, descend
+from diagnosis.fit.records import RecordsToFit
+from diagnosis.fit.starts import Point, point_of
+from diagnosis.machine.machine_protocol import CaseOfMachine
+from diagnosis.search.explanation import E, best_of_sets
+from plant.effects.search_space import Candidate
+
+Progress = Callable[[float, str], None]
+
+# An effect is exchanged for one that is no further behind in evidence in a part of the set, nor in loss in
+# its place once all else has followed; nor further are sets, before they are fitted together.
+_AS_LIKELY = 15.0
+
+
+class Move(ABC):
+    """what: in words, for whoever waits, and for what a time limit left out."""
+
+    @property
+    @abstractmethod
+    def what(self) -> str: ...
+
+    @abstractmethod
+    def apply(self, search: SearchLoop[Any]) -> None: ...
+
+
+class SearchLoop(ABC, Generic[E]):
+    """All that was fitted to the records of a case, the nominal alone first.
+
+    deadline_s : of time.monotonic(); after it nothing more is tried, and `left_out` names what was not.
+    points : of every candidate, where it may start, best first. rough : ends of effects alone that are not
+        yet finished, with these.
+    """
+
+    records: RecordsToFit
+
+    def __init__(self, case: CaseOfMachine, progress: Progress, deadline_s: float = np.inf) -> None:
+        self.case, self.progress, self.deadline_s = case, progress, deadline_s
+        self.found: list[E] = []
+        self.left_out: list[str] = []
+        self.points: list[tuple[Candidate, list[Point]]] = []
+        self.rough: list[tuple[Descent, list[Point]]] = []
+        # Whether starts of records that are only predicted feel contacts.
+        self.touching = False
+        # Already tried: sets without one of their effects, with a simpler one, with another in its place.
+        self._reduced: set[tuple[object, ...]] = set()
+
+    def anew(self, case: CaseOfMachine) -> SearchLoop[E]:
+        """Of the same records in another form."""
+        return type(self)(case, self.progress, self.deadline_s)
+
+    @property
+    def base(self) -> E:
+        return self.found[0]
+
+    @property
+    def likeliest(self) -> E:
+        return max(self.found, key=lambda e: e.evidence)
+
+    @property
+    def simulations(self) -> int:
+        return self.records.simulations
+
+    @property
+    @abstractmethod
+    def unexplained(self) -> bool:
+        """Whether the likeliest leaves something that interests."""
+
+    @abstractmethod
+    def explained(self, end: Descent) -> E:
+        """An end with what it leaves, weighed."""
+
+    @abstractmethod
+    def looked_for(self, candidate: Candidate, points: list[Point]) -> tuple[Candidate, list[Point]]:
+        """A candidate and its points beside the nominal as they are tried from then on."""
+
+    @abstractmethod
+    def looked_at_beside(
+        self, parent: Descent, candidate: Candidate, points: Sequence[Point]
+    ) -> tuple[Candidate, list[Point]]:
+        """A candidate and some of its points beside a set, simulated, best first."""
+
+    @abstractmethod
+    def polished(self, end: Descent, rank: int, around: Descent) -> Descent:
+        """An end beside a fit, the rank-th of those tried together, as far as it is worth."""
+
+    def tried(self, moves: Iterable[Move], begin: float, share: float = 0.0) -> None:
+        """As long as there is time; begin, share: of the progress."""
+        count = len(moves) if isinstance(moves, Sequence) else 1
+        for k, move in enumerate(moves):
+            self.progress(begin + share * min(k / count, 1.0), move.what)
+            if not self.late(move.what):
+                move.apply(self)
+
+    def late(self, what: str) -> bool:
+        if time.monotonic() < self.deadline_s:
+            return False
+        if what not in self.left_out:
+            self.left_out.append(what)
+        return True
+
+    def add(self, end: Descent) -> E:
+        explained = self.explained(end)
+        self.found.append(explained)
+        return explained
+
+    def finish(self) -> None:
+        """What was found of every effect alone, as far as it is worth."""
+        for k, (end, points) in enumerate(sorted(self.rough, key=lambda one: one[0].loss)):
+            found = self.add(self.polished(end, k, self.base.end))
+            # Where it ended alone may be far from every start, and right beside another effect.
+            points.insert(0, point_of(found.end))
+
+    def simpler(self, explanation: E) -> None:
+        """The same with effects in place of those that contain them, from where these ended: further values
+        may have led out of a minimum in which the simpler effect was left."""
+        end = explanation.end
+        for k, containing in enumerate(end.candidates):
+            for candidate in [c for c, _ in self.points if c.effect == containing.kind.contains]:
+                if (this := (*explanation.names, explanation.evidence, candidate.effect)) in self._reduced:
+                    continue
+                self._reduced.add(this)
+                candidates = (*end.candidates[:k], candidate, *end.candidates[k + 1 :])
+                first = sum(len(c.axes) for c in end.candidates[:k]) + len(candidate.axes)
+                x = np.delete(
+                    end.coordinates, slice(first, first + len(containing.axes) - len(candidate.axes))
+                )
+                self.add(descend(self.records, candidates, end.deviations, x, end.start))
+
+    def exchanged(self, explanation: E, sought: Iterable[str]) -> None:
+        """The same with one of the effects sought replaced by another, as likely in a part of the set.
+
+        Larger sets are sought beside the likeliest parts alone: of two effects that no record tells apart,
+        the one that was extended would win by what was found beside it.
+        """
+        best = best_of_sets(self.found)
+        for k, name in enumerate(explanation.names):
+            if name not in sought:
+                continue
+            rest = {c.effect: c.kind.contains for c in explanation.end.candidates if c.effect != name}
+            for rival in [*best.values()]:
+                new = set(rival.names) - {*explanation.names}
+                kept = set(rival.names) - new
+                part = best.get(tuple(sorted({*kept, name})))
+                if len(new) != 1 or not kept <= rest.keys() or part is None:
+                    continue
+                (other,) = (c for c in rival.end.candidates if c.effect in new)
+                key = tuple(sorted((*rest, other.effect)))
+                contained = other.effect in rest.values() or other.kind.contains in rest
+                if key in best or contained or rival.evidence < part.evidence - _AS_LIKELY:
+                    continue
+                around = (best.get(tuple(sorted(rest))) or self.without(explanation, k)).end
+                if (this := (*key, around.loss, explanation.evidence, rival.evidence)) in self._reduced:
+                    continue
+                self._reduced.add(this)
+                joined = self._joined(around, rival, [other], explanation.end.loss)
+                if joined is not None:
+                    best[key] = joined
+
+    def joined(self, one: E, other: E) -> None:
+        """Both together where no set of their effects is known: each may explain other records, and larger
+        sets are sought beside the likeliest alone."""
+        further = [c for c in other.end.candidates if c.effect not in one.names]
+        together = (*one.end.candidates, *further)
+        key = tuple(sorted(c.effect for c in together))
+        contained = {c.kind.contains for c in together} & set(key)
+        if len(key) > self.case.machine.weighing.most_effects or contained or key in best_of_sets(self.found):
+            return
+        if (this := (*key, one.evidence, other.evidence)) not in self._reduced:
+            self._reduced.add(this)
+            self._joined(one.end, other, further, one.end.loss)
+
+    def _joined(self, around: Descent, rival: E, further: Sequence[Candidate], loss: float) -> E | None:
+        """Effects of a rival beside others, from where it ended; None where much more than `loss` is left."""
+        at = [rival.end.coordinates_of(rival.names.index(c.effect)) for c in further]
+        x, candidates = np.concatenate([around.coordinates, *at]), (*around.candidates, *further)
+        followed, d, x = best_following(self.records, around, candidates, [x])
+        if followed >= loss + _AS_LIKELY:
+            return None
+        return self.add(descend(self.records, candidates, d, x, around.start))
+
+    def without(self, explanation: E, k: int) -> E:
+        """The best explanation by the same effects but the k-th."""
+        end = explanation.end
+        rest = tuple(c for j, c in enumerate(end.candidates) if j != k)
+        key = tuple(sorted(c.effect for c in rest))
+        if rest and (this := (*explanation.names, explanation.evidence, k)) not in self._reduced:
+            self._reduced.add(this)
+            x = np.concatenate([end.coordinates_of(j) for j in range(len(end.candidates)) if j != k])
+            self.add(descend(self.records, rest, end.deviations, x, end.start))
+        return max((e for e in self.found if e.key == key), key=lambda e: e.evidence)
+
+    def by_these(self, chosen: Sequence[str], within: E) -> E:
+        """The best explanation by these effects alone, `within` itself where it has no others."""
+        key = tuple(sorted(chosen))
+        if within.key == key:
+            return within
+        while not any(e.key == key for e in self.found):
+            k = next(k for k, name in enumerate(within.names) if name not in chosen)
+            within = self.without(within, k)
+        return max((e for e in self.found if e.key == key), key=lambda e: e.evidence)

@@ -1,0 +1,432 @@
+"""What a search may try next. Each move says what it is, and descends when it is applied.
+
+What moves lead to is one of `Search.found`; which of them are proposed depends on what was found before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.signal import find_peaks
+
+from diagnosis.fit.descent import Descent, best_following, descend, refined, scanned
+from diagnosis.fit.records import Records, Start
+from diagnosis.fit.starts import Point, beside, point_of, points_of
+from diagnosis.machine.case import Case
+from diagnosis.machine.machine_protocol import Real
+from diagnosis.search.explanation import Weighed, best_of_sets
+from diagnosis.search.loop import Move, SearchLoop
+from diagnosis.search.settled import settled
+from diagnosis.search.windows import in_windows
+from plant.effects import LOOK_ALIKES, Effect
+from plant.effects.search_space import Candidate
+
+# Starts descended from alone; further ones, local minima of a grid of one value, whatever they leave.
+_ALONE, _LOCAL_MINIMA = 2, 1
+# Parents extended, and effects fitted beside each: pairs, larger sets.
+_PARENTS, _TRIED = (3, 1), (6, 4)
+# Further parents beside which only what every machine has some of is fitted, how many of these beside each,
+# and how far behind in evidence they may be.
+_FURTHER, _TRIED_BESIDE_FURTHER, _FAR_BEHIND = 2, 2, 100.0
+# Ends of effects alone that are finished, and sets in which what looks like an effect takes its place.
+FINISHED = 6
+# Sets of an effect in which what looks like it takes its place.
+_ALIKE = 3
+# Beside values pulled this far (tolerances), effects that multiply one are tried as well; pulled farther, in
+# place of the value.
+_PULLED, _BEYOND_BELIEF = 1.8, 2.0
+# Fits in windows: effects tried beside the best, and sets of one and of two continued in free runs.
+_BESIDE_IN_WINDOWS, _FREED = 4, (2, 3)
+# Loss that the best of them gains in windows, or none is continued.
+_GAINED = 15.0
+# Frequencies tried beside others.
+_FREQUENCIES = 3
+# Loss that an effect beside others gains once all else has followed, or its set is not descended on; unless
+# it is so much worse that the linearisation says nothing (set on 44 generated cases: of 325 in between, one
+# ended more than 15 below).
+_PROMISING, _ASTRAY = 3.0, 20.0
+# Scans of sets with contacts, each of the likeliest that is left or has gained this since its last.
+_SCANS, _GAINED_BY_SCAN = 2, 2.0
+# Sets of each size with contacts whose starts feel them, and how far behind in evidence they may be.
+_TOUCHING, _TOUCHING_ITERATIONS, _UNLIKELY = 2, 5, 150.0
+
+
+@dataclass(frozen=True, eq=False)
+class Alone(Move):
+    """An effect alone, from the best of its starts."""
+
+    candidate: Candidate
+
+    @property
+    def what(self) -> str:
+        return self.candidate.effect
+
+    @classmethod
+    def proposed(cls, search: SearchLoop[Any]) -> list[Alone]:
+        """But those that contain a simpler one."""
+        spaces = search.case.machine.candidates(search.case.experiments)
+        return [cls(candidate) for candidate in spaces if candidate.kind.contains is None]
+
+    def apply(self, search: SearchLoop[Any]) -> None:
+        around = search.base.end
+        points = points_of(search.records, around, self.candidate)
+        if points:
+            candidate, points = search.looked_for(self.candidate, points)
+        if points:
+            search.points.append((candidate, points))
+            search.rough.append((descended(search, around, candidate, points, around.jacobian), points))
+
+
+def descended(
+    search: SearchLoop[Any], around: Descent, candidate: Candidate, points: Sequence[Point], nominal: Real
+) -> Descent:
+    """The best end of a candidate beside a fit, from its best points that are apart."""
+    chosen, most = [points[0]], 2 * _ALONE if _turned(search, candidate) else _ALONE
+    for point in points[1:]:
+        if len(chosen) == most or point.loss > search.base.end.loss + 5:
+            break
+        if all(point.far_from(other) for other in chosen):
+            chosen.append(point)
+    further = [point for point in _local_minima(points) if all(map(point.far_from, chosen))]
+    chosen += further[:_LOCAL_MINIMA]
+    ends = [_from(search, around, candidate, point, nominal) for point in chosen]
+    return min(ends, key=lambda end: end.loss)
+
+
+def _turned(search: SearchLoop[Any], candidate: Candidate) -> bool:
+    return candidate.kind.absolute_angle and not search.case.machine.unknown_start.zero_seen
+
+
+def _from(
+    search: SearchLoop[Any], around: Descent, candidate: Candidate, point: Point, nominal: Real
+) -> Descent:
+    return descend(
+        search.records,
+        (*around.candidates, candidate),
+        point.deviations,
+        np.concatenate([around.coordinates, point.coordinates]),
+        point.start,
+        nominal_jacobian=nominal,
+        columns=around.columns,
+        iterations=9,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Enlarge(Move):
+    """An effect that contains a simpler one (Stribeck friction Coulomb's), from where a set of that ended."""
+
+    candidate: Candidate
+    inner: Descent
+    starts: Sequence[Real]
+
+    @property
+    def what(self) -> str:
+        return self.candidate.effect
+
+    @classmethod
+    def proposed(cls, search: SearchLoop[Any], sets: Sequence[Weighed]) -> Iterator[Enlarge]:
+        """With several further values the first time, then with those that this found."""
+        pool = list(best_of_sets(sets).values())
+        for candidate in search.case.machine.candidates(search.case.experiments):
+            for inner in [e.end for e in pool if candidate.kind.contains in e.names]:
+                known = [points[0] for c, points in search.points if c.effect == candidate.effect]
+                starts = [point.coordinates[1:] for point in known]
+                starts = starts or [np.array(x) for x in sorted({x[1:] for x in candidate.starts})[::2]]
+                yield cls(candidate, inner, starts)
+
+    def apply(self, search: SearchLoop[Any]) -> None:
+        inner, candidate = self.inner, self.candidate
+        k = inner.names.index(str(candidate.kind.contains))
+        first = sum(len(c.axes) for c in inner.candidates[: k + 1])
+        ends = [
+            descend(
+                search.records,
+                (*inner.candidates[:k], candidate, *inner.candidates[k + 1 :]),
+                inner.deviations,
+                np.concatenate([inner.coordinates[:first], further, inner.coordinates[first:]]),
+                inner.start,
+                nominal_jacobian=inner.jacobian[:, : inner.deviations.size],
+                columns=inner.columns,
+                iterations=6,
+            )
+            for further in self.starts
+        ]
+        best = min(ends, key=lambda end: end.loss)
+        if len(best.names) == 1:
+            search.points.append((candidate, [point_of(best)]))
+        search.add(best)
+
+
+@dataclass(frozen=True, eq=False)
+class Beside(Move):
+    """The most promising effects beside a set; everywhere: of what every machine has some of alone."""
+
+    parent: Descent
+    most: int
+    everywhere: bool = False
+
+    @property
+    def what(self) -> str:
+        return f"further effects beside {' and '.join(self.parent.names)}"
+
+    @classmethod
+    def proposed(cls, search: SearchLoop[Any], count: int) -> list[Beside]:
+        """Sets of so many effects, from the likeliest of one fewer.
+
+        Friction and tilt, which may be more than what is sought, take the first places; what else is likely
+        shows what it explains once they are beside it.
+        """
+        pool = list(best_of_sets(e for e in search.found if len(e.names) == count - 1).values())
+        parents = pool[: _PARENTS[count > 2]]
+        found = [cls(parent.end, _TRIED[count > 2]) for parent in parents]
+        tried, further = {_unusual(parent) for parent in parents} | {frozenset[str]()}, 0
+        for parent in pool[len(parents) :] if search.unexplained else ():
+            if further == _FURTHER or parent.evidence < pool[0].evidence - _FAR_BEHIND:
+                break
+            if _unusual(parent) not in tried:
+                tried, further = tried | {_unusual(parent)}, further + 1
+                found.append(cls(parent.end, _TRIED_BESIDE_FURTHER, everywhere=True))
+        return found
+
+    def apply(self, search: SearchLoop[Any]) -> None:
+        parent = self.parent
+        trials = sorted(self._trials(search), key=lambda trial: trial[1].loss)
+        chosen: dict[tuple[str, float], tuple[Candidate, Point]] = {}
+        for candidate, point in trials:
+            pulled = candidate.kind.multiplies is not None and np.any(np.abs(parent.deviations) > _PULLED)
+            if len(chosen) < self.most or pulled:
+                # Beside contacts that switch, and values pulled far, the one side may look better and the
+                # other be so.
+                side = candidate.axes[0].low if parent.non_smooth or pulled else 0.0
+                chosen.setdefault((candidate.effect, side), (candidate, point))
+        nominal = parent.jacobian[:, : parent.deviations.size]
+        ends = [
+            _from(search, parent, candidate, point, nominal)
+            for candidate, point in chosen.values()
+            if not -_ASTRAY < parent.loss - point.loss < _PROMISING
+        ]
+        for k, end in enumerate(sorted(ends, key=lambda end: end.loss)):
+            search.add(search.polished(end, k, parent))
+
+    def _trials(self, search: SearchLoop[Any]) -> Iterator[tuple[Candidate, Point]]:
+        """The best point of every candidate beside the parent."""
+        held = {name for c in self.parent.candidates for name in (c.effect, c.kind.contains)} - {None}
+        for candidate, points in search.points:
+            if candidate.effect in held or candidate.kind.contains in held:
+                continue
+            if self.everywhere and not candidate.kind.everywhere:
+                continue
+            # A frequency, and a zero that no other output tells, may be any other beside another effect.
+            anew = candidate.kind.harmonic is not None or _turned(search, candidate)
+            candidate, near = search.looked_at_beside(self.parent, candidate, points[:1] if anew else points)
+            if anew:
+                further = points_of(search.records, self.parent, candidate, every=2)[:_FREQUENCIES]
+                if candidate.kind.harmonic is not None:
+                    # Their losses are a linear arm's; where it is not, they may leave less than it would.
+                    further += beside(search.records, self.parent, candidate, further)
+                near += further
+            yield from ((candidate, point) for point in sorted(near, key=lambda point: point.loss)[:1])
+
+
+@dataclass(frozen=True, eq=False)
+class InPlaceOf(Move):
+    """An effect that multiplies a nominal value, in place of that value pulled beyond belief."""
+
+    parent: Descent
+    candidate: Candidate
+    coordinates: Real
+    deviations: Real
+
+    @property
+    def what(self) -> str:
+        return self.candidate.effect
+
+    @classmethod
+    def proposed(cls, search: SearchLoop[Any], parent: Descent) -> Iterator[InPlaceOf]:
+        nominal, listed = search.records.nominal, [candidate for candidate, _ in search.points]
+        factors = nominal.factors(parent.deviations)
+        for k, key in enumerate(nominal.keys):
+            if abs(parent.deviations[k]) < _BEYOND_BELIEF:
+                continue
+            found = in_place_of(key, factors[key], listed)
+            if found is not None and found[0].effect not in parent.names:
+                yield cls(parent, *found, np.where(np.arange(nominal.count) == k, 0.0, parent.deviations))
+
+    def apply(self, search: SearchLoop[Any]) -> None:
+        point = Point(self.parent.loss, self.coordinates, self.deviations, self.parent.start)
+        nominal = self.parent.jacobian[:, : self.deviations.size]
+        end = _from(search, self.parent, self.candidate, point, nominal)
+        search.add(search.polished(end, 0, self.parent))
+
+
+def in_place_of(key: str, factor: float, listed: Sequence[Candidate]) -> tuple[Candidate, Real] | None:
+    """The effect that multiplies a nominal parameter by this factor, or by the nearest one worth a name."""
+    sign = 1 if factor > 1 else -1
+    for candidate in listed:
+        if candidate.kind.multiplies == key and candidate.sign == sign:
+            return candidate, np.clip([candidate.axes[0].coordinate(factor)], *candidate.box)
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class InWindows(Move):
+    """Torques over the angle and what stands beside them, from where fits in windows ended."""
+
+    acting: Sequence[Candidate]
+
+    @property
+    def what(self) -> str:
+        return "fits in windows"
+
+    @classmethod
+    def proposed(cls, search: SearchLoop[Any]) -> list[InWindows]:
+        acting = [c for c, _ in search.points if c.kind.absolute_angle or c.kind.harmonic == "hub_angle"]
+        return [cls(acting)] if acting and isinstance(search.case, Case) else []
+
+    def apply(self, search: SearchLoop[Any]) -> None:
+        assert isinstance(search.case, Case)
+        base, states = search.base.end, search.records.state_spread.size
+        windows = search.anew(in_windows(search.case))
+        assert isinstance(windows.records, Records)
+        start, _ = settled(windows.records, base.deviations, (), windows.records.at_rest())
+        windows.add(descend(windows.records, (), base.deviations, base.coordinates, start))
+        around = windows.base.end
+        for candidate in self.acting:
+            points = points_of(windows.records, around, candidate)
+            if points and not search.late(self.what):
+                windows.add(descended(windows, around, candidate, points, around.jacobian))
+        windows.points = [(c, points) for c, points in search.points if c.kind.harmonic != "time"]
+        best = min((e.end for e in windows.found), key=lambda end: end.loss)
+        if best.loss > around.loss - _GAINED:
+            return
+        if not search.late(self.what):
+            Beside(best, _BESIDE_IN_WINDOWS).apply(windows)
+        for count, most in enumerate(_FREED, start=1):
+            of_count = [e.end for e in windows.found if len(e.names) == count]
+            for end in sorted(of_count, key=lambda end: end.loss)[:most]:
+                start = Start(end.start.states[:, :states], end.start.zeros)
+                freed = descend(search.records, end.candidates, end.deviations, end.coordinates, start)
+                search.add(refined(search.records, freed))
+
+
+@dataclass(frozen=True, eq=False)
+class Scan(Move):
+    """A set with contacts once more from far values of all its parameters."""
+
+    end: Descent
+
+    @property
+    def what(self) -> str:
+        return "scans of sets with contacts"
+
+    @classmethod
+    def proposed(cls, search: SearchLoop[Any]) -> Iterator[Scan]:
+        """The likeliest that is left, or has gained since its last."""
+        done: dict[tuple[str, ...], float] = {}
+        for _ in range(_SCANS):
+            likeliest = (
+                e
+                for key, e in best_of_sets(search.found).items()
+                if e.end.non_smooth and e.end.loss < done.get(key, np.inf) - _GAINED_BY_SCAN
+            )
+            this = next(likeliest, None)
+            if this is None:
+                return
+            done[this.key] = this.end.loss
+            yield cls(this.end)
+
+    def apply(self, search: SearchLoop[Any]) -> None:
+        search.add(refined(search.records, scanned(search.records, self.end)))
+
+
+@dataclass(frozen=True, eq=False)
+class FromContacts(Move):
+    """A set with contacts once more from starts of the records that feel them."""
+
+    end: Descent
+
+    @property
+    def what(self) -> str:
+        return "starts of records in free play"
+
+    @classmethod
+    def proposed(cls, search: SearchLoop[Any]) -> Iterator[FromContacts]:
+        """The likeliest sets of each size."""
+        if not search.case.machine.unknown_start.tried.size:
+            return
+        search.touching = True
+        sets = [e for e in best_of_sets(search.found).values() if e.end.non_smooth]
+        for count in range(1, search.case.machine.weighing.most_effects + 1):
+            for e in [e for e in sets if len(e.names) == count][:_TOUCHING]:
+                if e.evidence >= search.likeliest.evidence - _UNLIKELY:
+                    yield cls(e.end)
+
+    def apply(self, search: SearchLoop[Any]) -> None:
+        end = self.end
+        assert isinstance(search.records, Records)
+        start, _ = settled(search.records, end.deviations, end.effects, end.start, touching=True)
+        again = descend(
+            search.records,
+            end.candidates,
+            end.deviations,
+            end.coordinates,
+            start,
+            nominal_jacobian=end.jacobian[:, : end.deviations.size],
+            touching=True,
+            iterations=_TOUCHING_ITERATIONS,
+        )
+        search.add(min(end, again, key=lambda one: one.loss))
+
+
+@dataclass(frozen=True, eq=False)
+class LookAlike(Move):
+    """A cause beyond the list in place of the effect that it looks like."""
+
+    end: Descent
+    kind: type[Effect]
+
+    @property
+    def what(self) -> str:
+        return "causes beyond the list that look like an effect"
+
+    @classmethod
+    def proposed(cls, search: SearchLoop[Any]) -> Iterator[LookAlike]:
+        """Wherever that may be the answer, and alone: what one effect looks like may look like two others as
+        well."""
+        if not isinstance(search.case, Case):
+            return
+        best = best_of_sets(search.found)
+        likeliest = list(best.values())[:FINISHED]
+        for kind in LOOK_ALIKES.values():
+            sets = [e for e in likeliest if kind.look_alike_of in e.names][:_ALIKE]
+            alone = [e for e in best.values() if e.names == (kind.look_alike_of,) and e not in sets]
+            yield from (cls(e.end, kind) for e in (*sets, *alone))
+
+    def apply(self, search: SearchLoop[Any]) -> None:
+        end, k = self.end, self.end.names.index(str(self.kind.look_alike_of))
+        rig = search.records.nominal.at(end.deviations).description
+        other = self.kind.in_place_of(end.candidates[k], end.coordinates_of(k), rig)
+        candidates = (*end.candidates[:k], other, *end.candidates[k + 1 :])
+        first = sum(len(c.axes) for c in end.candidates[:k])
+        rest = end.coordinates[:first], end.coordinates[first + len(end.candidates[k].axes) :]
+        trials = [np.concatenate([rest[0], start, rest[1]]) for start in other.starts]
+        _, d, x = best_following(search.records, end, candidates, trials)
+        search.add(descend(search.records, candidates, d, x, end.start))
+
+
+def _unusual(explanation: Weighed) -> frozenset[str]:
+    """Its effects but those that every machine has some of."""
+    return frozenset(c.effect for c in explanation.end.candidates if not c.kind.everywhere)
+
+
+def _local_minima(points: Sequence[Point]) -> list[Point]:
+    """Of a grid of one value, best first; of several values none is sought."""
+    if points[0].coordinates.size != 1:
+        return []
+    line = sorted(points, key=lambda point: float(point.coordinates[0]))
+    peaks, _ = find_peaks([-np.inf, *(-point.loss for point in line), -np.inf])
+    return sorted([line[k - 1] for k in peaks], key=lambda point: point.loss)

@@ -1,0 +1,213 @@
+"""The search beside a model error: sets of effects that explain records beside what no effect explains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from diagnosis.fit.descent import Descent, descend, loss_at, occam, refined
+from diagnosis.fit.records import Records, Start, share_left
+from diagnosis.fit.starts import Point, beside
+from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+from diagnosis.search.explanation import Explanation, best_of_sets
+from diagnosis.search.loop import Progress, SearchLoop
+from diagnosis.search.moves import FINISHED, Alone, Beside, Enlarge, FromContacts, InWindows, LookAlike, Scan
+from diagnosis.search.settled import settled
+from plant.effects.search_space import Candidate
+
+# Of every candidate's points, that are tried beside others: the best, and as many of the rest.
+_BESIDE_POINTS = 4
+# Ends beside a set that are refined where contacts switch.
+_REFINED = 2
+# Sets of several whose simple effects are also continued as those that contain them.
+_CONTINUED = 3
+# Evidence that larger sets gain, or none that are larger still are tried.
+_WORTH = 15.0
+# Loss that other starts of the records gain, or a set is not descended on from there.
+_GAINED_BY_START = 2.0
+# Of octaves, what is felt where disturbances of the inputs are amplified.
+_AMPLIFIED = 0.5
+_LAST_ITERATIONS, _LAST_TOLERANCE = 20, 0.02
+
+
+class Search(SearchLoop[Explanation]):
+    """All that was fitted to a case, the nominal alone first.
+
+    at_inputs : the model error is one of the inputs, whatever the machine makes of it (`Levels`).
+    first_halves : names of the estimation records that are first halves of held-out ones (`Case.in_halves`):
+        what a set leaves of these counts as left of held-out records. A second look.
+    """
+
+    records: Records
+
+    def __init__(
+        self,
+        case: CaseOfMachine,
+        progress: Progress,
+        deadline_s: float = np.inf,
+        at_inputs: bool = False,
+        first_halves: tuple[str, ...] = (),
+    ) -> None:
+        super().__init__(case, progress, deadline_s)
+        self.at_inputs, self.first_halves = at_inputs, first_halves
+        self.records = Records(case, case.estimation, at_inputs=at_inputs)
+        self.held_out = Records(case, case.held_out, at_inputs=at_inputs)
+
+    @property
+    def simulations(self) -> int:
+        return self.records.simulations + self.held_out.simulations
+
+    @property
+    def amplifies(self) -> bool:
+        """Whether the machine makes much more of a disturbance of its inputs than of the inputs."""
+        return bool(np.min(self.records.levels.felt) < _AMPLIFIED)
+
+    def anew(self, case: CaseOfMachine) -> Search:
+        """Of the same records in another form."""
+        return Search(case, self.progress, self.deadline_s, self.at_inputs)
+
+    def run(self) -> None:
+        """The nominal, every effect alone, then sets of two, three and more beside the likeliest.
+
+        Beyond three only while the likeliest leaves more of the motion than is stated not to interest, and
+        the last size was worth it. A second look is to take less time than the first: none beyond two where
+        contacts switch, and no scans, windows and starts of contacts.
+        """
+        nothing = np.zeros(self.records.nominal.count)
+        start, _ = settled(self.records, nothing, (), self.records.at_rest())
+        self.add(descend(self.records, (), nothing, np.zeros(0), start, iterations=12))
+        self.tried(Alone.proposed(self), 0.05, 0.4)
+        self.finish()
+        self.tried(Enlarge.proposed(self, self.found), 0.45)
+        for count in range(2, self.case.machine.weighing.most_effects + 1):
+            if count > 3 and not (self.unexplained and self._worth(count - 1)):
+                break
+            if count > 2 and self.first_halves and self.likeliest.end.non_smooth:
+                break
+            self.tried(Beside.proposed(self, count), min(0.45 + 0.25 * (count - 2), 0.9), 0.1)
+        if self.unexplained and not self.first_halves:
+            self.tried(InWindows.proposed(self), 0.95)
+        several = best_of_sets(e for e in self.found if len(e.names) > 1)
+        self.tried(Enlarge.proposed(self, list(several.values())[:_CONTINUED]), 0.96)
+        if self.unexplained and not self.first_halves:
+            self.tried(Scan.proposed(self), 0.97)
+            self.tried(FromContacts.proposed(self), 0.97)
+        self.tried(LookAlike.proposed(self), 0.98)
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether the likeliest leaves more of the motion than is stated not to interest."""
+        return bool(np.max(self.likeliest.shares) > self.case.machine.weighing.model_error)
+
+    def _worth(self, count: int) -> bool:
+        """Whether the likeliest set of so many effects is much likelier than that of one fewer."""
+        largest, smaller = (
+            max((e.evidence for e in self.found if len(e.names) == n), default=-np.inf)
+            for n in (count, count - 1)
+        )
+        return largest > smaller + _WORTH
+
+    def looked_for(self, candidate: Candidate, points: list[Point]) -> tuple[Candidate, list[Point]]:
+        return candidate, points
+
+    def looked_at_beside(
+        self, parent: Descent, candidate: Candidate, points: Sequence[Point]
+    ) -> tuple[Candidate, list[Point]]:
+        """The best and, because beside another effect any size may be right, some of the rest."""
+        rest = points[_BESIDE_POINTS:]
+        some = [*points[:_BESIDE_POINTS], *rest[:: max(1, len(rest) // _BESIDE_POINTS)]]
+        return candidate, beside(self.records, parent, candidate, some)
+
+    def polished(self, end: Descent, rank: int, around: Descent) -> Descent:
+        alone = not around.candidates
+        if rank >= (FINISHED if alone else _REFINED):
+            return end
+        if alone and not end.converged:
+            end = descend(self.records, end.candidates, end.deviations, end.coordinates, end.start)
+        return refined(self.records, self.begun(end))
+
+    def begun(self, end: Descent) -> Descent:
+        """Descended on where starts sought with these effects leave less: the nominal's may be far off, and
+        where nobody knows a linear part no step leads from there."""
+        if self.case.machine.unknown_start.responses is not None or not end.start.states.size:
+            return end
+        start, e = settled(self.records, end.deviations, end.effects, end.start)
+        loss, _ = loss_at(self.records, e, end.deviations, start)
+        if loss > end.loss - _GAINED_BY_START:
+            return end
+        return descend(self.records, end.candidates, end.deviations, end.coordinates, start)
+
+    def acts_on_held_out(self, explanation: Explanation, k: int) -> float:
+        """Share of the motion that the k-th effect changes of held-out records, all else as it is; of the
+        output that shows most of it."""
+        end, held = explanation.end, self.held_out
+        rest = [effect for j, effect in enumerate(end.effects) if j != k]
+        start = self._beginning(held, end.start)
+        pairs = zip(
+            held.residuals(end.deviations, end.effects, start),
+            held.residuals(end.deviations, rest, start),
+            strict=True,
+        )
+        motion = held.levels.motion.reshape(-1, self.case.noise.size).sum(axis=0)
+        changed = sum(np.sum((with_it - without) ** 2, axis=0) for with_it, without in pairs)
+        return float(np.sqrt(np.max(changed / motion)))
+
+    def finished(self, explanation: Explanation) -> Explanation:
+        """Descended to its end."""
+        end = explanation.end
+        return self.add(
+            descend(
+                self.records,
+                end.candidates,
+                end.deviations,
+                end.coordinates,
+                end.start,
+                iterations=_LAST_ITERATIONS,
+                tolerance=_LAST_TOLERANCE,
+            )
+        )
+
+    def stated(self, of: Explanation | None = None) -> Explanation:
+        """With nominal values as stated, effects as they are: only the starts are fitted."""
+        end = (of or self.base).end
+        stated = np.zeros(end.deviations.size)
+        start, e = settled(self.records, stated, end.effects, self._beginning(self.records, end.start))
+        loss, prior = loss_at(self.records, e, stated, start)
+        weights = self.records.levels.weights(e)
+        moved = replace(end, deviations=stated, start=start, left=e, weights=weights, loss=loss, prior=prior)
+        return self.explained(moved)
+
+    def left_by(self, other: Explanation) -> Real:
+        """(2, Y) shares that the same effects leave here, descended on from where another search ended."""
+        end = other.end
+        here = descend(self.records, end.candidates, end.deviations, end.coordinates, end.start)
+        return self.explained(here).shares
+
+    def explained(self, end: Descent) -> Explanation:
+        """With what it predicts of the held-out records, their starts fitted (`settled`)."""
+        records, held = self.records, self.held_out
+        beginning = self._beginning(held, end.start)
+        touching = self.touching and end.non_smooth
+        start, e = settled(held, end.deviations, end.effects, beginning, touching=touching)
+        left, left_held_out = records.residuals_of(end.left), held.residuals_of(e)
+        states = 0.5 * np.sum((start.states / held.state_spread) ** 2, axis=1)
+        fitted, begun = records.energies(left), [e.name in self.first_halves for e in records.experiments]
+        predicted = np.concatenate([fitted[:, begun], held.energies(left_held_out)], axis=1)
+        return Explanation(
+            end,
+            -np.concatenate([records.losses(end.left), held.losses(e) + states]),
+            -end.prior,
+            occam(records, end),
+            left,
+            left_held_out,
+            np.array([share_left(fitted), share_left(predicted)]),
+        )
+
+    def _beginning(self, held: Records, fitted: Start) -> Start:
+        """Starts of records as their first samples say, sensors at the zeros that others have."""
+        start = held.at_rest()
+        if not start.zeros.size:
+            return start
+        return start.with_zeros(fitted.zeros, self.case.machine.unknown_start.state_per_zero)
