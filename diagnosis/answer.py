@@ -118,10 +118,6 @@ class Diagnosis:
         of the held-out gap, and nobody says that they are the cause.
     noise_below_stated : tuple of (output, noise, stated noise). Of an own machine whose records show less
         noise than is stated, in whose place it was counted.
-    first_halves : tuple of str. Estimation records of `case` that are first halves of held-out ones, fitted
-        along because the others leave the answer open; held out are then the second halves.
-    left_before_halves : float. Share of the motion that the nominal, re-estimated on the other records alone,
-        leaves of the whole held-out records, of the output with most; nan without first halves.
     competing : tuple of CompetingHypothesis. Fitted explanations that contradict each other, most probable
         first, for `next_experiment`; only for a flexible link.
     shares : Shares or None. Only of a machine with a stated model error.
@@ -153,8 +149,6 @@ class Diagnosis:
     unlisted: tuple[Any, ...] = ()
     partial_model: tuple[str, ...] = ()
     noise_below_stated: tuple[tuple[str, float, float], ...] = ()
-    first_halves: tuple[str, ...] = ()
-    left_before_halves: float = float("nan")
     competing: tuple[CompetingHypothesis, ...] = ()
     shares: Shares | None = None
 

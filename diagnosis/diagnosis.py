@@ -32,7 +32,6 @@ from diagnosis.fit.residual import ResidualModel
 from diagnosis.imperfect.answered import (
     beside_imperfections,
     looked_at_again,
-    looked_at_halves,
     reaches_noise,
     searched,
 )
@@ -118,7 +117,7 @@ def _answered(
         progress(_FIRST_SEARCH + (1 - _FIRST_SEARCH) * done, what)
 
     if not isinstance(case, PlantCase):
-        return looked_at_halves(beside_imperfections(found, rng), again, deadline_s, rng)
+        return beside_imperfections(found, rng)
     if not weighing.stated and reaches_noise(found):
         exact = _without_error(case.without_model_error(), again, rng)
         if exact.verdict != "unknown":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -81,36 +80,6 @@ def looked_at_again(
     search.run()
     again = beside_imperfections(search, rng)
     return again if again.combination and not set(again.combination) & named else answer
-
-
-def looked_at_halves(
-    answer: Diagnosis, progress: Progress, deadline_s: float, rng: np.random.Generator
-) -> Diagnosis:
-    """The answer of an arm whose held-out records may show what its estimation records do not.
-
-    An effect that only held-out records excite is in no fit: it stays "unknown", or is none. The first halves
-    of these records are then fitted along, and the second halves judge. Taken where that names what the first
-    answer does not, closes most of the gap there, and is surer of its main cause than a first answer that
-    names one; not sought where that is sure, nor where nothing interests.
-    """
-    case, shares = answer.case, answer.shares
-    left = max(shares.before) if shares else 0.0
-    if answer.probability >= SURE or not (answer.verdict == "unknown" or left > case.model_error):
-        return answer
-    halves, names = case.in_halves()
-    if not names:
-        return answer
-    search = Search(halves.at_fast_lengths(), progress, deadline_s, first_halves=names)
-    search.run()
-    again = beside_imperfections(search, rng)
-    named = set(again.combination) - set(answer.combination)
-    main_cause, main_again = (max(a.probabilities.values()) for a in (answer, again))
-    surer = answer.verdict != "effect" or main_again > main_cause
-    if named and surer and again.gap_closed > _MOST_OF_IT:
-        return replace(again, first_halves=names, left_before_halves=left)
-    if shares and search.left_out:
-        return replace(answer, shares=replace(shares, not_tried=("first halves of held-out records",)))
-    return answer
 
 
 def reaches_noise(search: Search) -> bool:

@@ -291,9 +291,6 @@ def _part(
     elif estimated < held_out and score_of(explanation, weighing) > _BEHIND + score_of(rest, weighing):
         # Without it the others fit the records they were fitted to as well, with values that others refute.
         share = held_out
-    if search.first_halves:
-        # What is asked is what closes the gap that the other records do not show.
-        share = held_out
     share = max(share, seen.share if seen else 0.0)
     matters = _soft(share / limit / model_error, _INTERESTS_WIDTH)
     off = _tolerances_off(search, explanation, k)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.fft import prev_fast_len
 
 from diagnosis.machine.flexible_arm import NOISE, FlexibleArm
-from diagnosis.machine.machine_protocol import FEWEST_SAMPLES, Real, RecordedCase, Role, check_record
+from diagnosis.machine.machine_protocol import Real, RecordedCase, Role, check_record
 from diagnosis.machine.quantisation_grid import grid_step
 from ident.data.arrays import lock
 from plant.rig import Output, Rig
@@ -109,20 +109,6 @@ class Case(RecordedCase[Experiment]):
         transform is fast."""
         parts = (e.part(e.name, e.role, 0, prev_fast_len(len(e.output))) for e in self.experiments)
         return replace(self, experiments=tuple(parts))
-
-    def in_halves(self) -> tuple[Case, tuple[str, ...]]:
-        """With the first half of every held-out record among the estimation records, and the names of these;
-        records that stand still in a half stay whole."""
-        experiments, halves = [*self.estimation], list[str]()
-        for e in self.held_out:
-            half, end = len(e.output) // 2, len(e.output)
-            if half < FEWEST_SAMPLES or not all(np.ptp(y, axis=0).all() for y in np.split(e.output, [half])):
-                experiments.append(e)
-                continue
-            halves.append(f"{e.name} (first half)")
-            experiments.append(e.part(halves[-1], "estimation", 0, half))
-            experiments.append(e.part(f"{e.name} (second half)", "held_out", half, end))
-        return replace(self, experiments=tuple(experiments)), tuple(halves)
 
     @property
     def outputs(self) -> tuple[Output, ...]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from diagnosis.fit.descent import Descent, descend, loss_at, occam, refined
-from diagnosis.fit.records import Records, Start, share_left
+from diagnosis.fit.records import Records, Start
 from diagnosis.fit.starts import Point, beside
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.search.explanation import Explanation, best_of_sets
@@ -36,8 +36,6 @@ class Search(SearchLoop[Explanation]):
     """All that was fitted to a case, the nominal alone first.
 
     at_inputs : the model error is one of the inputs, whatever the machine makes of it (`Levels`).
-    first_halves : names of the estimation records that are first halves of held-out ones (`Case.in_halves`):
-        what a set leaves of these counts as left of held-out records. A second look.
     """
 
     records: Records
@@ -48,10 +46,9 @@ class Search(SearchLoop[Explanation]):
         progress: Progress,
         deadline_s: float = np.inf,
         at_inputs: bool = False,
-        first_halves: tuple[str, ...] = (),
     ) -> None:
         super().__init__(case, progress, deadline_s)
-        self.at_inputs, self.first_halves = at_inputs, first_halves
+        self.at_inputs = at_inputs
         self.records = Records(case, case.estimation, at_inputs=at_inputs)
         self.held_out = Records(case, case.held_out, at_inputs=at_inputs)
 
@@ -72,8 +69,7 @@ class Search(SearchLoop[Explanation]):
         """The nominal, every effect alone, then sets of two, three and more beside the likeliest.
 
         Beyond three only while the likeliest leaves more of the motion than is stated not to interest, and
-        the last size was worth it. A second look is to take less time than the first: none beyond two where
-        contacts switch, and no scans, windows and starts of contacts.
+        the last size was worth it.
         """
         nothing = np.zeros(self.records.nominal.count)
         start, _ = settled(self.records, nothing, (), self.records.at_rest())
@@ -84,14 +80,12 @@ class Search(SearchLoop[Explanation]):
         for count in range(2, self.case.machine.weighing.most_effects + 1):
             if count > 3 and not (self.unexplained and self._worth(count - 1)):
                 break
-            if count > 2 and self.first_halves and self.likeliest.end.non_smooth:
-                break
             self.tried(Beside.proposed(self, count), min(0.45 + 0.25 * (count - 2), 0.9), 0.1)
-        if self.unexplained and not self.first_halves:
+        if self.unexplained:
             self.tried(InWindows.proposed(self), 0.95)
         several = best_of_sets(e for e in self.found if len(e.names) > 1)
         self.tried(Enlarge.proposed(self, list(several.values())[:_CONTINUED]), 0.96)
-        if self.unexplained and not self.first_halves:
+        if self.unexplained:
             self.tried(Scan.proposed(self), 0.97)
             self.tried(FromContacts.proposed(self), 0.97)
         self.tried(LookAlike.proposed(self), 0.98)
@@ -193,8 +187,6 @@ class Search(SearchLoop[Explanation]):
         start, e = settled(held, end.deviations, end.effects, beginning, touching=touching)
         left, left_held_out = records.residuals_of(end.left), held.residuals_of(e)
         states = 0.5 * np.sum((start.states / held.state_spread) ** 2, axis=1)
-        fitted, begun = records.energies(left), [e.name in self.first_halves for e in records.experiments]
-        predicted = np.concatenate([fitted[:, begun], held.energies(left_held_out)], axis=1)
         return Explanation(
             end,
             -np.concatenate([records.losses(end.left), held.losses(e) + states]),
@@ -202,7 +194,7 @@ class Search(SearchLoop[Explanation]):
             occam(records, end),
             left,
             left_held_out,
-            np.array([share_left(fitted), share_left(predicted)]),
+            np.array([records.shares(left), held.shares(left_held_out)]),
         )
 
     def _beginning(self, held: Records, fitted: Start) -> Start:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -61,34 +59,6 @@ def test_every_effect_is_a_candidate_whose_starts_make_an_effect():
             effect = candidate.effect_at(np.array(start))
             assert effect.id == candidate.effect
             assert np.all((np.array(start) >= low) & (np.array(start) <= high)), candidate.effect
-
-
-def test_held_out_records_in_halves():
-    rng = np.random.default_rng(3)
-    still = rng.standard_normal((60, 2))
-    still[30:, 1] = 0.2
-    c = _experiment("c", "held_out", voltage_V=np.arange(61.0), output=rng.standard_normal((61, 2)))
-    c = replace(c, missing=(3, 29, 30, 60), reference_rad=np.arange(61.0), readings=c.output[::2])
-    short = _experiment("d", "held_out", voltage_V=np.zeros(39), output=rng.standard_normal((39, 2)))
-    rests = _experiment("e", "held_out", voltage_V=np.zeros(60), output=still)
-    halves, names = _case(_experiment("a"), c, short, rests).in_halves()
-    # Too few samples, and a sensor that would seem dead: not cut.
-    assert [(e.name, e.role) for e in halves.experiments] == [
-        ("a", "estimation"),
-        ("c (first half)", "estimation"),
-        ("c (second half)", "held_out"),
-        ("d", "held_out"),
-        ("e", "held_out"),
-    ]
-    assert names == ("c (first half)",)
-    first, second = halves.experiments[1:3]
-    assert (first.missing, second.missing) == ((3, 29), (0, 30))
-    assert (first.first_row, second.first_row) == (0, 30)
-    for name in ("voltage_V", "output", "reference_rad"):
-        whole = np.concatenate([getattr(first, name), getattr(second, name)])
-        np.testing.assert_array_equal(whole, getattr(c, name))
-    # The grid of a sensor is read off all of its values.
-    assert len(first.readings) == len(second.readings) == 31
 
 
 def test_records_are_cut_to_lengths_without_large_prime_factors():

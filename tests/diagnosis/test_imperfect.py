@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,9 +25,6 @@ from diagnosis.fit.records import Records, Start, StartColumns
 from diagnosis.fit.starts import Point, points_of
 from diagnosis.imperfect.answered import (
     _in_part,
-    beside_imperfections,
-    looked_at_halves,
-    searched,
 )
 from diagnosis.imperfect.carried import shares_of
 from diagnosis.imperfect.verdict import TEMPER, _enough, _weights, is_silent, judged
@@ -569,12 +565,6 @@ def test_a_long_delay_is_found_beside_what_hides_it(tmp_path):
     assert _found(tmp_path, 40, 6173, 39) == {"input_delay", "joint_compliance"}
 
 
-@pytest.mark.slow
-def test_a_disturbance_goes_on_in_the_second_halves_that_judge(tmp_path):
-    # Begun anew there it would leave more than none does, and no set with it could be the answer.
-    assert _found(tmp_path, 40, 6199, 35) == {"periodic_disturbance", "hardening_spring"}
-
-
 @pytest.mark.parametrize(
     ("losses", "begun"),
     [
@@ -584,7 +574,7 @@ def test_a_disturbance_goes_on_in_the_second_halves_that_judge(tmp_path):
         ([5, 6, 90, 95, 99], [0]),
     ],
 )
-def test_a_fit_alone_also_begins_at_a_local_minimum_of_its_grid(losses, begun):
+def test_a_fit_alone_also_begins_at_a_local_minimum_of_its_grid(losses, begun, monkeypatch):
     def points(values):
         start = SimpleNamespace(zeros=np.zeros(0))
         grid = [Point(loss, np.full(values, float(k)), None, start) for k, loss in enumerate(losses)]
@@ -592,12 +582,14 @@ def test_a_fit_alone_also_begins_at_a_local_minimum_of_its_grid(losses, begun):
 
     tried: list[Point] = []
     nominal = SimpleNamespace(end=SimpleNamespace(loss=0.5))
-    search = SimpleNamespace(
-        base=nominal, _turned=lambda c: False, _from=lambda a, c, point, n: tried.append(point) or point
+    search = SimpleNamespace(base=nominal)
+    monkeypatch.setattr("diagnosis.search.moves._turned", lambda search, candidate: False)
+    monkeypatch.setattr(
+        "diagnosis.search.moves._from", lambda s, a, c, point, n: tried.append(point) or point
     )
     for values, expected in ((1, begun), (2, [0])):
         tried.clear()
-        Search._descended(search, None, None, points(values), None)
+        descended(search, None, None, points(values), None)
         assert [point.coordinates[0] for point in tried] == expected
 
 
@@ -781,13 +773,12 @@ def _judged(sets, **told):
     return judged(_searched(sets, **told))
 
 
-def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0, first_halves=()):
+def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
     """A search that has found sets of effects by what they gain and leave: (log likelihood, shares of the
     motion left of estimation and of held-out records).
 
     step_m: of the tip's values. acts: share of the motion that each effect changes of held-out records.
     stated: what stated values leave, as an explanation. turned_rad: of every coordinate that is an angle.
-    first_halves: of held-out records, that are fitted along.
     """
     rng = np.random.default_rng(9)
     records = []
@@ -832,7 +823,6 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0, first_hal
         simpler=lambda explanation: None,
         exchanged=lambda explanation, sought: None,
         joined=lambda one, other: None,
-        first_halves=first_halves,
         acts_on_held_out=lambda whole, k: acts,
         by_these=lambda names, whole: found[frozenset(names)],
         finished=lambda explanation: explanation,
@@ -849,67 +839,6 @@ def test_simpler_effects_are_sought_in_every_set_that_is_as_likely(further_gain,
     search.simpler = lambda explanation: asked.append(explanation.key)
     assert len(judged(search).judged) > 1
     assert asked == [friction, with_tilt][: 1 + sought]
-
-
-@pytest.mark.parametrize(("first_halves", "answer"), [((), "none"), (("a",), "hardening_spring")])
-def test_in_a_second_look_an_effect_carries_what_it_does_of_held_out_records(first_halves, answer):
-    sets = {(): (0.0, 0.02, 0.06), ("hardening_spring",): (24.0, 0.02, 0.01)}
-    assert _judged(sets, first_halves=first_halves).answer == answer
-
-
-def _swinging_out(effect):
-    """Records of an independent simulator: only the held-out one begins far from a hub angle of zero."""
-    rng = np.random.default_rng(21)
-    background = Background(dry_friction_Nm=0.004, presliding_rad=1e-3)
-    truth = Truth(RIG.model_dump(exclude={"tolerances"}), (effect,), background)
-    records = []
-    for name, role, start_rad, size in (
-        ("a", "estimation", 0.0, 0.6),
-        ("b", "estimation", 0.0, 0.6),
-        ("c", "held_out", 1.2, 1.5),
-    ):
-        voltage = size * rng.choice([-1.0, 1.0], 40).repeat(15)
-        clean = truth.record(voltage, None, None, Before(start_rad))
-        read = np.column_stack([clean.hub_angle_rad, clean.tip_m])
-        noise = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
-        records.append(Experiment(name, role, voltage, read + noise * rng.standard_normal(read.shape)))
-    return Case("swinging out", RIG, tuple(records), 0.05)
-
-
-@cache
-def _first_look_at_a_spring():
-    case = _swinging_out({"name": "hardening_spring", "cubic_Nm_rad3": 0.02})
-    return case, beside_imperfections(searched(case, lambda share, words: None), np.random.default_rng(0))
-
-
-def test_what_only_held_out_records_excite_is_found_in_their_first_halves():
-    case, first = _first_look_at_a_spring()
-    assert first.combination != ("hardening_spring",)
-    assert np.isnan(first.left_before_halves)
-    in_no_time = looked_at_halves(first, lambda share, words: None, -np.inf, np.random.default_rng(0))
-    assert in_no_time.combination == first.combination
-    assert in_no_time.shares.not_tried == ("first halves of held-out records",)
-    found = diagnose(case)
-    assert (found.combination, found.first_halves) == (("hardening_spring",), ("c (first half)",))
-    assert [(e.name, len(e.output)) for e in found.case.held_out] == [("c (second half)", 300)]
-    (spring,) = [e for e in found.effects if e.name == "hardening_spring"]
-    assert spring.parameters["cubic_Nm_rad3"] == pytest.approx(0.02, rel=0.05)
-    assert found.left_before_halves == max(first.shares.before) > 0.05
-    # What is said of held-out records is said of those that no fit has seen.
-    assert found.gap_closed > 0.95
-    before = found.residuals_refit["c (second half)"][:, 0] * case.noise[0]
-    share = np.sqrt(np.mean(before**2)) / np.std(case.held_out[0].output[300:, 0])
-    assert found.shares.before[0] == pytest.approx(share, rel=0.1)
-
-
-def test_a_second_look_replaces_no_effect_that_was_surer(monkeypatch):
-    _, first = _first_look_at_a_spring()
-    monkeypatch.setattr("diagnosis.imperfect.answered.SURE", 1.1)
-    for probability, replaced in ((0.3, True), (1.0, False)):
-        cause = {**dict.fromkeys(first.probabilities, 0.0), "gravity": probability}
-        named = replace(first, verdict="effect", combination=("gravity",), probabilities=cause)
-        found = looked_at_halves(named, lambda share, words: None, np.inf, np.random.default_rng(0))
-        assert (found.combination != ("gravity",)) == replaced
 
 
 def test_two_likely_sets_that_explain_other_records_are_also_fitted_together():

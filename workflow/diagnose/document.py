@@ -22,7 +22,7 @@ def document_of(
     `effects` are all possible answers, best first, "none" and "unknown" among them: `probability` of being
     the main cause (they sum to one), `presence` of being there at all. gap_* are the pooled root mean square
     of (measured - model)/noise over the held-out experiments. partial_model: what the repaired model holds of
-    an answer "unknown". first_halves: records of held-out experiments that were fitted along (`Diagnosis`).
+    an answer "unknown".
     beside: what else was looked at.
     """
     document = {
@@ -47,8 +47,6 @@ def document_of(
         "noise_floor": found.noise_floor,
         "noise_below_stated": found.noise_below_stated,
         "held_out_decided": found.held_out_decided,
-        "first_halves": found.first_halves,
-        "left_before_halves": found.left_before_halves,
         "unlisted": [effect.to_dict() for effect in found.unlisted],
         "gap_closed": found.gap_closed,
         "gap_closed_interval": found.gap_closed_interval,
