@@ -295,6 +295,16 @@ class UncertainPlant:
         """Poles strictly outside the unit circle; integrators are not among them."""
         return int(np.sum(np.abs(self._other_poles) > 1.0))
 
+    def slow_poles_rad_s(self, below_rad_s: float) -> tuple[float, ...]:
+        """|log z|/dt of nominal poles below a frequency, ascending, 0 for integrators: from there on the plant
+        integrates. As many as zeros below it are left out, the fastest first."""
+        poles, zeros = (
+            np.sort(np.abs(np.log(roots[roots != 0])) / self.dt_s)
+            for roots in (self._other_poles, self.zeros)
+        )
+        slow = [0.0] * self.n_integrators + [float(pole) for pole in poles if pole < below_rad_s]
+        return tuple(slow[: max(len(slow) - int(np.sum(zeros < below_rad_s)), 0)])
+
     @property
     def _other_poles(self) -> Complex:
         """Poles without the integrators."""

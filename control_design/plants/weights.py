@@ -5,6 +5,8 @@ On the circle s = j (2/dt) tan(omega dt/2), so a weight means the same for every
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -45,21 +47,27 @@ class RationalWeight(BaseModel):
         return np.asarray(value, dtype=np.complex128)
 
 
+def integral_corner(bandwidth_rad_s: float, modulus_margin: float) -> float:
+    """wc/5 of `bandwidth_weight`: up to there integral action is asked for."""
+    return float(_INTEGRAL_SHARE * bandwidth_rad_s * np.sqrt(2.0 - modulus_margin**2))
+
+
 def bandwidth_weight(
-    bandwidth_rad_s: float, modulus_margin: float, floor: float, *, integral_factors: int = 0
+    bandwidth_rad_s: float, modulus_margin: float, floor: float, *, slow_poles_rad_s: Sequence[float] = ()
 ) -> RationalWeight:
-    """W1 = (m s + wc)/(s + wc r) times ((s + wc/5)/s)^n, wc = bandwidth sqrt(2 - m^2).
+    """W1 = (m s + wc)/(s + wc r) times (s + wc/5)/(s + p) for every slow pole p, wc = bandwidth sqrt(2 - m^2).
 
     |W1| is at least sqrt 2 up to the bandwidth, m = modulus_margin far above it and 1/r at zero frequency, r
-    = floor (0: integral). n = integral_factors: a plant that integrates by itself meets a weight of slope one
+    = floor (0: integral). slow_poles_rad_s: magnitudes of the plant's poles below wc/5, 0 for an integrator. A plant that integrates by itself from p on meets a weight of slope one
     without any action of the controller's own integrator, which the optimiser would then make arbitrarily
-    slow; each factor asks for integral action by a fifth of the corner, near which the slowest pole then is.
+    slow. Each factor asks for integral action by a fifth of the corner, near which the slowest pole then is.
     """
     corner = bandwidth_rad_s * np.sqrt(2.0 - modulus_margin**2)
+    share = integral_corner(bandwidth_rad_s, modulus_margin)
     numerator, denominator = np.array([modulus_margin, corner]), np.array([1.0, corner * floor])
-    for _ in range(integral_factors):
-        numerator = np.polymul(numerator, [1.0, _INTEGRAL_SHARE * corner])
-        denominator = np.polymul(denominator, [1.0, 0.0])
+    for pole in slow_poles_rad_s:
+        numerator = np.polymul(numerator, [1.0, share])
+        denominator = np.polymul(denominator, [1.0, pole])
     return RationalWeight(numerator=tuple(numerator), denominator=tuple(denominator))
 
 

@@ -25,7 +25,7 @@ from control_design.controllers.biquads import SOLVER_SLACK, SectionKind
 from control_design.plants.ellipses import Real
 from control_design.plants.frequency_grid import lowest_rad_s
 from control_design.plants.plant_set import UncertainPlant, count_integrators
-from control_design.plants.weights import RationalWeight, bandwidth_weight, effort_limit_weight
+from control_design.plants.weights import RationalWeight, bandwidth_weight, effort_limit_weight, integral_corner
 from control_design.specification.requirement import (
     Findings,
     LoopFunction,
@@ -153,16 +153,16 @@ class Specification(BaseModel):
         pair: SectionKind = "notch" if self.structure == "pi_d_notch" else "second_order"
         return (*head, *real, *([pair] * ((rest - len(real)) // 2)))
 
-    def tracking_weight(self, plant_integrators: int = 0) -> RationalWeight | None:
-        """W1 without the modulus margin, or None without a tracking requirement."""
+    def tracking_weight(self, plant: UncertainPlant | None = None) -> RationalWeight | None:
+        """W1 without the modulus margin, or None without a tracking requirement; None for a plant that does
+        not integrate."""
         if self.sensitivity_weight is not None or self.bandwidth_rad_s is None:
             return self.sensitivity_weight
-        return bandwidth_weight(
-            self.bandwidth_rad_s,
-            self.modulus_margin,
-            0.0 if self.integrator else self.low_frequency_rejection,
-            integral_factors=plant_integrators if self.integrator else 0,
-        )
+        slow: tuple[float, ...] = ()
+        if self.integrator and plant is not None:
+            slow = plant.slow_poles_rad_s(integral_corner(self.bandwidth_rad_s, self.modulus_margin))
+        floor = 0.0 if self.integrator else self.low_frequency_rejection
+        return bandwidth_weight(self.bandwidth_rad_s, self.modulus_margin, floor, slow_poles_rad_s=slow)
 
     def limit_weight(self) -> RationalWeight | None:
         """W3, or None where effort is not limited."""
@@ -227,7 +227,7 @@ class Tracking(WeightedRequirement):
 
     @classmethod
     def of(cls, spec: Specification, plant: UncertainPlant) -> Tracking | None:
-        weight = spec.tracking_weight(plant.n_integrators)
+        weight = spec.tracking_weight(plant)
         return None if weight is None else cls(weight, above=spec.modulus_margin)
 
 
@@ -403,7 +403,7 @@ def _refuse_zeros(spec: Specification, plant: UncertainPlant) -> None:
     w = 2.0 / plant.dt_s * (outside - 1.0) / (outside + 1.0)
     if float(np.asarray(plant.nominal.D)[0, 0]) == 0.0 or spec.computational_delay_samples > 0:
         w = np.append(w, 2.0 / plant.dt_s)
-    weight = spec.tracking_weight(plant.n_integrators)
+    weight = spec.tracking_weight(plant)
     bound = np.zeros(0) if weight is None else np.abs(weight.at(w))
     if not np.any(bound > 1.0):
         return
@@ -419,7 +419,7 @@ def _refuse_zeros(spec: Specification, plant: UncertainPlant) -> None:
         for _ in range(60):
             middle = 0.5 * (low + high)
             trial = spec.model_copy(update={"bandwidth_rad_s": max(middle, 1e-300)})
-            weight = trial.tracking_weight(plant.n_integrators)
+            weight = trial.tracking_weight(plant)
             possible = weight is not None and bool(np.all(np.abs(weight.at(w)) <= 1.0))
             low, high = (middle, high) if possible else (low, middle)
         message += (

@@ -99,3 +99,18 @@ def test_modes_of_known_poles():
     s = -0.1 * 20 + 20j * np.sqrt(1 - 0.01)
     (mode,) = modes_of(np.exp(0.01 * np.array([s, s.conjugate(), -3])), 0.01)
     assert (mode.omega_rad_s, mode.zeta) == pytest.approx((20, 0.1))
+
+
+def test_a_plant_integrates_from_its_slow_poles_on_unless_a_zero_follows():
+    s = control.tf("s")
+    arm = 1 / (s * (2.0 * s + 0.6))
+    for system, expected in (
+        (arm, [0.0, 0.3]),
+        (arm * (s + 0.35) / (s + 50.0), [0.0]),
+        (arm * (s + 5.0) / (s + 50.0), [0.0, 0.3]),
+        (1 / (s - 0.4), [0.4]),
+        (1 / (s**2 + 0.1 * s + 4.0), [2.0, 2.0]),
+        (1.0 + 0.0 * s, []),
+    ):
+        plant = UncertainPlant("arm", control.ss(control.c2d(control.ss(system), 1e-3, method="tustin")))
+        np.testing.assert_allclose(plant.slow_poles_rad_s(3.0), expected, rtol=1e-3, atol=1e-9)
