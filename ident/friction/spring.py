@@ -9,6 +9,7 @@ load's friction does to the load's own motion.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.signal import bilinear, lfilter
@@ -46,7 +47,10 @@ class Spring:
         """(T,) friction of unit level at the load of a motor at position (T,), as it acts at the motor."""
         return self._followed(direction_of(self._followed(position - position[0]), presliding))
 
-    def _followed(self, signal: RealArray) -> RealArray:
+    @cached_property
+    def _filter(self) -> tuple[RealArray, RealArray]:
         square = self.omega_rad_s**2
-        b, a = bilinear([square], [1.0, 2 * self.zeta * self.omega_rad_s, square], 1 / self.dt_s)
-        return np.asarray(lfilter(b, a, signal))
+        return bilinear([square], [1.0, 2 * self.zeta * self.omega_rad_s, square], 1 / self.dt_s)  # type: ignore[no-any-return]
+
+    def _followed(self, signal: RealArray) -> RealArray:
+        return np.asarray(lfilter(*self._filter, signal))
