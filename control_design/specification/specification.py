@@ -51,6 +51,11 @@ class Specification(BaseModel):
         default=None,
         description="|S| stays below -3 dB up to here, rad/s; none = no tracking requirement (pure damping)",
     )
+    lowest_bandwidth_rad_s: _Positive | None = Field(
+        default=None,
+        description="where bandwidth_rad_s cannot be met, the highest that can, down to here; none = "
+        "bandwidth_rad_s as it stands",
+    )
     integrator: bool = Field(default=False, description="the controller has a pole at z = 1")
     low_frequency_rejection: float = Field(
         default=1e-3,
@@ -120,6 +125,10 @@ class Specification(BaseModel):
     def _consistent(self) -> Specification:
         if self.sensitivity_weight is not None and self.bandwidth_rad_s is not None:
             raise ValueError("give bandwidth_rad_s or sensitivity_weight, not both")
+        if self.lowest_bandwidth_rad_s is not None and not (
+            self.bandwidth_rad_s is not None and self.lowest_bandwidth_rad_s < self.bandwidth_rad_s
+        ):
+            raise ValueError("lowest_bandwidth_rad_s needs a larger bandwidth_rad_s, which is tried first")
         if self.effort_weight is not None and (self.effort_limit or self.effort_rolloff_rad_s):
             raise ValueError("give effort_limit (with effort_rolloff_rad_s) or effort_weight, not both")
         if self.effort_rolloff_rad_s is not None and self.effort_limit is None:

@@ -51,6 +51,7 @@ def _design(
         design = find_design(
             plants, specification, asked.synthesis, asked.certificate, stage_rng(seed, "design"), report
         )
+        specification = design.specification or specification
         nothing = CertifyResult(None, certified=False, reason=design.reason)
         if design.synthesis is None:
             return _Designed(replace(design, reason=f"specification not met: {design.reason}"), nothing)

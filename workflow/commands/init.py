@@ -292,5 +292,4 @@ def _numbers(found: Found) -> dict[str, Any]:
         "turned": look.turned,
         "friction": draft.friction,
         "unstable_per_s": draft.unstable_per_s,
-        "gamma_of_the_quick_model": draft.gamma,
     }

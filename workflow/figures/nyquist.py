@@ -67,7 +67,7 @@ def loop_of(run: RunView) -> UncertainLoop:
 @style.drawing("nyquist")
 def draw_nyquist(run: RunView) -> Figure:
     """Whole curve of a run's loop (as far as it fits) and the surroundings of -1."""
-    loop, margin = loop_of(run), run.config.specification.modulus_margin
+    loop, margin = loop_of(run), run.specification.modulus_margin
     figure, (whole, near) = style.panels(6.0, 1, 2)
     size = np.abs(loop.centre)
     reach = _reach(size)

@@ -34,7 +34,7 @@ def draw_overview(run: RunView) -> Figure:
     gain.set(xscale="log", yscale="log", xlabel="frequency [rad/s]", ylabel=f"gain [{unit}]")
     gain.set_ylim(0.3 * band.gain.min(), 3 * band.gain.max())
     gain.set_title("Identified, with its uncertainty")
-    margin = run.config.specification.modulus_margin
+    margin = run.specification.modulus_margin
     draw_around_minus_one(around, loop_of(run), level=spread.frequency.level, modulus_margin=margin)
     around.set_title("Loop around -1")
     half = slice(0, loop.time_s.size // 2)

@@ -92,7 +92,7 @@ def curves_of(run: RunView, omega_rad_s: Real | None = None) -> tuple[Sensitivit
     return sensitivity_curves(
         run.plant,
         run.controller,
-        run.config.specification,
+        run.specification,
         run.loop_grid if omega_rad_s is None else omega_rad_s,
         input_unit=run.input_unit,
         output_unit=run.output_unit,

@@ -18,6 +18,7 @@ from control_design.analysis.stability import ModeChange, closed_loop_poles
 from control_design.controllers.controller import Controller
 from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
+from control_design.specification import Specification
 from control_design.synthesis.synthesis_result import SynthesisResult
 from ident.basis.options import IdentOptions
 from ident.checks.distortion_findings import distortion_findings
@@ -157,6 +158,11 @@ class RunView:
     config_text: str
     manifest: Mapping[str, Any]
 
+    @property
+    def specification(self) -> Specification:
+        """What was designed for: with the bandwidth that was chosen."""
+        return self.results.design.specification or self.config.specification
+
     @cached_property
     def channels(self) -> tuple[ChannelView, ...]:
         return tuple(self._channel(index) for index in range(len(self.config.channels)))
@@ -255,7 +261,7 @@ class RunView:
     @property
     def requirements(self) -> list[tuple[str, Any, str, str]]:
         """Name, value, unit and meaning of what the specification asks for."""
-        asked = self.config.specification
+        asked = self.specification
         units = {
             "effort_limit": ratio_unit(self.input_unit, self.output_unit),
             "input_limit": self.input_unit,

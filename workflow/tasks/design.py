@@ -20,7 +20,7 @@ from control_design.convex.youla import youla_bracket
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import RationalWeight, Specification, SpecificationError
 from control_design.synthesis.joint_synthesis import synthesise_jointly
-from control_design.synthesis.synthesis import synthesise
+from control_design.synthesis.bandwidth import synthesise_widest
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from ident.uncertainty import ResponsePosterior
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
@@ -61,16 +61,23 @@ def find_design(
     certificate then asks. A specification that no controller can meet is a result, not an error: the report
     has to say what blocks it.
     """
+    # As it is stored: without what a run says beside it.
+    specification = Specification.model_validate(
+        specification.model_dump(include=set(Specification.model_fields))
+    )
     try:
         if options.calibrate and undrawable(plants) is None:
+            specification, _ = synthesise_widest(plants, specification, synthesis, rng=rng)
             found = synthesise_jointly(plants, specification, synthesis, rng=rng, progress=progress)
             result, jointly = found.result, said("draws_stable", found)
         else:
-            result = synthesise(plants, specification, synthesis, rng=rng, progress=progress)
+            specification, result = synthesise_widest(
+                plants, specification, synthesis, rng=rng, progress=progress
+            )
             jointly = None
     except SpecificationError as impossible:
-        return DesignResult(None, met=False, reason=str(impossible))
-    return DesignResult(result, result.gamma <= 1.0, said("outcome", result), jointly)
+        return DesignResult(None, met=False, reason=str(impossible), specification=specification)
+    return DesignResult(result, result.gamma <= 1.0, said("outcome", result), jointly, specification)
 
 
 def certify_asked(

@@ -20,6 +20,7 @@ from control_design.controllers.controller import Controller, FrictionFeedforwar
 from control_design.convex.reference_filter import ReferenceFilter
 from control_design.convex.youla import YoulaBracket
 from control_design.plants.plant_set import Channel as PlantChannel, UncertainPlant
+from control_design.specification import Specification
 from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
 from ident.basis.model import GobfModel
 from ident.checks.plausible_modes import PairKind, kind_of_pair
@@ -323,12 +324,14 @@ class IdentifiedPlant:
 @dataclass(frozen=True, eq=False)
 class DesignResult:
     """synthesis: None where the specification is impossible from the start; reason: met, or how far and which
-    frequency and requirement block it; jointly: what became of designing for sampled responses."""
+    frequency and requirement block it; jointly: what became of designing for sampled responses.
+    specification: with the bandwidth that was chosen, where the one asked for leaves that open."""
 
     synthesis: SynthesisResult | None
     met: bool
     reason: str
     jointly: str | None = None
+    specification: Specification | None = field(default=None, metadata={"since": 2})
 
     @property
     def gamma(self) -> float | None:

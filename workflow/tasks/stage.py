@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from control_design.plants.plant_set import UncertainPlant
+from control_design.specification import Specification
 from workflow.config.run_config import RunConfig
 from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
@@ -30,6 +31,11 @@ class StageInput:
     def plant(self) -> UncertainPlant:
         """The plant that was identified."""
         return self.results.uncertainty.plant(self.config)
+
+    @property
+    def specification(self) -> Specification:
+        """What was designed for: with the bandwidth that was chosen."""
+        return self.results.design.specification or self.config.specification
 
     def rng(self, *names: str) -> np.random.Generator:
         """The random stream of these names: the same whatever else ran before."""

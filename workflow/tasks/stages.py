@@ -50,7 +50,7 @@ def find_achievable(stage: StageInput) -> AchievablePerformance:
     config = stage.config
     report = partial(stage.progress.update, "achievable_performance")
     with naming("achievable performance"):
-        return find_bracket([stage.plant], config.specification, config.achievable_performance, report)
+        return find_bracket([stage.plant], stage.specification, config.achievable_performance, report)
 
 
 def certify_controller(stage: StageInput) -> CertifyResult:
@@ -60,7 +60,7 @@ def certify_controller(stage: StageInput) -> CertifyResult:
     if law is None:
         return CertifyResult(None, certified=False, reason=design.reason)
     with naming("certify"):
-        return certify_asked(law, [stage.plant], config.specification, config.certificate, rng)
+        return certify_asked(law, [stage.plant], stage.specification, config.certificate, rng)
 
 
 def design_filter(stage: StageInput) -> ReferenceFilterResult:
@@ -82,7 +82,7 @@ def find_amplitude_cost(stage: StageInput) -> AmplitudeCost:
     config, own = stage.config, stage.results.design.controller
     if not config.control_channel.uncertainty.about_amplitudes or own is None:
         return AmplitudeCost()
-    asked, tell = config.specification, partial(stage.progress.update, "amplitude_cost")
+    asked, tell = stage.specification, partial(stage.progress.update, "amplitude_cost")
     linear = stage.results.uncertainty.plant(config, behind_friction=True)
     with naming("amplitude cost"):
         # From the starts of the run's own design: what differs is the plant.
@@ -133,7 +133,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         "achievable_performance",
-        _PLANT,
+        (*_PLANT, "design"),  # which chooses the bandwidth
         find_achievable,
         2.5,
         uses={"specification": True, "achievable_performance": True, **_PURPOSES},

@@ -1,0 +1,75 @@
+"""The bandwidth of a specification that leaves it open down to `lowest_bandwidth_rad_s`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from control_design.plants.plant_set import UncertainPlant
+from control_design.specification import Specification, SpecificationError
+from control_design.synthesis.synthesis import Progress, synthesise
+from control_design.synthesis.synthesis_options import SynthesisOptions
+from control_design.synthesis.synthesis_result import SynthesisResult
+
+# A quick design, one start on a coarse grid, is to keep this much clear of the specification.
+_CLEAR = 0.95
+_QUICK = {
+    "starts": 1,
+    "sufficient_gamma": _CLEAR,
+    "exchange_rounds": 0,
+    "iterations": 50,
+    "grid_points": 60,
+    "mode_points": 30,
+    "dense_points": 1500,
+}
+# Bandwidths that are tried lie this ratio apart, about: the full search closes a part of it again.
+_RATIO = 1.3
+
+
+def synthesise_widest(
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    options: SynthesisOptions | None = None,
+    *,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+) -> tuple[Specification, SynthesisResult]:
+    """`synthesise` for the highest bandwidth that is met, from bandwidth_rad_s down to
+    lowest_bandwidth_rad_s; and the specification with that bandwidth. Where none is met, for the lowest.
+
+    Quick designs look for it by bisection: a wider bandwidth is taken to ask for more. Without
+    lowest_bandwidth_rad_s, and where the full search meets bandwidth_rad_s, nothing is lowered. Raises
+    SpecificationError as `synthesise`.
+    """
+    options, tell = options or SynthesisOptions(), progress or (lambda fraction, message: None)
+    top, lowest = specification.bandwidth_rad_s, specification.lowest_bandwidth_rad_s
+    if top is None or lowest is None:
+        return specification, synthesise(plants, specification, options, rng=rng, progress=progress)
+    count = 1 + int(np.ceil(np.log(top / lowest) / np.log(_RATIO)))
+    tried = [stated(specification, value) for value in np.geomspace(top, lowest, max(count, 2)).tolist()]
+    root, quick = int(rng.integers(2**63)), options.model_copy(update=_QUICK)
+
+    def gamma(one: Specification) -> float:
+        tell(0.0, f"bandwidth {one.bandwidth_rad_s:.3g} rad/s")
+        try:
+            return synthesise(plants, one, quick, rng=np.random.default_rng(root)).gamma
+        except SpecificationError:
+            return np.inf
+
+    low, high = 0, len(tried) - 1  # all from `high` on are met, or nothing is known of the last
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if gamma(tried[middle]) <= _CLEAR else (middle + 1, high)
+    for one in tried[high:]:
+        found = synthesise(plants, one, options, rng=np.random.default_rng(root), progress=progress)
+        if found.gamma <= 1.0:
+            break
+    return one, found
+
+
+def stated(specification: Specification, bandwidth_rad_s: float) -> Specification:
+    """The specification with this bandwidth and no other."""
+    return specification.model_copy(
+        update={"bandwidth_rad_s": float(f"{bandwidth_rad_s:.3g}"), "lowest_bandwidth_rad_s": None}
+    )
