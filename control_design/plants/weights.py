@@ -14,6 +14,8 @@ from control_design.plants.ellipses import Complex
 
 # Of the corner. SIMC, at its fastest: a quarter of the crossover (Skogestad, J. Process Control 13, 2003).
 _INTEGRAL_SHARE = 0.2
+# Of the corner. Whether a plant's pole is slower than this no record tells: beside it, ellipses are wide.
+_SLOWEST = 0.01
 _ROLLOFF_END = 40.0  # the effort weight flattens this far above its corner, so that it stays proper
 
 
@@ -58,7 +60,7 @@ def bandwidth_weight(
     """W1 = (m s + wc)/(s + wc r) times (s + wc/5)/(s + p) for every slow pole p, wc = bandwidth sqrt(2 - m^2).
 
     |W1| is at least sqrt 2 up to the bandwidth, m = modulus_margin far above it and 1/r at zero frequency, r
-    = floor (0: integral). slow_poles_rad_s: magnitudes of the plant's poles below wc/5, 0 for an integrator. A plant that integrates by itself from p on meets a weight of slope one
+    = floor (0: integral). slow_poles_rad_s: magnitudes of the plant's poles below wc/5, 0 for an integrator; others are taken to be at least wc/100. A plant that integrates by itself from p on meets a weight of slope one
     without any action of the controller's own integrator, which the optimiser would then make arbitrarily
     slow. Each factor asks for integral action by a fifth of the corner, near which the slowest pole then is.
     """
@@ -67,7 +69,7 @@ def bandwidth_weight(
     numerator, denominator = np.array([modulus_margin, corner]), np.array([1.0, corner * floor])
     for pole in slow_poles_rad_s:
         numerator = np.polymul(numerator, [1.0, share])
-        denominator = np.polymul(denominator, [1.0, pole])
+        denominator = np.polymul(denominator, [1.0, max(pole, _SLOWEST * corner) if pole else 0.0])
     return RationalWeight(numerator=tuple(numerator), denominator=tuple(denominator))
 
 

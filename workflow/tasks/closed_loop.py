@@ -26,7 +26,7 @@ from workflow.tasks.stage import StageInput
 
 _LEAD_IN = 0.05  # share of the record before the step, so that the picture shows rest
 # A run counts as settled when, at the end of either half, it moves by less than this share of the step and,
-# where tracking is asked for, has arrived within it.
+# where tracking is asked for, has arrived within it. Within one count of the sensor no controller sees it.
 _SETTLED = 0.1
 _SHORTEST, _LONGEST, _LONGEST_DRAWN = 200, 6000, 60_000
 
@@ -34,7 +34,8 @@ _SHORTEST, _LONGEST, _LONGEST_DRAWN = 200, 6000, 60_000
 @dataclass(frozen=True, eq=False)
 class Trial:
     """What is asked of the loop: reference step after the lead-in, input disturbance from half-way on; (T,)
-    each. given: what the loop is given for the reference, which a filter makes of it."""
+    each. given: what the loop is given for the reference, which a filter makes of it. resolution: one count
+    of the sensor."""
 
     time_s: Real
     reference: Real
@@ -43,6 +44,7 @@ class Trial:
     step: float
     half: int
     tracking: bool
+    resolution: float = 0.0
 
 
 def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
@@ -154,6 +156,7 @@ def make_trial(
         half=half,
         tracking=config.specification.bandwidth_rad_s is not None
         or config.specification.sensitivity_weight is not None,
+        resolution=options.measurement_step,
     )
 
 
@@ -216,8 +219,8 @@ def describe(runs: LoopRuns, trial: Trial) -> tuple[LoopMetrics, ...]:
         )
         error = trial.reference - output
         ends = [_tail(error[: trial.half]), _tail(error[trial.half :])]
-        steady = all(np.ptp(end) <= _SETTLED * abs(trial.step) for end in ends)
-        arrived = abs(float(np.mean(ends[0]))) <= _SETTLED * abs(trial.step)
+        steady = all(np.ptp(end) <= max(_SETTLED * abs(trial.step), 2 * trial.resolution) for end in ends)
+        arrived = abs(float(np.mean(ends[0]))) <= max(_SETTLED * abs(trial.step), trial.resolution)
         rows.append(
             LoopMetrics(
                 **vars(step_metrics(step)),

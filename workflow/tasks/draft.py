@@ -34,7 +34,9 @@ _SAME_LIMIT = 1e-3
 class Draft:
     """look: at the records that are fitted. fitted, validates: samples of one log that is split, else None.
     limit: at which commands stand in the logs, else the largest command, and whether it was `clipped`.
-    step: of the output's quantisation, 0 without one. specification: keys of [specification]."""
+    step: of the output's quantisation, 0 without one. specification: keys of [specification].
+    reference_step: half the rms motion, or, beside an unstable pole, what the effort limit answers with the
+    largest command."""
 
     look: FirstLook
     position: bool
@@ -43,12 +45,8 @@ class Draft:
     clipped: bool
     step: float
     specification: Mapping[str, Any]
+    reference_step: float
     unstable_per_s: float
-
-    @property
-    def reference_step(self) -> float:
-        """What the effort limit answers with the largest command."""
-        return _rounded(self.limit / self.specification["effort_limit"])
 
     @property
     def friction(self) -> bool:
@@ -77,6 +75,7 @@ def draft_of(records: Sequence[Record], *, position: bool, limit: float | None =
         limit is not None or at_limit is not None,
         grid_step([record.output[:, 0] for record in records], np.finfo(np.float64).tiny),
         _specification(look, effort, reached, unstable),
+        _rounded(reached / effort if unstable or not spread > 0 else 0.5 * spread),
         unstable,
     )
 
