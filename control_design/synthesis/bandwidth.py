@@ -38,9 +38,8 @@ def synthesise_widest(
     """`synthesise` for the highest bandwidth that is met, from bandwidth_rad_s down to
     lowest_bandwidth_rad_s; and the specification with that bandwidth. Where none is met, for the lowest.
 
-    Quick designs look for it by bisection: a wider bandwidth is taken to ask for more. Without
-    lowest_bandwidth_rad_s, and where the full search meets bandwidth_rad_s, nothing is lowered. Raises
-    SpecificationError as `synthesise`.
+    Quick designs look for it by bisection: a wider bandwidth is taken to ask for more. What a quick design
+    misses and the full one would meet is not found. Raises SpecificationError as `synthesise`.
     """
     options, tell = options or SynthesisOptions(), progress or (lambda fraction, message: None)
     top, lowest = specification.bandwidth_rad_s, specification.lowest_bandwidth_rad_s

@@ -175,13 +175,13 @@ def test_calibration_is_designed_for(monkeypatch):
 
     def plain(plants, specification, options, *, rng, progress):
         asked.append("plain")
-        return result
+        return specification, result
 
     def jointly(plants, specification, options, *, rng, progress):
         asked.append("jointly")
         return JointDesign(result, (), 10_000, (7, 2), True)
 
-    monkeypatch.setattr("workflow.tasks.design.synthesise", plain)
+    monkeypatch.setattr("workflow.tasks.design.synthesise_widest", plain)
     monkeypatch.setattr("workflow.tasks.design.synthesise_jointly", jointly)
     exact = UncertainPlant("exact", model().to_control())
     options = CertificateOptions.model_validate({"calibrate": True})

@@ -67,7 +67,8 @@ def find_design(
     )
     try:
         if options.calibrate and undrawable(plants) is None:
-            specification, _ = synthesise_widest(plants, specification, synthesis, rng=rng)
+            if specification.lowest_bandwidth_rad_s is not None:
+                specification, _ = synthesise_widest(plants, specification, synthesis, rng=rng)
             found = synthesise_jointly(plants, specification, synthesis, rng=rng, progress=progress)
             result, jointly = found.result, said("draws_stable", found)
         else:

@@ -1,0 +1,72 @@
+"""The bandwidth that a specification leaves open."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from control_design import Specification, SpecificationError, UncertainPlant
+from control_design.synthesis.bandwidth import synthesise_widest
+from control_design.synthesis.synthesis import synthesise
+from control_design.synthesis.synthesis_options import SynthesisOptions
+
+_DT = 0.01
+_EFFORT = SynthesisOptions(starts=2, grid_points=80, dense_points=2000)
+
+
+def _inertia(delay_samples: int = 0) -> UncertainPlant:
+    arm = control.c2d(control.ss(control.tf([1.0], [1.0, 0.5, 0.0])), _DT)
+    late = control.ss(control.tf([1.0], [1.0] + [0.0] * delay_samples, _DT))
+    return UncertainPlant("arm", arm * late if delay_samples else arm)
+
+
+def _asked(**change) -> Specification:
+    stated = {"bandwidth_rad_s": 40.0, "lowest_bandwidth_rad_s": 0.5, "controller_order": 3}
+    return Specification(**(stated | {"integrator": True} | change))
+
+
+def test_the_highest_bandwidth_that_is_met_is_taken():
+    rng = np.random.default_rng(1)
+    found = {}
+    for delay in (2, 20):
+        plant = _inertia(delay)
+        used, result = synthesise_widest([plant], _asked(), _EFFORT, rng=rng)
+        assert result.gamma <= 1.0
+        assert used.lowest_bandwidth_rad_s is None
+        assert used.bandwidth_rad_s is not None and 0.5 <= used.bandwidth_rad_s < 40.0
+        wider = used.model_copy(update={"bandwidth_rad_s": 1.8 * used.bandwidth_rad_s})
+        try:
+            assert synthesise([plant], wider, _EFFORT, rng=np.random.default_rng(2)).gamma > 1.0
+        except SpecificationError:
+            pass  # the delay alone forbids it
+        found[delay] = used.bandwidth_rad_s
+    # What a dead time leaves is in proportion to it.
+    assert 4 < found[2] / found[20] < 12
+
+
+def test_a_bandwidth_that_is_met_stays():
+    asked = _asked(bandwidth_rad_s=1.0)
+    used, result = synthesise_widest([_inertia()], asked, _EFFORT, rng=np.random.default_rng(1))
+    assert (used.bandwidth_rad_s, result.gamma <= 1.0) == (1.0, True)
+
+
+def test_nothing_is_lowered_unless_it_is_asked_for():
+    asked = _asked(lowest_bandwidth_rad_s=None, bandwidth_rad_s=6.0)
+    plant = _inertia(20)
+    used, result = synthesise_widest([plant], asked, _EFFORT, rng=np.random.default_rng(1))
+    assert used == asked
+    assert result.gamma == synthesise([plant], asked, _EFFORT, rng=np.random.default_rng(1)).gamma
+
+
+def test_where_none_is_met_the_lowest_is_designed_for():
+    asked = _asked(effort_limit=1e-3)
+    with pytest.raises(SpecificationError, match="effort"):
+        synthesise_widest([_inertia()], asked, _EFFORT, rng=np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("change", [{"bandwidth_rad_s": 0.5}, {"bandwidth_rad_s": None}])
+def test_a_lowest_bandwidth_needs_a_higher_one(change):
+    with pytest.raises(ValidationError, match="lowest_bandwidth_rad_s needs a larger bandwidth_rad_s"):
+        _asked(**change)
