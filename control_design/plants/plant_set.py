@@ -296,7 +296,7 @@ class UncertainPlant:
         return int(np.sum(np.abs(self._other_poles) > 1.0))
 
     def slow_poles_rad_s(self, below_rad_s: float) -> tuple[float, ...]:
-        """|log z|/dt of nominal poles below a frequency, ascending, 0 for integrators: from there on the plant
+        """|log z|/dt of nominal poles below a frequency, ascending, 0 for integrators: beyond each the plant
         integrates. As many as zeros below it are left out, the fastest first."""
         poles, zeros = (
             np.sort(np.abs(np.log(roots[roots != 0])) / self.dt_s)

@@ -25,7 +25,12 @@ from control_design.controllers.biquads import SOLVER_SLACK, SectionKind
 from control_design.plants.ellipses import Real
 from control_design.plants.frequency_grid import lowest_rad_s
 from control_design.plants.plant_set import UncertainPlant, count_integrators
-from control_design.plants.weights import RationalWeight, bandwidth_weight, effort_limit_weight, integral_corner
+from control_design.plants.weights import (
+    RationalWeight,
+    bandwidth_weight,
+    effort_limit_weight,
+    integral_corner,
+)
 from control_design.specification.requirement import (
     Findings,
     LoopFunction,

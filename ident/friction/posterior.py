@@ -109,9 +109,7 @@ def _behind_observed(
     response, change, factor = tangent_beside(less, model, beside, options, n_known=known)
     whitening = np.array([1.0, *(response.report.ar_coefficients if response.report else ())])
     wider = np.sqrt(heterogeneity(found, records, autoregressive(whitening)))
-    factor_of_arm = np.hstack(
-        [wider * response.covariance_factor, _by_linear_force(records, less, response)]
-    )
+    factor_of_arm = np.hstack([wider * response.covariance_factor, _by_linear_force(records, less, response)])
     response = replace(response, covariance_factor=factor_of_arm)
     both = [0, *([plain.shape[1] - 1] if found.spring is not None else [])]
     level, spread = found.level + float(change[both].sum()), wider * factor[both].sum(axis=0)
@@ -142,7 +140,7 @@ def _by_linear_force(
             change = share * (1j * omega) ** i * gain
             # On the doubled poles, which hold G^2 s^i but for the delay, relative to G.
             basis = real_rows(rows[:, : response.poles.order] / gain[:, None])
-            columns.append(np.linalg.lstsq(basis, real_rows(change), rcond=None)[0])
+            columns.append(np.asarray(np.linalg.lstsq(basis, real_rows(change), rcond=None)[0]))
         moved = [np.gradient(one, response.dt_s) for one in moved]
     found = np.zeros((response.mean.size, len(columns)))
     found[: response.poles.order] = np.column_stack(columns)

@@ -50,7 +50,7 @@ class Spring:
     @cached_property
     def _filter(self) -> tuple[RealArray, RealArray]:
         square = self.omega_rad_s**2
-        return bilinear([square], [1.0, 2 * self.zeta * self.omega_rad_s, square], 1 / self.dt_s)  # type: ignore[no-any-return]
+        return bilinear([square], [1.0, 2 * self.zeta * self.omega_rad_s, square], 1 / self.dt_s)
 
     def _followed(self, signal: RealArray) -> RealArray:
         return np.asarray(lfilter(*self._filter, signal))

@@ -19,8 +19,8 @@ from control_design.convex.reference_filter import design_reference_filter
 from control_design.convex.youla import youla_bracket
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import RationalWeight, Specification, SpecificationError
-from control_design.synthesis.joint_synthesis import synthesise_jointly
 from control_design.synthesis.bandwidth import synthesise_widest
+from control_design.synthesis.joint_synthesis import synthesise_jointly
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from ident.uncertainty import ResponsePosterior
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings

@@ -131,7 +131,7 @@ def _rounded(value: float) -> float:
 
 
 def _specification(look: FirstLook, effort: float, limit: float, unstable: float) -> dict[str, Any]:
-    """Requirements that leave the bandwidth to what the identified arm allows, but beside an unstable pole."""
+    """Requirements that leave the bandwidth to what the identified arm allows; not with an unstable pole."""
     dt_s = look.records[0].dt_s
     highest = look.told_rad_s[1] if look.told_rad_s else 0.05 * np.pi / dt_s
     base = look.mode[0] if look.mode else highest
