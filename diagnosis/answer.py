@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -12,6 +12,7 @@ from diagnosis.fit.residual import pooled_rms
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.machine.rounding import rounding_effect
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
+from plant.effects.search_space import Candidate
 
 Verdict = Literal["none", "effect", "unknown"]
 DetailVerdict = Literal["none", "parametric", "effect", "ambiguous", "unknown", "not_converged"]
@@ -23,8 +24,12 @@ NOISE_FLOOR = 1.0
 FAR_OFF = 3.0
 # Below this probability of the first answer, or with another one above that, the answer is called ambiguous.
 SURE, POSSIBLE = 0.8, 0.05
+# Shares of a range: a value this near its end is pinned there, an interval this wide says nothing.
+_PINNED, _WIDE = 1e-3, 0.9
 # Of the bootstrap of the share closed: draws, samples of a block.
 _BLOCKS, _BLOCK = 2000, 50
+# Standard deviations by which energies exceed that of noise, or it is noise.
+_CHANCE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +43,10 @@ class NamedEffect:
     parameters, intervals : parameter -> value, 95 % interval (low, high). From the most probable set of
         effects that holds it; empty for none and unknown, and where no size of the effect was worth a fit.
     gap_after : float. Pooled RMS of the held-out residuals over the noise with that set; nan without a fit.
+    explains : share, its 95 % interval (low, high). Of the energy of the validation error beyond noise that
+        it explains in that set; of one that is not in the repaired model without an interval (nan).
+    remarks : parameter -> what its interval does not say: at an end of its range, or as wide as that.
+    untried : what it would need to be tried; "" where it was.
     """
 
     name: str
@@ -46,6 +55,30 @@ class NamedEffect:
     parameters: dict[str, float]
     intervals: dict[str, tuple[float, float]]
     gap_after: float
+    explains: tuple[float, float, float] = (float("nan"),) * 3
+    remarks: Mapping[str, str] = field(default_factory=dict)
+    untried: str = ""
+
+
+@dataclass(frozen=True)
+class Completeness:
+    """Whether the effects of the repaired model are all, whichever they are.
+
+    probability : that no more than the threshold remains. threshold : share of the motion; 0 where the
+        simulation is to be as good as the sensors.
+    remains : output -> share of the motion (RMS about its mean) that remains beyond sensor noise in
+        validation records. in_units : the same in the output's unit.
+    """
+
+    probability: float
+    threshold: float
+    remains: Mapping[str, float]
+    in_units: Mapping[str, float]
+
+    @property
+    def most(self) -> float:
+        """Of the output that shows most."""
+        return max(self.remains.values())
 
 
 @dataclass(frozen=True)
@@ -93,6 +126,10 @@ class Diagnosis:
     """What is wrong with a model, as far as its records tell.
 
     verdict, detail_verdict : str
+    probabilities : answer -> probability, summing to one. Main cause; "none": no effect, and that is all;
+        "unknown": none of the candidates, and more remains than the threshold.
+    sets : effects -> probability, summing to one. () is none, ("unknown",) unknown. Whether a set is all is
+        another question (`completeness`).
     effects : tuple of NamedEffect. Every effect, none and unknown; the answer first, then by presence, with
         none and unknown last unless they are the answer.
     combination : tuple of str. Effects that are accepted together; empty for the verdicts none and unknown.
@@ -116,11 +153,14 @@ class Diagnosis:
         cause beyond the list that looks like one of it, with whatever it acts beside.
     partial_model : tuple of str. Effects of the repaired model where the answer is unknown: they close most
         of the held-out gap, and nobody says that they are the cause.
+    completeness : whether that is all.
     noise_below_stated : tuple of (output, noise, stated noise). Of an own machine whose records show less
         noise than is stated, in whose place it was counted.
     competing : tuple of CompetingHypothesis. Fitted explanations that contradict each other, most probable
         first, for `next_experiment`; only for a flexible link.
     shares : Shares or None. Only of a machine with a stated model error.
+    white : (Y,) or None. What sensors have in the unit of the residuals of a page, taken off their sizes;
+        None: sizes are over noise, which is one of them.
     """
 
     case: Any
@@ -145,12 +185,14 @@ class Diagnosis:
     residuals_refit: dict[str, Real]
     residuals_after: dict[str, Real]
     simulations: int
+    completeness: Completeness
     held_out_decided: bool = False
     unlisted: tuple[Any, ...] = ()
     partial_model: tuple[str, ...] = ()
     noise_below_stated: tuple[tuple[str, float, float], ...] = ()
     competing: tuple[CompetingHypothesis, ...] = ()
     shares: Shares | None = None
+    white: Real | None = None
 
     @property
     def added(self) -> tuple[str, ...]:
@@ -169,6 +211,17 @@ class Diagnosis:
     def presence(self, name: str) -> float:
         """Probability that an effect is there at all; of "none" and "unknown" that they are the answer."""
         return next(effect.presence for effect in self.effects if effect.name == name)
+
+    @property
+    def present(self) -> tuple[NamedEffect, ...]:
+        """Effects that are more likely there than not, and those of the answer."""
+        likely = (e for e in self.effects if e.name not in ("none", "unknown"))
+        return tuple(e for e in likely if e.presence >= 0.5 or e.name in self.combination)
+
+    @property
+    def untried(self) -> dict[str, str]:
+        """Effect -> what it needs to be tried."""
+        return {e.name: e.untried for e in self.effects if e.untried}
 
     @property
     def runner_up(self) -> str:
@@ -212,14 +265,22 @@ class Diagnosis:
     def gap_by_experiment(self) -> dict[str, dict[Model, float]]:
         """Experiment -> model -> RMS of the residuals over noise, all sensors together."""
         return {
-            e.name: {model: pooled_rms(self.residuals[model][e.name]) for model in self.models}
+            e.name: {model: self.size_of([self.residuals[model][e.name]]) for model in self.models}
             for e in self.case.experiments
         }
+
+    def size_of(self, residuals: Sequence[Real]) -> float:
+        """The one size of residuals (T, Y) of some records: RMS, beyond sensor noise that of the worst
+        output (`white`)."""
+        together = np.concatenate(residuals)
+        if self.white is None:
+            return pooled_rms(together)
+        return float(np.max(_beyond(np.mean(together**2, axis=0), self.white**2, len(together))))
 
     @property
     def worst_experiment(self) -> tuple[str, float]:
         """Where most is left with the effects added: its name and RMS over noise."""
-        after = {name: pooled_rms(e) for name, e in self.residuals_after.items()}
+        after = {name: self.size_of([e]) for name, e in self.residuals_after.items()}
         name = max(after, key=after.__getitem__)
         return name, after[name]
 
@@ -239,6 +300,48 @@ def best_first(
 
 def held_out_gap(case: CaseOfMachine, residuals: dict[str, Real]) -> float:
     return pooled_rms(np.concatenate([residuals[e.name].ravel() for e in case.held_out]))
+
+
+def remarks(
+    candidate: Candidate, coordinates: Real, intervals: Mapping[str, tuple[float, float]]
+) -> dict[str, str]:
+    """Parameter -> what its interval does not say: pinned at an end of its range, or as wide as that."""
+    found = {}
+    for axis, x in zip(candidate.axes, coordinates, strict=True):
+        low, high = axis.box
+        if axis.parameter not in intervals or not np.isfinite(high - low):
+            continue
+        ends = np.clip(np.sort(np.abs(intervals[axis.parameter])), axis.low, axis.high)
+        if min(x - low, high - x) < _PINNED * (high - low):
+            found[axis.parameter] = f"at the {'lower' if x - low < high - x else 'upper'} end of its range"
+        elif axis.low >= 0 and axis.coordinate(ends[1]) - axis.coordinate(ends[0]) > _WIDE * (high - low):
+            found[axis.parameter] = "anywhere in its range"
+    return found
+
+
+def left_of(case: CaseOfMachine, residuals: Mapping[str, Real]) -> tuple[Real, Real]:
+    """(Y,) share of the motion, and (Y,) RMS in the outputs' units, that whitened residuals of validation
+    records (T, Y) have beyond sensor noise and rounding. The motion: RMS about the mean of a record."""
+    held, rounding = case.held_out, rounding_effect(case)
+    samples = sum(len(e.output) for e in held)
+    white = 1.0 + (0.0 if rounding is None else rounding.variances / case.noise**2)
+    energy = np.sum([np.sum(residuals[e.name] ** 2, axis=0) for e in held], axis=0)
+    rms = case.noise * _beyond(energy / samples, white, samples)
+    motion = np.sqrt(sum(len(e.output) * np.var(e.output, axis=0) for e in held) / samples)
+    return rms / motion, rms
+
+
+def _beyond(mean_square: Real, white: Real | float, samples: int) -> Real:
+    """(Y,) RMS beyond white noise of this variance; 0 where the noise of so many samples could make it."""
+    beyond = mean_square - white
+    return np.sqrt(np.where(beyond > _CHANCE * white * np.sqrt(2 / samples), beyond, 0.0))
+
+
+def completeness_of(case: CaseOfMachine, probability: float, residuals: Mapping[str, Real]) -> Completeness:
+    """Of what a model leaves, whitened (T, Y); see `Completeness`."""
+    names = case.machine.output_names
+    share, rms = (dict(zip(names, map(float, v), strict=True)) for v in left_of(case, residuals))
+    return Completeness(float(probability), case.machine.weighing.model_error, share, rms)
 
 
 def share_closed(
@@ -267,7 +370,7 @@ def share_closed(
 
     # A gap that the noise of so many samples could make is none to close.
     count = sums[:, 2].sum()
-    if sums[:, 0].sum() / count - floor**2 < 3 * floor**2 * np.sqrt(2 / count):
+    if sums[:, 0].sum() / count - floor**2 < _CHANCE * floor**2 * np.sqrt(2 / count):
         return float("nan"), (float("nan"), float("nan"))
     low, high = np.nanquantile(share(drawn), [0.025, 0.975])
     return float(share(sums.sum(axis=0))), (float(low), float(high))

@@ -19,7 +19,9 @@ from diagnosis.answer import (
     NamedEffect,
     Verdict,
     best_first,
+    completeness_of,
     held_out_gap,
+    remarks,
     share_closed,
 )
 from diagnosis.evidence.confirmation import confronted
@@ -48,6 +50,8 @@ from diagnosis.search.loop import Progress
 from plant.effects import LOOK_ALIKES
 from plant.effects.search_space import Candidate
 
+# Share of a time limit for fits; the rest is for what the answer needs besides.
+_SEARCHED = 0.9
 # Share of the progress that the first search is; the second may not be needed.
 _FIRST_SEARCH = 0.6
 # Noise of an own machine is what the quietest octave shows where that is below the one share of what is
@@ -80,7 +84,7 @@ def diagnose(
     """
     rng = np.random.default_rng(0) if rng is None else rng
     progress = progress or (lambda fraction, message: None)
-    deadline_s = time.monotonic() + time_limit_s
+    deadline_s = time.monotonic() + _SEARCHED * time_limit_s
     answer = _answered(case, progress, rng, deadline_s)
     if answer.verdict != "none" or not isinstance(case, PlantCase) or time.monotonic() > deadline_s:
         return answer
@@ -164,7 +168,7 @@ def _without_error(case: CaseOfMachine, progress: Progress, rng: np.random.Gener
         detail_verdict=_detail(verdict, weighed, ambiguous_with, last),
         probabilities=weighed.cause,
         sets=weighed.sets,
-        effects=_named(model, hypotheses, weighed, together, last, rounding, rng),
+        effects=_named(model, hypotheses, weighed, together, last, (gap_refit, floor), rounding, rng),
         combination=together if verdict == "effect" else (),
         ambiguous_with=ambiguous_with,
         gap_before=gap_before,
@@ -181,6 +185,7 @@ def _without_error(case: CaseOfMachine, progress: Progress, rng: np.random.Gener
         residuals_refit=refit,
         residuals_after=after,
         simulations=model.simulations,
+        completeness=completeness_of(case, 1 - weighed.cause["unknown"], after),
         held_out_decided=seen is not None,
         unlisted=likeliest.fit.effects if verdict == "unknown" and not likeliest.is_answer else (),
         competing=_to_part(case, hypotheses, weighed, alike) if isinstance(case, Case) else (),
@@ -269,9 +274,11 @@ def _named(
     weighed: Probabilities,
     together: Sequence[str],
     last: Descent,
+    gap: tuple[float, float],
     rounding: Rounding | None,
     rng: np.random.Generator,
 ) -> tuple[NamedEffect, ...]:
+    """gap : of the nominal on validation records over noise, and the noise floor."""
     case = model.case
     samples = float(np.mean([len(record.output) for record in case.estimation]))
 
@@ -281,26 +288,40 @@ def _named(
     entries = []
     for name in case.machine.weighing.listed:
         holding = [h for h in hypotheses if name in h.names]
-        parameters: dict[str, float] = {}
-        intervals: dict[str, tuple[float, float]] = {}
-        gap = float("nan")
+        entry = NamedEffect(name, weighed.cause[name], weighed.presence[name], {}, {}, float("nan"))
         if holding:
             end = last if name in last.names else max(holding, key=lambda h: h.log_weight).fit
             k = end.names.index(name)
-            parameters = end.candidates[k].parameters(end.coordinates_of(k))
-            intervals = _intervals(end, k, samples, rng)
-            gap = gap_of(end)
+            intervals, after = _intervals(end, k, samples, rng), gap_of(end)
+            rest = {n for n in end.names if n != name}
+            without = min(gap_of(h.fit) for h in hypotheses if rest == set(h.names)) if rest else gap[0]
+            entry = replace(
+                entry,
+                parameters=end.candidates[k].parameters(end.coordinates_of(k)),
+                intervals=intervals,
+                gap_after=after,
+                explains=(_explained(without, after, *gap), float("nan"), float("nan")),
+                remarks=remarks(end.candidates[k], end.coordinates_of(k), intervals),
+            )
         elif rounding is not None and name == rounding.name:
-            parameters, intervals = rounding.effect.parameters(), rounding.intervals
-            gap = gap_of(last)
-        entries.append(
-            NamedEffect(name, weighed.cause[name], weighed.presence[name], parameters, intervals, gap)
-        )
+            entry = replace(
+                entry,
+                parameters=rounding.effect.parameters(),
+                intervals=rounding.intervals,
+                gap_after=gap_of(last),
+            )
+        entries.append(entry)
     entries += [
         NamedEffect(name, weighed.cause[name], weighed.cause[name], {}, {}, float("nan"))
         for name in ("none", "unknown")
     ]
     return best_first(entries, weighed.answer, together)
+
+
+def _explained(without: float, after: float, refit: float, floor: float) -> float:
+    """Share of the energy of the validation error beyond noise that an effect explains; nan without one."""
+    error = refit**2 - floor**2
+    return float(np.clip((without**2 - after**2) / error, 0.0, 1.0)) if error > 0 else float("nan")
 
 
 def _intervals(

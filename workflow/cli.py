@@ -661,6 +661,13 @@ def diagnose(
     python: Annotated[
         str | None, typer.Option(help="Python file with a simulation, in place of a case.")
     ] = None,
+    motion: Annotated[
+        str | None,
+        typer.Option(
+            help="Of an FMU or Python file: the first output is the position or speed of the body that the "
+            "first input drives. [default: by its unit]"
+        ),
+    ] = None,
     log: Annotated[
         list[str] | None,
         typer.Option(help="Log of that machine; of several the last one judges, of one its last third."),
@@ -693,6 +700,8 @@ def diagnose(
     model = {key: name for key, name in {"mjcf": mjcf, "fmu": fmu, "python": python}.items() if name}
     if bool(case) == bool(model) or bool(model) != bool(log):
         raise InputError("diagnose: expected cases, or --mjcf, --fmu or --python with --log")
+    if motion and not (fmu or python):
+        raise InputError("diagnose: --motion is of --fmu or --python; in a case file: motion = ...")
     case = case or []
     need(*([Path(name) for name in (*model.values(), *(log or []))] if model else []))
     if case and not any(place.exists() for place in case):
@@ -708,8 +717,9 @@ def diagnose(
         from workflow.diagnose.command import diagnose_cases
         from workflow.diagnose.simulator_case import settings_of
 
+        stated = {**model, "log": log, **({"motion": motion} if motion else {})}
         found = diagnose_cases(
-            [settings_of({**model, "log": log}, "--log")] if model else case,
+            [settings_of(stated, "--log")] if model else case,
             out,
             rig=rig,
             jobs=jobs,

@@ -72,6 +72,7 @@ class RecordsToFit:
         self.case, self.experiments = case, tuple(experiments)
         self.likelihood, self.nominal = likelihood, nominal
         self.simulations = 0
+        self.before_each: Callable[[], None] = lambda: None
         ends = np.cumsum([e.output.size for e in experiments])
         self.parts = [slice(int(b - e.output.size), int(b)) for b, e in zip(ends, experiments, strict=True)]
         lacking = [list(getattr(e, "missing", ())) for e in experiments]
@@ -104,6 +105,7 @@ class RecordsToFit:
         """measured - model (T, Y) of the r-th record."""
         experiment, far = self.experiments[r], self._far[r]
         self.simulations += 1
+        self.before_each()
         begun = (state, zeros) if state.size or zeros.size else ()
         e = experiment.output - simulate(experiment.input, *begun, **later(experiment))
         missing, kept = self._missing[r]

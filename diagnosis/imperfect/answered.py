@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,7 +18,9 @@ from diagnosis.answer import (
     NamedEffect,
     Verdict,
     best_first,
+    completeness_of,
     held_out_gap,
+    remarks,
     share_closed,
 )
 from diagnosis.fit.coordinates import parameter_intervals
@@ -52,8 +56,32 @@ def searched(case: CaseOfMachine, progress: Progress, deadline_s: float = np.inf
     deadline_s : of time.monotonic(); after it nothing more is tried.
     """
     search = Search(case, progress, deadline_s)
-    search.run()
+    run(search)
     return search
+
+
+class OutOfTimeError(BaseException):
+    """Ends a fit on its way; a simulation's own errors are none of it."""
+
+
+def run(search: Search) -> None:
+    """The search to its end or to its deadline, whatever is being fitted then, once the nominal is."""
+
+    def watch() -> None:
+        if search.found and time.monotonic() > search.deadline_s:
+            raise OutOfTimeError
+
+    watched = (search.records, search.held_out) if np.isfinite(search.deadline_s) else ()
+    for records in watched:
+        records.before_each = watch
+    try:
+        search.run()
+    except OutOfTimeError:
+        fitted = {name for e in search.found for name in e.names} | {*search.left_out}
+        search.left_out += [n for n in search.case.machine.weighing.listed if n not in fitted]
+        search.left_out.append("what was being fitted")
+    for records in watched:
+        records.before_each = lambda: None
 
 
 def looked_at_again(
@@ -77,7 +105,7 @@ def looked_at_again(
         left = search.left_by(named_alone)
         if np.max(left) < answer.case.machine.weighing.model_error:
             return answer
-    search.run()
+    run(search)
     again = beside_imperfections(search, rng)
     return again if again.combination and not set(again.combination) & named else answer
 
@@ -97,7 +125,7 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
     listed = case.machine.weighing.listed
     found = judging.judged(search)
     search.progress(1.0, "done")
-    refit, best = search.base, found.judged[0]
+    refit, best = found.nominal, found.judged[0]
     accepted, partial, looks_like = refit, tuple[str, ...](), False
     if found.answer == "unknown":
         looks_like = best.explains > 0.5 and not set(best.explanation.names) <= set(listed)
@@ -110,6 +138,9 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
         accepted = _kept(search, whole, found.accepted)
         if accepted.pooled_held_out(case.noise) > refit.pooled_held_out(case.noise):
             accepted = whole.explanation
+    if accepted.names:
+        # Values are re-estimated beside effects too only where that leaves less of the held-out records.
+        accepted = min(accepted, search.stated(accepted), key=lambda e: e.pooled_held_out(case.noise))
     before = _whitened(case, search.stated())
     moved, after = _whitened(case, refit), _whitened(case, accepted)
     rounding = rounding_effect(case)
@@ -119,13 +150,14 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
     kind = named.get(found.answer, "effect")
     ambiguous = _ambiguous(found)
     keys = search.records.nominal.keys
+    shares = shares_of(search, found.accepted or partial, accepted, refit, rng)
     return Diagnosis(
         case=case,
         verdict=kind,
         detail_verdict=_detail(kind, found, ambiguous, accepted),
         probabilities=found.probabilities.cause,
         sets=found.probabilities.sets,
-        effects=_named(search, found, accepted, listed, rng),
+        effects=_named(search, found, accepted, shares.carried, rng),
         combination=found.accepted,
         ambiguous_with=ambiguous,
         gap_before=held_out_gap(case, before),
@@ -142,9 +174,10 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
         residuals_refit=moved,
         residuals_after=after,
         simulations=search.simulations,
+        completeness=completeness_of(case, judging.below_threshold(search, accepted), after),
         unlisted=(accepted if partial else best.explanation).end.effects if looks_like else (),
         partial_model=partial,
-        shares=shares_of(search, found.accepted or partial, accepted, rng),
+        shares=shares,
         competing=_competing(search, found),
     )
 
@@ -154,6 +187,8 @@ def _kept(search: Search, whole: judging.Judged, accepted: Iterable[str]) -> Exp
     least = _LEAST_KEPT * search.case.machine.weighing.model_error
     shares, accepted = {part.name: part.share for part in whole.parts}, set(accepted)
     kept = [n for n in whole.explanation.names if n in accepted or shares.get(n, 0.0) > least]
+    if judging.late(search):
+        return whole.explanation
     return search.finished(search.by_these(kept, whole.explanation))
 
 
@@ -166,12 +201,12 @@ def _in_part(search: Search, found: judging.Verdict, *, looks_like: bool) -> Exp
     listed = (one for one in found.judged if one.parts and len(one.parts) == len(one.explanation.names))
     whole = found.judged[0] if looks_like else next(listed, None)
     if whole is None:
-        return search.base
+        return found.nominal
     unlisted = set(whole.explanation.names) - {part.name for part in whole.parts}
     part, noise = _kept(search, whole, unlisted), search.case.noise
-    closes = closed_by(search, part) > _MOST_OF_IT and np.max(part.shares[1]) < 1 - _MOST_OF_IT
-    nearer = part.pooled_held_out(noise) < search.stated().pooled_held_out(noise)
-    return part if closes and nearer else search.base
+    closes = closed_by(search, part, found.nominal) > _MOST_OF_IT
+    nearer = part.pooled_held_out(noise) < found.nominal.pooled_held_out(noise)
+    return part if closes and nearer and np.max(part.shares[1]) < 1 - _MOST_OF_IT else found.nominal
 
 
 def _competing(search: Search, found: judging.Verdict) -> tuple[CompetingHypothesis, ...]:
@@ -238,27 +273,33 @@ def _named(
     search: Search,
     found: judging.Verdict,
     accepted: Explanation,
-    listed: Sequence[str],
+    carried: Mapping[str, tuple[float, float, float]],
     rng: np.random.Generator,
 ) -> tuple[NamedEffect, ...]:
-    weighed, case = found.probabilities, search.case
+    weighed, case, sets = found.probabilities, search.case, best_of_sets(search.found)
+    likeliest = [accepted, *(one.explanation for one in found.judged), *sets.values()]
     entries = []
-    for name in listed:
-        holding = [e for e in search.found if name in e.names]
-        parameters: dict[str, float] = {}
-        intervals: dict[str, tuple[float, float]] = {}
-        gap = float("nan")
-        if holding:
-            best = accepted if name in accepted.names else max(holding, key=lambda e: e.evidence)
+    for name in weighed.presence:
+        entry = NamedEffect(name, weighed.cause[name], weighed.presence[name], {}, {}, float("nan"))
+        best = next((e for e in likeliest if name in e.names), None)
+        if best is not None:
             k = best.names.index(name)
-            parameters = best.end.candidates[k].parameters(best.end.coordinates_of(k))
+            candidate, coordinates = best.end.candidates[k], best.end.coordinates_of(k)
             intervals = _intervals(search, best, k, rng)
-            gap = held_out_gap(case, _whitened(case, best))
+            rest = judging.best_without(sets, best, name)
+            explains = closed_by(search, best, found.nominal) - closed_by(search, rest, found.nominal)
+            entry = replace(
+                entry,
+                parameters=candidate.parameters(coordinates),
+                intervals=intervals,
+                gap_after=held_out_gap(case, _whitened(case, best)),
+                explains=carried.get(name) or (max(explains, 0.0), float("nan"), float("nan")),
+                remarks=remarks(candidate, coordinates, intervals),
+            )
         elif found.rounding is not None and name == found.rounding.name:
-            parameters, intervals = found.rounding.effect.parameters(), found.rounding.intervals
-        entries.append(
-            NamedEffect(name, weighed.cause[name], weighed.presence[name], parameters, intervals, gap)
-        )
+            effect = found.rounding.effect
+            entry = replace(entry, parameters=effect.parameters(), intervals=found.rounding.intervals)
+        entries.append(replace(entry, untried=found.untried.get(name, "")))
     for name in ("none", "unknown"):
         entries.append(NamedEffect(name, weighed.cause[name], weighed.cause[name], {}, {}, float("nan")))
     return best_first(entries, found.answer, found.accepted)

@@ -11,7 +11,7 @@ import numpy as np
 
 from diagnosis.answer import Shares
 from diagnosis.imperfect.horizon import horizon_samples, shares_over_horizon
-from diagnosis.imperfect.verdict import is_silent
+from diagnosis.imperfect.verdict import is_silent, late
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.rounding import rounding_effect
 from diagnosis.search.explanation import Explanation
@@ -23,42 +23,47 @@ _LEAST_CLOSED, _WORTH_A_THIRD = 0.02, 0.1
 
 
 def shares_of(
-    search: Search, matter: Sequence[str], accepted: Explanation, rng: np.random.Generator
+    search: Search,
+    matter: Sequence[str],
+    accepted: Explanation,
+    nominal: Explanation,
+    rng: np.random.Generator,
 ) -> Shares:
     """Shares of the energy of the held-out residuals beyond white noise of the stated size (design 6.2).
 
-    matter : those of the effects of the repaired model that are not small.
+    matter : those of the effects of the repaired model that are not small. nominal : what they are added to.
 
     Carried is the Shapley value of every effect of the repaired model, small ones included: what it closes,
     averaged over the orders in which they could be added, so that it depends on none and all together are
-    what the model closes; intervals by bootstrap over blocks of samples.
+    what the model closes; intervals by bootstrap over blocks of samples. None where a time limit left no time
+    for the parts of the model.
     """
-    base, held = search.base, search.held_out
+    held = search.held_out
     fitted = [name for name in matter if name in accepted.names]
     names = (*fitted, *(name for name in accepted.names if name not in fitted))
-    subsets = {
-        chosen: search.by_these(chosen, accepted)
-        for count in range(len(names) + 1)
-        for chosen in combinations(names, count)
-    }
+    parts = [chosen for count in range(len(names) + 1) for chosen in combinations(names, count)]
+    known = {accepted.key, *(e.key for e in search.found)}
+    in_time = not late(search) or all(tuple(sorted(chosen)) in known for chosen in parts)
+    subsets = {chosen: search.by_these(chosen, accepted) for chosen in (parts if in_time else ((),))}
     # Alone a part may run away, far beyond what the nominal leaves: it carries nothing.
-    nothing = _blocks(search, subsets[()])
+    nothing = _blocks(search, nominal)
     blocks = {
         chosen: min(_blocks(search, explanation), nothing, key=np.sum)
         for chosen, explanation in subsets.items()
     }
     drawn = rng.integers(0, blocks[()].size, (_DRAWS, blocks[()].size))
     carried = {}
-    for name in names:
+    for name in names if in_time else ():
         value = _shapley(name, names, {c: b.sum(keepdims=True) for c, b in blocks.items()})[0]
         spread = _shapley(name, names, {c: b[drawn].sum(axis=1) for c, b in blocks.items()})
         low, high = np.quantile(spread, [0.025, 0.975])
         carried[name] = (float(value), float(low), float(high))
-    closed = {e.key: closed_by(search, e) for e in sorted(search.found, key=lambda e: e.evidence) if e.names}
+    ranked = sorted(search.found, key=lambda e: e.evidence)
+    closed = {e.key: closed_by(search, e, nominal) for e in ranked if e.names}
     told = sorted(((c, key) for key, c in closed.items() if _tells(key, closed)), reverse=True)[:_MOST_TOLD]
     return Shares(
         names=tuple(search.case.machine.output_names),
-        before=tuple(map(float, held.shares(base.left_held_out))),
+        before=tuple(map(float, held.shares(nominal.left_held_out))),
         after=tuple(map(float, held.shares(accepted.left_held_out))),
         interests=search.case.machine.weighing.model_error,
         carried=carried,
@@ -67,13 +72,13 @@ def shares_of(
         not_tried=tuple(search.left_out),
         silent=tuple(name for name in fitted if is_silent(search, accepted, name)),
         at_inputs=search.at_inputs,
-        **_over_horizon(search, accepted),
+        **_over_horizon(search, accepted, nominal),
     )
 
 
-def closed_by(search: Search, explanation: Explanation) -> float:
+def closed_by(search: Search, explanation: Explanation, nominal: Explanation) -> float:
     """Share of the energy of the held-out residuals beyond noise that a set closes."""
-    return 1 - float(np.sum(_blocks(search, explanation)) / np.sum(_blocks(search, search.base)))
+    return 1 - float(np.sum(_blocks(search, explanation)) / np.sum(_blocks(search, nominal)))
 
 
 def _tells(key: tuple[str, ...], closed: Mapping[tuple[str, ...], float]) -> bool:
@@ -83,11 +88,11 @@ def _tells(key: tuple[str, ...], closed: Mapping[tuple[str, ...], float]) -> boo
     return closed[key] > max([0.0, *parts]) + more
 
 
-def _over_horizon(search: Search, accepted: Explanation) -> dict[str, Any]:
+def _over_horizon(search: Search, accepted: Explanation, nominal: Explanation) -> dict[str, Any]:
     held, samples = search.held_out, horizon_samples(search.held_out)
     longest = max(len(record.output) for record in held.experiments)
     found = []
-    for e in (search.base, accepted):
+    for e in (nominal, accepted):
         responses = held.nominal.at(e.end.deviations).unknown_start.responses
         if not samples or responses is None:
             return {}

@@ -44,6 +44,8 @@ _FITTED = 100
 # Imaginary part of a real pole; largest pole; radians of a swing in a part of a sample, and the largest
 # power of two of parts.
 _REAL, _UNSTABLE, _TURNED, _MOST_PARTS = 1e-9, 1.1, 0.1, 4
+# What no filter of a response of one comes to; far below what overflows.
+_GROWS = 1e100
 
 
 class NotFollowedError(ValueError, ArithmeticError):
@@ -306,6 +308,8 @@ def _filter(response: Real, ahead: int) -> tuple[Real, Real]:
             continue
         rows = np.concatenate([np.arange(ahead, first), rows])
         alone = lfilter([1.0], own, pulse)
+        if not np.max(np.abs(alone)) < _GROWS:
+            continue  # faster than any response that ends at one
         delayed = np.column_stack(
             [np.concatenate([np.zeros(j), alone[: L - j]]) for j in range(ahead, ahead + order)]
         )

@@ -69,6 +69,7 @@ class Plant:
         here what is left over makes the answer "unknown". None: zero where the simulation with the right
         effects does reach the noise, else 0.05; a smaller gap that no effect explains is then "unknown".
     dt_s : float. Sampling period, for pages; `with_effects` states it.
+    inactive : effect -> what it needs to be tried, as `with_effects` states it; not tried is not ruled out.
     start : name -> standard deviation (around zero) of a state at the start of a record that nobody knows
         Beside a model error it is fitted for every record; the simulation takes the states (name -> value) as
         a fourth argument.
@@ -83,12 +84,13 @@ class Plant:
     model_error: float | None = None
     dt_s: float = float("nan")
     start: Mapping[str, float] = field(default_factory=dict)
+    inactive: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         lock(self, "noise")
         object.__setattr__(self, "effects", tuple(self.effects))
         object.__setattr__(self, "output_names", tuple(self.output_names))
-        for key in ("parameters", "tolerances", "start"):
+        for key in ("parameters", "tolerances", "start", "inactive"):
             object.__setattr__(self, key, MappingProxyType(dict(getattr(self, key))))
         for name, spread in self.start.items():
             if not 0 < spread < np.inf:

@@ -23,6 +23,7 @@ _MISSING = {
     "input": "changes a command, and the stated input is none or zero in every record",
     "body": "needs motion=, the output that is the body's position or speed",
 }
+_NEEDS = {"input": "a command among the inputs", "body": "motion: the output that is the body's motion"}
 _GROUPS = {"input": "actuator", "body": "body", "output": "sensor"}
 # What no record of one output can tell from its twin at the input where the machine is linear.
 _TWINS = ("output_lag", "output_delay", "output_gain")
@@ -124,7 +125,12 @@ def with_effects(
                 check=kind.check,
             )
         )
-    equipped = replace(plant, effects=tuple(found), dt_s=dt_s)
+    there = {effect.name for effect in found}
+    inactive = dict(plant.inactive)
+    if names == "all":
+        inactive |= {prefix + n: _NEEDS[KINDS[n].where] for n in _of_all(plant) if n not in chosen}
+    inactive = {name: needs for name, needs in inactive.items() if name not in there}
+    equipped = replace(plant, effects=tuple(found), dt_s=dt_s, inactive=inactive)
     _try(equipped, experiments[0], body)
     smooth = [n for n in chosen if n in _SMOOTH]
     if smooth and isinstance(body, Body) and body.doubt:
@@ -136,9 +142,13 @@ def with_effects(
     return equipped
 
 
-def _applying(plant: Plant, places: Mapping[Where, object]) -> list[str]:
+def _of_all(plant: Plant) -> list[str]:
     left_out = _BY_NAME_ONLY if len(plant.output_names) > 1 else (*_BY_NAME_ONLY, *_TWINS)
-    return [n for n, kind in KINDS.items() if n not in left_out and places[kind.where] is not None]
+    return [name for name in KINDS if name not in left_out]
+
+
+def _applying(plant: Plant, places: Mapping[Where, object]) -> list[str]:
+    return [name for name in _of_all(plant) if places[KINDS[name].where] is not None]
 
 
 def _column(plant: Plant, output: str) -> int:

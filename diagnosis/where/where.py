@@ -1,8 +1,8 @@
 """Where the gap between machine and model lies: frequency, regime, time, amplitude, experiment, sensor.
 
 Everything is read from whitened residuals (measured - model) / noise of every experiment, whichever model
-made them: as given, with refitted parameters, or repaired. Beside a model error, what a good model may miss
-of the motion stands in the place of the noise.
+made them: as given, with refitted parameters, or repaired. Beside a model error, noise and what a good
+model may miss of the motion stand together in the place of the noise.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def where(
         raise ValueError(f"level must lie between 0 and 1; got {level}")
     rng = np.random.default_rng(0) if rng is None else rng
     if case.model_error > 0:
-        case, residuals = over_levels(case, residuals, case.model_error * motion_of(case))
+        case, residuals = over_levels(case, residuals, thresholds_of(case))
     moved, sensors = motions(case, residuals), sensors_of(case)
     e = {name: np.asarray(residuals[name], dtype=np.float64) for name in moved}
     found = _by_parts(e, sensors, case.rig.sampling.dt_s, level)
@@ -76,9 +76,8 @@ def where(
 
 def where_in_records(case: CaseOfMachine, residuals: Mapping[str, Real], dt_s: float) -> Where:
     """Of any machine: by sensor, experiment and frequency; arguments as of `where`."""
-    model_error = case.machine.weighing.model_error
-    if model_error > 0:
-        _, residuals = over_levels(case, residuals, model_error * motion_of(case))
+    if case.machine.weighing.model_error > 0:
+        _, residuals = over_levels(case, residuals, thresholds_of(case))
     return _by_parts(residuals, case.machine.output_names, dt_s, LEVEL)
 
 
@@ -99,6 +98,11 @@ def motion_of(case: CaseOfMachine) -> Real:
     return np.sqrt(
         np.average([np.var(e.output, axis=0) for e in held], axis=0, weights=[len(e.output) for e in held])
     )
+
+
+def thresholds_of(case: CaseOfMachine) -> Real:
+    """(Y,) what a good model leaves of the outputs: the share of the motion that it may miss, and noise."""
+    return np.hypot(case.machine.weighing.model_error * motion_of(case), case.noise)
 
 
 AnyCase = TypeVar("AnyCase", bound=CaseOfMachine)

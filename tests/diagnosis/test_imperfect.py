@@ -264,8 +264,9 @@ def test_a_time_limit_says_what_was_not_tried(gap_cases):
     case = load_case(gap_cases / "workshop" / "labelled" / "work-05").case
     found = diagnose(case, time_limit_s=0.0)
     assert found.verdict == "unknown"
-    assert found.shares is not None
-    assert "joint_compliance" in found.shares.not_tried
+    assert found.untried["joint_compliance"] == "more time"
+    # Nothing was tried: an unlisted cause is no likelier than it was before.
+    assert found.probabilities["unknown"] < 0.2
 
 
 def test_what_the_held_out_records_contradict_is_no_answer():
@@ -283,7 +284,7 @@ def test_what_the_held_out_records_contradict_is_no_answer():
     search.run()
     found = judged(search)
     assert "hardening_spring" not in found.accepted
-    shares = shares_of(search, found.accepted, search.base, rng)
+    shares = shares_of(search, found.accepted, found.nominal, found.nominal, rng)
     assert all(closed > 0 for _, closed in shares.closes)
 
 
@@ -351,13 +352,14 @@ def test_what_others_imitate_only_in_the_records_they_are_fitted_to_is_named():
         # A tilt that an estimation record drifts off with carries much of it and little of the held-out one.
         ("gravity", (400.0, 0.25, 0.05), ("actuator_dead_zone",)),
         ("gravity", (400.0, 0.25, 0.09), ("gravity", "actuator_dead_zone")),
-        # No machine has a little of a periodic disturbance; one that is plain to see is a finding.
-        ("periodic_disturbance", (400.0, 0.05, 0.05), ("actuator_dead_zone", "periodic_disturbance")),
-        ("coulomb_friction", (400.0, 0.05, 0.05), ("actuator_dead_zone",)),
-        ("periodic_disturbance", (400.0, 0.03, 0.03), ("actuator_dead_zone",)),
+        # One threshold, whatever the name.
+        ("periodic_disturbance", (400.0, 0.06, 0.06), ("actuator_dead_zone", "periodic_disturbance")),
+        ("coulomb_friction", (400.0, 0.06, 0.06), ("actuator_dead_zone", "coulomb_friction")),
+        ("periodic_disturbance", (400.0, 0.04, 0.04), ("actuator_dead_zone",)),
+        ("coulomb_friction", (400.0, 0.04, 0.04), ("actuator_dead_zone",)),
     ],
 )
-def test_what_every_machine_has_a_little_of_must_carry_more_to_interest(second, without, accepted):
+def test_every_effect_must_carry_the_stated_threshold_of_held_out_records(second, without, accepted):
     found = _judged(
         {
             (): (0.0, 0.3, 0.3),
@@ -408,9 +410,11 @@ def test_held_out_records_veto_that_nothing_is_missing():
     assert _judged({(): (0.0, 0.03, 0.03)}).answer == "none"
 
 
-@pytest.mark.parametrize(("effect", "answer"), [("backlash", "backlash"), ("actuator_dead_zone", "unknown")])
-def test_more_may_be_left_after_contacts_than_beside_anything_else(effect, answer):
-    assert _judged({(): (0.0, 0.4, 0.4), (effect,): (600.0, 0.12, 0.12)}).answer == answer
+@pytest.mark.parametrize(("effect", "all_of_it"), [("backlash", True), ("actuator_dead_zone", False)])
+def test_more_may_be_left_after_contacts_than_beside_anything_else(effect, all_of_it):
+    found = _judged({(): (0.0, 0.4, 0.4), (effect,): (600.0, 0.12, 0.12)})
+    assert found.answer == effect
+    assert (found.judged[0].complete > 0.5) == all_of_it
 
 
 @pytest.mark.parametrize(("acts", "answer"), [(0.0, "actuator_saturation"), (0.3, "none")])
@@ -472,7 +476,7 @@ def test_a_look_alike_leaves_no_more_of_held_out_records_than_what_it_looks_like
 
 def test_a_look_alike_of_what_every_machine_has_must_carry_as_much():
     # A tilt of the background: a spring to ground explains it, and is no cause beyond the list for that.
-    assert _judged({(): (0.0, 0.105, 0.05), ("ground_spring",): (400.0, 0.01, 0.01)}).answer == "none"
+    assert _judged({(): (0.0, 0.105, 0.04), ("ground_spring",): (400.0, 0.01, 0.01)}).answer == "none"
     assert _judged({(): (0.0, 0.105, 0.08), ("ground_spring",): (400.0, 0.01, 0.01)}).answer == "unknown"
 
 
@@ -517,8 +521,7 @@ def test_a_tilt_in_any_direction_is_found_where_the_tip_tells_the_zero():
 def test_an_answer_leaves_no_more_of_held_out_records_than_the_stated_values():
     sets = {(): (0.0, 0.3, 0.3), ("actuator_dead_zone",): (400.0, 0.01, 0.01)}
     assert _judged(sets).answer == "actuator_dead_zone"
-    less = SimpleNamespace(pooled_held_out=lambda noise: -1.0)
-    assert _judged(sets, stated=less).answer != "actuator_dead_zone"
+    assert _judged(sets, stated=0.005).answer != "actuator_dead_zone"
 
 
 @pytest.mark.parametrize(
@@ -778,7 +781,7 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
     motion left of estimation and of held-out records).
 
     step_m: of the tip's values. acts: share of the motion that each effect changes of held-out records.
-    stated: what stated values leave, as an explanation. turned_rad: of every coordinate that is an angle.
+    stated: share that stated values leave. turned_rad: of every coordinate that is an angle.
     """
     rng = np.random.default_rng(9)
     records = []
@@ -815,7 +818,7 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
     return SimpleNamespace(
         found=list(found.values()),
         base=found[frozenset()],
-        stated=lambda: stated or found[frozenset()],
+        stated=lambda: found[frozenset()] if stated is None else fitted((), 0.0, stated, stated),
         case=case,
         records=Records(case, case.estimation),
         held_out=Records(case, case.held_out),
@@ -823,6 +826,8 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
         simpler=lambda explanation: None,
         exchanged=lambda explanation, sought: None,
         joined=lambda one, other: None,
+        left_out=(),
+        deadline_s=np.inf,
         acts_on_held_out=lambda whole, k: acts,
         by_these=lambda names, whole: found[frozenset(names)],
         finished=lambda explanation: explanation,
@@ -862,8 +867,7 @@ def test_two_likely_sets_that_explain_other_records_are_also_fitted_together():
 @pytest.mark.parametrize(
     ("names", "left", "stated", "partial"),
     [
-        pytest.param("gravity", 0.2, 0.3, ("gravity",), id="most-of-it"),
-        pytest.param("gravity", 0.22, 0.3, (), id="less-than-half-of-the-energy"),
+        pytest.param("gravity", 0.25, 0.3, (), id="less-than-half-of-the-energy"),
         pytest.param("gravity", 0.2, 0.19, (), id="more-than-the-model-as-stated"),
         pytest.param("ground_spring", 0.2, 0.3, (), id="not-of-the-list"),
         pytest.param("ground_spring", 0.02, 0.3, ("ground_spring",), id="what-it-looks-like"),
@@ -871,10 +875,7 @@ def test_two_likely_sets_that_explain_other_records_are_also_fitted_together():
 )
 def test_what_closes_most_of_a_gap_of_unknown_cause_is_told(names, left, stated, partial):
     # 0.3 of the motion is left without it.
-    as_stated = SimpleNamespace(
-        pooled_held_out=lambda noise: float(np.sum((np.full((400, 2), stated) / noise) ** 2))
-    )
-    search = _searched({(): (0.0, 0.3, 0.3), (names,): (400.0, left, left)}, stated=as_stated)
+    search = _searched({(): (0.0, 0.3, 0.3), (names,): (400.0, left, left)}, stated=stated)
     found = judged(search)
     assert found.answer == "unknown"
     assert _in_part(search, found, looks_like=left < 0.05).names == partial
@@ -896,6 +897,40 @@ def test_a_partial_model_that_leaves_half_of_the_motion_is_none():
 def test_what_may_be_left_is_as_the_docs_say(stated, told):
     weighing = Weighing(model_error=0.05, stated=stated)
     assert {left: round(_enough(left * 0.05, weighing), 2) for left in told} == told
+
+
+@pytest.mark.parametrize(
+    ("left", "answer", "presence"),
+    [(0.1, "gravity", (0.9, 1.0)), (0.2, "gravity", (0.5, 0.9)), (0.27, "unknown", (0.0, 0.3))],
+)
+def test_an_effect_is_present_though_something_else_is_missing(left, answer, presence):
+    # 0.3 of the motion is left without it; what carries less than is left may only stand in for that.
+    found = _judged({(): (0.0, 0.3, 0.3), ("gravity",): (400.0, left, left)})
+    assert found.answer == answer
+    low, high = presence
+    assert low < found.probabilities.presence["gravity"] < high
+    assert sum(found.probabilities.cause.values()) == pytest.approx(1.0)
+    assert sum(found.probabilities.sets.values()) == pytest.approx(1.0)
+
+
+def test_effects_that_make_up_for_each_other_carry_no_more_than_their_set():
+    alone = (100.0, 2.0, 2.0)
+    sets = {(): (0.0, 0.8, 0.8), ("gravity", "tip_payload"): (400.0, 0.7, 0.7)}
+    found = _judged(sets | {("gravity",): alone, ("tip_payload",): alone})
+    assert found.answer == "unknown"
+
+
+def test_untried_is_not_absent():
+    search = _searched({(): (0.0, 0.3, 0.3), ("gravity",): (4.0, 0.29, 0.29)})
+    tried = judged(search)
+    search.left_out = ["joint_compliance", "further effects beside gravity"]
+    found = judged(search)
+    assert tried.probabilities.cause["unknown"] > 0.8
+    assert found.answer == "unknown"
+    assert found.probabilities.cause["unknown"] < 0.4
+    assert found.untried == {"joint_compliance": "more time"}
+    assert found.probabilities.presence["joint_compliance"] > 0.4
+    assert sum(found.probabilities.sets.values()) == pytest.approx(1.0)
 
 
 def test_a_set_that_one_record_alone_prefers_is_less_sure():

@@ -14,7 +14,7 @@ from scipy.signal import lsim
 
 from diagnosis import EffectParameter, Plant, PlantEffect, PlantExperiment, with_effects
 from diagnosis.machine.listed_effects import KINDS
-from diagnosis.machine.motion_effects import LinearBody
+from diagnosis.machine.motion_effects import LinearBody, PulseResponse
 from diagnosis.machine.plant_effect import Change
 from tests.diagnosis.machines import rubbing
 
@@ -364,3 +364,11 @@ def test_a_trial_that_friction_cannot_be_put_around_ran_away():
         stated = replace(plant, simulation=lambda p, e, u, name=name: simulation(p, {name: {}}, u))
         with pytest.raises(ValueError, match="friction and springs need a force that moves the body"):
             with_effects(stated, ["coulomb_friction"], [record], dt_s=DT_S, motion="x")
+
+
+def test_a_response_that_grows_without_end_prints_nothing(capfd):
+    k = np.arange(20000)
+    response = np.minimum(1e-3 * (1.05 ** np.minimum(k, 2000) - 1), 1e4)
+    assert not PulseResponse.of(response, 0.002, of_speed=False).linear
+    printed = capfd.readouterr()
+    assert (printed.out, printed.err) == ("", "")

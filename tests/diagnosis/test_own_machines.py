@@ -16,11 +16,21 @@ import pytest
 from numba import njit
 
 from benchmarks import emps_axis
-from diagnosis import Plant, PlantCase, PlantExperiment, diagnose, with_effects
+from diagnosis import (
+    EffectParameter,
+    Plant,
+    PlantCase,
+    PlantEffect,
+    PlantExperiment,
+    diagnose,
+    with_effects,
+)
 from diagnosis.fit.descent import descend
 from diagnosis.imperfect.answered import beside_imperfections, searched
 from diagnosis.search.moves import Alone, Beside, Enlarge, FromContacts, Scan
 from diagnosis.search.search import Search
+from diagnosis.where.where import where_in_records
+from examples import own_plant
 from tests.diagnosis.machines import rubbing
 
 DT_S, SAMPLES = 0.01, 700
@@ -378,3 +388,114 @@ def test_emps_by_names_alone_gives_the_published_values(flexlink_data):
     assert values["coulomb_friction"]["force"] == pytest.approx(published["coulomb_N"], rel=0.05)
     assert values["output_offset"]["offset"] == pytest.approx(published["offset_N"], rel=0.05)
     assert found.gap_closed > 0.9
+
+
+def _carriage_records(dry_N):
+    rng = np.random.default_rng(1)
+    for k, role in enumerate(("estimation", "estimation", "held_out")):
+        force = (3.0 + k) * rng.choice([-1.0, 1.0], 30).repeat(20)
+        position = own_plant.carriage(force, 2.0, 80.0, 3.0, 0.0, dry_N) + 2e-4 * rng.standard_normal(600)
+        yield PlantExperiment(f"r{k}", role, force[:, None], position[:, None])
+
+
+def _rubbing(name, dry_N):
+    """Dry friction under a name of one's own."""
+
+    def simulate(p, effects, u):
+        dry = effects[name]["force_N"] if name in effects else 0.0
+        values = (p[key] for key in own_plant.STATED)
+        return own_plant.carriage(np.ascontiguousarray(u[:, 0]), *values, 0.0, dry)[:, None]
+
+    effect = PlantEffect(name, (EffectParameter("force_N", 1e-3, 3.0),), dependence="continuous")
+    plant = Plant(
+        simulate,
+        own_plant.STATED,
+        own_plant.TOLERANCES,
+        ("position_m",),
+        np.array([2e-4]),
+        (effect,),
+        0.05,
+        0.01,
+    )
+    return PlantCase("c", plant, tuple(_carriage_records(dry_N)))
+
+
+@pytest.mark.parametrizeX
+def test_one_threshold_whatever_an_effect_is_called(dry_N, there):
+    names = ("coulomb_friction", "dry_friction", "drag_of_the_seal")
+    found = [diagnose(_rubbing(name, dry_N)) for name in names]
+    presence = [one.presence(name) for one, name in zip(found, names, strict=True)]
+    assert (min(presence) > 0.9) == (max(presence) > 0.9) == there
+    assert presence == pytest.approx([presence[0]] * 3, abs=1e-6)
+    for one in found:
+        # Re-estimated only where validation records improve; what remains is told in both units.
+        assert one.gap_after <= one.gap_refit <= one.gap_before
+        left = one.completeness
+        motion = np.std(one.case.held_out[0].output[:, 0])
+        assert left.in_units["position_m"] == pytest.approx(left.remains["position_m"] * motion)
+        assert (left.probability > 0.5) == (left.most < 0.05)
+
+
+def _noisy_motor():
+    rng, noise = np.random.default_rng(0), 1.5
+    records = []
+    for name, role, size in (("a", "estimation", 0.8), ("b", "estimation", 1.2), ("c", "held_out", 1.0)):
+        voltage = size * rng.choice([-1.0, 1.0], 30).repeat(20)[:, None]
+        speed = _shaft({"time_constant_s": 0.2, "gain": 10.0}, {}, voltage) + 6.0
+        records.append(PlantExperiment(name, role, voltage, speed + noise * rng.standard_normal(speed.shape)))
+    stated, known = {"time_constant_s": 0.2, "gain": 10.0}, {"time_constant_s": 0.1, "gain": 0.05}
+    return Plant(_shaft, stated, known, ("speed_rad_s",), np.array([noise]), model_error=0.05), records
+
+
+def test_noise_is_no_model_error_in_where_and_what_remains():
+    plant, records = _noisy_motor()
+    equipped = with_effects(plant, ("output_offset", "input_delay"), records, dt_s=DT_S)
+    found = diagnose(PlantCase("noisy", equipped, tuple(records)))
+    assert found.combination == ("output_offset",)
+    assert not where_in_records(found.case, found.residuals_after, DT_S).is_gap
+    assert where_in_records(found.case, found.residuals_refit, DT_S).is_gap
+    assert found.completeness.most == 0.0
+
+
+def test_effects_of_a_body_are_not_ruled_out_where_no_motion_is_stated():
+    plant, records = _noisy_motor()
+    without = with_effects(plant, "all", records, dt_s=DT_S)
+    assert {"coulomb_friction", "spring"} <= set(without.inactive)
+    moving = {"motion": "speed_rad_s", "motion_is": "speed"}
+    assert not with_effects(plant, "all", records, dt_s=DT_S, **moving).inactive
+    assert not with_effects(without, ("spring",), records, dt_s=DT_S, **moving).inactive.keys() & {"spring"}
+    assert not with_effects(plant, ("input_delay",), records, dt_s=DT_S).inactive
+
+
+class _Clock:
+    """Every simulation takes a twentieth of a second, nothing else takes any."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def monotonic(self):
+        return self.now
+
+    def simulate(self, parameters, effects, inputs):
+        self.now += 0.05
+        return _carriage(parameters, effects, inputs)
+
+
+@pytest.mark.parametrize("limit_s", [20.0, 60.0])
+def test_a_time_limit_is_kept_while_a_fit_is_running(monkeypatch, limit_s):
+    clock = _Clock()
+    for module in ("diagnosis", "imperfect.answered", "imperfect.verdict", "search.loop"):
+        monkeypatch.setattr(f"diagnosis.{module}.time", clock)
+    rng, truth = np.random.default_rng(3), {"mass_kg": 1.0, "damper": 2.0, "spring": 50.0}
+    records = []
+    for name, role in (("a", "estimation"), ("b", "held_out")):
+        force = rng.choice([-1.0, 1.0], 20).repeat(20)[:, None] + 0.3
+        records.append(PlantExperiment(name, role, force, _carriage(truth, {}, force)))
+    stated = dict.fromkeys(truth, 0.05)
+    plant = Plant(clock.simulate, truth, stated, ("position_m",), np.array([1e-5]), model_error=0.05)
+    equipped = with_effects(plant, "all", records, dt_s=DT_S, motion="position_m")
+    case = PlantCase("slow", equipped, tuple(records))
+    begun = clock.now
+    found = diagnose(case, time_limit_s=limit_s)
+    assert clock.now - begun < 1.1 * limit_s
+    assert found.shares.not_tried

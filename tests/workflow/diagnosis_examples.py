@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from diagnosis.answer import Diagnosis, NamedEffect, Shares
+from diagnosis.answer import Diagnosis, NamedEffect, Shares, completeness_of
 from diagnosis.fit.residual import ResidualModel, pooled_rms
 from diagnosis.machine.case import Case
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
@@ -117,11 +117,13 @@ class KnownAnswer:
                 parameters=fitted.get(name, {}),
                 intervals={k: (0.98 * v, 1.02 * v) for k, v in fitted.get(name, {}).items()},
                 gap_after=end if name in names else float("nan"),
+                explains=(min(closed, 1.0) if name in names else float("nan"), float("nan"), float("nan")),
             )
             for name, p in total.items()
         ]
         return Diagnosis(
             case=case,
+            completeness=completeness_of(case, 0.1 if self.verdict == "unknown" else 0.97, after),
             verdict=self.verdict,
             detail_verdict=self.detail,
             probabilities=total,

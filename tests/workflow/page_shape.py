@@ -26,7 +26,7 @@ _FIRST = """(() => {
 
 
 def shape_faults(
-    browser: Browser, path: Path, *, screens: float, words: int = 900, picture: bool = True
+    browser: Browser, path: Path, *, screens: float, words: int = 900, picture: bool = True, lines: int = 1
 ) -> list[str]:
     """What is too long, and what the first screen lacks, wide and narrow; what the page says twice."""
     found = []
@@ -39,8 +39,8 @@ def shape_faults(
                 found.append(f"{height:.1f} screens, at most {screens}")
             if said > words:
                 found.append(f"{said} words, at most {words}")
-            if round(first["headline"]) != 1:
-                found.append("the verdict takes more than a line")
+            if round(first["headline"]) > lines:
+                found.append(f"the verdict takes more than {lines} lines")
         if picture and first["picture"] > SCREEN:
             found.append(f"{width} px: the picture ends {first['picture']:.0f} px down")
         if not 0 < first["numbers_end"] <= SCREEN or first["numbers"] > 5:

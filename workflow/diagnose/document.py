@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from diagnosis.answer import Diagnosis
+from diagnosis.where.findings import Where
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.simulator_case import SimulatorCase
 from workflow.engine import codec
@@ -14,13 +15,22 @@ FORMAT = "flexlink-diagnosis-1"
 LEAST_SHOWN = 1e-4  # sets of effects less probable than this are left out
 
 
+def completeness_of(found: Diagnosis, remains: Where) -> dict[str, Any]:
+    """Whether the effects are all, what remains, and between which frequencies most of it lies."""
+    run = remains.concentration() if remains.is_gap else None
+    mostly = None if run is None else (run.low_Hz, run.high_Hz)
+    return {**codec.plain(found.completeness), "mostly_Hz": mostly, "in_record": found.worst_experiment[0]}
+
+
 def document_of(
     loaded: LoadedCase | SimulatorCase, found: Diagnosis, beside: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """The answer as plain values.
 
     `effects` are all possible answers, best first, "none" and "unknown" among them: `probability` of being
-    the main cause (they sum to one), `presence` of being there at all. gap_* are the pooled root mean square
+    the main cause (they sum to one), `presence` of being there at all. `presence` has that of every
+    candidate, with its size and the share of the validation error that it explains (interval in `explains`);
+    `completeness` says whether that is all. gap_* are the pooled root mean square
     of (measured - model)/noise over the held-out experiments. partial_model: what the repaired model holds of
     an answer "unknown".
     beside: what else was looked at.
@@ -32,6 +42,19 @@ def document_of(
         "detail_verdict": found.detail_verdict,
         "effects": found.effects,
         "combination": found.combination,
+        "presence": {
+            effect.name: {
+                "probability": effect.presence,
+                "parameters": effect.parameters,
+                "intervals": effect.intervals,
+                "remarks": effect.remarks,
+                "explains": effect.explains,
+                "needs": effect.untried,
+            }
+            for effect in found.effects
+            if effect.name not in ("none", "unknown")
+        },
+        "completeness": found.completeness,
         "partial_model": found.partial_model,
         "ambiguous_with": found.ambiguous_with,
         "probability": found.probability,

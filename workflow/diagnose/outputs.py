@@ -15,9 +15,9 @@ from plant.rig import Rig
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.controller_check import ControllerCheck, NoControllerError, check_controller
 from workflow.diagnose.directory import answer_text
-from workflow.diagnose.document import document_of
+from workflow.diagnose.document import completeness_of, document_of
 from workflow.diagnose.following import following
-from workflow.diagnose.pages import CasePage, case_page, moved, plant_page
+from workflow.diagnose.pages import CasePage, case_page, moved, plant_page, remains_of
 from workflow.diagnose.simulator_case import SimulatorCase
 from workflow.engine import codec, storage
 from workflow.engine.errors import naming
@@ -60,7 +60,7 @@ class Work:
             found = self.diagnose(case, progress=lambda f, m: report(_DIAGNOSED * f, m))
             report(_DIAGNOSED, "where")
             place = where(found.case, found.residuals_refit, found.probabilities)
-            remains = where(found.case, found.residuals_after)
+            remains = remains_of(found)
             report(_WHERE, "next experiment")
             coming = following(found)
             report(_NEXT, "controller")
@@ -82,6 +82,7 @@ class Work:
         beside = {
             "where": place,
             "remains": remains,
+            "completeness": completeness_of(found, remains),
             "next_experiment": {"advice": coming.advice, **codec.plain(coming.proposal or {})},
             "controller": {"skipped": no_check} if check is None else check.document(),
         }
@@ -95,7 +96,10 @@ class Work:
             files = {f"{name}.html": plant_page(found, coming).encode()}
             if loaded.repaired is not None:
                 files[f"{name}.xml"] = loaded.repaired(found).encode()
-        beside = {"next_experiment": {"advice": coming.advice, **codec.plain(coming.repeat or {})}}
+        beside = {
+            "completeness": completeness_of(found, remains_of(found)),
+            "next_experiment": {"advice": coming.advice, **codec.plain(coming.repeat or {})},
+        }
         return self._with_document(loaded, found, beside, files), time.process_time()
 
     def _with_document(
@@ -115,7 +119,8 @@ def _control(found: Diagnosis) -> tuple[ControllerCheck | None, str]:
     """The check, or why there is none: a reason of ours (the page's templates know it) or of the design."""
     if found.verdict == "none":
         return None, "no_gap"
-    if found.verdict == "unknown" or found.detail_verdict == "not_converged":
+    incomplete = found.completeness.probability < 0.5
+    if found.verdict == "unknown" or incomplete or found.detail_verdict == "not_converged":
         return None, "not_explained"
     try:
         return check_controller(found.case, found.rig, found.repair), ""

@@ -11,10 +11,13 @@ from math import copysign
 from pathlib import Path
 from typing import Any
 
-from diagnosis.answer import Diagnosis, held_out_gap
-from diagnosis.machine.own_plant import Plant
+import numpy as np
+
+from diagnosis.answer import Diagnosis, left_of
+from diagnosis.machine.own_plant import Plant, PlantCase
+from diagnosis.machine.rounding import rounding_effect
 from diagnosis.where.findings import Where
-from diagnosis.where.where import motion_of, over_levels, where_in_records
+from diagnosis.where.where import motion_of, over_levels, where, where_in_records
 from plant.effects import EFFECTS
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.controller_check import ControllerCheck
@@ -65,7 +68,7 @@ def plant_page(found: Diagnosis, coming: Following) -> str:
     page = {
         "found": found,
         "where": where_in_records(found.case, found.residuals_refit, dt_s),
-        "remains": where_in_records(found.case, found.residuals_after, dt_s),
+        "remains": remains_of(found),
         "next_experiment": coming,
         "numbers": json.dumps(numbers, indent=1),
     }
@@ -92,6 +95,7 @@ def _rendered(
         moved=moved(found, found.deviations),
         moved_refit=moved(found, found.deviations_refit),
         partial=partial_answers(found),
+        left=left(found),
         effects=EFFECTS,
         checks=checks(found),
         **values,
@@ -106,28 +110,48 @@ def checks(found: Diagnosis) -> dict[str, str]:
 
 
 def shown(found: Diagnosis) -> Diagnosis:
-    """Residuals and gaps over a hundredth of each output's motion (RMS about its mean, held-out records).
+    """Residuals over a hundredth of each output's motion (RMS about its mean, validation records), and sizes
+    in it: of the output with most, beyond sensor noise and rounding.
 
     The floor is then the stated model error in per cent. As it is where the simulation is exact.
     """
     if not found.case.model_error > 0:
         return found
-    level = 0.01 * motion_of(found.case)
+    level, rounding = 0.01 * motion_of(found.case), rounding_effect(found.case)
     (case, before), (_, refit), (_, after) = (
         over_levels(found.case, residuals, level)
         for residuals in (found.residuals_before, found.residuals_refit, found.residuals_after)
     )
-    return replace(
+    white = np.sqrt(found.case.noise**2 + (0.0 if rounding is None else rounding.variances)) / level
+    page = replace(
         found,
         case=case,
         residuals_before=before,
         residuals_refit=refit,
         residuals_after=after,
-        gap_before=held_out_gap(case, before),
-        gap_refit=held_out_gap(case, refit),
-        gap_after=held_out_gap(case, after),
         noise_floor=100 * found.case.model_error,
+        white=white,
     )
+    start, moved_to, end = (
+        page.size_of([one[e.name] for e in case.held_out]) for one in (before, refit, after)
+    )
+    return replace(page, gap_before=start, gap_refit=moved_to, gap_after=end)
+
+
+def left(found: Diagnosis) -> list[tuple[str, list[tuple[float, float]], float]]:
+    """Output, (share of the motion, RMS in its unit) of every model of the page, noise in its unit."""
+    models = [left_of(found.case, found.residuals[model]) for model in found.models]
+    return [
+        (name, [(float(share[k]), float(rms[k])) for share, rms in models], float(found.case.noise[k]))
+        for k, name in enumerate(found.case.machine.output_names)
+    ]
+
+
+def remains_of(found: Diagnosis) -> Where:
+    """Where the rest lies that the repaired model leaves."""
+    if isinstance(found.case, PlantCase):
+        return where_in_records(found.case, found.residuals_after, found.case.dt_s)
+    return where(found.case, found.residuals_after)
 
 
 def moved(found: Diagnosis, deviations: Mapping[str, float]) -> Mapping[str, float]:

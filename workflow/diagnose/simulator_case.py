@@ -26,6 +26,7 @@ from workflow.diagnose.case_settings import CaseName
 from workflow.engine import storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import hash_of
+from workflow.text.names import unit_of
 
 _KINDS = ("mjcf", "fmu", "python")
 _PLACES = ("input", "output")
@@ -33,6 +34,10 @@ _PLACES = ("input", "output")
 _FITTED = 2 / 3
 # Of an FMU's or a Python file's value where nothing else is stated.
 _TOLERANCE = 0.05
+# Units of what moves, and of what drives it.
+_Moves = Literal["position", "speed"]
+_MOTIONS: Mapping[str, _Moves] = {"m": "position", "rad": "position", "m/s": "speed", "rad/s": "speed"}
+_DRIVES = ("N", "N m", "V", "A")
 # Third differences of white noise have twenty times its variance; no motion is left in them.
 _THIRD = 20.0
 
@@ -223,9 +228,15 @@ def _with_all(
         plant = Plant(
             simulation, parameters, every, tuple(outputs), noise, effects, settings.model_error, dt_s
         )
-        motion = outputs[0] if settings.motion else None
         around = partial(with_effects, experiments=experiments, dt_s=dt_s, at_rest_before=False)
-        plant = around(plant, "all", motion=motion, motion_is=settings.motion or "position")
+        motion, motion_is = (outputs[0], settings.motion) if settings.motion else _motion(inputs, outputs)
+        try:
+            plant = around(plant, "all", motion=motion, motion_is=motion_is)
+        except ValueError:
+            # A motion that was only guessed may be none: its effects then stay untried, and the page says so.
+            if settings.motion or motion is None:
+                raise
+            plant = around(plant, "all")
         there = {effect.name for effect in plant.effects}
         kinds = {place: [k for k in KINDS if k in there and KINDS[k].where == place] for place in _PLACES}
         for column, name in enumerate(inputs[1:], start=1):
@@ -235,6 +246,15 @@ def _with_all(
         return plant, None
 
     return finish
+
+
+def _motion(inputs: Sequence[str], outputs: Sequence[str]) -> tuple[str | None, _Moves]:
+    """The output that is the motion of a body, by its unit: the only one that is a position or a speed, where
+    the first input is what drives a body."""
+    kinds = {name: _MOTIONS[unit] for name in outputs if (unit := unit_of(name)) in _MOTIONS}
+    if len(kinds) != 1 or unit_of(inputs[0]) not in _DRIVES:
+        return None, "position"
+    return next(iter(kinds.items()))
 
 
 def _sampling(tables: Sequence[Table], settings: SimulatorSettings) -> float:

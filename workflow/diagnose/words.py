@@ -58,14 +58,17 @@ def sureness(p: float) -> str:
 
 
 def short_answer(document: Mapping[str, Any]) -> str:
-    """The verdict of a JSON answer in a few words."""
+    """Both answers of a JSON document in a few words: which effects are present, and whether that is all."""
     if document["detail_verdict"] == "not_converged":
         return "not converged"
-    if document["verdict"] != "effect":
+    chosen = document["combination"]
+    present = [n for n, e in document["presence"].items() if n in chosen or e["probability"] >= 0.5]
+    if not present:
         none = "no significant model error" if "shares" in document else "no model error"
         return none if document["verdict"] == "none" else "none of the candidate effects"
-    names = listing([in_words(name) for name in document["combination"]])
-    return f"{names} (ambiguous)" if document["detail_verdict"] == "ambiguous" else names
+    more = "" if document["completeness"]["probability"] >= 0.5 else ", and something else"
+    unsure = " (ambiguous)" if document["detail_verdict"] == "ambiguous" else ""
+    return listing([in_words(name) for name in present]) + unsure + more
 
 
 def closure_words(document: Mapping[str, Any]) -> str:

@@ -17,25 +17,21 @@ from workflow.figures.bands import Real, outline
 from workflow.text.formats import listing
 
 _MOST_BARS = 8
+_LEAST = 0.02
 _LOOKS = {"stated": ("s", -0.22), "refit": ("D", 0.0), "repaired": ("o", 0.22)}
 
 
 @style.drawing("gap_probabilities")
 def draw_probabilities(found: Diagnosis) -> Figure:
-    """Bars of the likeliest causes, the accepted ones in colour; all others are added up in a last bar."""
-    ranked = sorted(found.probabilities.items(), key=lambda item: -item[1])
-    accepted = set(found.combination) or {"none" if found.verdict == "none" else "unknown"}
-    shown = ranked[: min(_MOST_BARS, sum(p >= 0.005 for _, p in ranked) or 1)]
-    names = [style.plain(in_words(name), 52) for name, _ in shown]
-    percent = [100 * p for _, p in shown]
+    """Bars: presence of the likeliest effects, those of the answer in colour; whether more is missing."""
+    ranked = sorted(found.effects, key=lambda effect: -effect.presence)
+    shown = [e for e in ranked if e.presence >= 0.005 and e.name not in ("none", "unknown")][:_MOST_BARS]
+    names = [*(style.plain(in_words(e.name), 52) for e in shown), "something else is missing"]
+    percent = [100 * p for p in (*(e.presence for e in shown), 1 - found.completeness.probability)]
     own = gap_style.MODELS["repaired"]["color"]
-    colours = [own if name in accepted else gap_style.PALE for name, _ in shown]
-    if len(ranked) > len(shown):
-        names.append(f"all {len(ranked) - len(shown)} others together")
-        percent.append(max(0.0, 100 - sum(percent)))
-        colours.append(gap_style.PALE)
+    colours = [own if e in found.present else gap_style.PALE for e in shown] + [gap_style.PALE]
     labels = ["under 0.1 %" if p < 0.1 else f"{p:.3g} %" for p in percent]
-    return _bars(names, percent, labels, colours, "Which cause, given the records", "probability [%]")
+    return _bars(names, percent, labels, colours, "Is it present, given the records", "probability [%]")
 
 
 @style.drawing("gap_waterfall")
@@ -44,7 +40,12 @@ def draw_waterfall(found: Diagnosis) -> Figure:
 
     Beside a model error: in per cent of the motion.
     """
-    gaps, rows, floor = found.gaps, found.gap_by_experiment, found.noise_floor
+    gaps, floor = found.gaps, found.noise_floor
+    # Nothing beyond noise has no place on a logarithmic axis.
+    rows = {
+        name: {model: max(value, _LEAST * floor) for model, value in entry.items()}
+        for name, entry in found.gap_by_experiment.items()
+    }
     rough = found.case.model_error
     words, line = gap_style.SHARE_AXIS if rough > 0 else gap_style.RESIDUAL_AXIS, gap_style.floor_of(rough)
     figure, (left, right) = style.panels(max(3.4, 1.8 + 0.3 * len(rows)), 1, 2, width_ratios=[1.0, 1.15])
