@@ -420,7 +420,7 @@ def _rubbing(name, dry_N):
     return PlantCase("c", plant, tuple(_carriage_records(dry_N)))
 
 
-@pytest.mark.parametrizeX
+@pytest.mark.parametrize(("dry_N", "there"), [(0.4, False), (0.7, True)])
 def test_one_threshold_whatever_an_effect_is_called(dry_N, there):
     names = ("coulomb_friction", "dry_friction", "drag_of_the_seal")
     found = [diagnose(_rubbing(name, dry_N)) for name in names]
