@@ -35,8 +35,9 @@ def test_what_slow_strokes_say_of_fast_ones_is_named_and_not_sure(flexlink_data)
     # Fitted below 0.083 m/s, the two leave nearly twice what does not interest of motions up to 0.125 m/s.
     assert set(found.combination) == {"coulomb_friction", "constant_offset"}
     assert found.gap_closed > 0.8
-    assert "unknown" in found.ambiguous_with
-    assert found.probability < 0.6
+    assert found.presence("coulomb_friction") > 0.9
+    assert found.completeness.probability < 0.1
+    assert found.probability < 0.7
 
 
 def test_with_friction_by_direction_listed_it_explains_more_than_an_offset(flexlink_data):

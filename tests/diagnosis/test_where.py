@@ -344,7 +344,9 @@ def test_beside_a_model_error_sizes_are_over_what_a_model_may_miss():
         e.name: np.sqrt(2) * size * np.sin(2 * np.pi * 5 * DT * np.arange(len(e.output))) for e in experiments
     }
     found = where(case, {name: e[:, None] for name, e in tone.items()})
-    assert found.gap.gap_rms == pytest.approx(np.sqrt(3**2 - 1), rel=0.01)
+    # Sensor noise is allowed beside it.
+    allowed = np.hypot(error * np.std(held.output), NOISE[0]) / NOISE[0]
+    assert found.gap.gap_rms == pytest.approx(np.sqrt((size / allowed) ** 2 - 1), rel=0.01)
     assert {c.route for c in found.curves} == {"hub_torque", "hub_angle"}
     assert "deflection" not in {r.axis for r in found.regimes}
     assert found.dominant_sensor is None
