@@ -21,6 +21,7 @@ import numpy as np
 from ident.basis.functions import all_pass_signal
 from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions, IdentOptions
+from ident.checks.validation import fit_on_fresh_data
 from ident.data.arrays import RealArray
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
@@ -77,10 +78,8 @@ def two_stage(
     first = GobfModel(poles, np.zeros(poles.order), records[0].dt_s, feedthrough=1.0)
     # Behind a noise model: what noise of high frequency moved at a low one would pass for excitation there.
     loops = [tangent([loop], first, _FIRST_STAGE) for loop in closed]
-    rests = [
-        record.input[:, 0] - loop.simulate(_reference(record))
-        for record, loop in zip(records, loops, strict=True)
-    ]
+    # With its own start and offset: a log may begin in motion, and at any operating point.
+    rests = [fit_on_fresh_data(loop, record).residual for loop, record in zip(loops, closed, strict=True)]
     if plant is None:
         options = options.with_delay_stated()
         plant = identify(records, options).model
@@ -94,6 +93,27 @@ def two_stage(
         for rest, u in zip(rests, moved, strict=True)
     ]
     return TwoStage(tuple(_opened(records, rests, plant)), tuple(fits), plant)
+
+
+def with_controller(record: Record, numerator: Sequence[float], denominator: Sequence[float]) -> Record:
+    """The record with what its known controller K = numerator / denominator, in z, highest power first, tells
+    of a reference r that was not recorded: u = K (r - y) says denominator u + numerator y = numerator r, free
+    of the noise in y. That signal, delayed by the order, is the reference of the result, which is shorter by
+    the order.
+
+    Raises ValueError for a controller that is not proper, or more than one input or output.
+    """
+    order = len(denominator) - 1
+    late = order + 1 - len(numerator)
+    if late < 0 or not denominator[0] or not any(numerator):
+        raise ValueError("the controller needs a denominator of at least the numerator's degree")
+    if record.input.shape[1] != 1 or record.output.shape[1] != 1:
+        raise ValueError(f"{record.label}: a controller has one input and one output")
+    u, y = record.input[:, 0], record.output[:, 0]
+    known = np.convolve(u, denominator)[order : u.size]
+    known += np.convolve(y, [0.0] * late + list(numerator))[order : u.size]
+    rest = record.slice(order, record.n_samples)
+    return replace(rest, reference=known[:, None], reference_names=("controller",))
 
 
 def _opened(records: Sequence[Record], rests: Sequence[RealArray], plant: GobfModel) -> list[Record]:

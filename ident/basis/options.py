@@ -217,15 +217,15 @@ class EmbeddingOptions(BaseModel):
         description="prior probability that the poles lack a lightly damped mode; 0: do not look for "
         "one. For records only, not for measured frequency responses",
     )
-    coloured_noise: bool = Field(
+    coloured_noise: bool | Literal["auto"] = Field(
         default=False, description="whiten with an AR model of the residuals, three rounds"
     )
     max_ar_order: int = Field(
         default=8,
         ge=1,
         le=100,
-        description="largest AR order of the noise model that BIC may choose; default: 8 "
-        "(flexlink identify: 32 where 8 is not enough)",
+        description="largest AR order of the noise model that BIC may choose; default: 8, or 32 where the "
+        "residuals are not white behind that (coloured_noise = 'auto')",
     )
     order_given: bool | None = Field(
         default=None,

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.signal import correlate
 from scipy.stats import chi2, norm
 
+from ident.basis.posterior import ResponsePosterior
+from ident.checks.validation import fit_on_fresh_data
 from ident.data.arrays import RealArray, lock
 from ident.data.finding import Finding, FindingKind, finding
+from ident.data.nonparametric import empirical_frf
+from ident.data.record import Record
+
+# Frequencies at which feedback is looked for, and bands over which it is averaged.
+_RESOLVED, _BANDS = 60, 6
+# Standard deviations of chance that are taken off: with six bands, one in a hundred logs goes beyond.
+_SURE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,20 +122,63 @@ def independence_test(
 
 
 def residual_advice(
-    whiteness: ResidualTest, independence: ResidualTest, *, noise_order: int = 0, friction: bool = False
+    whiteness: ResidualTest,
+    independence: ResidualTest,
+    *,
+    noise_order: int = 0,
+    friction: bool = False,
+    observer: bool = False,
 ) -> list[Finding]:
     """What is wrong where a test fails; nothing where both pass.
 
     noise_order: order of the noise model behind which whiteness was tested, 0 without one. friction: nobody
-    has looked for it, and it could be identified with the arm.
+    has looked for it, and it could be identified with the arm. observer: whiteness is that of its prediction
+    errors, which need no noise model.
     """
     found = []
     if not independence.passed:
         found.append(finding(FindingKind.NOT_INDEPENDENT, lag=independence.largest[0]))
     if not whiteness.passed:
-        values = {"noise_order": noise_order, "independent": independence.passed, "friction": friction}
-        found.append(finding(FindingKind.NOT_WHITE, **values))
+        independent = independence.passed
+        told = {"noise_order": noise_order, "independent": independent, "friction": friction}
+        found.append(finding(FindingKind.NOT_WHITE, **told, observer=observer))
     return found
+
+
+def fed_back(posterior: ResponsePosterior, records: Sequence[Record], level: float = 0.95) -> float:
+    """How far what the residuals still have in common with the input would move the response at least, in
+    radii of its ellipses: root mean square over each of a few bands, chance taken off, of all the largest.
+
+    records: those of the posterior, one input and one output. Where a loop feeds noise back, that part is
+    noncausal, of the size of what feedback moves a direct fit by: both are the cross spectrum of noise and
+    input over the input's. Bands that the records say nothing of are left out.
+    """
+    shortest = min(record.n_samples for record in records) - posterior.input_delay_samples
+    rest = [
+        replace(
+            record.slice(0, shortest),
+            output=fit_on_fresh_data(posterior, record).residual[:shortest, None],
+            reference=None,
+            reference_names=(),
+        )
+        for record in records
+    ]
+    half = max(5, shortest // (4 * _RESOLVED))
+    common = empirical_frf(rest, half_width_lines=half, level=level)
+    omega = common.omega_rad_s
+    ellipses = posterior.at(omega, level)
+    radius = ellipses.ellipse().semi_major
+    chance = np.trace(common.covariance, axis1=1, axis2=2)
+    told = (radius < np.abs(ellipses.centre)) & (chance < np.abs(ellipses.centre) ** 2)
+    band = np.digitize(omega, np.geomspace(omega[0], omega[-1], _BANDS + 1)[1:-1])
+    moved, chance = np.abs(common.centre) ** 2 / radius**2, chance / radius**2
+    surest = 0.0
+    for k in np.unique(band[told]):
+        among = told & (band == k)
+        # Of independent noise squares at the lines are exponentially distributed.
+        deviation = np.sqrt(np.sum(chance[among] ** 2)) / np.count_nonzero(among)
+        surest = max(surest, float(np.mean(moved[among] - chance[among]) - _SURE * deviation))
+    return float(np.sqrt(surest))
 
 
 def _centred(signals: Sequence[RealArray], max_lag: int) -> list[RealArray]:

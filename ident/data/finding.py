@@ -73,6 +73,9 @@ class FindingKind(Enum):
     CHI_SQUARE = auto()
     # Records made in closed loop.
     TWO_STAGE = auto()
+    INDIRECT = auto()
+    DIRECT = auto()
+    DIRECT_WITH_FRICTION = auto()
     UNEXPLAINED_INPUT = auto()
     # Noise and nonlinear distortion.
     LINEAR = auto()

@@ -9,7 +9,8 @@ import pytest
 from scipy import signal
 
 from ident.basis.options import EmbeddingOptions, IdentOptions
-from ident.closed_loop import two_stage
+from ident.checks.residual_tests import fed_back
+from ident.closed_loop import two_stage, with_controller
 from ident.data.record import Record
 from ident.one_input import identify
 from ident.uncertainty.embedding import tangent
@@ -72,6 +73,47 @@ def test_any_model_of_the_plant_will_do_and_a_good_one_does_better():
     assert errors[0] < errors[2]
     # Sensor noise of standard deviation .05 / sqrt(1 - .7^2).
     assert found[0].noise_std == pytest.approx(0.07, rel=0.1)
+
+
+@pytest.mark.parametrize(("start", "offset"), [(0, 0.0), (1000, 0.0), (0, 100.0)])
+def test_a_log_may_begin_in_motion_and_stand_anywhere(start, offset):
+    """The same rows of one loop: from rest, from the middle, and around another position."""
+    record = log(np.random.default_rng(9), noise=0.05)
+    away = replace(record, reference=record.reference + offset, output=record.output + offset)
+    stage = two_stage([away.slice(start, record.n_samples)], OPTIONS)
+    closed = np.polyadd(A, GAIN * np.asarray(B))
+    ideal = signal.lfilter(A, closed, record.reference[:, 0])[start:]
+    assert np.linalg.norm(stage.records[0].input[:, 0] - ideal) < 0.02 * np.linalg.norm(ideal)
+
+
+def test_a_known_controller_tells_the_reference():
+    """A PI controller in any units: denominator u + numerator y is numerator r, whatever the noise."""
+    rng = np.random.default_rng(10)
+    num, den = [3.0, -2.9], [1.0, -1.0]
+    r, noise = rng.standard_normal(500), rng.standard_normal(500)
+    u, y = np.zeros(500), noise.copy()
+    for k in range(1, 500):
+        y[k] = 0.9 * y[k - 1] + 0.05 * u[k - 1] + noise[k]
+        u[k] = u[k - 1] + num[0] * (r[k] - y[k]) + num[1] * (r[k - 1] - y[k - 1])
+    record = Record("log", u[:, None], y[:, None], DT, ("u",), ("y",))
+    found = with_controller(record, num, den)
+    np.testing.assert_allclose(found.reference[:, 0], np.convolve(r, num)[1:500], atol=1e-9)
+    np.testing.assert_array_equal(found.input, record.input[1:])
+    late = with_controller(record, num, [1.0, -1.0, 0.0])  # the same controller a sample later
+    np.testing.assert_allclose(np.diff(u)[1:] + np.convolve(y, num)[1:499], late.reference[:, 0])
+    with pytest.raises(ValueError, match="at least the numerator's degree"):
+        with_controller(record, [1.0, 2.0], [1.0])
+
+
+def test_what_is_fed_back_is_seen_in_radii_of_the_ellipses():
+    """Of the direct way noise in a loop is many of them; two-stage leaves none."""
+    record = log(np.random.default_rng(11))
+    opened = two_stage([record], OPTIONS).records
+    times = [
+        fed_back(tangent(used, identify(used, OPTIONS).model, BOUNDS), used) for used in ([record], opened)
+    ]
+    assert times[0] > 5
+    assert times[1] < 1
 
 
 PLANTS = {

@@ -114,13 +114,17 @@ def test_advice_is_about_the_tests_that_fail():
     assert residual_advice(*good) == []
     for order in (0, 8):
         alone = residual_advice(whiteness_test([colour]), independence_test([u], [colour]), noise_order=order)
-        assert alone == [finding(FindingKind.NOT_WHITE, noise_order=order, independent=True, friction=False)]
+        assert alone == [
+            finding(
+                FindingKind.NOT_WHITE, noise_order=order, independent=True, friction=False, observer=False
+            )
+        ]
     missed = finding(FindingKind.NOT_INDEPENDENT, lag=5)
     assert residual_advice(good[0], independence_test([u], [driven])) == [missed]
     both = residual_advice(whiteness_test([colour]), independence_test([u], [driven]), friction=True)
     assert both == [
         missed,
-        finding(FindingKind.NOT_WHITE, noise_order=0, independent=False, friction=True),
+        finding(FindingKind.NOT_WHITE, noise_order=0, independent=False, friction=True, observer=False),
     ]
 
 
