@@ -65,7 +65,7 @@ app = typer.Typer(
 )
 
 # Settings whose fields are set by options; such an option has one of these in place of its help.
-_IDENT = "ident.basis.options:IdentOptions"
+_IDENT = "workflow.config.uncertainty_options:FitOptions"
 _ELLIPSES = "workflow.config.uncertainty_options:UncertaintyOptions"
 _LOGS, _CHANNEL = "workflow.config.run_config:FileSource", "workflow.config.run_config:Channel"
 _PLAN = "plant.experiment_plan:ExperimentPlan"
@@ -423,7 +423,11 @@ def identify(
     ] = None,
     reference: Annotated[
         str | None,
-        typer.Option(help="Reference column of logs made in closed loop: identified in two stages."),
+        typer.Option(help="Reference column of logs made in closed loop [default: what looks like one]."),
+    ] = None,
+    loop_method: Annotated[
+        str | None,
+        typer.Option(help="Of logs made in closed loop: auto, direct or two_stage [default: auto]."),
     ] = None,
     input_limit: Annotated[float | None, typer.Option(help=_LOGS)] = None,
     n_pairs: Annotated[int | None, typer.Option("--pairs", help=_IDENT)] = None,
@@ -435,7 +439,7 @@ def identify(
     level: Annotated[float | None, typer.Option(help=_ELLIPSES)] = None,
     response: Annotated[str | None, typer.Option(help=_ELLIPSES)] = None,
     band_rad_s: Annotated[tuple[float, float] | None, typer.Option("--band", help=_CHANNEL)] = None,
-    noise: Annotated[str, typer.Option(help=_IDENT)] = "auto",
+    noise: Annotated[str | None, typer.Option(help=_IDENT)] = None,
     max_ar_order: Annotated[int | None, typer.Option("--noise-order", help=_ELLIPSES)] = None,
     omega_min_rad_s: Annotated[float | None, typer.Option("--omega-min", help=_IDENT)] = None,
     omega_max_rad_s: Annotated[float | None, typer.Option("--omega-max", help=_IDENT)] = None,
@@ -457,15 +461,16 @@ def identify(
 ) -> None:
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
     need(*log, *(validation or []))
-    from ident.basis.options import IdentOptions
     from workflow.commands.logs import are_responses, read_logs
-    from workflow.config.uncertainty_options import UncertaintyOptions
+    from workflow.config.run_config import ClosedLoopData
+    from workflow.config.uncertainty_options import FitOptions, UncertaintyOptions
     from workflow.engine.storage import refuse_in_the_way
 
     given = locals() | {"relative_degree": _degree(relative_degree)}
-    options = _settings(IdentOptions, given)
+    options = _settings(FitOptions, given)
     with _watched(quiet) as progress:
         described = _settings(UncertaintyOptions, given)
+        loop = _settings(ClosedLoopData, {"method": loop_method})
         written = [("--out", out), ("--report", report_page), ("--export", export)]
         # A log given twice would count its noise twice as well known, or validate what it was fitted to.
         refuse_in_the_way([*log, *(validation or [])], [(name, path) for name, path in written if path])
@@ -476,7 +481,7 @@ def identify(
                 "--report": report_page, "--validation": validation, "--reference": reference,
                 "--band": band_rad_s, "--input-limit": input_limit, "--noise-order": max_ar_order,
                 "--time-unit": time_unit, "--scale": scale, "--offset": offset, "--unit": unit,
-                "--repair": repair,
+                "--repair": repair, "--loop-method": loop_method,
             }  # fmt: skip
             summary = identify_response(
                 log,
@@ -516,7 +521,7 @@ def identify(
             options=options,
             described=described,
             band_rad_s=band_rad_s,
-            noise_order=max_ar_order,
+            loop=loop,
             out=out,
             report=report_page,
             export=export,
@@ -825,7 +830,7 @@ def _show(summary: RunSummary, as_json: bool) -> None:
 
 
 def _leave(summary: RunSummary) -> None:
-    if not summary.certified:
+    if summary.certified is False:
         raise typer.Exit(_complain(summary.verdict, EXIT_NOT_CERTIFIED))
 
 

@@ -160,7 +160,7 @@ def print_summary(summary: RunSummary) -> None:
                 label, _text(row.label), _text(row.value), end_section=index == len(section.rows) - 1
             )
     console.print(table)
-    if summary.certified:
+    if summary.certified is not False:
         console.print(_text(summary.verdict), highlight=False, soft_wrap=True)
     if summary.report_path:
         console.print(f"report: {_text(summary.report_path)}", highlight=False, soft_wrap=True)

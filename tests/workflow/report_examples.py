@@ -30,7 +30,7 @@ from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import RunConfig
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks import closed_loop as closed_loop_stage, uncertainty as uncertainty_stage
-from workflow.tasks.identification import as_fitted
+from workflow.tasks.identification import as_fitted, residual_tests
 from workflow.tasks.loop_conditions import condition_run
 from workflow.tasks.results import (
     AchievablePerformance,
@@ -291,10 +291,10 @@ def _save_uncertainty(run: RunDirectory, results: tuple[IdentifiedChannel, ...],
             posterior(result.model),
             result,
             omega,
-            omega,
-            repeat_scatter=tuple(scatter_rows()) if scatter else None,
+            tests=residual_tests(posterior(result.model), result.bounded),
         )
-        channels.append(replace(found, nominal=result.model))
+        rows = tuple(scatter_rows()) if scatter else None
+        channels.append(replace(found, nominal=result.model, repeat_scatter=rows))
     run.save_stage("uncertainty", UncertaintyResult(tuple(channels)), "00")
 
 

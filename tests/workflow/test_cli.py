@@ -21,7 +21,7 @@ from tests.workflow.command import FAST_ARM, ROOT, start_flexlink
 from workflow import cli
 from workflow.cli import main
 from workflow.config.run_config import FileSource
-from workflow.config.uncertainty_options import UncertaintyOptions
+from workflow.config.uncertainty_options import FitOptions, UncertaintyOptions
 from workflow.engine import interrupts
 
 FILES_CONFIG = """
@@ -400,7 +400,7 @@ def test_help_keeps_what_stands_in_brackets(flexlink, command, words):
         ("identify", IdentOptions, "--pairs", "n_pairs", "[at least 0; at most 12]"),
         ("identify", IdentOptions, "--integrators", "integrators", "[at least 0; at most 3; default: 0]"),
         ("identify", UncertaintyOptions, "--level", "level", "[above 0.5; below 1; default: 0.95]"),
-        ("identify", IdentOptions, "--noise", "noise", "[white, auto] [default: auto]"),
+        ("identify", FitOptions, "--noise", "noise", "[white, auto; default: auto]"),
         ("identify", IdentOptions, "--feedthrough", "feedthrough", "."),
         ("look", FileSource, "--decimal", "decimal", "[point, comma]"),
         ("excite", ExperimentPlan, "--periods", "periods", "[at least 1; at most 1000; default: 2]"),

@@ -207,7 +207,8 @@ def test_logs_of_a_closed_loop_in_two_stages(flexlink, undrawn, tmp_path):
     (mode,) = numbers["modes"]
     assert mode["omega_rad_s"] == pytest.approx(30.0, rel=0.02)
     assert mode["damping"] == pytest.approx(0.1, rel=0.1)
-    assert "The reference explains" in numbers["two_stage"]
+    assert numbers["closed_loop"]["method"] == "two_stage"
+    assert "The reference explains" in numbers["closed_loop"]["reason"]
     assert "The reference explains" in Page((tmp_path / "page.html").read_text(encoding="utf-8")).text
 
 
@@ -335,8 +336,11 @@ def test_integers_called_seconds_are_doubted(flexlink, tmp_path):
         (("--level", "0.2"), "flexlink: --level: input should be greater than 0.5"),
         (("--pairs", "13"), "flexlink: --pairs: input should be less than or equal to 12, got 13"),
         (("--response", "amplitude 2"), "expected 'as recorded', 'without friction', 'this amplitude' or"),
-        (("--response", "this amplitude", "--band", "10", "20"), "takes logs as measured: no band"),
-        (("--band", "50", "20"), "lower below upper"),
+        (
+            ("--response", "this amplitude", "--band", "10", "20"),
+            "takes records as measured: no increments",
+        ),
+        (("--band", "50", "20"), "a band needs 0 < low < high in rad/s; got 50, 20"),
         (("--band", "50", "2000"), "the band must lie in (0, 628"),
         (("--pairs", "12", "--report", "{out}/page.html"), "too few"),
     ],

@@ -98,7 +98,9 @@ def write(folder, signals, names, units=(1.0, 1.0, 1.0, 1.0), separator=","):
 def drafted(flexlink, logs, *options):
     out = logs[0].parent / "my.toml"
     answer = flexlink("init", *logs, "--out", out, *options, "--json")
-    return answer.document(), out.read_text(), load_config(out)[0]
+    document = answer.document()
+    assert "certified" not in document  # nothing was
+    return document, out.read_text(), load_config(out)[0]
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from ident.basis.model_files import ModelFile
 from ident.basis.options import IdentOptions
 from ident.data.record import Record
 from workflow.commands.logs import Logs
+from workflow.config.run_config import ClosedLoopData
 from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.engine import codec, interrupts, storage
 from workflow.engine.errors import InputError
@@ -31,7 +32,7 @@ def identify_logs(
     options: IdentOptions | None = None,
     described: UncertaintyOptions | None = None,
     band_rad_s: tuple[float, float] | None = None,
-    noise_order: int | None = None,
+    loop: ClosedLoopData | None = None,
     out: Path | None = None,
     report: Path | None = None,
     export: Path | None = None,
@@ -42,8 +43,7 @@ def identify_logs(
     out: npz with model and posterior, for `flexlink design`; report: HTML page; export: the model as .json
     or .mat. Every file is written when everything is known, and whole. band_rad_s, described: as of
     `identify_records`; where friction is identified the output is the position of the shaft it acts on.
-    noise_order: largest order of the noise model behind the ellipses; none given: 8, or 32 where that leaves
-    coloured residuals. Raises InputError.
+    loop: how to use logs made in closed loop. Raises InputError.
     """
     progress, described = progress or Progress(), described or UncertaintyOptions()
     if export is not None and export.suffix.lower() not in MODEL_SUFFIXES:
@@ -53,16 +53,17 @@ def identify_logs(
     for record in logs.measured:
         refuse_constant_input(record)
     common = with_common_sampling_time([*logs.measured, *logs.fresh])
-    result = identify_records(
-        common[: len(logs.measured)],
-        common[len(logs.measured) :],
-        options,
-        described=described,
-        band_rad_s=band_rad_s,
-        noise_order=noise_order,
-        with_plot=report is not None,
-        progress=progress,
-    )
+    with speaking("identify"):
+        result = identify_records(
+            common[: len(logs.measured)],
+            common[len(logs.measured) :],
+            options,
+            described=described,
+            band_rad_s=band_rad_s,
+            loop=loop,
+            with_plot=report is not None,
+            progress=progress,
+        )
     matched = beside(result.about, true_modes)
     result = replace(result, true_modes=matched, input_limit=logs.input_limit)
     written: dict[Path, bytes] = {}

@@ -10,7 +10,7 @@ from pathlib import Path
 from ident.data.record import Record
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response
-from ident.data.roles import roles_of
+from ident.data.roles import roles_with_reference
 from workflow.engine.errors import naming
 
 
@@ -56,14 +56,18 @@ def read_logs(
 
     scale, offset, units, repair, resample_s, unwrap, decimal: as in `Record.from_file`. time_unit: of the
     time column, where its name does not say it. reference: column of the reference of logs made in closed
-    loop, for the two-stage method. input_limit: what the amplifier gives at most; larger commands in the logs
+    loop, found like the others. input_limit: what the amplifier gives at most; larger commands in the logs
     are taken as that. Raises InputError: one line naming file, column or line.
     """
     if input_name is None or output_name is None or (time is None and dt_s is None):
         with naming(str(logs[0])):
             table, log = read_table(logs[0]).with_decimal(decimal), shlex.quote(str(logs[0]))
-            roles = roles_of(table, log, input=input_name, output=output_name, time=time, reference=reference)
-        input_name, output_name = roles.input, roles.output
+            roles = roles_with_reference(
+                table, log, "identify", input=input_name, output=output_name, time=time, reference=reference
+            )
+        input_name, output_name, found = roles.input, roles.output, roles.reference
+        if found and all(found in read_table(path).names for path in (*logs[1:], *validation)):
+            reference = found
         time = roles.time if time is None and dt_s is None else time
 
     def read(path: Path) -> Record:

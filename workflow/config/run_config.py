@@ -16,13 +16,12 @@ from pydantic import AfterValidator, Field, model_validator
 
 from control_design.specification import Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
-from ident.basis.options import IdentOptions
 from plant.experiment_plan import ExperimentPlan
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
 from workflow.config.renamed_keys import with_current_keys
 from workflow.config.rig_settings import EffectTable, Excitation, Multisine, RigChoice
 from workflow.config.settings import InputPath, Section, check, read_toml, repeated
-from workflow.config.uncertainty_options import UncertaintyOptions
+from workflow.config.uncertainty_options import FitOptions, UncertaintyOptions
 
 Role = Literal["estimation", "validation", "repeat"]
 Name = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=80)]
@@ -190,7 +189,7 @@ Source = Annotated[SimulatedSource | FileSource, Field(discriminator="kind")]
 
 def _ordered(band: tuple[float, float]) -> tuple[float, float]:
     if not 0 < band[0] < band[1]:
-        raise ValueError(f"a band needs 0 < low < high in rad/s; got {band[0]}, {band[1]}")
+        raise ValueError(f"a band needs 0 < low < high in rad/s; got {band[0]:g}, {band[1]:g}")
     return band
 
 
@@ -221,8 +220,13 @@ class Channel(Section):
     bounds_band_rad_s: Band | None = Field(
         None, description="band of the data for the ellipses, if wider than that of the poles"
     )
-    identification: IdentOptions = Field(default_factory=IdentOptions)
+    identification: FitOptions = Field(default_factory=lambda: FitOptions.model_validate({}))
     uncertainty: UncertaintyOptions = Field(default_factory=UncertaintyOptions)
+
+    @property
+    def data_band_rad_s(self) -> tuple[float, float] | None:
+        """Band of the data behind the ellipses; None where they are not confined to one."""
+        return self.bounds_band_rad_s or self.band_rad_s
 
     @property
     def embedding(self) -> UncertaintyOptions:
@@ -273,13 +277,61 @@ class RunSpecification(Specification):
     )
 
 
+class StatedController(Section):
+    """u = K (r - y) of the loop the logs were made in."""
+
+    numerator: tuple[float, ...] = Field(
+        min_length=1, description="coefficients of K in z, highest power first, in units of the logs"
+    )
+    denominator: tuple[float, ...] = Field(
+        min_length=1, description="the same of its denominator; the delay of the computation belongs to it"
+    )
+
+    @model_validator(mode="after")
+    def _proper(self) -> Self:
+        if len(self.numerator) > len(self.denominator) or not self.denominator[0] or not any(self.numerator):
+            raise ValueError("K needs a denominator of at least the numerator's degree, and a gain")
+        return self
+
+
 class ClosedLoopData(Section):
     """Use of logs made in closed loop."""
 
-    method: Literal["direct", "two_stage"] = Field(
-        "direct",
-        description="direct: the logged input; two_stage: the part of the input that the reference explains",
+    method: Literal["auto", "direct", "two_stage", "indirect"] = Field(
+        "auto",
+        description="direct: the logged input; two_stage: the part of the input that the reference explains; "
+        "indirect: the same with what the stated controller tells of the reference; auto: the data decide",
     )
+    controller: StatedController | None = Field(
+        None, description="of the loop the logs were made in: numerator and denominator in z"
+    )
+    controller_file: InputPath | None = Field(
+        None,
+        description="the same from a file: controller.json of a run, or A, B, C, D, dt_s (npz, json, mat)",
+    )
+
+    @property
+    def controlled(self) -> bool:
+        """The controller of the loop is known."""
+        return self.controller is not None or self.controller_file is not None
+
+    @property
+    def stated(self) -> bool:
+        """The logs were made in closed loop, whatever they look like."""
+        return self.method != "auto" or self.controlled
+
+    @model_validator(mode="after")
+    def _one_controller(self) -> Self:
+        if self.method == "indirect" and not self.controlled:
+            raise ValueError(
+                "method = 'indirect' needs the controller of the loop: controller = { numerator = [...], "
+                "denominator = [...] } in z, or controller_file"
+            )
+        if self.method in ("direct", "two_stage") and self.controlled:
+            raise ValueError(f"method = {self.method!r} uses no controller: leave one of them out")
+        if self.controller is not None and self.controller_file is not None:
+            raise ValueError("give controller or controller_file, not both")
+        return self
 
 
 class ClosedLoopOptions(Section):
@@ -401,8 +453,8 @@ class RunConfig(Section):
                 "'without friction' in [channels.uncertainty] of a channel"
             )
         if self.friction_identified:
-            if self.closed_loop_data.method == "two_stage":
-                raise ValueError("identifying friction needs closed_loop_data.method = 'direct'")
+            if self.closed_loop_data.method not in ("auto", "direct"):
+                raise ValueError("identifying friction needs closed_loop_data.method = 'direct' or 'auto'")
             control_options = self.control_channel.identification
             if control_options.integrators > 1 or control_options.feedthrough:
                 raise ValueError(
@@ -471,7 +523,9 @@ class RunConfig(Section):
     def input_files(self) -> list[Path]:
         """Every file the run reads besides its configuration."""
         if isinstance(self.source, FileSource):
-            return sorted({record.path for record in self.source.records})
+            controller = self.closed_loop_data.controller_file
+            paths = {record.path for record in self.source.records}
+            return sorted(paths if controller is None else paths | {controller})
         return [self.source.rig] if isinstance(self.source.rig, Path) else []
 
     def to_document(self) -> dict[str, Any]:

@@ -1,21 +1,35 @@
-"""Method and model class of the ellipses."""
+"""Settings of a channel: its fit, and method and model class of its ellipses."""
 
 from __future__ import annotations
 
 import re
-from typing import Literal, Self
+from collections.abc import Mapping
+from typing import Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from ident.basis.options import EmbeddingOptions
+from ident.basis.options import EmbeddingOptions, IdentOptions
 
 _NUMBER = r"(\d+(?:\.\d+)?)"
 _RANGE = rf"amplitudes from {_NUMBER} to {_NUMBER}"
 
 
+class FitOptions(IdentOptions):
+    """Settings of the fit of a channel: those of any fit, but that the data decide about its noise model."""
+
+    noise: Literal["white", "auto"] = Field(
+        "auto", description=IdentOptions.model_fields["noise"].description
+    )
+
+
 class UncertaintyOptions(EmbeddingOptions):
     """Ellipses around an identified response: method and model class (design 4.5)."""
 
+    coloured_noise: bool | Literal["auto"] = Field(
+        "auto",
+        description="whiten with an AR model of the residuals, three rounds; auto: where they are not white, "
+        "or where max_ar_order is given",
+    )
     method: Literal["tangent", "records", "conditions", "classical"] = Field(
         "tangent",
         description="tangent: noise; records: also the scatter between records, for arms that differ "
@@ -33,6 +47,13 @@ class UncertaintyOptions(EmbeddingOptions):
         "the rms of the recorded inputs; amplitudes from 2 to 8: the same at any rms of "
         "the input between these, in its unit",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _order_asked_for(cls, stated: Any) -> Any:
+        if isinstance(stated, Mapping) and "max_ar_order" in stated:
+            return {"coloured_noise": True, **stated}
+        return stated
 
     @field_validator("response")
     @classmethod

@@ -9,7 +9,7 @@ Several sources are several plants that one controller has to serve.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,29 +21,24 @@ from control_design.plants.plant_set import UncertainPlant, count_integrators, f
 from control_design.plants.stated_uncertainty import StatedDiscs
 from ident.basis.model_files import FORMAT
 from ident.data.ellipses import chi2_radius
-from ident.data.foreign_files import content_of
 from ident.data.frf_records import FrfRepeats
-from ident.data.mat_files import mat_variables
 from ident.data.record_files import READERS, read_table
 from ident.data.response_columns import has_response
 from ident.frequency_fit import identify_frf
 from ident.uncertainty import FrequencyUncertainty
 from workflow.config.design_file import DesignFile
 from workflow.config.run_config import RunConfig
-from workflow.engine import codec, documents, storage
+from workflow.engine import codec
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.exports import read_model
 from workflow.tasks.pipeline import certified_for, config_of
 from workflow.tasks.results import IdentifiedPlant, RunResults
+from workflow.tasks.system_files import DOCUMENTS, read_document, read_state_space
 from workflow.tasks.uncertainty import agreement_of
 from workflow.text.templates import said, words
 
 # Endings that may hold a model; a table of any other that is read holds a measured response.
-_DOCUMENTS = (".json", ".mat", ".npz")
-_SAMPLING_TIME = ("dt_s", "dt", "Ts")
-# Of an entry of a state space in any units: products of some of them are still numbers.
-_LARGEST = 1e50
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +89,9 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
         about = certified_for(results, config)
         plant = results.uncertainty.plant(config)
         return DesignSource(plant, "run directory", (f"about {about}",), config, about)
-    if _ending(path) in READERS and _ending(path) not in _DOCUMENTS:
+    if _ending(path) in READERS and _ending(path) not in DOCUMENTS:
         return _measured(path, design)
-    document = _read_document(path)
+    document = read_document(path)
     if "A" not in document and _ending(path) in READERS and _holds_response(path):
         return _measured(path, design)
     with naming(str(path)):
@@ -129,20 +124,6 @@ def _holds_response(path: Path) -> bool:
         return False  # whoever reads it as a model says what is wrong
 
 
-def _read_document(path: Path) -> dict[str, Any]:
-    """Top-level names and values of a .npz, .json or .mat file. Raises InputError."""
-    suffix = path.suffix.lower()
-    if suffix == ".npz":
-        return storage.read_npz(path)
-    if suffix == ".json":
-        return documents.read_json(path)
-    if suffix != ".mat":
-        known = ", ".join((*_DOCUMENTS, *(ending for ending in READERS if ending not in _DOCUMENTS)))
-        raise InputError(f"{path}: not a run directory, and the ending is not one of {known}")
-    with naming(str(path)):
-        return mat_variables(content_of(path), path)
-
-
 def _stated(name: str, nominal: control.StateSpace, design: DesignFile, origin: str) -> DesignSource:
     """A model that brings no ellipses: with the uncertainty of the design file, if it states one."""
     if design.uncertainty is None:
@@ -153,52 +134,6 @@ def _stated(name: str, nominal: control.StateSpace, design: DesignFile, origin: 
         relative = design.uncertainty.multiplicative is not None
         discs = StatedDiscs(nominal, weight, "multiplicative" if relative else "additive")
     return DesignSource(UncertainPlant(name, nominal, discs), origin)
-
-
-def read_state_space(path: Path, document: Mapping[str, Any]) -> control.StateSpace:
-    """A, B, C, D and dt_s (or dt, Ts) of a file; D may be left out. Raises InputError."""
-    if str(document.get("format", "")).startswith("flexlink-controller"):
-        raise InputError(f"{path}: holds a controller, expected a plant")
-    given = [name for name in _SAMPLING_TIME if name in document]
-    missing = [name for name in "ABC" if name not in document]
-    if missing:
-        raise InputError(
-            f"{path}: no {missing[0]} in it: a plant needs the matrices A, B, C, D and dt_s, found "
-            f"{', '.join(sorted(document)) or 'nothing'}"
-        )
-    if not given:
-        raise InputError(
-            f"{path}: no dt_s in it: the design is discrete, sample a continuous model first (c2d in MATLAB, "
-            "sample in python-control)"
-        )
-    matrices = {name: _matrix(path, name, document[name]) for name in "ABCD" if name in document}
-    dt_s = _matrix(path, given[0], document[given[0]])
-    if dt_s.size != 1 or not dt_s.item() > 0:
-        raise InputError(f"{path}: {given[0]} must be one positive number, the sampling time in seconds")
-    n = round(np.sqrt(matrices["A"].size))
-    wanted = {"A": (n, n), "B": (n, 1), "C": (1, n), "D": (1, 1)}
-    for name, matrix in matrices.items():
-        flat_vector = name != "A" and matrix.ndim < 2
-        if not (matrix.shape == wanted[name] or (matrix.size == np.prod(wanted[name]) and flat_vector)):
-            raise InputError(
-                f"{path}: {name} is {'x'.join(map(str, matrix.shape)) or 'a number'}, expected "
-                f"{wanted[name][0]}x{wanted[name][1]}: one input, one output, A square"
-            )
-        matrices[name] = matrix.reshape(wanted[name])
-    matrices.setdefault("D", np.zeros((1, 1)))
-    return control.ss(*(matrices[name] for name in "ABCD"), dt_s.item(), remove_useless_states=False)
-
-
-def _matrix(path: Path, name: str, value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
-    try:
-        matrix = np.asarray(value)
-        if matrix.dtype.kind not in "fiu":
-            raise ValueError
-    except ValueError:
-        raise InputError(f"{path}: {name} must be a matrix of real numbers") from None
-    if not np.all(np.abs(matrix) < _LARGEST):
-        raise InputError(f"{path}: {name} has a value that is not finite or beyond {_LARGEST:g}")
-    return np.asarray(matrix, dtype=np.float64)
 
 
 def _refuse_untold_integrators(path: Path, nominal: control.StateSpace, design: DesignFile) -> None:
@@ -229,7 +164,7 @@ def _measured(path: Path, design: DesignFile) -> DesignSource:
             raise InputError(f"{path}: one frequency is no response; expected many")
     origin, said = "measured response", tuple[str, ...]()
     if about.nominal is not None:
-        nominal = read_state_space(about.nominal, _read_document(about.nominal))
+        nominal = read_state_space(about.nominal, read_document(about.nominal))
         if not np.isclose(float(nominal.dt), about.dt_s, rtol=1e-9, atol=0):
             raise InputError(
                 f"{about.nominal}: dt_s = {float(nominal.dt):.6g}, but [plant] says {about.dt_s:.6g}"

@@ -4,31 +4,46 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
-from ident.basis.options import IdentOptions
+import numpy as np
+from scipy.signal import lfilter
+
+from ident.basis.options import EmbeddingOptions, IdentOptions
+from ident.basis.posterior import ResponsePosterior
 from ident.checks.distortion_findings import amplitude_effects
 from ident.checks.input_checks import clipped
+from ident.checks.plausible_modes import pairs_outside
+from ident.checks.residual_tests import fed_back, independence_test, whiteness_test
 from ident.checks.validation import fit_in_windows, fit_on_fresh_data
-from ident.closed_loop import two_stage
-from ident.data.finding import Finding, FindingKind, finding
+from ident.closed_loop import TwoStage, two_stage, with_controller
+from ident.data.finding import Finding, FindingKind, distinct, finding
 from ident.data.record import Record
-from ident.data.signal_filter import band_limited, increments
+from ident.data.signal_filter import band_limited, increments, settling_time_s
 from ident.friction import (
     FrictionFit,
     fit_friction,
     identify_behind,
+    recorded_in_loop,
     refuse_unrecorded,
     refuse_unseen_shaft,
 )
 from ident.one_input import identify
 from ident.stabilisation import stabilisation
-from workflow.config.run_config import Channel, Role
+from ident.uncertainty.embedding import tangent
+from workflow.config.run_config import Channel, ClosedLoopData, FileSource, Role
 from workflow.engine.errors import naming
-from workflow.tasks.results import IdentifiedChannel, IdentifyResult
+from workflow.tasks.results import IdentifiedChannel, IdentifyResult, Tests
 from workflow.tasks.stage import StageInput
+from workflow.text.templates import said
 
 Report = Callable[[float, str], None]
 _OF_THE_FIT = 0.6  # share of the time; the stabilisation plot takes the rest
+# A reference that explains less of the input than this is no way to open the loop.
+_EXPLAINED_PERCENT = 50.0
+# Samples of a record that tell whether its command follows its output.
+_TELLING = 50_000
+_NOISE_ORDER = 32  # of ellipses against which what a loop feeds back is held
 
 
 def as_fitted(record: Record, channel: Channel, friction: FrictionFit | None = None) -> Record:
@@ -39,22 +54,48 @@ def as_fitted(record: Record, channel: Channel, friction: FrictionFit | None = N
         return friction.taken_off(record)
     if channel.increments:
         return increments(record)
-    return record if channel.band_rad_s is None else band_limited(record, *channel.band_rad_s)
+    return record if channel.band_rad_s is None else _inside(record, channel, channel.band_rad_s)
 
 
 def as_bounded(record: Record, channel: Channel, friction: FrictionFit | None = None) -> Record:
     """The channel's columns as the ellipses see them; the same unless a wider band is given for them."""
     if channel.bounds_band_rad_s is None:
         return as_fitted(record, channel, friction)
-    return band_limited(record.siso(channel.input, channel.output), *channel.bounds_band_rad_s)
+    return _inside(record.siso(channel.input, channel.output), channel, channel.bounds_band_rad_s)
+
+
+def _inside(record: Record, channel: Channel, band_rad_s: tuple[float, float]) -> Record:
+    """The record within a band; without the start that the filter spoils, unless it starts from rest, of a
+    short one half."""
+    filtered = band_limited(record, *band_rad_s)
+    if channel.identification.estimate_initial_state is False:
+        return filtered
+    settled = round(settling_time_s(record.dt_s, *band_rad_s) / record.dt_s)
+    return filtered.slice(min(settled, record.n_samples // 2), record.n_samples)
+
+
+def _searched_around(channel: Channel, dt_s: float) -> IdentOptions:
+    """No pair far outside the band, unless bounds are stated: it could only fit the filter's skirts."""
+    options, band = channel.identification, channel.band_rad_s
+    if band is None or options.coordinates == "raw":
+        return options
+    bounds = {"omega_min_rad_s": band[0] / 2, "omega_max_rad_s": min(2 * band[1], 0.9 * np.pi / dt_s)}
+    return options.model_copy(update={k: v for k, v in bounds.items() if getattr(options, k) is None})
 
 
 def identify_channels(stage: StageInput) -> IdentifyResult:
     """Fit every channel; free runs on all validation and repeat records."""
     config, records = stage.config, stage.results.records
-    measured = [item.record for item in records.of_role("estimation")]
-    unseen = [item for item in records.records if item.role != "estimation"]
-    friction = friction_of(stage) if config.friction_identified else None
+    unseen = [(item.record, item.role) for item in records.records if item.role != "estimation"]
+    friction, shaft = None, config.control_channel
+    if config.friction_identified:
+        with naming(f"channel {shaft.label!r}"):
+            ranges = [channel.uncertainty.amplitudes for channel in config.channels]
+            progress = partial(stage.progress.update, "identify", 0.0)
+            friction = shaft_friction(records.fitted(shaft), shaft, ranges, lambda done, what: progress(what))
+    in_loop = isinstance(config.source, FileSource) and (
+        config.closed_loop_data.stated or made_in_loop(records.fitted(shaft))
+    )
     channels = []
     for k, channel in enumerate(config.channels):
 
@@ -68,43 +109,140 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
                     "the friction of logs made in a loop is known behind the output that is fed back only: "
                     "leave this channel out, or give it response = 'as recorded'"
                 )
-            bounded, finding = [as_bounded(record, channel, known) for record in measured], None
-            used = [as_fitted(record, channel, known) for record in measured]
-            if config.closed_loop_data.method == "two_stage":
-                opened = two_stage(bounded, channel.identification)
-                used = bounded = list(opened.records)
-                finding = opened.finding
-                if channel.bounds_band_rad_s is not None:
-                    used = [as_fitted(record, channel) for record in bounded]
-            options = channel.identification
-            if known is not None or finding is not None:
-                # The arm with friction was fitted without delay, and a closed loop looks like one.
-                options = options.with_delay_stated()
-            found = identified_channel(
-                channel.label,
-                used,
-                # A free run of an integrating plant drifts away with friction; it is judged as it was fitted.
-                [(as_fitted(item.record, channel, known), item.role) for item in unseen],
-                options,
-                report,
-                two_stage=finding,
-                friction=known,
-            )
-            as_measured = records.fitted(channel)
-            if known is not None:
-                found = clipped_as_measured(found, as_measured)
-            warnings = found.identification.search.warnings
-            found = with_warnings(found, (*warnings, *amplitude_effects(as_measured)))
-            channels.append(
-                replace(
-                    found,
-                    bounded=tuple(bounded),
-                    increments=channel.increments,
-                    band_rad_s=channel.band_rad_s,
-                    bounds_band_rad_s=channel.bounds_band_rad_s,
-                )
-            )
+            measured = records.fitted(channel)
+            loop = config.closed_loop_data if in_loop else None
+            channels.append(identify_channel(channel, measured, unseen, loop, report, friction=known))
     return IdentifyResult(tuple(channels), friction)
+
+
+def made_in_loop(measured: Sequence[Record]) -> bool:
+    """Whether records of the output that may be fed back were made in closed loop."""
+    return recorded_in_loop([record.slice(0, min(record.n_samples, _TELLING)) for record in measured])
+
+
+def shaft_friction(
+    measured: Sequence[Record],
+    channel: Channel,
+    amplitudes: Sequence[tuple[float, float] | None],
+    report: Report,
+) -> FrictionFit:
+    """Coulomb friction of the shaft whose position a channel measures. amplitudes: that responses are asked
+    for at."""
+    for wanted in amplitudes:
+        refuse_unrecorded(measured, wanted)
+    found = fit_friction(measured, channel.identification, progress=report)
+    refuse_unseen_shaft(found, measured)
+    return found
+
+
+def identify_channel(
+    channel: Channel,
+    measured: Sequence[Record],
+    unseen: Sequence[tuple[Record, Role]],
+    loop: ClosedLoopData | None,
+    report: Report,
+    *,
+    friction: FrictionFit | None = None,
+    with_plot: bool = True,
+) -> IdentifiedChannel:
+    """One channel from records: what `flexlink run` and `flexlink identify` do.
+
+    measured: SISO, as recorded; unseen: others, with their roles; loop: how to use logs made in closed loop,
+    None for others; friction: of the shaft that the output is the position of. Raises ValueError, one line,
+    where the logs cannot carry it.
+    """
+    options, given = _searched_around(channel, measured[0].dt_s), None
+    if friction is not None or loop is not None:
+        # The arm with friction was fitted without delay, and a closed loop looks like one.
+        options = options.with_delay_stated()
+    # A free run of an integrating plant drifts away with friction; it is judged as it was fitted.
+    fresh = [(as_fitted(record, channel, friction), role) for record, role in unseen]
+    doubted = (*measured, *(record for record, _ in unseen))
+    doubts = distinct([doubt for record in doubted for doubt in record.doubts])
+
+    def fitted(opened: TwoStage | None, closed_loop: Finding | None = None) -> IdentifiedChannel:
+        if opened is None:
+            bounded = [as_bounded(record, channel, friction) for record in measured]
+            used = [as_fitted(record, channel, friction) for record in measured]
+        else:
+            used = bounded = list(opened.records)
+            if channel.bounds_band_rad_s is not None:
+                used = [as_fitted(record, channel) for record in bounded]
+        found = identified_channel(
+            channel.label, used, fresh, options, report, with_plot=with_plot, friction=friction
+        )
+        if friction is not None:
+            found = clipped_as_measured(found, measured)
+        warnings = [*doubts, *amplitude_effects(measured), *found.identification.warnings]
+        model = found.model
+        if (band := channel.data_band_rad_s) is not None:
+            # The search may go an octave further.
+            warnings += pairs_outside(model.poles, options.fixed(), model.dt_s, band)
+        return replace(
+            with_warnings(found, [*warnings, *(opened.warnings if opened else ())]),
+            bounded=tuple(bounded),
+            increments=channel.increments,
+            band_rad_s=channel.band_rad_s,
+            bounds_band_rad_s=channel.bounds_band_rad_s,
+            closed_loop=closed_loop,
+        )
+
+    if friction is not None:
+        return fitted(None, finding(FindingKind.DIRECT_WITH_FRICTION) if friction.in_loop else None)
+    if loop is None:
+        return fitted(None)
+    moving = all(record.reference is not None and np.ptp(record.reference) > 0 for record in measured)
+    controlled = loop.controlled
+    ways = [("two_stage", moving), ("direct", True), ("indirect", controlled)]
+    explained = None
+    for way in [way for way, open_ in ways if open_] if loop.method == "auto" else [loop.method]:
+        if way == "direct":
+            found = fitted(None)
+            given, spoilt = _direct(found, explained, stated=loop.method == "direct")
+            if not spoilt or loop.method != "auto":
+                return replace(found, closed_loop=given)
+            continue
+        known = measured if way == "two_stage" else with_stated_controller(measured, loop)
+        opened = two_stage([as_bounded(record, channel) for record in known], options)
+        explained = min(opened.fit_percent)
+        if explained >= _EXPLAINED_PERCENT or loop.method != "auto":
+            kind = FindingKind.TWO_STAGE if way == "two_stage" else FindingKind.INDIRECT
+            return fitted(opened, finding(kind, **opened.finding.values))
+    assert given is not None
+    raise ValueError(said("loop_refused", given.values, controlled))
+
+
+def with_stated_controller(measured: Sequence[Record], loop: ClosedLoopData) -> list[Record]:
+    """The records with what the stated controller tells of the reference. Raises InputError for a file that
+    holds none."""
+    if loop.controller is not None:
+        numerator, denominator = list(loop.controller.numerator), list(loop.controller.denominator)
+    else:
+        from workflow.tasks.system_files import read_controller  # what reads systems is slow to load
+
+        assert loop.controller_file is not None
+        numerator, denominator = read_controller(loop.controller_file, measured[0].dt_s)
+    return [with_controller(record, numerator, denominator) for record in measured]
+
+
+def _direct(found: IdentifiedChannel, explained: float | None, *, stated: bool) -> tuple[Finding, bool]:
+    """What is to be said of the logged input taken as it is, and whether noise that the loop fed back spoils
+    the model.
+
+    Feedback does no harm where the residuals are not found again in later inputs; else what they have in
+    common with the input, noncausal as it is, is held against the ellipses. White residuals behind a noise
+    model are no reason to rely on these: they take model and noise as independent, which a loop undoes.
+    """
+    model, residuals = found.model, found.identification.residuals
+    delay = model.input_delay_samples
+    inputs = [record.input[: record.n_samples - delay, 0] for record in found.used]
+    why, times = "clean", 0.0
+    if independence_test(inputs, residuals).precedes_input:
+        bounds = EmbeddingOptions(coloured_noise=True, max_ar_order=_NOISE_ORDER)
+        times = fed_back(tangent(found.bounded, model, bounds), found.bounded)
+        why = "small" if times <= 1 else "spoilt"
+    told = {} if explained is None else {"explained_percent": explained}
+    return finding(FindingKind.DIRECT, why=why, times=times, stated=stated, **told), why == "spoilt"
 
 
 def with_warnings(found: IdentifiedChannel, warnings: Sequence[Finding]) -> IdentifiedChannel:
@@ -120,20 +258,27 @@ def clipped_as_measured(found: IdentifiedChannel, measured: Sequence[Record]) ->
     return with_warnings(found, [*others, *clipped(measured)])
 
 
-def friction_of(stage: StageInput) -> FrictionFit:
-    """Coulomb friction of the shaft whose position the control channel measures."""
-    channel = stage.config.control_channel
-    with naming(f"channel {channel.label!r}"):
-        at_shaft = stage.results.records.fitted(channel)
-        for other in stage.config.channels:
-            refuse_unrecorded(at_shaft, other.uncertainty.amplitudes)
-        found = fit_friction(
-            at_shaft,
-            channel.identification,
-            progress=lambda done, what: stage.progress.update("identify", 0.0, what),
-        )
-        refuse_unseen_shaft(found, at_shaft)
-        return found
+def residual_tests(
+    posterior: ResponsePosterior, records: Sequence[Record], friction: FrictionFit | None = None
+) -> Tests:
+    """Whiteness and independence of what the posterior's own mean leaves of the records behind the ellipses.
+
+    friction: records of the shaft's position as measured are held against its simulation instead, which has
+    the friction between the samples, too. Where the bounds have a noise model, whiteness is that of the
+    residuals behind it: they rest on those.
+    """
+    # Prediction errors of an observer are white as they are.
+    in_loop = friction is not None and friction.in_loop
+    colour = () if posterior.report is None or in_loop else posterior.report.ar_coefficients
+    filter_of_noise = np.array([1.0, *colour])
+    residuals = [
+        fit_on_fresh_data(posterior, record).residual if friction is None else friction.residual(record)
+        for record in records
+    ]
+    whitened = [lfilter(filter_of_noise, np.ones(1), residual)[len(colour) :] for residual in residuals]
+    delay = posterior.input_delay_samples
+    inputs = [record.input[: record.n_samples - delay, 0] for record in records]
+    return whiteness_test(whitened), independence_test(inputs, residuals)
 
 
 def identified_channel(
@@ -144,7 +289,6 @@ def identified_channel(
     report: Report,
     *,
     with_plot: bool = True,
-    two_stage: Finding | None = None,
     friction: FrictionFit | None = None,
 ) -> IdentifiedChannel:
     """Model of SISO records as the fit is to see them, with free runs on the records it does not see.
@@ -185,5 +329,4 @@ def identified_channel(
         fresh=fits,
         fresh_roles=tuple(role for _, role in fresh),
         stabilisation=plot,
-        two_stage=two_stage,
     )

@@ -108,7 +108,8 @@ class IdentifiedChannel:
     """One channel: what was fitted to what, and free runs on the records that were not fitted.
 
     used: SISO estimation records as the fit saw them; bounded: the same as the ellipses see them; fresh: free
-    runs, fresh_roles the role of each; two_stage: what the two-stage method did, None where it was not used.
+    runs, fresh_roles the role of each; closed_loop: how logs made in a loop were used and why, None for
+    others.
     """
 
     name: str
@@ -121,7 +122,7 @@ class IdentifiedChannel:
     increments: bool = False
     band_rad_s: Interval | None = None
     bounds_band_rad_s: Interval | None = None
-    two_stage: Finding | None = None
+    closed_loop: Finding | None = None
 
     @property
     def model(self) -> GobfModel:
@@ -244,9 +245,9 @@ class UncertainChannel:
 
     nominal: model on the identified poles that is nearest to the posterior; frequency: ellipses on the
     display grid; empirical: response without a model, where the records allow one; tests: whiteness and
-    independence of the residuals on the estimation records; behind_friction: the linear arm, where the
-    ellipses are about amplitudes; repeat_scatter: None without repeats; intervals:
-    None where the method has none.
+    independence of the residuals on the estimation records; advice: where they fail; behind_friction: the
+    linear arm, where the ellipses are about amplitudes; repeat_scatter: None without repeats; intervals: None
+    where the method has none.
     """
 
     name: str
@@ -262,6 +263,7 @@ class UncertainChannel:
     behind_friction: IdentifiedPlant | None = None
     intervals: Intervals | None = None
     repeat_scatter: tuple[ScatterRow, ...] | None = None
+    advice: tuple[Finding, ...] = ()
 
     @property
     def noise_order(self) -> int:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from ident.data.finding import Finding
 from workflow.config.run_config import RunConfig
 from workflow.engine import codec
 from workflow.tasks.design import bracket_numbers, joint_numbers
@@ -27,13 +28,13 @@ class RunSummary:
     """Rows to read, `numbers` (JSON-able) to compute with, and the verdict in one line.
 
     `certified` is False when the specification is missed or the certificate fails; the verdict then says by
-    how much and at which frequencies.
+    how much and at which frequencies. None: nothing was to be certified.
     """
 
     title: str
     sections: Sequence[Section]
     numbers: Mapping[str, Any] = field(default_factory=dict)
-    certified: bool = True
+    certified: bool | None = None
     verdict: str = ""
     report_path: str | None = None
 
@@ -41,7 +42,7 @@ class RunSummary:
         """JSON-able."""
         return {
             "title": self.title,
-            "certified": self.certified,
+            **({} if self.certified is None else {"certified": self.certified}),
             "verdict": self.verdict,
             "report": self.report_path,
             "numbers": dict(self.numbers),
@@ -115,7 +116,7 @@ def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
         **{f"fit_{role}_percent": fits for role, fits in found.fit_percent.items()},
         "warnings": [words(item) for item in identification.warnings],
         "verdicts": [words(item) for item in identification.verdicts],
-        "two_stage": None if found.two_stage is None else words(found.two_stage),
+        "closed_loop": way_numbers(found.closed_loop),
         "modes": [
             {"frequency_Hz": mode.frequency_Hz, **codec.plain(mode), "is_mode": found.is_mode(mode)}
             for mode in found.modes
@@ -124,6 +125,11 @@ def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
         "tangent_optimality": identification.tangent_optimality,
         "search_evaluations": identification.search.evaluations,
     }
+
+
+def way_numbers(found: Finding | None) -> dict[str, Any] | None:
+    """How logs made in a loop were used, and why; None for others."""
+    return None if found is None else {"method": found.kind.name.lower(), "reason": words(found)}
 
 
 def uncertainty_numbers(spread: UncertainChannel) -> dict[str, Any]:
@@ -136,6 +142,7 @@ def uncertainty_numbers(spread: UncertainChannel) -> dict[str, Any]:
             row["frequency_Hz"] = list(known.frequency_Hz)
     for row, test in zip(found["tests"], spread.tests, strict=True):
         row["verdict"] = words(test.finding)
+    found["advice"] = [words(item) for item in spread.advice]
     return {**found, "report": codec.plain(spread.posterior.report)}
 
 
@@ -144,7 +151,7 @@ def channel_numbers(found: IdentifiedChannel, spread: UncertainChannel) -> dict[
     ellipses = uncertainty_numbers(spread)
     return {
         **model_numbers(found),
-        **{key: ellipses[key] for key in ("bands", "intervals", "tests", "repeat_scatter")},
+        **{key: ellipses[key] for key in ("bands", "intervals", "tests", "advice", "repeat_scatter")},
     }
 
 

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from itertools import pairwise
+from operator import itemgetter
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
 
 from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import Mode
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.checks.answer import zero_is_inside
-from ident.checks.residual_tests import independence_test, whiteness_test
-from ident.checks.validation import ScatterRow, fit_on_fresh_data, repeat_scatter
+from ident.checks.residual_tests import residual_advice, whiteness_test
+from ident.checks.validation import ScatterRow, repeat_scatter
 from ident.data.distortion import distortion_of
 from ident.data.finding import FindingKind, distinct
 from ident.data.nonparametric import empirical_frf
@@ -39,7 +41,7 @@ from ident.uncertainty.pole_intervals import growth_intervals, pole_intervals
 from workflow.config.run_config import Channel
 from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.engine.errors import naming
-from workflow.tasks.identification import as_bounded
+from workflow.tasks.identification import as_bounded, residual_tests
 from workflow.tasks.results import (
     Band,
     IdentifiedChannel,
@@ -58,6 +60,9 @@ from workflow.text.templates import words
 
 _FEWEST_FREQUENCIES = 100
 _SHARE_INSIDE = 0.9
+# Largest orders of the noise model that are tried, until the residuals behind it are white.
+_NOISE_ORDERS = (8, 32)
+T = TypeVar("T")
 
 N_BANDS = 6
 """Bands of equal width on the log axis in which radii and scatter are summarised."""
@@ -75,41 +80,114 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
         stage.progress.update("uncertainty", done / len(order), channel.label)
         with naming(f"channel {channel.label!r}"):
             friction = identified.friction if channel.uncertainty.friction_identified else None
-            poles, tests = result.model.poles, None
-            if friction is None:
-                linear = posterior = posterior_of(
-                    result.model, result.bounded, channel.embedding, records.records
-                )
-            else:
-                measured = records.fitted(channel)
-                find = without_friction if k == control else other_output_without_friction
-                behind = find(measured, friction, result.model, channel.embedding)
-                linear = behind.response
-                if k == control:
-                    tests = residual_tests(linear, measured, behind.friction)
-                posterior, poles, equivalent = described_response(
-                    behind,
-                    poles,
-                    friction,
-                    measured,
-                    channel.uncertainty,
-                    stage.rng("uncertainty", channel.label),
-                    equivalent,
-                )
-            omega = display_grid(result.model, result.bounded)
-            channels[k] = uncertain_channel(
-                channel.uncertainty.method,
-                channel.uncertainty.level,
-                posterior,
+            found, equivalent = uncertainty_of(
+                channel,
                 result,
-                omega,
-                nominal_grid(omega, result.data_band_rad_s),
-                poles=poles,
-                linear=linear,
-                tests=tests,
-                repeat_scatter=scatter_of(channel, result, records.records, bands_of(omega), friction),
+                records.fitted(channel),
+                stage.rng("uncertainty", channel.label),
+                friction=friction,
+                at_shaft=k == control,
+                equivalent=equivalent,
+                records=records.records,
             )
+            bands = [(band.from_rad_s, band.to_rad_s) for band in found.bands]
+            scatter = scatter_of(channel, result, records.records, bands, friction)
+            channels[k] = replace(found, repeat_scatter=scatter)
     return UncertaintyResult(tuple(channels[k] for k in sorted(channels)), equivalent)
+
+
+def uncertainty_of(
+    channel: Channel,
+    result: IdentifiedChannel,
+    measured: Sequence[Record],
+    rng: np.random.Generator,
+    *,
+    friction: FrictionFit | None = None,
+    at_shaft: bool = True,
+    equivalent: EquivalentFriction | None = None,
+    records: Sequence[RunRecord] = (),
+) -> tuple[UncertainChannel, EquivalentFriction | None]:
+    """Ellipses of one channel, as `flexlink run` and `flexlink identify` have them, and the viscous friction
+    that acts like the dry one where they are about amplitudes.
+
+    measured: SISO estimation records as recorded; friction: of the shaft, whose position the channel's output
+    is where at_shaft; equivalent: where it is known from the shaft; records: with their conditions.
+    """
+    poles, options = result.model.poles, channel.embedding
+    if friction is None:
+        white = whiteness_test(result.identification.residuals).passed
+
+        def posterior_behind(asked: UncertaintyOptions) -> tuple[ResponsePosterior, Tests]:
+            found = tangent(result.bounded, result.model, asked)
+            return found, residual_tests(found, result.bounded)
+
+        if options.method == "tangent" or options.coloured_noise == "auto":
+            (posterior, tests), options = _with_noise_model(options, white, posterior_behind)
+        if options.method != "tangent":
+            posterior = posterior_of(result.model, result.bounded, options, records)
+            tests = residual_tests(posterior, result.bounded)
+        linear = posterior
+    else:
+        # An observer has a noise model of its own.
+        white = friction.in_loop or whiteness_test([friction.residual(record) for record in measured]).passed
+        find = without_friction if at_shaft else other_output_without_friction
+
+        def arm_behind(asked: UncertaintyOptions) -> tuple[BehindFriction, Tests]:
+            found = find(measured, friction, result.model, asked)
+            if not at_shaft:
+                return found, residual_tests(found.response, result.bounded)
+            return found, residual_tests(found.response, measured, found.friction)
+
+        (behind, tests), _ = _with_noise_model(options, white, arm_behind)
+        linear = behind.response
+        posterior, poles, equivalent = described_response(
+            behind, poles, friction, measured, channel.uncertainty, rng, equivalent
+        )
+    band = result.data_band_rad_s
+    omega = nominal_grid(display_grid(result.model, result.bounded), band)
+    observer = friction is not None and friction.in_loop
+    found = uncertain_channel(
+        channel.uncertainty.method,
+        channel.uncertainty.level,
+        posterior,
+        result,
+        omega,
+        poles=poles,
+        linear=linear,
+        tests=tests,
+    )
+    advice = residual_advice(
+        *tests,
+        noise_order=found.noise_order,
+        friction=friction is None and band is None and not result.increments,
+        observer=observer and at_shaft,
+    )
+    return replace(found, advice=tuple(advice)), equivalent
+
+
+def _with_noise_model(
+    options: UncertaintyOptions, white: bool, found_with: Callable[[UncertaintyOptions], tuple[T, Tests]]
+) -> tuple[tuple[T, Tests], UncertaintyOptions]:
+    """What is found with as much of a noise model as the residuals ask for, and the settings with it.
+
+    White-noise bounds around coloured residuals are far too narrow, so the data decide unless it is stated.
+    """
+    if options.coloured_noise != "auto":
+        return found_with(options), options
+    if white:
+        plain = options.model_copy(update={"coloured_noise": False})
+        return found_with(plain), plain
+    tried = []
+    for order in _NOISE_ORDERS:
+        asked = options.model_copy(update={"coloured_noise": True, "max_ar_order": order})
+        found = found_with(asked)
+        whiteness, _ = found[1]
+        tried.append((whiteness.probability, found, asked))
+        if whiteness.passed:
+            break
+    # A longer noise model has to make the residuals whiter: inside a band it can also turn upon itself.
+    _, best, asked = max(tried, key=itemgetter(0))
+    return best, asked
 
 
 def described_response(
@@ -140,23 +218,21 @@ def uncertain_channel(
     posterior: ResponsePosterior,
     result: IdentifiedChannel,
     omega: Real,
-    nominal_omega: Real,
     *,
+    tests: Tests,
     poles: Poles | None = None,
     linear: ResponsePosterior | None = None,
-    repeat_scatter: tuple[ScatterRow, ...] | None = None,
-    tests: Tests | None = None,
 ) -> UncertainChannel:
-    """Everything said about a posterior. omega (F,): shown; nominal_omega (F,): where the nominal has to be
-    right; poles: of the nominal, where they are not the model's; linear: posterior of the model, where that
-    is another one; tests: of the residuals, where they are known already."""
+    """Everything said about a posterior. omega (F,): shown, and where the nominal has to be right; tests: of
+    the residuals; poles: of the nominal, where they are not the model's; linear: posterior of the model,
+    where that is another one."""
     model, behind = result.model, None
     if linear is not None and linear is not posterior:
-        behind = IdentifiedPlant(nominal_of(linear, model.poles, nominal_omega), linear, level)
+        behind = IdentifiedPlant(nominal_of(linear, model.poles, omega), linear, level)
     linear = linear or posterior
     refuse_unanswered(result, linear, omega)
     frequency = posterior.at(omega, level)
-    nominal = nominal_of(posterior, poles or model.poles, nominal_omega)
+    nominal = nominal_of(posterior, poles or model.poles, omega)
     return UncertainChannel(
         name=result.name,
         method=method,
@@ -171,11 +247,10 @@ def uncertain_channel(
             band_rad_s=result.data_band_rad_s,
         ),
         bands=tuple(band_row(frequency, low, high) for low, high in bands_of(omega)),
-        tests=residual_tests(linear, result.bounded) if tests is None else tests,
-        agreement=agreement_of(posterior.at(nominal_omega, level), nominal.frequency_response),
+        tests=tests,
+        agreement=agreement_of(frequency, nominal.frequency_response),
         behind_friction=behind,
         intervals=intervals_of(linear, model.stable_poles, level),
-        repeat_scatter=repeat_scatter,
     )
 
 
@@ -279,30 +354,6 @@ def agreement_of(
         largest_distance=float(distance[worst]),
         at_rad_s=float(frequency.omega_rad_s[worst]),
     )
-
-
-def residual_tests(
-    posterior: ResponsePosterior, records: Sequence[Record], friction: FrictionFit | None = None
-) -> Tests:
-    """Whiteness and independence of what the posterior's own mean leaves of the records behind the ellipses.
-
-    friction: records of the shaft's position as measured are held against its simulation instead, which has
-    the friction between the samples, too. Where the bounds have a noise model, whiteness is that of the
-    residuals behind it: they rest on those.
-    """
-    in_loop = (
-        friction is not None and friction.in_loop
-    )  # an observer's prediction errors are white as they are
-    colour = () if posterior.report is None or in_loop else posterior.report.ar_coefficients
-    filter_of_noise = np.array([1.0, *colour])
-    residuals = [
-        fit_on_fresh_data(posterior, record).residual if friction is None else friction.residual(record)
-        for record in records
-    ]
-    whitened = [lfilter(filter_of_noise, np.ones(1), residual)[len(colour) :] for residual in residuals]
-    delay = posterior.input_delay_samples
-    inputs = [record.input[: record.n_samples - delay, 0] for record in records]
-    return whiteness_test(whitened), independence_test(inputs, residuals)
 
 
 def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> Intervals | None:

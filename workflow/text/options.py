@@ -34,6 +34,7 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "time_unit": "--time-unit",
         "resample_s": "--resample-s",
         "validation": "--validation",
+        "closed_loop_data.method": "--loop-method",
     },
 }
 """Options of a command by the key of the setting, with the value that switches it on where the key has none
