@@ -16,6 +16,7 @@ from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray, real_rows
+from ident.data.ellipses import chi2_radius
 from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
@@ -26,14 +27,12 @@ from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
 
 _NOISE_ORDER = 32
-# A law of friction that was not found in a log may still be there to this share of the level.
+# No law is exact. One that was not found in a log may still be there to this share of the level, and as much
+# of the friction, rms, may look like a linear force, which shows in no residual (standard deviation).
 _SHAPE = 0.05
-# Standard deviation of the part of the friction that looks like a linear force, rms. No law is exact, and
-# this part of its error shows in no residual: without it half of the ellipses missed the arm where the law
-# of the machine was not the one fitted (`benchmarks.closed_loop_machines`).
-_LIKE_LINEAR = 0.02
-# On this many frequencies it is put onto the basis functions.
-_FREQUENCIES = 400
+# What is put onto the basis functions: on so many frequencies, from so many records' lengths on. By itself it
+# leaves the gain its sign, as a force of a passive arm does: its 95 % radius stays below this share.
+_FREQUENCIES, _LENGTHS, _LARGEST, _LEVEL = 400, 100, 0.85, 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +127,7 @@ def _by_linear_force(
     friction, rms over the records. less: the records with the friction taken off.
     """
     longest_s = max(record.n_samples for record in records) * response.dt_s
-    omega = np.geomspace(1 / longest_s, np.pi / response.dt_s, _FREQUENCIES)
+    omega = np.geomspace(1 / (_LENGTHS * longest_s), np.pi / response.dt_s, _FREQUENCIES)
     rows = response.frequency_rows(omega)
     gain = rows @ response.mean
     force = [(one.input - other.input)[:, 0] for one, other in zip(records, less, strict=True)]
@@ -136,8 +135,9 @@ def _by_linear_force(
     columns = list[RealArray]()
     for i in range(3):
         if i >= response.integrators:
-            share = _LIKE_LINEAR * np.sqrt(_mean_square(force) / _mean_square(moved))
-            change = share * (1j * omega) ** i * gain
+            size = _SHAPE * np.sqrt(_mean_square(force) / _mean_square(moved))
+            change = size * (1j * omega) ** i * gain
+            change /= 1 + chi2_radius(_LEVEL) / _LARGEST * np.abs(change)
             # On the doubled poles, which hold G^2 s^i but for the delay, relative to G.
             basis = real_rows(rows[:, : response.poles.order] / gain[:, None])
             columns.append(np.asarray(np.linalg.lstsq(basis, real_rows(change), rcond=None)[0]))

@@ -21,6 +21,7 @@ from control_design.specification.requirement import LoopFunction, Specification
 from control_design.synthesis.joint_synthesis import JointDesign
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import Outcome
+from ident.uncertainty import FrequencyUncertainty
 from tests.compiler import compiled, needs_compiler
 from tests.workflow.report_examples import (
     DT_S,
@@ -52,7 +53,7 @@ from workflow.tasks.results import (
     ReferenceFilterResult,
     SampledResponses,
 )
-from workflow.tasks.summary import verdict_of
+from workflow.tasks.summary import untold_below_rad_s, verdict_of
 from workflow.text.templates import environment, said
 
 
@@ -296,3 +297,18 @@ def test_reference_filter_in_c_agrees_to_1e_12(filtered, tmp_path):
     reference = np.repeat(np.random.default_rng(5).standard_normal(40), 25)
     answer = np.array([code.reference_filter_step(state, value) for value in reference])
     assert np.max(np.abs(answer - found.filtered(reference))) < 1e-12
+
+
+def test_a_verdict_says_up_to_where_the_logs_tell_nothing():
+    omega = np.array([0.1, 1.0, 10.0, 100.0])
+    covariance = np.array([400.0, 4.0, 0.01, 4.0])[:, None, None] * np.eye(2)
+    found = FrequencyUncertainty(omega, np.array([2.0, 2.0, 2.0, 1.0]) + 0j, covariance, 0.01)
+    assert untold_below_rad_s(found) == 1.0
+    assert untold_below_rad_s(replace(found, covariance=covariance / 1e6)) == 0.0
+    assert untold_below_rad_s(replace(found, covariance=covariance * 1e6)) == 100.0
+    design = DesignResult(SimpleNamespace(gamma=1.2), met=False, reason="gamma 1.2")
+    rest = CertifyResult(None, certified=False, reason="NOT met"), ClosedLoopResult()
+    for met, begins in ((False, "specification not met: gamma 1.2; "), (True, "not certified: NOT met; ")):
+        words = verdict_of(replace(design, met=met), *rest, achievable(0.8), 3, 1.0)
+        assert words.startswith(f"{begins}below 1 rad/s (0.159 Hz) the logs do not tell the response")
+        assert "flexlink excite" in words

@@ -6,7 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from ident.data.finding import Finding
+from ident.uncertainty import FrequencyUncertainty
 from workflow.config.run_config import RunConfig
 from workflow.engine import codec
 from workflow.tasks.design import bracket_numbers, joint_numbers
@@ -75,7 +78,14 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
             "closed_loop": loop_numbers(loop),
         },
         certified=certify.certified and settles,
-        verdict=verdict_of(design, certify, loop, achievable, config.specification.controller_order),
+        verdict=verdict_of(
+            design,
+            certify,
+            loop,
+            achievable,
+            config.specification.controller_order,
+            untold_below_rad_s(results.uncertainty.channels[config.control_index].frequency),
+        ),
         report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
     )
 
@@ -86,13 +96,23 @@ def verdict_of(
     loop: ClosedLoopResult,
     achievable: AchievablePerformance | None = None,
     order: int | None = None,
+    untold_rad_s: float = 0.0,
 ) -> str:
-    """One line: certified, or what is missed, by how much and at which frequency, and, where the achievable
-    performance is given, whether a higher order would help."""
-    advice = ""
+    """One line: certified, or what is missed, by how much and at which frequency; where the achievable
+    performance is given, whether a higher order would help; up to where the ellipses are wider than the
+    gain, if they are."""
+    advice, untold = "", said("untold", untold_rad_s)
     if achievable is not None and order is not None and design.gamma is not None:
         advice = said("order_advice", achievable, design.gamma, order)
-    return said("run_verdict", design, certify, loop, advice)
+    return said("run_verdict", design, certify, loop, untold or advice, untold)
+
+
+def untold_below_rad_s(found: FrequencyUncertainty) -> float:
+    """Up to here an ellipse is wider than the gain, from the lowest frequency on; 0 where none is."""
+    told = np.flatnonzero(found.enclosing_radius() < np.abs(found.centre))
+    if told.size == 0:
+        return float(found.omega_rad_s[-1])
+    return float(found.omega_rad_s[told[0] - 1]) if told[0] else 0.0
 
 
 def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
