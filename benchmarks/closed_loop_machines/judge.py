@@ -46,6 +46,8 @@ _RADIUS_2 = -2 * np.log(0.05)  # chi-square of two degrees of freedom, 95 %
 # A next step names a command, an option or a setting.
 _STEP = re.compile(r"flexlink \w+|--[a-z]|[a-z]+_[a-z_]+ = |integrators? = |\[\w+\]")
 
+_PROGRESS = re.compile(r"flexlink: \d+ s: ")
+
 
 def judged(one: Machine, folder: Path, bla: int = 0, judge_only: bool = False) -> dict[str, Any]:
     """Everything the table needs, also written to FOLDER/NAME/judged.json. judge_only: runs are there."""
@@ -98,6 +100,7 @@ def _flexlink(*words: str) -> tuple[int, str, list[str]]:
     except subprocess.TimeoutExpired:
         return -1, "", [f"no answer in {_LONGEST_S} s"]
     said = [line.strip() for line in (ended.stderr or ended.stdout).splitlines() if line.strip()]
+    said = [line for line in said if not _PROGRESS.match(line)]
     return ended.returncode, ended.stdout, said or ["(nothing said)"]
 
 

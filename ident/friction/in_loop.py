@@ -16,6 +16,7 @@ Neglected: a level that depends on position or load; what the sensor's noise doe
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,7 +45,7 @@ from ident.friction.gauss_newton import (
     with_covariance,
 )
 from ident.friction.inverse_dynamics import direction_of, highest_Hz, level_of, rms_speed, smoothed
-from ident.friction.observer import LOST, ObserverFilter, observed, prediction_errors
+from ident.friction.observer import LOST, LostError, ObserverFilter, observed, prediction_errors
 from ident.friction.spring import Spring
 from ident.identification import Identification
 from ident.one_input import identify, untested_model
@@ -164,15 +165,22 @@ def fit_friction_in_loop(
         found = _in_turns(logs, found, few)
     if found.significant:
         report(0.4, "friction: falling with speed, beyond a spring")
-        found = _with_stribeck(logs, _with_friction_beyond(logs, found))
+        for extended in (_with_friction_beyond, _with_stribeck):
+            with suppress(LostError):  # what no observer follows explains nothing better
+                found = extended(logs, found)
     report(0.5, "friction: level and arm in turns")
-    simple, found = found, _with_more_poles(logs, found, options)
+    simple = found
+    with suppress(LostError):
+        found = _with_more_poles(logs, found, options)
     for delay in range(1, _LONGEST_DELAY + 1) if options.delay_left_to_data else ():
         report(0.5 + 0.1 * min(delay, 4), "friction: dead time")
         late = {"input_delay_samples": delay}
         arm = replace(simple.arm, structure=options.model_copy(update=late).structure())
-        simple = _in_turns(logs, replace(simple, arm=arm), few.model_copy(update=late), _FEW_ROUNDS)
-        tried = _with_more_poles(logs, simple, options.model_copy(update=late))
+        try:
+            simple = _in_turns(logs, replace(simple, arm=arm), few.model_copy(update=late), _FEW_ROUNDS)
+            tried = _with_more_poles(logs, simple, options.model_copy(update=late))
+        except LostError:
+            break
         if not logs.errors(tried) < logs.errors(found):
             break
         found = tried
@@ -373,7 +381,7 @@ def _equations(
         u = u[:, d > _NUISANCE_RANK * d.max(initial=0.0)]
         rows = rows - u @ (u.T @ rows)
         if not np.all(np.isfinite(rows)):
-            raise ValueError(LOST)
+            raise LostError(LOST)
         blocks.append(rows[:, :-1])
         targets.append(rows[:, -1])
     return blocks, targets

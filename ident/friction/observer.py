@@ -27,6 +27,12 @@ LOST = (
     "no model of the arm with dry friction follows the logs; response = 'as recorded' needs none, n_real and "
     "n_pairs state the number of poles"
 )
+
+
+class LostError(ValueError):
+    """No observer follows the logs with this arm and law."""
+
+
 # Force that an observer expects in a sample, in units of the input's rms over the noise of the position: from
 # an observer slower than the arm to one that takes the last two samples for its state.
 _RATIOS = np.geomspace(1e-4, 10, 11)
@@ -114,7 +120,7 @@ def prediction_errors(found: FrictionFit, records: Sequence[Record]) -> float:
 def observed(found: FrictionFit, records: Sequence[Record]) -> FrictionFit:
     """The fit with the observer whose predictions of the records are best; near the one it has, if any.
 
-    Raises ValueError where no observer follows them.
+    Raises LostError where no observer follows them.
     """
     noise = np.sqrt(np.mean([noise_of(record.output[:, 0]) ** 2 for record in records]))
     rms = np.sqrt(np.mean([np.mean(record.input**2) for record in records]))
@@ -125,5 +131,5 @@ def observed(found: FrictionFit, records: Sequence[Record]) -> FrictionFit:
             one = replace(found, correction=correction, ratio=float(ratio))
             tried.append((prediction_errors(one, records), one))
     if not tried:
-        raise ValueError(LOST)
+        raise LostError(LOST)
     return min(tried, key=lambda one: one[0])[1]
