@@ -2,8 +2,8 @@
 
 Labelled and sealed cases of the shared folder (with the truth, where that is told) and three real machines.
 Per case: CPU, simulations, the answer with its size, and the probabilities of sets. `--against NAME` tells
-where benchmarks/results/NAME.txt says otherwise; `--change "module:NAME=value ..."` sets constants first, to
-see what each of them earns.
+where benchmarks/results/NAME.txt says otherwise; what a constant or a move of
+the search earns is seen with `--change "module:NAME=value ..."` and `--without "Scan LookAlike"`.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from benchmarks import emps_axis, ruler_robot, serial_link_stage
 from benchmarks.harness import RESULTS, Print, data_folder, main, timed
 from diagnosis import Diagnosis, diagnose
 from diagnosis.machine.machine_protocol import CaseOfMachine
+from diagnosis.search import moves
 from workflow.diagnose.case_files import load_case
 
 # Folder below the shared cases, with the rig file where it is not the usual one: without a model error, with.
@@ -127,7 +128,9 @@ def frozen(name: str) -> dict[str, dict[str, Any]]:
     return {case: json.loads("{" + rest) for case, found, rest in parts if found}
 
 
-def run(out: Print, *, only: str = "", against: str = "", change: str = "") -> None:
+def run(out: Print, *, only: str = "", against: str = "", change: str = "", without: str = "") -> None:
+    for name in without.split():
+        getattr(moves, name).proposed = lambda *told: []
     for module, name, value in re.findall(r"(\S+):(\w+)=(\S+)", change):
         setattr(importlib.import_module(module), name, eval(value, {"np": np}))
     before = frozen(against) if against else {}

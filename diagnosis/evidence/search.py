@@ -30,6 +30,7 @@ SMALLEST_SIZE_RATIO, SMALLEST_SIZE_BESIDE = 0.06, 0.2
 _CLOSE = 20.0
 # A further effect has a smaller prior (7 in log weight): what gains less roughly is not finished.
 _LEAST_GAIN = 5.0
+# To an end, along flat valleys too.
 _FINE_ITERATIONS, _FINE_TOLERANCE = 40, 0.02
 # Starts of a further effect that are simulated beside a parent, of all that superposition looks at.
 _SIMULATED = 4
@@ -37,8 +38,6 @@ _SIMULATED = 4
 _HOPELESS = 0.1
 # Sets whose members are tried without one of them.
 _SETS_TO_REDUCE = 3
-# Single effects, and pairs, that are extended where no set explains everything; effects fitted beside each.
-_BEAM, _BESIDE = {1: 3, 2: 1}, 6
 _MOST_EFFECTS = 3
 # Sizes of non-smooth effects are refined where no more than this share of the gap, or this energy, is left.
 _NEAR, _NEAR_FLOOR = 0.25, 0.3
@@ -80,11 +79,11 @@ class WhiteSearch(SearchLoop[Hypothesis]):
         self.tried(Enlarge.proposed(self, self.found), 0.5)
         self.tried(InPlaceOf.proposed(self, self.base.end), 0.55)
         for count in range(2, _MOST_EFFECTS + 1):
-            parents = self._parents(count - 1)
-            if not parents or (count > 2 and self._hopeless(parents[0])):
+            moves = Beside.proposed(self, count)
+            if not moves or (count > 2 and self._hopeless(moves[0].parent)):
                 break
-            self.tried([Beside(parent, _BESIDE) for parent in parents], 0.4 + 0.1 * count, 0.1)
-            self.tried([m for parent in parents for m in InPlaceOf.proposed(self, parent)], 0.5 + 0.1 * count)
+            pulled = [m for move in moves for m in InPlaceOf.proposed(self, move.parent)]
+            self.tried([*moves, *pulled], 0.4 + 0.1 * count, 0.1)
             for one in sorted(self.found, key=lambda h: -h.log_weight)[:_SETS_TO_REDUCE]:
                 if self._near(one.end) and len(one.names) > 1:
                     self.simpler(one)
@@ -96,22 +95,6 @@ class WhiteSearch(SearchLoop[Hypothesis]):
     def unexplained(self) -> bool:
         """Whether the best set leaves something over, by its own evidence against that of an unknown rest."""
         return max(h.log_weight for h in self.found) < max(h.unknown_weight for h in self.found)
-
-    def _parents(self, count: int) -> list[Descent]:
-        """Sets of so many effects to which one more is added, best first.
-
-        The best one as soon as a set explains everything. Before, what is left over says little about which
-        member of the true set has been found: of single effects the three that would leave the most probable
-        unknown rest.
-        """
-        best = max(self.found, key=lambda h: h.log_weight)
-        if not self.unexplained or not best.names:
-            return [best.fit] if len(best.names) == count else []
-        parents: dict[tuple[str, ...], Descent] = {}
-        for h in sorted(self.found, key=lambda h: -h.unknown_weight):
-            if len(h.names) == count:
-                parents.setdefault(h.key, h.fit)
-        return list(parents.values())[: _BEAM[count]]
 
     def _hopeless(self, parent: Descent) -> bool:
         """Whether a third effect would follow something unknown, or what correct solvers of backlash differ
@@ -154,11 +137,12 @@ class WhiteSearch(SearchLoop[Hypothesis]):
         return candidate, beside(self.records, parent, candidate, near or points[:1])
 
     def polished(self, end: Descent, rank: int, around: Descent) -> Descent:
-        """Finished where it may matter: among faint effects a few units of loss decide, and stated values
-        that a gap has pulled far off need more than rough steps to come back."""
+        """Finished where it may matter: among faint effects alone a few units of loss decide, and stated
+        values that a gap has pulled far off need more than rough steps to come back."""
         best = min(h.fit.loss for h in self.found)
         smooth = all(c.dependence == "smooth" for c in end.candidates)
-        close = end.loss < best + _CLOSE and (smooth or end.loss < around.loss - _LEAST_GAIN)
+        faint = smooth and not around.candidates
+        close = end.loss < best + _CLOSE and (faint or end.loss < around.loss - _LEAST_GAIN)
         # A backlash that only looks like something else takes as long as everything besides.
         if not (close or rank == 0) or (rank > 0 and end.non_smooth and not self._near(end)):
             return end

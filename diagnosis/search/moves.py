@@ -24,13 +24,11 @@ from diagnosis.search.windows import in_windows
 from plant.effects import LOOK_ALIKES, Effect
 from plant.effects.search_space import Candidate
 
-# Starts descended from alone; further ones, local minima of a grid of one value, whatever they leave.
-_ALONE, _LOCAL_MINIMA = 2, 1
+# Starts descended from alone; further ones, local minima of a grid of one value, whatever they leave;
+# iterations of each (with five the serial link's first stage ends 5 % higher).
+_ALONE, _LOCAL_MINIMA, _ITERATIONS = 2, 1, 9
 # Parents extended, and effects fitted beside each: pairs, larger sets.
 _PARENTS, _TRIED = (3, 1), (6, 4)
-# Further parents beside which only what every machine has some of is fitted, how many of these beside each,
-# and how far behind in evidence they may be.
-_FURTHER, _TRIED_BESIDE_FURTHER, _FAR_BEHIND = 2, 2, 100.0
 # Ends of effects alone that are finished, and sets in which what looks like an effect takes its place.
 FINISHED = 6
 # Sets of an effect in which what looks like it takes its place.
@@ -101,7 +99,11 @@ def _turned(search: SearchLoop[Any], candidate: Candidate) -> bool:
 
 
 def _from(
-    search: SearchLoop[Any], around: Descent, candidate: Candidate, point: Point, nominal: Real
+    search: SearchLoop[Any],
+    around: Descent,
+    candidate: Candidate,
+    point: Point,
+    nominal: Real,
 ) -> Descent:
     return descend(
         search.records,
@@ -111,7 +113,7 @@ def _from(
         point.start,
         nominal_jacobian=nominal,
         columns=around.columns,
-        iterations=9,
+        iterations=_ITERATIONS,
     )
 
 
@@ -163,11 +165,10 @@ class Enlarge(Move):
 
 @dataclass(frozen=True, eq=False)
 class Beside(Move):
-    """The most promising effects beside a set; everywhere: of what every machine has some of alone."""
+    """The most promising effects beside a set."""
 
     parent: Descent
     most: int
-    everywhere: bool = False
 
     @property
     def what(self) -> str:
@@ -175,22 +176,14 @@ class Beside(Move):
 
     @classmethod
     def proposed(cls, search: SearchLoop[Any], count: int) -> list[Beside]:
-        """Sets of so many effects, from the likeliest of one fewer.
-
-        Friction and tilt, which may be more than what is sought, take the first places; what else is likely
-        shows what it explains once they are beside it.
-        """
-        pool = list(best_of_sets(e for e in search.found if len(e.names) == count - 1).values())
-        parents = pool[: _PARENTS[count > 2]]
-        found = [cls(parent.end, _TRIED[count > 2]) for parent in parents]
-        tried, further = {_unusual(parent) for parent in parents} | {frozenset[str]()}, 0
-        for parent in pool[len(parents) :] if search.unexplained else ():
-            if further == _FURTHER or parent.evidence < pool[0].evidence - _FAR_BEHIND:
-                break
-            if _unusual(parent) not in tried:
-                tried, further = tried | {_unusual(parent)}, further + 1
-                found.append(cls(parent.end, _TRIED_BESIDE_FURTHER, everywhere=True))
-        return found
+        """Sets of so many effects, from the likeliest of one fewer. Several of these while something that
+        interests is left, for what is left says little about which member of the true set has been found;
+        then the likeliest of all sets, if it is one. What interests is unknown where nobody has stated it."""
+        pool = list(best_of_sets(search.found).values())
+        parents = [e for e in pool if len(e.names) == count - 1][: _PARENTS[count > 2]]
+        if search.case.machine.weighing.stated and not search.unexplained:
+            parents = [e for e in parents if e is pool[0]]
+        return [cls(parent.end, _TRIED[count > 2]) for parent in parents]
 
     def apply(self, search: SearchLoop[Any]) -> None:
         parent = self.parent
@@ -217,8 +210,6 @@ class Beside(Move):
         held = {name for c in self.parent.candidates for name in (c.effect, c.kind.contains)} - {None}
         for candidate, points in search.points:
             if candidate.effect in held or candidate.kind.contains in held:
-                continue
-            if self.everywhere and not candidate.kind.everywhere:
                 continue
             # A frequency, and a zero that no other output tells, may be any other beside another effect.
             anew = candidate.kind.harmonic is not None or _turned(search, candidate)
@@ -416,11 +407,6 @@ class LookAlike(Move):
         trials = [np.concatenate([rest[0], start, rest[1]]) for start in other.starts]
         _, d, x = best_following(search.records, end, candidates, trials)
         search.add(descend(search.records, candidates, d, x, end.start))
-
-
-def _unusual(explanation: Weighed) -> frozenset[str]:
-    """Its effects but those that every machine has some of."""
-    return frozenset(c.effect for c in explanation.end.candidates if not c.kind.everywhere)
 
 
 def _local_minima(points: Sequence[Point]) -> list[Point]:

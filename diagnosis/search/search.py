@@ -11,7 +11,7 @@ from diagnosis.fit.descent import Descent, descend, loss_at, occam, refined
 from diagnosis.fit.records import Records, Start
 from diagnosis.fit.starts import Point, beside
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
-from diagnosis.search.explanation import Explanation, best_of_sets
+from diagnosis.search.explanation import Explanation
 from diagnosis.search.loop import Progress, SearchLoop
 from diagnosis.search.moves import FINISHED, Alone, Beside, Enlarge, FromContacts, InWindows, LookAlike, Scan
 from diagnosis.search.settled import settled
@@ -21,8 +21,6 @@ from plant.effects.search_space import Candidate
 _BESIDE_POINTS = 4
 # Ends beside a set that are refined where contacts switch.
 _REFINED = 2
-# Sets of several whose simple effects are also continued as those that contain them.
-_CONTINUED = 3
 # Evidence that larger sets gain, or none that are larger still are tried.
 _WORTH = 15.0
 # Loss that other starts of the records gain, or a set is not descended on from there.
@@ -83,9 +81,6 @@ class Search(SearchLoop[Explanation]):
             self.tried(Beside.proposed(self, count), min(0.45 + 0.25 * (count - 2), 0.9), 0.1)
         if self.unexplained:
             self.tried(InWindows.proposed(self), 0.95)
-        several = best_of_sets(e for e in self.found if len(e.names) > 1)
-        self.tried(Enlarge.proposed(self, list(several.values())[:_CONTINUED]), 0.96)
-        if self.unexplained:
             self.tried(Scan.proposed(self), 0.97)
             self.tried(FromContacts.proposed(self), 0.97)
         self.tried(LookAlike.proposed(self), 0.98)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from diagnosis import Experiment
 from diagnosis.evidence.search import fitted_to
 from diagnosis.fit import starts as starts_module
+from diagnosis.fit.levels import Levels
+from diagnosis.fit.likelihood import White
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.starts import points_of
 from tests.diagnosis.recorded import simulated_case
@@ -97,3 +100,33 @@ def test_a_disturbance_beside_backlash_is_found_from_a_fifth_off(tmp_path, seed)
     assert end.candidates[1].parameters(end.coordinates_of(1))["amplitude_Nm"] == pytest.approx(
         0.03, rel=0.01
     )
+
+
+def _records(rng):
+    return [
+        Experiment(name, "estimation", rng.standard_normal(60), rng.standard_normal((60, 2)))
+        for name in ("a", "b")
+    ]
+
+
+NOISE = np.array([0.1, 0.3])
+
+
+@pytest.mark.parametrize(
+    "likelihood",
+    [White(NOISE, np.zeros(2)), Levels.of(_records(np.random.default_rng(0)), NOISE, 0.05)],
+    ids=["white", "levels"],
+)
+def test_a_descent_may_stand_before_either_likelihood(likelihood):
+    """What it takes for granted: weights are the slope of the loss over e, `changed` that of `seen`, and
+    `unseen` its inverse."""
+    rng = np.random.default_rng(1)
+    residuals = [rng.standard_normal((60, 2)) for _ in range(2)]
+    e = np.concatenate([likelihood.seen(r) for r in residuals])
+    way = rng.standard_normal(e.size)
+    slope = (likelihood.loss(e + 1e-5 * way) - likelihood.loss(e - 1e-5 * way)) / 2e-5
+    assert slope == pytest.approx(likelihood.weights(e) * e @ way, rel=1e-6)
+    np.testing.assert_allclose(likelihood.unseen(e[:120], 2), residuals[0], atol=1e-12)
+    change = rng.standard_normal((60, 2))
+    moved = likelihood.seen(residuals[0] + change) - likelihood.seen(residuals[0])
+    np.testing.assert_allclose(likelihood.changed(change).ravel(), moved, atol=1e-12)
