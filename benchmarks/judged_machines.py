@@ -178,7 +178,13 @@ class Made:
         tolerances = dict.fromkeys(self.stated, 0.05)
         plant = Plant(simulate, self.stated, tolerances, self.outputs, noise, own)
         around = with_effects(
-            plant, "all", records, dt_s=self.dt_s, motion=self.motion, motion_is=self.motion_is
+            plant,
+            "all",
+            records,
+            dt_s=self.dt_s,
+            motion=self.motion,
+            motion_is=self.motion_is,
+            at_rest_before=False,
         )
         return PlantCase(called, around, tuple(records))
 
