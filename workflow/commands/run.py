@@ -80,8 +80,8 @@ def rebuild_report(
 def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
     """Simulate the experiments of a configuration; one CSV per record, named after it, then truth.json.
 
-    Columns time_s, voltage_V, hub_angle_rad, tip_m, so that the files can be read back as a log. Raises
-    InputError.
+    Columns time_s, reference_rad (of a loop), voltage_V, hub_angle_rad, tip_m, so that the files can be read
+    back as a log. Raises InputError.
     """
     config = load_simulation(config_path) if config_path is not None else built_in_config()[0]
     if not isinstance(config.source, SimulatedSource):
@@ -92,6 +92,7 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
     from workflow.tasks.simulated_rig import (
         INPUT_NAME,
         OUTPUT_NAMES,
+        REFERENCE_NAME,
         TRUTH_FILE,
         simulate_record,
         truth_of,
@@ -101,7 +102,10 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
     for index, entry in enumerate(config.source.records):
         with naming(f"{config_path or 'default arm'}: source.records[{index}] ({entry.name})"):
             record = simulate_record(config.source, entry, config.run.seed)
-        signals = dict(zip((INPUT_NAME, *OUTPUT_NAMES), [*record.input.T, *record.output.T], strict=True))
+        columns = [*record.input.T, *record.output.T]
+        signals = dict(zip((INPUT_NAME, *OUTPUT_NAMES), columns, strict=True))
+        if record.reference is not None:
+            signals = {REFERENCE_NAME: record.reference[:, 0], **signals}
         safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", entry.name)
         texts[f"{index + 1:02d}_{safe}.csv"] = storage.csv_text({"time_s": record.time_s, **signals})
     texts[TRUTH_FILE] = truth_of(config.source).model_dump_json(indent=1) + "\n"

@@ -52,6 +52,16 @@ class SimulatedRecord(Section):
     excitation: Excitation
 
 
+class SimulatedLoop(Section):
+    """PD controller of the hub angle, u = K_P e + K_D de/dt by backward differences."""
+
+    proportional_V_per_rad: float = Field(gt=0, description="K_P")
+    derivative_Vs_per_rad: float = Field(0.0, ge=0, description="K_D")
+    reference_rad_per_V: float = Field(
+        gt=0, description="the reference is the excitation of a record times this"
+    )
+
+
 class SimulatedSource(Section):
     kind: Literal["simulated"] = Field(description="records come from the simulated arm")
     rig: RigChoice = Field("paper_link", description="preset 'paper_link', or the path of a rig TOML file")
@@ -62,6 +72,9 @@ class SimulatedSource(Section):
         (), description="effects that the nominal rig lacks, e.g. coulomb_friction"
     )
     encoder_step_rad: float = Field(0.0, ge=0, description="resolution of the hub encoder; 0 is none")
+    loop: SimulatedLoop | None = Field(
+        None, description="records are made in closed loop, on this controller; default: in open loop"
+    )
     plan: ExperimentPlan | None = Field(
         None, exclude=True, description="estimation records, one per amplitude and realisation; read once"
     )

@@ -12,6 +12,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from control_design.analysis.closed_loop import simulate as simulate_loop
+from control_design.controllers.controller import Controller
 from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.data.record import Record
 from plant.effects import make_machine, parse_effects
@@ -26,7 +28,7 @@ from workflow.engine.randomness import stage_rng
 from workflow.tasks.results import IdentifiedChannel
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine
 
-INPUT_NAME = "voltage_V"
+INPUT_NAME, REFERENCE_NAME = "voltage_V", "reference_rad"
 OUTPUT_NAMES = SampledArm.output_names
 UNITS = {"voltage_V": "V", "hub_angle_rad": "rad", "tip_m": "m"}
 
@@ -39,28 +41,43 @@ def rig_of(source: SimulatedSource) -> Rig:
 def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) -> Record:
     """Run one experiment on the rig with the effects of the source.
 
-    The record has the commanded voltage, and hub angle (in encoder steps) and tip position as measured, from
-    rest. Excitation and sensor noise have random streams of their own, keyed by the record's name: a record
-    stays as it is when others come or go.
+    The record has the commanded voltage, hub angle (in encoder steps) and tip position as measured, from
+    rest, and the reference where the source has a loop. Excitation and sensor noise have random streams of
+    their own, keyed by the record's name: a record stays as it is when others come or go.
     """
     rig = rig_of(source)
-    voltage = entry.excitation.signal(rig.sampling.dt_s, stage_rng(seed, "records", entry.name, "excitation"))
-    trajectory = simulate(
-        rig,
-        voltage,
-        parse_effects(source.effects),
-        rng=stage_rng(seed, "records", entry.name, "noise"),
-        n_modes=source.modes,
-    )
+    dt_s, rng = rig.sampling.dt_s, stage_rng(seed, "records", entry.name, "noise")
+    voltage = entry.excitation.signal(dt_s, stage_rng(seed, "records", entry.name, "excitation"))
+    reference = None
+    if source.loop is None:
+        effects = parse_effects(source.effects)
+        output = simulate(rig, voltage, effects, rng=rng, n_modes=source.modes).output
+        output = quantised(output, source.encoder_step_rad)
+    else:
+        slope = source.loop.derivative_Vs_per_rad / dt_s
+        law = Controller(
+            np.zeros((1, 1)),
+            np.ones((1, 1)),
+            np.array([[-slope]]),
+            np.array([[source.loop.proportional_V_per_rad + slope]]),
+            dt_s,
+            computational_delay_samples=0,
+            input_limit=source.input_limit,
+        )
+        reference = source.loop.reference_rad_per_V * voltage
+        ran = simulate_loop(law, EncodedArm(source, (), rng), reference)
+        voltage, output = ran.command, ran.output
     return Record(
         name=entry.name,
-        input=trajectory.voltage_V[:, None],
-        output=quantised(trajectory.output, source.encoder_step_rad),
-        dt_s=rig.sampling.dt_s,
+        input=voltage[:, None],
+        output=output,
+        dt_s=dt_s,
         input_names=(INPUT_NAME,),
         output_names=OUTPUT_NAMES,
         input_units=(UNITS[INPUT_NAME],),
         output_units=tuple(UNITS[name] for name in OUTPUT_NAMES),
+        reference=None if reference is None else reference[:, None],
+        reference_names=() if reference is None else (REFERENCE_NAME,),
     )
 
 
