@@ -26,6 +26,7 @@ from scipy.stats import f as f_distribution
 from ident.basis.functions import nuisance_columns, regressor
 from ident.basis.options import IdentOptions
 from ident.basis.structure import answered, driving_input, stabilised
+from ident.checks.input_checks import refuse_few_lines
 from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.checks.validation import fit_in_windows
 from ident.coloured_noise import long_arx_filter, prewhitened
@@ -140,6 +141,7 @@ def fit_friction_in_loop(
     and where no observer follows the logs or parts of them contradict one another.
     """
     report = progress or (lambda fraction, message: None)
+    refuse_few_lines(records)
     logs = _Logs.of(records)
     report(0.0, "friction: start")
     ways = [direction_of(smoothed(r.output[:, 0]), _COARSE * logs.presliding) for r in logs.records]

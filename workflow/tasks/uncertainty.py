@@ -62,6 +62,14 @@ _FEWEST_FREQUENCIES = 100
 _SHARE_INSIDE = 0.9
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 _NOISE_ORDERS = (8, 32)
+# A model of a loop's logs outside most of its own ellipses explains nothing: machines whose certificates held
+# had 87 % or more of them around their model, wrong ones 46 % or less (benchmarks.closed_loop_machines).
+_MOST = 50.0
+# So does one whose best fit to a log is below this, where the sensor's noise leaves a third of the rest at
+# most (right ones had 90 % and more, wrong ones 75 % and less), or one of no shaft: it neither integrates nor
+# has inertia.
+_EXPLAINED, _BEYOND_NOISE = 80.0, 3.0
+_NO_SHAFT = {FindingKind.INTEGRATORS, FindingKind.ANSWERS_AT_ONCE}
 T = TypeVar("T")
 
 N_BANDS = 6
@@ -111,7 +119,8 @@ def uncertainty_of(
     that acts like the dry one where they are about amplitudes.
 
     measured: SISO estimation records as recorded; friction: of the shaft, whose position the channel's output
-    is where at_shaft; equivalent: where it is known from the shaft; records: with their conditions.
+    is where at_shaft; equivalent: where it is known from the shaft; records: with their conditions. Raises
+    ValueError, one line, where the model explains nothing.
     """
     poles, options = result.model.poles, channel.embedding
     if friction is None:
@@ -156,6 +165,8 @@ def uncertainty_of(
         linear=linear,
         tests=tests,
     )
+    if observer or (result.closed_loop is not None and result.closed_loop.kind is not FindingKind.DIRECT):
+        refuse_unexplained(result, found.agreement, friction)
     advice = residual_advice(
         *tests,
         noise_order=found.noise_order,
@@ -268,6 +279,30 @@ def refuse_unanswered(result: IdentifiedChannel, posterior: ResponsePosterior, o
         raise ValueError(
             f"the output '{result.output}' does not answer to the input '{result.input}': "
             f"{words(wrapped[0]) if wrapped else why}"
+        )
+
+
+def refuse_unexplained(
+    result: IdentifiedChannel, agreement: NominalAgreement, friction: FrictionFit | None
+) -> None:
+    """Raises ValueError, one line, where the model of logs made in a loop explains nothing, so that no number
+    of it means anything. friction: of the fit, None where none was identified."""
+    found = result.identification
+    best = max(*found.fit_percent.tolist(), *(fit.fit_percent for fit in result.fresh), 0.0)
+    kinds, why = {warning.kind for warning in found.warnings}, ""
+    if agreement.share_inside_percent < _MOST:
+        outside, at = 100 - agreement.share_inside_percent, agreement.at_rad_s
+        why = f"it lies outside {outside:.0f} % of its own ellipses, most near {at:.3g} rad/s"
+    elif friction is not None and best < _EXPLAINED and found.noise_std > _BEYOND_NOISE * friction.noise_std:
+        times = found.noise_std / friction.noise_std
+        why = f"its best fit to one is {best:.0f} %, and it leaves {times:.0f} times the sensor's noise"
+    elif friction is not None and kinds >= _NO_SHAFT:
+        why = "the motion comes before its command; was the command logged late?"
+    if why:
+        instead = "" if friction is None else "set response = 'as recorded', or "
+        raise ValueError(
+            f"no model of '{result.output}' explains these logs: {why}; check what changes between the logs "
+            f"(load, filter, time stamps), {instead}record others: flexlink excite --closed-loop LOG..."
         )
 
 
