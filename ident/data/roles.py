@@ -72,6 +72,15 @@ def roles_of(table: Table, log: str, command: str = "identify", **stated: str | 
     )
     if input_ is not None and output is not None and input_ != output and not wished:
         return Roles(time, input_, output)
+    for role, found, unit, word in (("input", inputs, _DRIVEN, _INPUT), ("output", outputs, _MOVED, _OUTPUT)):
+        still = [name for name in table.names if name not in moving and _says(table, name, unit, word)]
+        still = [name for name in still if not is_time(table, name) and not _is_wished(table, name)]
+        if still and not found and not stated.get(role):
+            raise ValueError(
+                f"{table.path}: '{shown(still[0], 30)}' stands still, so that nothing can be identified from "
+                f"this log; leave it out, or name the {role} if it is another column: flexlink {command} "
+                f"{log} --{role} NAME"
+            )
     listed = shown(", ".join(shown(name, 30) for name in table.names), 90)
     if outputs and not inputs and not stated.get("input") and set(rest) <= {*outputs, *wished}:
         raise ValueError(

@@ -284,6 +284,52 @@ def test_the_reported_log_becomes_a_controller_without_an_edit(flexlink, tmp_pat
     assert mode.damping[0] - 5e-5 < 0.0496 < mode.damping[1] + 5e-5
 
 
+@pytest.mark.slow
+def test_the_axis_of_emps_becomes_a_controller(refused, flexlink, tmp_path, flexlink_data):
+    """Against its published model: 95.1089 kg, 203.5034 N s/m, 20.3935 N, 35.15065188 N/V."""
+    out = tmp_path / "my.toml"
+    line = refused("init", flexlink_data / "emps" / "emps_train.csv", "--out", out)
+    assert flexlink(*shlex.split(line.split("type: flexlink ")[1]), "--out", out).code == 0
+    answer = flexlink("run", "--config", out, "--out", tmp_path / "out", "--json")
+    assert answer.document()["certified"]
+    results = RunResults(RunDirectory.open(tmp_path / "out"))
+    # Our own inverse dynamics of the record: 20.4 N, 95.1 kg; measured here 20.1 N, 2.15 1/s, 93.7 kg.
+    assert 35.15065 * results.identify.friction.level == pytest.approx(20.39, rel=0.03)
+    model = results.identify.channels[0].model
+    assert not model.poles.pairs.size
+    slowest = -np.log(np.max(model.poles.real[model.poles.real < 1])) / model.dt_s
+    assert slowest == pytest.approx(203.5034 / 95.1089, rel=0.03)
+    s = 1j * np.array([5.0, 10.0, 20.0])
+    published = np.abs(35.15065 / (s * (95.1089 * s + 203.5034)))
+    assert np.abs(model.frequency_response(s.imag)) == pytest.approx(published, rel=0.05)
+
+
+def test_the_notch_of_the_ruler_robot(flexlink, tmp_path, flexlink_data):
+    """The strip with the hub held rings at 2.52 Hz: there the hub does not answer to its drive."""
+    sweeps = [flexlink_data / "slfr_krauss_2009" / f"swept_sine_amp50_rep{k}.csv" for k in (1, 2, 3)]
+    answer = flexlink("init", *sweeps, "--out", tmp_path / "my.toml", "--json")
+    seen = answer.document()["numbers"]["seen"]
+    assert seen["first_mode"] is None  # the motor damps it
+    assert seen["notch_rad_s"] / (2 * np.pi) == pytest.approx(2.52, rel=0.03)
+    wanted = load_config(tmp_path / "my.toml")[0].specification
+    assert wanted.bandwidth_rad_s < seen["notch_rad_s"] / 2.5
+
+
+@pytest.mark.slow
+def test_one_move_of_two_coupled_links_asks_for_another_experiment(
+    refused, flexlink, tmp_path, flexlink_data
+):
+    """20 s of smoothed steps, of which the response shows up to 1.2 Hz: the first mode is at 2.7 Hz."""
+    log, out = flexlink_data / "quanser_2dsfl" / "lqr_run.csv", tmp_path / "my.toml"
+    line = refused("init", log, "--out", out)
+    assert flexlink(*shlex.split(line.split("type: flexlink ")[1]), "--out", out).code == 0
+    line = refused("run", "--config", out, "--out", tmp_path / "out")
+    assert "response = 'as recorded'" in line
+    text = out.read_text().replace('"without friction"', '"as recorded"')
+    out.write_text(text + '\n[closed_loop_data]\nmethod = "two_stage"\n')
+    assert "flexlink excite --closed-loop" in refused("run", "--config", out, "--out", tmp_path / "out")
+
+
 def test_a_reference_planned_for_the_loop_keeps_its_limits_on_the_machine(flexlink, tmp_path, signals):
     """Played on the machine that made the logs: within 15 % of what is expected, as friction bends it."""
     logs = write(tmp_path, signals, ("t_s", "ref_rad", "u_A", "y_rad"))

@@ -31,6 +31,7 @@ from workflow.tasks.summary import RunSummary
 from workflow.text.templates import environment, rows_of
 
 _SHORT = 60  # letters of a log's name
+_NEARLY_ALL = 0.99  # rows of a held log: one may be missing
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ class Found:
     time_unit_stated: bool
     repair: bool
     resample_s: float | None
+    repeats: int
     decimal: str | None
     unwrap: Mapping[str, float]
     scale: Mapping[str, float]
@@ -126,6 +128,7 @@ def init(
         time_unit is not None and roles.time is not None,
         how["repair"],
         how["resample_s"],
+        read.repeats,
         decimal,
         how["unwrap"],
         scaled,
@@ -148,12 +151,14 @@ def init(
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """One channel of logs as read. how: the settings of `Record.from_file`; unit_of: input and output."""
+    """One channel of logs as read. how: the settings of `Record.from_file`; unit_of: input and output;
+    repeats: rows of the logs that are alike, one after the other, 1 where each is its own."""
 
     roles: Roles
     how: dict[str, Any]
     unit_of: dict[str, str]
     records: list[Record]
+    repeats: int
 
 
 def read_channel(
@@ -205,11 +210,20 @@ def read_channel(
         "resample_s": max(steps, default=None),
         "unwrap": dict(unwrap or {}) or _wrapping(tables, roles.output),
     }
-    records = []
-    for table in tables:
-        with naming(str(table.path)):
-            record = Record.from_file(table, [roles.input], [roles.output], **how)
-            records.append(record if input_limit is None else record.limited(input_limit))
+
+    def taken() -> list[Record]:
+        found = []
+        for table in tables:
+            with naming(str(table.path)):
+                record = Record.from_file(table, [roles.input], [roles.output], **how)
+                found.append(record if input_limit is None else record.limited(input_limit))
+        return found
+
+    records = taken()
+    repeats = min(_repeats(record) for record in records)
+    if repeats > 1 and not steps:
+        how["resample_s"] = float(f"{repeats * records[0].dt_s:.9g}")
+        records = taken()
     for record in records:
         refuse_constant_input(record)
     records = with_common_sampling_time(records)
@@ -217,7 +231,16 @@ def read_channel(
         name: (units or {}).get(name, "" if name in (scale or {}) else tables[0].unit(name))
         for name in (roles.input, roles.output)
     }
-    return Channel(roles, how, unit_of, records)
+    return Channel(roles, how, unit_of, records, repeats if not steps else 1)
+
+
+def _repeats(record: Record) -> int:
+    """Rows after which a logger that is faster than the controller writes new ones; 1 where it is not."""
+    columns = [record.input, record.output, *([] if record.reference is None else [record.reference])]
+    changes = np.flatnonzero(np.any(np.diff(np.hstack(columns), axis=0) != 0, axis=1))
+    gaps = np.diff(changes)
+    usual = int(np.median(gaps)) if gaps.size else 1
+    return usual if usual > 1 and np.mean(gaps % usual == 0) > _NEARLY_ALL else 1
 
 
 def configuration(found: Found, records: Sequence[Entry]) -> str:
@@ -287,6 +310,7 @@ def _numbers(found: Found) -> dict[str, Any]:
         "roles": codec.plain(found.roles),
         "told_rad_s": codec.plain(look.told_rad_s),
         "first_mode": codec.plain(look.mode),
+        "notch_rad_s": look.notch,
         "motion": codec.plain(look.motion),
         "delay_samples": look.delay,
         "turned": look.turned,

@@ -10,12 +10,19 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from diagnosis.machine.quantisation_grid import grid_step
-from ident.checks.input_checks import clipped_share
+from ident.checks.input_checks import clipped_share, refuse_few_lines
 from ident.data.record import Record
-from workflow.tasks.first_look import FirstLook, first_look, from_reference, told_response
+from ident.friction import recorded_in_loop
+from workflow.tasks.first_look import (
+    FirstLook,
+    first_look,
+    from_reference,
+    told_response,
+    unseen_limit,
+)
 from workflow.tasks.loop_sensitivity import rms_of
 
-# Of the first mode, or of the highest frequency that the logs tell: the bandwidth that is asked for, and the
+# Of the first mode or notch, or of the highest frequency that the logs tell: the bandwidth that is asked for, and the
 # one that is asked for at least.
 _PART, _LEAST_PART = 3, 30
 _ORDER = 5
@@ -28,13 +35,16 @@ _FITTED, _FEWEST = 0.7, 1000
 _MORE = 3.0
 # Both ends of the command stand at one limit within this.
 _SAME_LIMIT = 1e-3
+# A limit that the motion shows is known to this share.
+_SAME_DIGITS = 5e-3
 
 
 @dataclass(frozen=True)
 class Draft:
-    """look: at the records that are fitted. fitted, validates: samples of one log that is split, else None.
-    limit: at which commands stand in the logs, else the largest command, and whether it was `clipped`.
-    step: of the output's quantisation, 0 without one. specification: keys of [specification].
+    """look: at the records that are fitted. split_sample: of one log that is split, else None. limit: as
+    stated, or at which commands stand in the logs (`clipped`) or were cut after they were logged (`unseen`),
+    else the largest command. step: of the output's quantisation, 0 without one. specification: keys of
+    [specification].
     reference_step: half the rms motion, or, beside an unstable pole, what the effort limit answers with the
     largest command."""
 
@@ -43,6 +53,7 @@ class Draft:
     split_sample: int | None
     limit: float
     clipped: bool
+    unseen: bool
     step: float
     specification: Mapping[str, Any]
     reference_step: float
@@ -57,12 +68,20 @@ class Draft:
 
 def draft_of(records: Sequence[Record], *, position: bool, limit: float | None = None) -> Draft:
     """Of SISO records of one sampling time, of which the last validates; of one the last part, where that is
-    honest. limit: of the amplifier, if it is known."""
+    honest. limit: of the amplifier, if it is known. Raises ValueError, one line, where the logs of a loop
+    excite few frequencies."""
     fitted = list(records[:-1]) or list(records)
+    if all(record.reference is not None for record in fitted) or recorded_in_loop(fitted):
+        refuse_few_lines(fitted)
     look = first_look(fitted, position=position)
     highest = max(float(np.max(np.abs(record.input))) for record in records)
-    at_limit = _limit(records)
-    reached = limit or at_limit or highest
+    at_limit, unseen = _limit(records), None
+    if limit is None and at_limit is None:
+        unseen = unseen_limit(look, position=position)
+    if unseen is not None:
+        unseen = _of_a_data_sheet(unseen)
+        look = first_look([record.limited(unseen) for record in fitted], position=position)
+    reached = limit or at_limit or unseen or highest
     spread = _moved(fitted, look)
     # A step of half the spread may ask for the largest command, and the loop for more than the recorded one.
     effort = max(reached / (0.5 * spread) if spread > 0 else 1.0, _MORE * recorded_effort(look.records))
@@ -72,7 +91,8 @@ def draft_of(records: Sequence[Record], *, position: bool, limit: float | None =
         position,
         _split(records[0]) if len(records) == 1 else None,
         reached,
-        limit is not None or at_limit is not None,
+        at_limit is not None,
+        unseen is not None,
         grid_step([record.output[:, 0] for record in records], np.finfo(np.float64).tiny),
         _specification(look, effort, reached, unstable),
         _rounded(reached / effort if unstable or not spread > 0 else 0.5 * spread),
@@ -109,6 +129,12 @@ def _limit(records: Sequence[Record]) -> float | None:
     return high if abs(high + low) <= _SAME_LIMIT * high else None
 
 
+def _of_a_data_sheet(limit: float) -> float:
+    """The same with as few digits as the logs allow."""
+    rounded = [float(f"{limit:.{digits}g}") for digits in (1, 2, 3)]
+    return next((value for value in rounded if abs(value / limit - 1) < _SAME_DIGITS), limit)
+
+
 def _split(record: Record) -> int | None:
     """First sample of the part of one log that validates; None where a part would be too short or still."""
     at = round(_FITTED * record.n_samples)
@@ -134,7 +160,7 @@ def _specification(look: FirstLook, effort: float, limit: float, unstable: float
     """Requirements that leave the bandwidth to what the identified arm allows; not with an unstable pole."""
     dt_s = look.records[0].dt_s
     highest = look.told_rad_s[1] if look.told_rad_s else 0.05 * np.pi / dt_s
-    base = look.mode[0] if look.mode else highest
+    base = look.mode[0] if look.mode else look.notch or highest
     bandwidth = _BEYOND_UNSTABLE * unstable if unstable else base / _PART
     return {
         "bandwidth_rad_s": _rounded(bandwidth),

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 from scipy.signal import butter, sosfiltfilt
 
 from ident.basis.model import GobfModel
@@ -33,6 +34,9 @@ _EXCITED, _ABOVE_FLOOR = 1e-6, 10.0
 # A term of the motion is there with so many standard deviations, and this share of the rms command below; a
 # spring with a larger one, as slow drift and the sensor's own errors look like a weak one.
 _SURE, _WORTH, _SPRING = 5.0, 0.01, 0.04
+# A limit that the command has without showing it: clipped there, so much less of it stays unexplained. Tried
+# first at these quantiles of the command.
+_LESS, _LIMITS = 0.25, (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.93, 0.96, 0.98)
 # Distance from one of the response times the force that the rigid motion takes, in the median: dry friction
 # makes up to this of it where it is as large as that force.
 _AGREES = 0.8
@@ -105,17 +109,30 @@ class RigidMotion:
 @dataclass(frozen=True, eq=False)
 class FirstLook:
     """told_rad_s: lowest and highest frequency at which the response is told. model: None where nothing
-    explains it. mode: natural frequency [rad/s] and damping ratio of the first. delay: fewest samples that
-    the response allows. turned: the output falls when the command is positive; records and model have the
-    command with its sign changed then."""
+    explains it. mode: natural frequency [rad/s] and damping ratio of the first; notch: frequency [rad/s] of
+    the slowest lightly damped zero. delay: fewest samples that the response allows. turned: the output falls
+    when the command is positive; records and model have the command with its sign changed then."""
 
     records: tuple[Record, ...]
     told_rad_s: tuple[float, float] | None = None
     model: GobfModel | None = None
     motion: RigidMotion | None = None
     mode: tuple[float, float] | None = None
+    notch: float | None = None
     delay: int = 0
     turned: bool = False
+
+    @property
+    def rigid_below_rad_s(self) -> float | None:
+        """Below it no mode can be: the rigid motion explains the command there."""
+        told = self.motion is not None and self.motion.explained > _EXPLAINED and not self.motion.sprung
+        return self.motion.below_rad_s if self.motion is not None and told else None
+
+    @property
+    def rigid(self) -> bool:
+        """As far up as the logs tell."""
+        bare = self.model is not None and not self.model.poles.pairs.size and self.notch is None
+        return bare and self.rigid_below_rad_s is not None
 
 
 def first_look(records: Sequence[Record], *, position: bool) -> FirstLook:
@@ -141,14 +158,42 @@ def first_look(records: Sequence[Record], *, position: bool) -> FirstLook:
         response = replace(response, centre=-response.centre)
     sprung = motion is not None and motion.sprung
     integrators = int(position and not sprung)
+    look = FirstLook(cut, told, motion=motion, turned=turned)
     bounds: dict[str, float] = {}
-    if motion is not None and motion.explained > _EXPLAINED and not sprung:
-        # No mode below, and no pole that is slower than the logs tell.
-        bounds = {"omega_min_rad_s": motion.below_rad_s, "decay_min_per_s": _SLOWEST * told[0], "max_real": 1}
+    if look.rigid_below_rad_s is not None:
+        # No pole either that is slower than the logs tell.
+        slowest = _SLOWEST * told[0]
+        bounds = {"omega_min_rad_s": look.rigid_below_rad_s, "decay_min_per_s": slowest, "max_real": 1}
     found, delay = _delayed(response, _fitted(response, integrators, **bounds), integrators, bounds)
-    model = None if found is None else found.model
-    mode = _first_mode(model, told, 0.0 if motion is None else motion.below_rad_s)
-    return FirstLook(cut, told, model, motion, mode, delay, turned)
+    if found is None:
+        return look
+    above = max(told[0], 0.0 if motion is None else motion.below_rad_s)
+    notch = next((float(omega) for omega in _notches(found.model) if above < omega < told[1]), None)
+    mode = _first_mode(found.model, above, told[1])
+    return replace(look, model=found.model, mode=mode, notch=notch, delay=delay)
+
+
+def unseen_limit(look: FirstLook, *, position: bool) -> float | None:
+    """The limit at which an amplifier cut the command after it was logged: with the command clipped there,
+    the rigid motion explains it. None where there is none."""
+    motion, told = look.motion, look.told_rad_s
+    if motion is None or told is None:
+        return None
+
+    def left(limit: float) -> float:
+        """Power of the command that the motion leaves, of the clipped command's."""
+        clipped = [replace(one, input=np.clip(one.input, -limit, limit)) for one in look.records]
+        found = rigid_motion(clipped, motion.below_rad_s, told[1], position=position)
+        return np.inf if found is None else 1 - found.explained
+
+    size = np.abs(np.concatenate([record.input[:, 0] for record in look.records]))
+    limits = np.quantile(size, _LIMITS)
+    lefts = [left(float(limit)) for limit in limits]
+    k = int(np.argmin(lefts))
+    if not lefts[k] < _LESS * (1 - motion.explained):
+        return None
+    around = float(limits[max(k - 1, 0)]), float(limits[min(k + 1, limits.size - 1)])
+    return float(minimize_scalar(left, bounds=around, method="bounded", options={"maxiter": 12}).x)
 
 
 def _less_friction(record: Record, level: float, below_rad_s: float, position: bool) -> Record:
@@ -223,7 +268,8 @@ def _fitted(response: FrequencyUncertainty, integrators: int, **known: float) ->
     options = {
         "integrators": integrators,
         "max_real": 2,
-        "max_pairs": 3,
+        # Twice as many numbers measured as fitted: fewer lines draw any mode.
+        "max_pairs": min(3, max(0, (response.omega_rad_s.size - 5) // 4)),
         "evaluations": 100,
         "starts": 2,
     } | known
@@ -265,21 +311,21 @@ def _delayed(
     return fits[delay], delay
 
 
-def _swinging(model: GobfModel) -> RealArray:
-    """Natural frequencies [rad/s] of lightly damped poles and zeros, ascending."""
+def _notches(model: GobfModel) -> RealArray:
+    """Natural frequencies [rad/s] of lightly damped zeros, ascending."""
     zeros = np.asarray(model.zeros())
     s = np.log(zeros[(np.imag(zeros) > 0) & (np.abs(zeros) > 0)]) / model.dt_s
-    notches = np.abs(s)[np.abs(np.real(s)) < _SWINGS * np.abs(s)]
+    return np.sort(np.abs(s)[np.abs(np.real(s)) < _SWINGS * np.abs(s)])
+
+
+def _swinging(model: GobfModel) -> RealArray:
+    """Natural frequencies [rad/s] of lightly damped poles and zeros, ascending."""
     peaks = model.poles.omega_rad_s(model.dt_s)[model.poles.zeta() < _SWINGS]
-    return np.sort(np.concatenate([notches, peaks]))
+    return np.sort(np.concatenate([_notches(model), peaks]))
 
 
-def _first_mode(
-    model: GobfModel | None, told: tuple[float, float], rigid_rad_s: float
-) -> tuple[float, float] | None:
+def _first_mode(model: GobfModel, above_rad_s: float, told_rad_s: float) -> tuple[float, float] | None:
     """The slowest pair that swings, shows, and is no motion of the rigid machine on a spring."""
-    if model is None:
-        return None
     z, zeros = model.poles.pairs, np.asarray(model.zeros())
     omega, zeta = model.poles.omega_rad_s(model.dt_s), model.poles.zeta()
     found = None
@@ -288,7 +334,7 @@ def _first_mode(
         at = np.exp(1j * omega[k] * model.dt_s)
         nearest = min(np.abs(zeros - z[k]), default=np.inf) if zeros.size else np.inf
         left = min(nearest, abs(z[k] - z[k].conj())) / abs(at - z[k])
-        inside = max(told[0], rigid_rad_s) < omega[k] < 1.2 * told[1]
+        inside = above_rad_s < omega[k] < 1.2 * told_rad_s
         if 1.05 * _LEAST_DAMPING < zeta[k] < _SWINGS and inside and left > _PROMINENT:
             found = float(omega[k]), float(zeta[k])
     return found

@@ -1,0 +1,260 @@
+"""Closed-loop logs that cannot carry a model, or look as if they could not: one line with the next step, or
+the right answer; never a traceback, never a wrong model.
+
+The machine is two inertias on a spring with dry friction, from the independent simulator of
+`benchmarks.closed_loop_machines`. What is taken is run up to its design, and compared with the truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from benchmarks.closed_loop_machines.judge import read_law, violations
+from benchmarks.closed_loop_machines.simulator import Law, Plant, response
+from workflow.engine.errors import InputError
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks import pipeline
+from workflow.tasks.results import RunResults
+
+DT_S, PERIOD = 0.004, 1500
+MOTOR, LOAD, ANTIRESONANCE, TORQUE, COULOMB = 2e-3, 5e-3, 2 * np.pi * 5.0, 0.6, 0.03
+REACHED = "its design is reached"
+COLUMNS = {"t_s": "t", "ref_rad": "r", "i_cmd_A": "u", "enc_rad": "y"}
+NO_REFERENCE = {name: key for name, key in COLUMNS.items() if key != "r"}
+
+
+def plant(*, load=LOAD, limit=np.inf, stiction=COULOMB, count=2 * np.pi / 16384):
+    stiffness = LOAD * ANTIRESONANCE**2
+    damping = 0.1 * np.sqrt(stiffness / (1 / MOTOR + 1 / LOAD))
+    friction = np.array([[COULOMB, stiction, 0.05, 0, 0], [0, 0, 1, 0, 0]])
+    return Plant(
+        np.array([MOTOR, load]), np.array([4e-3, 0]), np.zeros(2), np.array([[0, 1, stiffness, damping, 0]]),
+        friction, np.zeros(3), TORQUE, 0, 1.0, DT_S, 1, count, limit,
+    )  # fmt: skip
+
+
+def pid(p=1.0, d=0.06, i=0.0):
+    """u = p e + d de/dt (over 6 ms) + i times the integral of e."""
+    keep = np.exp(-DT_S / 0.006)
+    steep, one = d * (1 - keep) / DT_S, np.array([1.0, -1.0])
+    b = np.array([(1 - keep) * one, i * DT_S * one])
+    return Law(np.diag([keep, 1.0]), b, np.array([-steep, 1.0]), (p + steep) * one, np.zeros(2))
+
+
+def multisine(rng, rms):
+    lines = np.arange(2, round(25 * PERIOD * DT_S))
+    spectrum = np.zeros(PERIOD // 2 + 1, complex)
+    spectrum[lines] = np.exp(2j * np.pi * rng.random(lines.size)) / np.hypot(1, lines / (2 * PERIOD * DT_S))
+    signal = np.fft.irfft(spectrum, PERIOD)
+    return np.tile(rms * signal / signal.std(), 3)
+
+
+def log(seed, rms=0.2, *, machine=None, law=None, reference=None, noise=0.0):
+    """The last two of three periods: t, r, u, y and `applied`, the command behind the amplifier's limit."""
+    rng = np.random.default_rng(seed)
+    r = multisine(rng, rms) if reference is None else reference
+    got = (machine or plant()).run(law or pid(), r, 0.0, noise * rng.standard_normal(r.size))
+    late = {name: got[name][PERIOD:] for name in ("u", "y")}
+    limit = np.inf if machine is None else machine.limit
+    r = r[PERIOD:]
+    return {"t": np.arange(r.size) * DT_S, "r": r, **late, "applied": np.clip(late["u"], -limit, limit)}
+
+
+def logs(*, levels=(0.2, 0.1, 0.15), **how):
+    return [log(k, rms, **how) for k, rms in enumerate(levels, 1)]
+
+
+def written(folder, made, columns=COLUMNS):
+    paths = []
+    for k, one in enumerate(made, 1):
+        paths.append(folder / f"run{k}.csv")
+        table = np.column_stack([one[key] for key in columns.values()])
+        np.savetxt(paths[-1], table, "%.7g", delimiter=",", header=",".join(columns), comments="")
+    return paths
+
+
+@pytest.fixture
+def up_to_design(monkeypatch):
+    """`flexlink run` ends before its design."""
+
+    def stop(stage):
+        raise InputError(REACHED)
+
+    stages = [replace(one, run=stop) if one.name == "design" else one for one in pipeline.STAGES]
+    monkeypatch.setattr(pipeline, "STAGES", tuple(stages))
+
+
+@pytest.fixture
+def taken(flexlink, tmp_path, up_to_design):
+    """Results of `init` and `run` on logs that have to be taken."""
+
+    def run(paths):
+        assert flexlink("init", *paths, "--out", tmp_path / "my.toml").code == 0
+        answer = flexlink("run", "--config", tmp_path / "my.toml", "--out", tmp_path / "out")
+        assert REACHED in answer.err, answer.err
+        return RunResults(RunDirectory.open(tmp_path / "out"))
+
+    return run
+
+
+@pytest.fixture
+def line(flexlink, tmp_path, up_to_design):
+    """The one line with which `init`, or else `run` on what it wrote, refuses logs."""
+
+    def ask(paths):
+        answer = flexlink("init", *paths, "--out", tmp_path / "my.toml")
+        if answer.code == 0:
+            answer = flexlink("run", "--config", tmp_path / "my.toml", "--out", tmp_path / "out")
+        assert answer.code == 2, answer
+        assert answer.out == "" or "my.toml" in answer.out
+        assert answer.err.count("\n") == 1, answer.err
+        assert REACHED not in answer.err
+        return answer.err
+
+    return ask
+
+
+def assert_right(results, *, share=0.02, friction=0.02):
+    """First mode, friction and response between .5 and 25 Hz are the true ones, within so much."""
+    channel, machine = results.uncertainty.channels[0], plant()
+    a, b, c = machine.sampled()
+    pole = max(np.linalg.eigvals(machine.linear()[0]), key=np.imag)
+    model = results.identify.channels[0].model
+    (omega,) = model.poles.omega_rad_s(DT_S)
+    assert omega == pytest.approx(abs(pole), rel=share)
+    assert results.identify.friction.level == pytest.approx(COULOMB / TORQUE, rel=friction)
+    at = np.geomspace(3, 150, 100)
+    error = channel.posterior.at(at).centre / response(a, b, c, at, DT_S) - 1
+    assert np.median(np.abs(error)) < share
+
+
+@pytest.mark.slow
+def test_two_controllers_are_taken(taken, tmp_path):
+    made = [log(1), log(2, law=pid(1.5, 0.08)), log(3, 0.15, law=pid(0.7, 0.05)), log(4, 0.12)]
+    # Measured: .03 % of the response.
+    assert_right(taken(written(tmp_path, made)))
+
+
+@pytest.mark.parametrize("turned", ["u", pytest.param("y", marks=pytest.mark.slow)])
+def test_a_turned_sign_is_turned_back(taken, tmp_path, turned):
+    made = [{**one, turned: -one[turned]} for one in logs(levels=(0.2, 0.15))]
+    assert_right(taken(written(tmp_path, made)))
+
+
+@pytest.mark.parametrize("column", ["u", pytest.param("applied", marks=pytest.mark.slow)])
+def test_a_limit_of_the_amplifier_is_seen_before_and_after_it(taken, tmp_path, column):
+    made = logs(levels=(0.2, 0.15, 0.2), machine=plant(limit=0.5))
+    results = taken(written(tmp_path, made, COLUMNS | {"i_cmd_A": column}))
+    assert_right(results)
+    assert "input_limit = 0.5" in (tmp_path / "my.toml").read_text()
+
+
+@pytest.mark.slow
+def test_a_noisy_sensor_without_a_reference_widens(taken, tmp_path):
+    """Noise a tenth of the motion: measured 1.6 % of the response, 3 % of the friction."""
+    assert_right(taken(written(tmp_path, logs(noise=0.02), NO_REFERENCE)), share=0.05, friction=0.1)
+
+
+@pytest.mark.slow
+def test_rows_that_a_fast_logger_repeats_are_taken_once(taken, tmp_path):
+    made = [{key: np.repeat(values, 4) for key, values in one.items()} for one in logs(levels=(0.2, 0.15))]
+    for one in made:
+        one["t"] = np.arange(one["t"].size) * DT_S / 4
+    assert_right(taken(written(tmp_path, made)))
+
+
+@pytest.mark.slow
+def test_one_log_has_its_last_part_validate(taken, tmp_path):
+    reference = np.tile(multisine(np.random.default_rng(1), 0.2), 2)
+    results = taken(written(tmp_path, [log(1, reference=reference)]))
+    assert [item.role for item in results.records.records] == ["estimation", "validation"]
+    assert_right(results)
+
+
+def sine(k):
+    return 0.1 * (1 + k) * np.sin(2 * np.pi * 1.5 * DT_S * np.arange(3 * PERIOD))
+
+
+def kick(k):
+    return np.where(np.arange(3 * PERIOD) < 100, 0.5 * k, 0.0)
+
+
+def step(k):
+    return np.where(np.arange(3 * PERIOD) > 300, 0.3 * k, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("reference", "law", "machine", "columns"),
+    [
+        (sine, pid(), plant(), COLUMNS),
+        (sine, pid(), plant(), NO_REFERENCE),
+        (kick, pid(3.0, -0.03), plant(limit=1.0), COLUMNS),
+        (kick, pid(3.0, -0.03), plant(limit=1.0), NO_REFERENCE),
+        (step, pid(1.0, 0.03, 4.0), plant(stiction=2 * COULOMB), COLUMNS),
+    ],
+    ids=["sine", "sine, no reference", "limit cycle", "limit cycle, no reference", "hunting"],
+)
+def test_few_frequencies_are_refused(line, flexlink, tmp_path, reference, law, machine, columns):
+    made = [log(k, reference=reference(k), law=law, machine=machine) for k in (1, 2, 3)]
+    paths = written(tmp_path, made, columns)
+    said = line(paths)
+    assert "sine or a limit cycle" in said
+    assert "flexlink excite --closed-loop" in said
+
+
+def test_two_references_are_asked_about(line, tmp_path):
+    made = [{**one, "s": 0.9 * one["r"]} for one in logs(levels=(0.2, 0.1))]
+    said = line(written(tmp_path, made, COLUMNS | {"soll_rad": "s"}))
+    assert "ref_rad and soll_rad may be the reference of 'enc_rad'" in said
+    assert "--reference ref_rad" in said
+
+
+def test_a_log_without_motion_is_named(line, tmp_path):
+    made = [log(k, reference=np.full(3 * PERIOD, 1e-3)) for k in (1, 2)]
+    assert "'enc_rad' stands still" in line(written(tmp_path, made))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda one, k: {"y": lfilter([0.1], [1, -0.9], one["y"])}, "no model of 'enc_rad' explains"),
+        (lambda one, k: {"u": log(10 + k)["u"]}, "'enc_rad'"),
+        pytest.param(
+            lambda one, k: {"u": np.concatenate([np.full(5, one["u"][0]), one["u"][:-5]])},
+            "logged late",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            lambda one, k: log(k, machine=plant(load=3 * LOAD)) if k == 1 else {},
+            "no model of",
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["filtered position", "command of another axis", "late command", "another load"],
+)
+def test_logs_that_contradict_an_arm_are_refused(line, tmp_path, change, said):
+    made = [one | change(one, k) for k, one in enumerate(logs())]
+    assert said in line(written(tmp_path, made))
+
+
+@pytest.mark.slow
+def test_what_is_taken_is_certified_and_holds_on_the_true_machine(flexlink, tmp_path):
+    machine = plant(limit=0.5)
+    made = [
+        log(1, machine=machine),
+        log(2, law=pid(1.5, 0.08), machine=machine),
+        log(3, 0.15, machine=machine),
+    ]
+    paths = written(tmp_path, made)
+    assert flexlink("init", *paths, "--out", tmp_path / "my.toml").code == 0
+    answer = flexlink("run", "--config", tmp_path / "my.toml", "--out", tmp_path / "out", "--json")
+    assert answer.document()["certified"]
+    results = RunResults(RunDirectory.open(tmp_path / "out"))
+    (verdict,) = results.certify.certificate.plants
+    law, delay = read_law(tmp_path / "out" / "controller.json")
+    stated = {"worst_margins": vars(verdict.worst_margins), "bandwidth_rad_s": verdict.bandwidth_rad_s}
+    assert violations(replace(plant(), delay=1 + delay), 0.0, law, stated) == []
