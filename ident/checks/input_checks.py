@@ -41,9 +41,9 @@ _DRIFT_LEVEL = 1e-5
 _AS_WELL = 1.05
 # Inputs are one signal if a combination of them, each scaled to unit length, has less of the power.
 _SAME_INPUT = 1e-12
-# Of a sine in a Hann window there are 2; of 45 closed-loop machines' logs, moves among them, 10 or more; of
-# measured ones 8 or more. Hunting of an integrator against stiction had up to 7.
-_FEWEST_LINES, _WITHOUT_REFERENCE = 4.0, 8.0
+# Of a sine in a Hann window there are 2, of an integrator that hunts against stiction up to 3.3; of 45
+# closed-loop machines' logs, moves among them, 10 or more; of measured ones 8 or more.
+_FEWEST_LINES = 6.0
 # Deviations from an operating point this many times larger are lost beside it.
 _LARGE_OFFSET = 10.0
 
@@ -60,9 +60,8 @@ def refuse_few_lines(records: Sequence[Record]) -> None:
         power += own / max(float(own.sum()), np.finfo(np.float64).tiny)
     count, largest_Hz = power.sum() ** 2 / (power @ power), (1 + power.argmax()) / (shortest * dt_s)
     references = [record.reference for record in records if record.reference is not None]
-    known = len(references) == len(records)
-    still = known and not any(np.any(np.ptp(reference, axis=0)) for reference in references)
-    if count >= (_FEWEST_LINES if known else _WITHOUT_REFERENCE) and not still:
+    still = bool(references) and not any(np.any(np.ptp(one, axis=0)) for one in references)
+    if count >= _FEWEST_LINES and not still:
         return
     why = (
         f"the reference '{records[0].reference_names[0]}' of these logs stands still"

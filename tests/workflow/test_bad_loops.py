@@ -184,7 +184,7 @@ def kick(k):
 
 
 def step(k):
-    return np.where(np.arange(3 * PERIOD) > 300, 0.3 * k, 0.0)
+    return np.where(np.arange(3 * PERIOD) > 300, 0.1 * k, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def step(k):
         (sine, pid(), plant(), NO_REFERENCE),
         (kick, pid(3.0, -0.03), plant(limit=1.0), COLUMNS),
         (kick, pid(3.0, -0.03), plant(limit=1.0), NO_REFERENCE),
-        (step, pid(1.0, 0.03, 4.0), plant(stiction=2 * COULOMB), COLUMNS),
+        (step, pid(1.0, 0.06, 4.0), plant(stiction=2 * COULOMB), COLUMNS),
     ],
     ids=["sine", "sine, no reference", "limit cycle", "limit cycle, no reference", "hunting"],
 )
@@ -214,7 +214,7 @@ def test_two_references_are_asked_about(line, tmp_path):
 
 
 def test_a_log_without_motion_is_named(line, tmp_path):
-    made = [log(k, reference=np.full(3 * PERIOD, 1e-3)) for k in (1, 2)]
+    made = [log(k, reference=1e-3 * multisine(np.random.default_rng(k), 1.0)) for k in (1, 2)]
     assert "'enc_rad' stands still" in line(written(tmp_path, made))
 
 

@@ -47,6 +47,8 @@ def _next(found: LogLook) -> str:
     if found.roles is None:
         return found.unclear
     roles = found.roles
+    if roles.reference:  # made in closed loop
+        return f"flexlink init {shlex.quote(str(found.path))} --out my.toml"
     named = {"--input": roles.input, "--output": roles.output, "--time": roles.time}
     options = [f"{option} {shlex.quote(name)}" for option, name in named.items() if name]
     options += [] if roles.time else ["--dt-s SECONDS"]
