@@ -21,6 +21,7 @@ import numpy as np
 from ident.basis.functions import all_pass_signal
 from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions, IdentOptions
+from ident.checks.input_checks import refuse_few_lines
 from ident.checks.validation import fit_on_fresh_data
 from ident.data.arrays import RealArray
 from ident.data.finding import Finding, FindingKind, finding
@@ -67,13 +68,14 @@ def two_stage(
     r -> u is fitted with a direct term and as many poles as the data ask for, whatever `options` say about
     the plant; on common poles, by each record for itself, so that controllers may differ. plant: G0; default:
     that of a second stage on the direct fit. Raises ValueError when a record has not exactly one reference
-    and input.
+    and input, or where the records excite few frequencies.
 
     Noise at the plant's input reaches the output through G, far from white where G integrates: the ellipses
     then need a noise model of high order (`EmbeddingOptions.max_ar_order`).
     """
     options = options or IdentOptions()
     closed, fixed = [_reference_to_input(record) for record in records], options.fixed()
+    refuse_few_lines(records)
     poles = quick_poles(closed, options)
     first = GobfModel(poles, np.zeros(poles.order), records[0].dt_s, feedthrough=1.0)
     # Behind a noise model: what noise of high frequency moved at a low one would pass for excitation there.

@@ -198,12 +198,15 @@ def step(k):
     ],
     ids=["sine", "sine, no reference", "limit cycle", "limit cycle, no reference", "hunting"],
 )
-def test_few_frequencies_are_refused(line, flexlink, tmp_path, reference, law, machine, columns):
+def test_few_frequencies_are_refused(line, refused, tmp_path, reference, law, machine, columns):
     made = [log(k, reference=reference(k), law=law, machine=machine) for k in (1, 2, 3)]
     paths = written(tmp_path, made, columns)
     said = line(paths)
     assert "sine or a limit cycle" in said
     assert "flexlink excite --closed-loop" in said
+    if "ref_rad" in columns and np.ptp(made[0]["r"]) > 0:
+        named = "--reference", "ref_rad", "--input", "i_cmd_A", "--output", "enc_rad", "--integrators", 1
+        assert "sine or a limit cycle" in refused("identify", *paths, *named)
 
 
 def test_two_references_are_asked_about(line, tmp_path):
@@ -239,6 +242,18 @@ def test_a_log_without_motion_is_named(line, tmp_path):
 def test_logs_that_contradict_an_arm_are_refused(line, tmp_path, change, said):
     made = [one | change(one, k) for k, one in enumerate(logs())]
     assert said in line(written(tmp_path, made))
+
+
+@pytest.mark.slow
+def test_a_second_output_behind_the_friction_is_refused(flexlink, refused, tmp_path, up_to_design):
+    made = [one | {"tip": lfilter([0.3], [1, -0.7], one["y"])} for one in logs(levels=(0.2, 0.15))]
+    paths, config = written(tmp_path, made, COLUMNS | {"tip_m": "tip"}), tmp_path / "my.toml"
+    assert flexlink("init", *paths, "--out", config).code == 0
+    more = '[[channels]]\ninput = "i_cmd_A"\noutput = "tip_m"\npurpose = "performance"\n'
+    more += "[channels.identification]\nintegrators = 1\n[channels.uncertainty]\n"
+    config.write_text(f'{config.read_text()}\n{more}response = "without friction"\n')
+    said = refused("run", "--config", config, "--out", tmp_path / "out")
+    assert "leave this channel out, or give it response = 'as recorded'" in said
 
 
 @pytest.mark.slow
