@@ -35,7 +35,7 @@ ELSEWHERE = {
 CONSOLE = ["c_code.md", "which_data.md"]
 # Run as notebooks: what their pages must say, in this order.
 NOTEBOOKS = {
-    "closed_loop": r"reference_rad|first mode *│ 47|noise = \"auto\"|0.18\d* V|certified|float|<img",
+    "closed_loop": r"reference_rad|first mode *│ 4|without friction|0.18\d* V|certified|<img|controller_step",
     "engineer": r"tip_m|mode *│ 7.6|mode *│ 3[23]|no warnings|certified|float hub_step|runs/mine|<img",
     "student": r"<img|dry \(Coulomb\) friction|torque_Nm = 0.040|<img|repaired</th>\s*<td>0.0004|= 0.04$",
     "lecturer": r"<img|32.2 Hz|order 4|<img|half axis|<img|<b>Certified|tracking|is not met",
