@@ -22,8 +22,8 @@ from workflow.tasks.first_look import (
 )
 from workflow.tasks.loop_sensitivity import rms_of
 
-# Of the first mode or notch, or of the highest frequency that the logs tell: the bandwidth that is asked for, and the
-# one that is asked for at least.
+# Of the first mode or notch, or of the highest frequency that the logs tell: the bandwidth that is asked for,
+# and the one that is asked for at least.
 _PART, _LEAST_PART = 3, 30
 _ORDER = 5
 # An unstable pole has to be left behind by the bandwidth, by this factor.
