@@ -138,7 +138,7 @@ def fit_friction_in_loop(
 
     records: one input, and the position of the shaft that the friction acts on as the one output. options: of
     the search for the arm's poles; a delay that is not stated is sought. Raises ValueError as `identify`,
-    and where no observer follows the logs or parts of them contradict one another.
+    where the logs excite few frequencies, no observer follows them, or parts of them contradict one another.
     """
     report = progress or (lambda fraction, message: None)
     refuse_few_lines(records)
