@@ -43,13 +43,13 @@ _SAME_DIGITS = 5e-3
 class Draft:
     """look: at the records that are fitted. split_sample: of one log that is split, else None. limit: as
     stated, or at which commands stand in the logs (`clipped`) or were cut after they were logged (`unseen`),
-    else the largest command. step: of the output's quantisation, 0 without one. specification: keys of
-    [specification].
-    reference_step: half the rms motion, or, beside an unstable pole, what the effort limit answers with the
-    largest command."""
+    else the largest command. in_loop: a reference was recorded, or the command follows the position. step: of
+    the output's quantisation, 0 without one. specification: keys of [specification]. reference_step: half the
+    rms motion, or, beside an unstable pole, what the effort limit answers with the largest command."""
 
     look: FirstLook
     position: bool
+    in_loop: bool
     split_sample: int | None
     limit: float
     clipped: bool
@@ -71,7 +71,8 @@ def draft_of(records: Sequence[Record], *, position: bool, limit: float | None =
     honest. limit: of the amplifier, if it is known. Raises ValueError, one line, where the logs of a loop
     excite few frequencies."""
     fitted = list(records[:-1]) or list(records)
-    if all(record.reference is not None for record in fitted) or recorded_in_loop(fitted):
+    in_loop = all(record.reference is not None for record in fitted) or recorded_in_loop(fitted)
+    if in_loop:
         refuse_few_lines(fitted)
     look = first_look(fitted, position=position)
     highest = max(float(np.max(np.abs(record.input))) for record in records)
@@ -89,6 +90,7 @@ def draft_of(records: Sequence[Record], *, position: bool, limit: float | None =
     return Draft(
         look,
         position,
+        in_loop,
         _split(records[0]) if len(records) == 1 else None,
         reached,
         at_limit is not None,
