@@ -378,7 +378,10 @@ def _equations(
         nuisance = whiten(
             nuisance_columns(found.model.poles, driven.size, max(1, structure.integrators), True)
         )
-        length = np.linalg.norm(nuisance, axis=0)
+        with np.errstate(over="ignore"):  # of an observer that does not follow
+            length = np.linalg.norm(nuisance, axis=0)
+        if not np.all(np.isfinite(length)):
+            raise LostError(LOST)
         u, d, _ = np.linalg.svd(nuisance[:, length > 0] / length[length > 0], full_matrices=False)
         u = u[:, d > _NUISANCE_RANK * d.max(initial=0.0)]
         rows = rows - u @ (u.T @ rows)
