@@ -156,6 +156,7 @@ class Diagnosis:
     completeness : whether that is all.
     noise_below_stated : tuple of (output, noise, stated noise). Of an own machine whose records show less
         noise than is stated, in whose place it was counted.
+    doubts : sentences on what makes the answer doubtful, whatever the fit says (`machine.probed`).
     competing : tuple of CompetingHypothesis. Fitted explanations that contradict each other, most probable
         first, for `next_experiment`; only for a flexible link.
     shares : Shares or None. Only of a machine with a stated model error.
@@ -190,6 +191,7 @@ class Diagnosis:
     unlisted: tuple[Any, ...] = ()
     partial_model: tuple[str, ...] = ()
     noise_below_stated: tuple[tuple[str, float, float], ...] = ()
+    doubts: tuple[str, ...] = ()
     competing: tuple[CompetingHypothesis, ...] = ()
     shares: Shares | None = None
     white: Real | None = None

@@ -40,6 +40,7 @@ from diagnosis.imperfect.answered import (
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine
 from diagnosis.machine.own_plant import PlantCase
+from diagnosis.machine.probed import doubts_about
 from diagnosis.machine.rounding import Rounding, leads_over, rounding_effect
 from diagnosis.next_experiment.discrimination import (
     CompetingHypothesis,
@@ -80,11 +81,22 @@ def diagnose(
         beside a model error.
     rng : Of interval draws and bootstrap; without it a fixed sequence, so that one case has one answer.
 
-    Warns where the records of an own machine show less noise than is stated, and an effect in what that hid.
+    Warns where the records of an own machine show less noise than is stated, and an effect in what that hid,
+    and of what makes its answer doubtful (`doubts_about`, which raises ValueError where it is random).
     """
     rng = np.random.default_rng(0) if rng is None else rng
     progress = progress or (lambda fraction, message: None)
     deadline_s = time.monotonic() + _SEARCHED * time_limit_s
+    doubts = doubts_about(case, deadline_s) if isinstance(case, PlantCase) else ()
+    for doubt in doubts:
+        warnings.warn(f"plant: {doubt}", stacklevel=2)
+    return replace(_at_noise_seen(case, progress, rng, deadline_s), doubts=doubts)
+
+
+def _at_noise_seen(
+    case: CaseOfMachine, progress: Progress, rng: np.random.Generator, deadline_s: float
+) -> Diagnosis:
+    """With the noise as stated, or as the records show it where that tells more."""
     answer = _answered(case, progress, rng, deadline_s)
     if answer.verdict != "none" or not isinstance(case, PlantCase) or time.monotonic() > deadline_s:
         return answer
@@ -100,7 +112,7 @@ def diagnose(
     words = ", ".join(
         f"{name} {seen:.3g}, stated {stated:.3g}" for name, seen, stated in last.noise_below_stated
     )
-    warnings.warn(f"plant: the records show less noise than stated, which counts: {words}", stacklevel=2)
+    warnings.warn(f"plant: the records show less noise than stated, which counts: {words}", stacklevel=3)
     return last
 
 

@@ -22,6 +22,8 @@ Role = Literal["estimation", "held_out"]
 Record = TypeVar("Record", bound="RecordOfMachine")
 
 FEWEST_SAMPLES = 20
+# A search simulates every record some thousand times: more records than this take hours, however short.
+MOST_RECORDS = 500
 
 
 @dataclass(frozen=True)
@@ -148,6 +150,7 @@ class RecordedCase(ABC, Generic[Record]):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "experiments", tuple(self.experiments))
+        check_count(len(self.experiments), f"case {self.name}")
         names = [experiment.name for experiment in self.experiments]
         for name in names:
             if names.count(name) > 1:
@@ -181,6 +184,14 @@ class RecordedCase(ABC, Generic[Record]):
 
 
 CaseOfMachine = RecordedCase[Any]
+
+
+def check_count(records: int, where: str) -> None:
+    """Raises ValueError, one line: more records than a search can simulate."""
+    if records > MOST_RECORDS:
+        raise ValueError(
+            f"{where}: {records} records, at most {MOST_RECORDS}; give the longest, or those that differ most"
+        )
 
 
 def check_record(record: RecordOfMachine, output_names: Sequence[str] = ()) -> None:

@@ -43,9 +43,13 @@ _MOST_EFFECTS = 5
 # What a good model of a real machine may miss of its motion, where nobody has stated it.
 _USUAL_MODEL_ERROR = 0.05
 # In noise deviations: beyond any record, and its square is still a number.
-_RUNAWAY = 1e12
+RUNAWAY = 1e12
 # What a simulation may raise where a trial runs away; any other error is one of the simulation.
 _NUMERICAL = (ArithmeticError, RuntimeWarning, np.linalg.LinAlgError)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float, np.integer, np.floating)) and bool(np.isfinite(value))
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,11 +106,20 @@ class Plant:
             )
         if self.model_error is not None and not self.model_error >= 0:
             raise ValueError(f"plant: model_error must not be negative; got {self.model_error}")
+        for key, value in self.parameters.items():
+            if not _is_number(value):
+                raise ValueError(f"plant: parameter {key} must be a finite number; got {value!r}")
         for key, tolerance in self.tolerances.items():
             if key not in self.parameters:
                 raise ValueError(f"plant: tolerance of {key}, which is no parameter of it")
-            if not 0 < tolerance <= 10:
-                raise ValueError(f"plant: tolerance of {key} must be between 0 and 10; got {tolerance}")
+            if not _is_number(tolerance) or not 0 < tolerance <= 10:
+                raise ValueError(
+                    f"plant: tolerance of {key} must be between 0 and 10 (a share of the value); "
+                    f"got {tolerance!r}"
+                )
+        for effect in self.effects:
+            if not isinstance(effect, PlantEffect):
+                raise ValueError(f"plant: effects must be PlantEffect; got {effect!r}")
         names = [effect.name for effect in self.effects]
         for name in names:
             if names.count(name) > 1:
@@ -154,12 +167,13 @@ class Plant:
 
     def simulator(self, effects: Sequence[Change]) -> Callable[..., Real]:
         """Inputs (T, U) -> outputs (T, Y); where a trial of a fit runs away, a large finite number."""
-        far, at_rest = _RUNAWAY * self.noise, self.simulated(effects)
+        far, at_rest = RUNAWAY * self.noise, self.simulated(effects)
 
         def outputs(inputs: Real, states: Real | None = None, zeros: Real | None = None) -> Real:
             run = self.simulated(effects, states) if self.start and states is not None else at_rest
             try:
-                found = run(inputs)
+                with np.errstate(all="ignore"):  # of a trial that runs away
+                    found = run(inputs)
             except _NUMERICAL:
                 found = np.full((len(inputs), far.size), np.nan)
             return np.clip(np.where(np.isnan(found), far, found), -far, far)
@@ -190,12 +204,18 @@ class Plant:
         def told_simulation(begun: tuple[float, ...], inputs: Real) -> Real:
             start = (dict(zip(self.start, begun, strict=True)),) if self.start else ()
             try:
-                found = np.asarray(self.simulation(self.parameters, told, inputs, *start), dtype=np.float64)
+                given = self.simulation(self.parameters, told, inputs, *start)
+                if np.iscomplexobj(given):
+                    raise ValueError("complex outputs")
+                found = np.asarray(given, dtype=np.float64)
             except _NUMERICAL:
                 raise
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 reason = " ".join(f"{type(error).__name__}: {error}".split())
-                raise ValueError(f"{self._at(effects)} the simulation ended with {reason}") from error
+                raise ValueError(
+                    f"{self._at(effects)} the simulation ended with {reason}; of values it cannot take, "
+                    "return nan"
+                ) from error
             if found.ndim != 2 or len(found) != len(inputs) or found.shape[1] < self.noise.size:
                 raise ValueError(
                     f"{self._at(effects)} the simulation must give outputs "

@@ -106,7 +106,8 @@ def with_effects(
     if measured_motion is not None:
         places["input"] = None
     found = list(plant.effects)
-    chosen = _applying(plant, places) if names == "all" else names
+    own = {effect.name for effect in plant.effects}
+    chosen = [n for n in _applying(plant, places) if prefix + n not in own] if names == "all" else names
     for name in chosen:
         kind, place = KINDS[name], places[KINDS[name].where]
         if place is None or (kind.where == "input" and not sizes.input > 0):
@@ -128,7 +129,9 @@ def with_effects(
     there = {effect.name for effect in found}
     inactive = dict(plant.inactive)
     if names == "all":
-        inactive |= {prefix + n: _NEEDS[KINDS[n].where] for n in _of_all(plant) if n not in chosen}
+        inactive |= {
+            prefix + n: _NEEDS[KINDS[n].where] for n in _of_all(plant) if places[KINDS[n].where] is None
+        }
     inactive = {name: needs for name, needs in inactive.items() if name not in there}
     equipped = replace(plant, effects=tuple(found), dt_s=dt_s, inactive=inactive)
     _try(equipped, experiments[0], body)

@@ -18,6 +18,7 @@ from diagnosis import (
     with_effects,
 )
 from diagnosis.machine.machine_protocol import Weighing
+from diagnosis.machine.probed import doubts_about
 from examples import own_plant
 from plant import simulate
 from tests.diagnosis.synthetic_residuals import RIG, made, white
@@ -163,8 +164,76 @@ PLANT = Plant(
 BOTH = (GOOD, replace(GOOD, name="b", role="held_out"))
 
 
+DIFFERENT = (GOOD, replace(GOOD, name="b", role="held_out", output=GOOD.output + 1))
+
+
+def _with_offset(effects, outputs):
+    return outputs + effects.get("offset", {"y": 0.0})["y"]
+
+
 def _random(parameters, effects, inputs, rng=np.random.default_rng(0)):  # noqa: B008
     return inputs + rng.standard_normal(inputs.shape)
+
+
+def _random_beside(parameters, effects, inputs, rng=np.random.default_rng(0)):  # noqa: B008
+    return parameters["k"] * inputs + (parameters["k"] != 2.0) * rng.standard_normal(inputs.shape)
+
+
+def _left(parameters, effects, inputs):
+    raise SystemExit
+
+
+def _doubts(simulation, **how):
+    return doubts_about(PlantCase("c", replace(PLANT, simulation=simulation, **how), DIFFERENT))
+
+
+@pytest.mark.parametrize(
+    ("simulation", "how", "said"),
+    [
+        (lambda p, e, u: p["k"] * u, {}, ["offset changes no output"]),
+        (lambda p, e, u: _with_offset(e, 2.0 * u), {}, ["k changes no output"]),
+        (lambda p, e, u: _with_offset(e, p["k"] * u / (p["k"] < 2.1)), {}, ["diverges with k at 2.21"]),
+        (lambda p, e, u: _with_offset(e, u / (p["k"] > 1.9)), {}, ["diverges with k at 1.81"]),
+        (
+            lambda p, e, u: _with_offset(e, u * (1 if p["k"] < 2.1 else np.nan)),
+            {},
+            ["diverges with k at 2.21"],
+        ),
+        (lambda p, e, u: _with_offset(e, round(p["k"], 1) * u), {}, ["not smooth in k"]),
+        (lambda p, e, u: _with_offset(e, np.sin(3e4 * p["k"]) * u), {}, ["not smooth in k"]),
+        (lambda p, e, u: _with_offset(e, p["k"] * u), {"tolerances": {"k": 10.0}}, []),
+        (lambda p, e, u: _with_offset(e, p["k"] ** 3 * u), {}, []),
+        (lambda p, e, u: _with_offset(e, p["k"] * u), {"tolerances": {"k": 1.0}}, []),
+    ],
+)
+def test_what_makes_an_answer_doubtful_is_said(simulation, how, said):
+    found = _doubts(simulation, **how)
+    assert len(found) == len(said)
+    for sentence, words in zip(found, said, strict=True):
+        assert words in sentence
+
+
+def test_a_validation_record_that_was_fitted_validates_nothing():
+    plant = replace(PLANT, simulation=lambda p, e, u: _with_offset(e, p["k"] * u))
+    assert doubts_about(PlantCase("c", plant, BOTH)) == (
+        "the validation record b is the same as a: add another one",
+    )
+
+
+def test_doubts_are_in_the_answer_and_its_document():
+    case = PlantCase("c", replace(PLANT, model_error=0.05), DIFFERENT)
+    with pytest.warns(UserWarning, match="offset changes no output"):
+        found = diagnose(case)
+    assert found.doubts == doubts_about(case) != ()
+
+
+def test_an_effect_of_ones_own_stands_for_the_listed_one_of_its_name():
+    own = PlantEffect("output_offset", (EffectParameter("y", 0.1, 1.0),), signed=True)
+    plant = replace(PLANT, effects=(own,))
+    equipped = with_effects(plant, "all", [GOOD], dt_s=0.1)
+    assert equipped.effects[0] is own
+    assert [e.name for e in equipped.effects].count("output_offset") == 1
+    assert "output_drift" in {e.name for e in equipped.effects}
 
 
 def _listed(name, level=1.0, late=1, **how):
@@ -203,6 +272,20 @@ def test_only_numerical_failures_of_a_trial_are_taken_for_running_away():
         (lambda: replace(PLANT, noise=np.array([0.0])), "one noise level above zero per output"),
         (lambda: replace(PLANT, tolerances={"m": 0.1}), "tolerance of m, which is no parameter"),
         (lambda: replace(PLANT, tolerances={"k": 0.0}), "must be between 0 and 10"),
+        (lambda: replace(PLANT, tolerances={"k": 11.0}), "must be between 0 and 10"),
+        (lambda: replace(PLANT, tolerances={"k": "5 %"}), "must be between 0 and 10 .*; got '5 %'"),
+        (lambda: replace(PLANT, parameters={"k": "2"}), "parameter k must be a finite number; got '2'"),
+        (lambda: replace(PLANT, effects=("offset",)), "effects must be PlantEffect; got 'offset'"),
+        (
+            lambda: PlantCase("c", PLANT, tuple(replace(GOOD, name=f"{k}") for k in range(10_000))),
+            "case c: 10000 records, at most 500; give the longest",
+        ),
+        (
+            lambda: _doubts(_random_beside),
+            "two simulations with the same parameters, not those stated, differ",
+        ),
+        (lambda: _doubts(_left), "the simulation ended with SystemExit"),
+        (lambda: _doubts(lambda p, e, u: u * 1j), "the simulation ended with ValueError: complex outputs"),
         (lambda: PlantCase("c", replace(PLANT, effects=()), BOTH), "lists no effect"),
         (lambda: replace(PLANT, effects=PLANT.effects * 2), "listed twice"),
         (lambda: replace(PLANT, model_error=-1.0), "model_error"),

@@ -76,6 +76,11 @@ def test_a_mujoco_model_is_diagnosed_and_comes_back_repaired(tmp_path, flexlink)
         ('mjcf = "arm.xml"\nlog = "one.csv"\nmodel_err = 0.1', "did you mean model_error?"),
         ('python = "empty.py"\nlog = "one.csv"', "does not define simulate"),
         ('python = "wrong.py"\nlog = "one.csv"', "ended with NameError"),
+        ('python = "left.py"\nlog = "one.csv"', "ended with SystemExit"),
+        ('python = "list.py"\nlog = "one.csv"', "TOLERANCES must be name -> number"),
+        ('python = "gain.py"\nlog = "short.csv"', "last third validates; give more of it, or a second --log"),
+        ('python = "gain.py"\nlog = "row.csv"', "a single row of numbers"),
+        (f'python = "gain.py"\nlog = {["no.csv"] * 501}', "501 records, at most 500"),
         ('fmu = "arm.xml"\nlog = "one.csv"', "not a zip archive"),
     ],
 )
@@ -86,7 +91,15 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, text, complaint):
     (tmp_path / "arm.fmu").write_text("")
     (tmp_path / "empty.py").write_text("")
     (tmp_path / "wrong.py").write_text("nothing")
+    gain = 'INPUTS, OUTPUTS, PARAMETERS = "motor", "hinge", {"k": 2.0}\n'
+    gain += 'def simulate(p, effects, inputs):\n    return p["k"] * inputs\n'
+    (tmp_path / "gain.py").write_text(gain)
+    (tmp_path / "list.py").write_text(gain + 'TOLERANCES = ["k"]\n')
+    (tmp_path / "left.py").write_text("raise SystemExit")
     write_log(tmp_path / "one.csv", 0, 0.0)
+    for name, rows in (("short", 13), ("row", 2)):
+        lines = (tmp_path / "one.csv").read_text().splitlines()[:rows]
+        (tmp_path / f"{name}.csv").write_text("\n".join(lines))
     with pytest.raises(InputError, match=re.escape(complaint)) as raised:
         load_simulator_case(settings_of(tomllib.loads(text), "case.toml"), tmp_path, "case.toml")
     assert "\n" not in str(raised.value)

@@ -69,6 +69,7 @@ def document_of(
         "gap_after": found.gap_after,
         "noise_floor": found.noise_floor,
         "noise_below_stated": found.noise_below_stated,
+        "doubts": found.doubts,
         "held_out_decided": found.held_out_decided,
         "unlisted": [effect.to_dict() for effect in found.unlisted],
         "gap_closed": found.gap_closed,

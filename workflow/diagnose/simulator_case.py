@@ -15,7 +15,7 @@ from pydantic import Field, PositiveFloat, model_validator
 
 from diagnosis.answer import Diagnosis
 from diagnosis.machine.listed_effects import KINDS
-from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.machine_protocol import Real, check_count
 from diagnosis.machine.own_plant import Plant, PlantCase, PlantExperiment
 from diagnosis.machine.with_effects import with_effects
 from ident.data.record_files import read_table
@@ -114,6 +114,8 @@ def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) 
     model = folder / settings.model
     if not model.is_file():
         raise InputError(f"{source}: no such model file: {model}")
+    with naming(source):
+        check_count(len(settings.logs), "log")
     paths = [folder / name for name in settings.logs]
     tables = []
     for path in paths:
@@ -196,13 +198,19 @@ def _fmu(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s
 def _python(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s: float) -> Any:
     try:
         there = runpy.run_path(str(model))
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ValueError(f"ended with {type(error).__name__}: {error}") from error
     missing = [key for key in ("simulate", "PARAMETERS", "INPUTS", "OUTPUTS") if key not in there]
     if missing:
         raise ValueError(f"does not define {missing[0]}; expected simulate, PARAMETERS, INPUTS and OUTPUTS")
-    inputs, outputs = tuple(there["INPUTS"]), tuple(there["OUTPUTS"])
+    # One name without a comma behind it is no tuple.
+    inputs, outputs = (
+        (names,) if isinstance(names, str) else tuple(names) for names in (there["INPUTS"], there["OUTPUTS"])
+    )
     tolerances, effects = there.get("TOLERANCES", {}), tuple(there.get("EFFECTS", ()))
+    for key, values in (("PARAMETERS", there["PARAMETERS"]), ("TOLERANCES", tolerances)):
+        if not isinstance(values, Mapping):
+            raise ValueError(f'{key} must be name -> number, as {{"mass_kg": 1.2}}; got {values!r}')
     simulate, parameters = there["simulate"], there["PARAMETERS"]
     finish = _with_all(simulate, parameters, tolerances, effects, inputs, outputs, settings, dt_s)
     return inputs, outputs, finish
@@ -296,11 +304,13 @@ def _experiments(
         name = path.stem if [p.stem for p in paths].count(path.stem) == 1 else f"{path.stem} {k + 1}"
         if len(paths) > 1:
             role: Literal["estimation", "held_out"] = "held_out" if k == len(paths) - 1 else "estimation"
-            found.append(PlantExperiment(name, role, u, y))
+            with naming(str(path)):
+                found.append(PlantExperiment(name, role, u, y))
             continue
         cut = int(_FITTED * len(y))
-        found.append(PlantExperiment(f"{name} (first part)", "estimation", u[:cut], y[:cut]))
-        found.append(PlantExperiment(f"{name} (last part)", "held_out", u[cut:], y[cut:]))
+        with naming(f"{path}: of a single log the last third validates; give more of it, or a second --log"):
+            found.append(PlantExperiment(f"{name} (first part)", "estimation", u[:cut], y[:cut]))
+            found.append(PlantExperiment(f"{name} (last part)", "held_out", u[cut:], y[cut:]))
     return tuple(found)
 
 

@@ -1,0 +1,93 @@
+"""What a simulation of one's own does beside its stated values, before a fit relies on it."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.own_plant import RUNAWAY, Plant, PlantCase
+
+# Of a tolerance: the step of a fit's slopes, and the largest change of a value (in logarithms) looked at.
+_STEP, _FARTHEST = 1e-3, 0.5
+# Slopes over one step and over two differ by less than this share where outputs are smooth.
+_BENT = 0.5
+# Records in which a value or an effect may show.
+_RECORDS = 5
+
+
+def doubts_about(case: PlantCase, deadline_s: float = np.inf) -> tuple[str, ...]:
+    """Sentences on what makes an answer doubtful: values and effects that change nothing, values at which
+    the simulation diverges or is not smooth, records that validate nothing.
+
+    deadline_s : of time.monotonic(); what is left then is not looked at.
+
+    Raises ValueError, one line: a simulation that is random beside its stated values.
+    """
+    plant = case.plant
+    found: list[str] = []
+    inputs = [e.input for e in case.estimation[:_RECORDS]]
+    moved = plant.scaled({key: np.exp(min(t, _FARTHEST)) for key, t in plant.tolerances.items()})
+    first, second = _outputs(moved, inputs[0]), _outputs(moved, inputs[0])
+    if not np.array_equal(first, second):
+        raise ValueError(
+            f"case {case.name}: two simulations with the same parameters, not those stated, differ by up "
+            f"to {np.max(np.abs(first - second)):.3g}; make simulate a function of its arguments alone "
+            "(no random numbers, nothing kept between calls)"
+        )
+    stated = [_outputs(plant, u) for u in inputs]
+    for key, tolerance in plant.tolerances.items():
+        if time.monotonic() > deadline_s:
+            return tuple(found)
+        found += _of_value(plant, key, tolerance, inputs, stated)
+    for effect in plant.effects:
+        if effect.acts is None and time.monotonic() < deadline_s:
+            candidate = effect.candidates()[0]
+            change = candidate.effect_at(np.array(candidate.starts[-1 if effect.grows else 0]))
+            runs = zip(inputs, stated, strict=True)
+            if all(np.array_equal(plant.simulator([change])(u), y) for u, y in runs):
+                found.append(f"{effect.name} changes no output: does simulate use its argument effects?")
+    for e in case.held_out:
+        for other in case.estimation:
+            if np.array_equal(e.output, other.output):
+                found.append(f"the validation record {e.name} is the same as {other.name}: add another one")
+    return tuple(found)
+
+
+def _of_value(plant: Plant, key: str, tolerance: float, inputs: list[Real], stated: list[Real]) -> list[str]:
+    farthest = min(tolerance, _FARTHEST)
+
+    def change(by: float, k: int = 0) -> Real:
+        return _outputs(plant.scaled({key: float(np.exp(by))}), inputs[k]) - stated[k]
+
+    ends = [change(farthest), change(-farthest)]
+    lost = [
+        s
+        for s, y in zip((1, -1), ends, strict=True)
+        if np.max(np.abs(y)) > 0.5 * np.min(RUNAWAY * plant.noise)
+    ]
+    if lost:
+        at = " and ".join(f"{plant.parameters[key] * np.exp(s * farthest):.4g}" for s in lost)
+        return [f"the simulation diverges with {key} at {at}, inside its tolerance: it is not judged there"]
+    if not any(np.any(y) for y in ends):
+        if any(np.any(change(farthest, k)) for k in range(1, len(inputs))):
+            return []
+        return [f"{key} changes no output: does simulate use it, and is it other than zero?"]
+    one, two = change(_STEP * tolerance), change(2 * _STEP * tolerance)
+    bent = _rms(two - 2 * one, plant) / (2 * _STEP)
+    flat = not np.any(two) and _rms(ends[0], plant) > 1
+    if flat or (bent > 1 and _rms(two - 2 * one, plant) > _BENT * _rms(two, plant)):
+        return [
+            f"the outputs are not smooth in {key}: its re-estimated value, and sizes beside it, may be wrong"
+        ]
+    return []
+
+
+def _outputs(plant: Plant, inputs: Real) -> Real:
+    return plant.simulator(())(inputs)
+
+
+def _rms(outputs: Real, plant: Plant) -> float:
+    """Over noise."""
+    return float(np.sqrt(np.mean((outputs / plant.noise) ** 2)))
