@@ -56,17 +56,25 @@ _LONGEST_MODEL = 2**26  # bytes
 _SMOOTHED = 9  # samples, of a measured angle whose speed is asked
 # Noise deviations that the largest start of an effect has to move a record somewhere to be looked for.
 _SEEN = 3.0
+# Numbers of a file have no more digits than this.
+_NO_LEVER_M = 1e-6
 # Of the rate at which an inverted joint falls.
 _HELD = 1.5
 _KEPT, _KEPT_PATHS = 8, 60
 _UNITS = {"hinge": ("Nm", "rad", "kg_m2"), "slide": ("N", "m", "kg")}
 _STANDARD_GRAVITY = 9.81
+# Its defaults are MuJoCo's own: what an edit adds takes nothing from the default class of a model.
+_PLAIN = mujoco.MjSpec()
+_LAGS = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
+# Which numbers of an actuator's gain and bias are force, by type: fixed or none, affine, muscle.
+_FORCES = {0: (0,), 1: (0, 1, 2), 2: (2, 3)}
 
 
-def measurable(path: str) -> tuple[str, ...]:
-    """Names of joints and sensors of one number in an MJCF file."""
+def names(path: str) -> dict[str, list[str]]:
+    """Kind -> names of what an MJCF file has of it: "actuator", "sensor", "joint"."""
     spec = _read(path)
-    return tuple(dict.fromkeys(one.name for one in (*spec.sensors, *spec.joints) if one.name))
+    every = {"actuator": spec.actuators, "sensor": spec.sensors, "joint": spec.joints}
+    return {kind: [one.name for one in every[kind] if one.name] for kind in every}
 
 
 _FILES = re.compile(rb"""\b(file|(?:mesh|texture|asset)dir)\s*=\s*["']([^"'<]+)""")
@@ -141,7 +149,8 @@ class Quantity:
 class MujocoArm:
     """A model with its actuators as inputs and some of its sensors, or joints, as outputs.
 
-    spec : mujoco.MjSpec. outputs : (Y,) names of joints or of sensors of one number.
+    spec : mujoco.MjSpec. outputs : (Y,) names of sensors of one number or of joints, "joint NAME" where
+    both have the name.
     dt_s : sampling period of the records; the model takes the fewest equal steps no longer than its own.
     tracking_rad_s : how fast the simulation is drawn to the measured joints; 0 is a free run.
     """
@@ -169,27 +178,21 @@ class MujocoArm:
             raise ValueError("the model has no actuator")
         for name in self.outputs:
             if spec.sensor(name) is None:
-                if spec.joint(name) is None:
+                joint = name if spec.joint(name) is not None else name.removeprefix("joint ")
+                if spec.joint(joint) is None:
                     there = [one.name for one in (*spec.joints, *spec.sensors) if one.name]
                     raise ValueError(f"no joint or sensor is called {name!r}; there are {', '.join(there)}")
                 spec.add_sensor(
                     name=name,
                     type=mujoco.mjtSensor.mjSENS_JOINTPOS,
                     objtype=mujoco.mjtObj.mjOBJ_JOINT,
-                    objname=name,
+                    objname=joint,
                 )
         model = spec.compile()
         for name in self.outputs:
             if model.sensor(name).dim[0] != 1:
                 raise ValueError(f"sensor {name} has {model.sensor(name).dim[0]} numbers, expected one")
-        # Inertias as numbers, whatever they were made of: they are then values like any other.
-        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
-        spec.compiler.settotalmass = -1
-        for k, body in enumerate(spec.bodies):
-            if model.body_mass[k] > 0:
-                body.explicitinertial = True
-                body.mass, body.inertia = model.body_mass[k], model.body_inertia[k]
-                body.ipos, body.iquat = model.body_ipos[k], model.body_iquat[k]
+        _put_compiled(spec, model)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -286,25 +289,58 @@ class MujocoArm:
         late = partial(
             Quantity, unit=self.dt_s, span=(0.02, longest), starts=(0.2, min(20.0, longest)), group="actuator"
         )
-        yield Quantity(f"{one.name}.gain", 1.0, partial(_put_gain, one.name))
-        yield late(f"{one.name}.lag", lag, partial(_put_lag, one.name), "time_constant_s", everywhere=True)
+        if {int(one.gaintype), int(one.biastype)} <= set(_FORCES):
+            yield Quantity(f"{one.name}.gain", 1.0, partial(_put_gain, one.name))
+        if one.dyntype in _LAGS:
+            yield late(
+                f"{one.name}.lag", lag, partial(_put_lag, one.name), "time_constant_s", everywhere=True
+            )
         put = partial(_put_delay, "actuator", one.name, self.spec.option.timestep)
         yield late(f"{one.name}.delay", float(one.delay), put, "delay_s")
 
     def _of_link(self, body: Any) -> Iterator[Quantity]:
         model = self.nominal
         k = model.body(body.name).id
-        if not (body.mass > 0 and model.body_weldid[k]):
+        if not model.body_weldid[k]:
+            return
+        if model.body_weldid[k] == k and (at := self._load_place(k)):
+            put = partial(_put_payload, *at)
+            mass = float(np.sum(model.body_mass[model.body_weldid == k]))
+            yield Quantity(f"{body.name}.payload", 0.0, put, "mass_kg", mass, (1e-3, 10.0), group="link")
+        if not body.mass > 0:
             return
         yield Quantity(f"{body.name}.mass", float(body.mass), partial(_put_mass, body.name))
         # Of a link on one hinge in the world, inertia is what armature is.
         if model.body_weldid[model.body_parentid[model.body_weldid[k]]]:
             yield Quantity(f"{body.name}.inertia", 1.0, partial(_put_inertia, body.name))
-        if body.sites and k not in model.body_parentid[1:]:
-            put = partial(_put_payload, body.name, tuple(body.sites[0].pos))
-            yield Quantity(
-                f"{body.name}.payload", 0.0, put, "mass_kg", float(body.mass), (1e-3, 10.0), group="link"
-            )
+
+    def _load_place(self, k: int) -> tuple[str, tuple[float, ...]] | None:
+        """Body and place in it of a payload of link k with all that is fixed to it: the first site.
+
+        Without a site, of a last link the far end: where the line from its joint through its centre of mass
+        leaves its geoms' boxes and bodies. None: a link between others, or one that turns about its centre.
+        """
+        model, data = self.nominal, mujoco.MjData(self.nominal)
+        link = np.flatnonzero(model.body_weldid == k)
+        for site in range(model.nsite):
+            if model.site_bodyid[site] in link:
+                return model.body(model.site_bodyid[site]).name, tuple(model.site_pos[site])
+        if any(model.body_weldid[model.body_parentid[c]] == k for c in set(model.body_weldid) - {0, k}):
+            return None
+        mujoco.mj_kinematics(model, data)
+        joint = data.xanchor[model.body_jntadr[k]]
+        lever = np.average(data.xipos[link], axis=0, weights=model.body_mass[link]) - joint
+        length = float(np.linalg.norm(lever))
+        if length < _NO_LEVER_M:
+            return None
+        along = lever / length
+        far = float(np.max((np.vstack([data.xpos[link], data.xipos[link]]) - joint) @ along))
+        for g in np.flatnonzero(np.isin(model.geom_bodyid, link)):
+            turn, box = data.geom_xmat[g].reshape(3, 3), model.geom_aabb[g]
+            centre = data.geom_xpos[g] + turn @ box[:3] - joint
+            far = max(far, float(along @ centre + np.abs(along @ turn) @ box[3:]))
+        at = joint + far * along - data.xpos[k]
+        return model.body(k).name, tuple(data.xmat[k].reshape(3, 3).T @ at)
 
     def _of_sensor(self, name: str, swing: float) -> Iterator[Quantity]:
         sensor = self.spec.sensor(name)
@@ -320,25 +356,41 @@ class MujocoArm:
 
     def _sizes(self, experiments: Sequence[PlantExperiment]) -> dict[str, tuple[float, float, float]]:
         """Largest force of its actuators, travel and speed of every joint; of one not measured, of all."""
-        seen: dict[str, tuple[float, float, float]] = {}
-        for k, joint, _ in self.tracked:
-            force = position = speed = 0.0
-            for e in experiments:
-                q = e.output[:, k]
-                v = savgol_filter(q, _SMOOTHED, 2, deriv=1, delta=self.dt_s)
-                total = np.zeros(len(q))
-                for u, one in enumerate(self.spec.actuators):
-                    if one.target == joint:
-                        g, b = one.gear[0], one.biasprm
-                        total += g * (one.gainprm[0] * e.input[:, u] + b[0] + g * (b[1] * q + b[2] * v))
-                force = max(force, float(np.max(np.abs(total))))
-                position, speed = max(position, float(np.ptp(q))), max(speed, float(np.max(np.abs(v))))
-            seen[joint] = force, position, speed
+        columns = [k for k, _, _ in self.tracked]
+        joints = [self.nominal.joint(joint) for _, joint, _ in self.tracked]
+        dofs = [int(joint.dofadr[0]) for joint in joints]
+        biggest = np.zeros((len(columns), 3))
+        for e in experiments:
+            q = e.output[:, columns]
+            v = savgol_filter(q, _SMOOTHED, 2, deriv=1, delta=self.dt_s, axis=0)
+            forces = self._forces(e.input[:, : len(self.inputs)], q, v)[:, dofs]
+            here = [np.max(np.abs(forces), axis=0), np.ptp(q, axis=0), np.max(np.abs(v), axis=0)]
+            biggest = np.maximum(biggest, np.transpose(here))
+        seen = {joint.name: tuple(map(float, row)) for joint, row in zip(joints, biggest, strict=True)}
         usual = tuple(max((one[k] for one in seen.values()), default=0.0) or 1.0 for k in range(3))
         return {
             joint.name: tuple(s or u for s, u in zip(seen.get(joint.name, (0.0,) * 3), usual, strict=True))  # type: ignore[misc]
             for joint in self.spec.joints
         }
+
+    def _forces(self, commands: Real, q: Real, v: Real) -> Real:
+        """(T, DOF) what the actuators do to every joint at measured positions and speeds, without delay."""
+        spec = self.spec.copy()
+        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+        for one in spec.actuators:
+            one.delay, one.nsample = 0.0, 0
+        model = spec.compile()
+        data, joints = mujoco.MjData(model), [model.joint(joint) for _, joint, _ in self.tracked]
+        at, dofs = [j.qposadr[0] for j in joints], [j.dofadr[0] for j in joints]
+        forces = np.zeros((len(q), model.nv))
+        for k, command in enumerate(commands):
+            data.qpos[at], data.qvel[dofs], data.ctrl[:] = q[k], v[k], command
+            _start_filters(model, data, command)
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            mujoco.mj_fwdActuation(model, data)
+            forces[k] = data.qfrc_actuator
+        return forces
 
     def _commanded(
         self, simulation: Simulation, stated: Mapping[str, float], experiments: Sequence[PlantExperiment]
@@ -359,10 +411,10 @@ class MujocoArm:
         """Half the largest speed over the travel [rad/s], and enough to hold every joint against gravity."""
         model, data = self.nominal, mujoco.MjData(self.nominal)
         mujoco.mj_forward(model, data)
-        fastest = 0.0
+        fastest, sizes = 0.0, self._sizes(experiments)
         for _, name, inertia in self.tracked:
             joint = model.joint(name)
-            _, travel, speed = self._sizes(experiments)[name]
+            _, travel, speed = sizes[name]
             axis, body = data.xaxis[joint.id], joint.bodyid[0]
             pull = np.linalg.norm(np.cross(axis, model.opt.gravity)) * float(model.body_subtreemass[body])
             arm = np.linalg.norm(np.cross(axis, data.subtree_com[body] - data.xanchor[joint.id]))
@@ -411,7 +463,16 @@ class MujocoArm:
             tuple(effect for effect in missing if seen(effect)),
             model_error * self._commanded(simulation, stated, experiments),
             self.dt_s,
+            inactive=self._untried(every),
         )
+
+    def _untried(self, every: Mapping[str, Quantity]) -> dict[str, str]:
+        moving = {self.nominal.body(k).name for k in set(self.nominal.body_weldid) - {0}}
+        needs = {f"{name}.payload": f"a <site> in the body {name}, where a load may be" for name in moving}
+        for one in self.spec.actuators:
+            needs[f"{one.name}.gain"] = "an actuator whose gain is fixed, affine or a muscle's"
+            needs[f"{one.name}.lag"] = "an actuator without dynamics or with those of a filter"
+        return {name: need for name, need in sorted(needs.items()) if name not in every}
 
 
 @dataclass(frozen=True, eq=False)
@@ -445,7 +506,8 @@ class Simulation:
     def _compiled(self, spec: Any) -> tuple[Any, Any]:
         omega = self.arm.tracking_rad_s
         for _, joint, inertia in self.arm.tracked if omega else ():
-            one = spec.add_actuator(name=f"tracking {joint}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            one = spec.add_actuator(_PLAIN.default, name=f"tracking {joint}", target=joint)
+            one.trntype, one.gear = mujoco.mjtTrn.mjTRN_JOINT, np.eye(6)[0]
             one.gaintype, one.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
             one.gainprm[0] = 1.0
             one.biasprm[1], one.biasprm[2] = -inertia * omega**2, -2 * inertia * omega
@@ -473,14 +535,7 @@ class Simulation:
             if omega:
                 target = omega**2 * (path - offset[k]) + 2 * omega * speed
                 control[:, U + j] = inertia / gain[k] * target
-        if model.na:
-            data.act[:] = 0.0
-            for u in range(U):
-                if (
-                    model.actuator_actadr[u] >= 0
-                    and model.actuator_dyntype[u] != mujoco.mjtDyn.mjDYN_INTEGRATOR
-                ):
-                    data.act[model.actuator_actadr[u]] = inputs[0, u]
+        _start_filters(model, data, inputs[0, :U])
         for u in range(U):
             n = model.actuator_history[u, 0]
             if n:
@@ -513,6 +568,13 @@ class Simulation:
         return found
 
 
+def _start_filters(model: Any, data: Any, commands: Real) -> None:
+    """As if the commands had been held for long; what integrates them starts at zero."""
+    for u in range(len(commands)):
+        if model.actuator_actadr[u] >= 0 and model.actuator_dyntype[u] != mujoco.mjtDyn.mjDYN_INTEGRATOR:
+            data.act[model.actuator_actadr[u]] = commands[u]
+
+
 def _begun(q: Real, dt_s: float) -> tuple[float, float]:
     """Position and speed of the first row; at rest unless the first samples say otherwise."""
     n = min(_SMOOTHED, len(q))
@@ -525,6 +587,27 @@ def _begun(q: Real, dt_s: float) -> tuple[float, float]:
 
 def _usual_tolerance(name: str) -> float:
     return TOLERANCES.get(name.rpartition(".")[2], _ELSE)
+
+
+def _put_compiled(spec: Any, model: Any) -> None:
+    """As numbers what the compiler makes of other numbers: an edit then changes one value and no second."""
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    spec.compiler.settotalmass = -1
+    for k, body in enumerate(spec.bodies):
+        if model.body_mass[k] > 0:
+            body.explicitinertial = True
+            body.mass, body.inertia = model.body_mass[k], model.body_inertia[k]
+            body.ipos, body.iquat = model.body_ipos[k], model.body_iquat[k]
+            body.fullinertia, body.ialt.type = np.full(6, np.nan), mujoco.mjtOrientation.mjORIENTATION_QUAT
+    for k, joint in enumerate(spec.joints):
+        if np.any(joint.springdamper):
+            _put_component(joint, "stiffness", 0, model.jnt_stiffness[k])
+            _put_component(joint, "damping", 0, model.dof_damping[model.jnt_dofadr[k]])
+            joint.springdamper = np.zeros(2)
+    for k, one in enumerate(spec.actuators):
+        # Else dampratio, of which the compiler makes a damping: the spec holds it as a positive number.
+        if one.biastype == mujoco.mjtBias.mjBIAS_AFFINE:
+            one.biasprm = model.actuator_biasprm[k]
 
 
 # Each writes a value into an MjSpec once the arguments before it are bound.
@@ -552,8 +635,9 @@ def _put_component(one: Any, key: str, k: int, value: float) -> None:
 def _put_gain(name: str, spec: Any, factor: float) -> None:
     """Force of an actuator, its feedback included."""
     one = spec.actuator(name)
-    one.gainprm = np.array(one.gainprm) * np.r_[[factor] * 3, np.ones(7)]
-    one.biasprm = np.array(one.biasprm) * np.r_[[factor] * 3, np.ones(7)]
+    for key, kind in (("gainprm", one.gaintype), ("biasprm", one.biastype)):
+        for k in _FORCES[int(kind)]:
+            _put_component(one, key, k, factor * getattr(one, key)[k])
 
 
 def _put_lag(name: str, spec: Any, value: float) -> None:
@@ -581,7 +665,7 @@ def _put_inertia(name: str, spec: Any, factor: float) -> None:
     body.inertia = np.array(body.inertia) * factor
 
 
-def _put_payload(name: str, at: tuple[float, float, float], spec: Any, mass: float) -> None:
+def _put_payload(name: str, at: tuple[float, ...], spec: Any, mass: float) -> None:
     load = spec.body(name).add_body(name=f"{name} payload", pos=at)
     load.explicitinertial, load.mass, load.ipos = True, mass, np.zeros(3)
     load.inertia = np.full(3, 1e-9 * mass)
@@ -590,7 +674,10 @@ def _put_payload(name: str, at: tuple[float, float, float], spec: Any, mass: flo
 def _put_backlash(name: str, spec: Any, gap: float) -> None:
     """A second joint on the same axis that is free within the gap; armature stays at the first, the motor."""
     joint = spec.joint(name)
+    in_degrees = spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
+    gap = np.rad2deg(gap) if in_degrees else gap
     joint.parent.add_joint(
+        _PLAIN.default,
         name=f"{name} backlash",
         type=joint.type,
         axis=joint.axis,

@@ -207,3 +207,165 @@ def test_a_pipe_in_a_model_is_refused_and_not_waited_for(tmp_path, named):
     for path in (model, pipe, tmp_path / "parts"):
         with pytest.raises(ValueError, match="is no file, but a folder, pipe or device"):
             MujocoArm.from_file(str(path), outputs=("hinge",), dt_s=DT_S)
+
+
+def link(inertial: str, *, rest: str = "", joint: str = "", motor: str = '<motor name="m" joint="hinge"/>'):
+    text = f"""<mujoco>{rest}<option timestep="0.001"/><worldbody><body name="rod">
+    <joint name="hinge" axis="0 0 1" {joint}/>{inertial}</body></worldbody>
+    <actuator>{motor}</actuator></mujoco>"""
+    return MujocoArm(mujoco.MjSpec.from_string(text), ("hinge",), DT_S), mujoco.MjModel.from_xml_string(text)
+
+
+PLAIN = '<inertial pos="0.5 0 0" mass="1" diaginertia="0.01 0.05 0.05"/>'
+FLANGE = (
+    '<body name="flange" pos="1 0 0"><inertial pos="0 0 0" mass="0.5" diaginertia="0.01 0.01 0.01"/></body>'
+)
+
+
+@pytest.mark.parametrize(
+    ("inertial", "rest"),
+    [
+        ('<inertial pos="0.5 0 0.1" mass="1" fullinertia="0.02 0.05 0.06 1e-3 2e-3 3e-3"/>', ""),
+        ('<inertial pos="0.5 0 0" mass="1" diaginertia="0.03 0.05 0.06" euler="30 20 10"/>', ""),
+        ('<geom type="box" size=".5 .1 .2" pos="0.5 0 0" euler="0 30 0"/>', '<compiler settotalmass="3"/>'),
+        (f"{PLAIN}{FLANGE}", '<compiler fusestatic="true"/>'),
+        (PLAIN, '<compiler boundmass="2" boundinertia="0.04"/>'),
+    ],
+)
+def test_an_inertia_is_read_as_mujoco_reads_it_however_it_is_written(inertial, rest):
+    """Principal axes may come back in another order: compared as the inertia about the joint."""
+    arm, given = link(inertial, rest=rest)
+    mass = np.zeros(2)
+    for k, model in enumerate((given, arm.nominal)):
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        mass[k] = data.qM[0]
+    np.testing.assert_allclose(arm.nominal.body_mass, given.body_mass, rtol=1e-12)
+    np.testing.assert_allclose(mass[1], mass[0], rtol=1e-9)
+
+
+def edited(arm: MujocoArm, name: str, value: float):
+    """(the model with one value, compiled as the diagnosis simulates it; the quantity)"""
+    measured = PlantExperiment("one", "estimation", np.column_stack([steps()] * 2), steps()[:, None])
+    every = arm.quantities((measured,))
+    simulation = arm.plant((measured,), np.array([1e-4])).simulation
+    return simulation._compiled(simulation.edited({name: value}))[0], every[name]
+
+
+@pytest.mark.parametrize(
+    ("joint", "motor", "name", "value"),
+    [
+        ('springdamper="0.1 1"', "", "hinge.damping", "dof_damping"),
+        ('springdamper="0.1 1"', "", "hinge.stiffness", "jnt_stiffness"),
+        ('class="stiff"', "", "hinge.stiffness", "jnt_stiffness"),
+        ('class="stiff"', "", "hinge.armature", "dof_armature"),
+    ],
+)
+def test_a_value_that_the_compiler_or_a_class_gives_is_nominal_and_can_be_changed(joint, motor, name, value):
+    rest = '<default><default class="stiff"><joint stiffness="4" armature="0.3"/></default></default>'
+    arm, given = link(PLAIN, rest=rest, joint=joint)
+    model, quantity = edited(arm, name, 0.5)
+    assert quantity.value == pytest.approx(getattr(given, value)[0], rel=1e-12) != 0
+    assert getattr(model, value)[0] == 0.5
+
+
+@pytest.mark.parametrize("damping", ['dampratio="1"', 'kv="3"', ""])
+def test_the_gain_of_a_servo_is_its_stiffness_and_its_damping(damping):
+    """The ratio of damping stands for a number that the compiler makes of stiffness and inertia."""
+    arm, given = link(PLAIN, motor=f'<position name="m" joint="hinge" kp="40" {damping}/>')
+    model, _ = edited(arm, "m.gain", 0.25)
+    np.testing.assert_allclose(model.actuator_gainprm[0], 0.25 * given.actuator_gainprm[0])
+    np.testing.assert_allclose(model.actuator_biasprm[0], 0.25 * given.actuator_biasprm[0], rtol=1e-12)
+
+
+def test_the_gain_of_a_muscle_is_its_force():
+    """Its other numbers are lengths and speeds."""
+    arm, given = link(PLAIN, motor='<muscle name="m" joint="hinge" lengthrange="-1 1" force="30"/>')
+    model, _ = edited(arm, "m.gain", 0.5)
+    expected = np.array(given.actuator_gainprm[0])
+    expected[2] *= 0.5
+    np.testing.assert_allclose(model.actuator_gainprm[0][[0, 1, 2, 4]], expected[[0, 1, 2, 4]])
+
+
+@pytest.mark.parametrize("dyntype", ["integrator", "user"])
+def test_a_lag_is_not_tried_where_an_actuator_has_other_dynamics(dyntype):
+    arm, _ = link(PLAIN, motor=f'<general name="m" joint="hinge" dyntype="{dyntype}" dynprm="1" actdim="1"/>')
+    plant, _ = plant_of(arm, steps(), turned(steps()))
+    assert "m.lag" not in {effect.name for effect in plant.effects} | set(plant.parameters)
+    assert "m.lag" in plant.inactive
+
+
+def test_what_an_edit_adds_takes_nothing_from_the_default_class():
+    """Neither the tracking nor the joint of the backlash: limits, gears and friction are the arm's."""
+    rest = """<default><joint damping="2" armature="0.1" frictionloss="1" stiffness="3"/>
+    <general gear="7" ctrlrange="-1 1" forcerange="-2 2"/></default>"""
+    arm, _ = link(PLAIN, rest=rest)
+    arm = MujocoArm(arm.spec, ("hinge",), DT_S, tracking_rad_s=3.0)
+    model, _ = edited(arm, "hinge.backlash", 0.02)
+    assert model.actuator("tracking hinge").gear[0] == 1.0
+    assert not model.actuator("tracking hinge").ctrllimited[0]
+    assert not model.actuator("tracking hinge").forcelimited[0]
+    joint = model.joint("hinge backlash")
+    assert joint.damping[0] == joint.armature[0] == joint.frictionloss[0] == joint.stiffness[0] == 0
+    np.testing.assert_allclose(joint.range, [-0.01, 0.01])
+
+
+@pytest.mark.parametrize("angle", ["degree", "radian"])
+def test_a_gap_is_as_wide_in_the_repaired_file_as_it_was_found(angle):
+    arm, _ = link(PLAIN, rest=f'<compiler angle="{angle}"/>', joint='armature="0.1"')
+    plant, _ = plant_of(arm, steps(), turned(steps()))
+    text = arm.repaired(plant, plant, (Change("hinge.backlash", {"gap_rad": 0.02}),))
+    np.testing.assert_allclose(
+        mujoco.MjModel.from_xml_string(text).joint("hinge backlash").range, [-0.01, 0.01]
+    )
+
+
+TIP = (
+    '<body name="tip" pos="1 0 0">{}<joint name="wrist" axis="0 0 1"/><geom size="0.1" pos="0.4 0 0"/></body>'
+)
+
+
+@pytest.mark.parametrize(
+    ("inertial", "at"),
+    [
+        ('<geom type="capsule" fromto="0 0 0 0.8 0 0" size="0.02"/>', {"rod": (0.82, 0, 0)}),
+        (f"{PLAIN}{FLANGE}", {"rod": (1.0, 0, 0)}),
+        (f'{PLAIN}<body pos="0.9 0 0"><site pos="0 0 0.1"/></body>', {"rod": (0.9, 0, 0.1)}),
+        (f"{PLAIN}{TIP.format('')}", {"tip": (1.5, 0, 0)}),
+        (f'{PLAIN}<site pos="0.3 0 0"/>{TIP.format("")}', {"rod": (0.3, 0, 0), "tip": (1.5, 0, 0)}),
+    ],
+)
+def test_a_payload_is_tried_at_a_site_or_the_far_end_of_a_last_link(inertial, at):
+    """A link with what is fixed to it; a link between others without a site is listed as not tried."""
+    arm, _ = link(inertial)
+    plant, _ = plant_of(arm, steps(), turned(steps()))
+    moving = {"rod", "tip"} if "wrist" in inertial else {"rod"}
+    assert {name for name in plant.inactive if "payload" in name} == {
+        f"{n}.payload" for n in moving - set(at)
+    }
+    for name, place in at.items():
+        model, _ = edited(arm, f"{name}.payload", 0.5)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        (load,) = (k for k in range(model.nbody) if model.body(k).name.endswith("payload"))
+        np.testing.assert_allclose(data.xpos[load], place, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "drive",
+    [
+        ('<motor name="m" joint="hinge" gear="4"/>', ""),
+        (
+            '<motor name="m" tendon="t" gear="2"/>',
+            '<tendon><fixed name="t"><joint joint="hinge" coef="2"/></fixed></tendon>',
+        ),
+        ('<general name="m" joint="hinge" gainprm="4" dyntype="filter" dynprm="0.1"/>', ""),
+        ('<motor name="m" joint="hinge" gear="4" delay="0.02" nsample="30"/>', ""),
+    ],
+)
+def test_the_force_on_a_joint_is_what_its_actuators_do_whatever_lies_between(drive):
+    motor, tendon = drive
+    arm, _ = link(PLAIN, motor=f"{motor}</actuator>{tendon}<actuator>")
+    torque = steps()
+    measured = PlantExperiment("one", "estimation", np.column_stack([torque, torque]), torque[:, None])
+    assert arm._sizes((measured,))["hinge"][0] == pytest.approx(4 * np.max(np.abs(torque)), rel=1e-9)

@@ -105,6 +105,64 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, text, complaint):
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.parametrize(
+    ("motor", "hinge", "sensor", "columns", "complaint"),
+    [
+        (
+            "hinge",
+            "hinge",
+            "",
+            {"hinge": "u"},
+            'say which is which, columns = {"actuator hinge" = ..., "joint',
+        ),
+        ("hinge", "hinge", "", {"actuator hinge": "u"}, ""),
+        (
+            "u",
+            "hinge",
+            "hinge",
+            {},
+            'say which is which, columns = {"sensor hinge" = ..., "joint hinge" = ...}',
+        ),
+        ("u", "hinge", "hinge", {"joint hinge": "hinge"}, ""),
+        ("s", "hinge", "s", {"actuator s": "u", "sensor s": "speed"}, ""),
+        ("a", "a", "a", {"actuator a": "u", "sensor a": "speed", "joint a": "hinge"}, ""),
+        (
+            "motor",
+            "hinge",
+            "",
+            {"motor": "hinge"},
+            "column 'hinge' is both motor and hinge: say which of the two",
+        ),
+        ("u", "hinge", "", {"elbow": "speed"}, "no actuator, sensor or joint is called 'elbow'"),
+        ("u", "hinge", "s", {"s": "velocity"}, "has no column 'velocity' (s)"),
+    ],
+)
+def test_a_name_that_two_things_have_is_asked_for(tmp_path, motor, hinge, sensor, columns, complaint):
+    """Angle, speed and command of the log each end where they belong, or one line asks."""
+    pytest.importorskip("mujoco")
+    text = HINGE.replace('name="hinge"', f'name="{hinge}"').replace('joint="hinge"', f'joint="{hinge}"')
+    text = text.replace('"motor"', f'"{motor}"')
+    if sensor:
+        velocity = f'<sensor><jointvel name="{sensor}" joint="{hinge}"/></sensor></mujoco>'
+        text = text.replace("</mujoco>", velocity)
+    (tmp_path / "arm.xml").write_text(text)
+    write_log(tmp_path / "one.csv", 0, 0.0)
+    rows = np.loadtxt(tmp_path / "one.csv", delimiter=",", skiprows=1)
+    rows = np.column_stack([rows, np.gradient(rows[:, 2], DT_S)])
+    angle = "joint hinge" if columns == {"actuator hinge": "u"} else "hinge"
+    header = f"time_s,u,{angle},speed"
+    np.savetxt(tmp_path / "one.csv", rows, delimiter=",", header=header, comments="")
+    settings = settings_of({"mjcf": "arm.xml", "log": "one.csv", "columns": columns}, "case.toml")
+    if complaint:
+        with pytest.raises(InputError, match=re.escape(complaint)):
+            load_simulator_case(settings, tmp_path, "case.toml")
+        return
+    (first, _) = load_simulator_case(settings, tmp_path, "case.toml").case.experiments
+    assert np.array_equal(first.input[:, 0], rows[: len(first.input), 1])
+    measured = [3] * any("sensor" in c for c in columns) + [2] * (hinge == "hinge" or "joint a" in columns)
+    assert np.array_equal(first.output, rows[: len(first.output), measured])
+
+
 def test_the_command_refuses_with_exit_code_2(tmp_path, refused):
     for arguments in (("--mjcf", "arm.xml"), ("--log", "run.csv"), ()):
         assert "--mjcf" in refused("diagnose", *arguments, "--out", tmp_path / "out")

@@ -163,16 +163,56 @@ def _needs(package: str, extra: str) -> None:
 
 def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s: float) -> Any:
     _needs("mujoco", "mujoco")
-    from diagnosis.machine.mujoco_plant import MujocoArm, measurable
+    from diagnosis.machine.mujoco_plant import MujocoArm, names
 
-    names = {settings.columns.get(name, name): name for name in measurable(str(model))}
-    outputs = tuple(name for column, name in names.items() if column in tables[0].names)
-    if not outputs:
+    there = names(str(model))
+    kinds: dict[str, list[str]] = {}
+    for kind, several in there.items():
+        for name in several:
+            kinds.setdefault(name, []).append(kind)
+    used = [*settings.columns, *(c for c in tables[0].names if c not in settings.columns.values())]
+    for name in used:
+        if len(kinds.get(name, ())) > 1:
+            several = [f'"{kind} {name}" = ...' for kind in kinds[name]]
+            raise ValueError(
+                f"{name} is the name of {' and '.join(kinds[name])}: say which is which, "
+                f"columns = {{{', '.join(several)}}}"
+            )
+
+    def label(kind: str, name: str) -> str:
+        return f"{kind} {name}" if len(kinds.get(name, ())) > 1 else name
+
+    measured = {label(kind, name): (kind, name) for kind in ("sensor", "joint") for name in there[kind]}
+    columns = {name: settings.columns.get(name, name) for name in measured}
+    labels = tuple(name for name, column in columns.items() if column in tables[0].names)
+    if not labels:
         raise ValueError(
-            f"no column of {tables[0].path} is named after a joint or sensor ({', '.join(names)}); say which "
-            "is which under [columns]"
+            f"no column of {tables[0].path} is named after a joint or sensor "
+            f"({', '.join(columns.values())}); state which is which under [columns]"
         )
+    # A joint beside a sensor of its name is known to the plant by its label, any other by its own name.
+    outputs = tuple(
+        one if kind == "joint" and "sensor" in kinds[name] else name
+        for one in labels
+        for kind, name in [measured[one]]
+    )
     arm = MujocoArm.from_file(str(model), outputs=outputs, dt_s=dt_s)
+    commands = tuple(label("actuator", name) for name in arm.inputs)
+    unknown = [name for name in settings.columns if name not in (*commands, *measured, "time_s")]
+    if unknown:
+        raise ValueError(
+            f"columns: no actuator, sensor or joint is called {unknown[0]!r}; there are "
+            f"{', '.join((*commands, *measured))}"
+        )
+    absent = [name for name in settings.columns if name in measured and name not in labels]
+    if absent:
+        raise ValueError(f"columns: {tables[0].path} has no column {columns[absent[0]]!r} ({absent[0]})")
+    for name in commands:
+        both = [one for one in labels if columns[one] == settings.columns.get(name, name)]
+        if both:
+            raise ValueError(
+                f"column {columns[both[0]]!r} is both {name} and {both[0]}: say which of the two"
+            )
 
     def finish(experiments: Sequence[PlantExperiment], noise: Real) -> Any:
         tracking = settings.tracking_rad_s
@@ -183,7 +223,7 @@ def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_
         )
         return plant, lambda found: arm.repaired(plant, found.rig, found.repair)
 
-    return arm.inputs, outputs, finish
+    return commands, labels, finish
 
 
 def _fmu(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s: float) -> Any:
