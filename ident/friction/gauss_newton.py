@@ -35,6 +35,16 @@ WORTH = 0.5
 _CHANGE, _CHANGE_OF_LEVEL, _CHANGE_OF_LOG = 1e-3, 2e-3, 0.02
 
 
+class LostError(ValueError):
+    """No simulation or observer follows the logs with this arm and law."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "no model of the arm with dry friction follows the logs; response = 'as recorded' needs none, "
+            "n_real and n_pairs state the number of poles"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class FrictionFit:
     """A linear arm with dry friction, fitted to records of its shaft's position.
@@ -339,13 +349,17 @@ def least_squares(
     blocks: Sequence[RealArray], targets: Sequence[RealArray], known: RealArray
 ) -> tuple[RealArray, RealArray, float, float]:
     """Solution of the stacked rows, each record less its mean, and of known (., P + 1), rows and target, as
-    they are; the triangle R, the sum of squares of the targets and what the solution leaves of it.
+    they are; the triangle R, the sum of squares of the targets and what the solution leaves of it. Raises
+    LostError where something is not finite.
     """
-    a = np.vstack([*(block - block.mean(axis=0) for block in blocks), known[:, :-1]])
-    b = np.concatenate([*(target - target.mean() for target in targets), known[:, -1]])
-    length = np.linalg.norm(a, axis=0)
-    length[length == 0] = 1.0
-    triangle = triangle_of(np.column_stack([a / length, b]))
+    with np.errstate(invalid="ignore", over="ignore"):
+        a = np.vstack([*(block - block.mean(axis=0) for block in blocks), known[:, :-1]])
+        b = np.concatenate([*(target - target.mean() for target in targets), known[:, -1]])
+        length = np.linalg.norm(a, axis=0)
+        length[length == 0] = 1.0
+        triangle = triangle_of(np.column_stack([a / length, b]))
+    if not np.all(np.isfinite(triangle)):
+        raise LostError
     solution = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=1e-12)[0] / length
     return solution, triangle[:-1, :-1] * length, float(b @ b), float(triangle[-1, -1] ** 2)
 

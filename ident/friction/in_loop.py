@@ -38,6 +38,7 @@ from ident.friction.arm import FrictionLaw, less_friction
 from ident.friction.gauss_newton import (
     STD_LOG,
     FrictionFit,
+    LostError,
     driven_by_law,
     law_of,
     least_squares,
@@ -46,7 +47,7 @@ from ident.friction.gauss_newton import (
     with_covariance,
 )
 from ident.friction.inverse_dynamics import direction_of, highest_Hz, level_of, rms_speed, smoothed
-from ident.friction.observer import LOST, LostError, ObserverFilter, observed, prediction_errors
+from ident.friction.observer import ObserverFilter, observed, prediction_errors
 from ident.friction.spring import Spring
 from ident.identification import Identification
 from ident.one_input import identify, untested_model
@@ -381,12 +382,12 @@ def _equations(
         with np.errstate(over="ignore"):  # of an observer that does not follow
             length = np.linalg.norm(nuisance, axis=0)
         if not np.all(np.isfinite(length)):
-            raise LostError(LOST)
+            raise LostError
         u, d, _ = np.linalg.svd(nuisance[:, length > 0] / length[length > 0], full_matrices=False)
         u = u[:, d > _NUISANCE_RANK * d.max(initial=0.0)]
         rows = rows - u @ (u.T @ rows)
         if not np.all(np.isfinite(rows)):
-            raise LostError(LOST)
+            raise LostError
         blocks.append(rows[:, :-1])
         targets.append(rows[:, -1])
     return blocks, targets

@@ -20,18 +20,8 @@ from scipy.signal import sosfilt, zpk2sos
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
 from ident.friction.arm import SteppedArm
-from ident.friction.gauss_newton import FrictionFit
+from ident.friction.gauss_newton import FrictionFit, LostError
 from ident.friction.inverse_dynamics import noise_of
-
-LOST = (
-    "no model of the arm with dry friction follows the logs; response = 'as recorded' needs none, n_real and "
-    "n_pairs state the number of poles"
-)
-
-
-class LostError(ValueError):
-    """No observer follows the logs with this arm and law."""
-
 
 # Force that an observer expects in a sample, in units of the input's rms over the noise of the position: from
 # an observer slower than the arm to one that takes the last two samples for its state.
@@ -131,5 +121,5 @@ def observed(found: FrictionFit, records: Sequence[Record]) -> FrictionFit:
             one = replace(found, correction=correction, ratio=float(ratio))
             tried.append((prediction_errors(one, records), one))
     if not tried:
-        raise LostError(LOST)
+        raise LostError
     return min(tried, key=lambda one: one[0])[1]

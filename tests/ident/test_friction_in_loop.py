@@ -13,6 +13,7 @@ from ident.basis.poles import Poles
 from ident.checks.validation import fit_in_windows, fit_on_fresh_data
 from ident.data.record import Record
 from ident.friction import FrictionFit, fit_friction, identify_behind, without_friction
+from ident.friction.gauss_newton import LostError, least_squares
 from ident.friction.in_loop import recorded_in_loop
 from ident.friction.inverse_dynamics import direction_of, level_of, smoothed
 from ident.friction.spring import Spring
@@ -154,3 +155,10 @@ def test_the_load_of_a_belt_is_the_lowest_zero_of_the_motor() -> None:
     # A steady motion meets the whole of the load's friction.
     ramp = np.linspace(0.0, 1.0, 5000)
     assert found.force(ramp, 1e-6)[-1] == pytest.approx(1.0, abs=0.01)
+
+
+def test_equations_that_are_not_finite_lose_the_log():
+    rows = np.ones((6, 2))
+    rows[3, 1] = np.inf
+    with pytest.raises(LostError, match="no model of the arm with dry friction follows"):
+        least_squares([rows], [np.arange(6.0)], np.zeros((0, 3)))
