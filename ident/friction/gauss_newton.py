@@ -132,9 +132,12 @@ class FrictionFit:
         return np.asarray(left - left.mean())
 
     def taken_off(self, record: Record) -> Record:
-        """The record (one input; any outputs) as if its input had been smaller by the friction."""
+        """The record (one input; any outputs) as if its input had been smaller by the friction. Raises
+        LostError where that is not finite."""
         delay = self.arm.structure.input_delay_samples
         friction = self.motion(record)[1]
+        if not np.all(np.isfinite(friction)):
+            raise LostError
         return less_friction(record, friction + self.steady(record) if self.in_loop else friction, delay)
 
 
