@@ -220,7 +220,7 @@ def test_a_validation_record_that_was_fitted_validates_nothing():
     )
 
 
-def test_doubts_are_in_the_answer_and_its_document():
+def test_doubts_are_in_the_answer():
     case = PlantCase("c", replace(PLANT, model_error=0.05), DIFFERENT)
     with pytest.warns(UserWarning, match="offset changes no output"):
         found = diagnose(case)

@@ -73,6 +73,22 @@ def test_ellipses_and_mode_of_a_belt_are_those_without_friction(
     assert np.median(np.abs(ellipses.centre / true - 1)) < 0.005
 
 
+def test_ellipses_hold_a_part_of_the_friction_that_looks_like_damping(
+    belt: tuple[Machine, list[Record], FrictionFit],
+) -> None:
+    """5 % of the friction, one standard deviation: no residual shows it where it moves with the speed."""
+    one, records, found = belt
+    omega, dt_s = np.geomspace(2.0, 20.0, 30), one.plant.dt_s
+    arm = response(*one.plant.sampled(0.0), omega, dt_s)
+    ellipses = without_friction(records, found).response.at(omega)
+    speed = np.concatenate([np.gradient(smoothed(record.output[:, 0]), dt_s) for record in records])
+    damping = 0.05 * levels_of(one) / np.sqrt(np.mean(speed**2))
+    for sign in (-1.0, 1.0):
+        damped, far = (arm / (1 + sign * n * damping * 1j * omega * arm) for n in (1.0, 4.0))
+        assert np.all(ellipses.contains(damped))
+        assert not np.any(ellipses.contains(far))
+
+
 @pytest.mark.parametrize("kind", ["belt", "link", "screw", "pendulum", "fast"])
 def test_a_loop_is_told_by_its_reference_or_by_its_command(kind: str) -> None:
     one = machine(kind, 1)
