@@ -32,11 +32,10 @@ from workflow.engine.errors import (
     EXIT_INTERRUPTED,
     EXIT_NOT_CERTIFIED,
     EXIT_OK,
-    LONGEST_LINE,
     CommandInterruptedError,
     InputError,
     StageError,
-    cut,
+    cut_inside,
     describe_os_error,
     need,
     one_line,
@@ -874,7 +873,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if debug:
             traceback.print_exc()
         message, code = _explain(error)
-        return _complain(cut(one_line(message), LONGEST_LINE), code)
+        return _complain(cut_inside(one_line(message)), code)
     finally:
         interrupts.no_limit()
 

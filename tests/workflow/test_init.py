@@ -368,3 +368,16 @@ def test_a_reference_cannot_be_planned_without_knowing_the_loop(refused, flexlin
     assert not (tmp_path / "plan").exists()
     answer = flexlink("excite", "--closed-loop", *logs, *wanted, "--rms", 0.05, "--json")
     assert answer.document()["numbers"]["rms"] == [pytest.approx(0.05), pytest.approx(0.025)]
+
+
+@pytest.mark.parametrize("depth", [1, 4, 8])
+def test_what_to_type_is_whole_however_long_the_path(refused, flexlink, tmp_path, signals, depth):
+    """A message is cut where it is long: never in the command at its end."""
+    folder = tmp_path.joinpath(*["measured on the axis at the window"] * depth)
+    folder.mkdir(parents=True)
+    (log, *_) = write(folder, signals, ("zeit [s]", "kanal a", "kanal b", "kanal c"))
+    line = refused("init", log, "--out", tmp_path / "my.toml")
+    words = shlex.split(line.split("type: flexlink ")[1])
+    assert words[1] in (str(log), "LOG...")
+    assert words.count("--input") == words.count("--output") == 1
+    assert not any(word.endswith("...") for word in words[2:])

@@ -12,7 +12,7 @@ EXIT_BAD_INPUT = 2
 EXIT_NOT_CERTIFIED = 3
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 
-LONGEST_LINE = 300
+LONGEST_LINE = 600
 
 
 def one_line(text: object) -> str:
@@ -35,13 +35,19 @@ def cut(text: str, most: int) -> str:
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
+def cut_inside(text: str, most: int = LONGEST_LINE) -> str:
+    """The text, its middle left out where it is longer: where it went wrong comes first, what to type last."""
+    kept = (most - 5) // 2
+    return text if len(text) <= most else f"{text[:kept]} ... {text[-kept:]}"
+
+
 class InputError(ValueError):
     """Something the user gave (file, key, path, column) cannot be used; the message is one line."""
 
     exit_code = EXIT_BAD_INPUT
 
     def __init__(self, message: object) -> None:
-        super().__init__(cut(one_line(message), LONGEST_LINE))
+        super().__init__(cut_inside(one_line(message)))
 
 
 class StageError(RuntimeError):
@@ -50,7 +56,7 @@ class StageError(RuntimeError):
     exit_code = EXIT_INTERNAL
 
     def __init__(self, message: object) -> None:
-        super().__init__(cut(one_line(message), LONGEST_LINE))
+        super().__init__(cut_inside(one_line(message)))
 
 
 class CommandInterruptedError(RuntimeError):
