@@ -36,7 +36,7 @@ def cut(text: str, most: int) -> str:
 
 
 def cut_inside(text: str, most: int = LONGEST_LINE) -> str:
-    """The text, its middle left out where it is longer: where it went wrong comes first, what to type last."""
+    """The text, its middle left out where it is longer: what is wrong comes first, what to type last."""
     kept = (most - 5) // 2
     return text if len(text) <= most else f"{text[:kept]} ... {text[-kept:]}"
 
