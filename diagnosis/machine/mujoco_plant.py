@@ -14,14 +14,15 @@ gravity, delay of sensors; gain and offset of a sensor, which MJCF does not know
 
 A free run of an arm in a closed loop drifts away: its controller is not part of the model. The simulated
 joints are therefore held near the measured ones by a soft spring and damper of their own (`tracking_rad_s`),
-and the model is judged by what it does beside it. The start of a record is what its first rows say.
+and the model is judged by what it does beside it. The start of a record is fitted, for every set of values
+anew, within what its first rows leave open.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -61,11 +62,21 @@ _NO_LEVER_M = 1e-6
 # Of the rate at which an inverted joint falls.
 _HELD = 1.5
 _KEPT, _KEPT_PATHS = 8, 60
+# Samples of a parabola whose begin is a start; it is off by more than noise from so many deviations on.
+_SMOOTHED_FROM, _AS_NOISE = (4, 5, 7, 9, 12, 16, 21, 28), 2.0
 _UNITS = {"hinge": ("Nm", "rad", "kg_m2"), "slide": ("N", "m", "kg")}
 _STANDARD_GRAVITY = 9.81
 # Its defaults are MuJoCo's own: what an edit adds takes nothing from the default class of a model.
 _PLAIN = mujoco.MjSpec()
 _LAGS = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
+# When in a step, in steps from its begin, a force meets the position and the speed that the model then has:
+# Euler holds the speed of the step before, implicit ones solve for that of the next, RK4 takes means.
+_MET = {
+    int(mujoco.mjtIntegrator.mjINT_EULER): (0.0, -0.5),
+    int(mujoco.mjtIntegrator.mjINT_RK4): (0.5, 0.5),
+    int(mujoco.mjtIntegrator.mjINT_IMPLICIT): (0.0, 0.5),
+    int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST): (0.0, 0.5),
+}
 # Which numbers of an actuator's gain and bias are force, by type: fixed or none, affine, muscle.
 _FORCES = {0: (0,), 1: (0, 1, 2), 2: (2, 3)}
 
@@ -214,6 +225,12 @@ class MujocoArm:
                 dof = self.nominal.joint(sensor.objname).dofadr[0]
                 found.append((k, sensor.objname, float(self.nominal.dof_M0[dof])))
         return tuple(found)
+
+    @cached_property
+    def filtered(self) -> tuple[int, ...]:
+        """Actuators with a state that follows the command."""
+        model = self.nominal
+        return tuple(u for u in range(model.nu) if model.actuator_dyntype[u] in _LAGS[1:])
 
     def number(self, name: str, without: float) -> float:
         """A <numeric> of the file."""
@@ -445,7 +462,7 @@ class MujocoArm:
         every = self.quantities(experiments)
         stated = {name: one.value for name, one in every.items() if one.value != 0.0}
         tolerances = {name: self.number(f"tolerance.{name}", _usual_tolerance(name)) for name in stated}
-        simulation = Simulation(self, every)
+        simulation = Simulation(self, every, noise)
         as_stated = simulation(stated, {}, experiments[0].input)
 
         def seen(effect: PlantEffect) -> bool:
@@ -464,6 +481,7 @@ class MujocoArm:
             model_error * self._commanded(simulation, stated, experiments),
             self.dt_s,
             inactive=self._untried(every),
+            settled=simulation.settled,
         )
 
     def _untried(self, every: Mapping[str, Quantity]) -> dict[str, str]:
@@ -481,8 +499,10 @@ class Simulation:
 
     arm: MujocoArm
     quantities: Mapping[str, Quantity]
+    noise: Real
     _models: dict[Any, Any] = field(default_factory=dict, repr=False)
     _paths: dict[Any, Any] = field(default_factory=dict, repr=False)
+    _starts: dict[Any, _Start] = field(default_factory=dict, repr=False)
 
     def edited(self, values: Mapping[str, float]) -> Any:
         """The model (MjSpec) with these values."""
@@ -496,12 +516,16 @@ class Simulation:
     ) -> Real:
         values = {**parameters, **{name: next(iter(size.values())) for name, size in effects.items()}}
         changed = {k: v for k, v in values.items() if v != self.quantities[k].value}
+        model = self._model(changed)
+        return self._run(model, values, inputs, self._start(inputs).state if self.arm.tracked else None)
+
+    def _model(self, changed: Mapping[str, float]) -> tuple[Any, Any]:
         key = tuple(changed.items())
         if key not in self._models:
             if len(self._models) >= _KEPT:
                 self._models.pop(next(iter(self._models)))
             self._models[key] = self._compiled(self.edited(changed))
-        return self._run(self._models[key], values, inputs)
+        return self._models[key]
 
     def _compiled(self, spec: Any) -> tuple[Any, Any]:
         omega = self.arm.tracking_rad_s
@@ -514,7 +538,10 @@ class Simulation:
         model = spec.compile()
         return model, mujoco.MjData(model)
 
-    def _run(self, compiled: tuple[Any, Any], values: Mapping[str, float], inputs: Real) -> Real:
+    def _run(
+        self, compiled: tuple[Any, Any], values: Mapping[str, float], inputs: Real, start: Real | None
+    ) -> Real:
+        """start: (S,), see `_Start`."""
         arm, (model, data) = self.arm, compiled
         U, T = len(arm.inputs), len(inputs)
         h = model.opt.timestep
@@ -524,18 +551,19 @@ class Simulation:
         mujoco.mj_resetData(model, data)
         gain = np.array([values.get(f"{name}.sensor_gain", 1.0) for name in arm.outputs])
         offset = np.array([values.get(f"{name}.sensor_offset", 0.0) for name in arm.outputs])
-        # All integrators but one hold the speed of a whole step, which is that of its middle.
-        shift = 0.0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.5 * h
         omega = arm.tracking_rad_s
         for j, (k, joint, inertia) in enumerate(arm.tracked):
             late = values.get(f"{arm.outputs[k]}.sensor_delay", 0.0)
-            path, speed, first, begin = self._path(inputs[:, U + k], h, late, shift)
-            data.joint(joint).qpos[0] = (first - offset[k]) / gain[k]
-            data.joint(joint).qvel[0] = begin / gain[k]
+            path, speed = self._path(inputs[:, U + k], h, late, model.opt.integrator)
+            data.joint(joint).qpos[0] = (start[j] - offset[k]) / gain[k]
+            data.joint(joint).qvel[0] = start[len(arm.tracked) + j] / gain[k]
             if omega:
                 target = omega**2 * (path - offset[k]) + 2 * omega * speed
                 control[:, U + j] = inertia / gain[k] * target
         _start_filters(model, data, inputs[0, :U])
+        if start is not None:
+            adr = model.actuator_actadr[list(arm.filtered)]
+            data.act[adr] = start[2 * len(arm.tracked) :]
         for u in range(U):
             n = model.actuator_history[u, 0]
             if n:
@@ -553,19 +581,80 @@ class Simulation:
         columns = [model.sensor(name).adr[0] for name in arm.outputs]
         return np.asarray(sensed[0, ::steps][:, columns] * gain + offset)
 
-    def _path(self, y: Real, step_s: float, late_s: float, shift_s: float) -> tuple[Real, Real, float, float]:
-        """What was measured, and its slope, at every step, read `late_s` later; both at the first row."""
-        key = (y.tobytes(), late_s)
-        found: tuple[Real, Real, float, float]
-        if key not in self._paths:
-            if len(self._paths) >= _KEPT_PATHS:
-                self._paths.pop(next(iter(self._paths)))
+    def _path(self, y: Real, step_s: float, late_s: float, integrator: int) -> tuple[Real, Real]:
+        """What was measured, and its slope, as the tracking meets them in every step (`_MET`), read `late_s`
+        later."""
+
+        def compute() -> tuple[Real, Real]:
             dt_s = self.arm.dt_s
             path = CubicSpline(dt_s * np.arange(len(y)), y)
-            at = np.minimum(step_s * np.arange(len(y) * round(dt_s / step_s)) + late_s, dt_s * (len(y) - 1))
-            self._paths[key] = path(at), path(np.maximum(at - shift_s, 0.0), 1), *_begun(y, dt_s)
-        found = self._paths[key]
-        return found
+            at = step_s * np.arange(len(y) * round(dt_s / step_s)) + late_s
+            of_path, of_slope = (np.clip(at + part * step_s, 0.0, path.x[-1]) for part in _MET[integrator])
+            return path(of_path), path(of_slope, 1)
+
+        return _remembered(self._paths, (y.tobytes(), late_s), compute)
+
+    def _start(self, inputs: Real) -> _Start:
+        """Of a record: from its first samples, moved once by what the stated model leaves from there."""
+
+        def compute() -> _Start:
+            arm, U = self.arm, len(self.arm.inputs)
+            h = arm.nominal.opt.timestep
+            late = 0.0 if _MET[arm.nominal.opt.integrator] == (0.5, 0.5) else 0.5 * h
+            begun = [_begun(inputs[:, U + k], arm.dt_s, self.noise[k], late) for k, *_ in arm.tracked]
+            guess, spread = np.array(begun).reshape(-1, 2, 2).transpose(2, 1, 0).reshape(2, -1)
+            for u in arm.filtered:
+                guess, spread = np.append(guess, inputs[0, u]), np.append(spread, np.std(inputs[:, u]) or 1.0)
+            stated = {name: one.value for name, one in self.quantities.items() if one.value != 0.0}
+            model = self._model({})
+            first = self._run(model, stated, inputs, guess)
+            moved = guess + np.diag(spread)
+            runs = [self._run(model, stated, inputs, state) for state in moved]
+            slopes = [(run - first) / size for run, size in zip(runs, spread, strict=True)]
+            start = _Start(guess, guess, spread, np.array(slopes).reshape(-1, *first.shape), self.noise)
+            return replace(start, state=guess + start.shift(inputs[:, U:] - first))
+
+        return _remembered(self._starts, inputs.tobytes(), compute)
+
+    def settled(self, inputs: Real, outputs: Real) -> Real:
+        """Outputs (T, Y) as they are from the start that fits the record best; to first order in its move."""
+        if not self.arm.tracked:
+            return outputs
+        start = self._start(inputs)
+        shift = start.shift(inputs[:, len(self.arm.inputs) :] - outputs)
+        return np.asarray(outputs + np.tensordot(shift, start.slopes, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """Of a record (S,): positions, then speeds, of the tracked joints as their sensors tell them; what
+    filters of actuators hold.
+
+    guess, spread : of the first samples alone. slopes : (S, T, Y) of the outputs by the state.
+    """
+
+    state: Real
+    guess: Real
+    spread: Real
+    slopes: Real
+    noise: Real
+
+    def shift(self, left: Real) -> Real:
+        """(S,) by which the start moves that fits best where measured - model is left (T, Y)."""
+        level = np.sqrt(np.maximum(np.mean(left**2, axis=0), self.noise**2))
+        A = (self.slopes / level).reshape(len(self.state), -1)
+        H = A @ A.T + np.diag(self.spread**-2.0)
+        return np.asarray(
+            np.linalg.solve(H, A @ (left / level).ravel() + (self.guess - self.state) / self.spread**2)
+        )
+
+
+def _remembered(kept: dict[Any, Any], key: Any, compute: Callable[[], Any]) -> Any:
+    if key not in kept:
+        if len(kept) >= _KEPT_PATHS:
+            kept.pop(next(iter(kept)))
+        kept[key] = compute()
+    return kept[key]
 
 
 def _start_filters(model: Any, data: Any, commands: Real) -> None:
@@ -575,14 +664,22 @@ def _start_filters(model: Any, data: Any, commands: Real) -> None:
             data.act[model.actuator_actadr[u]] = commands[u]
 
 
-def _begun(q: Real, dt_s: float) -> tuple[float, float]:
-    """Position and speed of the first row; at rest unless the first samples say otherwise."""
-    n = min(_SMOOTHED, len(q))
-    fit, covariance = np.polyfit(dt_s * np.arange(n), q[:n], 1, cov=True)
-    if abs(fit[0]) < 4 * np.sqrt(covariance[0, 0]):
-        return float(q[0]), 0.0
-    fit = np.polyfit(dt_s * np.arange(n), q[:n], 2)
-    return float(fit[2]), float(fit[1])
+def _begun(q: Real, dt_s: float, noise: float, early_s: float) -> list[tuple[float, float]]:
+    """Position in the first row and speed a little earlier, each with what it may be off by: of the longest
+    parabola that leaves no more than noise of the first samples."""
+    for n in (n for n in _SMOOTHED_FROM if n <= len(q)):
+        time_s = dt_s * np.arange(n)
+        fit, covariance = np.polyfit(time_s, q[:n], 2, cov="unscaled")
+        left = float(np.sqrt(np.sum((q[:n] - np.polyval(fit, time_s)) ** 2) / (n - 3)))
+        if n > _SMOOTHED_FROM[0] and left > _AS_NOISE * noise:
+            break
+        level = max(left, noise)
+        off = _AS_NOISE * level * np.sqrt(np.diag(covariance))
+        found = [
+            (fit[2], min(off[2], level)),
+            (fit[1] - 2 * fit[0] * early_s, off[1] + abs(2 * fit[0]) * early_s),
+        ]
+    return found
 
 
 def _usual_tolerance(name: str) -> float:

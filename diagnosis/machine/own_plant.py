@@ -77,6 +77,8 @@ class Plant:
     start : name -> standard deviation (around zero) of a state at the start of a record that nobody knows
         Beside a model error it is fitted for every record; the simulation takes the states (name -> value) as
         a fourth argument.
+    settled : inputs, outputs -> outputs as they would be from the start that fits the record in these inputs
+        best, where a simulation knows that itself; every fit and every residual is of these.
     """
 
     simulation: Simulate
@@ -89,6 +91,7 @@ class Plant:
     dt_s: float = float("nan")
     start: Mapping[str, float] = field(default_factory=dict)
     inactive: Mapping[str, str] = field(default_factory=dict)
+    settled: Callable[[Real, Real], Real] | None = None
 
     def __post_init__(self) -> None:
         lock(self, "noise")
@@ -174,6 +177,8 @@ class Plant:
             try:
                 with np.errstate(all="ignore"):  # of a trial that runs away
                     found = run(inputs)
+                    if self.settled is not None and np.all(np.isfinite(found)):
+                        found = self.settled(inputs, found)
             except _NUMERICAL:
                 found = np.full((len(inputs), far.size), np.nan)
             return np.clip(np.where(np.isnan(found), far, found), -far, far)

@@ -67,6 +67,61 @@ def test_tracking_leaves_a_machine_that_is_the_model_where_it_is(tracking_rad_s)
     np.testing.assert_allclose(found, angle, rtol=0, atol=0.01 * np.std(angle))
 
 
+def two_links(integrator: str, step_s: float, kind: str = "motor") -> str:
+    """An arm that hangs, or a cart with a pendulum."""
+    joint = 'type="slide" axis="1 0 0"' if kind == "cart" else 'axis="0 1 0"'
+    drive = {"lag": "general", "servo": "position"}.get(kind, "motor")
+    more = {"lag": 'dyntype="filter" dynprm="0.05"', "servo": 'kp="20" kv="1"'}.get(kind, "")
+    return f"""<mujoco><option timestep="{step_s}" integrator="{integrator}"/><worldbody><body>
+    <joint name="one" {joint} damping="0.3" armature="0.02"/>
+    <inertial pos="0.1 0 -0.1" mass="1.2" diaginertia="0.01 0.01 0.01"/><body pos="0 0 -0.3">
+    <joint name="two" axis="0 1 0" damping="0.1" armature="0.01"/>
+    <inertial pos="0 0 -0.12" mass="0.8" diaginertia="0.004 0.004 0.004"/></body></body></worldbody>
+    <actuator><{drive} name="m1" joint="one" {more}/><{drive} name="m2" joint="two" {more}/></actuator>
+    </mujoco>"""
+
+
+def in_motion(xml: str, noise: float, seed: int, servo: bool = False) -> PlantExperiment:
+    """Recorded from somewhere in a motion on, under a controller that feels the true speeds."""
+    model, rng = mujoco.MjModel.from_xml_string(xml), np.random.default_rng(seed)
+    data, rows = mujoco.MjData(model), []
+    goal = rng.uniform(-0.8, 0.8, (7, 2)).repeat(50, axis=0)
+    for k in range(350):
+        push = np.array([20.0, 8.0]) * (goal[k] - data.qpos) - np.array([3.0, 0.8]) * data.qvel
+        data.ctrl[:] = goal[k] if servo else push
+        rows.append([*data.ctrl, *data.qpos])
+        mujoco.mj_step(model, data, round(DT_S / model.opt.timestep))
+    log = np.array(rows)[55:]
+    log[:, 2:] += noise * rng.standard_normal((len(log), 2))
+    return PlantExperiment(f"log {seed}", "held_out" if seed else "estimation", log, log[:, 2:])
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
+@pytest.mark.parametrize("kind", ["motor", "cart", "servo"])
+@pytest.mark.parametrize("tracking_rad_s", [9.0, 20.0])
+def test_the_true_model_leaves_the_noise_of_a_log_that_begins_in_motion(integrator, kind, tracking_rad_s):
+    noise, xml = 2e-4, two_links(integrator, 0.005, kind)
+    logs = [in_motion(xml, noise, seed, kind == "servo") for seed in range(3)]
+    arm = MujocoArm(mujoco.MjSpec.from_string(xml), ("one", "two"), DT_S, tracking_rad_s)
+    plant = arm.plant(logs, np.full(2, noise))
+    for log in logs:
+        left = plant.simulator(())(log.input) - log.output
+        # What the tracking makes of the noise of the path is up to as much again.
+        assert np.max(np.sqrt(np.mean(left**2, axis=0))) < 2 * noise
+        assert np.std(log.output, axis=0).min() > 200 * noise
+
+
+@pytest.mark.parametrize("kind", ["motor", "cart", "lag"])
+def test_steps_that_are_coarser_than_the_machine_leave_little_of_it(kind):
+    """The machine at a twentieth of the model's steps: classical Runge-Kutta leaves nothing."""
+    logs = [in_motion(two_links("RK4", 0.00025, kind), 0.0, seed) for seed in range(2)]
+    spec = mujoco.MjSpec.from_string(two_links("RK4", 0.005, kind))
+    plant = MujocoArm(spec, ("one", "two"), DT_S, 9.0).plant(logs, np.full(2, 1e-5))
+    for log in logs:
+        left = plant.simulator(())(log.input) - log.output
+        assert np.max(np.std(left, axis=0) / np.std(log.output, axis=0)) < 1e-3
+
+
 @pytest.mark.parametrize(
     ("effect", "value", "inertia", "damping"),
     [
@@ -147,6 +202,7 @@ def test_the_repaired_file_does_in_mujoco_what_the_diagnosis_simulated():
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     data.act[:] = torque[0]
+    data.joint("hinge").qpos[0], data.joint("hinge").qvel[0] = plant.simulation._start(inputs).state
     n = model.actuator_history[0, 0]
     mujoco.mj_initCtrlHistory(model, data, 0, None, np.full((n, 1), torque[0]))
     found = []
