@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
@@ -39,6 +39,7 @@ from diagnosis.machine.plant_effect import Change, EffectParameter, PlantEffect
 from plant.effects.search_space import Dependence, geometric
 
 Put = Callable[[Any, float], None]
+Kept = TypeVar("Kept")
 
 # Relative standard deviations where the file has no <numeric name="tolerance.NAME">, by a name's last part.
 TOLERANCES = {
@@ -500,8 +501,8 @@ class Simulation:
     arm: MujocoArm
     quantities: Mapping[str, Quantity]
     noise: Real
-    _models: dict[Any, Any] = field(default_factory=dict, repr=False)
-    _paths: dict[Any, Any] = field(default_factory=dict, repr=False)
+    _models: dict[Any, tuple[Any, Any]] = field(default_factory=dict, repr=False)
+    _paths: dict[Any, tuple[Real, Real]] = field(default_factory=dict, repr=False)
     _starts: dict[Any, _Start] = field(default_factory=dict, repr=False)
 
     def edited(self, values: Mapping[str, float]) -> Any:
@@ -517,15 +518,12 @@ class Simulation:
         values = {**parameters, **{name: next(iter(size.values())) for name, size in effects.items()}}
         changed = {k: v for k, v in values.items() if v != self.quantities[k].value}
         model = self._model(changed)
-        return self._run(model, values, inputs, self._start(inputs).state if self.arm.tracked else None)
+        return self._run(model, values, inputs, self._start(inputs).state)
 
     def _model(self, changed: Mapping[str, float]) -> tuple[Any, Any]:
-        key = tuple(changed.items())
-        if key not in self._models:
-            if len(self._models) >= _KEPT:
-                self._models.pop(next(iter(self._models)))
-            self._models[key] = self._compiled(self.edited(changed))
-        return self._models[key]
+        return _remembered(
+            self._models, tuple(changed.items()), lambda: self._compiled(self.edited(changed)), _KEPT
+        )
 
     def _compiled(self, spec: Any) -> tuple[Any, Any]:
         omega = self.arm.tracking_rad_s
@@ -538,9 +536,7 @@ class Simulation:
         model = spec.compile()
         return model, mujoco.MjData(model)
 
-    def _run(
-        self, compiled: tuple[Any, Any], values: Mapping[str, float], inputs: Real, start: Real | None
-    ) -> Real:
+    def _run(self, compiled: tuple[Any, Any], values: Mapping[str, float], inputs: Real, start: Real) -> Real:
         """start: (S,), see `_Start`."""
         arm, (model, data) = self.arm, compiled
         U, T = len(arm.inputs), len(inputs)
@@ -561,9 +557,7 @@ class Simulation:
                 target = omega**2 * (path - offset[k]) + 2 * omega * speed
                 control[:, U + j] = inertia / gain[k] * target
         _start_filters(model, data, inputs[0, :U])
-        if start is not None:
-            adr = model.actuator_actadr[list(arm.filtered)]
-            data.act[adr] = start[2 * len(arm.tracked) :]
+        data.act[model.actuator_actadr[list(arm.filtered)]] = start[2 * len(arm.tracked) :]
         for u in range(U):
             n = model.actuator_history[u, 0]
             if n:
@@ -590,7 +584,7 @@ class Simulation:
             path = CubicSpline(dt_s * np.arange(len(y)), y)
             at = step_s * np.arange(len(y) * round(dt_s / step_s)) + late_s
             of_path, of_slope = (np.clip(at + part * step_s, 0.0, path.x[-1]) for part in _MET[integrator])
-            return path(of_path), path(of_slope, 1)
+            return np.asarray(path(of_path)), np.asarray(path(of_slope, 1))
 
         return _remembered(self._paths, (y.tobytes(), late_s), compute)
 
@@ -618,9 +612,9 @@ class Simulation:
 
     def settled(self, inputs: Real, outputs: Real) -> Real:
         """Outputs (T, Y) as they are from the start that fits the record best; to first order in its move."""
-        if not self.arm.tracked:
-            return outputs
         start = self._start(inputs)
+        if not start.state.size:
+            return outputs
         shift = start.shift(inputs[:, len(self.arm.inputs) :] - outputs)
         return np.asarray(outputs + np.tensordot(shift, start.slopes, 1))
 
@@ -642,16 +636,18 @@ class _Start:
     def shift(self, left: Real) -> Real:
         """(S,) by which the start moves that fits best where measured - model is left (T, Y)."""
         level = np.sqrt(np.maximum(np.mean(left**2, axis=0), self.noise**2))
-        A = (self.slopes / level).reshape(len(self.state), -1)
+        A = (self.slopes / level).reshape(len(self.state), left.size)
         H = A @ A.T + np.diag(self.spread**-2.0)
         return np.asarray(
             np.linalg.solve(H, A @ (left / level).ravel() + (self.guess - self.state) / self.spread**2)
         )
 
 
-def _remembered(kept: dict[Any, Any], key: Any, compute: Callable[[], Any]) -> Any:
+def _remembered(
+    kept: dict[Any, Kept], key: Any, compute: Callable[[], Kept], most: int = _KEPT_PATHS
+) -> Kept:
     if key not in kept:
-        if len(kept) >= _KEPT_PATHS:
+        if len(kept) >= most:
             kept.pop(next(iter(kept)))
         kept[key] = compute()
     return kept[key]
