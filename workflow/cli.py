@@ -676,6 +676,9 @@ def diagnose(
         list[str] | None,
         typer.Option(help="Log of that machine; of several the last one judges, of one its last third."),
     ] = None,
+    dt_s: Annotated[float | None, typer.Option(help="Sampling period [s] of its logs without time.")] = None,
+    repair: Annotated[bool, typer.Option("--repair", help=_LOGS)] = False,
+    resample_s: Annotated[float | None, typer.Option(help=_LOGS)] = None,
     rig: Annotated[
         str | None,
         typer.Option(
@@ -706,6 +709,11 @@ def diagnose(
         raise InputError("diagnose: expected cases, or --mjcf, --fmu or --python with --log")
     if motion and not (fmu or python):
         raise InputError("diagnose: --motion is of --fmu or --python; in a case file: motion = ...")
+    of_logs = {"motion": motion, "dt_s": dt_s, "repair": repair or None, "resample_s": resample_s}
+    of_logs = {key: value for key, value in of_logs.items() if value is not None}
+    if of_logs and not model:
+        option = f"--{next(iter(of_logs)).replace('_', '-')}"
+        raise InputError(f"diagnose: {option} is of --mjcf, --fmu or --python; a case file says it itself")
     case = case or []
     need(*([Path(name) for name in (*model.values(), *(log or []))] if model else []))
     if case and not any(place.exists() for place in case):
@@ -721,7 +729,7 @@ def diagnose(
         from workflow.diagnose.command import diagnose_cases
         from workflow.diagnose.simulator_case import settings_of
 
-        stated = {**model, "log": log, **({"motion": motion} if motion else {})}
+        stated = {**model, "log": log, **of_logs}
         found = diagnose_cases(
             [settings_of(stated, "--log")] if model else case,
             out,

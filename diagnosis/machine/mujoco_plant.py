@@ -60,6 +60,8 @@ _SMOOTHED = 9  # samples, of a measured angle whose speed is asked
 _SEEN = 3.0
 # Numbers of a file have no more digits than this.
 _NO_LEVER_M = 1e-6
+# Share by which forces change to see the motion that they make.
+_FORCED = 0.05
 # Of the rate at which an inverted joint falls.
 _HELD = 1.5
 _KEPT, _KEPT_PATHS = 8, 60
@@ -247,19 +249,7 @@ class MujocoArm:
             *(one for joint in self.spec.joints for one in self._of_joint(joint, *sizes[joint.name])),
             *(one for actuator in self.spec.actuators for one in self._of_actuator(actuator, longest)),
             *(one for body in self.spec.bodies for one in self._of_link(body)),
-            *(
-                Quantity(
-                    f"gravity.{axis}",
-                    float(self.spec.option.gravity[k]),
-                    partial(_put_gravity, k),
-                    "acceleration_m_s2",
-                    _STANDARD_GRAVITY,
-                    signed=True,
-                    group="link",
-                    everywhere=True,
-                )
-                for k, axis in enumerate("xyz")
-            ),
+            *self._of_gravity(),
             *(one for y in zip(self.outputs, swings, strict=True) for one in self._of_sensor(*y)),
         ]
         return {one.name: one for one in found}
@@ -323,7 +313,8 @@ class MujocoArm:
             return
         if model.body_weldid[k] == k and (at := self._load_place(k)):
             put = partial(_put_payload, *at)
-            mass = float(np.sum(model.body_mass[model.body_weldid == k]))
+            # Of all that moves with it: what a robot carries is no multiple of its last link.
+            mass = float(model.body_subtreemass[model.body_rootid[k]])
             yield Quantity(f"{body.name}.payload", 0.0, put, "mass_kg", mass, (1e-3, 10.0), group="link")
         if not body.mass > 0:
             return
@@ -359,6 +350,25 @@ class MujocoArm:
             far = max(far, float(along @ centre + np.abs(along @ turn) @ box[3:]))
         at = joint + far * along - data.xpos[k]
         return model.body(k).name, tuple(data.xmat[k].reshape(3, 3).T @ at)
+
+    def _of_gravity(self) -> Iterator[Quantity]:
+        """Its direction: the largest component follows from the others and the size, unless it is released by
+        a tolerance of its own."""
+        gravity = np.array(self.spec.option.gravity)
+        main = int(np.argmax(np.abs(gravity)))
+        for k, axis in enumerate("xyz"):
+            name, turned = f"gravity.{axis}", k != main and gravity[main] != 0
+            if k != main or not gravity[main] or self.number(f"tolerance.{name}", 0.0) > 0:
+                yield Quantity(
+                    name,
+                    float(gravity[k]),
+                    partial(_put_gravity, k, main if turned else k),
+                    "acceleration_m_s2",
+                    _STANDARD_GRAVITY,
+                    signed=True,
+                    group="link",
+                    everywhere=True,
+                )
 
     def _of_sensor(self, name: str, swing: float) -> Iterator[Quantity]:
         sensor = self.spec.sensor(name)
@@ -413,15 +423,30 @@ class MujocoArm:
     def _commanded(
         self, simulation: Simulation, stated: Mapping[str, float], experiments: Sequence[PlantExperiment]
     ) -> float:
-        """Share of the motion that the commands make beside the tracking; 1 in a free run."""
-        if not (self.tracking_rad_s and self.tracked):
-            return 1.0
+        """Share of the motion that the forces of the actuators make beside the tracking; 1 in a free run of
+        motors.
+
+        Of a motor it is what its commands make. A servo makes the motion of its command whatever the machine
+        is: its force, without the damping of its own, makes what it strays from that. Of an actuator whose
+        gain is no quantity: its command.
+        """
+        spec, free = simulation.edited({}), list[int]()
+        for u, one in enumerate(list(spec.actuators)):
+            if f"{one.name}.gain" in stated:
+                own = one.biasprm[2]
+                _put_gain(one.name, spec, 1 + _FORCED)
+                if one.biastype == mujoco.mjtBias.mjBIAS_AFFINE:
+                    _put_component(one, "biasprm", 2, own)
+            else:
+                free.append(u)
+        forced = simulation._compiled(spec)
         made = moved = 0.0
         for e in experiments:
-            held = e.input.copy()
-            held[:, : len(self.inputs)] = np.mean(held[:, : len(self.inputs)], axis=0)
-            by_commands = simulation(stated, {}, e.input) - simulation(stated, {}, held)
-            made += float(np.sum(np.var(by_commands, axis=0) / np.var(e.output, axis=0)))
+            more = e.input.copy()
+            more[:, free] += _FORCED * (more[:, free] - np.mean(more[:, free], axis=0))
+            start = simulation._start(e.input).state
+            by_forces = simulation._run(forced, stated, more, start) - simulation(stated, {}, e.input)
+            made += float(np.sum(np.var(by_forces / _FORCED, axis=0) / np.var(e.output, axis=0)))
             moved += len(self.outputs)
         return float(min(np.sqrt(made / moved), 1.0))
 
@@ -715,8 +740,13 @@ def _put_first(joint: str, key: str, spec: Any, value: float) -> None:
         setattr(one, key, value)
 
 
-def _put_gravity(k: int, spec: Any, value: float) -> None:
-    _put_component(spec.option, "gravity", k, value)
+def _put_gravity(k: int, main: int, spec: Any, value: float) -> None:
+    """A component; another one (main) keeps the size."""
+    gravity = np.array(spec.option.gravity)
+    rest = gravity[main] ** 2 + gravity[k] ** 2 - value**2
+    gravity[main] = np.copysign(np.sqrt(max(rest, 0.0)), gravity[main])
+    gravity[k] = value
+    spec.option.gravity = gravity
 
 
 def _put_component(one: Any, key: str, k: int, value: float) -> None:

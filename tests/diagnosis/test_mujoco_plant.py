@@ -366,9 +366,9 @@ def test_what_an_edit_adds_takes_nothing_from_the_default_class():
     np.testing.assert_allclose(joint.range, [-0.01, 0.01])
 
 
-@pytest.mark.parametrize("angle", ["degree", "radian"])
+@pytest.mark.parametrize("angle", ["", 'angle="degree"', 'angle="radian"'])
 def test_a_gap_is_as_wide_in_the_repaired_file_as_it_was_found(angle):
-    arm, _ = link(PLAIN, rest=f'<compiler angle="{angle}"/>', joint='armature="0.1"')
+    arm, _ = link(PLAIN, rest=f"<compiler {angle}/>", joint='armature="0.1"')
     plant, _ = plant_of(arm, steps(), turned(steps()))
     text = arm.repaired(plant, plant, (Change("hinge.backlash", {"gap_rad": 0.02}),))
     np.testing.assert_allclose(
@@ -425,3 +425,59 @@ def test_the_force_on_a_joint_is_what_its_actuators_do_whatever_lies_between(dri
     torque = steps()
     measured = PlantExperiment("one", "estimation", np.column_stack([torque, torque]), torque[:, None])
     assert arm._sizes((measured,))["hinge"][0] == pytest.approx(4 * np.max(np.abs(torque)), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("gravity", "free", "tilted"),
+    [
+        ("0 0 -9.81", {"gravity.x", "gravity.y"}, {"gravity.x": (3.0, 0.0, -np.sqrt(9.81**2 - 9.0))}),
+        ("0 -9.81 0", {"gravity.x", "gravity.z"}, {"gravity.z": (0.0, -np.sqrt(9.81**2 - 9.0), 3.0)}),
+        ("1 0 -9.7", {"gravity.x", "gravity.y"}, {"gravity.x": (3.0, 0.0, -np.sqrt(9.7**2 + 1 - 9.0))}),
+        ("0 0 0", {"gravity.x", "gravity.y", "gravity.z"}, {"gravity.y": (0.0, 3.0, 0.0)}),
+    ],
+)
+def test_only_the_direction_of_gravity_is_open(gravity, free, tilted):
+    for released in (False, True):
+        rest = f'<option gravity="{gravity}"/>'
+        if released:
+            rest += '<custom><numeric name="tolerance.gravity.z" data="0.02"/></custom>'
+        arm, _ = link(PLAIN, rest=rest)
+        measured = PlantExperiment("one", "estimation", np.column_stack([steps()] * 2), steps()[:, None])
+        every = arm.quantities((measured,))
+        assert {name for name in every if "gravity" in name} == free | ({"gravity.z"} if released else set())
+        for name, expected in tilted.items():
+            np.testing.assert_allclose(edited(arm, name, 3.0)[0].opt.gravity, expected, atol=1e-12)
+    if gravity == "0 0 -9.81":
+        np.testing.assert_allclose(edited(arm, "gravity.z", -9.0)[0].opt.gravity, (0, 0, -9.0))
+
+
+@pytest.mark.parametrize("kp", [50.0, 500.0, 5000.0])
+def test_a_servo_is_judged_by_what_it_strays_from_its_command(kp):
+    """Behind a stiff servo with damping kv the joint lags the command by about kv/kp: the share of the motion
+    that its forces make falls as that does. Of a motor it is what its commands make."""
+    goal = np.sin(2 * np.pi * 0.5 * DT_S * np.arange(400)) * np.linspace(0, 1, 400)
+    drive = f'<position name="m" joint="hinge" kp="{kp}" kv="{2 * np.sqrt(kp)}"/>'
+    model = mujoco.MjModel.from_xml_string(link(PLAIN, motor=drive)[0].spec.to_xml())
+    data, angle = mujoco.MjData(model), []
+    for u in goal:
+        angle.append(data.qpos[0])
+        data.ctrl[0] = u
+        mujoco.mj_step(model, data, round(DT_S / model.opt.timestep))
+    angle = np.array(angle)
+    arm, _ = link(PLAIN, motor=drive)
+    measured = PlantExperiment("one", "estimation", np.column_stack([goal, angle]), angle[:, None])
+    arm = MujocoArm(arm.spec, ("hinge",), DT_S, 2.0)
+    share = arm.plant((measured,), np.array([1e-4]), model_error=1.0).model_error
+    strays = np.std(goal - angle) / np.std(angle)
+    assert share == pytest.approx(strays, rel=0.6)
+    torque = kp * (goal - angle)
+    motor, _ = link(PLAIN)
+    measured = PlantExperiment("one", "estimation", np.column_stack([torque, angle]), angle[:, None])
+    assert motor.plant((measured,), np.array([1e-4]), model_error=1.0).model_error > max(share, 0.9)
+
+
+def test_a_payload_may_be_as_heavy_as_all_that_carries_it():
+    arm, _ = link(f'{PLAIN}<site pos="1 0 0"/>{TIP.format("")}')
+    plant, _ = plant_of(arm, steps(), turned(steps()))
+    (tip,) = [e for e in plant.effects if e.name == "tip.payload"]
+    assert tip.parameters[0].high > 10 * arm.nominal.body_mass.sum() * 0.99

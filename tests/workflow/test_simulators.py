@@ -163,6 +163,94 @@ def test_a_name_that_two_things_have_is_asked_for(tmp_path, motor, hinge, sensor
     assert np.array_equal(first.output, rows[: len(first.output), measured])
 
 
+def rewritten(path: Path, kind: str) -> str:
+    """The same log as somebody else writes it; TOML that it needs."""
+    rows = np.loadtxt(path, delimiter=",", skiprows=1)
+    header, more = ["time_s", "motor", "hinge"], ""
+    factor = {"deg": 180 / np.pi, "mrad": 1e3, "counts": 4096 / (2 * np.pi)}
+    if kind in ("t_ms", "Time [us]", "t", "Zeit"):
+        header[0] = kind
+        rows[:, 0] *= {"t_ms": 1e3, "Time [us]": 1e6}.get(kind, 1.0)
+    elif kind == "no time":
+        header, rows, more = header[1:], rows[:, 1:], "dt_s = 0.01"
+    elif kind in ("hinge_deg", "hinge [mrad]", "counts"):
+        unit = next(u for u in factor if u in kind)
+        header[2], rows[:, 2] = ("hinge_counts" if unit == "counts" else kind), rows[:, 2] * factor[unit]
+        if unit == "counts":
+            header[2] = "enc [counts]"
+            more = f'columns = {{hinge = {{column = "enc [counts]", scale = {1 / factor[unit]!r}}}}}'
+    elif kind == "motor [mNm]":
+        header[1], rows[:, 1] = kind, 1e3 * rows[:, 1]
+    elif kind == "wraps":
+        rows[:, 2] = np.mod(rows[:, 2], 0.02)
+        more = 'columns = {hinge = {column = "hinge", unwrap = 0.02}}'
+    elif kind == "jitter":
+        rows[1:-1, 0] += 5e-4 * np.random.default_rng(0).uniform(-1, 1, len(rows) - 2)
+        more = "repair = true"
+    elif kind == "gap":
+        rows, more = np.delete(rows, [50, 51, 120], axis=0), "repair = true"
+    elif kind == "dead":
+        header.append("grip")
+        rows = np.column_stack([rows, np.zeros(len(rows))])
+    np.savetxt(path, rows, delimiter=",", header=",".join(header), comments="", fmt="%.12g")
+    return more
+
+
+KINDS = ["t_ms", "Time [us]", "t", "Zeit", "no time", "hinge_deg", "hinge [mrad]", "counts"]
+KINDS += ["motor [mNm]", "wraps", "jitter", "gap", "dead"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_log_is_read_as_it_is_written(tmp_path, kind):
+    """Units of headers, whatever time is called, stamps that jitter, lost rows, a column that is dead."""
+    pytest.importorskip("mujoco")
+    grip = '</body><body><joint name="grip"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
+    (tmp_path / "arm.xml").write_text(HINGE.replace("</body>", grip, 1))
+    write_log(tmp_path / "one.csv", 0, 0.1)
+    rows = np.loadtxt(tmp_path / "one.csv", delimiter=",", skiprows=1)
+    more = rewritten(tmp_path / "one.csv", kind)
+    settings = settings_of(tomllib.loads(f'mjcf = "arm.xml"\nlog = "one.csv"\n{more}'), "case.toml")
+    if kind == "dead":
+        with pytest.warns(UserWarning, match="left out: grip"):
+            case = load_simulator_case(settings, tmp_path, "case.toml").case
+    else:
+        case = load_simulator_case(settings, tmp_path, "case.toml").case
+    assert case.plant.dt_s == pytest.approx(DT_S, rel=1e-4)
+    assert case.outputs == ("hinge",)
+    first = case.experiments[0]
+    # Between readings that were lost or came late a spline of noisy angles is as good as these are.
+    loose = {"jitter": 1e-3, "gap": 1e-3, "wraps": 0.02 + 1e-9}.get(kind, 1e-9)
+    np.testing.assert_allclose(first.output, rows[: len(first.output), 2:], rtol=0, atol=loose)
+    if kind == "wraps":
+        np.testing.assert_allclose(
+            np.diff(first.output[:, 0]), np.diff(rows[: len(first.output), 2]), atol=1e-9
+        )
+    kept = np.ones(len(first.output), bool)
+    kept[[50, 51, 120]] = kind != "gap"
+    np.testing.assert_allclose(first.input[kept, 0], rows[: len(first.output)][kept, 1], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("kind", "complaint"),
+    [
+        ("jitter", "--repair (repair = true)"),
+        ("gap", "--repair (repair = true)"),
+        ("counts", 'columns = {"hinge" = {column = "enc [counts]", scale = ...}}'),
+        ("no time", "state its period (--dt-s, dt_s = ...)"),
+    ],
+)
+def test_what_a_log_lacks_is_asked_for_with_options_that_exist(tmp_path, refused, kind, complaint):
+    pytest.importorskip("mujoco")
+    (tmp_path / "arm.xml").write_text(HINGE)
+    write_log(tmp_path / "one.csv", 0, 0.1)
+    rewritten(tmp_path / "one.csv", kind)
+    columns = 'columns = {hinge = "enc [counts]"}' if kind == "counts" else ""
+    (tmp_path / "arm.toml").write_text(f'mjcf = "arm.xml"\nlog = "one.csv"\n{columns}')
+    model = ("--mjcf", tmp_path / "arm.xml", "--log", tmp_path / "one.csv")
+    arguments = (tmp_path / "arm.toml",) if columns else model
+    assert complaint in refused("diagnose", *arguments, "--out", tmp_path / "out")
+
+
 def test_the_command_refuses_with_exit_code_2(tmp_path, refused):
     for arguments in (("--mjcf", "arm.xml"), ("--log", "run.csv"), ()):
         assert "--mjcf" in refused("diagnose", *arguments, "--out", tmp_path / "out")

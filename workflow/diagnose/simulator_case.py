@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import runpy
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,11 +20,14 @@ from diagnosis.machine.listed_effects import KINDS
 from diagnosis.machine.machine_protocol import Real, check_count
 from diagnosis.machine.own_plant import Plant, PlantCase, PlantExperiment
 from diagnosis.machine.with_effects import with_effects
+from ident.data.record import Record
 from ident.data.record_files import read_table
+from ident.data.roles import time_of
 from ident.data.table import Table
-from ident.data.time_grid import sampling_time
+from ident.data.time_grid import TimeGrid, sampling_time
+from ident.data.units import written_unit
 from workflow.config.settings import Section, check
-from workflow.diagnose.case_settings import CaseName
+from workflow.diagnose.case_settings import CaseName, Column, ColumnChoice
 from workflow.engine import storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import hash_of
@@ -52,8 +57,10 @@ class SimulatorSettings(Section):
     log: str | Annotated[tuple[str, ...], Field(min_length=1)] = Field(
         description="log files; the last one is for validation, of a single one its last third"
     )
-    columns: dict[str, str] = Field({}, description="name in the model -> column, where they differ")
+    columns: dict[str, ColumnChoice] = Field({}, description="name in the model -> column, where they differ")
     dt_s: PositiveFloat | None = Field(None, description="sampling period of logs without a time column")
+    repair: bool = Field(False, description="put stamps that jitter, and missing rows, on a uniform grid")
+    resample_s: PositiveFloat | None = Field(None, description="put all rows on a grid of this step")
     noise: dict[str, PositiveFloat] = Field(
         {}, description="output -> standard deviation; default: estimated"
     )
@@ -170,8 +177,9 @@ def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_
     for kind, several in there.items():
         for name in several:
             kinds.setdefault(name, []).append(kind)
-    used = [*settings.columns, *(c for c in tables[0].names if c not in settings.columns.values())]
-    for name in used:
+    stated = {column.column for column in settings.columns.values()}
+    bare = [_bare(name) for name in tables[0].names if name not in stated]
+    for name in [*settings.columns, *(name for name in tables[0].names if name not in stated), *bare]:
         if len(kinds.get(name, ())) > 1:
             several = [f'"{kind} {name}" = ...' for kind in kinds[name]]
             raise ValueError(
@@ -183,8 +191,16 @@ def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_
         return f"{kind} {name}" if len(kinds.get(name, ())) > 1 else name
 
     measured = {label(kind, name): (kind, name) for kind in ("sensor", "joint") for name in there[kind]}
-    columns = {name: settings.columns.get(name, name) for name in measured}
+    columns = {name: _column(name, tables[0], settings).column for name in measured}
     labels = tuple(name for name, column in columns.items() if column in tables[0].names)
+    dead = [
+        name for name in labels if all(np.ptp(t.columns([columns[name]])[columns[name]]) == 0 for t in tables)
+    ]
+    if dead and len(dead) < len(labels):
+        warnings.warn(
+            f"columns that never change are left out: {', '.join(columns[n] for n in dead)}", stacklevel=2
+        )
+        labels = tuple(name for name in labels if name not in dead)
     if not labels:
         raise ValueError(
             f"no column of {tables[0].path} is named after a joint or sensor "
@@ -204,11 +220,11 @@ def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_
             f"columns: no actuator, sensor or joint is called {unknown[0]!r}; there are "
             f"{', '.join((*commands, *measured))}"
         )
-    absent = [name for name in settings.columns if name in measured and name not in labels]
+    absent = [name for name in settings.columns if name in measured and name not in (*labels, *dead)]
     if absent:
         raise ValueError(f"columns: {tables[0].path} has no column {columns[absent[0]]!r} ({absent[0]})")
     for name in commands:
-        both = [one for one in labels if columns[one] == settings.columns.get(name, name)]
+        both = [one for one in labels if columns[one] == _column(name, tables[0], settings).column]
         if both:
             raise ValueError(
                 f"column {columns[both[0]]!r} is both {name} and {both[0]}: say which of the two"
@@ -305,22 +321,111 @@ def _motion(inputs: Sequence[str], outputs: Sequence[str]) -> tuple[str | None, 
     return next(iter(kinds.items()))
 
 
+def _bare(column: str) -> str:
+    """A header without its unit: "elbow [deg]" and "elbow_deg" as "elbow"."""
+    unit = written_unit(column)
+    spelled = re.sub(r"\s*[\[(][^\[()\]]*[\])]\s*$", "", column)
+    return spelled.removesuffix(f"_{unit.replace('/', '_')}") if unit else column
+
+
+def _column(name: str, table: Table, settings: SimulatorSettings) -> Column:
+    """Where a quantity of the model stands: as said, under its own name, or under that with a unit behind."""
+    if name in settings.columns or name in table.names:
+        return settings.columns.get(name, Column(column=name))
+    alike = [column for column in table.names if _bare(column) == name]
+    return Column(column=alike[0] if len(alike) == 1 else name)
+
+
+_UNITS = re.compile(r"([uµμmckM]?)(rad|deg|°|N ?m|N|V|A|m)([/_]s(?:\^?2|²)?)?")
+_PREFIXES = {"": 1.0, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
+_TURN = {"rpm": np.pi / 30, "u/min": np.pi / 30}
+
+
+def _in_si(unit: str) -> float | None:
+    """SI units in one of these; None of what is no unit of a motion or its drive."""
+    found = _UNITS.fullmatch(unit)
+    if found is None:
+        return _TURN.get(unit.lower())
+    return _PREFIXES[found[1]] * (np.pi / 180 if found[2] in ("deg", "°") else 1.0)
+
+
+def _scale(name: str, column: Column, table: Table, settings: SimulatorSettings) -> float:
+    """What makes of a column the quantity in the model, which is in SI units unless its name says another."""
+    unit, own = table.unit(column.column), "" if settings.mjcf else written_unit(name)
+    if column.scale is not None or not unit or unit == own:
+        return 1.0 if column.scale is None else column.scale
+    per, of = _in_si(unit), _in_si(own) if own else 1.0
+    if per is None or of is None:
+        raise ValueError(
+            f"column {column.column!r} is in {unit}: state what makes it {own or 'SI units'}, "
+            f'columns = {{"{name}" = {{column = "{column.column}", scale = ...}}}}'
+        )
+    return per / of
+
+
+def _time(table: Table, settings: SimulatorSettings) -> tuple[str | None, str | None]:
+    """Column of the time, and its unit where a scale states it."""
+    stated = settings.columns.get("time_s")
+    if stated is not None:
+        units = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
+        if stated.scale is not None and stated.scale not in units:
+            raise ValueError(f"columns: time_s: scale is {stated.scale:g}; expected 1, 1e-3, 1e-6 or 1e-9")
+        return stated.column, units[stated.scale] if stated.scale is not None else None
+    return ("time_s" if "time_s" in table.names else time_of(table)), None
+
+
 def _sampling(tables: Sequence[Table], settings: SimulatorSettings) -> float:
     """The same in all logs."""
+    if settings.resample_s is not None:
+        return settings.resample_s
     found = []
     for table in tables:
-        column = settings.columns.get("time_s", "time_s")
-        if column not in table.names and settings.dt_s is None:
-            raise InputError(
-                f"{table.path}: no column time_s; state dt_s, or which column is the time under [columns]"
-            )
-        stamps = table.columns([column])[column] if column in table.names else None
         with naming(str(table.path)):
-            given = None if stamps is not None else settings.dt_s
-            found.append(sampling_time(table, stamps, column, given, options=False))
+            name, unit = _time(table, settings)
+            if name is None and settings.dt_s is None:
+                raise InputError(
+                    f"{table.path}: no column looks like time; state its period (--dt-s, dt_s = ...) or "
+                    'the column: columns = {time_s = "..."}'
+                )
+            if name is None:
+                found.append(sampling_time(table, None, None, settings.dt_s))
+                continue
+            stamps = table.seconds(name, table.columns([name])[name], unit)[0]
+            if settings.repair:
+                found.append(TimeGrid.of(table, name, stamps).dt_s)
+            else:
+                found.append(sampling_time(table, stamps, name, None))
     if max(found) > 1.001 * min(found):
-        raise InputError(f"{tables[0].path}: logs are sampled every {min(found):.6g} to {max(found):.6g} s")
+        raise InputError(
+            f"{tables[0].path}: logs are sampled every {min(found):.6g} to {max(found):.6g} s; put all on "
+            f"one grid: --resample-s {max(found):.6g} (resample_s)"
+        )
     return found[0]
+
+
+def _signals(table: Table, names: Sequence[str], held: int, settings: SimulatorSettings) -> Real:
+    """(T, N) in the model's units on the log's grid; the first ones (held) are commands."""
+    columns = [_column(name, table, settings) for name in names]
+    commands = list(dict.fromkeys(column.column for column in columns[:held]))
+    time, unit = _time(table, settings)
+    record = Record.from_file(
+        table,
+        commands,
+        list(dict.fromkeys(column.column for column in columns[held:] if column.column not in commands)),
+        time=time,
+        time_unit=unit,
+        dt_s=settings.dt_s if time is None else None,
+        repair=settings.repair,
+        resample_s=settings.resample_s,
+        unwrap={column.column: column.unwrap for column in columns if column.unwrap is not None},
+    )
+    read = dict(zip(record.input_names, record.input.T, strict=True))
+    read |= dict(zip(record.output_names, record.output.T, strict=True))
+    found = [
+        read[column.column] * _scale(name, column, table, settings) + column.offset
+        for name, column in zip(names, columns, strict=True)
+    ]
+    return np.column_stack(found)
 
 
 def _experiments(
@@ -333,12 +438,10 @@ def _experiments(
     tracked: bool,
 ) -> tuple[PlantExperiment, ...]:
     """Commands (with what was measured behind them where the simulation tracks it) and outputs."""
-    columns = [settings.columns.get(name, name) for name in (*inputs, *outputs)]
     found = []
     for k, (path, table) in enumerate(zip(paths, tables, strict=True)):
         with naming(str(path)):
-            read = table.columns(columns)
-        whole = np.column_stack([read[column] for column in columns])
+            whole = _signals(table, (*inputs, *outputs), len(inputs), settings)
         y = whole[:, len(inputs) :]
         u = whole if tracked else whole[:, : len(inputs)]
         name = path.stem if [p.stem for p in paths].count(path.stem) == 1 else f"{path.stem} {k + 1}"
