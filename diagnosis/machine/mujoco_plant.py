@@ -204,6 +204,7 @@ class MujocoArm:
                 )
         model = spec.compile()
         for name in self.outputs:
+            _refuse_free_base(model, name)
             if model.sensor(name).dim[0] != 1:
                 raise ValueError(f"sensor {name} has {model.sensor(name).dim[0]} numbers, expected one")
         _put_compiled(spec, model)
@@ -217,6 +218,19 @@ class MujocoArm:
     def nominal(self) -> Any:
         """The compiled model."""
         return self.spec.compile()
+
+    @cached_property
+    def moving(self) -> Any:
+        """The model (MjSpec) without meshes that touch nothing: their inertia stands in their bodies, and
+        every compilation would read them again."""
+        spec = self.spec.copy()
+        for geom in list(spec.geoms):
+            if geom.type == mujoco.mjtGeom.mjGEOM_MESH and not (geom.contype or geom.conaffinity):
+                spec.delete(geom)
+        used = {geom.meshname for geom in spec.geoms}
+        for mesh in [mesh for mesh in spec.meshes if mesh.name not in used]:
+            spec.delete(mesh)
+        return spec
 
     @cached_property
     def tracked(self) -> tuple[tuple[int, str, float], ...]:
@@ -473,7 +487,28 @@ class MujocoArm:
             name = change.id.removeprefix("wrong_")
             values[name] = values[name] * size if name in values else size
         assert isinstance(plant.simulation, Simulation)
-        spec = plant.simulation.edited({k: v for k, v in values.items() if v != plant.parameters.get(k)})
+        changed = {k: v for k, v in values.items() if v != plant.parameters.get(k)}
+        spec = plant.simulation.edited(changed, self.spec)
+        poses = [np.array(key.qpos) for key in spec.keys]
+        model, before = spec.compile(), self.nominal
+        # A joint within a backlash stands in the middle of a pose, and MuJoCo fills up its end.
+        for key, pose in zip(spec.keys, poses, strict=True):
+            if len(pose) == before.nq < model.nq:
+                key.qpos = model.qpos0
+                for j in range(before.njnt):
+                    one = model.joint(before.joint(j).name)
+                    first = before.jnt_qposadr[j]
+                    _put_component(
+                        key,
+                        "qpos",
+                        one.qposadr[0] + np.arange(one.qpos0.size),
+                        pose[first : first + one.qpos0.size],
+                    )
+        # Wherever it is written, it finds its meshes where they are.
+        if spec.modelfiledir:
+            spec.meshdir, spec.texturedir = (
+                str(Path(spec.modelfiledir, one).resolve()) for one in (spec.meshdir, spec.texturedir)
+            )
         spec.compile()
         return str(spec.to_xml())
 
@@ -530,9 +565,9 @@ class Simulation:
     _paths: dict[Any, tuple[Real, Real]] = field(default_factory=dict, repr=False)
     _starts: dict[Any, _Start] = field(default_factory=dict, repr=False)
 
-    def edited(self, values: Mapping[str, float]) -> Any:
-        """The model (MjSpec) with these values."""
-        spec = self.arm.spec.copy()
+    def edited(self, values: Mapping[str, float], of: Any = None) -> Any:
+        """The model (MjSpec) with these values; of: as a whole, else what moves of it."""
+        spec = (of or self.arm.moving).copy()
         for name, value in values.items():
             self.quantities[name].put(spec, value)
         return spec
@@ -665,6 +700,21 @@ class _Start:
         H = A @ A.T + np.diag(self.spread**-2.0)
         return np.asarray(
             np.linalg.solve(H, A @ (left / level).ravel() + (self.guess - self.state) / self.spread**2)
+        )
+
+
+def _refuse_free_base(model: Any, output: str) -> None:
+    """Raises ValueError where a joint hangs on a body that flies, of which nobody logs where it is."""
+    sensor = model.sensor(output)
+    if sensor.objtype[0] != mujoco.mjtObj.mjOBJ_JOINT:
+        return
+    root = model.body_rootid[model.jnt_bodyid[sensor.objid[0]]]
+    first = model.body_jntadr[root]
+    if first >= 0 and model.jnt_type[first] == mujoco.mjtJoint.mjJNT_FREE:
+        name = model.body(root).name
+        raise ValueError(
+            f"the base {name!r} moves freely, and no log says where it is: take its <freejoint/> out if it "
+            "was held; else give only logs of a held machine"
         )
 
 

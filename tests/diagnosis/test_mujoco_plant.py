@@ -481,3 +481,84 @@ def test_a_payload_may_be_as_heavy_as_all_that_carries_it():
     plant, _ = plant_of(arm, steps(), turned(steps()))
     (tip,) = [e for e in plant.effects if e.name == "tip.payload"]
     assert tip.parameters[0].high > 10 * arm.nominal.body_mass.sum() * 0.99
+
+
+CORNERS = """v 0 0 0
+v 1 0 0
+v 0 1 0
+v 0 0 1
+f 1 3 2
+f 1 2 4
+f 2 3 4
+f 1 4 3
+"""
+MESHED = """<mujoco model="m"><compiler {compiler}/><option timestep="0.001"/>{include}
+<default><default class="look"><geom contype="0" conaffinity="0" {density}/></default></default>
+<asset>{asset}</asset><worldbody><body name="rod">
+<joint name="hinge" axis="0 0 1" ref="30" range="-170 170" armature="0.1"/>
+<geom type="mesh" mesh="box" class="look"/><geom size="0.1" mass="1" pos="0.5 0 0"/>{hit}
+<body name="hand" pos="1 0 0">
+<joint name="wrist" axis="0 0 1"/><geom size="0.1" mass="1" pos="0.2 0 0"/></body></body></worldbody>
+<actuator><motor name="motor" joint="hinge"/></actuator>
+<keyframe><key name="home" qpos="0.2 0.3" ctrl="0.5"/></keyframe></mujoco>"""
+BOX = '<mesh name="box" file="box.obj" scale=".1 .1 .1"/>'
+
+
+@pytest.mark.parametrize(
+    ("compiler", "include", "asset", "density", "hit"),
+    [
+        ('meshdir="parts"', "", BOX, "", ""),
+        ('assetdir="parts"', "", BOX, 'mass="0"', '<geom type="mesh" mesh="box"/>'),
+        ("", '<include file="parts/inc.xml"/>', "", "", ""),
+        (
+            'meshdir="parts" texturedir="looks"',
+            "",
+            f'{BOX}<texture name="t" type="2d" file="t.png"/>',
+            "",
+            "",
+        ),
+    ],
+)
+def test_the_repaired_file_loads_where_it_is_written(tmp_path, compiler, include, asset, density, hit):
+    """Meshes and textures of folders, includes; a zero in degrees; a pose with a joint more."""
+    for folder in ("arm/parts", "arm/looks", "out"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "arm/parts/box.obj").write_text(CORNERS)
+    here = BOX.replace("box.obj", "parts/box.obj")
+    (tmp_path / "arm/parts/inc.xml").write_text(f"<mujoco><asset>{here}</asset></mujoco>")
+    import matplotlib.image
+
+    matplotlib.image.imsave(tmp_path / "arm/looks/t.png", np.zeros((4, 4)))
+    model = tmp_path / "arm" / "arm.xml"
+    model.write_text(MESHED.format(compiler=compiler, include=include, asset=asset, density=density, hit=hit))
+    arm = MujocoArm.from_file(str(model), outputs=("hinge",), dt_s=DT_S)
+    plant, _ = plant_of(arm, steps(), turned(steps()) + 0.5)
+    repaired = plant.scaled({"rod.mass": 1.2})
+    text = arm.repaired(plant, repaired, (Change("hinge.backlash", {"gap_rad": 0.02}),))
+    (tmp_path / "out" / "arm.xml").write_text(text)
+    given = mujoco.MjModel.from_xml_path(str(model))
+    again = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "arm.xml"))
+    assert (again.nmesh, again.ntex, again.ngeom) == (given.nmesh, given.ntex, given.ngeom)
+    np.testing.assert_allclose(again.body_mass[1:], given.body_mass[1:] * (1.2, 1), rtol=1e-5)
+    np.testing.assert_allclose(again.qpos0, (given.qpos0[0], 0, 0), atol=1e-5)
+    np.testing.assert_allclose(again.key_qpos, [[0.2, 0, 0.3]])
+    # What is simulated has no mesh but those that may hit something, and moves alike.
+    light = arm.moving.compile()
+    assert light.nmesh == (1 if hit else 0)
+    np.testing.assert_allclose(light.body_inertia, arm.nominal.body_inertia)
+
+
+@pytest.mark.parametrize(
+    ("base", "refused"), [("<freejoint/>", True), ("", False), ('<joint name="rail" type="slide"/>', False)]
+)
+def test_a_joint_on_a_base_that_flies_is_refused_in_one_line(base, refused):
+    text = f"""<mujoco><worldbody><body name="ball"><freejoint/><geom size="0.1"/></body>
+    <body name="trunk">{base}
+    <geom size="0.2"/><body><joint name="hip" axis="0 1 0"/><geom size="0.1" pos="0 0 -0.3"/></body></body>
+    </worldbody><actuator><motor joint="hip"/></actuator></mujoco>"""
+    spec = mujoco.MjSpec.from_string(text)
+    if refused:
+        with pytest.raises(ValueError, match=r"^the base 'trunk' moves freely, and no log says where it is"):
+            MujocoArm(spec, ("hip",), DT_S)
+    else:
+        MujocoArm(spec, ("hip",), DT_S)
