@@ -494,16 +494,12 @@ class MujocoArm:
         # A joint within a backlash stands in the middle of a pose, and MuJoCo fills up its end.
         for key, pose in zip(spec.keys, poses, strict=True):
             if len(pose) == before.nq < model.nq:
-                key.qpos = model.qpos0
-                for j in range(before.njnt):
-                    one = model.joint(before.joint(j).name)
-                    first = before.jnt_qposadr[j]
-                    _put_component(
-                        key,
-                        "qpos",
-                        one.qposadr[0] + np.arange(one.qpos0.size),
-                        pose[first : first + one.qpos0.size],
-                    )
+                whole = np.array(model.qpos0)
+                for joint in (before.joint(j) for j in range(before.njnt)):
+                    first, size = joint.qposadr[0], joint.qpos0.size
+                    at = model.joint(joint.name).qposadr[0]
+                    whole[at : at + size] = pose[first : first + size]
+                key.qpos = whole
         # Wherever it is written, it finds its meshes where they are.
         if spec.modelfiledir:
             spec.meshdir, spec.texturedir = (
