@@ -93,7 +93,7 @@ def _run(inputs: Real, A: Real, B: Real, gains: Real, p: np.record) -> Real:
     """Dry friction as the current that it takes off, so that the joint truly sticks; (T, 2)."""
     T = len(inputs)
     h = DT_S / SUBSTEPS
-    out = np.zeros((T, 2))
+    out = np.zeros((T, 3))
     command = np.zeros(T)
     x, y = np.zeros(4), np.zeros(4)
     x[0] = inputs[0, 2]
@@ -111,7 +111,7 @@ def _run(inputs: Real, A: Real, B: Real, gains: Real, p: np.record) -> Real:
         speed1 = keep * speed1 + (1 - keep) * (alpha - last1) / DT_S
         last0, last1 = theta, alpha
         i = gains[0] * (reference - theta) - gains[1] * alpha - gains[2] * speed0 - gains[3] * speed1
-        command[k] = min(max(i, -LIMIT_A), LIMIT_A)
+        command[k] = out[k, 2] = min(max(i, -LIMIT_A), LIMIT_A)
         late = late_value(command, k, p.input_delay_delay_s / DT_S, p.actuator_dead_zone_width_A)
         for _ in range(SUBSTEPS):
             pull = lagged(pull, late, h, p.actuator_lag_time_constant_s)
@@ -163,7 +163,7 @@ def case(folder: Path, stage: int) -> PlantCase:
     "other_stage" acts on the load: for stage 1 the spring torque of stage 2, for stage 2 the angular
     acceleration of what it stands on (second differences of 30 ms of the measured tip angle).
     """
-    _, _, reference, theta, alpha = logged(folder, stage)
+    command, _, reference, theta, alpha = logged(folder, stage)
     _, _, _, other_theta, other_alpha = logged(folder, 3 - stage)
     if stage == 1:
         spring = MANUFACTURER[2]["spring_Nm_rad"] / MANUFACTURER[1]["load_inertia_kg_m2"]
@@ -173,14 +173,14 @@ def case(folder: Path, stage: int) -> PlantCase:
         padded = np.pad(tip, n, mode="edge")
         outside = -(padded[2 * n :] - 2 * tip + padded[: -2 * n]) / (n * DT_S) ** 2
     inputs = np.column_stack([reference, outside, theta])
-    output = np.column_stack([theta, alpha])
+    output = np.column_stack([theta, alpha, command])
     first, second = slice(0, PERIOD), slice(PERIOD, 2 * PERIOD)
     noise = np.sqrt(np.mean((output[first] - output[second]) ** 2, axis=0) / 2)
     plant = Plant(
         simulation(manufacturers_gains(folder, stage)),
         MANUFACTURER[stage],
         TOLERANCES,
-        ("theta_rad", "alpha_rad"),
+        ("theta_rad", "alpha_rad", "command_A"),
         noise,
         EFFECTS,
     )

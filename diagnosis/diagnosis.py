@@ -98,7 +98,8 @@ def _at_noise_seen(
 ) -> Diagnosis:
     """With the noise as stated, or as the records show it where that tells more."""
     answer = _answered(case, progress, rng, deadline_s)
-    if answer.verdict != "none" or not isinstance(case, PlantCase) or time.monotonic() > deadline_s:
+    hidden = answer.verdict == "none" or (answer.shares and not any(answer.shares.before))
+    if not (hidden and isinstance(case, PlantCase)) or time.monotonic() > deadline_s:
         return answer
     seen = quietest([e * case.noise for e in answer.residuals_refit.values()])
     if not np.any(seen < _TOO_LOUD * case.noise):

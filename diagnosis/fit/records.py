@@ -216,13 +216,14 @@ class Records(RecordsToFit):
     def shares(self, residuals: Sequence[Real]) -> Real:
         """(Y,) RMS left beyond what sensors may have over the RMS of the motion (about the mean), all
         records; of both what is felt (`Levels`)."""
-        return share_left(self.energies(residuals))
+        return np.asarray(np.sqrt(mean_square_left(self.energies(residuals))))
 
-    def energies(self, residuals: Sequence[Real]) -> Real:
-        """(2, R, Y) energies left beyond what sensors may have, and of the motion, of every record."""
+    def energies(self, residuals: Sequence[Real], *, with_noise: bool = False) -> Real:
+        """(2, R, Y) energies left, beyond what sensors may have or with that, and of the motion, of every
+        record."""
         levels, Y = self.levels, self.case.noise.size
         energy = levels.energy(np.concatenate([coefficients(e) for e in residuals]))
-        beyond = levels.felt * (energy - levels.noise)
+        beyond = levels.felt * (energy - (0.0 if with_noise else levels.noise))
         left = np.maximum(np.bincount(levels.belongs, beyond), 0.0)
         return np.array([left, levels.motion]).reshape(2, -1, Y)
 
@@ -246,7 +247,7 @@ def later(experiment: RecordOfMachine) -> dict[str, int]:
     return {"first_row": first_row} if first_row else {}
 
 
-def share_left(energies: Real) -> Real:
-    """(2, R, Y) energies of `Records.energies` -> (Y,) RMS left over the RMS of the motion."""
+def mean_square_left(energies: Real) -> Real:
+    """(2, R, Y) energies of `Records.energies` -> (Y,) energy left over that of the motion."""
     left, motion = energies.sum(axis=1)
-    return np.asarray(np.sqrt(left / motion))
+    return np.asarray(left / motion)

@@ -58,6 +58,11 @@ _WORSE, _WORSE_BY = 1.15, 0.2
 _STANDS_IN, _STANDS_IN_WIDTH = 0.9, 0.3
 # How probable a cause beyond the list is that looks like an effect, beside the effect.
 _UNLISTED = 1 / 3
+# A change is constant that varies by less than this share of itself, the accuracy of difference quotients.
+_CONSTANT = 1e-3
+# Operating points are one where they leave no more of a constant's energy than this, as error bars of a third
+# of them do.
+_SAME_POINT = 0.1
 _LISTED_AS = {name: str(kind.look_alike_of) for name, kind in LOOK_ALIKES.items()}
 # What an effect needs that a time limit left out.
 TIME = "more time"
@@ -76,13 +81,14 @@ class Part:
     share : geometric mean of what it carries on estimation and on held-out records, no more than on these. An
         effect that is real carries something of both, but where it does nothing in the latter, or where the
         records speak for it and what it does on the former can be had otherwise.
-    by_name : it is that effect only by its name: the records never show what makes it this one.
+    by_name : probability that it is that effect only by its name: the records do not show what makes it
+        this one.
     """
 
     name: str
     share: float
     matters: float
-    by_name: bool = False
+    by_name: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,12 +312,12 @@ def _judged(
         if len(rest.names) < len(reduced.names) - 1:
             break
         reduced = rest
-    for k, c in enumerate(explanation.end.candidates):
-        at_edge = c.at_edge(explanation.end.coordinates_of(k))
-        parts[c.effect] = replace(parts[c.effect], by_name=at_edge)
-    by_name = any(part.by_name and part.matters > 0.5 for part in parts.values())
+    for k, name in enumerate(explanation.names):
+        parts[name] = replace(parts[name], by_name=_by_name(search, explanation, k))
+    by_name = max((part.by_name for part in parts.values() if part.matters > 0.5), default=0.0)
     left, carries = _beyond(explanation), share_beside(nominal, explanation)
-    explains = complete = 0.0 if by_name else _enough(left, weighing)
+    explains = 0.0 if by_name == 1 else _enough(left, weighing)
+    complete = (1 - by_name) * explains
     answers = {
         name
         for name, effect in zip(explanation.names, explanation.end.effects, strict=True)
@@ -323,6 +329,28 @@ def _judged(
     beyond = max((part.share for part in parts.values() if part.name not in answers), default=0.0)
     score = score_of(explanation, weighing)
     return Judged(explanation, named, score, explains, complete, left, carries, beyond)
+
+
+def _by_name(search: Search, explanation: Explanation, k: int) -> float:
+    """Probability that the k-th effect is none but by its name.
+
+    At an end of its range it is. A constant is what a static error of an unlisted cause adds, too, where it
+    is one share, below one, of the operating points of all records.
+    """
+    end, records = explanation.end, search.records
+    if end.candidates[k].at_edge(end.coordinates_of(k)):
+        return 1.0
+    column = end.jacobian[:, end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])]
+    added = [-records.likelihood.unseen(column[part], search.case.noise.size) for part in records.parts]
+    constant = np.array([np.mean(a, axis=0) for a in added])
+    if any(np.ptp(a) > _CONSTANT * np.max(np.abs(a)) for signal in added for a in signal.T if np.any(a)):
+        return 0.0
+    pairs = zip(records.experiments, explanation.left, strict=True)
+    point = np.array([np.mean(e.output - left, axis=0) for e, left in pairs]) - constant
+    point = np.where(constant, point, 0.0)
+    share = np.sum(constant * point) / (np.sum(point**2) or 1.0)
+    same = np.sum((constant - share * point) ** 2) < _SAME_POINT * np.sum(constant**2)
+    return _UNLISTED / (1 + _UNLISTED) if same and abs(share) < 1 else 0.0
 
 
 def best_without(
@@ -382,7 +410,7 @@ def share_beside(rest: Explanation, explanation: Explanation) -> float:
 
 def _carried(rest: Explanation, explanation: Explanation) -> Real:
     """(2,) the same of estimation records and of held-out ones, of the output that shows most of it."""
-    carried = np.sqrt(np.maximum(rest.shares**2 - explanation.shares**2, 0.0))
+    carried = np.sqrt(np.maximum(rest.mean_squares - explanation.mean_squares, 0.0))
     return np.asarray(np.max(carried, axis=1))
 
 
@@ -477,7 +505,7 @@ def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: f
         # It is all; all but a cause beyond the list that looks like an effect; something else is missing.
         branches = (one.complete, one.explains - one.complete, 1 - one.explains)
         for branch, probability in enumerate(branches):
-            genuine = [_genuine(p, one) if branch == 2 else 1.0 for p in parts]
+            genuine = [(1.0, float(p.by_name == 0), _genuine(p, one))[branch] for p in parts]
             there = [p.matters * real for p, real in zip(parts, genuine, strict=True)]
             for chosen in subsets(range(len(parts))) if probability > 0 else ():
                 share = one.weight * probability
@@ -503,7 +531,7 @@ def _genuine(part: Part, one: Judged) -> float:
     """Probability that an effect of a set is no stand-in for what that leaves; two that only make up for each
     other carry no more than the set does."""
     share = min(part.share, one.carries)
-    return 0.0 if part.by_name else _soft(share / _STANDS_IN / max(one.left, 1e-9), _STANDS_IN_WIDTH)
+    return (1 - part.by_name) * _soft(share / _STANDS_IN / max(one.left, 1e-9), _STANDS_IN_WIDTH)
 
 
 def subsets(items: Iterable[int]) -> list[tuple[int, ...]]:

@@ -19,7 +19,8 @@ class Explanation:
     log_likelihoods : (R,) of every record, estimation and held-out.
     log_prior, log_volume : of deviations, start and effects; what the records leave of them.
     left, left_held_out : experiment residuals (T, Y) in the outputs' units.
-    shares : (2, Y) RMS left over the motion: estimation records, held-out records.
+    shares : (2, Y) RMS left beyond noise over the motion: estimation records, held-out records.
+    mean_squares : (2, Y) energies left over those of the motion, noise included: of differences.
     """
 
     end: Descent
@@ -29,6 +30,7 @@ class Explanation:
     left: tuple[Real, ...]
     left_held_out: tuple[Real, ...]
     shares: Real
+    mean_squares: Real
 
     @property
     def names(self) -> tuple[str, ...]:

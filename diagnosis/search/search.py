@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from diagnosis.fit.descent import Descent, descend, loss_at, occam, refined
-from diagnosis.fit.records import Records, Start
+from diagnosis.fit.records import Records, Start, mean_square_left
 from diagnosis.fit.starts import Point, beside
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.search.explanation import Explanation
@@ -190,6 +190,12 @@ class Search(SearchLoop[Explanation]):
             left,
             left_held_out,
             np.array([records.shares(left), held.shares(left_held_out)]),
+            np.array(
+                [
+                    mean_square_left(of.energies(e, with_noise=True))
+                    for of, e in ((records, left), (held, left_held_out))
+                ]
+            ),
         )
 
     def _beginning(self, held: Records, fitted: Start) -> Start:

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numba import njit
+from scipy.signal import lfilter
 
 from benchmarks import emps_axis
 from diagnosis import (
@@ -195,6 +196,34 @@ def test_noise_stated_too_large_makes_no_effect():
         warnings.simplefilter("error", UserWarning)
         found = diagnose(case.with_noise(10 * case.noise))
     assert found.verdict == "none"
+
+
+def _level(u, outlet, offset):
+    """Level (T, 1) of a tank whose outflow is as its speed, from its balance under the mean inflow."""
+    keep = 1 - DT_S * outlet
+    begun = lfilter([DT_S], [1.0, -keep], u - np.mean(u))
+    return (10 * np.mean(u) + np.concatenate([[0.0], begun[:-1]]) + offset)[:, None]
+
+
+@pytest.mark.parametrize(("means", "real", "sure"), [((3, 3, 3), False, False), ((0, 3, 6), True, True)])
+def test_a_constant_at_one_operating_point_may_be_an_unlisted_static_error(means, real, sure):
+    """Of a leak, and of a true offset of the sensor; the first is 3 % of the level, whatever that is."""
+    rng, experiments = np.random.default_rng(5), []
+    for mean, role in zip(means, ("estimation", "estimation", "held_out"), strict=True):
+        u = mean + rng.uniform(-1, 1, SAMPLES // 20).repeat(20)
+        y = _level(u, 0.1, 0.9 if real else -0.03 * 10 * mean)
+        y = y + 1e-3 * rng.standard_normal(y.shape)
+        experiments.append(PlantExperiment(f"{role} {len(experiments)}", role, u[:, None], y))
+
+    def simulate(parameters, effects, inputs):
+        return _level(inputs[:, 0], *parameters.values(), 0.0)
+
+    plant = Plant(simulate, {"outlet": 0.1}, {"outlet": 0.01}, ("y",), np.array([1e-3]), model_error=0.05)
+    names = ["output_offset", "input_delay", "actuator_lag"]
+    plant = with_effects(plant, names, experiments, dt_s=DT_S, at_rest_before=False)
+    found = diagnose(PlantCase("level", plant, tuple(experiments)))
+    assert found.presence("output_offset") > 0.5
+    assert (found.presence("output_offset") > 0.8) is sure
 
 
 @pytest.mark.parametrize(("key", "tolerances", "true"), [("mass_kg", 6, 2.03), ("spring_N_m", -6, 78.0)])

@@ -39,6 +39,17 @@ def test_the_first_stage_of_the_serial_link_feels_the_other(flexlink_data):
     assert all("other_stage" in names and closed > 0.6 for names, closed in found.shares.closes)
     assert "other_stage" in found.combination
     assert found.gap_closed > 0.6
+    # The command shows the friction of a joint that a tight loop moves as told.
+    assert found.presence("coulomb_friction") + found.presence("stribeck_friction") > 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fitted", [(50, 75), (50,)])
+def test_friction_of_the_ruler_robot_is_present_at_both_amplitudes(flexlink_data, fitted):
+    found = diagnose(ruler_robot.case(flexlink_data, fitted, (50, 75)))
+    # Measured .86 and .74; what it explains lies within half as much noise again as is stated.
+    assert found.presence("coulomb_friction") > 0.5
+    assert found.presence("drive_offset") > 0.5
 
 
 @pytest.mark.slow
