@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
@@ -168,7 +168,11 @@ class WrongValue:
         return f"wrong_{self.multiplies}"
 
     def candidates(self) -> tuple[Candidate, ...]:
-        return ratio_candidates(self, self.tolerance, _LARGEST_RATIO)
+        # At its end a ratio wants to go on: the value is not the cause, or nowhere near.
+        return tuple(
+            replace(side, axes=(replace(side.axes[0], edge="high" if side.grows else "low"),))
+            for side in ratio_candidates(self, self.tolerance, _LARGEST_RATIO)
+        )
 
     def from_search(self, values: Mapping[str, float], sign: int) -> Change:
         return Change(self.id, MappingProxyType(dict(values)))

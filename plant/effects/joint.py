@@ -240,7 +240,7 @@ class TorqueRipple(Effect):
         # weight, whatever its direction.
         fewest = float(np.clip(0.5 * np.pi / scales.swing_rad, 2.0, 20.0))
         amplitude = log_axis("amplitude_Nm", 1e-6 * scales.torque_Nm, scales.torque_Nm)
-        cycles = Axis("cycles_per_rev", "linear", fewest, 80.0, 1e-4, edge=True)
+        cycles = Axis("cycles_per_rev", "linear", fewest, 80.0, 1e-4, edge="low")
         return (cls._candidate([amplitude, cycles, PHASE]),)
 
 
@@ -267,7 +267,7 @@ class PeriodicDisturbance(Effect):
         # What shakes the hub may be stronger than what the motor was asked for.
         amplitude = log_axis("amplitude_Nm", 1e-6 * scales.torque_Nm, 10 * scales.torque_Nm)
         low, high = 0.3 / scales.duration_s, 0.5 / scales.dt_s
-        frequency = Axis("frequency_Hz", "linear", low, high, 1e-5, edge=True)
+        frequency = Axis("frequency_Hz", "linear", low, high, 1e-5, edge="low")
         return (cls._candidate([amplitude, frequency, PHASE]),)
 
 

@@ -30,8 +30,8 @@ class Axis:
     """One coordinate of a search: parameter, scale, range, and a step for difference quotients.
 
     `low` and `high` are in the parameter's unit; the coordinate is its logarithm on a "log" axis. Its prior
-    is flat over the range; with `usual` (low, high) nine tenths of it lie there. edge: at the lower end the
-    records no longer show what makes the effect this one (a period never completed).
+    is flat over the range; with `usual` (low, high) nine tenths of it lie there. edge: at this end records no
+    longer show what makes the effect this one (a period never completed, a value that wants to go on).
     """
 
     parameter: str
@@ -39,12 +39,13 @@ class Axis:
     low: float
     high: float
     step: float
-    edge: bool = False
+    edge: Literal["", "low", "high"] = ""
     usual: tuple[float, float] | None = None
 
     def at_edge(self, coordinate: float) -> bool:
         """Whether the effect has turned into something else that happens to look like it (see `edge`)."""
-        return self.edge and self.value(coordinate) < 1.01 * self.low
+        value = self.value(coordinate)
+        return {"": False, "low": value < 1.01 * self.low, "high": value > 0.99 * self.high}[self.edge]
 
     def coordinate(self, value: float) -> float:
         return float(np.log(value)) if self.scale == "log" else float(value)

@@ -528,3 +528,29 @@ def test_a_time_limit_is_kept_while_a_fit_is_running(monkeypatch, limit_s):
     found = diagnose(case, time_limit_s=limit_s)
     assert clock.now - begun < 1.1 * limit_s
     assert found.shares.not_tried
+
+
+@pytest.mark.parametrize("ratio", [8.0, 20.0, 0.05])
+def test_a_value_that_is_pinned_at_its_bound_is_no_answer(ratio):
+    """A gain may be wrong by a factor of ten; beyond that the cause is unknown, and its remark says why."""
+
+    def simulate(parameters, effects, inputs):
+        offset = effects.get("offset", {}).get("size", 0.0)
+        return lfilter([0.0, 0.1], [1.0, -0.9], parameters["gain"] * inputs, axis=0) + offset
+
+    rng = np.random.default_rng(0)
+    experiments = []
+    for role in ("estimation", "held_out"):
+        pushed = rng.uniform(-1, 1, 30).repeat(10)[:, None]
+        moved = simulate({"gain": 2.0 * ratio}, {}, pushed) + 1e-3 * rng.standard_normal((300, 1))
+        experiments.append(PlantExperiment(role, role, pushed, moved))
+    offset = PlantEffect("offset", (EffectParameter("size", 1e-3, 10.0),), signed=True)
+    plant = Plant(simulate, {"gain": 2.0}, {"gain": 0.05}, ("y",), np.array([1e-3]), (offset,), 0.05, 0.01)
+    found = diagnose(PlantCase("one", plant, tuple(experiments)))
+    assert found.combination == (("wrong_gain",) if ratio == 8.0 else ())
+    (gain,) = [e for e in found.effects if e.name == "wrong_gain"]
+    if ratio == 8.0:
+        assert gain.parameters["ratio"] == pytest.approx(ratio, rel=0.01)
+        assert not gain.remarks
+    elif gain.parameters:
+        assert "end of its range" in gain.remarks["ratio"]
