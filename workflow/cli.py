@@ -646,6 +646,34 @@ def study(
     _leave(summary)
 
 
+@app.command(short_help="What logs can tell of a simulator's model, in seconds.")
+def check(
+    case: Annotated[
+        Path | None, typer.Argument(help="TOML file that names a simulator's model and its logs.")
+    ] = None,
+    mjcf: Annotated[str | None, typer.Option(help="MuJoCo model, in place of a file.")] = None,
+    fmu: Annotated[str | None, typer.Option(help="FMU, in place of a file; runs its native code.")] = None,
+    python: Annotated[str | None, typer.Option(help="Python file with a simulation.")] = None,
+    log: Annotated[list[str] | None, typer.Option(help="Log of the machine (repeatable).")] = None,
+    dt_s: Annotated[float | None, typer.Option(help="Sampling period [s] of its logs without time.")] = None,
+    repair: Annotated[bool, typer.Option("--repair", help=_LOGS)] = False,
+    resample_s: Annotated[float | None, typer.Option(help=_LOGS)] = None,
+    time_limit: TimeLimit = None,
+    as_json: Json = False,
+) -> None:
+    """Quality of logs, smallest sizes that show, candidates that act alike, what a next record needs."""
+    model = {key: name for key, name in {"mjcf": mjcf, "fmu": fmu, "python": python}.items() if name}
+    if bool(case) == bool(model) or bool(model) != bool(log):
+        raise InputError("check: expected a case file, or --mjcf, --fmu or --python with --log")
+    need(*([case] if case else [Path(name) for name in (*model.values(), *(log or []))]))
+    from workflow.diagnose.check import check as look_at_case
+    from workflow.diagnose.simulator_case import settings_of
+
+    of_logs = {"dt_s": dt_s, "repair": repair or None, "resample_s": resample_s}
+    stated = {**model, "log": log, **{key: value for key, value in of_logs.items() if value is not None}}
+    _show(look_at_case(case or settings_of(stated, "--log")), as_json)
+
+
 @app.command(short_help="Why machine and model differ: cause, size, closure.")
 def diagnose(
     out: Annotated[Path, typer.Option(help="Directory for answers, pages and repaired rigs; new or empty.")],

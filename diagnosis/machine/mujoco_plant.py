@@ -56,8 +56,11 @@ TOLERANCES = {
 _ELSE = 0.01  # gravity, sensors
 _LONGEST_MODEL = 2**26  # bytes
 _SMOOTHED = 9  # samples, of a measured angle whose speed is asked
-# Noise deviations that the largest start of an effect has to move a record somewhere to be looked for.
-_SEEN = 3.0
+# Noise deviations that the largest start of an effect has to move a record by to be looked for, and the
+# share of the model error that it has to make: what makes less is never named.
+_SEEN, _INTERESTS = 3.0, 0.5
+# The factor by which a stated value is wrong at that; records that are simulated for it.
+_WRONG, _LOOKED_AT = 3.0, 2
 # Numbers of a file have no more digits than this.
 _NO_LEVER_M = 1e-6
 # Share by which forces change to see the motion that they make.
@@ -520,24 +523,34 @@ class MujocoArm:
         stated = {name: one.value for name, one in every.items() if one.value != 0.0}
         tolerances = {name: self.number(f"tolerance.{name}", _usual_tolerance(name)) for name in stated}
         simulation = Simulation(self, every, noise)
-        as_stated = simulation(stated, {}, experiments[0].input)
+        share = model_error * self._commanded(simulation, stated, experiments)
+        records = experiments[:_LOOKED_AT]
+        as_stated = [simulation(stated, {}, e.input) for e in records]
 
-        def seen(effect: PlantEffect) -> bool:
-            size = effect.parameters[0]
-            moved = simulation(stated, {effect.name: {size.name: size.starts[-1]}}, experiments[0].input)
-            return bool(np.max(np.abs(moved - as_stated) / noise) > _SEEN)
+        def seen(parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]]) -> bool:
+            for e, before in zip(records, as_stated, strict=True):
+                moved = simulation({**stated, **parameters}, effects, e.input) - before
+                least = _INTERESTS * share * np.std(e.output, axis=0)
+                large = np.sqrt(np.mean(moved**2, axis=0)) > least
+                if np.any(large & (np.max(np.abs(moved), axis=0) > _SEEN * noise)):
+                    return True
+            return False
 
         missing = [one.effect for one in every.values() if one.value == 0.0]
+        sizes = {effect.name: effect.parameters[0] for effect in missing}
+        shown = {name for name, value in stated.items() if seen({name: _WRONG * value}, {})}
+        shown |= {name for name, size in sizes.items() if seen({}, {name: {size.name: size.starts[-1]}})}
+        silent = [f"wrong_{name}" for name in stated if name not in shown and tolerances[name] > 0]
         return Plant(
             simulation,
             stated,
-            {name: value for name, value in tolerances.items() if value > 0},
+            {name: value for name, value in tolerances.items() if value > 0 and name in shown},
             self.outputs,
             noise,
-            tuple(effect for effect in missing if seen(effect)),
-            model_error * self._commanded(simulation, stated, experiments),
+            tuple(effect for effect in missing if effect.name in shown),
+            share,
             self.dt_s,
-            inactive=self._untried(every),
+            inactive={**self._untried(every), **dict.fromkeys(silent, "records in which it shows")},
             settled=simulation.settled,
         )
 

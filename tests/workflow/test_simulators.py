@@ -306,3 +306,31 @@ def test_the_logs_of_the_example_are_what_its_script_records(tmp_path):
     for name in ("first.csv", "second.csv"):
         again, kept = (np.loadtxt(folder / name, delimiter=",", skiprows=1) for folder in (tmp_path, EXAMPLE))
         np.testing.assert_allclose(again, kept, rtol=0, atol=1e-3)
+
+
+def test_check_says_what_logs_can_tell(tmp_path, flexlink, refused):
+    """Of a bad log: a command that is cut off, one column of noise, values that act alike."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "arm.xml").write_text(HINGE)
+    for seed, name in enumerate(("one.csv", "two.csv")):
+        write_log(tmp_path / name, seed, 0.1)
+    rows = np.loadtxt(tmp_path / "two.csv", delimiter=",", skiprows=1)
+    rows[:, 1] = np.clip(rows[:, 1] + 1e-3 * np.arange(len(rows)), -0.5, 0.5)
+    np.savetxt(tmp_path / "two.csv", rows, delimiter=",", header="time_s,motor,hinge", comments="")
+    arguments = ["--mjcf", str(tmp_path / "arm.xml")]
+    for name in ("one.csv", "two.csv"):
+        arguments += ["--log", str(tmp_path / name)]
+    document = flexlink("check", *arguments, "--json").document()
+    rows_of = {(row["section"], row["label"]): row["value"] for row in document["table"]}
+    assert "is it cut off?" in rows_of["two", "command 1"]
+    assert ("one", "command 1") not in rows_of
+    assert rows_of["smallest size that shows", "motor.gain"].endswith("% of 1")
+    groups = [{*one["names"]} for one in document["numbers"]["alike"]]
+    assert {"hinge.damping", "rod.mass", "motor.gain"} in groups
+    assert any("with a known mass on it" in words for words in document["numbers"]["advice"])
+    (tmp_path / "arm.toml").write_text('mjcf = "arm.xml"\nlog = ["one.csv", "two.csv"]\n')
+    again = flexlink("check", str(tmp_path / "arm.toml"), "--json").document()
+    assert again["numbers"]["alike"] == document["numbers"]["alike"]
+    (tmp_path / "rig.toml").write_text('rig = "rig.toml"\nexperiments = []\n')
+    assert "names no simulator's model" in refused("check", tmp_path / "rig.toml")
+    assert "expected a case file, or --mjcf" in refused("check", "--mjcf", tmp_path / "arm.xml")

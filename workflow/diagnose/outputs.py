@@ -10,9 +10,11 @@ from typing import Any
 import tomlkit
 
 from diagnosis.answer import Diagnosis
+from diagnosis.machine.telling import telling
 from diagnosis.where.where import where
 from plant.rig import Rig
 from workflow.diagnose.case_files import LoadedCase
+from workflow.diagnose.check import of_case
 from workflow.diagnose.controller_check import ControllerCheck, NoControllerError, check_controller
 from workflow.diagnose.directory import answer_text
 from workflow.diagnose.document import completeness_of, document_of
@@ -24,6 +26,8 @@ from workflow.engine.errors import naming
 from workflow.engine.executor import Report
 from workflow.text.templates import render_text
 
+# Seconds for what records can tell.
+_TOLD_S = 10.0
 # Shares of a case's time, for the progress bar only.
 _DIAGNOSED, _WHERE, _NEXT, _CONTROLLER = 0.75, 0.8, 0.85, 0.9
 
@@ -93,12 +97,14 @@ class Work:
         with naming(f"case {name}"):
             found = self.diagnose(loaded.case, progress=lambda f, m: report(_CONTROLLER * f, m))
             coming = following(found)
-            files = {f"{name}.html": plant_page(found, coming).encode()}
+            told = of_case(loaded.case, telling(loaded.case, time.monotonic() + _TOLD_S))
+            files = {f"{name}.html": plant_page(found, coming, told).encode()}
             if loaded.repaired is not None:
                 files[f"{name}.xml"] = loaded.repaired(found).encode()
         beside = {
             "completeness": completeness_of(found, remains_of(found)),
             "next_experiment": {"advice": coming.advice, **codec.plain(coming.repeat or {})},
+            "check": told.numbers,
         }
         return self._with_document(loaded, found, beside, files), time.process_time()
 

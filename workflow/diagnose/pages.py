@@ -25,6 +25,7 @@ from workflow.diagnose.following import Following, following
 from workflow.diagnose.words import FILTERS
 from workflow.engine import storage
 from workflow.report.rendering import render_page
+from workflow.tasks.summary import RunSummary
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +54,9 @@ def case_page(page: CasePage, progress: Callable[[float, str], None] | None = No
     return _rendered("diagnosis/case.html.j2", page.found, progress, page=page, versions=versions)
 
 
-def plant_page(found: Diagnosis, coming: Following) -> str:
-    """One self-contained HTML page about a `PlantCase`; equal content gives equal bytes.
+def plant_page(found: Diagnosis, coming: Following, told: RunSummary | None = None) -> str:
+    """One self-contained HTML page about a `PlantCase`; equal content gives equal bytes. told: what its
+    records can tell (`workflow.diagnose.check`).
 
     Raises ValueError if the plant does not state its sampling period.
     """
@@ -70,6 +72,7 @@ def plant_page(found: Diagnosis, coming: Following) -> str:
         "where": where_in_records(found.case, found.residuals_refit, dt_s),
         "remains": remains_of(found),
         "next_experiment": coming,
+        "told": told,
         "numbers": json.dumps(numbers, indent=1),
     }
     return _rendered("diagnosis/plant.html.j2", found, page=page)
