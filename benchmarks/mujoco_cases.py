@@ -1,13 +1,15 @@
-"""Forty generated arms against their MuJoCo models: is the effect named, how near is its size, false alarms.
+"""Eighty generated arms against their MuJoCo models: is the effect named, how near is its size, false alarms.
 
-Arms of one and two joints follow random steps under a sampled PD controller; angles have noise of 0.2 mrad.
-The model has masses, damping and armature drawn off by their usual tolerances. Every other truth comes from
+Arms of one and two joints follow random steps under a sampled PD controller, or position servos of their own;
+angles have noise of 0.2 mrad. Two of three logs begin in motion. The model has any of MuJoCo's integrators, a
+gear or none, and masses, damping and armature drawn off by their usual tolerances. Every other truth is
 MuJoCo at a fifth of the model's step, with the effect put in by other means than the candidates use (torques
 of our own on the joints, an added geom, a tilted base, commands changed on their way); the others are the
 equations of motion of a planar arm, derived by hand and integrated by the classical Runge-Kutta method.
 
-Strict: the effect is the first answer. Size: the value in the repaired model (ratio times stated value, or
-size of an added effect) against the truth.
+First: the effect is the first answer; exact: it is the only one. Size: the value in the repaired model (ratio
+times stated value, or size of an added effect) against the truth. The order of the cases is drawn, so that
+the first ones of a series are a sample of it.
 """
 
 from __future__ import annotations
@@ -30,6 +32,10 @@ from diagnosis.machine.mujoco_plant import MujocoArm
 
 DT_S, STEP_S, SAMPLES, NOISE_RAD, MODEL_ERROR = 0.01, 0.0025, 300, 2e-4, 0.02
 GRAVITY = 9.81
+INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
+# Motors, motors behind a gear, position servos (stiffness, damping).
+DRIVES, GEAR, SERVO = ("motor", "gear", "servo"), 20.0, ((60.0, 6.0), (25.0, 2.0))
+MOVING = 70  # rows that a log lacks at its start
 LENGTHS_M, MASSES_KG, DAMPING, ARMATURE = (0.3, 0.25), (1.2, 0.8), (0.25, 0.12), (0.03, 0.015)
 JOINTS = ("shoulder", "elbow")
 
@@ -73,6 +79,9 @@ class Truth:
     joint: int
     size: float
     flat: bool
+    drive: str = "motor"
+    integrator: str = "Euler"
+    moving: bool = False
 
     @property
     def name(self) -> str:
@@ -107,7 +116,15 @@ class Truth:
 
 
 def xml_of(
-    n: int, flat: bool, masses: Any, damping: Any, armature: Any, step_s: float, tilt: float = 0.0
+    n: int,
+    flat: bool,
+    masses: Any,
+    damping: Any,
+    armature: Any,
+    step_s: float,
+    tilt: float = 0.0,
+    drive: str = "motor",
+    integrator: str = "RK4",
 ) -> str:
     """tilt: of the base, about y [rad]."""
     axis = "0 0 1" if flat else "0 1 0"
@@ -121,10 +138,15 @@ def xml_of(
             f'size="{LENGTHS_M[k] / 2} 0.01 0.01" mass="{masses[k]}" contype="0" conaffinity="0"/>'
             f"{site}{inner}</body>"
         )
-    motors = "".join(f'<motor name="motor{k + 1}" joint="{JOINTS[k]}"/>' for k in range(n))
+    kinds = {
+        "motor": ["motor"] * n,
+        "gear": [f'motor gear="{GEAR}"'] * n,
+        "servo": [f'position kp="{kp}" kv="{kv}"' for kp, kv in SERVO[:n]],
+    }
+    motors = "".join(f'<{kinds[drive][k]} name="motor{k + 1}" joint="{JOINTS[k]}"/>' for k in range(n))
     return (
         f'<mujoco model="arm"><compiler angle="radian"/>'
-        f'<option timestep="{step_s}" gravity="0 0 {-GRAVITY}"/>'
+        f'<option timestep="{step_s}" integrator="{integrator}" gravity="0 0 {-GRAVITY}"/>'
         f"<worldbody>{inner}</worldbody><actuator>{motors}</actuator></mujoco>"
     )
 
@@ -161,9 +183,12 @@ class InMujoco:
 
     def step(self, torque: Any) -> None:
         level, spring = self.truth.of("frictionloss", 0.0), self.truth.of("stiffness", 0.0)
+        kp, kv = np.array(SERVO[: self.truth.n]).T
         for _ in range(round(5 * DT_S / STEP_S)):
-            self.data.ctrl[:] = torque
-            v = self.data.qvel
+            v, held = self.data.qvel, torque
+            if self.truth.drive == "servo":  # the command is an angle
+                held = kp * (torque - self.data.qpos) - kv * v
+            self.data.ctrl[:] = held * self.truth.of("gain", 1.0)
             self.data.qfrc_applied[:] = -level * np.tanh(v / 5e-3) - spring * self.data.qpos
             mujoco.mj_step(self.model, self.data)
 
@@ -260,19 +285,20 @@ def at_rest(truth: Truth) -> Any:
 def record(truth: Truth, rng: np.random.Generator, *, by_equations: bool) -> tuple[Any, Any]:
     """Commands and readings (T, n) under the controller."""
     machine: InMujoco | ByEquations = ByEquations(truth) if by_equations else InMujoco(truth)
-    n = truth.n
-    steps = np.repeat(rng.uniform(-1.0, 1.0, (SAMPLES // 60 + 1, n)), 60, axis=0)[:SAMPLES]
+    n, rows = truth.n, SAMPLES + (MOVING if truth.moving else 0)
+    steps = np.repeat(rng.uniform(-1.0, 1.0, (rows // 60 + 1, n)), 60, axis=0)[:rows]
     steps[:20] = 0.0
     reference = at_rest(truth) + sosfilt(butter(2, 2.5, fs=1 / DT_S, output="sos"), steps, axis=0)
     kp, kd = np.array([25.0, 10.0])[:n], np.array([2.5, 0.8])[:n]
     offset = truth.of("sensor_offset", 0.0)
-    queue = deque([np.zeros(n)] * 40, maxlen=40)
-    lagged, last = np.zeros(n), None
-    U, Y = np.zeros((SAMPLES, n)), np.zeros((SAMPLES, n))
-    for k in range(SAMPLES):
+    first = at_rest(truth) if truth.drive == "servo" else np.zeros(n)
+    queue = deque([first] * 40, maxlen=40)
+    lagged, last = first, None
+    U, Y = np.zeros((rows, n)), np.zeros((rows, n))
+    for k in range(rows):
         q = machine.angle + offset + NOISE_RAD * rng.standard_normal(n)
         speed = np.zeros(n) if last is None else (q - last) / DT_S
-        u = kp * (reference[k] - q) - kd * speed
+        u = reference[k] if truth.drive == "servo" else kp * (reference[k] - q) - kd * speed
         queue.append(u)
         late = truth.of("delay", 0.0) / DT_S
         whole = np.floor(late).astype(int)
@@ -284,15 +310,16 @@ def record(truth: Truth, rng: np.random.Generator, *, by_equations: bool) -> tup
         # Mean of the lagged command over the sample.
         mean = sent + (lagged - sent) * np.where(T > 0, T / DT_S * (1 - keep), 0.0)
         lagged = keep * lagged + (1 - keep) * sent
-        machine.step(mean * truth.of("gain", 1.0))
-        U[k], Y[k], last = u, q, q
-    return U, Y
+        machine.step(mean if isinstance(machine, InMujoco) else mean * truth.of("gain", 1.0))
+        U[k], Y[k], last = u / (GEAR if truth.drive == "gear" else 1.0), q, q
+    return U[rows - SAMPLES :], Y[rows - SAMPLES :]
 
 
 def case_of(number: int, seed: int) -> tuple[Truth, PlantCase]:
-    """The number-th case, 0 to 39."""
+    """The number-th case, 0 to 79."""
     rng = np.random.default_rng([seed, number])
-    effect, n, joint = KINDS[number]
+    effect, n, joint = KINDS[number % len(KINDS)]
+    drive = DRIVES[number // 2 % 3]
     flat = effect == "tilt"
     low, high = SIZES.get(effect, (1.0, 1.0))
 
@@ -302,27 +329,39 @@ def case_of(number: int, seed: int) -> tuple[Truth, PlantCase]:
     truth = Truth(
         n, off(MASSES_KG, 0.02), off(DAMPING, 0.1), off(ARMATURE, 0.05), effect, joint,
         float(np.exp(rng.uniform(np.log(low), np.log(high)))), flat,
+        drive, INTEGRATORS[number // 2 % 4], number % 3 > 0,
     )  # fmt: skip
     experiments = []
     for role in ("estimation", "held_out"):
-        U, Y = record(truth, rng, by_equations=number % 2 == 1)
+        U, Y = record(truth, rng, by_equations=_by_equations(number))
         experiments.append(PlantExperiment(role, role, np.column_stack([U, Y]), Y))  # type: ignore[arg-type]
-    spec = mujoco.MjSpec.from_string(xml_of(n, flat, MASSES_KG, DAMPING, ARMATURE, STEP_S))
+    model = xml_of(n, flat, MASSES_KG, DAMPING, ARMATURE, STEP_S, drive=drive, integrator=truth.integrator)
+    spec = mujoco.MjSpec.from_string(model)
     arm = MujocoArm(spec, JOINTS[:n], DT_S)
     arm = MujocoArm(arm.spec, JOINTS[:n], DT_S, arm.tracking(experiments))
     plant = arm.plant(experiments, np.full(n, NOISE_RAD), model_error=MODEL_ERROR)
     return truth, PlantCase(f"case {number}", plant, tuple(experiments))
 
 
+def _by_equations(number: int) -> bool:
+    """Servos are in MuJoCo alone."""
+    return number % 2 == 1 and DRIVES[number // 2 % 3] != "servo"
+
+
 @dataclass(frozen=True)
 class Answer:
-    """Of one case: a line, whether the first answer is right, whether its value is near, a false alarm."""
+    """Of one case. off: relative error of the size where it is named; covers: its interval holds the truth;
+    sure: a wrong answer of more than 80 %, a wrong partner counted."""
 
     line: str
+    integrator: str
     none: bool
-    right: bool
-    near: bool
-    alarm: bool
+    first: bool
+    exact: bool
+    off: float
+    covers: bool
+    sure: bool
+    cpu_s: float
 
 
 def answer(number: int, seed: int) -> Answer:
@@ -333,31 +372,49 @@ def answer(number: int, seed: int) -> Answer:
         size = next(iter(change.values.values()))
         key = change.id.removeprefix("wrong_")
         values[key] = values[key] * size if key in values else size
-    none, right = truth.effect == "none", found.effects[0].name == truth.name
-    off = abs(values.get(truth.name.removeprefix("wrong_"), 0.0)) / truth.value - 1
-    source = "equations" if number % 2 else "MuJoCo"
+    none, key = truth.effect == "none", truth.name.removeprefix("wrong_")
+    first = found.effects[0].name == truth.name
+    exact = found.verdict == "none" if none else found.combination == (truth.name,)
+    off = abs(values.get(key, 0.0)) / truth.value - 1
+    covers = False
+    for low, high in found.effects[0].intervals.values() if first and not none else ():
+        stated = case.plant.parameters.get(key, 1.0)
+        covers = min(abs(low), abs(high)) * stated <= truth.value <= max(abs(low), abs(high)) * stated
+    source = "equations" if _by_equations(number) else "MuJoCo"
     size = "" if none else f"{truth.value:.4g}, found {100 * off:+.1f} %"
     line = (
-        f"{number:3d} {source:9s} {truth.n} joints  {truth.name:26s} {size:24s} -> "
-        f"{', '.join(found.combination) or found.verdict}  (gap {found.gap_refit:.1f} to "
-        f"{found.gap_after:.1f}, {cpu_s:.0f} s)"
+        f"{number:3d} {source:9s} {truth.integrator:12s} {truth.drive:5s} "
+        f"{'moving' if truth.moving else 'rest':6s} "
+        f"{truth.n} {truth.name:26s} {size:24s} -> {', '.join(found.combination) or found.verdict} "
+        f"{found.probability:.3f} (gap {found.gap_refit:.1f} to {found.gap_after:.1f}, {cpu_s:.0f} s)"
     )
-    return Answer(line, none, right, right and abs(off) <= 0.05, none and found.verdict == "effect")
+    sure = not exact and found.probability > 0.8 and found.verdict != "unknown"
+    return Answer(line, truth.integrator, none, first, exact, abs(off), covers, sure, cpu_s)
 
 
-def run(out: Print, *, seed: int = 15, first: int = 0, cases: int = 40, jobs: int = 2) -> None:
-    numbers = range(first, first + cases)
+def run(out: Print, *, seed: int = 15, first: int = 0, cases: int = 80, jobs: int = 2) -> None:
+    order = np.random.default_rng(seed).permutation(2 * len(KINDS)).tolist()
+    numbers = order[first : first + cases]
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         answers = []
-        for one in pool.map(answer, numbers, [seed] * cases):
+        for one in pool.map(answer, numbers, [seed] * len(numbers)):
             out(one.line)
             answers.append(one)
     effects = [one for one in answers if not one.none]
-    alarms = [one for one in answers if one.alarm]
+    named = [one for one in effects if one.first]
     out()
-    out(f"first answer right: {sum(one.right for one in effects)} of {len(effects)}")
-    out(f"right and value within 5 %: {sum(one.near for one in effects)} of {len(effects)}")
-    out(f"false alarms: {len(alarms)} of {len(answers) - len(effects)}")
+    for name in (*INTEGRATORS, "all"):
+        here = [one for one in effects if name in (one.integrator, "all")]
+        out(
+            f"{name:12s} exact {sum(one.exact for one in here)}, first {sum(one.first for one in here)} of "
+            f"{len(here)}"
+        )
+    alarms = [one for one in answers if one.none and not one.exact]
+    out(f"false alarms or unknown where nothing is hidden: {len(alarms)} of {len(answers) - len(effects)}")
+    out(f"size of those named first: median error {100 * float(np.median([o.off for o in named])):.1f} %")
+    out(f"interval holds the truth: {sum(one.covers for one in named)} of {len(named)}")
+    out(f"sure and wrong: {sum(one.sure for one in answers)} of {len(answers)}")
+    out(f"CPU: median {float(np.median([one.cpu_s for one in answers])):.0f} s")
 
 
 if __name__ == "__main__":
