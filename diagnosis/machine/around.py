@@ -111,7 +111,8 @@ class MeasuredBody:
     def under(self, started: Started, forces: BodyForces) -> Run:
         def simulated(inputs: Real) -> Real:
             found = np.array(started.run(inputs))
-            found[:, self.force] += forces.overcome(inputs[:, self.position], inputs[:, self.speed])
+            force = found[:, self.force]
+            force += forces.overcome(inputs[:, self.position], inputs[:, self.speed], force)
             return found
 
         return simulated

@@ -26,13 +26,15 @@ _SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.5, 0.8), "linear")
 
 @dataclass(frozen=True)
 class Sizes:
-    """Magnitudes of the records: largest input, force, position, speed, output; sampling; longest record."""
+    """Magnitudes of the records: largest input, force, position, speed, output about its mean, reading of it
+    about zero; sampling; longest record."""
 
     input: float = 1.0
     force: float = 1.0
     position: float = 1.0
     speed: float = 1.0
     output: float = 1.0
+    reading: float = 1.0
     dt_s: float = 1.0
     duration_s: float = 1.0
 
@@ -231,6 +233,27 @@ KINDS: dict[str, Kind] = {
         lambda s: (_log("coefficient", s.force / s.speed, 1e-5, 30.0, 1e-4, 3.0, 8),),
         check="move at several steady speeds and note the input: it should grow in proportion",
     ),
+    "viscous_asymmetry": Kind(
+        "body",
+        lambda v: {"asymmetry": v["coefficient"]},
+        lambda s: (_log("coefficient", s.force / s.speed, 1e-5, 30.0, 1e-4, 3.0, 8),),
+        signed=True,
+        dependence="continuous",
+        check="move at the same steady speeds both ways: one way takes more, in proportion to speed",
+    ),
+    "quadratic_drag": Kind(
+        "body",
+        lambda v: {"drag": v["coefficient"]},
+        lambda s: (_log("coefficient", s.force / s.speed**2, 1e-5, 30.0, 1e-3, 3.0, 8),),
+        check="move at several steady speeds: twice the speed should take four times the input",
+    ),
+    "load_friction": Kind(
+        "body",
+        lambda v: {"load": v["share"]},
+        lambda s: (EffectParameter("share", 1e-4, 0.9, (1e-3, 0.01, 0.05, 0.15, 0.3, 0.6)),),
+        dependence="continuous",
+        check="move slowly without and with a heavy load and compare what each takes beyond the load",
+    ),
     "spring": Kind(
         "body",
         lambda v: {"linear": v["stiffness"]},
@@ -249,6 +272,14 @@ KINDS: dict[str, Kind] = {
         lambda s: (_log("gap", s.output, 1e-4, 1.0, 1e-3, 0.5, 20),),
         dependence="non-smooth",
         check="hold the drive and move the load to and fro by hand: the free play is the backlash",
+    ),
+    "output_saturation": Kind(
+        "output",
+        _clipped,
+        lambda s: (_log("limit", s.reading, 0.05, 1.0, 0.3, 0.999, 16),),
+        grows=False,
+        dependence="continuous",
+        check="move slowly through the whole range: the reading should not stop before the machine does",
     ),
     "output_lag": Kind(
         "output",

@@ -57,7 +57,8 @@ class BodyForces:
     """Forces on a body against its motion, SI or whatever units force and motion have.
 
     Dry friction of size coulomb + excess exp(-|v| / stribeck_velocity), with `up` more while v > 0 and `down`
-    more while v < 0, at rest up to coulomb + excess; viscous v; linear x + cubic x^3, x from zero.
+    more while v < 0, at rest up to coulomb + excess; load times the force that is commanded, as dry friction;
+    viscous v + asymmetry |v| + drag v |v|; linear x + cubic x^3, x from zero.
     """
 
     coulomb: float = 0.0
@@ -68,12 +69,18 @@ class BodyForces:
     viscous: float = 0.0
     linear: float = 0.0
     cubic: float = 0.0
+    asymmetry: float = 0.0
+    drag: float = 0.0
+    load: float = 0.0
 
-    def overcome(self, x: Real, v: Real) -> Real:
-        """Force (T,) that a known motion takes against them."""
+    def overcome(self, x: Real, v: Real, rest: Real) -> Real:
+        """Force (T,) that a known motion takes against them, and a rest (T,) without them."""
         level = self.coulomb + self.excess * np.exp(-np.abs(v) / self.stribeck_velocity)
         dry = np.where(v > 0, level + self.up, np.where(v < 0, -level - self.down, 0.0))
-        return np.asarray(dry + self.viscous * v + self.linear * x + self.cubic * x**3)
+        smooth = (self.viscous + self.drag * np.abs(v)) * v + self.asymmetry * np.abs(v)
+        whole = rest + dry + smooth + self.linear * x + self.cubic * x**3
+        # The commanded force is the whole one: more of it is lost where it drives than where it brakes.
+        return np.asarray(whole / (1 - self.load * np.sign(v) * np.sign(whole)) - rest)
 
     @property
     def sizes(self) -> tuple[float, ...]:
@@ -82,7 +89,7 @@ class BodyForces:
     @property
     def smooth(self) -> bool:
         """Whether there are some that change little within a sample."""
-        return self.viscous != 0 or self.linear != 0 or self.cubic != 0
+        return any((self.viscous, self.linear, self.cubic, self.asymmetry, self.drag))
 
 
 def _logarithm(matrix: Real) -> Real:
@@ -159,7 +166,8 @@ class LinearBody:
         swing, gx, gv = self.turns
         stiffness = abs(forces.linear) + 3 * abs(forces.cubic) * largest**2
         turned = np.hypot(swing, np.sqrt(2 * abs(gx) * stiffness))
-        finer = max(turned, abs(forces.viscous * gv), _TURNED) / _TURNED
+        rubbed = (abs(forces.viscous) + abs(forces.asymmetry)) * abs(gv)
+        finer = max(turned, rubbed, _TURNED) / _TURNED
         return int(2 ** min(np.ceil(np.log2(finer)), _MOST_PARTS))
 
     def answer(
@@ -267,7 +275,9 @@ class PulseResponse:
     ) -> tuple[Real, Real, Real]:
         """The same as `LinearBody.answer`, the motion being that of a simulation under held forces."""
         seen = self.motion(simulated, force)
-        held, x, v = _solve(*seen, force - command, self.position, self.speed, self.ahead, forces.sizes)
+        held, x, v = _solve(
+            *seen, force - command, command, self.position, self.speed, self.ahead, forces.sizes
+        )
         motion = v if self.of_speed else x
         return held, motion, motion
 
@@ -369,6 +379,7 @@ def _solve(
     position: Real,
     speed: Real,
     held: Real,
+    command: Real,
     hx: Real,
     hv: Real,
     ahead: int,
@@ -387,26 +398,36 @@ def _solve(
             dv += hv[n - j] * change[j]
         ax, av = position[n] + dx - gx * held[k], speed[n] + dv - gv * held[k]
         x0, v0 = (x[n - 1], v[n - 1]) if n > 0 else (ax, av)
-        f[k], x[n], v[n] = _acted(ax, av, x0, v0, gx, gv, sizes)
+        f[k], x[n], v[n] = _acted(ax, av, x0, v0, gx, gv, command[k], sizes)
         change[k] = f[k] - held[k]
     return f, x, v
 
 
 @njit(cache=True)
 def _acted(
-    ax: float, av: float, x0: float, v0: float, gx: float, gv: float, sizes: tuple[float, ...]
+    ax: float,
+    av: float,
+    x0: float,
+    v0: float,
+    gx: float,
+    gv: float,
+    command: float,
+    sizes: tuple[float, ...],
 ) -> tuple[float, float, float]:
     """Mean force over a sample or a part of one, position and speed at its end.
 
     ax, av : there without the forces; x0, v0 : at its start; gx, gv : what a unit force adds.
     """
-    coulomb, excess, falls, up, down, viscous, linear, cubic = sizes
+    coulomb, excess, falls, up, down, viscous, linear, cubic, asymmetry, drag, load = sizes
+    coulomb += load * abs(command)
     f, x1, end, level = 0.0, x0, v0, coulomb
-    for _ in range(2 if excess > 0 or cubic > 0 else 1):
+    for _ in range(2 if excess > 0 or cubic > 0 or asymmetry != 0 or drag > 0 else 1):
         # Smooth forces by the trapezoidal rule, the cubic one by its tangent at the end.
         stiffness = linear + 3 * cubic * x1 * x1
-        divisor = 1 + 0.5 * (viscous * gv + stiffness * gx)
-        smooth = -0.5 * (viscous * (v0 + av) + linear * x0 + stiffness * ax)
+        middle = 0.5 * (v0 + end)
+        slope = viscous + asymmetry * np.sign(middle) + drag * abs(middle)
+        divisor = 1 + 0.5 * (slope * gv + stiffness * gx)
+        smooth = -0.5 * (slope * (v0 + av) + linear * x0 + stiffness * ax)
         smooth += cubic * (x1**3 - 0.5 * x0**3)
         a, g = av + gv * smooth / divisor, gv / divisor
         if excess > 0:
@@ -498,7 +519,7 @@ def _through(
                     moved[i] += step[i, j] * state[j]
                 ax += of_x[i] * moved[i]
                 av += of_v[i] * moved[i]
-            f, x1, end = _acted(ax, av, x0, v0, gx, gv, sizes)
+            f, x1, end = _acted(ax, av, x0, v0, gx, gv, command[k], sizes)
             for i in range(N):
                 state[i] = moved[i] + pushed[i] * f
             mean[k] += f / parts

@@ -27,9 +27,17 @@ _NEEDS = {"input": "a command among the inputs", "body": "motion: the output tha
 _GROUPS = {"input": "actuator", "body": "body", "output": "sensor"}
 # What no record of one output can tell from its twin at the input where the machine is linear.
 _TWINS = ("output_lag", "output_delay", "output_gain")
-# A play of a force is rare; friction one way looks like an offset beside friction both ways.
-_BY_NAME_ONLY = ("input_backlash", "one_sided_friction")
-_SMOOTH = ("viscous_friction", "spring", "hardening_spring")
+# A play of a force is rare; friction one way looks like an offset beside friction both ways, and so does one
+# in proportion to speed or load in a few records.
+_BY_NAME_ONLY = (
+    "input_backlash",
+    "one_sided_friction",
+    "viscous_asymmetry",
+    "quadratic_drag",
+    "load_friction",
+    "output_saturation",
+)
+_SMOOTH = ("viscous_friction", "viscous_asymmetry", "quadratic_drag", "spring", "hardening_spring")
 _SMOOTHED = 11  # samples, of a measured position whose speed is asked
 
 
@@ -99,6 +107,7 @@ def with_effects(
         sizes,
         input=sizes.force if body and input == force else _largest(e.input[:, input] for e in experiments),
         output=_largest(e.output[:, seen] - np.mean(e.output[:, seen]) for e in experiments),
+        reading=_largest(e.output[:, seen] for e in experiments),
         dt_s=dt_s,
         duration_s=dt_s * max(len(e.input) for e in experiments),
     )

@@ -14,7 +14,7 @@ from scipy.signal import lsim
 
 from diagnosis import EffectParameter, Plant, PlantEffect, PlantExperiment, with_effects
 from diagnosis.machine.listed_effects import KINDS
-from diagnosis.machine.motion_effects import LinearBody, PulseResponse
+from diagnosis.machine.motion_effects import BodyForces, LinearBody, PulseResponse
 from diagnosis.machine.plant_effect import Change
 from tests.diagnosis.machines import rubbing
 
@@ -261,6 +261,46 @@ def test_friction_one_way_in_the_direction_of_the_force():
         assert np.all(_missed(sign * found, truth, sign * simulation({}, {}, force[:, None])) < 1e-3)
 
 
+@pytest.mark.parametrize("motion", ["x", "v"])
+@pytest.mark.parametrize(
+    ("name", "values", "more"),
+    [
+        ("viscous_asymmetry", {"coefficient": 0.6}, lambda x, v: 0.6 * abs(v)),
+        ("quadratic_drag", {"coefficient": 1.5}, lambda x, v: 1.5 * v * abs(v)),
+    ],
+)
+def test_friction_by_direction_and_by_the_square_of_speed(name, values, more, motion):
+    force, simulation = _force(DT_S), _Counted("on a spring", DT_S)
+    truth = rubbing(_acceleration("on a spring", more), force, DT_S, lambda v: 1e-12)
+    plant = _wrapped(simulation, force, [name], DT_S, motion)
+    found = plant.simulated([Change(name, values)])(force[:, None])
+    assert np.all(_missed(found, truth, simulation({}, {}, force[:, None])) < 2e-3)
+
+
+@pytest.mark.parametrize("motion", ["x", "v"])
+def test_friction_in_proportion_to_the_force_that_is_commanded(motion):
+    force, simulation, now = _force(DT_S), _Counted("mass", DT_S), 0.0
+
+    def acceleration(x, v, u):
+        nonlocal now
+        now = abs(u)
+        return u / 2
+
+    truth = rubbing(acceleration, force, DT_S, lambda v: 0.15 * now / 2)
+    plant = _wrapped(simulation, force, ["load_friction"], DT_S, motion)
+    found = plant.simulated([Change("load_friction", {"share": 0.15})])(force[:, None])
+    assert np.all(_missed(found, truth, simulation({}, {}, force[:, None])) < 1e-3)
+
+
+def test_forces_that_a_known_motion_takes():
+    x, v, rest = np.array([0.3, -0.2, 0.1]), np.array([2.0, -1.0, 0.5]), np.array([4.0, -3.0, -2.0])
+    forces = BodyForces(asymmetry=0.3, drag=0.2)
+    np.testing.assert_allclose(forces.overcome(x, v, rest), 0.3 * np.abs(v) + 0.2 * v * np.abs(v))
+    # Of 5 that drive a fifth is lost on the way to 4; braking, friction helps: of 2 only 2/1.2 are needed.
+    lost = BodyForces(load=0.2).overcome(x, v, rest)
+    np.testing.assert_allclose(rest + lost, [5.0, -3.75, -2.0 / 1.2])
+
+
 def _after(name, values, signal, **more):
     """What an effect makes of a signal (T,) that a simulation passes on."""
     record = PlantExperiment("a", "estimation", signal[:, None], signal[:, None])
@@ -291,6 +331,7 @@ def test_effects_of_actuator_and_sensor_are_their_equations():
     behind = ramp - 3.0 * 0.05 * (1 - np.exp(-t / 0.05))
     np.testing.assert_allclose(_after("output_lag", {"time_constant_s": 0.05}, ramp), behind, atol=1e-12)
     assert np.ptp(_after("actuator_saturation", {"limit": 0.5}, u)) == 1.0
+    np.testing.assert_array_equal(_after("output_saturation", {"limit": 0.5}, u), np.clip(u, -0.5, 0.5))
     dead = _after("actuator_dead_zone", {"width": 0.5}, u)
     np.testing.assert_allclose(dead[np.abs(u) > 0.5], (u - 0.5 * np.sign(u))[np.abs(u) > 0.5])
     assert not np.any(dead[np.abs(u) <= 0.5])
