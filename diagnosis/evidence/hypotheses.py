@@ -7,8 +7,8 @@ solvers disagree about, which is small for smooth effects and larger where conta
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import log_ndtr
@@ -24,6 +24,8 @@ DISAGREEMENT = {"smooth": 0.03, "continuous": 0.06, "non-smooth": 0.25}
 _PRIOR_NONE, PRIOR_UNKNOWN = 0.25, 0.1
 _PRIOR_COUNT = {1: 0.5, 2: 0.14, 3: 0.01}
 _UNKNOWN = ("unknown",)
+# The same of real machines: one effect, several, a cause beyond the list; for what was not tried.
+_ONE, _SEVERAL, _BEYOND = 0.35, 0.45, 0.15
 # An unknown cause beside a set of effects, relative to that set alone.
 _UNKNOWN_BESIDE = float(np.log(PRIOR_UNKNOWN / _PRIOR_NONE))
 # Where contacts switch, what two correct solvers disagree about is not white: further effects beside a
@@ -156,6 +158,31 @@ class Probabilities:
             cause["none"] = 0.0
         sets = {key if key == _UNKNOWN else tuple(sorted((*key, name))): p for key, p in self.sets.items()}
         return Probabilities(cause, sets, {**self.presence, name: certain})
+
+    def with_untried(self, untried: Mapping[str, str], *, larger: bool) -> Probabilities:
+        """What no candidate explains may be one that was not tried, or a larger set where none was (larger).
+
+        Unknown is shared between these and a cause beyond the list, as their prior probabilities are.
+        """
+        cause, presence = dict(self.cause), dict(self.presence)
+        listed = dict.fromkeys([*presence, *untried])
+        tried = 1 - len(untried) / len(listed)
+        missed = _ONE * (1 - tried) + _SEVERAL * (1 - (0.0 if larger else tried**2))
+        moved = cause["unknown"] * missed / (missed + _BEYOND)
+        sets = {**self.sets, _UNKNOWN: self.sets[_UNKNOWN] - moved}
+        cause["unknown"] -= moved
+        for name in untried or listed:
+            share = moved / len(untried or listed)
+            sets[(name,)] = sets.get((name,), 0.0) + share
+            for entries in (cause, presence):
+                entries[name] = entries.get(name, 0.0) + share
+        return Probabilities(cause, sets, presence)
+
+    def counting_as_unknown(self, untried: Iterable[str]) -> Probabilities:
+        """What was not tried counts as unknown, of the cause."""
+        cause = {name: p for name, p in self.cause.items() if name not in untried}
+        cause["unknown"] += sum(self.cause.values()) - sum(cause.values())
+        return replace(self, cause=cause)
 
     @property
     def answer(self) -> str:

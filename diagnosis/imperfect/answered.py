@@ -2,27 +2,12 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
-from diagnosis.answer import (
-    FAR_OFF,
-    NOISE_FLOOR,
-    POSSIBLE,
-    SURE,
-    DetailVerdict,
-    Diagnosis,
-    NamedEffect,
-    Verdict,
-    best_first,
-    completeness_of,
-    held_out_gap,
-    remarks,
-    share_closed,
-)
+from diagnosis.answer import Diagnosis, held_out_gap
+from diagnosis.assembled import Fitted, Judgement, Model, assembled
 from diagnosis.fit.coordinates import parameter_intervals
 from diagnosis.fit.descent import Descent
 from diagnosis.imperfect import verdict as judging
@@ -30,7 +15,6 @@ from diagnosis.imperfect.carried import closed_by, shares_of
 from diagnosis.machine.case import Case
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
-from diagnosis.machine.rounding import rounding_effect
 from diagnosis.next_experiment.discrimination import CompetingHypothesis, fitted_hypothesis
 from diagnosis.search.explanation import Explanation, best_of_sets
 from diagnosis.search.loop import Progress
@@ -56,32 +40,8 @@ def searched(case: CaseOfMachine, progress: Progress, deadline_s: float = np.inf
     deadline_s : of time.monotonic(); after it nothing more is tried.
     """
     search = Search(case, progress, deadline_s)
-    run(search)
+    search.run_in_time()
     return search
-
-
-class OutOfTimeError(BaseException):
-    """Ends a fit on its way; a simulation's own errors are none of it."""
-
-
-def run(search: Search) -> None:
-    """The search to its end or to its deadline, whatever is being fitted then, once the nominal is."""
-
-    def watch() -> None:
-        if search.found and time.monotonic() > search.deadline_s:
-            raise OutOfTimeError
-
-    watched = (search.records, search.held_out) if np.isfinite(search.deadline_s) else ()
-    for records in watched:
-        records.before_each = watch
-    try:
-        search.run()
-    except OutOfTimeError:
-        fitted = {name for e in search.found for name in e.names} | {*search.left_out}
-        search.left_out += [n for n in search.case.machine.weighing.listed if n not in fitted]
-        search.left_out.append("what was being fitted")
-    for records in watched:
-        records.before_each = lambda: None
 
 
 def looked_at_again(
@@ -105,7 +65,7 @@ def looked_at_again(
         left = search.left_by(named_alone)
         if np.max(left) < answer.case.machine.weighing.model_error:
             return answer
-    run(search)
+    search.run_in_time()
     again = beside_imperfections(search, rng)
     return again if again.combination and not set(again.combination) & named else answer
 
@@ -141,40 +101,30 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
     if accepted.names:
         # Values are re-estimated beside effects too only where that leaves less of the held-out records.
         accepted = min(accepted, search.stated(accepted), key=lambda e: e.pooled_held_out(case.noise))
-    before = _whitened(case, search.stated())
-    moved, after = _whitened(case, refit), _whitened(case, accepted)
-    rounding = rounding_effect(case)
-    floor = NOISE_FLOOR if rounding is None else rounding.floor
-    closed, interval = share_closed(case, moved, after, rng, floor)
-    named: dict[str, Verdict] = {"none": "none", "unknown": "unknown"}
-    kind = named.get(found.answer, "effect")
-    ambiguous = _ambiguous(found)
-    keys = search.records.nominal.keys
-    shares = shares_of(search, found.accepted or partial, accepted, refit, rng)
-    return Diagnosis(
-        case=case,
-        verdict=kind,
-        detail_verdict=_detail(kind, found, ambiguous, accepted),
-        probabilities=found.probabilities.cause,
-        sets=found.probabilities.sets,
-        effects=_named(search, found, accepted, shares.carried, rng),
-        combination=found.accepted,
-        ambiguous_with=ambiguous,
-        gap_before=held_out_gap(case, before),
-        gap_refit=held_out_gap(case, moved),
-        gap_after=held_out_gap(case, after),
-        noise_floor=floor,
-        gap_closed=closed,
-        gap_closed_interval=interval,
-        deviations=dict(zip(keys, map(float, accepted.end.deviations), strict=True)),
-        deviations_refit=dict(zip(keys, map(float, refit.end.deviations), strict=True)),
-        rig=search.records.nominal.at(accepted.end.deviations).description,
-        repair=(*accepted.end.effects, *([found.rounding.effect] if found.rounding else [])),
-        residuals_before=before,
-        residuals_refit=moved,
-        residuals_after=after,
+    names = found.accepted or partial
+    shares = shares_of(search, names, accepted, refit, rng)
+
+    def model(of: Explanation) -> Model:
+        return Model(of.end.deviations, _whitened(case, of))
+
+    return assembled(
+        case,
+        search.records.nominal,
+        Judgement(
+            found.probabilities,
+            found.answer,
+            found.accepted,
+            model(search.stated()),
+            model(refit),
+            model(accepted),
+            accepted.end.effects,
+            judging.below_threshold(search, accepted),
+            found.rounding,
+            untried=found.untried,
+        ),
+        _fitted(search, found, accepted, shares.carried, rng),
+        rng,
         simulations=search.simulations,
-        completeness=completeness_of(case, judging.below_threshold(search, accepted), after),
         unlisted=(accepted if partial else best.explanation).end.effects if looks_like else (),
         partial_model=partial,
         shares=shares,
@@ -250,59 +200,31 @@ def _whitened(case: CaseOfMachine, explanation: Explanation) -> dict[str, Real]:
     return {e.name: named[e.name] for e in case.experiments}
 
 
-def _ambiguous(found: judging.Verdict) -> tuple[str, ...]:
-    weighed = found.probabilities
-    share = {name: p for name, p in weighed.presence.items() if name not in found.accepted}
-    share |= {name: weighed.cause[name] for name in ("none", "unknown")}
-    share.pop(found.answer, None)
-    return tuple(name for name, p in sorted(share.items(), key=lambda item: -item[1]) if p >= POSSIBLE)
-
-
-def _detail(
-    kind: Verdict, found: judging.Verdict, ambiguous: Sequence[str], accepted: Explanation
-) -> DetailVerdict:
-    if kind == "unknown":
-        return "unknown"
-    if kind == "none":
-        far = np.max(np.abs(accepted.end.deviations), initial=0.0) > FAR_OFF
-        return "parametric" if far else "none"
-    return "ambiguous" if found.probabilities.cause[found.answer] < SURE or ambiguous else "effect"
-
-
-def _named(
+def _fitted(
     search: Search,
     found: judging.Verdict,
     accepted: Explanation,
     carried: Mapping[str, tuple[float, float, float]],
     rng: np.random.Generator,
-) -> tuple[NamedEffect, ...]:
-    weighed, case, sets = found.probabilities, search.case, best_of_sets(search.found)
+) -> Callable[[str], Fitted | None]:
+    sets = best_of_sets(search.found)
     likeliest = [accepted, *(one.explanation for one in found.judged), *sets.values()]
-    entries = []
-    for name in weighed.presence:
-        entry = NamedEffect(name, weighed.cause[name], weighed.presence[name], {}, {}, float("nan"))
+
+    def fitted(name: str) -> Fitted | None:
         best = next((e for e in likeliest if name in e.names), None)
-        if best is not None:
-            k = best.names.index(name)
-            candidate, coordinates = best.end.candidates[k], best.end.coordinates_of(k)
-            intervals = _intervals(search, best, k, rng)
-            rest = judging.best_without(sets, best, name)
-            explains = closed_by(search, best, found.nominal) - closed_by(search, rest, found.nominal)
-            entry = replace(
-                entry,
-                parameters=candidate.parameters(coordinates),
-                intervals=intervals,
-                gap_after=held_out_gap(case, _whitened(case, best)),
-                explains=carried.get(name) or (max(explains, 0.0), float("nan"), float("nan")),
-                remarks=remarks(candidate, coordinates, intervals),
-            )
-        elif found.rounding is not None and name == found.rounding.name:
-            effect = found.rounding.effect
-            entry = replace(entry, parameters=effect.parameters(), intervals=found.rounding.intervals)
-        entries.append(replace(entry, untried=found.untried.get(name, "")))
-    for name in ("none", "unknown"):
-        entries.append(NamedEffect(name, weighed.cause[name], weighed.cause[name], {}, {}, float("nan")))
-    return best_first(entries, found.answer, found.accepted)
+        if best is None:
+            return None
+        k, rest = best.names.index(name), judging.best_without(sets, best, name)
+        explains = closed_by(search, best, found.nominal) - closed_by(search, rest, found.nominal)
+        return Fitted(
+            best.end.candidates[k],
+            best.end.coordinates_of(k),
+            _intervals(search, best, k, rng),
+            held_out_gap(search.case, _whitened(search.case, best)),
+            carried.get(name) or (max(explains, 0.0), float("nan"), float("nan")),
+        )
+
+    return fitted
 
 
 def _intervals(

@@ -64,8 +64,6 @@ _CONSTANT = 1e-3
 # of them do.
 _SAME_POINT = 0.1
 _LISTED_AS = {name: str(kind.look_alike_of) for name, kind in LOOK_ALIKES.items()}
-# What an effect needs that a time limit left out.
-TIME = "more time"
 # Draws of the Bayesian bootstrap over records.
 _DRAWS = 400
 # Sets this far behind in score take no part.
@@ -190,40 +188,12 @@ def judged(search: Search) -> Verdict:
         beside[rounding.name] = share
         leads = share > max((part.share for part in sets[0].parts), default=0.0)
         probabilities = probabilities.beside(rounding.name, leads=leads)
-    untried = {name: TIME for name in weighing.listed if name in search.left_out}
-    untried |= getattr(search.case.machine, "inactive", {})
-    probabilities = _with_untried(probabilities, untried, larger=len(search.left_out) > 0)
-    answer = _answer(probabilities, untried)
+    untried = search.untried
+    probabilities = probabilities.with_untried(untried, larger=len(search.left_out) > 0)
+    answer = probabilities.counting_as_unknown(untried).answer
     accepted = _accepted(probabilities, answer, sets, beside)
     rounded = rounding if beside else None
     return Verdict(probabilities, sets, answer, accepted, nominal, untried, rounded)
-
-
-def _with_untried(probabilities: Probabilities, untried: Mapping[str, str], *, larger: bool) -> Probabilities:
-    """What no candidate explains may be one that was not tried, or a larger set where none was (larger).
-
-    Unknown is shared between these and a cause beyond the list, as their prior probabilities are.
-    """
-    cause, presence = dict(probabilities.cause), dict(probabilities.presence)
-    listed = dict.fromkeys([*presence, *untried])
-    tried = 1 - len(untried) / len(listed)
-    missed = _PRIOR_COUNT[1] * (1 - tried) + sum(_PRIOR_COUNT[2:]) * (1 - (0.0 if larger else tried**2))
-    moved = cause["unknown"] * missed / (missed + _PRIOR_UNKNOWN)
-    sets = {**probabilities.sets, ("unknown",): probabilities.sets[("unknown",)] - moved}
-    cause["unknown"] -= moved
-    for name in untried or listed:
-        share = moved / len(untried or listed)
-        sets[(name,)] = sets.get((name,), 0.0) + share
-        for entries in (cause, presence):
-            entries[name] = entries.get(name, 0.0) + share
-    return Probabilities(cause, sets, presence)
-
-
-def _answer(probabilities: Probabilities, untried: Mapping[str, str]) -> str:
-    """The likeliest main cause; what was not tried counts as unknown."""
-    cause = {name: p for name, p in probabilities.cause.items() if name not in untried}
-    cause["unknown"] += sum(probabilities.cause[name] for name in untried)
-    return max(cause, key=cause.__getitem__)
 
 
 def late(search: Search) -> bool:

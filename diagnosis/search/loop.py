@@ -34,6 +34,14 @@ class Move(ABC):
     def apply(self, search: SearchLoop[Any]) -> None: ...
 
 
+# What an effect needs that a time limit left out.
+TIME = "more time"
+
+
+class OutOfTimeError(BaseException):
+    """Ends a fit on its way; a simulation's own errors are none of it."""
+
+
 class SearchLoop(ABC, Generic[E]):
     """All that was fitted to the records of a case, the nominal alone first.
 
@@ -70,6 +78,40 @@ class SearchLoop(ABC, Generic[E]):
     @property
     def simulations(self) -> int:
         return self.records.simulations
+
+    @abstractmethod
+    def run(self) -> None:
+        """All of it, the nominal first."""
+
+    @property
+    def watched(self) -> tuple[RecordsToFit, ...]:
+        """Whose simulations a time limit ends."""
+        return (self.records,)
+
+    def run_in_time(self) -> None:
+        """To its end or to its deadline, whatever is being fitted then, once the nominal is."""
+
+        def watch() -> None:
+            if self.found and time.monotonic() > self.deadline_s:
+                raise OutOfTimeError
+
+        watched = self.watched if np.isfinite(self.deadline_s) else ()
+        for records in watched:
+            records.before_each = watch
+        try:
+            self.run()
+        except OutOfTimeError:
+            fitted = {name for e in self.found for name in e.names} | {*self.left_out}
+            self.left_out += [n for n in self.case.machine.weighing.listed if n not in fitted]
+            self.left_out.append("what was being fitted")
+        for records in watched:
+            records.before_each = lambda: None
+
+    @property
+    def untried(self) -> dict[str, str]:
+        """Effect -> what it needs to be tried."""
+        late = {name: TIME for name in self.case.machine.weighing.listed if name in self.left_out}
+        return late | getattr(self.case.machine, "inactive", {})
 
     @property
     @abstractmethod

@@ -51,6 +51,10 @@ class Search(SearchLoop[Explanation]):
         self.held_out = Records(case, case.held_out, at_inputs=at_inputs)
 
     @property
+    def watched(self) -> tuple[Records, ...]:
+        return self.records, self.held_out
+
+    @property
     def simulations(self) -> int:
         return self.records.simulations + self.held_out.simulations
 

@@ -1,0 +1,223 @@
+"""The answer about a machine whose simulation, with the right effects, is as good as the sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from diagnosis.answer import NOISE_FLOOR, POSSIBLE, Diagnosis, held_out_gap
+from diagnosis.assembled import Fitted, Judgement, Model, assembled
+from diagnosis.evidence.confirmation import confronted
+from diagnosis.evidence.hypotheses import DISAGREEMENT, Hypothesis, Probabilities, probabilities
+from diagnosis.evidence.search import WhiteSearch
+from diagnosis.fit.coordinates import parameter_intervals
+from diagnosis.fit.descent import Descent, descend
+from diagnosis.fit.residual import ResidualModel
+from diagnosis.machine.case import Case
+from diagnosis.machine.machine_protocol import CaseOfMachine
+from diagnosis.machine.rounding import leads_over, rounding_effect
+from diagnosis.next_experiment.discrimination import (
+    CompetingHypothesis,
+    competing_hypotheses,
+    competing_hypothesis,
+)
+from diagnosis.search.loop import Progress
+from plant.effects import LOOK_ALIKES
+from plant.effects.search_space import Candidate
+
+# At most so many explanations are told apart by the next experiment.
+_MOST_COMPETING = 3
+# Difference of the cost that the records do not tell apart (chi-square, 95 %, two parameters).
+_AS_GOOD = 6.0
+_LAST_ITERATIONS, _LAST_TOLERANCE = 40, 0.01
+_DRAWS = 4000
+
+
+def without_error(
+    case: CaseOfMachine, progress: Progress, rng: np.random.Generator, deadline_s: float = np.inf
+) -> Diagnosis:
+    """deadline_s : of time.monotonic(); what was not tried until then is said, and lowers "unknown"."""
+    search = WhiteSearch(case, progress, deadline_s)
+    search.run_in_time()
+    model, base = search.records, search.base.end
+    every: Sequence[Hypothesis] = search.found
+    untried = search.untried
+    left_out = [what for what in search.left_out if what not in untried]
+    weighed = probabilities(every)
+    accepted = _accepted(every, weighed.answer)
+    unknown = weighed.answer == "unknown"
+    leading = max(every, key=lambda h: h.unknown_weight) if unknown else accepted
+    late = search.late("confrontation with validation records")
+    seen = None if late or (unknown and leading.is_answer) else confronted(model, every, leading)
+    if seen is not None:
+        every = seen
+        weighed = probabilities(every)
+        accepted = _accepted(every, weighed.answer)
+    hypotheses = [h for h in every if h.is_answer]
+    alike = [h for h in every if not h.is_answer]
+    likeliest = max(every, key=lambda h: h.unknown_weight)
+    last = accepted.fit if late else _refined(model, accepted.fit)
+    refit = model.by_experiment(base.deviations, ())
+    after = model.by_experiment(last.deviations, last.effects)
+    rounding, together = rounding_effect(case), accepted.names
+    if rounding is not None:
+        leads = leads_over(case, rounding, refit, after)
+        weighed = weighed.beside(rounding.name, leads=leads)
+        together = rounding.joined(accepted.names, leads=leads)
+    if search.left_out:
+        weighed = weighed.with_untried(untried, larger=True)
+    # What was not tried counts as unknown.
+    judged = weighed.counting_as_unknown(untried).answer
+    found = Judgement(
+        weighed,
+        judged,
+        together,
+        Model(np.zeros(model.nominal.count), model.by_experiment(np.zeros(model.nominal.count), ())),
+        Model(base.deviations, refit),
+        Model(last.deviations, after),
+        last.effects,
+        1 - weighed.cause["unknown"]
+        if not untried
+        else 1 - sum(weighed.cause[name] for name in ("unknown", *untried)),
+        rounding,
+        _as_good(hypotheses, accepted) if judged != "unknown" else (),
+        untried,
+        converged=last.converged or late,
+    )
+    return assembled(
+        case,
+        model.nominal,
+        found,
+        _fitted(
+            model,
+            hypotheses,
+            last,
+            rounding.floor if rounding else NOISE_FLOOR,
+            held_out_gap(case, refit),
+            rng,
+        ),
+        rng,
+        simulations=model.simulations,
+        held_out_decided=seen is not None,
+        doubts=(f"the time limit left out {', '.join(left_out)}",) if left_out else (),
+        unlisted=likeliest.fit.effects if found.verdict == "unknown" and not likeliest.is_answer else (),
+        competing=_to_part(case, hypotheses, weighed, alike) if isinstance(case, Case) else (),
+    )
+
+
+def _as_good(hypotheses: Sequence[Hypothesis], accepted: Hypothesis) -> tuple[str, ...]:
+    """Effects of sets of the same number that fit as well as the accepted one."""
+    rivals = [h for h in hypotheses if accepted.names and len(h.names) == len(accepted.names)]
+    near = [h for h in rivals if h.fit.cost <= accepted.fit.cost + _AS_GOOD]
+    return tuple(name for h in sorted(near, key=lambda h: h.fit.cost) for name in h.names)
+
+
+def _to_part(
+    case: Case, hypotheses: Sequence[Hypothesis], weighed: Probabilities, alike: Sequence[Hypothesis]
+) -> tuple[CompetingHypothesis, ...]:
+    """What the next experiment is to separate; what is unknown is one where it has a name (a look-alike)."""
+    competing = competing_hypotheses(case, hypotheses, weighed.sets)
+    if not alike:
+        return competing
+    likeliest = max(alike, key=lambda h: h.unknown_weight)
+    imitated = [LOOK_ALIKES[n].look_alike_of for n in likeliest.names if n in LOOK_ALIKES]
+    if min([weighed.cause["unknown"], *(weighed.presence[str(name)] for name in imitated)]) < POSSIBLE:
+        return competing
+    double = competing_hypothesis(case, likeliest.fit, weighed.cause["unknown"])
+    return tuple(sorted((*competing, double), key=lambda hypothesis: -hypothesis.probability))[
+        :_MOST_COMPETING
+    ]
+
+
+def _accepted(hypotheses: Sequence[Hypothesis], answer: str) -> Hypothesis:
+    """The best hypothesis of the answer: nothing added for none and unknown, else the set it leads."""
+    names = () if answer in ("none", "unknown") else (answer,)
+    return max((h for h in hypotheses if h.names[:1] == names), key=lambda h: h.log_weight)
+
+
+def _refined(model: ResidualModel, end: Descent) -> Descent:
+    if not end.candidates and not end.deviations.size:
+        return end
+    last = descend(
+        model,
+        end.candidates,
+        end.deviations,
+        end.coordinates,
+        model.start,
+        iterations=_LAST_ITERATIONS,
+        tolerance=_LAST_TOLERANCE,
+    )
+    return last if last.loss <= end.loss else end
+
+
+def _fitted(
+    model: ResidualModel,
+    hypotheses: Sequence[Hypothesis],
+    last: Descent,
+    floor: float,
+    gap_refit: float,
+    rng: np.random.Generator,
+) -> Callable[[str], Fitted | None]:
+    """floor, gap_refit : of validation records over noise: what noise and rounding leave, and the nominal."""
+    case = model.case
+    samples = float(np.mean([len(record.output) for record in case.estimation]))
+
+    def gap_of(end: Descent) -> float:
+        return held_out_gap(case, model.by_experiment(end.deviations, end.effects, case.held_out))
+
+    def fitted(name: str) -> Fitted | None:
+        holding = [h for h in hypotheses if name in h.names]
+        if not holding:
+            return None
+        end = last if name in last.names else max(holding, key=lambda h: h.log_weight).fit
+        k, after = end.names.index(name), gap_of(end)
+        rest = {n for n in end.names if n != name}
+        without = [gap_of(h.fit) for h in hypotheses if rest == set(h.names)] if rest else [gap_refit]
+        share = _explained(min(without, default=float("nan")), after, gap_refit, floor)
+        return Fitted(
+            end.candidates[k],
+            end.coordinates_of(k),
+            _intervals(end, k, samples, rng),
+            after,
+            (share, float("nan"), float("nan")),
+        )
+
+    return fitted
+
+
+def _explained(without: float, after: float, refit: float, floor: float) -> float:
+    """Share of the energy of the validation error beyond noise that an effect explains; nan without one."""
+    error = refit**2 - floor**2
+    return float(np.clip((without**2 - after**2) / error, 0.0, 1.0)) if error > 0 else float("nan")
+
+
+def _intervals(
+    end: Descent, k: int, samples_per_record: float, rng: np.random.Generator
+) -> dict[str, tuple[float, float]]:
+    """95 % intervals of the parameters of the k-th candidate, from Gaussian draws of its coordinates.
+
+    What is left beyond the noise widens them in proportion, and so does what solvers may disagree about.
+    """
+    candidate: Candidate = end.candidates[k]
+    at = end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])
+    rows = slice(at, at + len(candidate.axes))
+    covariance = (
+        np.asarray(np.linalg.pinv(end.hessian, hermitian=True), dtype=np.float64)[rows, rows]
+        * max(1.0, end.rms**2)
+        * _solver_variance(end, samples_per_record)
+    )
+    return parameter_intervals(candidate, end.coordinates_of(k), covariance, rng, _DRAWS)
+
+
+def _solver_variance(end: Descent, samples_per_record: float) -> float:
+    """Variance of fitted values in units of what white noise gives, where contacts switch.
+
+    Two correct solvers of backlash drift apart once a contact falls differently, and stay apart to the end of
+    a record: an error of their usual disagreement that is correlated over the record.
+    """
+    if not end.non_smooth:
+        return 1.0
+    # median of the half-normal prior of the disagreement's size
+    usual = 0.674 * DISAGREEMENT["non-smooth"]
+    return 1.0 + usual**2 * samples_per_record
