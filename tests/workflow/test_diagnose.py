@@ -157,6 +157,21 @@ def test_every_verdict_has_its_words(folder, engine, words, undrawn):
     assert (answer["verdict"], answer["detail_verdict"]) == (engine.verdict, engine.detail)
 
 
+def test_doubts_are_said_on_the_page_and_in_the_terminal(folder, undrawn, tmp_path):
+    doubts = ("the simulation ignores its gain", "is that the right log?")
+
+    def engine(case, *, progress=None):
+        return replace(KnownAnswer((FRICTION,))(case), doubts=doubts)
+
+    files = made(folder, engine)
+    page = " ".join(re.sub(r"<[^>]+>", " ", files["arm.html"].decode()).split())
+    for doubt, end in zip(doubts, (".", ""), strict=True):
+        assert f"This makes the answer doubtful: {doubt}{end}" in page
+    shown = command._summary([json.loads(files["arm.json"])], [], tmp_path).sections
+    rows = [row for section in shown for row in section.rows if row[0] == "doubtful"]
+    assert [row[1] for row in rows] == list(doubts)
+
+
 def test_what_closes_most_of_the_gap_of_an_unknown_cause_is_written_down(folder, undrawn):
     files = made(folder, KnownAnswer((FRICTION,), "unknown", "unknown"))
     answer = json.loads(files["arm.json"])
