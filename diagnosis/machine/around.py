@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+from scipy.signal import fftconvolve
 
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.motion_effects import BodyForces, PulseResponse, with_forces
@@ -14,6 +15,10 @@ from diagnosis.machine.motion_effects import BodyForces, PulseResponse, with_for
 Run = Callable[[Real], Real]
 Values = Mapping[str, float]
 
+# Rounds of a simulation around a drive, and what the last may still move, over what the effects add there.
+_ROUNDS, _CLOSE = 8, 1e-4
+# Steps to a fixed point beside a linear loop, how many of them each next one is mixed of, and when it stands.
+_STEPS, _MIXED, _STANDS = 200, 8, 1e-9
 # A force that the simulation does not follow to this share of what it changes was not found.
 _MISSED = 0.05
 # Share of the largest early motion after a pulse that is one.
@@ -122,17 +127,92 @@ AnyBody = Body | MeasuredBody
 
 
 @dataclass(frozen=True, eq=False)
+class Drive:
+    """A signal inside a loop that the simulation closes: `signal`, column of what it returns, is the command
+    of the drive, and the simulation adds column `added` of its inputs to that.
+
+    What an effect makes of the command comes back through the loop: it is solved beside the loop's response
+    to a pulse, then simulated; where the loop is not linear, again beside what that gives.
+    """
+
+    added: int
+    signal: int
+    dt_s: float
+    at_rest_before: bool = True
+    _kept: dict[Hashable, Any] = field(default_factory=dict, repr=False)
+
+    def under(self, started: Started, acting: Sequence[tuple[Acts, Values]], run: Run) -> Run:
+        """The simulation with effects on the signal, in the order given; not a number where no fixed point
+        was found."""
+
+        def changed(command: Real) -> Real:
+            now = command
+            for acts, values in acting:
+                before = 0.0 if self.at_rest_before else float(now[0])
+                now = acts.change(now, values, self.dt_s, before)
+            return np.asarray(now - command)
+
+        def simulated(inputs: Real) -> Real:
+            def with_added(extra: Real) -> tuple[Real, Real]:
+                moved = np.array(inputs)
+                moved[:, self.added] += extra
+                found = run(moved)
+                return found, found[:, self.signal]
+
+            asked = (started.key, inputs.shape)
+            if asked not in self._kept:
+                self._kept[asked] = self._response(started.at_rest, inputs)
+            response = self._kept[asked]
+            extra = np.zeros(len(inputs))
+            found, command = with_added(extra)
+            for _ in range(_ROUNDS):
+                beyond = command - fftconvolve(response, extra)[: extra.size]
+                extra, expected = _fixed(changed, beyond, response, extra)
+                found, command = with_added(extra)
+                missed, size = _norm(command - expected), _norm(extra)
+                if not missed > _CLOSE * size:
+                    return found
+            return found if missed < _MISSED * size else np.full_like(found, np.nan)
+
+        return simulated
+
+    def _response(self, run: Run, inputs: Real) -> Real:
+        """(T,) of the signal to one that is added over the first sample, small beside what moves it."""
+        small = 1e-3 * max(float(np.std(run(inputs)[:, self.signal])), 1e-9)
+        pushed = np.array(inputs)
+        pushed[0, self.added] += small
+        return np.asarray((run(pushed) - run(inputs))[:, self.signal] / small)
+
+
+def _fixed(changed: Callable[[Real], Real], beyond: Real, response: Real, start: Real) -> tuple[Real, Real]:
+    """x (T,) = changed(beyond + response * x), and that command; Anderson's mixing of the last steps."""
+    points, steps, x = list[Real](), list[Real](), start
+    for _ in range(_STEPS):
+        command = beyond + fftconvolve(response, x)[: x.size]
+        step = changed(command) - x
+        if not _norm(step) > _STANDS * _norm(x):
+            break
+        points, steps = [*points, x][-_MIXED:], [*steps, step][-_MIXED:]
+        x = x + step
+        if len(steps) > 1:
+            moves, turns = np.diff(points, axis=0).T, np.diff(steps, axis=0).T
+            mixed = np.linalg.lstsq(turns, step, rcond=1e-12)[0]
+            x = x - (moves + turns) @ mixed
+    return x, np.asarray(beyond + fftconvolve(response, x)[: x.size])
+
+
+@dataclass(frozen=True, eq=False)
 class Acts:
     """What an effect does to a simulation.
 
-    on : column of the inputs or outputs, or a body. where : "input", "output" or "body".
+    on : column of the inputs or outputs, a drive, or a body. where : "input", "output" or "body".
     change : of a column, (T,), values, dt_s, what it was before its first row -> (T,); of a body, values ->
         fields of `BodyForces`.
     at_rest_before : an input was zero before its first row; else, and every output, as in that row.
     """
 
     where: Literal["input", "output", "body"]
-    on: int | AnyBody
+    on: int | AnyBody | Drive
     change: Callable[..., Any]
     dt_s: float
     at_rest_before: bool = True
@@ -141,8 +221,11 @@ class Acts:
 def around(started: Started, acting: Sequence[tuple[Acts, Values]]) -> Run:
     """A simulation with effects around it, on each column in the order given."""
     bodies: dict[int, tuple[AnyBody, dict[str, float]]] = {}
+    drives: dict[int, tuple[Drive, list[tuple[Acts, Values]]]] = {}
     for acts, values in acting:
-        if not isinstance(acts.on, int):
+        if isinstance(acts.on, Drive):
+            drives.setdefault(id(acts.on), (acts.on, []))[1].append((acts, values))
+        elif not isinstance(acts.on, int):
             _, sizes = bodies.setdefault(id(acts.on), (acts.on, {}))
             for name, value in acts.change(values).items():
                 # Laws of dry friction that are tried together add up, but for the speed over which one falls.
@@ -153,14 +236,23 @@ def around(started: Started, acting: Sequence[tuple[Acts, Values]]) -> Run:
         at_rest = body.under(replace(inner, run=inner.at_rest, start=None), forces)
         inner = Started(body.under(inner, forces), at_rest, known, inner.start)
 
+    for drive, effects in drives.values():
+        told = tuple((id(acts.change), *values.items()) for acts, values in effects)
+        outer = drive.under(inner, effects, inner.run), drive.under(inner, effects, inner.at_rest)
+        inner = Started(*outer, (inner.key, told), inner.start)
+
     def simulated(inputs: Real) -> Real:
         return _changed(inner.run(_changed(inputs, acting, "input")), acting, "output")
 
     return simulated
 
 
+def _norm(x: Real) -> float:
+    return float(np.linalg.norm(x))
+
+
 def _changed(signals: Real, acting: Sequence[tuple[Acts, Values]], where: str) -> Real:
-    here = [(acts, values) for acts, values in acting if acts.where == where]
+    here = [(acts, values) for acts, values in acting if acts.where == where and isinstance(acts.on, int)]
     if not here:
         return signals
     found = np.array(signals, dtype=np.float64)

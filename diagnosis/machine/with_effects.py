@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from scipy.signal import savgol_filter
 
-from diagnosis.machine.around import Acts, AnyBody, Body, MeasuredBody
+from diagnosis.machine.around import Acts, AnyBody, Body, Drive, MeasuredBody
 from diagnosis.machine.listed_effects import KINDS, Sizes, Where
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.own_plant import Plant, PlantExperiment
@@ -48,6 +48,7 @@ def with_effects(
     *,
     dt_s: float,
     input: int = 0,  # noqa: A002
+    drive: str | int | None = None,
     force: int | None = None,
     motion: str | int | None = None,
     motion_is: Literal["position", "speed"] = "position",
@@ -63,6 +64,8 @@ def with_effects(
         of a sensor where there are several outputs (with one, they look like those of the actuator).
     dt_s : sampling period.
     input : column of the command that effects of an actuator change.
+    drive : of a loop that the simulation closes: output, or column of what it returns, that is the command of
+        its drive. The simulation adds `input`, zeros in records, to it; effects of the actuator act there.
     force : column of the force on the body, held over each sample; default `input`.
     motion : output, or column of what the simulation returns (beyond the outputs: a motion nobody measured),
         of the body that friction and springs act on.
@@ -88,6 +91,11 @@ def with_effects(
             count = experiments[0].input.shape[1]
             raise ValueError(f"plant: there is no input {column}; the records have {count}, from 0 on")
     seen = 0 if output is None else _column(plant, output)
+    commanded = 0.0
+    if drive is not None:
+        signal = drive if isinstance(drive, int) else _column(plant, drive)
+        commanded = _largest(_motion(plant, e, signal) for e in experiments)
+        largest_force = largest_force or (commanded if force == input else None)
     body: AnyBody | None = None
     if motion is not None:
         moving = motion if isinstance(motion, int) else _column(plant, motion)
@@ -111,7 +119,10 @@ def with_effects(
         dt_s=dt_s,
         duration_s=dt_s * max(len(e.input) for e in experiments),
     )
-    places: dict[Where, int | AnyBody | None] = {"input": input, "output": seen, "body": body}
+    places: dict[Where, int | AnyBody | Drive | None] = {"input": input, "output": seen, "body": body}
+    if drive is not None:
+        places["input"] = Drive(input, signal, dt_s, at_rest_before)
+        sizes = replace(sizes, input=commanded)
     if measured_motion is not None:
         places["input"] = None
     found = list(plant.effects)
@@ -201,7 +212,9 @@ def _motion(plant: Plant, experiment: PlantExperiment, column: int) -> Real:
         return experiment.output[:, column]
     simulated = np.asarray(plant.simulation(plant.parameters, {}, experiment.input))
     if simulated.ndim != 2 or simulated.shape[1] <= column:
-        raise ValueError(f"plant: motion= is column {column} of a simulation that returns {simulated.shape}")
+        raise ValueError(
+            f"plant: motion= or drive= is column {column} of a simulation that returns {simulated.shape}"
+        )
     return np.asarray(simulated[:, column])
 
 

@@ -12,7 +12,15 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.signal import lsim
 
-from diagnosis import EffectParameter, Plant, PlantEffect, PlantExperiment, with_effects
+from diagnosis import (
+    EffectParameter,
+    Plant,
+    PlantCase,
+    PlantEffect,
+    PlantExperiment,
+    diagnose,
+    with_effects,
+)
 from diagnosis.machine.listed_effects import KINDS
 from diagnosis.machine.motion_effects import BodyForces, LinearBody, PulseResponse
 from diagnosis.machine.plant_effect import Change
@@ -299,6 +307,62 @@ def test_forces_that_a_known_motion_takes():
     # Of 5 that drive a fifth is lost on the way to 4; braking, friction helps: of 2 only 2/1.2 are needed.
     lost = BodyForces(load=0.2).overcome(x, v, rest)
     np.testing.assert_allclose(rest + lost, [5.0, -3.75, -2.0 / 1.2])
+
+
+def _looped(reference, added, command=lambda c, k: c[k]):
+    """Position and command (T, 2) of a mass under proportional-derivative control, one sample late."""
+    x, v, found, commands = 0.0, 0.0, np.zeros((reference.size, 2)), np.zeros(reference.size)
+    for k in range(reference.size):
+        commands[k] = 40 * (reference[k] - x) - 8 * v
+        found[k] = x, commands[k]
+        pull = command(commands, k) + added[k]
+        for _ in range(4):
+            v += DT_S / 4 * (pull - 2 * v - 0.5 * v * abs(v)) / 1.0
+            x += DT_S / 4 * v
+    return found
+
+
+def _late(c, k):
+    return 0.7 * (c[k - 2] if k > 1 else 0.0) + 0.3 * (c[k - 3] if k > 2 else 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "inside"),
+    [
+        ("input_offset", {"offset": 1.5}, lambda c, k: c[k] + 1.5),
+        ("actuator_gain", {"relative_error": -0.4}, lambda c, k: 0.6 * c[k]),
+        ("actuator_dead_zone", {"width": 2.0}, lambda c, k: np.sign(c[k]) * max(abs(c[k]) - 2.0, 0.0)),
+        ("actuator_saturation", {"limit": 9.0}, lambda c, k: min(max(c[k], -9.0), 9.0)),
+        ("input_delay", {"delay_s": 2.3 * DT_S}, _late),
+    ],
+)
+def test_an_effect_of_the_drive_inside_a_loop_is_the_one_written_into_it(name, values, inside):
+    reference = np.random.default_rng(6).uniform(-1, 1, 12).repeat(25)
+    inputs = np.column_stack([reference, np.zeros(reference.size)])
+    truth = _looped(reference, inputs[:, 1], inside)
+    record = PlantExperiment("a", "estimation", inputs, truth[:, :1])
+    plant = Plant(lambda p, e, u: _looped(u[:, 0], u[:, 1]), {}, {}, ("x",), np.array([1e-4]))
+    plant = with_effects(plant, [name], [record], dt_s=DT_S, input=1, drive=1)
+    found = plant.simulated([Change(name, values)])(inputs)
+    free = _looped(reference, inputs[:, 1])[:, :1]
+    assert np.linalg.norm(free - truth[:, :1]) > 0.05 * np.linalg.norm(truth[:, 0])
+    assert np.linalg.norm(found - truth[:, :1]) < 1e-3 * np.linalg.norm(free - truth[:, :1])
+
+
+@pytest.mark.slow
+def test_an_effect_of_the_drive_inside_a_loop_is_diagnosed():
+    rng, records = np.random.default_rng(8), []
+    for role in ("estimation", "estimation", "held_out"):
+        inputs = np.column_stack([rng.uniform(-1, 1, 12).repeat(25), np.zeros(300)])
+        truth = _looped(*inputs.T, lambda c, k: np.sign(c[k]) * max(abs(c[k]) - 2.0, 0.0))
+        y = truth[:, :1] + 1e-3 * rng.standard_normal((300, 1))
+        records.append(PlantExperiment(f"{role} {len(records)}", role, inputs, y))
+    plant = Plant(lambda p, e, u: _looped(*u.T), {}, {}, ("x",), np.array([1e-3]), model_error=0.02)
+    names = ["input_offset", "actuator_gain", "actuator_dead_zone", "input_delay"]
+    plant = with_effects(plant, names, records, dt_s=DT_S, input=1, drive=1)
+    found = diagnose(PlantCase("loop", plant, tuple(records)))
+    assert found.combination == ("actuator_dead_zone",)
+    assert found.repair[0].values["width"] == pytest.approx(2.0, rel=0.02)
 
 
 def _after(name, values, signal, **more):
