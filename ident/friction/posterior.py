@@ -14,6 +14,7 @@ import numpy as np
 
 from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions
+from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray, real_rows
 from ident.data.ellipses import chi2_radius
@@ -108,12 +109,50 @@ def _behind_observed(
     response, change, factor = tangent_beside(less, model, beside, options, n_known=known)
     whitening = np.array([1.0, *(response.report.ar_coefficients if response.report else ())])
     wider = np.sqrt(heterogeneity(found, records, autoregressive(whitening)))
-    factor_of_arm = np.hstack([wider * response.covariance_factor, _by_linear_force(records, less, response)])
-    response = replace(response, covariance_factor=factor_of_arm)
+    by_force = _by_linear_force(records, less, response)
+    response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
+    response, factor_of_arm = _of_known_sign(response, longest_s=max(r.n_samples for r in less) * model.dt_s)
     both = [0, *([plain.shape[1] - 1] if found.spring is not None else [])]
     level, spread = found.level + float(change[both].sum()), wider * factor[both].sum(axis=0)
-    spread = np.append(spread, np.zeros(factor_of_arm.shape[1] - spread.size))
+    spread = factor_of_arm @ np.append(spread, np.zeros(by_force.shape[1]))
     return BehindFriction(response, response, level, spread, found)
+
+
+def _of_known_sign(response: ResponsePosterior, longest_s: float) -> tuple[ResponsePosterior, RealArray]:
+    """The same with a gain at low frequencies that keeps its sign, and the unit normals it stands on now:
+    (P'', P') times those before.
+
+    Below what the logs tell, the arm is its inertia and one damping or stiffness k. Data tell k, to a
+    deviation s, and G = 1 / k is not Gaussian where s is large: an ellipse of G would hold zero, which no
+    passive arm has. Along the one normal that moves the gain at low frequency, with x = rho a / (jw + a) the
+    relative change of G at the 95 % radius, x / (1 + x) takes its place: a further pole at a (1 + rho).
+    Neglected: gains more than twice the centre's, with which a loop is the tighter there.
+    """
+    factor, n = response.covariance_factor, response.covariance_factor.shape[1]
+    omega = np.geomspace(1 / (_LENGTHS * longest_s), np.pi / response.dt_s, _FREQUENCIES)
+    rows = response.frequency_rows(omega)
+    gain = rows @ response.mean
+    lowest = np.real(rows[0] @ factor / gain[0])
+    rho = chi2_radius(_LEVEL) * float(np.linalg.norm(lowest))
+    if response.unstable.order or rho < _LARGEST:
+        return response, np.eye(n)
+    along = lowest / np.linalg.norm(lowest)
+    moved = rows @ (factor @ along)
+    corner = float(omega[np.argmax(np.abs(moved / gain) < np.abs(moved / gain)[0] / np.sqrt(2))])
+    slow, fast = np.exp(-response.dt_s * corner * np.array([1.0, 1 + rho]))
+    z = np.exp(1j * omega * response.dt_s)
+    poles = response.poles.appended(Poles(np.array([fast])))
+    more = replace(
+        response,
+        poles=poles,
+        mean=np.zeros(response.mean.size + 1),
+        covariance_factor=np.zeros((response.mean.size + 1, 1)),
+    )
+    wanted = [gain, *(rows @ (factor - np.outer(factor @ along, along))).T, moved * (z - slow) / (z - fast)]
+    basis = real_rows(more.frequency_rows(omega) / gain[:, None])
+    found = np.linalg.lstsq(basis, real_rows(np.column_stack(wanted) / gain[:, None]), rcond=None)[0]
+    onto = np.vstack([np.eye(n) - np.outer(along, along), along])
+    return replace(more, mean=found[:, 0], covariance_factor=found[:, 1:]), onto
 
 
 def _by_linear_force(
@@ -137,7 +176,6 @@ def _by_linear_force(
         if i >= response.integrators:
             size = _SHAPE * np.sqrt(_mean_square(force) / _mean_square(moved))
             change = size * (1j * omega) ** i * gain
-            change /= 1 + chi2_radius(_LEVEL) / _LARGEST * np.abs(change)
             # On the doubled poles, which hold G^2 s^i but for the delay, relative to G.
             basis = real_rows(rows[:, : response.poles.order] / gain[:, None])
             columns.append(np.asarray(np.linalg.lstsq(basis, real_rows(change), rcond=None)[0]))
