@@ -128,12 +128,6 @@ class FirstLook:
         told = self.motion is not None and self.motion.explained > _EXPLAINED and not self.motion.sprung
         return self.motion.below_rad_s if self.motion is not None and told else None
 
-    @property
-    def rigid(self) -> bool:
-        """As far up as the logs tell."""
-        bare = self.model is not None and not self.model.poles.pairs.size and self.notch is None
-        return bare and self.rigid_below_rad_s is not None
-
 
 def first_look(records: Sequence[Record], *, position: bool) -> FirstLook:
     """Of SISO records of one sampling time; by the reference where all have one. position: of the output,
