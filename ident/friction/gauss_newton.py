@@ -32,7 +32,7 @@ _STEPS, _LENGTHS = 8, (1.0, 0.5, 0.25, 0.1)
 # A residual sum of squares that falls by less than this many noise variances is at its end.
 WORTH = 0.5
 # Sizes of the changes that derivatives are taken from, relative to the motion and to the level.
-_CHANGE, _CHANGE_OF_LEVEL, _CHANGE_OF_LOG = 1e-3, 2e-3, 0.02
+_CHANGE, _CHANGE_OF_LEVEL, _CHANGE_OF_LOG, _CHANGE_BEYOND = 1e-3, 2e-3, 0.02, 0.05
 
 
 class LostError(ValueError):
@@ -118,12 +118,12 @@ class FrictionFit:
     def steady(self, record: Record) -> RealArray:
         """(T,) bias and friction beyond the spring, at the shaft: what the observer need not simulate."""
         force = np.full(record.n_samples, self.bias)
-        return force + self.beyond * self.force_beyond(record) if self.spring is not None else force
+        return force + self.force_beyond(record, self.beyond) if self.spring is not None else force
 
-    def force_beyond(self, record: Record) -> RealArray:
-        """(T,) friction of unit level beyond the spring, as it acts at the shaft."""
+    def force_beyond(self, record: Record, level: float) -> RealArray:
+        """(T,) friction of a level beyond the spring, as it acts at the shaft."""
         assert self.spring is not None
-        return self.spring.force(record.output[:, 0], self.law.presliding)
+        return level * self.spring.force(record.output[:, 0], level)
 
     def residual(self, record: Record) -> RealArray:
         """(T - delay,) what the simulation leaves of the position, less its mean, in the rows that answer to
@@ -228,7 +228,9 @@ def driven_by_law(found: FrictionFit, record: Record) -> RealArray:
     if found.arm.structure.integrators:
         columns.append(np.ones(friction.size))
     if found.spring is not None:
-        columns.append(found.force_beyond(record))
+        size = _CHANGE_BEYOND * found.level
+        ends = [found.force_beyond(record, level) for level in (found.beyond + size, found.beyond)]
+        columns.append((ends[0] - ends[1]) / size)
     return np.column_stack([-arm.simulate(column) for column in columns])
 
 
@@ -244,7 +246,7 @@ def driven_by_shape(found: FrictionFit, record: Record, speed: float) -> RealArr
         columns.append((found.friction_of(record, law) - friction) / excess)
     spring = Spring.of(found.model) if found.spring is None else None
     if spring is not None:
-        there = spring.force(record.output[:, 0], found.law.presliding)
+        there = spring.force(record.output[:, 0], found.law.level)
         columns.append(there - friction / found.law.level)
     return np.column_stack([np.zeros((friction.size, 0)), *(-arm.simulate(column) for column in columns)])
 

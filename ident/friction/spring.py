@@ -1,33 +1,38 @@
 """Friction beyond the first spring of an arm: at the load of a belt, a shaft or a harmonic drive.
 
-The load of a motor that is held still swings at the lowest zero of the motor's response. Nothing but friction
-acts on the load, so that it follows the motor as Z = omega^2 / (s^2 + 2 zeta omega s + omega^2), and by
-reciprocity a torque at the load moves the motor as Z times as much at the motor does. Neglected: what the
-load's friction does to the load's own motion.
+The load of a motor that is held still swings at the lowest zero of the motor's response. It follows the motor
+as Z = omega^2 / (s^2 + 2 zeta omega s + omega^2), less what its friction holds back, and by reciprocity a
+torque at the load moves the motor as Z times as much at the motor does. So the friction at the load is found
+from the motor's position alone, by stepping a damped load behind it. Neglected: further springs.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
+import numba
 import numpy as np
 from scipy.signal import bilinear, lfilter
 
 from ident.basis.model import GobfModel
 from ident.data.arrays import RealArray
-from ident.friction.inverse_dynamics import direction_of
 
 # A zero that is damped more than this, or lies above the first mode, is no load behind a spring.
 _LARGEST_DAMPING = 0.5
+# Of the zero: where the inertia is read off; steps per sample of the load.
+_RIGID, _STEPS = 0.5, 8
 
 
 @dataclass(frozen=True)
 class Spring:
-    """How the load follows the motor; omega_rad_s, zeta: of the load with the motor held still."""
+    """How the load follows the motor; omega_rad_s, zeta: of the load with the motor held still; compliance:
+    of the spring, in output units per input unit, 0 where it does not show."""
 
     omega_rad_s: float
     zeta: float
+    compliance: float
     dt_s: float
 
     @classmethod
@@ -41,11 +46,28 @@ class Spring:
         if not (modes.size and np.any(low)):
             return None
         k = int(np.flatnonzero(low)[np.argmin(np.abs(rates[low]))])
-        return cls(float(np.abs(rates[k])), float(zeta[k]), model.dt_s)
+        swings = model.poles.zeta() < _LARGEST_DAMPING
+        first = int(np.argmin(np.where(swings, model.poles.omega_rad_s(model.dt_s), np.inf)))
+        zero, pole = float(np.abs(rates[k])), float(modes.min())
+        # Below the zero the arm is an inertia, of which the load's share sets the mode apart from the zero.
+        at = _RIGID * zero
+        late = np.exp(1j * at * model.dt_s * (model.input_delay_samples + 0.5))
+        stiff = 1 / (late * model.frequency_response(np.array([at]))[0])
+        bends = [
+            1 - (at / w) ** 2 + 2j * z * at / w
+            for w, z in ((zero, zeta[k]), (pole, model.poles.zeta()[first]))
+        ]
+        inertia = -float(np.real(stiff * bends[0] / bends[1])) / at**2
+        load = inertia * (1 - (zero / pole) ** 2)
+        return cls(zero, float(zeta[k]), 1 / (load * zero**2) if load > 0 else 0.0, model.dt_s)
 
-    def force(self, position: RealArray, presliding: float) -> RealArray:
-        """(T,) friction of unit level at the load of a motor at position (T,), as it acts at the motor."""
-        return self._followed(direction_of(self._followed(position - position[0]), presliding))
+    def force(self, position: RealArray, level: float) -> RealArray:
+        """(T,) friction per unit of its level at the load of a motor at position (T,), as it acts at the
+        motor. level: in units of the input; it holds the load where the spring pulls less."""
+        found = np.empty(position.size)
+        kept = level * self.compliance * self.omega_rad_s**2
+        _hold(position - position[0], self.omega_rad_s, self.zeta, self.dt_s, kept, found)
+        return self._followed(found)
 
     @cached_property
     def _filter(self) -> tuple[RealArray, RealArray]:
@@ -54,3 +76,22 @@ class Spring:
 
     def _followed(self, signal: RealArray) -> RealArray:
         return np.asarray(lfilter(*self._filter, signal))
+
+
+@numba.njit(cache=True)
+def _hold(motor: Any, omega: float, zeta: float, dt_s: float, level: float, found: Any) -> None:
+    """Fill found (T,): mean friction over each sample, per unit of its level, on a load behind a motor (T,) that
+    moves evenly between the samples. level: as an acceleration."""
+    load, speed, h = motor[0], 0.0, dt_s / _STEPS
+    for k in range(motor.size):
+        following = motor[min(k + 1, motor.size - 1)]
+        rate, total = (following - motor[k]) / dt_s, 0.0
+        for step in range(_STEPS):
+            ahead = motor[k] + (step + 0.5) * h * rate
+            load += 0.5 * h * speed
+            free = speed + h * (omega**2 * (ahead - load) + 2 * zeta * omega * (rate - speed))
+            kept = max(abs(free) - h * level, 0.0)
+            total += (abs(free) - kept) / (h * level) * np.sign(free) if level > 0 else np.sign(free)
+            speed = np.sign(free) * kept
+            load += 0.5 * h * speed
+        found[k] = total / _STEPS

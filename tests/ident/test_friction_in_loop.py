@@ -168,9 +168,13 @@ def test_the_load_of_a_belt_is_the_lowest_zero_of_the_motor() -> None:
     found = Spring.of(GobfModel(poles, fitted, dt_s, integrators=1))
     assert found is not None
     assert found.omega_rad_s == pytest.approx(10 * np.pi, rel=0.02)
-    # A steady motion meets the whole of the load's friction.
-    ramp = np.linspace(0.0, 1.0, 5000)
-    assert found.force(ramp, 1e-6)[-1] == pytest.approx(1.0, abs=0.01)
+    assert found.compliance == pytest.approx(1 / spring, rel=0.05)
+    # A steady motion meets the whole of the load's friction; below a twist of level / spring the load stands,
+    # and its friction is what the spring pulls.
+    ramp, level = np.linspace(0.0, 1.0, 5000), 0.5
+    assert found.force(ramp, level)[-1] == pytest.approx(1.0, abs=0.01)
+    twist = 0.4 * level / spring * np.sin(2 * np.pi * 0.2 * dt_s * np.arange(20_000))
+    assert found.force(twist, level)[5000:] == pytest.approx(spring * twist[5000:] / level, abs=0.02)
 
 
 def test_equations_that_are_not_finite_lose_the_log():
