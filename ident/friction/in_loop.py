@@ -80,8 +80,9 @@ _CONTRADICTORY = 100.0
 
 
 def recorded_in_loop(records: Sequence[Record]) -> bool:
-    """Whether the command follows the position: a reference was recorded, or the command's prediction from
-    its own past becomes better with that of the position (Granger, Econometrica 37(3), 1969) in one of them."""
+    """Whether the command follows the position: a reference was recorded, or in some record the command's
+    prediction from its own past becomes better with that of the position (Granger, Econometrica 37(3), 1969).
+    """
     if any(record.reference is not None for record in records):
         return True
     told = max(_told_by_position(record.input[:, 0], record.output[:, 0]) for record in records)

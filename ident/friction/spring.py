@@ -41,21 +41,21 @@ class Spring:
         zeros = model.zeros()
         rates = np.log(zeros[zeros.imag > 0]) / model.dt_s
         zeta = np.abs(rates.real) / np.abs(rates)
-        modes = model.poles.omega_rad_s(model.dt_s)[model.poles.zeta() < _LARGEST_DAMPING]
-        low = (zeta < _LARGEST_DAMPING) & (np.abs(rates) < modes.min(initial=np.inf))
-        if not (modes.size and np.any(low)):
+        of_poles = model.poles.zeta()
+        modes = np.where(of_poles < _LARGEST_DAMPING, model.poles.omega_rad_s(model.dt_s), np.inf)
+        pole = float(modes.min(initial=np.inf))
+        low = (zeta < _LARGEST_DAMPING) & (np.abs(rates) < pole)
+        if not (np.isfinite(pole) and np.any(low)):
             return None
         k = int(np.flatnonzero(low)[np.argmin(np.abs(rates[low]))])
-        swings = model.poles.zeta() < _LARGEST_DAMPING
-        first = int(np.argmin(np.where(swings, model.poles.omega_rad_s(model.dt_s), np.inf)))
-        zero, pole = float(np.abs(rates[k])), float(modes.min())
+        zero, both = float(np.abs(rates[k])), (zeta[k], of_poles[np.argmin(modes)])
         # Below the zero the arm is an inertia, of which the load's share sets the mode apart from the zero.
         at = _RIGID * zero
         late = np.exp(1j * at * model.dt_s * (model.input_delay_samples + 0.5))
         stiff = 1 / (late * model.frequency_response(np.array([at]))[0])
         bends = [
-            1 - (at / w) ** 2 + 2j * z * at / w
-            for w, z in ((zero, zeta[k]), (pole, model.poles.zeta()[first]))
+            1 - (at / omega) ** 2 + 2j * damping * at / omega
+            for omega, damping in zip((zero, pole), both, strict=True)
         ]
         inertia = -float(np.real(stiff * bends[0] / bends[1])) / at**2
         load = inertia * (1 - (zero / pole) ** 2)
@@ -80,8 +80,8 @@ class Spring:
 
 @numba.njit(cache=True)
 def _hold(motor: Any, omega: float, zeta: float, dt_s: float, level: float, found: Any) -> None:
-    """Fill found (T,): mean friction over each sample, per unit of its level, on a load behind a motor (T,) that
-    moves evenly between the samples. level: as an acceleration."""
+    """Fill found (T,): mean friction over each sample, per unit of its level, on a load behind a motor (T,)
+    that moves evenly between the samples. level: as an acceleration."""
     load, speed, h = motor[0], 0.0, dt_s / _STEPS
     for k in range(motor.size):
         following = motor[min(k + 1, motor.size - 1)]
