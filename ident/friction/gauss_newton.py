@@ -118,12 +118,12 @@ class FrictionFit:
     def steady(self, record: Record) -> RealArray:
         """(T,) bias and friction beyond the spring, at the shaft: what the observer need not simulate."""
         force = np.full(record.n_samples, self.bias)
-        return force + self.force_beyond(record, self.beyond) if self.spring is not None else force
+        return force if self.spring is None else force + self.force_beyond(record, self.beyond, self.law)
 
-    def force_beyond(self, record: Record, level: float) -> RealArray:
-        """(T,) friction of a level beyond the spring, as it acts at the shaft."""
+    def force_beyond(self, record: Record, level: float, law: FrictionLaw) -> RealArray:
+        """(T,) friction of a level beyond the spring, as it acts at the shaft; law: that of the shaft."""
         assert self.spring is not None
-        return level * self.spring.force(record.output[:, 0], level)
+        return level * self.spring.force(record.output[:, 0], level, law)
 
     def residual(self, record: Record) -> RealArray:
         """(T - delay,) what the simulation leaves of the position, less its mean, in the rows that answer to
@@ -220,17 +220,20 @@ def driven_by_law(found: FrictionFit, record: Record) -> RealArray:
     """
     arm = replace(found.model.stable_part, input_delay_samples=0)
     friction, parameters = found.motion(record)[1], parameters_of(found.law)
+    beyond = 0.0 if found.spring is None else found.force_beyond(record, found.beyond, found.law)
     columns = []
     for k in range(parameters.size):
         change = np.zeros(parameters.size)
         change[k] = size = _CHANGE_OF_LOG if k % 2 else _CHANGE_OF_LEVEL * found.level
-        columns.append((found.friction_of(record, law_of(parameters + change)) - friction) / size)
+        law = law_of(parameters + change)
+        columns.append((found.friction_of(record, law) - friction) / size)
+        if found.spring is not None and np.isfinite(found.law.fall):
+            columns[-1] = columns[-1] + (found.force_beyond(record, found.beyond, law) - beyond) / size
     if found.arm.structure.integrators:
         columns.append(np.ones(friction.size))
     if found.spring is not None:
         size = _CHANGE_BEYOND * found.level
-        ends = [found.force_beyond(record, level) for level in (found.beyond + size, found.beyond)]
-        columns.append((ends[0] - ends[1]) / size)
+        columns.append((found.force_beyond(record, found.beyond + size, found.law) - beyond) / size)
     return np.column_stack([-arm.simulate(column) for column in columns])
 
 
@@ -246,7 +249,7 @@ def driven_by_shape(found: FrictionFit, record: Record, speed: float) -> RealArr
         columns.append((found.friction_of(record, law) - friction) / excess)
     spring = Spring.of(found.model) if found.spring is None else None
     if spring is not None:
-        there = spring.force(record.output[:, 0], found.law.level)
+        there = spring.force(record.output[:, 0], found.law.level, found.law)
         columns.append(there - friction / found.law.level)
     return np.column_stack([np.zeros((friction.size, 0)), *(-arm.simulate(column) for column in columns)])
 

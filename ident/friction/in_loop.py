@@ -168,9 +168,10 @@ def fit_friction_in_loop(
         found = _in_turns(logs, found, few)
     if found.significant:
         report(0.4, "friction: falling with speed, beyond a spring")
-        for extended in (_with_friction_beyond, _with_stribeck):
-            with suppress(LostError):  # what no observer follows explains nothing better
-                found = extended(logs, found)
+        with suppress(LostError):  # what no observer follows explains nothing better
+            found = _with_friction_beyond(logs, found, few)
+        with suppress(LostError):
+            found = _with_stribeck(logs, found)
     report(0.5, "friction: level and arm in turns")
     simple = found
     with suppress(LostError):
@@ -222,11 +223,18 @@ def _above_noise(records: Sequence[Record], options: IdentOptions) -> IdentOptio
 
 
 def _beyond(found: FrictionFit, options: IdentOptions) -> IdentOptions:
-    """No pair far below the first mode, and one real pole: what is left of friction looks like slow ones."""
+    """No pair far below the first mode, and one real pole: what is left of friction looks like slow ones.
+    Poles and zeros of a driven shaft take turns: with friction at the load, whose zero is known, no pair
+    below the middle between it and the mode."""
     poles, update = found.model.poles, {"max_real": min(options.max_real, 1)}
     modes = poles.omega_rad_s(found.model.dt_s)[poles.zeta() < LARGEST_DAMPING]
-    lowest = {"omega_min_rad_s": _LOWEST_PAIR * float(modes.min())} if modes.size else {}
-    return options.model_copy(update=update | (lowest if options.omega_min_rad_s is None else {}))
+    if modes.size:
+        least = _LOWEST_PAIR * float(modes.min())
+        if found.spring is not None and found.spring.omega_rad_s < modes.max():
+            least = float(np.sqrt(found.spring.omega_rad_s * modes[modes > found.spring.omega_rad_s].min()))
+        if options.omega_min_rad_s is None or found.spring is not None:
+            update = update | {"omega_min_rad_s": least}
+    return options.model_copy(update=update)
 
 
 def _with_more_poles(logs: _Logs, found: FrictionFit, options: IdentOptions) -> FrictionFit:
@@ -253,7 +261,8 @@ def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: in
         tried = []
         for model in models:
             anew = started(model, options.structure(), found.law)
-            anew = replace(anew, bias=found.bias, spring=found.spring, beyond=found.beyond)
+            spring = found.spring and (Spring.of(model) or found.spring)
+            anew = replace(anew, bias=found.bias, spring=spring, beyond=found.beyond)
             if not search:
                 anew = replace(anew, correction=found.correction, ratio=found.ratio)
             tried.append(observed(anew, logs.records))
@@ -312,8 +321,9 @@ def _with_stribeck(logs: _Logs, found: FrictionFit) -> FrictionFit:
     return best if best.law.excess > 0 and better else found
 
 
-def _with_friction_beyond(logs: _Logs, found: FrictionFit) -> FrictionFit:
-    """The same with friction on the other side of the first spring, where that is worth its parameter."""
+def _with_friction_beyond(logs: _Logs, found: FrictionFit, few: IdentOptions) -> FrictionFit:
+    """The same with friction on the other side of the first spring, where that is worth its parameter. The
+    spring is read off the arm once more when most of the friction is known, which bends the arm's zero."""
     spring = Spring.of(found.model)
     if spring is None:
         return found
@@ -321,6 +331,7 @@ def _with_friction_beyond(logs: _Logs, found: FrictionFit) -> FrictionFit:
     best = replace(found, spring=spring, beyond=half, law=replace(found.law, level=half))
     for _ in range(_STRIBECK_STEPS):
         best = _stepped(logs, best)
+    best = _in_turns(logs, best, few)
     better = logs.errors(best) < logs.errors(found) * (1 - logs.criterion)
     return best if best.beyond > 0 and better else found
 

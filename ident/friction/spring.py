@@ -1,23 +1,22 @@
 """Friction beyond the first spring of an arm: at the load of a belt, a shaft or a harmonic drive.
 
 The load of a motor that is held still swings at the lowest zero of the motor's response. It follows the motor
-as Z = omega^2 / (s^2 + 2 zeta omega s + omega^2), less what its friction holds back, and by reciprocity a
+as Z = (w^2 + 2 zeta w s) / (s^2 + 2 zeta w s + w^2), less what its friction holds back, and by reciprocity a
 torque at the load moves the motor as Z times as much at the motor does. So the friction at the load is found
-from the motor's position alone, by stepping a damped load behind it. Neglected: further springs.
+from the motor's position alone, by stepping a damped load behind it, from rest. Neglected: further springs.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numba
 import numpy as np
-from scipy.signal import bilinear, lfilter
 
 from ident.basis.model import GobfModel
 from ident.data.arrays import RealArray
+from ident.friction.arm import FrictionLaw
 
 # A zero that is damped more than this, or lies above the first mode, is no load behind a spring.
 _LARGEST_DAMPING = 0.5
@@ -61,37 +60,40 @@ class Spring:
         load = inertia * (1 - (zero / pole) ** 2)
         return cls(zero, float(zeta[k]), 1 / (load * zero**2) if load > 0 else 0.0, model.dt_s)
 
-    def force(self, position: RealArray, level: float) -> RealArray:
+    def force(self, position: RealArray, level: float, law: FrictionLaw) -> RealArray:
         """(T,) friction per unit of its level at the load of a motor at position (T,), as it acts at the
-        motor. level: in units of the input; it holds the load where the spring pulls less."""
+        motor, held over each sample. level: in units of the input; it holds the load where the spring pulls
+        less. law: of the motor; that of the load falls with speed alike."""
         found = np.empty(position.size)
         kept = level * self.compliance * self.omega_rad_s**2
-        _hold(position - position[0], self.omega_rad_s, self.zeta, self.dt_s, kept, found)
-        return self._followed(found)
-
-    @cached_property
-    def _filter(self) -> tuple[RealArray, RealArray]:
-        square = self.omega_rad_s**2
-        return bilinear([square], [1.0, 2 * self.zeta * self.omega_rad_s, square], 1 / self.dt_s)
-
-    def _followed(self, signal: RealArray) -> RealArray:
-        return np.asarray(lfilter(*self._filter, signal))
+        shape = law.excess / max(law.level, np.finfo(np.float64).tiny), law.fall
+        _hold(position - position[0], self.omega_rad_s, self.zeta, self.dt_s, kept, *shape, found)
+        return found
 
 
 @numba.njit(cache=True)
-def _hold(motor: Any, omega: float, zeta: float, dt_s: float, level: float, found: Any) -> None:
-    """Fill found (T,): mean friction over each sample, per unit of its level, on a load behind a motor (T,)
-    that moves evenly between the samples. level: as an acceleration."""
-    load, speed, h = motor[0], 0.0, dt_s / _STEPS
+def _hold(
+    motor: Any, omega: float, zeta: float, dt_s: float, level: float, excess: float, fall: float, found: Any
+) -> None:
+    """Fill found (T,): mean over each sample of what reaches the motor of the friction, per unit of its
+    level, on a load behind a motor (T,) that moves evenly between the samples. level: as an acceleration;
+    excess: per unit of it, gone at speeds above fall. Half a drift, a kick in the middle, half a drift."""
+    h, soft, damp = dt_s / _STEPS, omega**2, 2 * zeta * omega
+    load, speed = motor[0], 0.0
+    x, v = 0.0, 0.0  # what the friction makes of the load by itself, the motor held
     for k in range(motor.size):
-        following = motor[min(k + 1, motor.size - 1)]
-        rate, total = (following - motor[k]) / dt_s, 0.0
+        rate, total = (motor[min(k + 1, motor.size - 1)] - motor[k]) / dt_s, 0.0
         for step in range(_STEPS):
-            ahead = motor[k] + (step + 0.5) * h * rate
             load += 0.5 * h * speed
-            free = speed + h * (omega**2 * (ahead - load) + 2 * zeta * omega * (rate - speed))
-            kept = max(abs(free) - h * level, 0.0)
-            total += (abs(free) - kept) / (h * level) * np.sign(free) if level > 0 else np.sign(free)
+            x += 0.5 * h * v
+            twist = motor[k] + (step + 0.5) * h * rate - load
+            free = speed + h * (soft * twist + damp * (rate - speed))
+            most = 1.0 if excess == 0 else 1 + excess * np.exp(-abs(speed) / fall)
+            kept = max(abs(free) - h * level * most, 0.0)
+            force = np.sign(free) * ((abs(free) - kept) / (h * level) if level > 0 else most)
             speed = np.sign(free) * kept
+            v += h * (force - soft * x - damp * v)
+            total += soft * x + damp * v
             load += 0.5 * h * speed
+            x += 0.5 * h * v
         found[k] = total / _STEPS

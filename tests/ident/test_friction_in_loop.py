@@ -13,6 +13,7 @@ from ident.basis.poles import Poles
 from ident.checks.validation import fit_in_windows, fit_on_fresh_data
 from ident.data.record import Record
 from ident.friction import FrictionFit, fit_friction, identify_behind, without_friction
+from ident.friction.arm import FrictionLaw
 from ident.friction.gauss_newton import LostError, least_squares
 from ident.friction.in_loop import recorded_in_loop
 from ident.friction.inverse_dynamics import direction_of, level_of, smoothed
@@ -171,10 +172,10 @@ def test_the_load_of_a_belt_is_the_lowest_zero_of_the_motor() -> None:
     assert found.compliance == pytest.approx(1 / spring, rel=0.05)
     # A steady motion meets the whole of the load's friction; below a twist of level / spring the load stands,
     # and its friction is what the spring pulls.
-    ramp, level = np.linspace(0.0, 1.0, 5000), 0.5
-    assert found.force(ramp, level)[-1] == pytest.approx(1.0, abs=0.01)
+    ramp, level, law = np.linspace(0.0, 1.0, 5000), 0.5, FrictionLaw(1.0)
+    assert found.force(ramp, level, law)[-1] == pytest.approx(1.0, abs=0.01)
     twist = 0.4 * level / spring * np.sin(2 * np.pi * 0.2 * dt_s * np.arange(20_000))
-    assert found.force(twist, level)[5000:] == pytest.approx(spring * twist[5000:] / level, abs=0.02)
+    assert found.force(twist, level, law)[5000:] == pytest.approx(spring * twist[5000:] / level, abs=0.02)
 
 
 def test_equations_that_are_not_finite_lose_the_log():
