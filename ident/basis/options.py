@@ -49,7 +49,13 @@ class IdentOptions(BaseModel):
         (),
         description="known poles outside the unit circle, each as real part, imaginary part >= 0",
     )
-    integrators: int = Field(0, ge=0, le=3, description="known poles at z = 1, as exact input filters")
+    integrators: int = Field(
+        0,
+        ge=0,
+        le=3,
+        description="known poles at z = 1, as exact input filters; default: none, and with friction in logs "
+        "of a loop one, unless a weight throws the arm over",
+    )
     feedthrough: bool = Field(
         False, description="direct term from the input to the output of the same sample"
     )
@@ -168,6 +174,11 @@ class IdentOptions(BaseModel):
     def delay_left_to_data(self) -> bool:
         """Nobody stated a delay, not even that there is none."""
         return "input_delay_samples" not in self.model_fields_set
+
+    @property
+    def integrators_left_to_data(self) -> bool:
+        """Nobody stated integrators or unstable poles, not even that there are none."""
+        return not self.model_fields_set & {"integrators", "unstable_poles"}
 
     def with_delay_stated(self) -> IdentOptions:
         """The same, the delay no longer sought: what is no record of one input and one output has none."""

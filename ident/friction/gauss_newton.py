@@ -7,7 +7,7 @@ doubled poles and to the parameters of the friction's law; the poles themselves 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -58,7 +58,8 @@ class FrictionFit:
     Of logs of a loop: correction (N,), the observer's (`step_through`) for a force of `ratio` at the input
     (in its unit per unit of the noise); the constant force, bias, and the level of friction beyond the
     first spring, which reaches the shaft through it (`spring`), both in units of the input. The covariance
-    has a row for the bias of an integrating arm and one for the level beyond the spring, too.
+    has a row for the bias of an integrating arm and one for the level beyond the spring, too. centre: from
+    where positions of an arm that does not integrate are told; of one that does, from where a log begins.
     """
 
     law: FrictionLaw
@@ -73,6 +74,7 @@ class FrictionFit:
     bias: float = 0.0
     spring: Spring | None = None
     beyond: float = 0.0
+    centre: float = field(default=0.0, metadata={"since": 2})
 
     @property
     def in_loop(self) -> bool:
@@ -113,7 +115,8 @@ class FrictionFit:
             return self.arm.run(self.coefficients, record.input[:, 0], law)
         delay, position = self.arm.structure.input_delay_samples, record.output[:, 0]
         driving = less_friction(record, self.steady(record), delay).input[:, 0]
-        return self.arm.run(self.coefficients, driving, law, position - position[0], self.correction)
+        start = position[0] if self.arm.structure.integrators else self.centre
+        return self.arm.run(self.coefficients, driving, law, position - start, self.correction)
 
     def steady(self, record: Record) -> RealArray:
         """(T,) bias and friction beyond the spring, at the shaft: what the observer need not simulate."""

@@ -64,6 +64,8 @@ _STAYS, _MOVES = 5e-3, 0.05
 _CAUSES, _NOTHING, _BY_CHANCE = 8, 1e-5, 1e-6
 # Largest step of the level, as a share of it; parts of a step that are tried.
 _LARGEST_STEP, _LENGTHS = 0.3, (1.0, 0.5, 0.25, 0.1)
+# Change of a constant force, as a share of the rms input, that a derivative is taken from.
+_CHANGE_OF_BIAS = 0.01
 # Deflection before slipping, as a share of the rms motion, expected within a factor of twenty; the start,
 # which sees a smoothed motion, takes more.
 _PRESLIDING, _COARSE = 1e-5, 10.0
@@ -108,19 +110,21 @@ def _told_by_position(u: RealArray, y: RealArray) -> float:
 @dataclass(frozen=True, eq=False)
 class _Logs:
     """What is fitted: records without their references; presliding: expected deflection before slipping, in
-    units of the position; least: smallest level, rms: of the input."""
+    units of the position; least: smallest level, rms: of the input; centre: of the positions."""
 
     records: tuple[Record, ...]
     presliding: float
     least: float
     rms: float
+    centre: float
 
     @classmethod
     def of(cls, records: Sequence[Record]) -> _Logs:
         motion = float(np.sqrt(np.mean([np.var(record.output) for record in records])))
         rms = float(np.sqrt(np.mean([np.mean(record.input**2) for record in records])))
         plain = tuple(replace(record, reference=None, reference_names=()) for record in records)
-        return cls(plain, _PRESLIDING * motion, 1e-6 * rms, rms)
+        centre = float(np.mean([np.mean(record.output) for record in records]))
+        return cls(plain, _PRESLIDING * motion, 1e-6 * rms, rms, centre)
 
     @property
     def criterion(self) -> float:
@@ -130,6 +134,10 @@ class _Logs:
 
     def errors(self, found: FrictionFit) -> float:
         return prediction_errors(found, self.records)
+
+    def worth(self, found: FrictionFit) -> float:
+        """Errors, larger by what the number of poles costs."""
+        return self.errors(found) * (1 + found.model.order * self.criterion)
 
 
 def fit_friction_in_loop(
@@ -145,27 +153,9 @@ def fit_friction_in_loop(
     refuse_few_lines(records)
     logs = _Logs.of(records)
     report(0.0, "friction: start")
-    ways = [direction_of(smoothed(r.output[:, 0]), _COARSE * logs.presliding) for r in logs.records]
-    law = FrictionLaw(
-        max(level_of(logs.records, ways, stiff=not options.integrators), logs.least), logs.presliding
-    )
-    options = _above_noise(logs.records, options)
-    used = [
-        less_friction(record, law.level * way, options.input_delay_samples)
-        for record, way in zip(logs.records, ways, strict=True)
-    ]
-    sought = not (options.integrators or options.unstable_poles)
-    if sought:
-        options = options.with_unstable(find_unstable(used, options))
-    few = _simplest(options)
-    model = untested_model([prewhitened(record, long_arx_filter(used, few)) for record in used], _moving(few))
     report(0.1, "friction: level and a simple arm in turns")
-    found = _in_turns(logs, started(model, few.structure(), law), few)
-    if sought and options.unstable_poles:
-        # Once more with a better friction, which the growth depends on.
-        options = options.with_unstable(find_unstable([found.taken_off(r) for r in logs.records], options))
-        few = _simplest(options)
-        found = _in_turns(logs, found, few)
+    options, found = _of_structure(logs, _above_noise(logs.records, options))
+    few = _simplest(options)
     if found.significant:
         report(0.4, "friction: falling with speed, beyond a spring")
         with suppress(LostError):  # what no observer follows explains nothing better
@@ -185,7 +175,7 @@ def fit_friction_in_loop(
             tried = _with_more_poles(logs, simple, options.model_copy(update=late))
         except LostError:
             break
-        if not logs.errors(tried) < logs.errors(found):
+        if not logs.worth(tried) < logs.worth(found):  # a pair more in place of a delay is no better
             break
         found = tried
     report(1.0, "friction identified")
@@ -197,6 +187,51 @@ def fit_friction_in_loop(
             "(position, load, temperature), or use response = 'as recorded'"
         )
     return replace(found, covariance_factor=np.sqrt(spread) * found.covariance_factor)
+
+
+def _of_structure(logs: _Logs, options: IdentOptions) -> tuple[IdentOptions, FrictionFit]:
+    """The options with their structure, and the fit with the fewest poles. Where the integrators are not
+    stated: one, or a weight that throws the arm over, whichever predicts better."""
+    if not options.integrators_left_to_data:
+        found = _simple(logs, options)
+        assert found is not None
+        return found
+    tried = list[tuple[IdentOptions, FrictionFit]]()
+    for integrators in (1, 0):
+        with suppress(LostError):
+            one = options.model_copy(update={"integrators": integrators})
+            found = _simple(logs, one, thrown_over=not integrators)
+            tried += [found] if found else []
+    if not tried:
+        raise LostError
+    return min(tried, key=lambda pair: logs.worth(pair[1]))
+
+
+def _simple(
+    logs: _Logs, options: IdentOptions, *, thrown_over: bool = False
+) -> tuple[IdentOptions, FrictionFit] | None:
+    """The options with the unstable poles that show, and level and arm in turns; thrown_over: None where none
+    shows."""
+    ways = [direction_of(smoothed(r.output[:, 0]), _COARSE * logs.presliding) for r in logs.records]
+    level = max(level_of(logs.records, ways, stiff=not options.integrators), logs.least)
+    used = [
+        less_friction(record, level * way, options.input_delay_samples)
+        for record, way in zip(logs.records, ways, strict=True)
+    ]
+    sought = not (options.integrators or options.unstable_poles)
+    if sought:
+        options = options.with_unstable(find_unstable(used, options))
+    if thrown_over and not options.unstable_poles:
+        return None
+    few = _simplest(options)
+    model = untested_model([prewhitened(record, long_arx_filter(used, few)) for record in used], _moving(few))
+    start = started(model, few.structure(), FrictionLaw(level, logs.presliding))
+    found = _in_turns(logs, replace(start, centre=logs.centre), few)
+    if sought and options.unstable_poles:
+        # Once more with a better friction, which the growth depends on.
+        options = options.with_unstable(find_unstable([found.taken_off(r) for r in logs.records], options))
+        found = _in_turns(logs, found, _simplest(options))
+    return options, found
 
 
 def _simplest(options: IdentOptions) -> IdentOptions:
@@ -262,7 +297,7 @@ def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: in
         for model in models:
             anew = started(model, options.structure(), found.law)
             spring = found.spring and (Spring.of(model) or found.spring)
-            anew = replace(anew, bias=found.bias, spring=spring, beyond=found.beyond)
+            anew = replace(anew, bias=found.bias, spring=spring, beyond=found.beyond, centre=found.centre)
             if not search:
                 anew = replace(anew, correction=found.correction, ratio=found.ratio)
             tried.append(observed(anew, logs.records))
@@ -300,14 +335,31 @@ def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
         tried = replace(
             found,
             law=replace(law, level=max(law.level, logs.least)),
-            bias=found.bias + length * float(step[q]) if integrating else 0.0,
+            bias=found.bias + length * float(step[q]) if integrating else found.bias,
             beyond=max(found.beyond + length * float(step[-1]), 0.0) if found.spring else 0.0,
             coefficients=found.coefficients + arm * length * change[:p],
         )
         if logs.errors(tried) < errors:
             found = tried
             break
+    found = found if integrating else _held(logs, found)
     return with_covariance(found, blocks, targets, noise)
+
+
+def _held(logs: _Logs, found: FrictionFit) -> FrictionFit:
+    """The same with the constant force (a weight) that leaves the predictions of an arm that does not
+    integrate no mean error, where that lowers the others."""
+
+    def off(one: FrictionFit) -> float:
+        left = [record.output[:, 0] - one.centre - one.motion(record)[0] for record in logs.records]
+        return float(np.mean(np.concatenate([part[part.size // 20 :] for part in left])))
+
+    size = _CHANGE_OF_BIAS * logs.rms
+    before, after = off(found), off(replace(found, bias=found.bias + size))
+    if not np.isfinite(after) or after == before:
+        return found
+    tried = replace(found, bias=found.bias - size * before / (after - before))
+    return tried if logs.errors(tried) < logs.errors(found) else found
 
 
 def _with_stribeck(logs: _Logs, found: FrictionFit) -> FrictionFit:
@@ -348,13 +400,14 @@ def identify_behind(
     records: those of the fit, with the friction taken off (`FrictionFit.taken_off`). Residuals and fit are
     those of simulations over windows (`fit_in_windows`).
     """
-    options = _above_noise(records, options or IdentOptions())
-    if found.arm.structure.unstable.order:
-        options = options.with_unstable(found.arm.structure.unstable)
+    options, structure = _above_noise(records, options or IdentOptions()), found.arm.structure
+    options = options.model_copy(update={"integrators": structure.integrators})
+    if structure.unstable.order:
+        options = options.with_unstable(structure.unstable)
     n_real, n_pairs = (
         all_ - known for all_, known in zip(found.model.poles.counts, options.fixed().counts, strict=True)
     )
-    delay = found.arm.structure.input_delay_samples
+    delay = structure.input_delay_samples
     known = {"n_real": n_real, "n_pairs": n_pairs, "input_delay_samples": delay}
     options, whiten = _beyond(found, _moving(options)).model_copy(update=known), ObserverFilter.of(found)
     behind = identify([whiten.filtered(record) for record in records], options, progress=progress)

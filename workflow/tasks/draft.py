@@ -159,14 +159,14 @@ def _rounded(value: float) -> float:
 
 
 def _specification(look: FirstLook, effort: float, limit: float, unstable: float) -> dict[str, Any]:
-    """Requirements that leave the bandwidth to what the identified arm allows; not with an unstable pole."""
+    """Requirements that leave the bandwidth to what the identified arm allows."""
     dt_s = look.records[0].dt_s
     highest = look.told_rad_s[1] if look.told_rad_s else 0.05 * np.pi / dt_s
     base = look.mode[0] if look.mode else look.notch or highest
-    bandwidth = _BEYOND_UNSTABLE * unstable if unstable else base / _PART
+    bandwidth = max(base / _PART, _BEYOND_UNSTABLE * unstable)
     return {
         "bandwidth_rad_s": _rounded(bandwidth),
-        **({} if unstable else {"lowest_bandwidth_rad_s": _rounded(base / _LEAST_PART)}),
+        "lowest_bandwidth_rad_s": _rounded(max(base / _LEAST_PART, unstable)),
         "modulus_margin": 0.5,
         "effort_limit": _rounded(effort),
         # Above what the logs tell the command falls off.

@@ -96,6 +96,12 @@ class RigidMotion:
         return against and not (self.viscous.shown and self.viscous.value > 0)
 
     @property
+    def free(self) -> bool:
+        """Whether nothing holds the position: a spring or weight would show."""
+        held = self.stiffness is None or self.stiffness.share > _WORTH
+        return self.explained > _EXPLAINED and not held
+
+    @property
     def sprung(self) -> bool:
         """Whether a spring or weight holds the position, or throws it over."""
         return (
