@@ -261,14 +261,15 @@ def _beyond(found: FrictionFit, options: IdentOptions) -> IdentOptions:
     """No pair far below the first mode, and one real pole: what is left of friction looks like slow ones.
     Poles and zeros of a driven shaft take turns: with friction at the load, whose zero is known, no pair
     below the middle between it and the mode."""
-    poles, update = found.model.poles, {"max_real": min(options.max_real, 1)}
+    poles = found.model.poles
+    update: dict[str, float | int] = {"max_real": min(options.max_real, 1)}
     modes = poles.omega_rad_s(found.model.dt_s)[poles.zeta() < LARGEST_DAMPING]
     if modes.size:
         least = _LOWEST_PAIR * float(modes.min())
         if found.spring is not None and found.spring.omega_rad_s < modes.max():
             least = float(np.sqrt(found.spring.omega_rad_s * modes[modes > found.spring.omega_rad_s].min()))
         if options.omega_min_rad_s is None or found.spring is not None:
-            update = update | {"omega_min_rad_s": least}
+            update["omega_min_rad_s"] = least
     return options.model_copy(update=update)
 
 

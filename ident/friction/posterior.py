@@ -152,7 +152,8 @@ def _of_known_sign(response: ResponsePosterior, longest_s: float) -> tuple[Respo
     basis = real_rows(more.frequency_rows(omega) / gain[:, None])
     found = np.linalg.lstsq(basis, real_rows(np.column_stack(wanted) / gain[:, None]), rcond=None)[0]
     onto = np.vstack([np.eye(n) - np.outer(along, along), along])
-    return replace(more, mean=found[:, 0], covariance_factor=found[:, 1:]), onto
+    mean, spread = np.asarray(found[:, 0], np.float64), np.asarray(found[:, 1:], np.float64)
+    return replace(more, mean=mean, covariance_factor=spread), onto
 
 
 def _by_linear_force(
