@@ -111,14 +111,14 @@ def _behind_observed(
     wider = np.sqrt(heterogeneity(found, records, autoregressive(whitening)))
     by_force = _by_linear_force(records, less, response)
     response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
-    response, factor_of_arm = _of_known_sign(response, longest_s=max(r.n_samples for r in less) * model.dt_s)
+    response, factor_of_arm = of_known_sign(response, longest_s=max(r.n_samples for r in less) * model.dt_s)
     both = [0, *([plain.shape[1] - 1] if found.spring is not None else [])]
     level, spread = found.level + float(change[both].sum()), wider * factor[both].sum(axis=0)
     spread = factor_of_arm @ np.append(spread, np.zeros(by_force.shape[1]))
     return BehindFriction(response, response, level, spread, found)
 
 
-def _of_known_sign(response: ResponsePosterior, longest_s: float) -> tuple[ResponsePosterior, RealArray]:
+def of_known_sign(response: ResponsePosterior, longest_s: float) -> tuple[ResponsePosterior, RealArray]:
     """The same with a gain at low frequencies that keeps its sign, and the unit normals it stands on now:
     (P'', P') times those before.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,13 +12,16 @@ from benchmarks.closed_loop_machines.simulator import Law, response
 from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
+from ident.basis.posterior import ResponsePosterior
 from ident.checks.validation import fit_in_windows, fit_on_fresh_data
+from ident.data.ellipses import chi2_radius
 from ident.data.record import Record
 from ident.friction import FrictionFit, fit_friction, identify_behind, without_friction
 from ident.friction.arm import FrictionLaw
 from ident.friction.gauss_newton import LostError, least_squares
 from ident.friction.in_loop import recorded_in_loop
 from ident.friction.inverse_dynamics import direction_of, level_of, smoothed
+from ident.friction.posterior import of_known_sign
 from ident.friction.spring import Spring
 
 
@@ -95,6 +100,80 @@ def test_a_loop_is_told_by_its_reference_or_by_its_command(kind: str) -> None:
     one = machine(kind, 1)
     assert recorded_in_loop([logged(one, 0)])
     assert recorded_in_loop([logged(one, 0, reference=False)])
+
+
+def test_one_log_that_shows_the_loop_is_enough() -> None:
+    """The logs of one experiment come from one loop, however little the others show."""
+    one = machine("belt", 1)
+    told, still = logged(one, 0, reference=False), logged(one, 1, reference=False)
+    rng = np.random.default_rng(0)
+    unseen = replace(still, input=rng.standard_normal(still.input.shape))
+    assert not recorded_in_loop([unseen])
+    assert recorded_in_loop([unseen, told])
+
+
+def test_friction_at_the_load_of_a_wheel_is_found_with_its_share() -> None:
+    """Four fifths of the friction are at the load, which stands while the spring pulls less."""
+    one = machine("wheel", 2)
+    motor, load = one.plant.friction[:2, 0] / one.plant.torque_per_u
+    found = fit_friction([logged(one, log) for log in (0, 1)], IdentOptions())
+    assert found.level == pytest.approx(motor + load, rel=0.03)
+    assert found.beyond / found.level == pytest.approx(load / (motor + load), rel=0.03)
+    spring = one.plant.springs[0, 2]
+    assert found.spring is not None
+    assert found.spring.compliance == pytest.approx(
+        one.plant.torque_per_u / spring * one.plant.scale, rel=0.05
+    )
+
+
+@pytest.mark.slow
+def test_the_fit_decides_that_a_weight_throws_the_arm_over() -> None:
+    one = machine("pendulum", 1)
+    found = fit_friction([logged(one, log) for log in (0, 1)], IdentOptions())
+    structure = found.arm.structure
+    (growth,) = [pole.real for pole in one.plant.linear(one.draft.q_operating)[3] if pole.real > 1e-6]
+    assert structure.integrators == 0
+    assert -np.log(structure.unstable.real) / one.plant.dt_s == pytest.approx([growth], rel=0.02)
+    assert found.level == pytest.approx(levels_of(one), rel=0.03)
+    # Stated, the structure stays.
+    stated = IdentOptions(integrators=1, n_real=1, n_pairs=1, input_delay_samples=one.plant.delay)
+    assert fit_friction([logged(one, 0)], stated).arm.structure.integrators == 1
+
+
+def test_a_gain_that_the_logs_do_not_tell_keeps_its_sign() -> None:
+    """1 / (s (s + a)) with a known to twice its size: its gain at low frequency is 1 / a, or anything."""
+    dt_s, a = 1e-2, 0.5
+    poles = Poles.from_continuous(decay_per_s=[a, 20.0], dt_s=dt_s).doubled()
+    omega = np.geomspace(1e-3, 100.0, 200)
+    empty = np.zeros((poles.order, 1))
+    blank = ResponsePosterior(poles, empty[:, 0], empty, dt_s, integrators=1)
+    rows, s = blank.frequency_rows(omega), 1j * omega
+    late = np.exp(-0.5j * omega * dt_s) / (s + 20.0)
+    arm, by_damping = late / (s * (s + a)), late / (s * (s + a) ** 2)
+    wanted = np.column_stack([arm, a * by_damping, 0.01 * arm]) / np.abs(arm)[:, None]
+    basis = rows / np.abs(arm)[:, None]
+    held = np.linalg.lstsq(
+        np.vstack([basis.real, basis.imag]), np.vstack([wanted.real, wanted.imag]), rcond=None
+    )[0]
+    before = replace(blank, mean=held[:, 0], covariance_factor=held[:, 1:])
+    after, normals = of_known_sign(before, longest_s=10.0)
+    ellipses = [one.at(omega) for one in (before, after)]
+    radius = [
+        chi2_radius(0.95) * np.sqrt(np.linalg.eigvalsh(one.covariance)[:, -1]) / np.abs(one.centre)
+        for one in ellipses
+    ]
+    rho = chi2_radius(0.95)
+    assert ellipses[1].centre == pytest.approx(ellipses[0].centre, rel=1e-6)
+    assert radius[0][0] == pytest.approx(rho, rel=0.01)
+    assert radius[1][0] == pytest.approx(rho / (1 + rho), rel=0.02)
+    assert radius[1].max() < 1
+    # Where the logs tell the gain, nothing changes: from ten times the corner on.
+    high = omega > 10 * a * (1 + rho)
+    assert radius[1][high] == pytest.approx(radius[0][high], rel=0.05)
+    assert normals.shape == (after.covariance_factor.shape[1], before.covariance_factor.shape[1])
+    # A gain that is told stays as it is.
+    told = replace(before, covariance_factor=0.1 * before.covariance_factor)
+    assert of_known_sign(told, longest_s=10.0)[0] is told
 
 
 @pytest.mark.parametrize("seed", range(4))
