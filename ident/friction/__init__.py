@@ -4,7 +4,7 @@ from ident.friction.amplitude import EquivalentFriction, at_amplitudes, equivale
 from ident.friction.arm import FrictionLaw
 from ident.friction.fit import fit_friction, refuse_unseen_shaft
 from ident.friction.gauss_newton import FrictionFit
-from ident.friction.in_loop import identify_behind, recorded_in_loop
+from ident.friction.in_loop import identify_behind, precedes_command, recorded_in_loop
 from ident.friction.posterior import BehindFriction, other_output_without_friction, without_friction
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "fit_friction",
     "identify_behind",
     "other_output_without_friction",
+    "precedes_command",
     "recorded_in_loop",
     "refuse_unrecorded",
     "refuse_unseen_shaft",

@@ -296,7 +296,9 @@ def test_the_axis_of_emps_becomes_a_controller(refused, flexlink, tmp_path, flex
     # Our own inverse dynamics of the record: 20.4 N, 95.1 kg; measured here 20.1 N, 2.15 1/s, 93.7 kg.
     assert 35.15065 * results.identify.friction.level == pytest.approx(20.39, rel=0.03)
     model = results.identify.channels[0].model
-    assert not model.poles.pairs.size
+    # No mode of a rigid axis: a pair, if any, is damped and far above what the log moves.
+    assert np.all(model.poles.zeta() > 0.2)
+    assert np.all(model.poles.omega_rad_s(model.dt_s) > 200)
     slowest = -np.log(np.max(model.poles.real[model.poles.real < 1])) / model.dt_s
     assert slowest == pytest.approx(203.5034 / 95.1089, rel=0.03)
     s = 1j * np.array([5.0, 10.0, 20.0])

@@ -31,6 +31,7 @@ from ident.friction import (
     at_amplitudes,
     equivalent_friction,
     other_output_without_friction,
+    precedes_command,
     without_friction,
 )
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
@@ -66,10 +67,8 @@ _NOISE_ORDERS = (8, 32)
 # had 87 % or more of them around their model, wrong ones 46 % or less (benchmarks.closed_loop_machines).
 _MOST = 50.0
 # So does one whose best fit to a log is below this, where the sensor's noise leaves a third of the rest at
-# most (right ones had 90 % and more, wrong ones 75 % and less), or one of no shaft: it neither integrates nor
-# has inertia.
+# most (right ones had 90 % and more, wrong ones 75 % and less).
 _EXPLAINED, _BEYOND_NOISE = 80.0, 3.0
-_NO_SHAFT = {FindingKind.INTEGRATORS, FindingKind.ANSWERS_AT_ONCE}
 T = TypeVar("T")
 
 N_BANDS = 6
@@ -166,7 +165,12 @@ def uncertainty_of(
         tests=tests,
     )
     if observer or (result.closed_loop is not None and result.closed_loop.kind is not FindingKind.DIRECT):
-        refuse_unexplained(result, found.agreement, friction)
+        late = (
+            friction is not None
+            and FindingKind.ANSWERS_AT_ONCE in {warning.kind for warning in result.identification.warnings}
+            and precedes_command(friction, measured, channel.identification)
+        )
+        refuse_unexplained(result, found.agreement, friction, late=late)
     advice = residual_advice(
         *tests,
         noise_order=found.noise_order,
@@ -283,20 +287,25 @@ def refuse_unanswered(result: IdentifiedChannel, posterior: ResponsePosterior, o
 
 
 def refuse_unexplained(
-    result: IdentifiedChannel, agreement: NominalAgreement, friction: FrictionFit | None
+    result: IdentifiedChannel,
+    agreement: NominalAgreement,
+    friction: FrictionFit | None,
+    *,
+    late: bool = False,
 ) -> None:
     """Raises ValueError, one line, where the model of logs made in a loop explains nothing, so that no number
-    of it means anything. friction: of the fit, None where none was identified."""
+    of it means anything. friction: of the fit, None where none was identified; late: the motion comes before
+    its command."""
     found = result.identification
     best = max(*found.fit_percent.tolist(), *(fit.fit_percent for fit in result.fresh), 0.0)
-    kinds, why = {warning.kind for warning in found.warnings}, ""
+    why = ""
     if agreement.share_inside_percent < _MOST:
         outside, at = 100 - agreement.share_inside_percent, agreement.at_rad_s
         why = f"it lies outside {outside:.0f} % of its own ellipses, most near {at:.3g} rad/s"
     elif friction is not None and best < _EXPLAINED and found.noise_std > _BEYOND_NOISE * friction.noise_std:
         times = found.noise_std / friction.noise_std
         why = f"its best fit to one is {best:.0f} %, and it leaves {times:.0f} times the sensor's noise"
-    elif friction is not None and kinds >= _NO_SHAFT:
+    elif late:
         why = "the motion comes before its command; was the command logged late?"
     if why:
         instead = "" if friction is None else "set response = 'as recorded', or "
