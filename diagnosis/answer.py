@@ -27,7 +27,7 @@ SURE, POSSIBLE = 0.8, 0.05
 # Shares of a range: a value this near its end is pinned there, an interval this wide says nothing.
 _PINNED, _WIDE = 1e-3, 0.9
 # Of the bootstrap of the share closed: draws, samples of a block.
-_BLOCKS, _BLOCK = 2000, 50
+_BLOCKS, BLOCK = 2000, 50
 # Standard deviations by which energies exceed that of noise, or it is noise.
 _CHANCE = 3.0
 
@@ -357,8 +357,8 @@ def share_closed(
     pairs = []
     for experiment in case.held_out:
         T = len(experiment.output)
-        for start in range(0, T, _BLOCK):
-            part = slice(start, start + _BLOCK)
+        for start in range(0, T, BLOCK):
+            part = slice(start, start + BLOCK)
             a, b = before[experiment.name][part], after[experiment.name][part]
             pairs.append((float(np.sum(a**2)), float(np.sum(b**2)), a.size))
     sums = np.array(pairs)

@@ -12,12 +12,13 @@ from diagnosis.evidence.confirmation import confronted
 from diagnosis.evidence.hypotheses import DISAGREEMENT, Hypothesis, Probabilities, probabilities
 from diagnosis.evidence.search import WhiteSearch
 from diagnosis.fit.coordinates import parameter_intervals
-from diagnosis.fit.descent import Descent, descend
+from diagnosis.fit.descent import FINE, Descent, descend
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine
 from diagnosis.machine.rounding import leads_over, rounding_effect
 from diagnosis.next_experiment.discrimination import (
+    MOST_COMPETING,
     CompetingHypothesis,
     competing_hypotheses,
     competing_hypothesis,
@@ -26,11 +27,8 @@ from diagnosis.search.loop import Progress
 from plant.effects import LOOK_ALIKES
 from plant.effects.search_space import Candidate
 
-# At most so many explanations are told apart by the next experiment.
-_MOST_COMPETING = 3
 # Difference of the cost that the records do not tell apart (chi-square, 95 %, two parameters).
 _AS_GOOD = 6.0
-_LAST_ITERATIONS, _LAST_TOLERANCE = 40, 0.01
 _DRAWS = 4000
 
 
@@ -126,7 +124,7 @@ def _to_part(
         return competing
     double = competing_hypothesis(case, likeliest.fit, weighed.cause["unknown"])
     return tuple(sorted((*competing, double), key=lambda hypothesis: -hypothesis.probability))[
-        :_MOST_COMPETING
+        :MOST_COMPETING
     ]
 
 
@@ -145,8 +143,7 @@ def _refined(model: ResidualModel, end: Descent) -> Descent:
         end.deviations,
         end.coordinates,
         model.start,
-        iterations=_LAST_ITERATIONS,
-        tolerance=_LAST_TOLERANCE,
+        **FINE,
     )
     return last if last.loss <= end.loss else end
 

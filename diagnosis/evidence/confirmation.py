@@ -19,11 +19,7 @@ from diagnosis.fit.discrepancy import Discrepancy, discrepancy
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import solver_spread, without_drift
 from diagnosis.machine.machine_protocol import Real
-
-# Log odds for an unknown rest that held-out records may add before the answer counts as not confirmed.
-_CONFIRMED = 2.0
-# Log weight by which another one may lead the answer once both have predicted the held-out records.
-_CONTRADICTED = 2.0
+from diagnosis.search.loop import SUBSTANTIAL
 
 
 def confronted(
@@ -39,7 +35,7 @@ def confronted(
     if not case.held_out:
         return None
     first = _prediction(model, leading.fit)
-    confirmed = leading.is_answer and first.unknown_gain < _CONFIRMED
+    confirmed = leading.is_answer and first.unknown_gain < SUBSTANTIAL
     if confirmed and not _contradicted(model, hypotheses, leading, first):
         return None
     best = max(h.evidence for h in hypotheses)
@@ -57,7 +53,7 @@ def _contradicted(
     model: ResidualModel, hypotheses: Sequence[Hypothesis], leading: Hypothesis, first: _Prediction
 ) -> bool:
     """Whether another one with no more effects is well ahead of the leading one once both have predicted."""
-    ahead = leading.log_weight + first.gain + _CONTRADICTED
+    ahead = leading.log_weight + first.gain + SUBSTANTIAL
     close: dict[tuple[frozenset[str], bool], Hypothesis] = {}
     for h in sorted(hypotheses, key=lambda h: -h.weight):
         if len(h.names) <= len(leading.names) or not leading.names:

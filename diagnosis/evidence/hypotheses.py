@@ -23,9 +23,8 @@ DISAGREEMENT = {"smooth": 0.03, "continuous": 0.06, "non-smooth": 0.25}
 # Prior probabilities by number of effects; they are shared equally among the sets of that size.
 _PRIOR_NONE, PRIOR_UNKNOWN = 0.25, 0.1
 _PRIOR_COUNT = {1: 0.5, 2: 0.14, 3: 0.01}
+PRIORS = (_PRIOR_COUNT[1], _PRIOR_COUNT[2] + _PRIOR_COUNT[3], PRIOR_UNKNOWN)
 _UNKNOWN = ("unknown",)
-# The same of real machines: one effect, several, a cause beyond the list; for what was not tried.
-_ONE, _SEVERAL, _BEYOND = 0.35, 0.45, 0.15
 # An unknown cause beside a set of effects, relative to that set alone.
 _UNKNOWN_BESIDE = float(np.log(PRIOR_UNKNOWN / _PRIOR_NONE))
 # Where contacts switch, what two correct solvers disagree about is not white: further effects beside a
@@ -159,16 +158,20 @@ class Probabilities:
         sets = {key if key == _UNKNOWN else tuple(sorted((*key, name))): p for key, p in self.sets.items()}
         return Probabilities(cause, sets, {**self.presence, name: certain})
 
-    def with_untried(self, untried: Mapping[str, str], *, larger: bool) -> Probabilities:
+    def with_untried(
+        self, untried: Mapping[str, str], priors: tuple[float, float, float] = PRIORS, *, larger: bool
+    ) -> Probabilities:
         """What no candidate explains may be one that was not tried, or a larger set where none was (larger).
 
-        Unknown is shared between these and a cause beyond the list, as their prior probabilities are.
+        Unknown is shared between these and a cause beyond the list, as their prior probabilities are
+        (priors: of one effect, of several, of such a cause).
         """
         cause, presence = dict(self.cause), dict(self.presence)
         listed = dict.fromkeys([*presence, *untried])
         tried = 1 - len(untried) / len(listed)
-        missed = _ONE * (1 - tried) + _SEVERAL * (1 - (0.0 if larger else tried**2))
-        moved = cause["unknown"] * missed / (missed + _BEYOND)
+        one, several, beyond = priors
+        missed = one * (1 - tried) + several * (1 - (0.0 if larger else tried**2))
+        moved = cause["unknown"] * missed / (missed + beyond)
         sets = {**self.sets, _UNKNOWN: self.sets[_UNKNOWN] - moved}
         cause["unknown"] -= moved
         for name in untried or listed:

@@ -10,10 +10,11 @@ import numpy as np
 from diagnosis.evidence.hypotheses import (
     DISAGREEMENT,
     PRIOR_UNKNOWN,
+    STILL_POSSIBLE,
     Hypothesis,
     log_prior,
 )
-from diagnosis.fit.descent import Descent, descend, refined
+from diagnosis.fit.descent import FINE, Descent, descend, refined
 from diagnosis.fit.discrepancy import discrepancy
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
@@ -26,12 +27,8 @@ from plant.effects.search_space import Candidate
 # An effect that changes no record by more than this many noise deviations (RMS) is not looked for: alone, and
 # beside others, where two dozen further effects have as many chances to follow noise and solver errors.
 SMALLEST_SIZE_RATIO, SMALLEST_SIZE_BESIDE = 0.06, 0.2
-# Ends whose loss is within this much of the best are finished: further behind no evidence makes up for it.
-_CLOSE = 20.0
 # A further effect has a smaller prior (7 in log weight): what gains less roughly is not finished.
 _LEAST_GAIN = 5.0
-# To an end, along flat valleys too.
-_FINE_ITERATIONS, _FINE_TOLERANCE = 40, 0.02
 # Starts of a further effect that are simulated beside a parent, of all that superposition looks at.
 _SIMULATED = 4
 # Where two effects leave more than this share of the gap, a third would only follow something unknown.
@@ -57,8 +54,7 @@ def fitted_to(
         deviations,
         coordinates,
         model.start,
-        iterations=_FINE_ITERATIONS,
-        tolerance=_FINE_TOLERANCE,
+        **FINE,
     )
 
 
@@ -142,7 +138,7 @@ class WhiteSearch(SearchLoop[Hypothesis]):
         best = min(h.fit.loss for h in self.found)
         smooth = all(c.dependence == "smooth" for c in end.candidates)
         faint = smooth and not around.candidates
-        close = end.loss < best + _CLOSE and (faint or end.loss < around.loss - _LEAST_GAIN)
+        close = end.loss < best + STILL_POSSIBLE and (faint or end.loss < around.loss - _LEAST_GAIN)
         # A backlash that only looks like something else takes as long as everything besides.
         if not (close or rank == 0) or (rank > 0 and end.non_smooth and not self._near(end)):
             return end

@@ -30,6 +30,8 @@ _REACHES, _POINTS = (0.1, 0.03), 9
 _FAR = np.array([-3.0, -2.0, -1.2, -0.6, -0.25, -0.08, 0.08, 0.25, 0.6, 1.2, 2.0, 3.0])
 # Above the loss of an end, that of a start which leads to no better one.
 _HOPELESS = 5.0
+# To an end, along flat valleys too.
+FINE: dict[str, Any] = {"iterations": 40, "tolerance": 0.02}
 # The Jacobian by the deviations, of the nominal or of a point nearby, is renewed at every third iteration.
 _AGAIN = 3
 

@@ -15,13 +15,13 @@ from diagnosis.imperfect.carried import closed_by, shares_of
 from diagnosis.machine.case import Case
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
-from diagnosis.next_experiment.discrimination import CompetingHypothesis, fitted_hypothesis
+from diagnosis.next_experiment.discrimination import MOST_COMPETING, CompetingHypothesis, fitted_hypothesis
 from diagnosis.search.explanation import Explanation, best_of_sets
 from diagnosis.search.loop import Progress
 from diagnosis.search.search import Search
 from plant.effects.search_space import Candidate
 
-_DRAWS, _MOST_COMPETING = 1000, 3
+_DRAWS = 1000
 # Small effects stay in the repaired model from this share of the model error on.
 _LEAST_KEPT = 0.3
 # Share of the stated model error that may act as an effect does: one standard deviation (set on 40 generated
@@ -189,7 +189,7 @@ def _competing(search: Search, found: judging.Verdict) -> tuple[CompetingHypothe
             noise,
             key,
         )
-        for key, end in list(kept.items())[:_MOST_COMPETING]
+        for key, end in list(kept.items())[:MOST_COMPETING]
     )
 
 

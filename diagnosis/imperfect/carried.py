@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from diagnosis.answer import Shares
+from diagnosis.answer import BLOCK, Shares
 from diagnosis.imperfect.horizon import horizon_samples, shares_over_horizon
 from diagnosis.imperfect.verdict import is_silent, late
 from diagnosis.machine.machine_protocol import Real
@@ -17,8 +17,8 @@ from diagnosis.machine.rounding import rounding_effect
 from diagnosis.search.explanation import Explanation
 from diagnosis.search.search import Search
 
-# Blocks of the bootstrap [samples]; draws; partial answers that are told.
-_BLOCK, _DRAWS, _MOST_TOLD = 50, 1000, 5
+# Draws of the bootstrap; partial answers that are told.
+_DRAWS, _MOST_TOLD = 1000, 5
 _LEAST_CLOSED, _WORTH_A_THIRD = 0.02, 0.1
 
 
@@ -106,7 +106,7 @@ def _blocks(search: Search, explanation: Explanation) -> Real:
     noise, rounding = search.case.noise, rounding_effect(search.case)
     white = 1.0 if rounding is None else 1.0 + rounding.variances / noise**2
     whitened = [np.sum((part / noise) ** 2 - white, axis=1) for part in explanation.left_held_out]
-    return np.concatenate([np.add.reduceat(e, np.arange(0, e.size, _BLOCK)) for e in whitened])
+    return np.concatenate([np.add.reduceat(e, np.arange(0, e.size, BLOCK)) for e in whitened])
 
 
 def _shapley(name: str, names: Sequence[str], energy: dict[tuple[str, ...], Real]) -> Real:

@@ -22,6 +22,7 @@ from diagnosis.evidence.hypotheses import Probabilities
 from diagnosis.machine.machine_protocol import Real, Weighing
 from diagnosis.machine.rounding import Rounding, rounding_effect
 from diagnosis.search.explanation import Explanation, best_of_sets
+from diagnosis.search.loop import SUBSTANTIAL
 from diagnosis.search.search import Search
 from plant.effects import LOOK_ALIKES
 
@@ -33,11 +34,11 @@ _VOLUME = 0.25
 _PRIOR_COUNT = (0.2, 0.35, 0.3, 0.1, 0.035, 0.015)
 # The one significance threshold, of every effect: the stated model error. It is soft, its width in natural
 # logarithms.
-_INTERESTS_WIDTH = 0.06
+_SOFT = 0.06
 # Held-out records of which an effect changes less than this (model errors) say nothing about it.
 _SILENT = 0.25
 # A wrong stated value interests from this many tolerances on.
-_FAR_OFF, _FAR_OFF_WIDTH = 4.4, 0.06
+_FAR_OFF = 4.4
 # And is none within this many.
 _WITHIN = 2.0
 # What a complete answer leaves, and what an unknown cause does: medians in model errors, widths (logarithms
@@ -68,8 +69,6 @@ _LISTED_AS = {name: str(kind.look_alike_of) for name, kind in LOOK_ALIKES.items(
 _DRAWS = 400
 # Sets this far behind in score take no part.
 _BEHIND, _MOST_SETS, _PASSES = 8.0, 8, 3
-# Sets no further behind have their effects exchanged for others that are as likely.
-_NEAR = 2.0
 
 
 @dataclass(frozen=True)
@@ -165,7 +164,7 @@ def judged(search: Search) -> Verdict:
         sets = _weighed(search, nominal)
         if late(search):
             break
-        near_sets = [one for one in sets if one.score > sets[0].score - _NEAR]
+        near_sets = [one for one in sets if one.score > sets[0].score - SUBSTANTIAL]
         for near in near_sets:
             search.exchanged(near.explanation, {part.name for part in near.parts if part.matters > 0.5})
             search.joined(sets[0].explanation, near.explanation)
@@ -189,7 +188,11 @@ def judged(search: Search) -> Verdict:
         leads = share > max((part.share for part in sets[0].parts), default=0.0)
         probabilities = probabilities.beside(rounding.name, leads=leads)
     untried = search.untried
-    probabilities = probabilities.with_untried(untried, larger=len(search.left_out) > 0)
+    probabilities = probabilities.with_untried(
+        untried,
+        (_PRIOR_COUNT[1], sum(_PRIOR_COUNT[2:]), _PRIOR_UNKNOWN),
+        larger=len(search.left_out) > 0,
+    )
     answer = probabilities.counting_as_unknown(untried).answer
     accepted = _accepted(probabilities, answer, sets, beside)
     rounded = rounding if beside else None
@@ -354,15 +357,15 @@ def _part(
         # Without it the others fit the records they were fitted to as well, with values that others refute.
         share = held_out
     share = max(share, seen.share if seen else 0.0)
-    matters = _soft(share / model_error, _INTERESTS_WIDTH)
+    matters = _soft(share / model_error)
     off = _tolerances_off(search, explanation, k)
     if off is not None:
         # A stated value in itself: what it changes may be imitated by the others within their tolerances. Far
         # off is not enough: of a value that nobody stated anything is.
         preferred = float(expit(_gain(explanation, listed) - _gain(rest, listed)))
-        matters = max(matters, preferred * _soft(off / _FAR_OFF, _FAR_OFF_WIDTH))
+        matters = max(matters, preferred * _soft(off / _FAR_OFF))
         # An effect and a deviation that cancel each other are no finding, whatever a fit without it left.
-        matters *= _soft(off / _WITHIN, _FAR_OFF_WIDTH)
+        matters *= _soft(off / _WITHIN)
     return Part(name, share, matters)
 
 
@@ -446,7 +449,7 @@ def _remaining(left: float, model_error: float, uncertain: float = 0.0) -> tuple
     return float(enough), float(_PRIOR_UNKNOWN / _UNKNOWN_WIDTH * np.exp(-0.5 * u**2))
 
 
-def _soft(ratio: float, width: float) -> float:
+def _soft(ratio: float, width: float = _SOFT) -> float:
     return float(expit(np.log(max(ratio, 1e-6)) / width))
 
 

@@ -33,6 +33,8 @@ from plant.simulation import simulate
 
 # In tolerances: small against one, large against the wobble of friction.
 _DEVIATION_STEP = 0.02
+# At most so many explanations are told apart by the next experiment.
+MOST_COMPETING = 3
 # A set less probable than this is only kept when there would be none at all without it.
 _SURVIVES = 0.01
 

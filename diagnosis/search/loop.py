@@ -18,9 +18,9 @@ from plant.effects.search_space import Candidate
 
 Progress = Callable[[float, str], None]
 
-# An effect is exchanged for one that is no further behind in evidence in a part of the set, nor in loss in
-# its place once all else has followed; nor further are sets, before they are fitted together.
-_AS_LIKELY = 15.0
+# Log odds that are worth a look (7 to 1), and that decide (3 million to 1): before a fit has ended its loss
+# may be off by several.
+SUBSTANTIAL, DECISIVE = 2.0, 15.0
 
 
 class Move(ABC):
@@ -199,7 +199,7 @@ class SearchLoop(ABC, Generic[E]):
                 (other,) = (c for c in rival.end.candidates if c.effect in new)
                 key = tuple(sorted((*rest, other.effect)))
                 contained = other.effect in rest.values() or other.kind.contains in rest
-                if key in best or contained or rival.evidence < part.evidence - _AS_LIKELY:
+                if key in best or contained or rival.evidence < part.evidence - DECISIVE:
                     continue
                 around = (best.get(tuple(sorted(rest))) or self.without(explanation, k)).end
                 if (this := (*key, around.loss, explanation.evidence, rival.evidence)) in self._reduced:
@@ -227,7 +227,7 @@ class SearchLoop(ABC, Generic[E]):
         at = [rival.end.coordinates_of(rival.names.index(c.effect)) for c in further]
         x, candidates = np.concatenate([around.coordinates, *at]), (*around.candidates, *further)
         followed, d, x = best_following(self.records, around, candidates, [x])
-        if followed >= loss + _AS_LIKELY:
+        if followed >= loss + DECISIVE:
             return None
         return self.add(descend(self.records, candidates, d, x, around.start))
 

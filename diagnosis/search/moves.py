@@ -18,7 +18,7 @@ from diagnosis.fit.starts import Point, beside, point_of, points_of
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.search.explanation import Weighed, best_of_sets
-from diagnosis.search.loop import Move, SearchLoop
+from diagnosis.search.loop import DECISIVE, SUBSTANTIAL, Move, SearchLoop
 from diagnosis.search.settled import settled
 from diagnosis.search.windows import in_windows
 from plant.effects import LOOK_ALIKES, Effect
@@ -38,16 +38,14 @@ _ALIKE = 3
 _PULLED, _BEYOND_BELIEF = 1.8, 2.0
 # Fits in windows: effects tried beside the best, and sets of one and of two continued in free runs.
 _BESIDE_IN_WINDOWS, _FREED = 4, (2, 3)
-# Loss that the best of them gains in windows, or none is continued.
-_GAINED = 15.0
 # Frequencies tried beside others.
 _FREQUENCIES = 3
 # Loss that an effect beside others gains once all else has followed, or its set is not descended on; unless
 # it is so much worse that the linearisation says nothing (set on 44 generated cases: of 325 in between, one
 # ended more than 15 below).
 _PROMISING, _ASTRAY = 3.0, 20.0
-# Scans of sets with contacts, each of the likeliest that is left or has gained this since its last.
-_SCANS, _GAINED_BY_SCAN = 2, 2.0
+# Scans of sets with contacts, each of the likeliest that is left or has gained since its last.
+_SCANS = 2
 # Sets of each size with contacts whose starts feel them, and how far behind in evidence they may be.
 _TOUCHING, _TOUCHING_ITERATIONS, _UNLIKELY = 2, 5, 150.0
 
@@ -292,7 +290,7 @@ class InWindows(Move):
                 windows.add(descended(windows, around, candidate, points, around.jacobian))
         windows.points = [(c, points) for c, points in search.points if c.kind.harmonic != "time"]
         best = min((e.end for e in windows.found), key=lambda end: end.loss)
-        if best.loss > around.loss - _GAINED:
+        if best.loss > around.loss - DECISIVE:
             return
         if not search.late(self.what):
             Beside(best, _BESIDE_IN_WINDOWS).apply(windows)
@@ -322,7 +320,7 @@ class Scan(Move):
             likeliest = (
                 e
                 for key, e in best_of_sets(search.found).items()
-                if e.end.non_smooth and e.end.loss < done.get(key, np.inf) - _GAINED_BY_SCAN
+                if e.end.non_smooth and e.end.loss < done.get(key, np.inf) - SUBSTANTIAL
             )
             this = next(likeliest, None)
             if this is None:

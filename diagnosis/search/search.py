@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from diagnosis.fit.descent import Descent, descend, loss_at, occam, refined
+from diagnosis.fit.descent import FINE, Descent, descend, loss_at, occam, refined
 from diagnosis.fit.records import Records, Start, mean_square_left
 from diagnosis.fit.starts import Point, beside
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.search.explanation import Explanation
-from diagnosis.search.loop import Progress, SearchLoop
+from diagnosis.search.loop import DECISIVE, SUBSTANTIAL, Progress, SearchLoop
 from diagnosis.search.moves import FINISHED, Alone, Beside, Enlarge, FromContacts, InWindows, LookAlike, Scan
 from diagnosis.search.settled import settled
 from plant.effects.search_space import Candidate
@@ -21,13 +21,8 @@ from plant.effects.search_space import Candidate
 _BESIDE_POINTS = 4
 # Ends beside a set that are refined where contacts switch.
 _REFINED = 2
-# Evidence that larger sets gain, or none that are larger still are tried.
-_WORTH = 15.0
-# Loss that other starts of the records gain, or a set is not descended on from there.
-_GAINED_BY_START = 2.0
 # Of octaves, what is felt where disturbances of the inputs are amplified.
 _AMPLIFIED = 0.5
-_LAST_ITERATIONS, _LAST_TOLERANCE = 20, 0.02
 
 
 class Search(SearchLoop[Explanation]):
@@ -100,7 +95,7 @@ class Search(SearchLoop[Explanation]):
             max((e.evidence for e in self.found if len(e.names) == n), default=-np.inf)
             for n in (count, count - 1)
         )
-        return largest > smaller + _WORTH
+        return largest > smaller + DECISIVE
 
     def looked_for(self, candidate: Candidate, points: list[Point]) -> tuple[Candidate, list[Point]]:
         return candidate, points
@@ -128,7 +123,7 @@ class Search(SearchLoop[Explanation]):
             return end
         start, e = settled(self.records, end.deviations, end.effects, end.start)
         loss, _ = loss_at(self.records, e, end.deviations, start)
-        if loss > end.loss - _GAINED_BY_START:
+        if loss > end.loss - SUBSTANTIAL:
             return end
         return descend(self.records, end.candidates, end.deviations, end.coordinates, start)
 
@@ -157,8 +152,7 @@ class Search(SearchLoop[Explanation]):
                 end.deviations,
                 end.coordinates,
                 end.start,
-                iterations=_LAST_ITERATIONS,
-                tolerance=_LAST_TOLERANCE,
+                **FINE,
             )
         )
 
