@@ -128,6 +128,19 @@ SECTIONS = {
             r"values: mass_kg \S+ \(([^)]*)\).*?coulomb_N \S+ \(([^)]*)\); offset_N \S+ \(([^)]*)\)",
             "{}, {}, {}",
         ),
+        Row(
+            "The same: probability that friction is present, and an offset (threshold not stated)",
+            "real_machine_gaps",
+            r"coulomb_friction \(there with (\S+?)\).*?constant_offset \(there with (\S+?)\)",
+            "{}; {}",
+        ),
+        Row(
+            "SLFR, a real flexible arm: probability that friction is present, fitted at two amplitudes; at one",
+            "real_machine_gaps",
+            r"^Fitted at 50 and 75.*?coulomb_friction \(there with (\S+?)\)"
+            r".*?^Fitted at 50,.*?coulomb_friction \(there with (\S+?)\)",
+            "{}; {}",
+        ),
     ),
     "Speed": (
         Row(
