@@ -135,7 +135,7 @@ SECTIONS = {
             "{}; {}",
         ),
         Row(
-            "SLFR, a real flexible arm: probability that friction is present, fitted at two amplitudes; at one",
+            "SLFR, a real flexible arm: probability that friction is present, fitted at 50 and 75; at 50",
             "real_machine_gaps",
             r"^Fitted at 50 and 75.*?coulomb_friction \(there with (\S+?)\)"
             r".*?^Fitted at 50,.*?coulomb_friction \(there with (\S+?)\)",
