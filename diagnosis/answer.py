@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -256,6 +257,28 @@ class Diagnosis:
             "repaired": self.gap_after,
         }
         return {model: pooled[model] for model in self.models}
+
+    @cached_property
+    def replays(self) -> dict[Model, dict[str, Real]]:
+        """First and last of the models -> validation record -> outputs (T, Y) from its start on under its
+        commands alone. Empty where no simulation is held near its records: residuals are of these then."""
+        plant = self.case.machine
+        if getattr(plant, "untracked", None) is None:
+            return {}
+        runs = {"stated": plant.replayed(()), self.models[-1]: self.rig.replayed(self.repair)}
+        return {model: {e.name: run(e.input) for e in self.case.held_out} for model, run in runs.items()}
+
+    @property
+    def replayed(self) -> dict[str, dict[Model, float]]:
+        """Output -> model -> RMS of measured less replayed, in the output's unit, all validation records."""
+        left = {
+            model: np.concatenate([e.output - runs[e.name] for e in self.case.held_out])
+            for model, runs in self.replays.items()
+        }
+        return {
+            name: {model: float(np.sqrt(np.mean(e[:, k] ** 2))) for model, e in left.items()}
+            for k, name in enumerate(self.case.machine.output_names if left else ())
+        }
 
     @property
     def rounding_rms(self) -> float:

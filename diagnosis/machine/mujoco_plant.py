@@ -552,6 +552,7 @@ class MujocoArm:
             self.dt_s,
             inactive={**self._untried(every), **dict.fromkeys(silent, "records in which it shows")},
             settled=simulation.settled,
+            untracked=Simulation(replace(self, tracking_rad_s=0.0), every, noise, _starts=simulation._starts),
         )
 
     def _untried(self, every: Mapping[str, Quantity]) -> dict[str, str]:
@@ -746,7 +747,7 @@ def _start_filters(model: Any, data: Any, commands: Real) -> None:
 
 def _begun(q: Real, dt_s: float, noise: float, early_s: float) -> list[tuple[float, float]]:
     """Position in the first row and speed a little earlier, each with what it may be off by: of the longest
-    parabola that leaves no more than noise of the first samples."""
+    parabola that leaves no more than noise of the first samples, and what its force may change in a row."""
     for n in (n for n in _SMOOTHED_FROM if n <= len(q)):
         time_s = dt_s * np.arange(n)
         fit, covariance = np.polyfit(time_s, q[:n], 2, cov="unscaled")
@@ -757,7 +758,7 @@ def _begun(q: Real, dt_s: float, noise: float, early_s: float) -> list[tuple[flo
         off = _AS_NOISE * level * np.sqrt(np.diag(covariance))
         found = [
             (fit[2], min(off[2], level)),
-            (fit[1] - 2 * fit[0] * early_s, off[1] + abs(2 * fit[0]) * early_s),
+            (fit[1] - 2 * fit[0] * early_s, off[1] + abs(2 * fit[0]) * dt_s),
         ]
     return found
 

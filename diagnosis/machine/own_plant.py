@@ -77,8 +77,10 @@ class Plant:
     start : name -> standard deviation (around zero) of a state at the start of a record that nobody knows
         Beside a model error it is fitted for every record; the simulation takes the states (name -> value) as
         a fourth argument.
-    settled : inputs, outputs -> outputs as they would be from the start that fits the record in these inputs
-        best, where a simulation knows that itself; every fit and every residual is of these.
+    settled : inputs, outputs -> outputs as they would be from the start that fits the record best, which is
+        in these inputs, where a simulation knows that itself; every fit and every residual is of these.
+    untracked : the simulation without what holds it near a record, which is in these inputs; None: nothing
+        does.
     """
 
     simulation: Simulate
@@ -92,6 +94,7 @@ class Plant:
     start: Mapping[str, float] = field(default_factory=dict)
     inactive: Mapping[str, str] = field(default_factory=dict)
     settled: Callable[[Real, Real], Real] | None = None
+    untracked: Simulate | None = None
 
     def __post_init__(self) -> None:
         lock(self, "noise")
@@ -184,6 +187,10 @@ class Plant:
             return np.clip(np.where(np.isnan(found), far, found), -far, far)
 
         return outputs
+
+    def replayed(self, effects: Sequence[Change]) -> Callable[..., Real]:
+        """As `simulator`, from the recorded start on under the commands alone."""
+        return replace(self, simulation=self.untracked or self.simulation, settled=None).simulator(effects)
 
     def simulated(self, effects: Sequence[Change], states: Real | None = None) -> Callable[[Real], Real]:
         """Inputs (T, U) -> outputs (T, Y) as the simulation gives them, listed effects around it.

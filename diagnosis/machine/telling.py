@@ -112,7 +112,8 @@ def _alike(columns: Mapping[str, Real]) -> tuple[Alike, ...]:
                 break
             others.remove(chosen[0])
             group = {names[k] for k in (j, *chosen)}
-            if not any(group <= {*one.names} or {*one.names} <= group for one in found):
+            if not any({*one.names} <= group for one in found):
+                found = [one for one in found if not group < {*one.names}]
                 found.append(Alike((names[j], *(names[k] for k in chosen)), left))
     return tuple(found)
 

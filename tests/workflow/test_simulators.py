@@ -59,6 +59,76 @@ def test_a_mujoco_model_is_diagnosed_and_comes_back_repaired(tmp_path, flexlink)
     assert "hinge.frictionloss" in (out / "arm.html").read_text()
 
 
+PENDULUM = """<mujoco><option timestep="0.002" integrator="{integrator}"/><worldbody><body name="arm">
+<joint name="shoulder" axis="0 1 0" damping="0.05" armature="0.01"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" density="1000"/></body></worldbody>
+<actuator><motor name="torque" joint="shoulder"/></actuator>
+<sensor><jointpos name="angle" joint="shoulder"/></sensor></mujoco>"""
+
+
+def write_pendulum_log(
+    path: Path, seed: int, load_kg: float, friction_Nm: float, samples: int = 1000
+) -> None:
+    """Under a PD controller, by the classical Runge-Kutta method: rod and caps by hand, a load at the tip."""
+    cylinder, ball = np.pi * 0.02**2 * 0.5 * 1000, 4 / 3 * np.pi * 0.02**3 * 1000
+    mass = cylinder + ball
+    inertia = cylinder * (0.5**2 / 12 + 0.02**2 / 4 + 0.25**2) + ball * (0.4 * 0.02**2 + 0.5**2 / 2)
+    inertia += 0.01 + load_kg * 0.52**2
+    weight = 9.81 * (0.25 * mass + 0.52 * load_kg)
+    rng = np.random.default_rng(seed)
+    goal = rng.uniform(-1.2, 1.2, 20).repeat(50)
+    x, rows, h = np.zeros(2), [], 0.01 / 20
+
+    def slope(x: np.ndarray, u: float) -> np.ndarray:
+        left = u - 0.05 * x[1] - friction_Nm * np.tanh(x[1] / 5e-3) - weight * np.sin(x[0])
+        return np.array([x[1], left / inertia])
+
+    for k in range(1000):
+        angle = x[0] + 2e-4 * rng.standard_normal()
+        u = 6.0 * (goal[k] - angle) - 0.6 * x[1]
+        rows.append([k * DT_S, u, angle])
+        for _ in range(20):
+            k1 = slope(x, u)
+            k2 = slope(x + h / 2 * k1, u)
+            k3 = slope(x + h / 2 * k2, u)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + slope(x + h * k3, u))
+    np.savetxt(path, rows, delimiter=",", header="time_s,torque,angle", comments="")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("integrator", "load_kg", "friction_Nm"),
+    [("implicitfast", 0.15, 0.12), ("RK4", 0.2, 0.0), ("implicit", 0.0, 0.1)],
+)
+def test_a_load_and_friction_of_a_pendulum_without_a_site_are_found(
+    tmp_path, flexlink, integrator, load_kg, friction_Nm
+):
+    """A load, weight and the gain of the drive look alike: what is not ruled out is said to be open."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "pend.xml").write_text(PENDULUM.format(integrator=integrator))
+    arguments = ["--mjcf", str(tmp_path / "pend.xml")]
+    for seed in range(3):
+        write_pendulum_log(tmp_path / f"p{seed}.csv", seed, load_kg, friction_Nm)
+        arguments += ["--log", str(tmp_path / f"p{seed}.csv")]
+    answer = flexlink("diagnose", *arguments, "--out", str(tmp_path / "out"), "--json", "--jobs", "1")
+    (case,) = answer.document()["cases"]
+    sizes = {"arm.payload": load_kg, "shoulder.frictionloss": friction_Nm}
+    for name, size in sizes.items():
+        found = case["presence"][name]
+        if size == 0:
+            assert found["probability"] < 0.5
+            continue
+        assert found["probability"] > 0.2
+        (low, high) = next(iter(found["intervals"].values()))
+        assert low <= size <= high
+        if name not in case["combination"]:
+            assert name in case["ambiguous_with"]
+    wrong = {*case["combination"]} - {name for name, size in sizes.items() if size}
+    assert not wrong or case["probability"] < 0.8
+    left = case["replayed"]["angle"]
+    assert left["repaired"] < 0.2 * left["stated"]
+
+
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [

@@ -22,8 +22,11 @@ _MODES = 3
 
 @style.drawing("gap_measured")
 def draw_measured_beside_simulated(found: Diagnosis) -> Figure:
-    """Validation record with the largest model error, a column per output in its unit; residuals below."""
-    case = found.case
+    """Validation record with the largest model error, a column per output in its unit; residuals below.
+
+    Of a model that fits hold near its records, the plain simulations from the recorded start.
+    """
+    case, runs = found.case, found.replays
     worst = max(case.held_out, key=lambda e: pooled_rms(found.residuals_before[e.name]))
     time = np.arange(len(worst.output), dtype=np.float64) * case.dt_s
     figure, grid = style.panels(
@@ -38,11 +41,18 @@ def draw_measured_beside_simulated(found: Diagnosis) -> Figure:
         for model in dict.fromkeys(("stated", found.models[-1])):
             look, name = gap_style.MODELS[model], gap_style.WORDS[model]
             residual = found.residuals[model][worst.name][:, column] * case.noise[column]
+            if runs:
+                residual = measured - runs[model][worst.name][:, column]
             above.plot(*outline(time, measured - residual, _TRACE_BINS), **look, label=name)
             below.plot(*outline(time, residual, _TRACE_BINS), **look)
         above.set(title=f"{style.plain(worst.name, 30)}: {words}", ylabel=f"{words} [{unit}]")
         below.set(xlabel="time [s]", ylabel=f"residual [{unit}]")
         above.margins(x=0.01)
+        if runs:  # a free run may fall over, far away from what was measured
+            far = np.ptp(measured)
+            for axes, low, high in ((above, np.min(measured), np.max(measured)), (below, 0.0, 0.0)):
+                bottom, top = axes.get_ylim()
+                axes.set_ylim(max(bottom, low - far), min(top, high + far))
     return figure
 
 
