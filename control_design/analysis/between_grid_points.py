@@ -207,7 +207,7 @@ def _normal(point: Complex, shape: Real) -> Complex:
     # Lengths in units of the largest: squares of squares stay far from the ends of the number range.
     scale = np.maximum(np.maximum(np.abs(point), major), 1e-100)
     turned, a, b = point * np.conj(axis) / scale, major / scale, minor / scale
-    t = np.maximum(secular_root(np.abs(turned.real), np.abs(turned.imag), a, b), 1e-30)
+    t = np.maximum(secular_root(np.abs(turned.real) * a, np.abs(turned.imag) * b, a * a, b * b), 1e-30)
     normal = (turned.real / (a**2 + t) + 1j * turned.imag / (b**2 + t)) * axis
     return np.asarray(quotient(normal, np.abs(normal), 1.0), dtype=np.complex128)
 

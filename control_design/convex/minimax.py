@@ -25,7 +25,6 @@ from control_design.plants.frequency_grid import with_violations
 _ROUND_NUMERATOR = 1e-3
 _ROUND_REACH = 1e-4
 _ROUND_FEASIBILITY = 1e-2  # while denominators are being made positive: their maximum may sit on the kink
-_GAP = 1e-5  # relative accuracy of gamma
 _EXCESS = 5e-4  # relative; accepted of the dense check over the programme
 _MOST_STEPS = 200  # of the interior point in one round; 5 to 40 are usual
 _KEPT = 1e-10  # singular values of the scaled basis below this fraction are no directions of the search
@@ -84,15 +83,20 @@ class MinimaxPoint(NamedTuple):
 
 
 def smallest_ratio(
-    basis: Complex, rows: PlaneRows, start: Real | None = None, *, most_rounds: int = 30
+    basis: Complex,
+    rows: PlaneRows,
+    start: Real | None = None,
+    *,
+    most_rounds: int = 30,
+    accuracy: float = 1e-5,
 ) -> MinimaxPoint:
-    """Minimise the largest numerator/denominator over real x (n,).
+    """Minimise the largest numerator/denominator over real x (n,), to a relative accuracy.
 
     basis (F, n): y = basis x. start: x (n,) to begin from; None, or where a denominator is not positive: the
     least-squares solution of the numerators, shortened until they are; where that fails, the denominators are
     made positive first.
     """
-    step = _Scaled(basis, rows)
+    step = _Scaled(basis, rows, accuracy)
     if start is not None and not np.min(rows.denominator(plane(basis @ start))) > 0:
         start = None
     z = step.least_squares() if start is None else step.back @ start
@@ -110,7 +114,7 @@ def smallest_ratio(
         if not reached < gamma:
             break
         gain, z, gamma = gamma - reached, new, reached
-        if gain < _GAP * gamma or step.constant:
+        if gain < accuracy * gamma or step.constant:
             break
     return MinimaxPoint(step.map @ z, gamma)
 
@@ -168,8 +172,8 @@ class _Scaled:
     x = map z, z = back x, y = planar z.
     """
 
-    def __init__(self, basis: Complex, rows: PlaneRows) -> None:
-        self.rows = rows
+    def __init__(self, basis: Complex, rows: PlaneRows, accuracy: float) -> None:
+        self.rows, self.accuracy = rows, accuracy
         planar = np.stack([basis.real, basis.imag], axis=1)  # (F, 2, n)
         seen = np.concatenate(
             [np.matmul(matrix, planar[rows.at]).reshape(-1, basis.shape[1]) for matrix in (rows.A, rows.C)]
@@ -260,7 +264,8 @@ class _Scaled:
             if largest < best_value:
                 best, best_value = z, largest
             gained = max(begin - best_value, 0.0)
-            enough = 0.3 * _GAP * factor if final else max(0.05 * gained, 0.1 * _GAP * factor)
+            enough = (0.3 if final else 0.1) * self.accuracy * factor
+            enough = enough if final else max(0.05 * gained, enough)
             if best_value < stop_below or (
                 float(dual @ slack) < enough
                 and largest - best_value < enough

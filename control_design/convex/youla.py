@@ -132,8 +132,15 @@ def youla_bracket(
 class BracketProblem:
     """One plant: parametrisation, grids and the three problems."""
 
-    def __init__(self, plant: UncertainPlant, specification: Specification, options: YoulaOptions) -> None:
-        self.plant, self.spec, self.options = plant, specification, options
+    def __init__(
+        self,
+        plant: UncertainPlant,
+        specification: Specification,
+        options: YoulaOptions,
+        *,
+        accuracy: float = 1e-5,
+    ) -> None:
+        self.plant, self.spec, self.options, self.accuracy = plant, specification, options, accuracy
         self.grids = Grids((plant,), specification, options)
         self.factors: Factors | None = None
         if np.any(np.abs(plant.poles) >= 1.0 - 1e-9):
@@ -144,11 +151,7 @@ class BracketProblem:
         self.dense_basis = self._basis(self.dense)
 
     def solve(self) -> PlantBracket:
-        enclosing, _, x = self.exchanged("enclosing", None)
-        # Where the enclosing discs cannot be stabilised together, the ellipses may be: started from the
-        # inscribed.
-        inscribed, grid_value, x_inscribed = self.exchanged("inscribed", None)
-        ellipse, _, _ = self.exchanged("ellipse", x if np.isfinite(enclosing) else x_inscribed)
+        (ellipse, _, _), (enclosing, _, _), (inscribed, grid_value, _) = self.answers()
         offset = np.abs(self.dense.ellipses.centre * self.dense.delay - self.dense_loop.base)
         exact = bool(np.all(offset <= 1e-6 * np.abs(self.dense_loop.base)))
         ellipse = min(ellipse, enclosing)  # the same Q does no worse on a smaller region
@@ -169,6 +172,22 @@ class BracketProblem:
         lean = self.grids.lean()[0]
         return hull_bound(lean, self._loop(lean), self._basis(lean), inscribed_grid, ellipse)
 
+    def answers(self) -> list[tuple[float, float, Real]]:
+        """Of ellipses, enclosing and inscribed discs: see `exchanged`."""
+        enclosing = self.exchanged("enclosing", None)
+        # Where the enclosing discs cannot be stabilised together, the ellipses may be: started from the
+        # inscribed.
+        inscribed = self.exchanged("inscribed", None)
+        start = enclosing if np.isfinite(enclosing[0]) else inscribed
+        return [self.exchanged("ellipse", start[2]), enclosing, inscribed]
+
+    def controller(self, x: Real) -> tuple[Real, Complex]:
+        """Frequencies (F,) of the programme and K (F,) there."""
+        lean = self.grids.lean()[0]
+        loop, q = self._loop(lean), self._basis(lean) @ x
+        sensitivity = loop.sensitivity + loop.sensitivity_slope * q
+        return lean.ellipses.omega_rad_s, (loop.effort + loop.effort_slope * q) / sensitivity
+
     def exchanged(self, region: Region, start: Real | None) -> tuple[float, float, Real]:
         """Optimum with violated frequencies added: (value on the dense grid, on the programme's, x)."""
 
@@ -176,7 +195,8 @@ class BracketProblem:
             lean = self.grids.lean()[0]
             if region == "ellipse":
                 return self._ellipse(lean, begin)
-            return smallest_ratio(self._basis(lean), self._rows(lean, region), begin)
+            rows = self._rows(lean, region)
+            return smallest_ratio(self._basis(lean), rows, begin, accuracy=self.accuracy)
 
         found = exchanged(
             solve,
@@ -196,11 +216,11 @@ class BracketProblem:
         for _ in range(_ELLIPSE_ROUNDS):
             angles = None if start is None else _best_angles(loop, data, basis @ start)
             rows = self._rows(data, "ellipse", angles)
-            new = smallest_ratio(basis, rows, start)
+            new = smallest_ratio(basis, rows, start, accuracy=self.accuracy)
             before = point.gamma
             if new.gamma < before:
                 point, start = new, new.x
-            if not new.gamma < before * (1 - 1e-4):
+            if not new.gamma < before * (1 - 10 * self.accuracy):
                 break
         return point
 

@@ -145,20 +145,19 @@ class Ellipses:
         return farthest_distance(-self.centre * np.conj(self.direction), self.semi_major, self.semi_minor)
 
 
-def secular_root(x: Real, y: Real, a: Real, b: Real) -> Real:
-    """Root t >= 0 of (a x/(a^2 + t))^2 + (b y/(b^2 + t))^2 = 1 for x, y, a >= b >= 0; inside the ellipse 0.
+def secular_root(p: Real, q: Real, c: Real, d: Real) -> Real:
+    """Root t >= 0 of (p/(c + t))^2 + (q/(d + t))^2 = 1 for p, q, c, d >= 0; 0 where the sum is below 1 there.
 
     The left side is convex and decreasing, so Newton from the left never overshoots.
     """
-    ax, by = a * x, b * y
     # Lower bounds of the root: each term alone <= 1. Both make the sum >= 1, where Newton is monotone.
-    t = np.maximum(np.maximum(ax - a * a, by - b * b), 0.0)
+    t = np.maximum(np.maximum(p - c, q - d), 0.0)
     tiny = 1e-300
     for _ in range(60):
-        da, db = a * a + t + tiny, b * b + t + tiny
-        pa, pb = (ax / da) ** 2, (by / db) ** 2
-        value = pa + pb - 1.0
-        slope = -2.0 * (pa / da + pb / db)
+        dc, dd = c + t + tiny, d + t + tiny
+        pc, qd = (p / dc) ** 2, (q / dd) ** 2
+        value = pc + qd - 1.0
+        slope = -2.0 * (pc / dc + qd / dd)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             step = np.where((value > 0) & (slope < 0), -value / np.where(slope < 0, slope, -1.0), 0.0)
         t = t + step
@@ -181,7 +180,7 @@ def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real
     the multiplier). Degenerate axes (segments, points) are the limit b -> 0.
     """
     x, y, a, b, scale = _to_scale(point, semi_major, semi_minor)
-    t = secular_root(x, y, a, b)
+    t = secular_root(a * x, b * y, a * a, b * b)
     da, db = a * a + t, b * b + t
     # t = 0 on a degenerate axis: the point projects onto the segment itself.
     nx, ny = quotient(a * a * x, da), quotient(b * b * y, db)
@@ -195,27 +194,12 @@ def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Rea
     """Distance from `point` to the farthest point of the axis-parallel ellipse at the origin. All (F,).
 
     Maximise |(a cos f + x, b sin f + y)| with x, y >= 0: the maximiser lies in the first quadrant, and its
-    multiplier m is the largest root of (a x/(m - a^2))^2 + (b y/(m - b^2))^2 = 1. With n = m - a^2 the root
-    lies between max(a x, b y - a^2 + b^2) (one term alone) and a x + b y (the sum of the terms), where
-    bisection finds it.
+    multiplier m is the largest root of (a x/(m - a^2))^2 + (b y/(m - b^2))^2 = 1: n = m - a^2 is a
+    `secular_root`.
     """
     x, y, a, b, scale = _to_scale(point, semi_major, semi_minor)
-    ax, by = a * x, b * y
-    gap = a * a - b * b
-    # Unknown n = m - a^2 >= 0. Bisection on log-free bounds: lower = larger single-term root, upper = sum of
-    # terms.
-    low = np.maximum(ax, np.maximum(by - gap, 0.0))
-    high = ax + by + 1e-300
-    for _ in range(80):
-        mid = 0.5 * (low + high)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            value = (ax / np.maximum(mid, 1e-300)) ** 2 + (by / np.maximum(mid + gap, 1e-300)) ** 2
-        above = value > 1.0
-        low = np.where(above, mid, low)
-        high = np.where(above, high, mid)
-        if np.all(high - low <= 2e-16 * (high + gap)):
-            break
-    n = 0.5 * (low + high)
+    by, gap = b * y, a * a - b * b
+    n = secular_root(a * x, by, np.zeros_like(gap), gap)
     sin_f = np.clip(quotient(by, n + gap), 0.0, 1.0)
     # cos from sin: when x = 0 the cosine term of the secular equation degenerates (n -> 0).
     cos_f = np.sqrt(1.0 - sin_f**2)

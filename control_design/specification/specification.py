@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, Literal
 
 import numpy as np
@@ -24,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from control_design.controllers.biquads import SOLVER_SLACK, SectionKind
 from control_design.plants.ellipses import Real
 from control_design.plants.frequency_grid import lowest_rad_s
-from control_design.plants.plant_set import UncertainPlant, count_integrators
+from control_design.plants.plant_set import Channel, UncertainPlant, count_integrators
 from control_design.plants.weights import (
     RationalWeight,
     bandwidth_weight,
@@ -295,15 +296,20 @@ class ModePeak(WeightedRequirement):
                     f"mode_peak_ratio: plant {plant.name!r} has no lightly damped mode; give mode_band_rad_s"
                 )
             band = modes[0].omega_rad_s / 1.5, modes[0].omega_rad_s * 1.5
-        high = min(band[1], plant.nyquist_rad_s)
-        omega = np.geomspace(band[0], high, 2000)
-        for mode in modes:
-            width = max(mode.zeta, 1e-9) * mode.omega_rad_s
-            omega = np.append(omega, mode.omega_rad_s + width * np.sinh(np.linspace(-3, 3, 121)))
-        omega = np.unique(omega[(omega >= band[0]) & (omega <= high)])
-        peak = float(np.max(np.abs(plant.damped.nominal_response(omega))))
+        peak = _nominal_peak(plant.damped, band[0], min(band[1], plant.nyquist_rad_s))
         weight = constant_weight(1.0 / (spec.mode_peak_ratio * peak))
         return cls(weight, band, channel=plant.performance)
+
+
+@lru_cache(maxsize=32)  # every grid of a synthesis asks for the requirements of its plant
+def _nominal_peak(channel: Channel, low_rad_s: float, high_rad_s: float) -> float:
+    """Largest nominal gain in a band, refined around the modes."""
+    omega = np.geomspace(low_rad_s, high_rad_s, 2000)
+    for mode in channel.modes:
+        width = max(mode.zeta, 1e-9) * mode.omega_rad_s
+        omega = np.append(omega, mode.omega_rad_s + width * np.sinh(np.linspace(-3, 3, 121)))
+    omega = np.unique(omega[(omega >= low_rad_s) & (omega <= high_rad_s)])
+    return float(np.max(np.abs(channel.nominal_response(omega))))
 
 
 @dataclass(frozen=True)

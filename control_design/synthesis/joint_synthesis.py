@@ -50,6 +50,7 @@ def synthesise_jointly(
     stable_share: float = 0.999,
     draws: int = 10_000,
     rounds: int = 3,
+    first: SynthesisResult | None = None,
     progress: Progress | None = None,
 ) -> JointDesign:
     """`synthesise`, and again with guards until the share of stable draws is what is asked.
@@ -57,6 +58,7 @@ def synthesise_jointly(
     stable_share : of sampled responses that must be stable.
     draws : responses drawn after every design, fresh ones each time.
     rounds : designs with guards at most.
+    first : the design without guards, where it is known already.
 
     Raises SpecificationError if specification and plants contradict each other (before optimising).
     Raises ValueError if the share lies outside (0, 1), the draws are too few to show it, or an uncertainty
@@ -75,7 +77,8 @@ def synthesise_jointly(
     best: JointDesign | None = None
     for number in range(rounds + 1):
         part = part_of(tell, number, rounds + 1)
-        result = synthesise(plants, specification, options, rng=rng, progress=part, guards=guards)
+        result = first if first is not None and number == 0 else None
+        result = result or synthesise(plants, specification, options, rng=rng, progress=part, guards=guards)
         if result.outcome is Outcome.NOT_CONVERGED:
             best = best or JointDesign(result, tuple(guards), draws, (), False)
             break

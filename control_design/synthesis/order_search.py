@@ -15,6 +15,7 @@ from control_design.synthesis.problem import EXCHANGE_TOLERANCE
 from control_design.synthesis.starts import StartMaker, with_gain
 from control_design.synthesis.synthesis_result import StartReport
 from control_design.synthesis.work_pool import Candidate, StartTask, WorkPool, Workshop
+from control_design.synthesis.youla_starts import FreeControllers, fitted
 
 Told = Callable[[float, str], None]
 
@@ -28,6 +29,10 @@ _RETRIEVALS = 3  # rounds for ends that are good on the grid and not robustly st
 _RETREAT, _RETREATS = 0.8, 20  # factor on their gain, and how often, until they are stable on the finer grid
 _FINISHING = 10  # rounds for the best alone, until dense check and grid agree
 _AGREE = 1.001
+_NO_RESONANCE = 0.3  # damping that fits begin with: a narrow one of their own hides between grid points
+_WEIGHTED = 3  # rounds of fits with random weights
+# Of the worst case that the small Youla problem reaches, which lies up to 8 % above that of the default one.
+_NEAR, _FAIR = 1.03, 1.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +87,52 @@ class OrderSearch:
         if not found:
             return OrderResult(None, tuple(self.reports), (), self._nearest(ends))
         return self._exchange(found)
+
+    def quick(self, free: FreeControllers) -> tuple[OrderResult, bool]:
+        """From controllers of the Youla bound: the result, and whether the search may end with it.
+
+        One fit of each, then fits with random weights, then shaped and random loops. It may end where the
+        result lies within `_NEAR` of what the controllers of any order reach, or where as many ends as asked
+        agree on it and it meets the specification; before the last starts only within `_FAIR`.
+        """
+        found: list[Candidate] = []
+
+        def settled(gamma: float, fair: float = np.inf) -> bool:
+            near = free.gamma / _NEAR <= gamma <= _NEAR * free.gamma < np.inf
+            return near or (gamma <= min(1.0, fair * free.gamma) and self._agree(found))
+
+        for turn in range(_WEIGHTED + 2):
+            self.tell(0.1 * turn, f"start {turn + 1} of {_WEIGHTED + 2}, from controllers of any order")
+            starts = self._fits(free, turn) if turn <= _WEIGHTED else self._others()
+            found += self._done([self._task(x) for x in starts])
+            least = min((c.gamma_grid for c in found), default=np.inf)
+            if self._enough(found) or settled(least, _FAIR):
+                break
+        ends = self._retrieved(found)
+        if not ends:
+            return OrderResult(None, tuple(self.reports), (), self._nearest(found) if found else None), False
+        result = self._exchange(ends, hops=False)
+        assert result.best is not None
+        return result, self._enough([result.best]) or settled(result.best.gamma)
+
+    def _fits(self, free: FreeControllers, turn: int) -> list[Real]:
+        """Stable fits of the controllers of any order; from the second turn on with random weights."""
+        damping = max(1.01 * (self.spec.controller_damping or 0.0), _NO_RESONANCE)
+        rng = self.rng if turn else None
+        fits = [fitted(self.cascade, each, least_damping=damping, rng=rng) for each in free.each]
+        stable = [self._stabilised(x) for x in fits if x is not None]
+        return [x for x in stable if x is not None]
+
+    def _others(self) -> list[Real]:
+        """Shaped loops and random ones of little gain."""
+        if any(plant.unstable_poles for plant in self.problem.plants):
+            return []
+        maker = self._maker()
+        shaped = [x for x, _ in maker.shaped(_DRAWS, _SHAPED_TRACKING)]
+        return shaped + [maker.low_gain() for _ in range(min(self.options.starts, _SHAPED_TRACKING))]
+
+    def _stabilised(self, parameters: Real) -> Real | None:
+        return parameters if np.isfinite(self._descent().value(parameters)) else self._retreat(parameters)
 
     def _nearest(self, ends: Sequence[Candidate]) -> Real:
         """Parameters that are stable on the grid, the smallest worst case first; else nearest to the
@@ -151,8 +202,8 @@ class OrderSearch:
     def _descent(self) -> MinimaxDescent:
         return self.workshop.descent(self.cascade, tuple(self.problem.grids))
 
-    def _starts(self) -> list[StartTask]:
-        maker = StartMaker(
+    def _maker(self) -> StartMaker:
+        return StartMaker(
             self.cascade,
             self.problem.lean(),
             self.problem.integrators,
@@ -161,6 +212,9 @@ class OrderSearch:
             controller_damping=self.spec.controller_damping,
             keeps_sign=self.problem.asks_tracking or self.problem.integrators > 0,
         )
+
+    def _starts(self) -> list[StartTask]:
+        maker = self._maker()
         tracking = self.problem.asks_tracking
         given = [self._task(x) for x in self.given]
         if any(plant.unstable_poles for plant in self.problem.plants):
@@ -178,7 +232,7 @@ class OrderSearch:
         mixed = [start for pair in zip_longest(shaped, random) for start in pair if start is not None]
         return [*given, *mixed]
 
-    def _exchange(self, found: list[Candidate]) -> OrderResult:
+    def _exchange(self, found: list[Candidate], *, hops: bool = True) -> OrderResult:
         """Add violated frequencies of the best candidates, improve them on the finer grid, and again.
 
         Several are carried along at first: the best on a coarse grid is often not the best on a finer one.
@@ -200,8 +254,8 @@ class OrderSearch:
             starts = [c.parameters for c in pool]
             if fresh and min(c.gamma_grid for c in fresh) < pool[0].gamma * (1 - tolerance):
                 starts.append(min(fresh, key=lambda c: c.gamma_grid).parameters)
-            hops = min(_HOPS if number == 0 else _LATER_HOPS, self.options.starts)
-            starts += [self._hop(pool[0].parameters) for _ in range(hops)]
+            count = min(_HOPS if number == 0 else _LATER_HOPS, self.options.starts) if hops else 0
+            starts += [self._hop(pool[0].parameters) for _ in range(count)]
             fresh = []
             for at, end in enumerate(self._done([self._task(x) for x in starts])):
                 fresh.append(end)

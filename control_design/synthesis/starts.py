@@ -112,7 +112,7 @@ class StartMaker:
         columns = np.stack([p**power / whole for power in range(n, -1, -1)], axis=1) * weight[:, None]
         size = np.linalg.norm(columns, axis=0)
         solution = np.linalg.lstsq(real_rows(columns) / size, real_rows(wanted * weight), rcond=1e-9)[0]
-        return _in_sections(self.cascade.sections, solution / size, denominators)
+        return in_sections(self.cascade.sections, solution / size, denominators)
 
     def _wishes(self, data: PlantData) -> tuple[Real, Complex, Real]:
         """(omega, wanted K, weight), each (n,), for one plant on its lean grid."""
@@ -360,7 +360,7 @@ def with_cancelling_section(
     return np.concatenate([parameters, zeros, poles])
 
 
-def _in_sections(
+def in_sections(
     sections: Sequence[SectionKind], numerator: Real, denominators: Sequence[Real]
 ) -> Real | None:
     """Parameters of numerator/(product of denominators): roots dealt to sections, gain to the first.

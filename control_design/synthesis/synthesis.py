@@ -20,6 +20,7 @@ from control_design.synthesis.starts import with_cancelling_section
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
 from control_design.synthesis.work_pool import Candidate, WorkPool, Workshop
+from control_design.synthesis.youla_starts import free_controllers
 
 Progress = Callable[[float, str], None]
 
@@ -45,6 +46,7 @@ def synthesise(
     rng: np.random.Generator,
     progress: Progress | None = None,
     guards: Sequence[Guard] = (),
+    thorough: bool = True,
 ) -> SynthesisResult:
     """Design one controller for all plants: smallest gamma over every ellipse.
 
@@ -53,12 +55,15 @@ def synthesise(
     progress : called with (fraction, message).
     guards : single responses that must be stable as well, whatever the weights say of them.
 
+    thorough : search from many starts where those from the Youla bound do not settle it.
+
     Raises SpecificationError if specification and plants contradict each other (before optimising).
 
-    Every controller of order n - 2 is one of order n with a section whose zeros cancel its poles. The orders
-    n - 2, n - 4, ... are therefore solved first, each with its own generator derived from `rng`, and handed
-    upwards: with the same rng, plants and options two states more never give a larger gamma (from order 3 on
-    with a tracking requirement, else from order 2). See `order_search` for one order.
+    Controllers of the Youla bound, fitted by ones of the asked order, are improved first. They mostly end
+    near the bound, or agree: see `OrderSearch.quick`. Otherwise many starts follow. Every controller of order
+    n - 2 is one of order n with a section whose zeros cancel its poles, so these solve the orders n - 2, n -
+    4, ... first, each with its own generator derived from `rng`, and hand their results upwards. The better
+    of both is returned.
     """
     options = options or SynthesisOptions()
     specification.check_against(plants)
@@ -67,25 +72,21 @@ def synthesise(
     problem = Problem(tuple(plants), specification, options, tuple(guards))
     own_damping = max(0.8, 1.01 * (specification.controller_damping or 0.0))
     root = int(rng.integers(2**63))
+    cascade = Cascade(specification.sections(), problem.dt_s, problem.scale_rad_s)
     ladder = _ladder(specification.sections(), _LOWEST_TRACKING if problem.asks_tracking else _LOWEST_ORDER)
-    cascade: Cascade | None = None
-    result = OrderResult(None, (), ())
     reports: list[StartReport] = []
     workshop = Workshop(problem)
     with WorkPool(workshop, options.jobs) as pool:
-        for number, sections in enumerate(ladder):
-            lower, cascade = cascade, Cascade(sections, problem.dt_s, problem.scale_rad_s)
-            own = np.random.default_rng([root, cascade.order])
-            given: list[Real] = []
-            if lower is not None and result.best is not None:
-                given = [
-                    with_cancelling_section(lower, result.best.parameters, cascade, own, damping=own_damping)
-                    for _ in range(_EMBEDDINGS)
-                ]
-            part = part_of(tell, number, len(ladder), f"order {cascade.order}: ")
-            result = OrderSearch(workshop, pool, cascade, own, part, given).run()
-            reports += result.reports
-    assert cascade is not None
+        grids = list(problem.grids)
+        search = OrderSearch(workshop, pool, cascade, np.random.default_rng([root, 0]), part_of(tell, 0, 2))
+        result, settled = search.quick(free_controllers(problem.plants, specification))
+        reports += search.reports
+        if thorough and not settled:
+            problem.grids[:] = grids  # what the fits violated may be of no concern to other starts
+            rest = part_of(tell, 1, 2)
+            found = _climbed(workshop, pool, ladder, root, own_damping, result.best, rest, reports)
+            worse = result.best is None or (found.best and found.best.gamma <= result.best.gamma)
+            result = found if worse else result
     best = result.best
     if best is None or best.gamma >= _MEANINGLESS:
         nearest = result.nearest if best is None else best.parameters
@@ -100,6 +101,37 @@ def synthesise(
         gamma_history=result.history,
         grid_points=sum(grid.size for grid in problem.grids),
     )
+
+
+def _climbed(
+    workshop: Workshop,
+    pool: WorkPool,
+    ladder: Sequence[tuple[SectionKind, ...]],
+    root: int,
+    own_damping: float,
+    fitted: Candidate | None,
+    tell: Progress,
+    reports: list[StartReport],
+) -> OrderResult:
+    """Result of the last of the ladder's orders, each started from the one before and of its own; the last
+    from the fitted one, too. What was run is added to the reports."""
+    problem, result = workshop.problem, OrderResult(None, (), ())
+    cascade: Cascade | None = None
+    for number, sections in enumerate(ladder):
+        lower, cascade = cascade, Cascade(sections, problem.dt_s, problem.scale_rad_s)
+        own = np.random.default_rng([root, cascade.order])
+        given: list[Real] = []
+        if lower is not None and result.best is not None:
+            given = [
+                with_cancelling_section(lower, result.best.parameters, cascade, own, damping=own_damping)
+                for _ in range(_EMBEDDINGS)
+            ]
+        if number == len(ladder) - 1 and fitted is not None:
+            given.append(fitted.parameters)
+        part = part_of(tell, number, len(ladder), f"order {cascade.order}: ")
+        result = OrderSearch(workshop, pool, cascade, own, part, given).run()
+        reports += result.reports
+    return result
 
 
 def _seen_by_the_data(specification: Specification, plants: Sequence[UncertainPlant]) -> Specification:

@@ -53,7 +53,7 @@ def _sampled(controller: Controller, plant: UncertainPlant, near_rad_s: float) -
     s = 2j / plant.dt_s * np.tan(omega * plant.dt_s / 2)
     weight = np.abs((s / _CORNER + 1) / _LIMIT / (s / 4000 + 1))
     found = 0.0
-    for angle in np.linspace(0, 2 * np.pi, 181):
+    for angle in np.linspace(0, 2 * np.pi, 721):
         loop = k * e.points(np.cos(angle), np.sin(angle))
         found = max(found, float(np.max(weight * np.abs(loop / (1 + loop)))))
     return found
@@ -67,7 +67,7 @@ def test_it_is_designed_for_checked_and_proved_between_grid_points():
     certificate = certify(result.controller, [plant], spec)
     (item,) = [each for each in certificate.items if each.requirement == "largest |W T|"]
     assert item.achieved <= 1.01 * result.gamma  # 2000 points against a refined grid
-    # 181 angles of the boundary: the worst member is missed by (pi/181)^2/2 of the ellipse at most.
+    # 721 angles of the boundary: the worst member is missed by (pi/720)^2/2 of the ellipse at most.
     assert (
         item.achieved * (1 - 1e-3)
         <= _sampled(result.controller, plant, item.omega_rad_s)

