@@ -1,5 +1,5 @@
-"""Structured robust synthesis: the orders below the asked one first, then the asked one from their results;
-and why a controller is no design at all."""
+"""Structured robust synthesis: from controllers of the Youla bound, else from many starts, the orders below
+the asked one first; and why a controller is no design at all."""
 
 from __future__ import annotations
 

@@ -8,13 +8,13 @@ from control_design.plants.frequency_grid import GridOptions
 
 
 class SynthesisOptions(GridOptions):
-    """Effort of the search; the defaults solve an order-5 design in a few seconds."""
+    """Effort of the search; the defaults solve an order-5 design in about a second."""
 
     starts: int = Field(
         default=6,
         ge=1,
         le=100,
-        description="random low-gain starts of each order, and as many starts shaped at the modes",
+        description="random low-gain starts of each order, and as many starts shaped at the modes, where needed",
     )
     agreeing_starts: int = Field(
         default=3, ge=1, description="stop early when this many starts reach the best value within 0.1 %"
