@@ -213,7 +213,10 @@ def unstable_samples(controller: Controller, posterior: ResponsePosterior, rng: 
 
 def run(out: Print, *, first_seed: int = 0, seeds: int = 200) -> None:
     counts = dict.fromkeys(COUNTED, 0)
-    out("seed int modes delay order  outcome        gamma  bound/dense  proved  certify s  unstable")
+    times: list[float] = []
+    out(
+        "seed int modes delay order  outcome        gamma  bound/dense  proved  design s  certify s  unstable"
+    )
     for seed in range(first_seed, first_seed + seeds):
         plant, posterior, specification = random_case(seed)
         head = (
@@ -221,7 +224,9 @@ def run(out: Print, *, first_seed: int = 0, seeds: int = 200) -> None:
             f"{posterior.input_delay_samples:5d} {specification.controller_order:5d}  "
         )
         try:
-            result = synthesise([plant], specification, LOW_EFFORT, rng=np.random.default_rng(seed))
+            design = partial(synthesise, [plant], specification, LOW_EFFORT, rng=np.random.default_rng(seed))
+            result, taken = timed(design)
+            times.append(taken)
         except SpecificationError as error:
             counts["refused"] += 1
             counts["silent"] += "rad/s" not in str(error) and "delay" not in str(error)
@@ -248,7 +253,7 @@ def run(out: Print, *, first_seed: int = 0, seeds: int = 200) -> None:
         ratio = proof.gamma / certificate.gamma if np.isfinite(proof.gamma) else np.inf
         out(
             f"{head}{result.outcome.name:12s} {certificate.gamma:7.3f}  {ratio:11.5f}  "
-            f"{proof.proved!s:>6}  {spent:9.2f}  {unstable:3d} of {SAMPLED}"
+            f"{proof.proved!s:>6}  {taken:8.2f}  {spent:9.2f}  {unstable:3d} of {SAMPLED}"
         )
         if not proof.proved:
             out(f"       {proof.obstacle.value}")
@@ -258,6 +263,7 @@ def run(out: Print, *, first_seed: int = 0, seeds: int = 200) -> None:
     out()
     out(", ".join(f"{key} {value}" for key, value in counts.items()))
     out(MEANING)
+    out(f"CPU seconds of a design: median {np.median(times):.2f}, largest {np.max(times):.2f}")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ class SynthesisOptions(GridOptions):
         default=6,
         ge=1,
         le=100,
-        description="random low-gain starts of each order, and as many starts shaped at the modes, where needed",
+        description="random low-gain starts of each order, and as many shaped at the modes, where needed",
     )
     agreeing_starts: int = Field(
         default=3, ge=1, description="stop early when this many starts reach the best value within 0.1 %"
