@@ -410,7 +410,8 @@ def run(out: Print, *, seed: int = 15, first: int = 0, cases: int = 80, jobs: in
             f"{len(here)}"
         )
     alarms = [one for one in answers if one.none and not one.exact]
-    out(f"false alarms or unknown where nothing is hidden: {len(alarms)} of {len(answers) - len(effects)}")
+    out(f"first answer right: {len(named)} of {len(effects)}")
+    out(f"false alarms: {len(alarms)} of {len(answers) - len(effects)}")
     out(f"size of those named first: median error {100 * float(np.median([o.off for o in named])):.1f} %")
     out(f"interval holds the truth: {sum(one.covers for one in named)} of {len(named)}")
     out(f"sure and wrong: {sum(one.sure for one in answers)} of {len(answers)}")

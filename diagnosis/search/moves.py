@@ -176,11 +176,12 @@ class Beside(Move):
     def proposed(cls, search: SearchLoop[Any], count: int) -> list[Beside]:
         """Sets of so many effects, from the likeliest of one fewer. Several of these while something that
         interests is left, for what is left says little about which member of the true set has been found;
-        then the likeliest of all sets, if it is one. What interests is unknown where nobody has stated it."""
+        then those as likely as the likeliest of all sets: a small effect beside one of two that look alike
+        decides between them. What interests is unknown where nobody has stated it."""
         pool = list(best_of_sets(search.found).values())
         parents = [e for e in pool if len(e.names) == count - 1][: _PARENTS[count > 2]]
         if search.case.machine.weighing.stated and not search.unexplained:
-            parents = [e for e in parents if e is pool[0]]
+            parents = [e for e in parents if e.evidence > pool[0].evidence - DECISIVE]
         return [cls(parent.end, _TRIED[count > 2]) for parent in parents]
 
     def apply(self, search: SearchLoop[Any]) -> None:

@@ -112,8 +112,9 @@ class Search(SearchLoop[Explanation]):
         alone = not around.candidates
         if rank >= (FINISHED if alone else _REFINED):
             return end
-        if alone and not end.converged:
-            end = descend(self.records, end.candidates, end.deviations, end.coordinates, end.start)
+        if alone:
+            # Slopes of the nominal lead to an end that need not be one by slopes of its own.
+            end = descend(self.records, end.candidates, end.deviations, end.coordinates, end.start, **FINE)
         return refined(self.records, self.begun(end))
 
     def begun(self, end: Descent) -> Descent:

@@ -10,7 +10,7 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 
 from benchmarks import mujoco_cases as cases  # noqa: E402
-from diagnosis import PlantExperiment  # noqa: E402
+from diagnosis import PlantExperiment, diagnose  # noqa: E402
 from diagnosis.machine.mujoco_plant import MujocoArm  # noqa: E402
 from diagnosis.machine.plant_effect import Change, EffectParameter, PlantEffect  # noqa: E402
 
@@ -562,3 +562,13 @@ def test_a_joint_on_a_base_that_flies_is_refused_in_one_line(base, refused):
             MujocoArm(spec, ("hip",), DT_S)
     else:
         MujocoArm(spec, ("hip",), DT_S)
+
+
+def test_a_load_that_a_gain_imitates_stays_open_beside_it():
+    """A load, a mass and a gain leave alike; what is small beside one of them does not decide."""
+    truth, case = cases.case_of(63, 51)
+    found = diagnose(case)
+    assert truth.name == "link1.payload"
+    presence = {e.name: e.presence for e in found.effects}
+    assert presence["link1.payload"] > 0.2
+    assert max(presence["wrong_motor1.gain"], presence["wrong_link1.mass"]) < 0.8
