@@ -316,7 +316,9 @@ def _by_name(search: Search, explanation: Explanation, k: int) -> float:
     column = end.jacobian[:, end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])]
     added = [-records.likelihood.unseen(column[part], search.case.noise.size) for part in records.parts]
     constant = np.array([np.mean(a, axis=0) for a in added])
-    if any(np.ptp(a) > _CONSTANT * np.max(np.abs(a)) for signal in added for a in signal.T if np.any(a)):
+    if not np.any(constant) or any(
+        np.ptp(a) > _CONSTANT * np.max(np.abs(a)) for signal in added for a in signal.T if np.any(a)
+    ):
         return 0.0
     pairs = zip(records.experiments, explanation.left, strict=True)
     point = np.array([np.mean(e.output - left, axis=0) for e, left in pairs]) - constant

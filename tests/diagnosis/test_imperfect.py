@@ -792,12 +792,13 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
             StartColumns(np.zeros((0, 0)), (), np.zeros((0, 0))),
         )
         end = Descent(
-            chosen, nothing, x, start, nothing, nothing, np.zeros((0, 0)), columns, -gain, 0.0, True
+            chosen, nothing, x, start, nothing, nothing, np.zeros((count, x.size)), columns, -gain, 0.0, True
         )
         shares = np.array([[left, left], [held_out, held_out]])
         left_held_out = (np.full((400, 2), held_out),)
-        return Explanation(end, np.array([gain]), 0.0, 0.0, (), left_held_out, shares)
+        return Explanation(end, np.array([gain]), 0.0, 0.0, (), left_held_out, shares, shares**2)
 
+    count = sum(e.output.size for e in case.estimation)
     found = {frozenset(names): fitted(names, *numbers) for names, numbers in sets.items()}
     return SimpleNamespace(
         found=list(found.values()),
@@ -811,6 +812,7 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
         exchanged=lambda explanation, sought: None,
         joined=lambda one, other: None,
         left_out=(),
+        untried={},
         deadline_s=np.inf,
         acts_on_held_out=lambda whole, k: acts,
         by_these=lambda names, whole: found[frozenset(names)],
