@@ -103,6 +103,13 @@ SECTIONS = {
             "{2} of {1} ({0} controllers)",
         ),
         Row(
+            "Logs of ten kinds of machines under their controllers, with dry friction: `init` and `run` give "
+            "a controller, and 20 steps settle on the nonlinear machine",
+            "closed_loop_machines",
+            r"^all +\| (\d+) of (\d+) \| (\d+) of (\d+) \| (\d+) of (\d+) \|",
+            "{0} of {1} with a reference in the logs, {2} of {3} without; {4} of {5} certificates exceeded",
+        ),
+        Row(
             "Peak of the sensitivity on the nonlinear arm against the prediction",
             "closed_loop_sensitivity",
             r"at 0\.2 rad rms: worst -?([\d.]+) %",
