@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import norm
 
 from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions
@@ -125,18 +126,24 @@ def of_known_sign(response: ResponsePosterior, longest_s: float) -> tuple[Respon
     Below what the logs tell, the arm is its inertia and one damping or stiffness k. Data tell k, to a
     deviation s, and G = 1 / k is not Gaussian where s is large: an ellipse of G would hold zero, which no
     passive arm has. Along the one normal that moves the gain at low frequency, with x = rho a / (jw + a) the
-    relative change of G at the 95 % radius, x / (1 + x) takes its place: a further pole at a (1 + rho).
-    Neglected: gains more than twice the centre's, with which a loop is the tighter there.
+    relative change of G at the 95 % radius, x / (1 + x) takes its place: a further pole at a (1 + rho). The
+    centre is the mean of the gains above zero. Neglected: gains more than twice the centre's, with which a
+    loop is the tighter there.
     """
     factor, n = response.covariance_factor, response.covariance_factor.shape[1]
     omega = np.geomspace(1 / (_LENGTHS * longest_s), np.pi / response.dt_s, _FREQUENCIES)
     rows = response.frequency_rows(omega)
-    gain = rows @ response.mean
-    lowest = np.real(rows[0] @ factor / gain[0])
-    rho = chi2_radius(_LEVEL) * float(np.linalg.norm(lowest))
-    if response.unstable.order or rho < _LARGEST:
+    # The force it takes to move that slowly; the shaft goes where it is pushed.
+    turned = (1j * omega[0]) ** response.integrators
+    value, lowest = float(np.real(turned * rows[0] @ response.mean)), np.real(turned * rows[0] @ factor)
+    spread = float(np.linalg.norm(lowest))
+    if response.unstable.order or chi2_radius(_LEVEL) * spread < _LARGEST * value:
         return response, np.eye(n)
-    along = lowest / np.linalg.norm(lowest)
+    along = lowest / spread
+    # The mean of what the data leave above zero.
+    more_by = float(norm.pdf(value / spread) / norm.cdf(value / spread))
+    rho = chi2_radius(_LEVEL) / (value / spread + more_by)
+    gain = rows @ (mean := response.mean + more_by * (factor @ along))
     moved = rows @ (factor @ along)
     corner = float(omega[np.argmax(np.abs(moved / gain) < np.abs(moved / gain)[0] / np.sqrt(2))])
     slow, fast = np.exp(-response.dt_s * corner * np.array([1.0, 1 + rho]))
@@ -152,8 +159,8 @@ def of_known_sign(response: ResponsePosterior, longest_s: float) -> tuple[Respon
     basis = real_rows(more.frequency_rows(omega) / gain[:, None])
     found = np.linalg.lstsq(basis, real_rows(np.column_stack(wanted) / gain[:, None]), rcond=None)[0]
     onto = np.vstack([np.eye(n) - np.outer(along, along), along])
-    mean, spread = np.asarray(found[:, 0], np.float64), np.asarray(found[:, 1:], np.float64)
-    return replace(more, mean=mean, covariance_factor=spread), onto
+    mean, factor = np.asarray(found[:, 0], np.float64), np.asarray(found[:, 1:], np.float64)
+    return replace(more, mean=mean, covariance_factor=factor), onto
 
 
 def _by_linear_force(
