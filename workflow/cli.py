@@ -210,8 +210,19 @@ def simulate(
 @app.command(cls=_OfSettings, short_help="Plan an experiment: voltages as CSV, plan, page.")
 def excite(
     out: Annotated[Path, typer.Option(help="Directory for the files; new or empty.")],
-    band: Annotated[tuple[float, float], typer.Option(help="Frequencies to excite [Hz], low and high.")],
-    duration: Annotated[float, typer.Option(help="Time allowed for all records together [s].")],
+    band: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            help="Frequencies to excite [Hz], low and high [default with --closed-loop: two decades up to "
+            "twice the first mode, or the highest that the logs tell]"
+        ),
+    ] = None,
+    duration: Annotated[
+        float | None,
+        typer.Option(
+            help="Time allowed for all records together [s] [default with --closed-loop: what the band needs]"
+        ),
+    ] = None,
     log: Annotated[
         list[Path] | None, typer.Argument(help="With --closed-loop: logs of the loop that is there.")
     ] = None,
@@ -280,8 +291,11 @@ def excite(
         )
         _show(summary, as_json)
         return
-    if dt_s is None or voltage is None:
-        raise InputError("an experiment in open loop needs --dt-s SECONDS and --voltage LARGEST")
+    if dt_s is None or voltage is None or band is None or duration is None:
+        raise InputError(
+            "an experiment in open loop needs --dt-s SECONDS, --voltage LARGEST, --band LOW HIGH "
+            "and --duration SECONDS"
+        )
     from workflow.commands.excite import write_experiment
     from workflow.config.rig_settings import rig_called
     from workflow.tasks.experiment import Limits

@@ -28,6 +28,7 @@ from __future__ import annotations
 import json
 import re
 import resource
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -37,7 +38,7 @@ from typing import Any
 import numpy as np
 import scipy.signal
 
-from benchmarks.closed_loop_machines.logs import Machine, write
+from benchmarks.closed_loop_machines.logs import Machine, printed, write
 from benchmarks.closed_loop_machines.machines import TAU, loop_gain, loop_radius
 from benchmarks.closed_loop_machines.simulator import Array, Law, Plant, response
 
@@ -74,6 +75,41 @@ def judged(one: Machine, folder: Path, bla: int = 0, judge_only: bool = False) -
         found |= controller_on_machine(one, truth, run)
     (work / "judged.json").write_text(json.dumps(found, indent=1, default=float) + "\n")
     return found
+
+
+def followed(one: Machine, folder: Path, line: str) -> bool | None:
+    """Whether the next step of a line that ended without a certificate leads to one; None where it names
+    none. A reference that is planned is played on the machine, its last record validates; of several steps
+    that one is taken."""
+    work, logs = folder / one.name, sorted((folder / "logs" / one.name).glob("*"))
+    config, run, steps = work / "my.toml", work / "followed", work / "played"
+    if "flexlink excite --closed-loop" in line:
+        asked = [] if one.kept else ["--rms", f"{0.5 * one.draft.motion_rad * one.plant.scale:.4g}"]
+        plan = work / "plan"
+        shutil.rmtree(plan, ignore_errors=True)
+        if _flexlink("excite", "--closed-loop", *map(str, logs), "--out", str(plan), *asked)[0]:
+            return False
+        steps.mkdir(exist_ok=True)
+        made = replace(one, kept=True)
+        for k, file in enumerate(sorted(plan.glob("*.csv"))):
+            reference = np.loadtxt(file, delimiter=",", skiprows=1)[:, 1]
+            printed(made, made.play(reference, made.rng(3000 + k)), 0, 0.0, steps / f"{k:02d}.csv.gz")
+        config = work / "followed.toml"
+        if _flexlink("init", *map(str, sorted(steps.glob("*"))), "--out", str(config), "--replace")[0]:
+            return False
+    elif "response = 'as recorded'" in line:
+        text = config.read_text().replace('response = "without friction"', 'response = "as recorded"')
+        config = work / "followed.toml"
+        config.write_text(text)
+    elif "controller_order" in line:
+        config = work / "followed.toml"
+        text = (work / "my.toml").read_text()
+        config.write_text(text.replace("controller_order = 5", "controller_order = 8"))
+    else:
+        return None
+    words = "--config", str(config), "--out", str(run), "--replace", "--json"
+    code, text, _ = _flexlink("run", *words)
+    return code == 0 and bool(json.loads(text).get("certified"))
 
 
 def controller_on_machine(one: Machine, truth: dict[str, Any], run: Path) -> dict[str, Any]:

@@ -57,6 +57,12 @@ class Machine:
         start = self.centre / self.plant.scale
         return {"r": r, **self.plant.run(self.draft.law, r, start, noise, begin)}, begin
 
+    def play(self, reference: Array, rng: np.random.Generator) -> dict[str, Array]:
+        """Signals of one run with a reference (T,) in output units, from rest at the centre."""
+        noise = self.draft.noise_counts * self.plant.count * rng.standard_normal(reference.size)
+        start = self.centre / self.plant.scale
+        return {"r": reference, **self.plant.run(self.draft.law, reference, start, noise)}
+
     def rng(self, log: int) -> np.random.Generator:
         return np.random.default_rng([self.series, KINDS.index(self.kind), self.seed, 1 + log])
 
@@ -148,29 +154,35 @@ def _shape(name: str, n: int, before: int, dt: float, d: Draft, rng: np.random.G
     return shape
 
 
+def printed(one: Machine, got: dict[str, Array], begin: int, start_s: float, path: Path) -> None:
+    """A run from sample `begin` on, as a logger prints it."""
+    time, reference, command, output = one.draft.columns
+    u = got["u"] if one.as_commanded else np.clip(got["u"], -one.plant.limit, one.plant.limit)
+    u, n = u[begin:], got["u"].size - begin
+    clock = np.arange(n) * one.plant.dt_s + start_s
+    digits = max(4 - int(np.floor(np.log10(np.std(u)))), 2)
+    places = 6 if one.plant.scale == 1 else 5
+    table = {time: [f"{t * 1e3:.6g}" for t in clock] if time == "t_ms" else [f"{t:.5f}" for t in clock]}
+    if one.kept:
+        table[reference] = [f"{v:.{places}f}" for v in got["r"][begin:]]
+    table[command] = [f"{v:.{digits}f}" for v in u]
+    table[output] = [f"{v:.{places}f}" for v in got["y"][begin:]]
+    rows = [",".join(table), *map(",".join, zip(*table.values(), strict=True))]
+    path.write_bytes(gzip.compress(("\n".join(rows) + "\n").encode(), mtime=0))
+
+
 def write(one: Machine, folder: Path, truth: Path) -> list[Path]:
     """FOLDER/NAME/run1.csv.gz and on; TRUTH/NAME.json. The last run validates."""
     where = folder / one.name
     where.mkdir(parents=True, exist_ok=True)
     truth.mkdir(parents=True, exist_ok=True)
-    time, reference, command, output = one.draft.columns
     levels, paths, moved, dt = [], [], [], one.plant.dt_s
     for log in range(len(one.classes)):
         rng = one.rng(log)
         got, begin = one.record(log, rng)
-        u = got["u"] if one.as_commanded else np.clip(got["u"], -one.plant.limit, one.plant.limit)
-        u, n = u[begin:], got["u"].size - begin
-        clock = np.arange(n) * dt + (0.0 if one.at_rest[log] else round(float(rng.uniform(1, 60)), 1))
-        digits = max(4 - int(np.floor(np.log10(np.std(u)))), 2)
-        places = 6 if one.plant.scale == 1 else 5
-        table = {time: [f"{t * 1e3:.6g}" for t in clock] if time == "t_ms" else [f"{t:.5f}" for t in clock]}
-        if one.kept:
-            table[reference] = [f"{v:.{places}f}" for v in got["r"][begin:]]
-        table[command] = [f"{v:.{digits}f}" for v in u]
-        table[output] = [f"{v:.{places}f}" for v in got["y"][begin:]]
-        rows = [",".join(table), *map(",".join, zip(*table.values(), strict=True))]
+        start_s = 0.0 if one.at_rest[log] else round(float(rng.uniform(1, 60)), 1)
         paths.append(where / f"run{log + 1}.csv.gz")
-        paths[-1].write_bytes(gzip.compress(("\n".join(rows) + "\n").encode(), mtime=0))
+        printed(one, got, begin, start_s, paths[-1])
         moved.append(got["true"][begin:])
         levels.append(float(got["friction_Nm"]) / one.plant.torque_per_u)
     p, d = one.plant, one.draft
