@@ -49,13 +49,7 @@ class IdentOptions(BaseModel):
         (),
         description="known poles outside the unit circle, each as real part, imaginary part >= 0",
     )
-    integrators: int = Field(
-        0,
-        ge=0,
-        le=3,
-        description="known poles at z = 1, as exact input filters; default: none, and with friction in logs "
-        "of a loop one, unless a weight throws the arm over",
-    )
+    integrators: int = Field(0, ge=0, le=3, description="known poles at z = 1, as exact input filters")
     feedthrough: bool = Field(
         False, description="direct term from the input to the output of the same sample"
     )

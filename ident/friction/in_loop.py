@@ -98,6 +98,8 @@ def _told_by_position(u: RealArray, y: RealArray) -> float:
     """Chi-square, of `_CAUSES` numbers, by which the position's past tells more of a command than as much
     again of the command's own past, which in a sum of sines tells the rest as well."""
     n = _CAUSES
+    if u.size < 8 * n:
+        return 0.0
     rows, lags = np.arange(3 * n, u.size)[:, None], np.arange(1, n + 1)
     own, wanted = u[rows - np.arange(1, 3 * n + 1)], u[3 * n :]
     left = list[float]()

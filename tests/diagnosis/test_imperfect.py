@@ -910,6 +910,7 @@ def test_untried_is_not_absent():
     search = _searched({(): (0.0, 0.3, 0.3), ("gravity",): (4.0, 0.29, 0.29)})
     tried = judged(search)
     search.left_out = ["joint_compliance", "further effects beside gravity"]
+    search.untried = {"joint_compliance": "more time"}
     found = judged(search)
     assert tried.probabilities.cause["unknown"] > 0.8
     assert found.answer == "unknown"

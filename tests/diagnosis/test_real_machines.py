@@ -36,7 +36,8 @@ def test_the_first_stage_of_the_serial_link_feels_the_other(flexlink_data):
     assert found.completeness.probability < 0.1
     assert found.completeness.remains["alpha_rad"] > 0.2
     assert found.shares is not None
-    assert all("other_stage" in names and closed > 0.6 for names, closed in found.shares.closes)
+    assert found.shares.closes
+    assert all((closed > 0.6) == ("other_stage" in names) for names, closed in found.shares.closes)
     assert "other_stage" in found.combination
     assert found.gap_closed > 0.6
     # The command shows the friction of a joint that a tight loop moves as told.

@@ -178,7 +178,7 @@ def test_calibration_is_designed_for(monkeypatch):
         asked.append("plain")
         return specification, result
 
-    def jointly(plants, specification, options, *, rng, progress):
+    def jointly(plants, specification, options, *, rng, progress, first=None):
         asked.append("jointly")
         return JointDesign(result, (), 10_000, (7, 2), True)
 
@@ -192,7 +192,8 @@ def test_calibration_is_designed_for(monkeypatch):
     assert find_design([exact], spec(), how, options, rng).jointly is None
     kept = CertificateOptions.model_validate({})
     assert find_design([plant()], spec(), how, kept, rng).jointly is None
-    assert asked == ["jointly", "plain", "plain"]
+    # The joint design begins with the plain one.
+    assert asked == ["plain", "jointly", "plain", "plain"]
 
 
 def test_words_of_sampled_responses():

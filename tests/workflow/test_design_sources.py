@@ -244,6 +244,7 @@ def test_no_stable_start_means_no_controller(flexlink, wish, tmp_path, monkeypat
     from control_design.synthesis.order_search import OrderResult, OrderSearch
 
     monkeypatch.setattr(OrderSearch, "run", lambda self: OrderResult(None, (), ()))
+    monkeypatch.setattr(OrderSearch, "quick", lambda self, free: (OrderResult(None, (), ()), False))
     write_json(tmp_path / "arm.json", document(arm()))
     out = tmp_path / "controller.json"
     answer = flexlink("design", tmp_path / "arm.json", "--spec", wish(), "--out", out)

@@ -12,7 +12,7 @@ EXIT_BAD_INPUT = 2
 EXIT_NOT_CERTIFIED = 3
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 
-LONGEST_LINE = 600
+LONGEST_LINE = 300
 
 
 def one_line(text: object) -> str:
@@ -37,8 +37,8 @@ def cut(text: str, most: int) -> str:
 
 def cut_inside(text: str, most: int = LONGEST_LINE) -> str:
     """The text, its middle left out where it is longer: what is wrong comes first, what to type last."""
-    kept = (most - 5) // 2
-    return text if len(text) <= most else f"{text[:kept]} ... {text[-kept:]}"
+    head = most // 3
+    return text if len(text) <= most else f"{text[:head]} ... {text[head + 5 - most :]}"
 
 
 class InputError(ValueError):
