@@ -36,9 +36,12 @@ def cut(text: str, most: int) -> str:
 
 
 def cut_inside(text: str, most: int = LONGEST_LINE) -> str:
-    """The text, its middle left out where it is longer: what is wrong comes first, what to type last."""
-    head = most // 3
-    return text if len(text) <= most else f"{text[:head]} ... {text[head + 5 - most :]}"
+    """The text, cut where it is longer: at its end, but for the command to type there."""
+    at = text.find("type: flexlink ")
+    tail = text[at:] if at >= 0 and len(text) - at < most - 5 else ""
+    if len(text) <= most or not tail:
+        return cut(text, most)
+    return f"{text[: most - 5 - len(tail)]} ... {tail}"
 
 
 class InputError(ValueError):
