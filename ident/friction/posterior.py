@@ -32,8 +32,8 @@ _NOISE_ORDER = 32
 # No law is exact. One that was not found in a log may still be there to this share of the level, and as much
 # of the friction, rms, may look like a linear force, which shows in no residual (standard deviation).
 _SHAPE = 0.05
-# What is put onto the basis functions: on so many frequencies, from so many records' lengths on. By itself it
-# leaves the gain its sign, as a force of a passive arm does: its 95 % radius stays below this share.
+# What is put onto the basis functions: on so many frequencies, from so many records' lengths on. An ellipse
+# whose 95 % radius is beyond this share of the gain is made anew, with the sign of a passive arm.
 _FREQUENCIES, _LENGTHS, _LARGEST, _LEVEL = 400, 100, 0.85, 0.95
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import control
 import numpy as np
 import pytest
@@ -70,8 +72,9 @@ def test_same_seed_same_controller():
     assert codec.plain(results[0]) == codec.plain(results[1])
 
 
-@pytest.mark.parametrize("integrators", [1, 2])
-def test_integrating_arms_with_integral_action_are_certified(integrators):
+@cache
+def integrating_arm(integrators):
+    """Plant, result and certificate of an arm that integrates, under integral action."""
     system = hub_arm(integrators=integrators)
     plant = UncertainPlant("arm", system, RelativeDisc(system, 0.03, 60.0))
     specification = Specification(
@@ -85,15 +88,24 @@ def test_integrating_arms_with_integral_action_are_certified(integrators):
     )
     options = SynthesisOptions(starts=12, exchange_rounds=2, sufficient_gamma=0.97)
     result = synthesise([plant], specification, options, rng=np.random.default_rng(2))
-    certificate = certify(result.controller_or_raise(), [plant], specification)
+    return plant, result, certify(result.controller_or_raise(), [plant], specification)
+
+
+@pytest.mark.parametrize("integrators", [1, 2])
+def test_integrating_arms_with_integral_action_are_certified(integrators):
+    _, result, certificate = integrating_arm(integrators)
     assert certificate.certified, certificate.items
     assert certificate.plants[0].nyquist.required == (integrators + 1) / 2
     assert result.controller.input_limit == 10.0
-    # Asked for by a fifth of the corner where the loop crosses over at it, slower where it does so above it:
-    # the smallest worst case, which two searches found, has its slowest pole at a sixteenth.
+
+
+@pytest.mark.xfail(reason="the smallest worst case has its slowest pole at a sixteenth of the corner")
+@pytest.mark.parametrize("integrators", [1, 2])
+def test_integral_action_beside_an_integrator_is_not_slow(integrators):
+    """Asked for by a fifth of the corner; a tenth of it is slow."""
+    plant, _, certificate = integrating_arm(integrators)
     corner = 2.0 * np.sqrt(2 - 0.45**2)
-    radius = certificate.plants[0].pole_radius
-    assert -np.log(radius) / plant.dt_s > corner / 25
+    assert -np.log(certificate.plants[0].pole_radius) / plant.dt_s > corner / 10
 
 
 def test_active_damping_through_the_tip_without_tracking():
