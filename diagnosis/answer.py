@@ -94,11 +94,10 @@ class Shares:
     closes : (effects, share of the gap closed by them alone), most first; also where the answer is unknown.
     not_tried : what a time limit left out.
     silent : effects of the answer that do nothing in the held-out records.
-    at_inputs : the share that interests is one of the inputs, whatever the machine makes of it; shares are of
-        the motion without what a bias of that size lets drift.
-    horizon_samples : length of windows, each from the state that fits it best (`imperfect.horizon`), and
-        horizon_before, horizon_after : what is left in them, as before and after; 0 and empty for a machine
-        that says no states.
+    in_windows : the answer rests on windows, each from the state that fits it best (`fit.windows`), and so do
+        all residuals and shares of it.
+    horizon_samples : length of these, and horizon_before, horizon_after : what is left in them, as before and
+        after; 0 and empty for a machine that forgets its inputs.
     """
 
     names: tuple[str, ...]
@@ -110,7 +109,7 @@ class Shares:
     closes: tuple[tuple[tuple[str, ...], float], ...]
     not_tried: tuple[str, ...]
     silent: tuple[str, ...] = ()
-    at_inputs: bool = False
+    in_windows: bool = False
     horizon_samples: int = 0
     horizon_before: tuple[float, ...] = ()
     horizon_after: tuple[float, ...] = ()

@@ -99,9 +99,7 @@ def _answered(
     def again(done: float, what: str) -> None:
         progress(_FIRST_SEARCH + (1 - _FIRST_SEARCH) * done, what)
 
-    if not isinstance(case, PlantCase):
-        return beside_imperfections(found, rng)
-    if not weighing.stated and reaches_noise(found):
+    if isinstance(case, PlantCase) and not weighing.stated and reaches_noise(found):
         exact = without_error(case.without_model_error(), again, rng, deadline_s)
         if exact.verdict != "unknown":
             return exact

@@ -17,12 +17,13 @@ more than `_MOST`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import dct, idct
 
+from diagnosis.fit.windows import Windows
 from diagnosis.machine.machine_protocol import Real, RecordOfMachine
 
 _LOWEST = 4
@@ -40,25 +41,10 @@ def octaves_of(samples: int) -> npt.NDArray[np.int64]:
     return octave
 
 
-def disturbance(signal: Real, rng: np.random.Generator) -> Real:
-    """(T,) random, as large as a signal (T,), its octaves as large as they are there, but that they do not
-    fall off towards low frequencies: a bias that changes is as likely as anything faster."""
-    octave = octaves_of(signal.size)
-    energy = octave_energies(signal[:, None])[:, 0]
-    envelope = np.maximum.accumulate(energy[::-1])[::-1]
-    size = np.sqrt(envelope * energy.sum() / (np.sum(envelope) or 1.0) / np.bincount(octave))
-    return np.asarray(idct(size[octave] * rng.standard_normal(signal.size), norm="ortho"))
-
-
 def octave_energies(signals: Real) -> Real:
     """(T, Y) -> (octaves, Y)"""
     octave = octaves_of(len(signals))
     return np.array([np.bincount(octave, c * c) for c in dct(signals, axis=0, norm="ortho").T]).T
-
-
-def coefficients(residuals: Real) -> Real:
-    """(T, Y) -> (T Y,): orthonormal cosine transform of every output, sample by sample."""
-    return np.asarray(dct(residuals, axis=0, norm="ortho")).ravel()
 
 
 def quietest(signals: Sequence[Real]) -> Real:
@@ -76,18 +62,19 @@ class Levels:
     """Bands of the coefficients of some records.
 
     band : (N,) index of the band of every coefficient. counted : (B,) independent values of a band.
-    floor : (B,) energy F_b; noise : (B,) what sensors may have, noise and rounding. felt : (B,) what energy
-    left in a band counts. belongs : (B,) which of the R Y outputs of records it is of; motion : (R Y,) their
-    energies, counted so too.
+    floor : (B,) energy F_b; noise : (B,) what sensors may have, noise and rounding. belongs : (B,) which of
+    the R Y outputs of records it is of; motion : (R Y,) their energies, whole : about the mean of the record.
+    windows : that the coefficients are of.
     """
 
     band: npt.NDArray[np.int64]
     counted: Real
     floor: Real
     noise: Real
-    felt: Real
     belongs: npt.NDArray[np.int64]
     motion: Real
+    whole: Real
+    windows: Windows | None = field(default=None, kw_only=True)
 
     @classmethod
     def of(
@@ -95,54 +82,46 @@ class Levels:
         records: Sequence[RecordOfMachine],
         noise: Real,
         model_error: float,
-        amplified: Sequence[Real] = (),
         rounded: Real | float = 0.0,
+        windows: Windows | None = None,
     ) -> Levels:
         """noise (Y,): standard deviations; model_error: share of the motion that a good model may miss;
-        rounded (Y,): variances of rounding beside the noise.
-
-        amplified : of every record (octaves, Y), energy that a disturbance as large as its inputs has in its
-            outputs. Octaves in which that is more than an even part of the motion count the less: a machine
-            that integrates makes a motion of what nobody would call a model error, and a good model misses
-            it. Empty: none is.
-        """
+        rounded (Y,): variances of rounding beside the noise. In windows the bands are octaves of these, the
+        motion what they have of it."""
         rows, first, Y = [], 0, noise.size
         for r, record in enumerate(records):
             T = len(record.output)
-            octave = octaves_of(T)
-            octaves = int(octave[-1]) + 1
+            parts = windows.parts(T) if windows else [(slice(0, T), 1, T)]
+            octave = np.concatenate([np.tile(octaves_of(length), count) for _, count, length in parts])
+            octaves = int(np.max(octave)) + 1
             samples = np.bincount(octave).astype(np.float64)
-            motion = T * np.var(record.output, axis=0)
-            felt = np.ones((octaves, Y))
-            if amplified:
-                even = motion / octaves
-                felt = even / np.maximum(even, amplified[r])
-                centred = record.output - np.mean(record.output, axis=0)
-                motion = np.sum(felt * octave_energies(centred), axis=0)
-            floor = (_UNINTERESTING * model_error) ** 2 * motion / octaves / felt
+            whole = T * np.var(record.output, axis=0)
+            motion = windows.motion(record.output) if windows else whole
+            floor = (_UNINTERESTING * model_error) ** 2 * motion / octaves
             rows.append(
                 (
                     first + (octave[:, None] * Y + np.arange(Y)).ravel(),
                     np.repeat(np.minimum(samples, _MOST), Y),
                     (samples[:, None] * (noise**2 + rounded) + floor).ravel(),
                     (samples[:, None] * (_NOISE_ALLOWED**2 * noise**2 + rounded)).ravel(),
-                    felt.ravel(),
                     np.tile(r * Y + np.arange(Y), octaves),
                     motion,
+                    whole,
                 )
             )
             first += octaves * Y
-        return cls(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+        return cls(*(np.concatenate(column) for column in zip(*rows, strict=True)), windows=windows)
 
     def seen(self, residuals: Real) -> Real:
         """See `diagnosis.fit.likelihood.Likelihood`."""
-        return coefficients(residuals)
+        return self.changed(residuals).ravel()
 
     def unseen(self, e: Real, outputs: int) -> Real:
-        return np.asarray(idct(e.reshape(-1, outputs), axis=0, norm="ortho"))
+        e = e.reshape(-1, outputs)
+        return self.windows.unseen(e) if self.windows else np.asarray(idct(e, axis=0, norm="ortho"))
 
     def changed(self, outputs: Real) -> Real:
-        return np.asarray(dct(outputs, axis=-2, norm="ortho"))
+        return self.windows.seen(outputs) if self.windows else np.asarray(dct(outputs, axis=-2, norm="ortho"))
 
     def energy(self, e: Real) -> Real:
         return np.asarray(np.bincount(self.band, e * e, minlength=self.floor.size), dtype=np.float64)
@@ -152,15 +131,16 @@ class Levels:
         band = self.band[part]
         own = slice(int(band.min()), int(band.max()) + 1)
         belongs = self.belongs[own]
-        first = int(belongs.min())
+        outputs = slice(int(belongs.min()), int(belongs.max()) + 1)
         return Levels(
             band - own.start,
             self.counted[own],
             self.floor[own],
             self.noise[own],
-            self.felt[own],
-            belongs - first,
-            self.motion[first : int(belongs.max()) + 1],
+            belongs - outputs.start,
+            self.motion[outputs],
+            self.whole[outputs],
+            windows=self.windows,
         )
 
     def loss_of(self, energy: Real) -> float:

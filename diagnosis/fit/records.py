@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from diagnosis.fit.coordinates import quotients
-from diagnosis.fit.levels import Levels, coefficients, disturbance, octave_energies
+from diagnosis.fit.levels import Levels
 from diagnosis.fit.likelihood import Likelihood
 from diagnosis.fit.nominal import LogNormalParameters, NominalParameters
+from diagnosis.fit.windows import Windows
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
 from diagnosis.machine.rounding import rounding_effect
 
-# Draws of every disturbance.
-_DISTURBANCES = 4
 _ANGLE_STEP_RAD = 1e-3
 # Of the spread of a state at the start.
 _STATE_STEP = 1e-3
@@ -199,14 +198,11 @@ class Records(RecordsToFit):
     levels: Levels
 
     def __init__(
-        self, case: CaseOfMachine, experiments: Sequence[RecordOfMachine], *, at_inputs: bool = False
+        self, case: CaseOfMachine, experiments: Sequence[RecordOfMachine], windows: Windows | None = None
     ) -> None:
-        amplified = [_amplified(case, e) for e in experiments] if at_inputs else []
         rounding = rounding_effect(case)
         rounded = np.zeros(case.noise.size) if rounding is None else rounding.variances
-        self.levels = Levels.of(
-            experiments, case.noise, case.machine.weighing.model_error, amplified, rounded
-        )
+        self.levels = Levels.of(experiments, case.noise, case.machine.weighing.model_error, rounded, windows)
         super().__init__(case, experiments, self.levels, LogNormalParameters(case.machine))
 
     def losses(self, e: Real) -> Real:
@@ -215,30 +211,17 @@ class Records(RecordsToFit):
 
     def shares(self, residuals: Sequence[Real]) -> Real:
         """(Y,) RMS left beyond what sensors may have over the RMS of the motion (about the mean), all
-        records; of both what is felt (`Levels`)."""
+        records."""
         return np.asarray(np.sqrt(mean_square_left(self.energies(residuals))))
 
-    def energies(self, residuals: Sequence[Real], *, with_noise: bool = False) -> Real:
-        """(2, R, Y) energies left, beyond what sensors may have or with that, and of the motion, of every
-        record."""
+    def energies(self, residuals: Sequence[Real], *, carried: bool = False) -> Real:
+        """(2, R, Y) energies left beyond what sensors may have, and of the motion, of every record. carried:
+        to compare, noise included, and the motion as far as windows have it."""
         levels, Y = self.levels, self.case.noise.size
-        energy = levels.energy(np.concatenate([coefficients(e) for e in residuals]))
-        beyond = levels.felt * (energy - (0.0 if with_noise else levels.noise))
-        left = np.maximum(np.bincount(levels.belongs, beyond), 0.0)
-        return np.array([left, levels.motion]).reshape(2, -1, Y)
-
-
-def _amplified(case: CaseOfMachine, experiment: RecordOfMachine) -> Real:
-    """(octaves, Y) energies of what disturbances as large as its inputs do to the outputs, of the stated
-    machine from rest; to first order."""
-    simulate, rng = case.machine.simulator(()), np.random.default_rng(0)
-    u, small = experiment.input, case.machine.weighing.model_error
-    undisturbed = simulate(u)
-    added = [
-        simulate(u + small * column * disturbance(u @ column, rng)[:, None]) - undisturbed
-        for column in np.tile(np.eye(u.shape[1]), (_DISTURBANCES, 1))
-    ]
-    return np.asarray(sum(octave_energies(part / small) for part in added) / _DISTURBANCES)
+        energy = levels.energy(np.concatenate([levels.seen(e) for e in residuals]))
+        left = np.bincount(levels.belongs, energy if carried else energy - levels.noise)
+        motion = levels.motion if carried else levels.whole
+        return np.array([np.maximum(left, 0.0), motion]).reshape(2, -1, Y)
 
 
 def later(experiment: RecordOfMachine) -> dict[str, int]:

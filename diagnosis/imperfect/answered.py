@@ -15,6 +15,7 @@ from diagnosis.imperfect.carried import closed_by, shares_of
 from diagnosis.machine.case import Case
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+from diagnosis.machine.own_plant import PlantCase
 from diagnosis.next_experiment.discrimination import MOST_COMPETING, CompetingHypothesis, fitted_hypothesis
 from diagnosis.search.explanation import Explanation, best_of_sets
 from diagnosis.search.loop import Progress
@@ -47,27 +48,28 @@ def searched(case: CaseOfMachine, progress: Progress, deadline_s: float = np.inf
 def looked_at_again(
     first: Search, answer: Diagnosis, progress: Progress, deadline_s: float, rng: np.random.Generator
 ) -> Diagnosis:
-    """The answer of a machine that integrates, where what a bias makes of a free run does not interest.
+    """The answer of a machine that does not forget its inputs, from windows where a free run says less.
 
-    That drifts as far as it likes, and beside it nothing else seems to matter. Not sought where the records
-    leave no gap that interests, nor where the answer of the first search leaves none then either; not taken
-    where it only adds to what was named.
+    A free run drifts as far as it likes, and beside that nothing else seems to matter. Windows are not looked
+    at where the records leave no gap that interests, nor where the first answer leaves none, in them either;
+    they are not taken where they only add to what was named.
     """
-    if answer.verdict == "none":
+    # A rig's unlisted causes act within windows too: what is named of it in a free run stands.
+    sought = answer.verdict != "none" if isinstance(answer.case, PlantCase) else answer.verdict == "unknown"
+    windows = first.horizon if sought else None
+    if windows is None:
         return answer
-    search = Search(answer.case, progress, deadline_s, at_inputs=True)
-    if not search.amplifies:
-        return answer
+    search = Search(answer.case, progress, deadline_s, windows)
     named = set(answer.combination)
     holding = [e for e in first.found if named and named <= set(e.names)]
     if holding:
         named_alone = first.by_these(answer.combination, max(holding, key=lambda e: e.evidence))
         left = search.left_by(named_alone)
-        if np.max(left) < answer.case.machine.weighing.model_error:
+        if max(np.max(left), np.max(named_alone.shares)) < answer.case.machine.weighing.model_error:
             return answer
     search.run_in_time()
     again = beside_imperfections(search, rng)
-    return again if again.combination and not set(again.combination) & named else answer
+    return again if again.combination and not named < set(again.combination) else answer
 
 
 def reaches_noise(search: Search) -> bool:

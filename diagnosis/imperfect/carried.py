@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from diagnosis.answer import BLOCK, Shares
-from diagnosis.imperfect.horizon import horizon_samples, shares_over_horizon
+from diagnosis.fit.records import Records
 from diagnosis.imperfect.verdict import is_silent, late
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.rounding import rounding_effect
@@ -71,7 +71,7 @@ def shares_of(
         closes=tuple((key, c) for c, key in told),
         not_tried=tuple(search.left_out),
         silent=tuple(name for name in fitted if is_silent(search, accepted, name)),
-        at_inputs=search.at_inputs,
+        in_windows=search.windows is not None,
         **_over_horizon(search, accepted, nominal),
     )
 
@@ -89,16 +89,11 @@ def _tells(key: tuple[str, ...], closed: Mapping[tuple[str, ...], float]) -> boo
 
 
 def _over_horizon(search: Search, accepted: Explanation, nominal: Explanation) -> dict[str, Any]:
-    held, samples = search.held_out, horizon_samples(search.held_out)
-    longest = max(len(record.output) for record in held.experiments)
-    found = []
-    for e in (nominal, accepted):
-        responses = held.nominal.at(e.end.deviations).unknown_start.responses
-        if not samples or responses is None:
-            return {}
-        shares = shares_over_horizon(held, e.left_held_out, responses(e.end.effects, longest))
-        found.append(tuple(map(float, shares)))
-    return {"horizon_samples": samples, "horizon_before": found[0], "horizon_after": found[1]}
+    if search.horizon is None:
+        return {}
+    within = Records(search.case, search.case.held_out, search.horizon)
+    before, after = (tuple(map(float, within.shares(e.left_held_out))) for e in (nominal, accepted))
+    return {"horizon_samples": search.horizon.samples, "horizon_before": before, "horizon_after": after}
 
 
 def _blocks(search: Search, explanation: Explanation) -> Real:

@@ -19,6 +19,7 @@ from scipy.special import expit, softmax
 from scipy.stats import norm
 
 from diagnosis.evidence.hypotheses import Probabilities
+from diagnosis.fit.records import Records, mean_square_left
 from diagnosis.machine.machine_protocol import Real, Weighing
 from diagnosis.machine.rounding import Rounding, rounding_effect
 from diagnosis.search.explanation import Explanation, best_of_sets
@@ -407,19 +408,25 @@ def _tolerances_off(search: Search, explanation: Explanation, k: int) -> float |
 
 def below_threshold(search: Search, explanation: Explanation) -> float:
     """Probability that what is left is below the threshold, which other records would show another size of:
-    log-normal, as wide as the mean of those that there are is uncertain, and what solver and start add."""
-    energies = np.concatenate(
-        [
-            search.records.energies(explanation.left),
-            search.held_out.energies(explanation.left_held_out),
-        ],
-        axis=1,
-    )
-    of_records = np.max(np.sqrt(energies[0] / energies[1]), axis=1)
-    logs = np.log(np.maximum(of_records, _LEAST_LEFT))
-    width = np.hypot(_LEFT_WIDTH, np.std(logs) / np.sqrt(logs.size))
-    left = max(_left(explanation), _LEAST_LEFT)
-    return float(norm.cdf(np.log(search.case.machine.weighing.model_error / left) / width))
+    log-normal, as wide as the mean of those that there are is uncertain, and what solver and start add.
+
+    As the records run freely or in windows, whichever leaves less: a drift alone is no error that interests.
+    """
+    case, seen = search.case, [(search.records, search.held_out)]
+    if search.horizon and not search.windows:
+        seen.append(
+            (Records(case, case.estimation, search.horizon), Records(case, case.held_out, search.horizon))
+        )
+    found = []
+    for fitted, held in seen:
+        parts = [fitted.energies(explanation.left), held.energies(explanation.left_held_out)]
+        shares = [np.max(mean_square_left(part)) for part in parts]
+        energies = np.concatenate(parts, axis=1)
+        logs = np.log(np.maximum(np.max(np.sqrt(energies[0] / energies[1]), axis=1), _LEAST_LEFT))
+        width = np.hypot(_LEFT_WIDTH, np.std(logs) / np.sqrt(logs.size))
+        left = max(float(np.sqrt(np.mean(shares))), _LEAST_LEFT)
+        found.append(float(norm.cdf(np.log(case.machine.weighing.model_error / left) / width)))
+    return max(found)
 
 
 def _left(explanation: Explanation) -> float:

@@ -10,7 +10,6 @@ import numpy as np
 from diagnosis.machine.machine_protocol import KNOWN_START, Real, RecordOfMachine, UnknownStart, Weighing
 from plant.effects import EFFECTS, Effect, make_machine
 from plant.effects.search_space import Candidate, Scales
-from plant.modal import link_modes
 from plant.plan import SUBSTEP_S
 from plant.rig import Output, Rig
 from plant.simulation import Simulator, Start
@@ -83,7 +82,6 @@ class FlexibleArm:
         moved = [k for k, name in enumerate(self.outputs) if name in _ZERO]
         per_zero = np.zeros((len(spread), len(moved)))
         per_zero[0, 0] = -1.0
-        slowest_rad_s = link_modes(self.rig, 1).omega_rad_s[0]
         return UnknownStart(
             np.array(spread),
             np.array([_ZERO[self.outputs[k]] for k in moved]),
@@ -92,7 +90,6 @@ class FlexibleArm:
             self._first_sample,
             self._responses,
             zero_seen=_TIP in self.outputs,
-            slowest_period_samples=float(2 * np.pi / slowest_rad_s / self.rig.sampling.dt_s),
             tried=np.outer(_DRIFTS_RAD_S, np.eye(len(spread))[1]),
         )
 

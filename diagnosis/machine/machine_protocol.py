@@ -55,7 +55,6 @@ class UnknownStart:
     responses : effects, samples -> S arrays (T, Y): outputs per unit of a state, of the linear part; None
         where nobody knows that, and spreads are finite.
     zero_seen : bool. Another output tells the zero; else it matters only to what depends on the true angle.
-    slowest_period_samples : float. Period of the slowest mode; 0 where it is not known.
     tried : (., S) moves of a start that are tried beside contacts that switch.
     """
 
@@ -66,7 +65,6 @@ class UnknownStart:
     guess: Callable[[Any], Real]
     responses: Callable[[Sequence[Any], int], list[Real]] | None
     zero_seen: bool = True
-    slowest_period_samples: float = 0.0
     tried: Real = field(default_factory=lambda: np.zeros((0, 0)))
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
 from diagnosis.fit.descent import FINE, Descent, descend, loss_at, occam, refined
 from diagnosis.fit.records import Records, Start, mean_square_left
 from diagnosis.fit.starts import Point, beside
+from diagnosis.fit.windows import Windows
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.search.explanation import Explanation
 from diagnosis.search.loop import DECISIVE, SUBSTANTIAL, Progress, SearchLoop
@@ -21,14 +23,12 @@ from plant.effects.search_space import Candidate
 _BESIDE_POINTS = 4
 # Ends beside a set that are refined where contacts switch.
 _REFINED = 2
-# Of octaves, what is felt where disturbances of the inputs are amplified.
-_AMPLIFIED = 0.5
 
 
 class Search(SearchLoop[Explanation]):
     """All that was fitted to a case, the nominal alone first.
 
-    at_inputs : the model error is one of the inputs, whatever the machine makes of it (`Levels`).
+    windows : that records are seen in, each from its own start; None: as they run freely.
     """
 
     records: Records
@@ -38,12 +38,12 @@ class Search(SearchLoop[Explanation]):
         case: CaseOfMachine,
         progress: Progress,
         deadline_s: float = np.inf,
-        at_inputs: bool = False,
+        windows: Windows | None = None,
     ) -> None:
         super().__init__(case, progress, deadline_s)
-        self.at_inputs = at_inputs
-        self.records = Records(case, case.estimation, at_inputs=at_inputs)
-        self.held_out = Records(case, case.held_out, at_inputs=at_inputs)
+        self.windows = windows
+        self.records = Records(case, case.estimation, windows)
+        self.held_out = Records(case, case.held_out, windows)
 
     @property
     def watched(self) -> tuple[Records, ...]:
@@ -53,14 +53,14 @@ class Search(SearchLoop[Explanation]):
     def simulations(self) -> int:
         return self.records.simulations + self.held_out.simulations
 
-    @property
-    def amplifies(self) -> bool:
-        """Whether the machine makes much more of a disturbance of its inputs than of the inputs."""
-        return bool(np.min(self.records.levels.felt) < _AMPLIFIED)
+    @cached_property
+    def horizon(self) -> Windows | None:
+        """Windows in which no drift grows; None for a machine that forgets its inputs."""
+        return self.windows or Windows.of(self.case)
 
     def anew(self, case: CaseOfMachine) -> Search:
         """Of the same records in another form."""
-        return Search(case, self.progress, self.deadline_s, self.at_inputs)
+        return Search(case, self.progress, self.deadline_s, self.windows)
 
     def run(self) -> None:
         """The nominal, every effect alone, then sets of two, three and more beside the likeliest.
@@ -168,10 +168,11 @@ class Search(SearchLoop[Explanation]):
         return self.explained(moved)
 
     def left_by(self, other: Explanation) -> Real:
-        """(2, Y) shares that the same effects leave here, descended on from where another search ended."""
+        """(2, Y) shares of the motion here that the same effects leave, descended on from where another
+        search ended."""
         end = other.end
         here = descend(self.records, end.candidates, end.deviations, end.coordinates, end.start)
-        return self.explained(here).shares
+        return np.sqrt(self.explained(here).mean_squares)
 
     def explained(self, end: Descent) -> Explanation:
         """With what it predicts of the held-out records, their starts fitted (`settled`)."""
@@ -191,7 +192,7 @@ class Search(SearchLoop[Explanation]):
             np.array([records.shares(left), held.shares(left_held_out)]),
             np.array(
                 [
-                    mean_square_left(of.energies(e, with_noise=True))
+                    mean_square_left(of.energies(e, carried=True))
                     for of, e in ((records, left), (held, left_held_out))
                 ]
             ),

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.fft import dct
 from scipy.optimize import minimize
 
 from diagnosis import (
@@ -20,7 +21,7 @@ from diagnosis import (
     diagnose,
 )
 from diagnosis.fit.descent import Descent, descend, occam, refined, scanned
-from diagnosis.fit.levels import Levels, coefficients, quietest
+from diagnosis.fit.levels import Levels, quietest
 from diagnosis.fit.records import Records, Start, StartColumns
 from diagnosis.fit.starts import Point, points_of
 from diagnosis.imperfect.answered import (
@@ -43,6 +44,10 @@ from validation.blind.truth import Background, Before, Truth
 from workflow.diagnose.case_files import load_case
 
 RIG = paper_link()
+
+
+def coefficients(residuals):
+    return dct(residuals, axis=0, norm="ortho").ravel()
 
 
 def _experiment(name, role, output, voltage=None):

@@ -264,8 +264,8 @@ def test_what_is_wrong_is_named_beside_a_bias_that_drifts():
     found = diagnose(case, progress=lambda done, what: shares_done.append(done))
     assert shares_done == sorted(shares_done)
     assert (free.combination, found.combination) == (("input_offset",), ("input_delay",))
-    assert found.shares.at_inputs
-    assert not free.shares.at_inputs
+    assert found.shares.in_windows
+    assert not free.shares.in_windows
     delay = next(change.values["delay_s"] for change in found.repair if change.id == "input_delay")
     assert delay == pytest.approx(0.033, rel=0.05)
     assert found.gap_closed > 0

@@ -1,0 +1,144 @@
+"""Windows in which no drift grows: of machines that integrate, each from the state that fits it best."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import cumulative_trapezoid
+from scipy.signal import lfilter
+
+from diagnosis import Case, Plant, PlantCase, PlantExperiment, diagnose, with_effects
+from diagnosis.fit.windows import Windows
+from tests.diagnosis.machines import rubbing
+from tests.diagnosis.test_imperfect import RIG, _experiment
+from validation.blind.truth import Background, Before, Truth
+
+DT_S, SAMPLES = 0.01, 900
+ROLES = ("estimation", "estimation", "held_out")
+
+
+def _motor(parameters, effects, inputs):
+    """Angle (T, 1) of a motor and speed: what the user brings."""
+    T, gain = parameters.values()
+    decay, u = np.exp(-DT_S / T), inputs[:, 0]
+    speed = np.concatenate([[0.0], lfilter([gain * (1 - decay)], [1.0, -decay], u)[:-1]])
+    angle = np.concatenate([[0.0], np.cumsum(gain * u[:-1] * DT_S - T * np.diff(speed))])
+    return angle[:, None]
+
+
+def _tank(parameters, effects, inputs):
+    """Level (T, 1) of a tank without an outlet."""
+    return np.concatenate([[0.0], np.cumsum(inputs[:-1, 0]) * DT_S])[:, None] / parameters["area"]
+
+
+def _case(simulate, stated, truth, *, hold=30, scale=3.0, names="all", **around):
+    rng, records = np.random.default_rng(11), []
+    for k, role in enumerate(ROLES):
+        u = scale * (0.6 + 0.2 * k) * rng.uniform(-1, 1, SAMPLES // hold).repeat(hold)
+        y = truth(u, rng)
+        y = y + 2e-4 * np.std(y) * rng.standard_normal(SAMPLES)
+        records.append(PlantExperiment(f"record {k}", role, u[:, None], y[:, None]))
+    noise = np.array([2e-4 * np.mean([np.std(e.output) for e in records])])
+    plant = Plant(simulate, stated, dict.fromkeys(stated, 0.05), ("y",), noise)
+    return PlantCase("drifts", with_effects(plant, names, records, dt_s=DT_S, **around), tuple(records))
+
+
+def _slow(rng, size):
+    """A bias that nobody lists: it turns round once or twice in a record."""
+    t = np.arange(SAMPLES) / SAMPLES
+    return size * np.cos(2 * np.pi * rng.uniform(0.7, 1.6) * t + rng.uniform(0, 2 * np.pi))
+
+
+def _rubbing_motor(u, rng):
+    def rate(x, v, voltage):
+        return (10 * voltage - v) / 0.2
+
+    return rubbing(rate, u + _slow(rng, 0.12), DT_S, lambda v: 10 * 0.4 / 0.2)[:, 0]
+
+
+def _late_tank(u, rng):
+    fine = np.concatenate([np.zeros(45), (u + _slow(rng, 0.1)).repeat(10)])[: 10 * SAMPLES]
+    return cumulative_trapezoid(fine, dx=DT_S / 10, initial=0.0)[::10] / 2.0
+
+
+@pytest.mark.parametrize(
+    ("simulate", "stated", "truth", "motion", "name", "size"),
+    [
+        (_motor, {"time_s": 0.2, "gain": 10.0}, _rubbing_motor, "y", "coulomb_friction", 0.4),
+        (_tank, {"area": 2.04}, _late_tank, None, "input_delay", 0.045),
+    ],
+)
+def test_an_effect_is_sized_in_windows_beside_a_drift_nobody_lists(
+    simulate, stated, truth, motion, name, size
+):
+    found = diagnose(_case(simulate, stated, truth, motion=motion))
+    assert found.presence(name) > 0.8
+    (value,) = next(e for e in found.effects if e.name == name).parameters.values()
+    # 12 and 1 % measured: friction acts along the speed of a run that has drifted.
+    assert value == pytest.approx(size, rel=0.25)
+    assert found.completeness.probability > 0.5
+    assert found.shares.horizon_samples
+
+
+def _bar(effects, bias_V):
+    """Records of an independent simulator of a flexible link that nothing holds."""
+    rng, records = np.random.default_rng(1), []
+    truth = Truth(RIG.model_dump(exclude={"tolerances"}), effects, Background(presliding_rad=1e-4))
+    for name, role in zip("abc", ROLES, strict=True):
+        voltage = rng.choice([-2.0, 2.0], 60).repeat(20)
+        voltage -= np.mean(voltage)
+        turns = rng.uniform(0.6, 1.5) * np.arange(voltage.size) / voltage.size
+        bias = bias_V * np.sqrt(2) * np.cos(2 * np.pi * turns + rng.uniform(0, 6))
+        clean = truth.record(voltage + bias, None, None, Before(0.4))
+        output = np.column_stack([clean.hub_angle_rad, clean.tip_m])
+        records.append(_experiment(name, role, output, voltage))
+    return Case("bar", RIG, tuple(records), 0.05)
+
+
+@pytest.mark.slow
+def test_friction_of_a_link_that_drifts_is_named():
+    found = diagnose(_bar(({"name": "coulomb_friction", "torque_Nm": 0.1},), 0.1))
+    assert found.combination == ("coulomb_friction",)
+    assert found.shares.in_windows
+    # 3 % measured.
+    assert found.repair[0].torque_Nm == pytest.approx(0.1, rel=0.1)
+    assert found.completeness.probability > 0.5
+
+
+@pytest.mark.slow
+def test_a_drift_alone_makes_no_effect():
+    found = diagnose(_bar((), 0.1))
+    assert found.verdict == "unknown"
+    assert not found.present
+
+
+def test_what_a_state_does_is_left_out_but_for_the_first_window():
+    case = _case(_motor, {"time_s": 0.2, "gain": 10.0}, _rubbing_motor, names=["input_delay"])
+    windows = Windows.of(case)
+    assert windows is not None
+    # Three time constants at least, and the shorter the more windows.
+    assert 3 * 0.2 / DT_S - 1 <= windows.samples <= SAMPLES // 3
+    assert sum(count * length for _, count, length in windows.parts(SAMPLES)) == SAMPLES
+    t = np.arange(SAMPLES) * DT_S
+    free = (1.0 + 2.0 * np.exp(-t / 0.2))[:, None]
+    left = windows.unseen(windows.seen(free))
+    length = windows.parts(SAMPLES)[0][2]
+    np.testing.assert_allclose(left[:length], free[:length], atol=1e-9)
+    assert np.max(np.abs(left[length:])) < 1e-4
+    # Left out once, there is nothing more to leave out; and energies are those of the signal.
+    moved = np.random.default_rng(0).standard_normal((SAMPLES, 1))
+    seen = windows.seen(moved)
+    np.testing.assert_allclose(windows.seen(windows.unseen(seen)), seen, atol=1e-9)
+    assert np.sum(seen**2) <= np.sum(moved**2)
+    stacked = np.stack([moved, free])
+    np.testing.assert_allclose(windows.seen(stacked)[1], windows.seen(free), atol=1e-9)
+
+
+def test_a_machine_that_forgets_has_no_windows():
+    def simulate(parameters, effects, inputs):
+        return lfilter([0.1], [1.0, -0.9], inputs[:, 0])[:, None] * parameters["gain"]
+
+    def truth(u, rng):
+        return lfilter([0.1], [1.0, -0.9], u)
+
+    assert Windows.of(_case(simulate, {"gain": 1.0}, truth)) is None
