@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ident.basis.mimo_model import MimoModel
 from ident.basis.model import GobfModel, MisoModel
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray, lock, readonly
@@ -88,3 +89,21 @@ class MisoIdentification(FittedRecords):
     table counts 1 + U numbers per pole."""
 
     model: MisoModel
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MimoIdentification(FittedRecords):
+    """A fitted model of several inputs and outputs with shared poles, and how well it fits.
+
+    Residuals (T - delay, Y), in units of the outputs. rss, noise_std and the order table are those of outputs
+    made white, of noise one; noise_covariance (Y, Y) is that of the outputs' noise. output_fit_percent (K, Y)
+    is `fit_percent` by output. rank_one: the modes (of `MimoModel.residues`) that the records let have one
+    shape, and rank_one_test the level at which they do: chance that noise alone makes a fit with free residues
+    so much better.
+    """
+
+    model: MimoModel
+    noise_covariance: RealArray
+    output_fit_percent: RealArray
+    rank_one: tuple[bool, ...] = ()
+    rank_one_test: float = 1.0

@@ -49,7 +49,7 @@ from ident.search.pole_search import Fitted, PoleSearch, PolishedMinimum, Search
 # Initial states that raise the residual of a fit from rest by this factor may have led its search astray.
 _MISLED = 1.2
 # Where a combination of the inputs has less of the power the channels are told apart badly.
-_ALIKE_INPUT = 1e-2
+ALIKE_INPUT = 1e-2
 # A residual worth less than this share of its samples is not white.
 _COLOURED = 0.8
 
@@ -431,7 +431,7 @@ def _advice_on_inputs(fitted: Fitted, model: MisoModel, residuals: tuple[RealArr
     if model.order:
         found += explains_nothing(data, model.poles, search.fixed, np.concatenate(residuals))
     found += few_samples(data, model.order)
-    if least_independence(data) < _ALIKE_INPUT:
+    if least_independence(data) < ALIKE_INPUT:
         found.append(finding(FindingKind.ALIKE_INPUTS, inputs=str(list(model.input_names))))
     worth = data.colour(np.concatenate(residuals)).effective_samples
     if worth < _COLOURED * data.n_samples:

@@ -139,18 +139,25 @@ class Record:
         if dt_s is not None and not abs(self.dt_s - dt_s) <= 1e-9 * dt_s:
             raise ValueError(f"{self.label}: dt_s = {self.dt_s}, the model has {dt_s}")
 
+    def only(self, output: int) -> Record:
+        """The record with this output alone."""
+        units = self.output_units[output : output + 1]
+        return replace(
+            self,
+            output=self.output[:, [output]],
+            output_names=(self.output_names[output],),
+            output_units=units,
+        )
+
     def siso(self, input_name: str | None = None, output_name: str | None = None) -> Record:
         """The record with one input and one output; a name may be left out where there is only one column."""
         i = self._column("input", self.input_names, input_name)
         o = self._column("output", self.output_names, output_name)
         return replace(
-            self,
+            self.only(o),
             input=self.input[:, [i]],
-            output=self.output[:, [o]],
             input_names=(self.input_names[i],),
-            output_names=(self.output_names[o],),
             input_units=self.input_units[i : i + 1],
-            output_units=self.output_units[o : o + 1],
         )
 
     def _column(self, key: str, names: tuple[str, ...], name: str | None) -> int:

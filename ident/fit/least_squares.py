@@ -20,7 +20,7 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.arrays import ComplexArray, IntArray, RealArray
 from ident.fit.kernels import cost_of_point, driven_rows, linearise
-from ident.fit.problem import CandidateCost, Linearisation, ResidualColour, residual_colour
+from ident.fit.problem import CandidateCost, Linearisation, PoleProblem, ResidualColour, residual_colour
 
 # Directions of the columns weaker than this fraction of the strongest are left at zero: the data do not
 # show them.
@@ -141,14 +141,8 @@ class Regression:
         return residual_colour(residual, self.starts)
 
     def criterion(self, rss: float, order: int, worth: float) -> Callable[[float, int], float]:
-        """Ne ln(J/N) + (free numbers) ln Ne with Ne = worth."""
-        floor = max(EXPLAINED * float(self.y @ self.y), np.finfo(np.float64).tiny)
-
-        def value(rss: float, order: int) -> float:
-            fall = worth * np.log(max(rss, floor) / self.n_samples)
-            return float(fall + self.n_parameters(order) * np.log(worth))
-
-        return value
+        """See `information_criterion`."""
+        return information_criterion(float(self.y @ self.y), self, worth)
 
     def candidate_cost(self, space: SearchSpace, shared: Poles, local: Poles) -> CandidateCost:
         """Cost of candidates on top of frozen poles: `shared` are driven by the input, `local` are those of
@@ -162,6 +156,17 @@ class Regression:
             drive, frozen, self.starts, kept.local_q, free,
         )  # fmt: skip
         return CandidateCost(space, float(self.y @ self.y), lambda unit: cost_of_point(unit, *known))
+
+
+def information_criterion(power: float, data: PoleProblem, worth: float) -> Callable[[float, int], float]:
+    """Ne ln(J/N) + (free numbers) ln Ne with Ne = worth; power = |y|^2."""
+    floor = max(EXPLAINED * power, np.finfo(np.float64).tiny)
+
+    def value(rss: float, order: int) -> float:
+        fall = worth * np.log(max(rss, floor) / data.n_rows)
+        return float(fall + data.n_parameters(order) * np.log(worth))
+
+    return value
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,10 +69,14 @@ class CandidateCost:
             return self._many(units)
         return np.array([self._one(unit) for unit in kernel_array(units)])
 
+    def at(self, unit: RealArray) -> float:
+        """Residual sum of squares at a point (D,)."""
+        self.evaluations += 1
+        return self._one(unit)
+
     def log(self, unit: RealArray) -> float:
         """log J at a point (D,), as DIRECT sees it."""
-        self.evaluations += 1
-        return math.log(max(self._one(unit), self._floor))
+        return math.log(max(self.at(unit), self._floor))
 
 
 class Linearised(Protocol):

@@ -21,6 +21,8 @@ _EXCHANGES = 4
 # Two optima with equal numbers of poles whose -2 log likelihoods differ by less fit equally well: what
 # friction leaves in the records decides between them.
 _LIKELIER = 2.0
+# Damping ratio above which a pair does what real poles do, and how far apart two of them begin.
+_NO_OVERSHOOT, _APART = 0.9, 1.5
 
 
 def silent(fraction: float, message: str) -> None:
@@ -97,6 +99,30 @@ class OrderSelection:
             if not found.rss < best.rss * (1 - GAIN):
                 break
             best = self._noted(self.search.rescan(found))
+        return best
+
+    def with_real(self, best: Refined) -> Refined:
+        """Pairs without any overshoot as one real pole or two, as long as the criterion falls: what grows pair
+        by pair makes real poles of them."""
+        while self.options.n_real is None and self.options.n_pairs is None:
+            fixed, poles = self.search.fixed.pairs.size, best.poles
+            trials = []
+            for i in range(fixed, poles.pairs.size):
+                rate = np.log(poles.pairs[i])
+                if -rate.real / abs(rate) > _NO_OVERSHOOT:
+                    size = abs(rate)
+                    trials += [
+                        poles.without_pair(i).appended(Poles(np.exp(-size * np.array(apart))))
+                        for apart in ([1.0], [1.0 / _APART, _APART])
+                    ]
+            if not trials:
+                break
+            ends = [self._noted(self.search.descend(trial, "real poles of a pair")) for trial in trials]
+            criterion = self._criterion(best)
+            chosen = min(ends, key=lambda end: criterion(end.rss, end.poles.order))
+            if not criterion(chosen.rss, chosen.poles.order) < criterion(best.rss, best.poles.order):
+                break
+            best = self.pruned(chosen)
         return best
 
     def table(self, best: Refined) -> tuple[OrderStep, ...]:

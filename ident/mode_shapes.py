@@ -1,0 +1,307 @@
+"""One shape for every mode: a residue of rank one in place of a free one, where the records let it.
+
+A mode of a structure moves all sensors in one proportion and takes from all motors in one: its residue is
+c b. With free residues n poles make a model of up to n min(Y, U) states, and what they have too many of is
+noise. The likelihood ratio of both fits is chi-squared, with (Y - 1)(U - 1) degrees for a real pole and twice
+as many for a pair; modes that the records refuse as one, the worst first, keep free residues (two modes that
+lie together are such a case, or an input that does not act on the structure at all).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+from ident.basis.mimo_model import residue_columns
+from ident.basis.poles import NO_POLES, Poles
+from ident.data.arrays import ComplexArray, RealArray
+from ident.fit.least_squares import project
+from ident.fit.several_outputs import OutputRegressions
+
+_MOST_EVALUATIONS = 40
+Refused = Callable[[float, int], bool]
+
+
+@dataclass(frozen=True, eq=False)
+class Shaped:
+    """The fit with one shape per mode where `rank_one` says so: poles, coefficients (Y, U, B), direct terms
+    (Y, U), residual (Y, N), its sum of squares, and how many free numbers the shapes saved."""
+
+    poles: Poles
+    coefficients: RealArray
+    direct: RealArray
+    residual: RealArray
+    rss: float
+    rank_one: tuple[bool, ...]
+    saved: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Mode:
+    """A pole (upper one of a pair), its residue (Y, U), whether the pole moves and has one shape."""
+
+    pole: complex
+    residue: ComplexArray
+    moves: bool
+    rank_one: bool = True
+
+    @property
+    def is_pair(self) -> bool:
+        return self.pole.imag != 0
+
+    def saved(self) -> int:
+        outputs, inputs = self.residue.shape
+        return (outputs - 1) * (inputs - 1) * (1 + self.is_pair) * self.rank_one
+
+
+def one_shape_each(
+    data: OutputRegressions,
+    poles: Poles,
+    coefficients: RealArray,
+    direct: RealArray,
+    *,
+    n_fixed: tuple[int, int],
+    refused: Refused,
+) -> Shaped | None:
+    """Refit with one shape per mode from a fit with free residues, coefficients (Y, U, B), direct (Y, U).
+
+    n_fixed: real poles and pairs that do not move; those at zero stand for integrators, which every joint has
+    by itself. refused(rss, saved): whether a fit with so much left, and so many numbers fewer, is refused.
+    None where there is nothing to be saved: one input or output, poles that repeat, or all modes refused.
+    """
+    if min(direct.shape) < 2:
+        return None
+    try:
+        values, columns = residue_columns(poles)
+    except ValueError:
+        return None
+    residues = np.einsum("yub,bm->myu", coefficients, columns)
+    given = [*poles.real[: n_fixed[0]], *poles.pairs[: n_fixed[1]]]
+    modes = []
+    for pole in (*poles.real, *poles.pairs):
+        if pole == 0:
+            continue
+        at = int(np.argmin(np.abs(values - pole)))
+        modes.append(_Mode(complex(pole), residues[at], not any(pole == one for one in given)))
+    while any(mode.rank_one for mode in modes):
+        problem = _Shapes(data, modes)
+        problem.solve()
+        saved = sum(mode.saved() for mode in modes)
+        if not refused(problem.rss, saved):
+            return problem.shaped(poles, n_fixed)
+        gains = [problem.gain_of_freeing(k) if mode.rank_one else -1.0 for k, mode in enumerate(modes)]
+        worst = int(np.argmax(gains))
+        modes[worst] = replace(modes[worst], rank_one=False)
+    return None
+
+
+class _Shapes:
+    """Output error over poles, shapes and free residues; nuisances, integrators and direct terms, which are
+    linear, are projected out."""
+
+    def __init__(self, data: OutputRegressions, modes: list[_Mode]) -> None:
+        self.data, self.modes = data, modes
+        first = data.each[0]
+        self.u, self.segments, self.structure = first.u, first.segments, data.structure
+        self.y = np.stack([one.y for one in data.each])
+        free = [self._filtered(0.0, self.u)] if self.structure.integrators else []
+        free += [self.u] if self.structure.feedthrough else []
+        self.free = np.concatenate(free) if free else np.zeros((0, first.n_samples))
+        self.rss = np.inf
+
+    def _filtered(self, pole: complex, rows: RealArray | ComplexArray) -> RealArray | ComplexArray:
+        """Rows (R, N) through 1/(z - pole), record by record from rest."""
+        out = np.empty(rows.shape, dtype=np.complex128 if np.imag(pole) else rows.dtype)
+        for here in self.segments:
+            out[:, here] = lfilter([0.0, 1.0], [1.0, -pole if np.imag(pole) else -np.real(pole)], rows[:, here])
+        return out
+
+    def solve(self) -> None:
+        x = np.concatenate([_start(mode, self._sizes(mode)) for mode in self.modes])
+        found = least_squares(
+            lambda x: self._linearised(x)[0], x, lambda x: self._linearised(x)[1],
+            method="lm", x_scale="jac", max_nfev=_MOST_EVALUATIONS * 2,
+        )  # fmt: skip
+        self.x = found.x
+        residual, self._jacobian = self._linearised(self.x)
+        self.residual, self.rss = residual.reshape(self.y.shape), float(residual @ residual)
+
+    def _sizes(self, mode: _Mode) -> RealArray:
+        """How much each input drives a mode, (U,): by that a residue's columns are weighed."""
+        return np.linalg.norm(self._filtered(mode.pole, self.u), axis=1)
+
+    def _linearised(self, x: RealArray) -> tuple[RealArray, RealArray]:
+        """Residual (Y N,) and Jacobian (Y N, P), off the linear columns of every output."""
+        model, columns, at = np.zeros_like(self.y), list[RealArray](), 0
+        poles = []
+        for mode in self.modes:
+            count = _count(mode)
+            pole, residue, slopes = _unpacked(mode, x[at : at + count])
+            at += count
+            poles.append(pole)
+            state = self._filtered(pole, self.u)
+            model += _shown(residue @ state, mode)
+            if mode.moves:
+                again = residue @ self._filtered(pole, state)
+                columns += [_shown(step * again, mode) for step in _pole_steps(mode, pole)]
+            columns += [_shown(slope @ state, mode) for slope in slopes]
+        rows = np.concatenate([(self.y - model)[None], -np.array(columns)]).reshape(-1, self.y.shape[1])
+        self._take_out_linear(rows, poles)
+        rows = rows.reshape(1 + len(columns), -1)
+        return rows[0], rows[1:].T
+
+    def _take_out_linear(self, rows: RealArray, poles: list[complex]) -> None:
+        """Project rows (R, N) off nuisances and free columns, in place."""
+        first = self.data.each[0]
+        local_q = first.polynomials_q
+        if self.structure.estimate_initial_state:
+            local_q = project(first, NO_POLES, _as_poles(poles, bool(self.structure.integrators))).local_q
+        first.take_out_local(local_q, rows)
+        if len(self.free):
+            free = self.free.copy()
+            first.take_out_local(local_q, free)
+            q = np.linalg.qr(free.T)[0]
+            rows -= (rows @ q) @ q.T
+
+    def gain_of_freeing(self, index: int) -> float:
+        """How much less a free residue of one mode would leave, to first order."""
+        at = sum(_count(mode) for mode in self.modes[:index])
+        mode = self.modes[index]
+        pole, _, _ = _unpacked(mode, self.x[at : at + _count(mode)])
+        state = self._filtered(pole, self.u)
+        n_outputs = self.y.shape[0]
+        turns = (1.0, 1j) if mode.is_pair else (1.0,)
+        columns = []
+        for k in range(n_outputs):
+            for row in state:
+                for turn in turns:
+                    column = np.zeros_like(self.y)
+                    column[k] = _shown(turn * row[None], mode)[0]
+                    columns.append(column)
+        rows = np.array(columns).reshape(-1, self.y.shape[1])
+        self._take_out_linear(rows, [])
+        both = np.hstack([self._jacobian, rows.reshape(len(columns), -1).T])
+        q = np.linalg.qr(both / np.maximum(np.linalg.norm(both, axis=0), 1e-300))[0]
+        inside = q.T @ self.residual.ravel()
+        return float(inside @ inside)
+
+    def shaped(self, before: Poles, n_fixed: tuple[int, int]) -> Shaped:
+        """Coefficients on the basis of the poles as they are now."""
+        at, found = 0, []
+        for mode in self.modes:
+            count = _count(mode)
+            found.append(_unpacked(mode, self.x[at : at + count])[:2])
+            at += count
+        zeros = np.zeros(int(np.sum(before.real == 0)))
+        real = [(pole, residue) for pole, residue in found if pole.imag == 0]
+        pairs = [(pole, residue) for pole, residue in found if pole.imag != 0]
+        poles = Poles(
+            np.concatenate([zeros, [pole.real for pole, _ in real]]), np.array([pole for pole, _ in pairs], complex)
+        )
+        values, columns = residue_columns(poles)
+        explained = np.zeros_like(self.y)
+        for mode, (pole, residue) in zip(self.modes, found, strict=True):
+            explained += _shown(residue @ self._filtered(pole, self.u), mode)
+        linear = self._free_coefficients(self.y - explained, [pole for pole, _ in found])
+        n_outputs, n_inputs = self.y.shape[0], self.u.shape[0]
+        parts = linear.reshape(n_outputs, -1, n_inputs)
+        rho = np.zeros((poles.order, n_outputs, n_inputs), dtype=np.complex128)
+        for pole, residue in found:
+            rho[int(np.argmin(np.abs(values - pole)))] = residue
+            if pole.imag:
+                rho[int(np.argmin(np.abs(values - pole.conjugate())))] = residue.conj()
+        if zeros.size:
+            rho[int(np.argmin(np.abs(values)))] = parts[:, 0]
+        direct = parts[:, -1] if self.structure.feedthrough else np.zeros((n_outputs, n_inputs))
+        coefficients = np.real(np.einsum("bm,myu->yub", np.linalg.inv(columns.T), rho))
+        return Shaped(
+            poles, coefficients, direct, self.residual, self.rss,
+            tuple(mode.rank_one for mode in self.modes), sum(mode.saved() for mode in self.modes),
+        )  # fmt: skip
+
+    def _free_coefficients(self, rest: RealArray, poles: list[complex]) -> RealArray:
+        """Least squares of what the modes leave (Y, N) on the free columns, nuisances beside them: (Y, Q)."""
+        if not len(self.free):
+            return np.zeros((len(rest), 0))
+        first = self.data.each[0]
+        local_q = first.polynomials_q
+        if self.structure.estimate_initial_state:
+            local_q = project(first, NO_POLES, _as_poles(poles, bool(self.structure.integrators))).local_q
+        both = np.concatenate([rest, self.free])
+        first.take_out_local(local_q, both)
+        return np.linalg.lstsq(both[len(rest) :].T, both[: len(rest)].T, rcond=None)[0].T
+
+
+def _as_poles(poles: list[complex], integrates: bool) -> Poles:
+    real = [pole.real for pole in poles if pole.imag == 0]
+    return Poles(np.array([0.0] * integrates + real), np.array([pole for pole in poles if pole.imag], complex))
+
+
+def _shown(rows: RealArray | ComplexArray, mode: _Mode) -> RealArray:
+    """What a mode adds to the outputs: with its conjugate where it is a pair."""
+    return 2 * np.real(rows) if mode.is_pair else np.real(rows)
+
+
+def _count(mode: _Mode) -> int:
+    """Free numbers: decay (and angle), and a residue with or without one shape."""
+    outputs, inputs = mode.residue.shape
+    numbers = outputs + inputs - 1 if mode.rank_one else outputs * inputs
+    return (1 + mode.is_pair) * (numbers + mode.moves)
+
+
+def _start(mode: _Mode, sizes: RealArray) -> RealArray:
+    """Free numbers of a mode: log decay (and angle), then c and b without its largest, which is one."""
+    pole, residue = mode.pole, mode.residue
+    head = [np.log(-np.log(abs(pole)))] if mode.moves else []
+    head += [np.angle(pole)] if mode.moves and mode.is_pair else []
+    if mode.rank_one:
+        left, size, right = np.linalg.svd(residue * sizes)
+        b = right[0] / sizes
+        fixed = _largest(mode)
+        numbers = np.concatenate([left[:, 0] * size[0] * b[fixed], np.delete(b / b[fixed], fixed)])
+    else:
+        numbers = residue.ravel()
+    parts = [numbers.real, numbers.imag] if mode.is_pair else [numbers.real]
+    return np.concatenate([head, *parts])
+
+
+def _largest(mode: _Mode) -> int:
+    """The input that drives a mode most: its share of the shape is one."""
+    return int(np.argmax(np.linalg.norm(mode.residue, axis=0)))
+
+
+def _unpacked(mode: _Mode, x: RealArray) -> tuple[complex, ComplexArray, list[ComplexArray]]:
+    """Pole, residue (Y, U), and the residue's change with each of its free numbers."""
+    pole = mode.pole
+    if mode.moves:
+        size, x = np.exp(-np.exp(x[0])), x[1:]
+        if mode.is_pair:
+            pole, x = size * np.exp(1j * x[0]), x[1:]
+        else:
+            pole = complex(np.copysign(size, mode.pole.real))
+    outputs, inputs = mode.residue.shape
+    values = x[: x.size // 2] + 1j * x[x.size // 2 :] if mode.is_pair else x
+    turns = (1.0, 1j) if mode.is_pair else (1.0,)
+    slopes: list[ComplexArray] = []
+    if not mode.rank_one:
+        residue = values.reshape(outputs, inputs)
+        for turn in turns:
+            for k in range(values.size):
+                slopes.append(turn * np.eye(values.size)[k].reshape(outputs, inputs))
+        return complex(pole), residue, slopes
+    fixed = _largest(mode)
+    c, b = values[:outputs], np.insert(values[outputs:], fixed, 1.0)
+    for turn in turns:
+        slopes += [turn * np.outer(np.eye(outputs)[k], b) for k in range(outputs)]
+        slopes += [turn * np.outer(c, np.eye(inputs)[k]) for k in range(inputs) if k != fixed]
+    return complex(pole), np.outer(c, b), slopes
+
+
+def _pole_steps(mode: _Mode, pole: complex) -> list[complex]:
+    """Change of the pole with log decay, and with its angle."""
+    decay = pole * np.log(abs(pole)) if pole else 0j
+    return [decay, 1j * pole] if mode.is_pair else [decay]
