@@ -9,7 +9,7 @@ lie together are such a case, or an input that does not act on the structure at 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,8 +41,9 @@ class Shaped:
 
 
 @dataclass(frozen=True, eq=False)
-class _Mode:
-    """A pole (upper one of a pair), its residue (Y, U), whether the pole moves and has one shape."""
+class Mode:
+    """A pole (the upper one of a pair) and its residue (Y, U); whether the pole moves, whether the residue
+    has rank one."""
 
     pole: complex
     residue: ComplexArray
@@ -76,19 +77,11 @@ def one_shape_each(
     if min(direct.shape) < 2:
         return None
     try:
-        values, columns = residue_columns(poles)
+        modes = modes_of(poles, coefficients, n_fixed)
     except ValueError:
         return None
-    residues = np.einsum("yub,bm->myu", coefficients, columns)
-    given = [*poles.real[: n_fixed[0]], *poles.pairs[: n_fixed[1]]]
-    modes = []
-    for pole in (*poles.real, *poles.pairs):
-        if pole == 0:
-            continue
-        at = int(np.argmin(np.abs(values - pole)))
-        modes.append(_Mode(complex(pole), residues[at], not any(pole == one for one in given)))
     while any(mode.rank_one for mode in modes):
-        problem = _Shapes(data, modes)
+        problem = ModalFit(data, modes)
         problem.solve()
         saved = sum(mode.saved() for mode in modes)
         if not refused(problem.rss, saved):
@@ -99,11 +92,26 @@ def one_shape_each(
     return None
 
 
-class _Shapes:
-    """Output error over poles, shapes and free residues; nuisances, integrators and direct terms, which are
-    linear, are projected out."""
+def modes_of(
+    poles: Poles, coefficients: RealArray, n_fixed: tuple[int, int], rank_one: Sequence[bool] | None = None
+) -> list[Mode]:
+    """Modes of coefficients (Y, U, B), those at zero left out; rank_one: of each, default all. Raises
+    ValueError where poles repeat."""
+    values, columns = residue_columns(poles)
+    residues = np.einsum("yub,bm->myu", coefficients, columns)
+    given = [*poles.real[: n_fixed[0]], *poles.pairs[: n_fixed[1]]]
+    listed = [pole for pole in (*poles.real, *poles.pairs) if pole != 0]
+    return [
+        Mode(complex(pole), residues[int(np.argmin(np.abs(values - pole)))], pole not in given, one)
+        for pole, one in zip(listed, rank_one or [True] * len(listed), strict=True)
+    ]
 
-    def __init__(self, data: OutputRegressions, modes: list[_Mode]) -> None:
+
+class ModalFit:
+    """Output error over poles, shapes and free residues; nuisances, integrators and direct terms, which are
+    linear, are projected out. Begins at the modes as they are given."""
+
+    def __init__(self, data: OutputRegressions, modes: Sequence[Mode]) -> None:
         self.data, self.modes = data, modes
         first = data.each[0]
         self.u, self.segments, self.structure = first.u, first.segments, data.structure
@@ -111,7 +119,12 @@ class _Shapes:
         free = [self._filtered(0.0, self.u)] if self.structure.integrators else []
         free += [self.u] if self.structure.feedthrough else []
         self.free = np.concatenate(free) if free else np.zeros((0, first.n_samples))
-        self.rss = np.inf
+        self._set(np.concatenate([_start(mode, self._sizes(mode)) for mode in self.modes]))
+
+    def _set(self, x: RealArray) -> None:
+        self.x = x
+        residual, self._jacobian = self._linearised(x)
+        self.residual, self.rss = residual.reshape(self.y.shape), float(residual @ residual)
 
     def _filtered(self, pole: complex, rows: RealArray | ComplexArray) -> RealArray | ComplexArray:
         """Rows (R, N) through 1/(z - pole), record by record from rest."""
@@ -121,21 +134,19 @@ class _Shapes:
         return out
 
     def solve(self) -> None:
-        x = np.concatenate([_start(mode, self._sizes(mode)) for mode in self.modes])
+        """Levenberg and Marquardt from where the modes are."""
         found = least_squares(
-            lambda x: self._linearised(x)[0], x, lambda x: self._linearised(x)[1],
-            method="lm", x_scale="jac", max_nfev=_MOST_EVALUATIONS * 2,
+            lambda x: self._linearised(x)[0], self.x, lambda x: self._linearised(x)[1],
+            method="lm", x_scale="jac", max_nfev=_MOST_EVALUATIONS,
         )  # fmt: skip
-        self.x = found.x
-        residual, self._jacobian = self._linearised(self.x)
-        self.residual, self.rss = residual.reshape(self.y.shape), float(residual @ residual)
+        self._set(found.x)
 
-    def _sizes(self, mode: _Mode) -> RealArray:
+    def _sizes(self, mode: Mode) -> RealArray:
         """How much each input drives a mode, (U,): by that a residue's columns are weighed."""
         return np.linalg.norm(self._filtered(mode.pole, self.u), axis=1)
 
-    def _linearised(self, x: RealArray) -> tuple[RealArray, RealArray]:
-        """Residual (Y N,) and Jacobian (Y N, P), off the linear columns of every output."""
+    def _linearised(self, x: RealArray, *, linear: bool = True) -> tuple[RealArray, RealArray]:
+        """Residual (Y N,) and its Jacobian (Y N, P), off the nuisances and the linear columns of every output."""
         model, columns, at = np.zeros_like(self.y), list[RealArray](), 0
         poles = []
         for mode in self.modes:
@@ -150,28 +161,93 @@ class _Shapes:
                 columns += [_shown(step * again, mode) for step in _pole_steps(mode, pole)]
             columns += [_shown(slope @ state, mode) for slope in slopes]
         rows = np.concatenate([(self.y - model)[None], -np.array(columns)]).reshape(-1, self.y.shape[1])
-        self._take_out_linear(rows, poles)
+        self._take_out(rows, poles, linear=linear)
         rows = rows.reshape(1 + len(columns), -1)
         return rows[0], rows[1:].T
 
-    def _take_out_linear(self, rows: RealArray, poles: list[complex]) -> None:
-        """Project rows (R, N) off nuisances and free columns, in place."""
+    def _local_q(self, poles: Sequence[complex]) -> RealArray:
+        """Nuisance columns of each record, orthonormal."""
         first = self.data.each[0]
-        local_q = first.polynomials_q
-        if self.structure.estimate_initial_state:
-            local_q = project(first, NO_POLES, _as_poles(poles, bool(self.structure.integrators))).local_q
+        if not self.structure.estimate_initial_state:
+            return first.polynomials_q
+        real = [pole.real for pole in poles if pole.imag == 0]
+        pairs = np.array([pole for pole in poles if pole.imag], dtype=np.complex128)
+        local = Poles(np.array([0.0] * bool(self.structure.integrators) + real), pairs)
+        return project(first, NO_POLES, local).local_q
+
+    def _take_out(self, rows: RealArray, poles: Sequence[complex], *, linear: bool = True) -> None:
+        """Project rows (R, N) off nuisances and linear columns, in place."""
+        first, local_q = self.data.each[0], self._local_q(poles)
         first.take_out_local(local_q, rows)
-        if len(self.free):
+        if len(self.free) and linear:
             free = self.free.copy()
             first.take_out_local(local_q, free)
             q = np.linalg.qr(free.T)[0]
             rows -= (rows @ q) @ q.T
 
+    def covariance_factor(self) -> RealArray:
+        """S (P, P'), S S^T the covariance of all free numbers to first order, noise of one: the modes', then
+        of every output the coefficients of the linear columns."""
+        n_outputs, n_free = self.y.shape[0], len(self.free)
+        poles = [pole for pole, _ in self.found()]
+        columns = np.zeros((n_outputs * n_free, *self.y.shape))
+        for k in range(n_outputs):
+            columns[k * n_free : (k + 1) * n_free, k] = self.free
+        rows = columns.reshape(-1, self.y.shape[1])
+        self.data.each[0].take_out_local(self._local_q(poles), rows)
+        linear = rows.reshape(n_outputs * n_free, -1).T
+        # The modes' columns off the linear ones: what is left of these is independent of them.
+        mixed = np.linalg.lstsq(linear, self._slopes(poles), rcond=None)[0] if n_free else None
+        factor = _inverse_factor(self._jacobian)
+        if mixed is None:
+            return factor
+        own = _inverse_factor(linear)
+        return np.block([[factor, np.zeros((len(factor), own.shape[1]))], [mixed @ factor, own]])
+
+    def _slopes(self, poles: list[complex]) -> RealArray:
+        """The Jacobian of the residual off the nuisances only, (Y N, P): minus what the model moves by."""
+        return self._linearised(self.x, linear=False)[1]
+
+    def response_columns(self, omega_rad_s: RealArray) -> ComplexArray:
+        """Change of the response with each number of `covariance_factor`, (F, Y, U, P); inputs as they drive
+        the modes, without integrator and delay."""
+        z = np.exp(1j * np.asarray(omega_rad_s) * self.data.dt_s)
+        n_outputs, n_inputs = self.y.shape[0], self.u.shape[0]
+        columns: list[ComplexArray] = []
+        for mode, (pole, residue), slopes in self._unpacked():
+            def shown(change: ComplexArray, power: int, mode: Mode = mode, pole: complex = pole) -> ComplexArray:
+                first = change / (z[:, None, None] - pole) ** power
+                if not mode.is_pair:
+                    return first
+                return first + np.conj(change) / (z[:, None, None] - np.conj(pole)) ** power
+
+            if mode.moves:
+                columns += [shown(step * residue, 2) for step in _pole_steps(mode, pole)]
+            columns += [shown(slope, 1) for slope in slopes]
+        parts = [1 / z] if self.structure.integrators else []
+        parts += [np.ones_like(z)] if self.structure.feedthrough else []
+        for k in range(n_outputs):
+            for part in parts:
+                for j in range(n_inputs):
+                    column = np.zeros((z.size, n_outputs, n_inputs), dtype=np.complex128)
+                    column[:, k, j] = part
+                    columns.append(column)
+        return np.stack(columns, axis=-1)
+
+    def _unpacked(self) -> Iterator[tuple[Mode, tuple[complex, ComplexArray], list[ComplexArray]]]:
+        at = 0
+        for mode in self.modes:
+            pole, residue, slopes = _unpacked(mode, self.x[at : at + _count(mode)])
+            at += _count(mode)
+            yield mode, (pole, residue), slopes
+
+    def found(self) -> list[tuple[complex, ComplexArray]]:
+        """Pole and residue (Y, U) of every mode."""
+        return [both for _, both, _ in self._unpacked()]
+
     def gain_of_freeing(self, index: int) -> float:
         """How much less a free residue of one mode would leave, to first order."""
-        at = sum(_count(mode) for mode in self.modes[:index])
-        mode = self.modes[index]
-        pole, _, _ = _unpacked(mode, self.x[at : at + _count(mode)])
+        mode, (pole, _) = self.modes[index], self.found()[index]
         state = self._filtered(pole, self.u)
         n_outputs = self.y.shape[0]
         turns = (1.0, 1j) if mode.is_pair else (1.0,)
@@ -183,7 +259,7 @@ class _Shapes:
                     column[k] = _shown(turn * row[None], mode)[0]
                     columns.append(column)
         rows = np.array(columns).reshape(-1, self.y.shape[1])
-        self._take_out_linear(rows, [])
+        self._take_out(rows, [pole])
         both = np.hstack([self._jacobian, rows.reshape(len(columns), -1).T])
         q = np.linalg.qr(both / np.maximum(np.linalg.norm(both, axis=0), 1e-300))[0]
         inside = q.T @ self.residual.ravel()
@@ -191,11 +267,7 @@ class _Shapes:
 
     def shaped(self, before: Poles, n_fixed: tuple[int, int]) -> Shaped:
         """Coefficients on the basis of the poles as they are now."""
-        at, found = 0, []
-        for mode in self.modes:
-            count = _count(mode)
-            found.append(_unpacked(mode, self.x[at : at + count])[:2])
-            at += count
+        found = self.found()
         zeros = np.zeros(int(np.sum(before.real == 0)))
         real = [(pole, residue) for pole, residue in found if pole.imag == 0]
         pairs = [(pole, residue) for pole, residue in found if pole.imag != 0]
@@ -227,33 +299,31 @@ class _Shapes:
         """Least squares of what the modes leave (Y, N) on the free columns, nuisances beside them: (Y, Q)."""
         if not len(self.free):
             return np.zeros((len(rest), 0))
-        first = self.data.each[0]
-        local_q = first.polynomials_q
-        if self.structure.estimate_initial_state:
-            local_q = project(first, NO_POLES, _as_poles(poles, bool(self.structure.integrators))).local_q
         both = np.concatenate([rest, self.free])
-        first.take_out_local(local_q, both)
+        self.data.each[0].take_out_local(self._local_q(poles), both)
         return np.linalg.lstsq(both[len(rest) :].T, both[: len(rest)].T, rcond=None)[0].T
 
 
-def _as_poles(poles: list[complex], integrates: bool) -> Poles:
-    real = [pole.real for pole in poles if pole.imag == 0]
-    return Poles(np.array([0.0] * integrates + real), np.array([pole for pole in poles if pole.imag], complex))
+def _inverse_factor(columns: RealArray) -> RealArray:
+    """S with S S^T = (C^T C)^-1; columns scaled, so that what is left out as unseen has no units."""
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    triangle = np.linalg.qr(columns / scale, mode="r")
+    return np.asarray(np.linalg.pinv(triangle, rcond=1e-12) / scale[:, None])
 
 
-def _shown(rows: RealArray | ComplexArray, mode: _Mode) -> RealArray:
+def _shown(rows: RealArray | ComplexArray, mode: Mode) -> RealArray:
     """What a mode adds to the outputs: with its conjugate where it is a pair."""
     return 2 * np.real(rows) if mode.is_pair else np.real(rows)
 
 
-def _count(mode: _Mode) -> int:
+def _count(mode: Mode) -> int:
     """Free numbers: decay (and angle), and a residue with or without one shape."""
     outputs, inputs = mode.residue.shape
     numbers = outputs + inputs - 1 if mode.rank_one else outputs * inputs
     return (1 + mode.is_pair) * (numbers + mode.moves)
 
 
-def _start(mode: _Mode, sizes: RealArray) -> RealArray:
+def _start(mode: Mode, sizes: RealArray) -> RealArray:
     """Free numbers of a mode: log decay (and angle), then c and b without its largest, which is one."""
     pole, residue = mode.pole, mode.residue
     head = [np.log(-np.log(abs(pole)))] if mode.moves else []
@@ -269,12 +339,12 @@ def _start(mode: _Mode, sizes: RealArray) -> RealArray:
     return np.concatenate([head, *parts])
 
 
-def _largest(mode: _Mode) -> int:
+def _largest(mode: Mode) -> int:
     """The input that drives a mode most: its share of the shape is one."""
     return int(np.argmax(np.linalg.norm(mode.residue, axis=0)))
 
 
-def _unpacked(mode: _Mode, x: RealArray) -> tuple[complex, ComplexArray, list[ComplexArray]]:
+def _unpacked(mode: Mode, x: RealArray) -> tuple[complex, ComplexArray, list[ComplexArray]]:
     """Pole, residue (Y, U), and the residue's change with each of its free numbers."""
     pole = mode.pole
     if mode.moves:
@@ -301,7 +371,7 @@ def _unpacked(mode: _Mode, x: RealArray) -> tuple[complex, ComplexArray, list[Co
     return complex(pole), np.outer(c, b), slopes
 
 
-def _pole_steps(mode: _Mode, pole: complex) -> list[complex]:
+def _pole_steps(mode: Mode, pole: complex) -> list[complex]:
     """Change of the pole with log decay, and with its angle."""
     decay = pole * np.log(abs(pole)) if pole else 0j
     return [decay, 1j * pole] if mode.is_pair else [decay]

@@ -1,0 +1,104 @@
+"""Balls that hold the matrix response of a model of several inputs and outputs, poles included.
+
+To first order the error of the response is G - G0 = K(w) n with n of unit normals, from the Gauss-Newton
+covariance of poles, shapes and free residues. With free residues at given poles its covariance would be
+(noise covariance) x (input covariance P) exactly, so that G = G0 + Lo D Li with Lo Lo^H the noise covariance,
+Li^H Li = P and D of independent complex normals. Poles, which all channels share, and shapes add terms that
+are no such product. Lo stays, P is the mean over whitened outputs, and the ball |D|_F <= radius is as large as
+holds G with the asked probability: the quantile of a sum of weighted squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from ident.basis.structure import front_response
+import numpy.typing as npt
+from ident.data.arrays import ComplexArray, RealArray, lock
+from ident.data.record import Record
+from ident.fit.several_outputs import prepare_outputs, whitened
+from ident.identification import MimoIdentification
+from ident.mode_shapes import ModalFit, modes_of
+
+_DRAWS = 20_000  # of the sum of squares: its 95 % quantile then is right to about 1 %
+
+
+@dataclass(frozen=True, eq=False)
+class MatrixUncertainty:
+    """|Lo^-1 (G - G0) Li^-1|_F <= radius at every frequency.
+
+    omega_rad_s (F,), centre (F, Y, U), output_factor Lo (Y, Y) in units of the outputs, input_factor Li (F, U,
+    U), radius (F,), dt_s, level: probability of holding the response, frequency by frequency.
+    """
+
+    omega_rad_s: RealArray
+    centre: ComplexArray
+    output_factor: RealArray
+    input_factor: ComplexArray
+    radius: RealArray
+    dt_s: float
+    level: float
+
+    def __post_init__(self) -> None:
+        lock(self, "omega_rad_s", "output_factor", "radius")
+        lock(self, "centre", "input_factor", dtype=np.complex128)
+
+    @property
+    def enclosure(self) -> RealArray:
+        """Radius over that of independent circular normals, (F,): 1 where nothing is enclosed."""
+        count = 2 * self.centre.shape[1] * self.centre.shape[2]
+        return np.asarray(self.radius / np.sqrt(chi2.ppf(self.level, count) / 2))
+
+    def distance(self, response: ComplexArray) -> RealArray:
+        """|Lo^-1 (G - G0) Li^-1|_F over the radius, (F,), of responses (F, Y, U); up to 1 inside."""
+        left = np.linalg.solve(self.output_factor, response - self.centre)
+        inside = left @ np.linalg.inv(self.input_factor)
+        return np.asarray(np.linalg.norm(inside, axis=(1, 2)) / self.radius)
+
+    def holds(self, response: ComplexArray) -> npt.NDArray[np.bool_]:
+        """Whether each response (F, Y, U) lies in its ball, (F,)."""
+        return np.asarray(self.distance(response) <= 1)
+
+
+def matrix_uncertainty(
+    records: Sequence[Record],
+    identification: MimoIdentification,
+    omega_rad_s: RealArray,
+    *,
+    level: float = 0.95,
+) -> MatrixUncertainty:
+    """Balls of the matrix response at omega (F,), up to pi/dt (above 0 with integrators).
+
+    records, identification: of `identify_mimo`. First order in the noise, which is taken as white in time, and
+    for the order and the shapes that were chosen: nothing is added for modes that the records did not show.
+    Raises ValueError if the records are not those of the identification, or poles repeat.
+    """
+    model, structure = identification.model, identification.structure
+    factor = np.linalg.cholesky(identification.noise_covariance)
+    white = np.linalg.inv(factor)
+    data = prepare_outputs(whitened(records, white), structure)
+    rows = sum(len(part) for part in identification.residuals)
+    if data.each[0].n_samples != rows:
+        raise ValueError(
+            f"the records have {data.each[0].n_samples} rows, the identification {rows}: expected the records "
+            "it was made from"
+        )
+    own = np.einsum("xy,yub->xub", white, model.coefficients)
+    modes = modes_of(model.poles, own, identification.n_fixed, identification.rank_one or None)
+    fit = ModalFit(data, modes)
+    omega = np.asarray(omega_rad_s, dtype=np.float64)
+    front = front_response(omega, model.dt_s, model.integrators, model.input_delay_samples)
+    columns = fit.response_columns(omega) @ fit.covariance_factor() * front[:, None, None, None]
+    covariance = np.einsum("fyup,fyvp->fuv", columns.conj(), columns) / len(model.outputs)
+    upper = np.linalg.cholesky(covariance).conj().swapaxes(1, 2)
+    turned = np.einsum("fyup,fuv->fyvp", columns, np.linalg.inv(upper))
+    flat = turned.reshape(omega.size, -1, turned.shape[-1])
+    both = np.concatenate([flat.real, flat.imag], axis=1)
+    weights = np.linalg.svd(both, compute_uv=False) ** 2
+    squares = np.random.default_rng(0).standard_normal((_DRAWS, weights.shape[1])) ** 2
+    radius = np.sqrt(np.quantile(squares @ weights.T, level, axis=0))
+    return MatrixUncertainty(omega, model.frequency_response(omega), factor, upper, radius, model.dt_s, level)
