@@ -96,10 +96,9 @@ class MimoIdentification(FittedRecords):
     """A fitted model of several inputs and outputs with shared poles, and how well it fits.
 
     Residuals (T - delay, Y), in units of the outputs. rss, noise_std and the order table are those of outputs
-    made white, of noise one; noise_covariance (Y, Y) is that of the outputs' noise. output_fit_percent (K, Y)
+    made white, of noise one; noise_covariance (Y, Y) is that of the outputs' noise, output_fit_percent (K, Y)
     is `fit_percent` by output. rank_one: the modes (of `MimoModel.residues`) that the records let have one
-    shape, and rank_one_test the level at which they do: chance that noise alone makes a fit with free residues
-    so much better.
+    shape; rank_one_test: the chance that noise alone makes free residues fit so much better.
     """
 
     model: MimoModel

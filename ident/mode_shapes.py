@@ -23,6 +23,7 @@ from ident.fit.least_squares import project
 from ident.fit.several_outputs import OutputRegressions
 
 _MOST_EVALUATIONS = 40
+_LOG_DECAY = -25.0, 6.0  # of a sample: poles stay inside the circle, and off zero
 Refused = Callable[[float, int], bool]
 
 
@@ -56,7 +57,7 @@ class Mode:
 
     def saved(self) -> int:
         outputs, inputs = self.residue.shape
-        return (outputs - 1) * (inputs - 1) * (1 + self.is_pair) * self.rank_one
+        return int((outputs - 1) * (inputs - 1) * (1 + self.is_pair) * self.rank_one)
 
 
 def one_shape_each(
@@ -118,7 +119,7 @@ class ModalFit:
         self.y = np.stack([one.y for one in data.each])
         free = [self._filtered(0.0, self.u)] if self.structure.integrators else []
         free += [self.u] if self.structure.feedthrough else []
-        self.free = np.concatenate(free) if free else np.zeros((0, first.n_samples))
+        self.free = np.real(np.concatenate(free)) if free else np.zeros((0, first.n_samples))
         self._set(np.concatenate([_start(mode, self._sizes(mode)) for mode in self.modes]))
 
     def _set(self, x: RealArray) -> None:
@@ -130,23 +131,31 @@ class ModalFit:
         """Rows (R, N) through 1/(z - pole), record by record from rest."""
         out = np.empty(rows.shape, dtype=np.complex128 if np.imag(pole) else rows.dtype)
         for here in self.segments:
-            out[:, here] = lfilter([0.0, 1.0], [1.0, -pole if np.imag(pole) else -np.real(pole)], rows[:, here])
+            out[:, here] = lfilter(
+                [0.0, 1.0], [1.0, -pole if np.imag(pole) else -np.real(pole)], rows[:, here]
+            )
         return out
 
     def solve(self) -> None:
         """Levenberg and Marquardt from where the modes are."""
+
+        def residual(x: RealArray) -> RealArray:
+            return self._linearised(x)[0]
+
+        def jacobian(x: RealArray) -> RealArray:
+            return self._linearised(x)[1]
+
         found = least_squares(
-            lambda x: self._linearised(x)[0], self.x, lambda x: self._linearised(x)[1],
-            method="lm", x_scale="jac", max_nfev=_MOST_EVALUATIONS,
-        )  # fmt: skip
+            residual, self.x, jacobian, method="lm", x_scale="jac", max_nfev=_MOST_EVALUATIONS
+        )
         self._set(found.x)
 
     def _sizes(self, mode: Mode) -> RealArray:
         """How much each input drives a mode, (U,): by that a residue's columns are weighed."""
-        return np.linalg.norm(self._filtered(mode.pole, self.u), axis=1)
+        return np.asarray(np.linalg.norm(self._filtered(mode.pole, self.u), axis=1))
 
     def _linearised(self, x: RealArray, *, linear: bool = True) -> tuple[RealArray, RealArray]:
-        """Residual (Y N,) and its Jacobian (Y N, P), off the nuisances and the linear columns of every output."""
+        """Residual (Y N,) and its Jacobian (Y N, P), off the nuisances and every output's linear columns."""
         model, columns, at = np.zeros_like(self.y), list[RealArray](), 0
         poles = []
         for mode in self.modes:
@@ -215,11 +224,15 @@ class ModalFit:
         n_outputs, n_inputs = self.y.shape[0], self.u.shape[0]
         columns: list[ComplexArray] = []
         for mode, (pole, residue), slopes in self._unpacked():
-            def shown(change: ComplexArray, power: int, mode: Mode = mode, pole: complex = pole) -> ComplexArray:
-                first = change / (z[:, None, None] - pole) ** power
+
+            def shown(
+                change: ComplexArray, power: int, mode: Mode = mode, pole: complex = pole
+            ) -> ComplexArray:
+                first: ComplexArray = np.asarray(change / (z[:, None, None] - pole) ** power)
                 if not mode.is_pair:
                     return first
-                return first + np.conj(change) / (z[:, None, None] - np.conj(pole)) ** power
+                second = np.conj(change) / (z[:, None, None] - np.conj(pole)) ** power
+                return np.asarray(first + second)
 
             if mode.moves:
                 columns += [shown(step * residue, 2) for step in _pole_steps(mode, pole)]
@@ -272,7 +285,8 @@ class ModalFit:
         real = [(pole, residue) for pole, residue in found if pole.imag == 0]
         pairs = [(pole, residue) for pole, residue in found if pole.imag != 0]
         poles = Poles(
-            np.concatenate([zeros, [pole.real for pole, _ in real]]), np.array([pole for pole, _ in pairs], complex)
+            np.concatenate([zeros, [pole.real for pole, _ in real]]),
+            np.array([pole for pole, _ in pairs], complex),
         )
         values, columns = residue_columns(poles)
         explained = np.zeros_like(self.y)
@@ -301,7 +315,7 @@ class ModalFit:
             return np.zeros((len(rest), 0))
         both = np.concatenate([rest, self.free])
         self.data.each[0].take_out_local(self._local_q(poles), both)
-        return np.linalg.lstsq(both[len(rest) :].T, both[: len(rest)].T, rcond=None)[0].T
+        return np.asarray(np.linalg.lstsq(both[len(rest) :].T, both[: len(rest)].T, rcond=None)[0].T)
 
 
 def _inverse_factor(columns: RealArray) -> RealArray:
@@ -317,17 +331,18 @@ def _shown(rows: RealArray | ComplexArray, mode: Mode) -> RealArray:
 
 
 def _count(mode: Mode) -> int:
-    """Free numbers: decay (and angle), and a residue with or without one shape."""
+    """Free numbers: those of the pole, and of a residue with or without one shape."""
     outputs, inputs = mode.residue.shape
     numbers = outputs + inputs - 1 if mode.rank_one else outputs * inputs
-    return (1 + mode.is_pair) * (numbers + mode.moves)
+    return int((1 + mode.is_pair) * (numbers + mode.moves))
 
 
 def _start(mode: Mode, sizes: RealArray) -> RealArray:
-    """Free numbers of a mode: log decay (and angle), then c and b without its largest, which is one."""
+    """Free numbers of a mode: log decay (and a logistic number of the angle), then c, and b without its
+    largest, which is one."""
     pole, residue = mode.pole, mode.residue
     head = [np.log(-np.log(abs(pole)))] if mode.moves else []
-    head += [np.angle(pole)] if mode.moves and mode.is_pair else []
+    head += [-np.log(np.pi / np.angle(pole) - 1)] if mode.moves and mode.is_pair else []
     if mode.rank_one:
         left, size, right = np.linalg.svd(residue * sizes)
         b = right[0] / sizes
@@ -348,17 +363,17 @@ def _unpacked(mode: Mode, x: RealArray) -> tuple[complex, ComplexArray, list[Com
     """Pole, residue (Y, U), and the residue's change with each of its free numbers."""
     pole = mode.pole
     if mode.moves:
-        size, x = np.exp(-np.exp(x[0])), x[1:]
+        size, x = np.exp(-np.exp(np.clip(x[0], *_LOG_DECAY))), x[1:]
         if mode.is_pair:
-            pole, x = size * np.exp(1j * x[0]), x[1:]
+            pole, x = size * np.exp(1j * np.pi / (1 + np.exp(-x[0]))), x[1:]
         else:
             pole = complex(np.copysign(size, mode.pole.real))
     outputs, inputs = mode.residue.shape
-    values = x[: x.size // 2] + 1j * x[x.size // 2 :] if mode.is_pair else x
-    turns = (1.0, 1j) if mode.is_pair else (1.0,)
+    values = x[: x.size // 2] + 1j * x[x.size // 2 :] if mode.is_pair else x.astype(np.complex128)
+    turns = (1.0 + 0j, 1j) if mode.is_pair else (1.0 + 0j,)
     slopes: list[ComplexArray] = []
     if not mode.rank_one:
-        residue = values.reshape(outputs, inputs)
+        residue: ComplexArray = values.reshape(outputs, inputs)
         for turn in turns:
             for k in range(values.size):
                 slopes.append(turn * np.eye(values.size)[k].reshape(outputs, inputs))
@@ -366,12 +381,14 @@ def _unpacked(mode: Mode, x: RealArray) -> tuple[complex, ComplexArray, list[Com
     fixed = _largest(mode)
     c, b = values[:outputs], np.insert(values[outputs:], fixed, 1.0)
     for turn in turns:
-        slopes += [turn * np.outer(np.eye(outputs)[k], b) for k in range(outputs)]
-        slopes += [turn * np.outer(c, np.eye(inputs)[k]) for k in range(inputs) if k != fixed]
-    return complex(pole), np.outer(c, b), slopes
+        slopes += [np.asarray(turn * np.outer(np.eye(outputs)[k], b)) for k in range(outputs)]
+        others = (k for k in range(inputs) if k != fixed)
+        slopes += [np.asarray(turn * np.outer(c, np.eye(inputs)[k])) for k in others]
+    return complex(pole), np.asarray(np.outer(c, b)), slopes
 
 
 def _pole_steps(mode: Mode, pole: complex) -> list[complex]:
-    """Change of the pole with log decay, and with its angle."""
+    """Change of the pole with its log decay, and with the logistic number of its angle."""
     decay = pole * np.log(abs(pole)) if pole else 0j
-    return [decay, 1j * pole] if mode.is_pair else [decay]
+    angle = np.angle(pole)
+    return [decay, 1j * pole * angle * (1 - angle / np.pi)] if mode.is_pair else [decay]

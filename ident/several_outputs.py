@@ -53,7 +53,11 @@ class _Found(NamedTuple):
 
 
 def identify_mimo(
-    records: Sequence[Record], options: IdentOptions | None = None, *, progress: Progress | None = None
+    records: Sequence[Record],
+    options: IdentOptions | None = None,
+    *,
+    free_shapes: bool = False,
+    progress: Progress | None = None,
 ) -> MimoIdentification:
     """Fit one model with shared poles to all inputs and outputs of all records together.
 
@@ -63,6 +67,7 @@ def identify_mimo(
     options : IdentOptions
         As for `identify`, the same for every channel: integrators (at most one in a row; each joint has its
         own), delay and direct terms. A relative degree is refused, and what you know is not tested.
+    free_shapes : leave every residue free, instead of giving modes one shape where the records let them
     progress : callable, optional. Called with a fraction 0..1 and a short message.
 
     Raises ValueError, one line, if a record cannot be used: an output that stands still or is another one
@@ -78,8 +83,8 @@ def identify_mimo(
         )
     if options.integrators > 1:
         raise ValueError(
-            f"integrators = {options.integrators}: with several outputs at most one in a row; joints that turn "
-            "freely have one each, which is integrators = 1"
+            f"integrators = {options.integrators}: with several outputs at most one in a row; joints that "
+            "turn freely have one each, which is integrators = 1"
         )
     report = progress or silent
     _refuse_outputs(records, options)
@@ -87,8 +92,7 @@ def identify_mimo(
     start: Poles | None = None
     for turn in range(_ROUNDS):
         share = partial(_part, report, turn)
-        here = whitened(records, white)
-        found = _searched(here, options, share, start)
+        found = _searched(whitened(records, white), options, share, start)
         data, start = found.search.data, found.end.poles
         residual = data.residual(found.end.poles).reshape(len(data.each), -1)
         spare = 1 - data.n_parameters(found.end.poles.order) / data.n_samples
@@ -98,7 +102,7 @@ def identify_mimo(
             break
         white = refined
     report(0.95, "one shape for every mode")
-    return _described(records, here, white, found, options)
+    return _described(records, white, found, options, free_shapes=free_shapes)
 
 
 def _part(report: Progress, turn: int, fraction: float, message: str) -> None:
@@ -115,8 +119,8 @@ def _refuse_outputs(records: Sequence[Record], options: IdentOptions) -> None:
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     if np.linalg.eigvalsh(rows @ rows.T)[0] <= 1e-12:
         raise ValueError(
-            f"{records[0].label}: the outputs {list(records[0].output_names)} are linearly dependent (the same "
-            "sensor twice?); leave out what others tell"
+            f"{records[0].label}: the outputs {list(records[0].output_names)} are linearly dependent (the "
+            "same sensor twice?); leave out what others tell"
         )
 
 
@@ -130,7 +134,9 @@ def _searched(
         structure = replace(structure, estimate_initial_state=True)
     search = PoleSearch(prepare_outputs(part, structure), options)
     selection = OrderSelection(search, report)
-    end = selection.with_real(selection.run(None if start is None else search.descend(start, "other weights")))
+    end = selection.with_real(
+        selection.run(None if start is None else search.descend(start, "other weights"))
+    )
     verdicts: tuple[Finding, ...] = ()
     if options.estimate_initial_state == "auto" and not in_mid_record and end.poles.order:
         free = PoleSearch(prepare_outputs(part, replace(structure, estimate_initial_state=True)), options)
@@ -141,7 +147,7 @@ def _searched(
             search, selection = free, OrderSelection(free, report)
             end = selection.with_real(selection.run(other))
             structure = free.data.structure
-    if part is not records and len(part) < len(records) or in_mid_record:
+    if (part is not records and len(part) < len(records)) or in_mid_record:
         everything = PoleSearch(prepare_outputs(records, structure), options)
         end = everything.descend(end.poles, "final polish")
         everything.minima[:0] = search.minima
@@ -162,11 +168,7 @@ def _initial_state_test(
 
 
 def _described(
-    records: Sequence[Record],
-    here: Sequence[Record],
-    white: RealArray,
-    found: _Found,
-    options: IdentOptions,
+    records: Sequence[Record], white: RealArray, found: _Found, options: IdentOptions, *, free_shapes: bool
 ) -> MimoIdentification:
     """The model in the outputs' units, modes with one shape each where the records let them."""
     search, data = found.search, found.search.data
@@ -183,28 +185,24 @@ def _described(
     def chance(rss: float, saved: int) -> float:
         return float(chi2.sf(max(rss - free, 0.0) / noise_power * worth, saved))
 
-    shaped = one_shape_each(
-        data, poles, coefficients, direct,
-        n_fixed=search.fixed.counts, refused=lambda rss, saved: chance(rss, saved) < _LEVEL,
-    )  # fmt: skip
+    def refused(rss: float, saved: int) -> bool:
+        return chance(rss, saved) < _LEVEL
+
+    given = data, poles, coefficients, direct
+    shaped = None if free_shapes else one_shape_each(*given, n_fixed=search.fixed.counts, refused=refused)
     if shaped is not None:
         poles, coefficients, direct = shaped.poles, shaped.coefficients, shaped.direct
         residual, rss, unknowns = shaped.residual, shaped.rss, unknowns - shaped.saved
     back = np.linalg.inv(white)
-    model = _model(records[0], data.structure, poles, options, _mixed(back, coefficients), back @ direct)
+    own_units = np.einsum("xy,yub->xub", back, coefficients), back @ direct
+    model = _model(records[0], data.structure, poles, options, *own_units)
     noise = residual @ residual.T / (residual.shape[1] * (1 - unknowns / data.n_samples))
-    own = back @ residual
-    segments = data.each[0].segments
+    own, segments = back @ residual, data.each[0].segments
     measured = np.stack([one.y for one in prepare_outputs(records, data.structure).each])
-    by_output = np.array(
-        [
-            [
-                100 * (1 - np.linalg.norm(own[k, part]) / np.linalg.norm(y[part] - y[part].mean()))
-                for k, y in enumerate(measured)
-            ]
-            for part in segments
-        ]
-    )
+    fits_percent = [
+        [_fit_percent(own[k, part], y[part]) for k, y in enumerate(measured)] for part in segments
+    ]
+    by_output = np.array(fits_percent)
     return MimoIdentification(
         model=model,
         noise_covariance=back @ noise @ back.T,
@@ -228,8 +226,8 @@ def _described(
     )
 
 
-def _mixed(back: RealArray, coefficients: RealArray) -> RealArray:
-    return np.asarray(np.einsum("xy,yub->xub", back, coefficients))
+def _fit_percent(residual: RealArray, y: RealArray) -> float:
+    return float(100 * (1 - np.linalg.norm(residual) / np.linalg.norm(y - y.mean())))
 
 
 def _model(
@@ -257,9 +255,7 @@ def _model(
     )
 
 
-def _advice(
-    search: PoleSearch[OutputRegressions], model: MimoModel, residual: RealArray
-) -> list[Finding]:
+def _advice(search: PoleSearch[OutputRegressions], model: MimoModel, residual: RealArray) -> list[Finding]:
     data, found = search.data, pole_warnings(model.outputs[0], search.fixed, search.bounds)
     if model.order:
         for one, rest in zip(data.each, residual, strict=True):

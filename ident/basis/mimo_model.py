@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from ident.basis.functions import basis_response, basis_state_space
 from ident.basis.model import MisoModel
@@ -31,7 +32,7 @@ class Residues(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MimoModel:
-    """Y outputs of U inputs: `outputs` are the `MisoModel` of each, with the same poles, inputs and structure.
+    """Y outputs of U inputs: `outputs` are the `MisoModel` of each, with the same poles and structure.
 
     Raises ValueError if they differ in anything but their coefficients and names, a name repeats, or there
     are unstable poles.
@@ -124,9 +125,14 @@ class MimoModel:
 
         A pair whose residue has rank one has two states, whatever the numbers of inputs and outputs; an
         integrator as many as its residue has rank. The delay has a state per sample and input, or output
-        where there are fewer. Raises ValueError as `residues`.
+        where there are fewer. Without residues, every output has states of its own.
         """
-        found = self.residues()
+        try:
+            found = self.residues()
+        except ValueError:  # every output by itself
+            each = zip(*(one.state_space() for one in self.outputs), strict=True)
+            a_each, b_each, c_each, d_each = each
+            return block_diag(*a_each), np.vstack(b_each), block_diag(*c_each), np.vstack(d_each)
         blocks: list[tuple[RealArray, RealArray, RealArray]] = []
         for pole, residue in [(1.0 + 0j, found.at_one + 0j), *zip(found.poles, found.pole, strict=True)]:
             left, sizes, right = np.linalg.svd(residue)

@@ -1,4 +1,4 @@
-"""Records of several outputs made ready for one fit: the poles are shared, the coefficients every output's own.
+"""Records of several outputs made ready for one fit: poles are shared, coefficients are every output's own.
 
 For given poles all outputs have the same regressors, so the best coefficients are those of each output by
 itself and the cost is the sum of theirs. That is the likelihood where the noises of the outputs are

@@ -102,8 +102,8 @@ class OrderSelection:
         return best
 
     def with_real(self, best: Refined) -> Refined:
-        """Pairs without any overshoot as one real pole or two, as long as the criterion falls: what grows pair
-        by pair makes real poles of them."""
+        """Pairs without any overshoot as one real pole or two, as long as the criterion falls: what grows
+        pair by pair makes such pairs of real poles."""
         while self.options.n_real is None and self.options.n_pairs is None:
             fixed, poles = self.search.fixed.pairs.size, best.poles
             trials = []

@@ -2,10 +2,10 @@
 
 To first order the error of the response is G - G0 = K(w) n with n of unit normals, from the Gauss-Newton
 covariance of poles, shapes and free residues. With free residues at given poles its covariance would be
-(noise covariance) x (input covariance P) exactly, so that G = G0 + Lo D Li with Lo Lo^H the noise covariance,
-Li^H Li = P and D of independent complex normals. Poles, which all channels share, and shapes add terms that
-are no such product. Lo stays, P is the mean over whitened outputs, and the ball |D|_F <= radius is as large as
-holds G with the asked probability: the quantile of a sum of weighted squares.
+(noise covariance) x (input covariance P) exactly, so that G = G0 + Lo D Li with Lo Lo^H the noise
+covariance, Li^H Li = P and D of independent complex normals. Poles, which all channels share, and shapes add
+terms that are no such product. Lo stays, P is the mean over whitened outputs, and the ball |D|_F <= radius is
+as large as holds G with the asked probability: the quantile of a sum of weighted squares.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.stats import chi2
 
 from ident.basis.structure import front_response
-import numpy.typing as npt
 from ident.data.arrays import ComplexArray, RealArray, lock
 from ident.data.record import Record
 from ident.fit.several_outputs import prepare_outputs, whitened
@@ -31,8 +31,8 @@ _DRAWS = 20_000  # of the sum of squares: its 95 % quantile then is right to abo
 class MatrixUncertainty:
     """|Lo^-1 (G - G0) Li^-1|_F <= radius at every frequency.
 
-    omega_rad_s (F,), centre (F, Y, U), output_factor Lo (Y, Y) in units of the outputs, input_factor Li (F, U,
-    U), radius (F,), dt_s, level: probability of holding the response, frequency by frequency.
+    omega_rad_s (F,), centre (F, Y, U), output_factor Lo (Y, Y) in units of the outputs, input_factor Li
+    (F, U, U), radius (F,), dt_s, level: probability of holding the response, frequency by frequency.
     """
 
     omega_rad_s: RealArray
@@ -73,19 +73,19 @@ def matrix_uncertainty(
 ) -> MatrixUncertainty:
     """Balls of the matrix response at omega (F,), up to pi/dt (above 0 with integrators).
 
-    records, identification: of `identify_mimo`. First order in the noise, which is taken as white in time, and
-    for the order and the shapes that were chosen: nothing is added for modes that the records did not show.
-    Raises ValueError if the records are not those of the identification, or poles repeat.
+    records, identification: of `identify_mimo`. First order in the noise, which is taken as white in time,
+    and for the order and the shapes that were chosen: nothing is added for modes that the records did not
+    show. Raises ValueError if the records are not those of the identification, or poles repeat.
     """
     model, structure = identification.model, identification.structure
-    factor = np.linalg.cholesky(identification.noise_covariance)
-    white = np.linalg.inv(factor)
+    factor: RealArray = np.linalg.cholesky(identification.noise_covariance).astype(np.float64)
+    white: RealArray = np.linalg.inv(factor).astype(np.float64)
     data = prepare_outputs(whitened(records, white), structure)
     rows = sum(len(part) for part in identification.residuals)
     if data.each[0].n_samples != rows:
         raise ValueError(
-            f"the records have {data.each[0].n_samples} rows, the identification {rows}: expected the records "
-            "it was made from"
+            f"the records have {data.each[0].n_samples} rows, the identification {rows}: expected the "
+            "records it was made from"
         )
     own = np.einsum("xy,yub->xub", white, model.coefficients)
     modes = modes_of(model.poles, own, identification.n_fixed, identification.rank_one or None)
@@ -100,5 +100,5 @@ def matrix_uncertainty(
     both = np.concatenate([flat.real, flat.imag], axis=1)
     weights = np.linalg.svd(both, compute_uv=False) ** 2
     squares = np.random.default_rng(0).standard_normal((_DRAWS, weights.shape[1])) ** 2
-    radius = np.sqrt(np.quantile(squares @ weights.T, level, axis=0))
+    radius: RealArray = np.sqrt(np.quantile(squares @ weights.T, level, axis=0)).astype(np.float64)
     return MatrixUncertainty(omega, model.frequency_response(omega), factor, upper, radius, model.dt_s, level)
