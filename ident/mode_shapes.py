@@ -197,7 +197,10 @@ class ModalFit:
     def covariance_factor(self) -> RealArray:
         """S (P, P'), S S^T the covariance of all free numbers to first order, noise of one: the modes', then
         of every output the coefficients of the linear columns."""
+        factor = _inverse_factor(self._jacobian)
         n_outputs, n_free = self.y.shape[0], len(self.free)
+        if not n_free:
+            return factor
         poles = [pole for pole, _ in self.found()]
         columns = np.zeros((n_outputs * n_free, *self.y.shape))
         for k in range(n_outputs):
@@ -206,14 +209,11 @@ class ModalFit:
         self.data.each[0].take_out_local(self._local_q(poles), rows)
         linear = rows.reshape(n_outputs * n_free, -1).T
         # The modes' columns off the linear ones: what is left of these is independent of them.
-        mixed = np.linalg.lstsq(linear, self._slopes(poles), rcond=None)[0] if n_free else None
-        factor = _inverse_factor(self._jacobian)
-        if mixed is None:
-            return factor
+        mixed = np.linalg.lstsq(linear, self._slopes(), rcond=None)[0]
         own = _inverse_factor(linear)
         return np.block([[factor, np.zeros((len(factor), own.shape[1]))], [mixed @ factor, own]])
 
-    def _slopes(self, poles: list[complex]) -> RealArray:
+    def _slopes(self) -> RealArray:
         """The Jacobian of the residual off the nuisances only, (Y N, P): minus what the model moves by."""
         return self._linearised(self.x, linear=False)[1]
 
