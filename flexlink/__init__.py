@@ -7,8 +7,9 @@ Names are imported at first use, so `import flexlink` is fast. A result prints a
 it, `to_control()` converts it for python-control. Long computations use one BLAS thread, as the commands do.
 
 Data        `Record`, `FrfRepeats`, `FrequencyUncertainty`, `band_limited`, `empirical_frf`
-Models      `identify`, `identify_frf`, `identify_miso`, `uncertainty`, `GobfModel`, `Poles`, `IdentOptions`,
-            `EmbeddingOptions`, `Identification`, `Uncertainty`, `pole_intervals`, `error_surface`
+Models      `identify`, `identify_frf`, `identify_miso`, `identify_mimo`, `uncertainty`, `matrix_uncertainty`,
+            `GobfModel`, `Poles`, `IdentOptions`, `EmbeddingOptions`, `Identification`, `Uncertainty`,
+            `pole_intervals`, `error_surface`
 Basis       `regressor`, `basis_response`
 Controllers `UncertainPlant`, `Specification`, `RationalWeight`, `synthesise`, `SynthesisOptions`, `certify`,
             `Certificate`, `Controller`, `simulate_loop`, `step_metrics`, `c_source`,

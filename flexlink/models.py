@@ -28,7 +28,9 @@ from ident.frequency_fit import identify_frf
 from ident.identification import Identification as Identified
 from ident.one_input import identify as identify_records, identify_miso
 from ident.search.error_surface import ErrorSurface, error_surface as surface_of
+from ident.several_outputs import identify_mimo
 from ident.uncertainty.embedding import tangent
+from ident.uncertainty.matrix_response import matrix_uncertainty
 from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals
 from plant.rig import one_line
@@ -49,7 +51,9 @@ __all__ = [
     "error_surface",
     "identify",
     "identify_frf",
+    "identify_mimo",
     "identify_miso",
+    "matrix_uncertainty",
     "pole_intervals",
     "regressor",
     "uncertainty",

@@ -3,14 +3,15 @@
 A mode of a structure moves all sensors in one proportion and takes from all motors in one: its residue is
 c b. With free residues n poles make a model of up to n min(Y, U) states, and what they have too many of is
 noise. The likelihood ratio of both fits is chi-squared, with (Y - 1)(U - 1) degrees for a real pole and twice
-as many for a pair; modes that the records refuse as one, the worst first, keep free residues (two modes that
-lie together are such a case, or an input that does not act on the structure at all).
+as many for a pair. Mode after mode is tried, those nearest to one shape first; what the records refuse
+keeps a free residue: two modes that lie together, or an input that acts past the structure.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -23,6 +24,9 @@ from ident.fit.least_squares import project
 from ident.fit.several_outputs import OutputRegressions
 
 _MOST_EVALUATIONS = 40
+_ENOUGH = (
+    1e-7  # relative change of the residual's power: a thousandth of a degree of freedom in 10 000 samples
+)
 _LOG_DECAY = -25.0, 6.0  # of a sample: poles stay inside the circle, and off zero
 Refused = Callable[[float, int], bool]
 
@@ -81,16 +85,26 @@ def one_shape_each(
         modes = modes_of(poles, coefficients, n_fixed)
     except ValueError:
         return None
-    while any(mode.rank_one for mode in modes):
-        problem = ModalFit(data, modes)
+    modes = [replace(mode, rank_one=False) for mode in modes]
+    best = ModalFit(data, modes)
+    for k in np.argsort([_second_size(mode, best.sizes(mode)) for mode in modes]):
+        trial = [
+            replace(mode, rank_one=mode.rank_one or at == int(k))
+            for at, mode in enumerate(best.modes_found())
+        ]
+        problem = ModalFit(data, trial)
         problem.solve()
-        saved = sum(mode.saved() for mode in modes)
-        if not refused(problem.rss, saved):
-            return problem.shaped(poles, n_fixed)
-        gains = [problem.gain_of_freeing(k) if mode.rank_one else -1.0 for k, mode in enumerate(modes)]
-        worst = int(np.argmax(gains))
-        modes[worst] = replace(modes[worst], rank_one=False)
-    return None
+        if not refused(problem.rss, sum(mode.saved() for mode in trial)):
+            best = problem
+    if not any(mode.rank_one for mode in best.modes):
+        return None
+    return best.shaped(poles)
+
+
+def _second_size(mode: Mode, sizes: RealArray) -> float:
+    """Second singular value of a residue over its first, inputs weighed by how much they drive it."""
+    values = np.linalg.svd(mode.residue * sizes, compute_uv=False)
+    return float(values[1] / max(values[0], 1e-300))
 
 
 def modes_of(
@@ -120,7 +134,7 @@ class ModalFit:
         free = [self._filtered(0.0, self.u)] if self.structure.integrators else []
         free += [self.u] if self.structure.feedthrough else []
         self.free = np.real(np.concatenate(free)) if free else np.zeros((0, first.n_samples))
-        self._set(np.concatenate([_start(mode, self._sizes(mode)) for mode in self.modes]))
+        self._set(np.concatenate([_start(mode, self.sizes(mode)) for mode in self.modes]))
 
     def _set(self, x: RealArray) -> None:
         self.x = x
@@ -138,19 +152,24 @@ class ModalFit:
 
     def solve(self) -> None:
         """Levenberg and Marquardt from where the modes are."""
+        last: list[tuple[RealArray, tuple[RealArray, RealArray]]] = []
+
+        def both(x: RealArray) -> tuple[RealArray, RealArray]:
+            if not (last and np.array_equal(last[-1][0], x)):
+                last[:] = [(x.copy(), self._linearised(x))]
+            return last[-1][1]
 
         def residual(x: RealArray) -> RealArray:
-            return self._linearised(x)[0]
+            return both(x)[0]
 
         def jacobian(x: RealArray) -> RealArray:
-            return self._linearised(x)[1]
+            return both(x)[1]
 
-        found = least_squares(
-            residual, self.x, jacobian, method="lm", x_scale="jac", max_nfev=_MOST_EVALUATIONS
-        )
+        given: dict[str, Any] = {"method": "lm", "x_scale": "jac", "max_nfev": _MOST_EVALUATIONS}
+        found = least_squares(residual, self.x, jacobian, ftol=_ENOUGH, xtol=_ENOUGH, **given)
         self._set(found.x)
 
-    def _sizes(self, mode: Mode) -> RealArray:
+    def sizes(self, mode: Mode) -> RealArray:
         """How much each input drives a mode, (U,): by that a residue's columns are weighed."""
         return np.asarray(np.linalg.norm(self._filtered(mode.pole, self.u), axis=1))
 
@@ -258,27 +277,11 @@ class ModalFit:
         """Pole and residue (Y, U) of every mode."""
         return [both for _, both, _ in self._unpacked()]
 
-    def gain_of_freeing(self, index: int) -> float:
-        """How much less a free residue of one mode would leave, to first order."""
-        mode, (pole, _) = self.modes[index], self.found()[index]
-        state = self._filtered(pole, self.u)
-        n_outputs = self.y.shape[0]
-        turns = (1.0, 1j) if mode.is_pair else (1.0,)
-        columns = []
-        for k in range(n_outputs):
-            for row in state:
-                for turn in turns:
-                    column = np.zeros_like(self.y)
-                    column[k] = _shown(turn * row[None], mode)[0]
-                    columns.append(column)
-        rows = np.array(columns).reshape(-1, self.y.shape[1])
-        self._take_out(rows, [pole])
-        both = np.hstack([self._jacobian, rows.reshape(len(columns), -1).T])
-        q = np.linalg.qr(both / np.maximum(np.linalg.norm(both, axis=0), 1e-300))[0]
-        inside = q.T @ self.residual.ravel()
-        return float(inside @ inside)
+    def modes_found(self) -> list[Mode]:
+        """The modes as they are now."""
+        return [replace(mode, pole=pole, residue=residue) for mode, (pole, residue), _ in self._unpacked()]
 
-    def shaped(self, before: Poles, n_fixed: tuple[int, int]) -> Shaped:
+    def shaped(self, before: Poles) -> Shaped:
         """Coefficients on the basis of the poles as they are now."""
         found = self.found()
         zeros = np.zeros(int(np.sum(before.real == 0)))

@@ -23,6 +23,8 @@ _EXCHANGES = 4
 _LIKELIER = 2.0
 # Damping ratio above which a pair does what real poles do, and how far apart two of them begin.
 _NO_OVERSHOOT, _APART = 0.9, 1.5
+# Real poles have met if their decays differ by less than this share.
+_MET = 1e-4
 
 
 def silent(fraction: float, message: str) -> None:
@@ -123,7 +125,26 @@ class OrderSelection:
             if not criterion(chosen.rss, chosen.poles.order) < criterion(best.rss, best.poles.order):
                 break
             best = self.pruned(chosen)
-        return best
+        return self._apart(best)
+
+    def _apart(self, best: Refined) -> Refined:
+        """Without real poles that have met: a descent does not part them, and they have no residue each. One
+        in place of two, or both from further apart, whichever fits better."""
+        first = self.search.fixed.real.size
+        real = best.poles.real[first:]
+        order = np.argsort(real)
+        met = np.flatnonzero(np.diff(real[order]) <= _MET * (1 - real[order][1:]))
+        if not met.size or self.options.n_real is not None:
+            return best
+        slow, fast = first + order[met[0] + 1], first + order[met[0]]
+        one = best.poles.without_real(max(slow, fast)).without_real(min(slow, fast))
+        decay = -np.log(best.poles.real[slow])
+        trials = [
+            one.appended(Poles(np.exp(-decay * np.array(apart)))) for apart in ([1.0], [1 / _APART, _APART])
+        ]
+        ends = [self._noted(self.search.descend(trial, "real poles apart")) for trial in trials]
+        criterion = self._criterion(best)
+        return min(ends, key=lambda end: criterion(end.rss, end.poles.order))
 
     def table(self, best: Refined) -> tuple[OrderStep, ...]:
         """Everything that was tried, by order, judged by the residual of the chosen model."""
