@@ -21,7 +21,7 @@ from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
 from diagnosis.fit.starts import Point, beside, point_at, superposed
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.search.loop import Progress, SearchLoop
-from diagnosis.search.moves import Alone, Beside, Enlarge, InPlaceOf, LookAlike
+from diagnosis.search.moves import Alone, Beside, Enlarge, FromPoints, InPlaceOf, LookAlike
 from plant.effects.search_space import Candidate
 
 # An effect that changes no record by more than this many noise deviations (RMS) is not looked for: alone, and
@@ -70,7 +70,8 @@ class WhiteSearch(SearchLoop[Hypothesis]):
     def run(self) -> None:
         """The nominal, every effect alone, and sets of effects as long as they gain."""
         self.add(fitted_to(self.records, (), np.zeros(0), np.zeros(self.records.nominal.count)))
-        self.tried(Alone.proposed(self), 0.05, 0.4)
+        self.tried(Alone.proposed(self), 0.05, 0.1)
+        self.tried(FromPoints.proposed(self), 0.15, 0.3)
         self.finish()
         self.tried(Enlarge.proposed(self, self.found), 0.5)
         self.tried(InPlaceOf.proposed(self, self.base.end), 0.55)

@@ -7,7 +7,7 @@ squares). Derivatives by difference quotients; those by starts from the linear p
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -32,8 +32,9 @@ _FAR = np.array([-3.0, -2.0, -1.2, -0.6, -0.25, -0.08, 0.08, 0.25, 0.6, 1.2, 2.0
 _HOPELESS = 5.0
 # To an end, along flat valleys too.
 FINE: dict[str, Any] = {"iterations": 40, "tolerance": 0.02}
-# The Jacobian by the deviations, of the nominal or of a point nearby, is renewed at every third iteration.
-_AGAIN = 3
+# The Jacobian by the deviations, of the nominal or of a point nearby, is renewed at every third iteration,
+# where one simulation along all of them together differs from it by more than this share.
+_AGAIN, _AS_BEFORE = 3, 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +189,10 @@ def descend(
     damping, converged = 1e-3, False
     by_effects = np.zeros((e.size, A))
     for iteration in range(iterations):
-        if nominal_jacobian is None or iteration % _AGAIN == _AGAIN - 1:
+        if nominal_jacobian is None or (
+            iteration % _AGAIN == _AGAIN - 1
+            and _moved_on(nominal_jacobian, lambda d: left(d, x, start), d, e, deviation_step)  # noqa: B023
+        ):
             step = np.full(P, deviation_step)
             nominal_jacobian = quotients(lambda d: left(d, x, start), d, e, step)  # noqa: B023
         if columns is None or iteration == _AGAIN - 1:
@@ -230,6 +234,18 @@ def descend(
     jacobian = np.column_stack([nominal_jacobian, by_effects])
     weights = records.likelihood.weights(e)
     return Descent(tuple(candidates), d, x, start, e, weights, jacobian, columns, loss, prior, converged)
+
+
+def _moved_on(jacobian: Real, function: Callable[[Real], Real], at: Real, start: Real, step: float) -> bool:
+    """Whether derivatives (N, P) of a function (P,) -> (N,) are others at a point: along a direction of
+    random signs in which every column counts alike, so that the difference is the mean of theirs."""
+    sizes = np.linalg.norm(jacobian, axis=0)
+    if at.size < _AGAIN or step != _DEVIATION_STEP or not np.any(sizes):
+        return True
+    v = np.random.default_rng(0).choice([-1.0, 1.0], at.size) / np.maximum(sizes, 1e-2 * np.max(sizes))
+    v *= step / np.max(np.abs(v))
+    missed = function(at + v) - start - jacobian @ v
+    return bool(np.linalg.norm(missed) > _AS_BEFORE * np.linalg.norm(v * sizes))
 
 
 def steps_of(candidates: Sequence[Candidate]) -> tuple[float, Real]:

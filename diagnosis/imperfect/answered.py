@@ -135,10 +135,14 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
 
 
 def _kept(search: Search, whole: judging.Judged, accepted: Iterable[str]) -> Explanation:
-    """A set without what is not accepted and carries next to nothing, fitted to its end."""
+    """A set without what is not accepted and carries next to nothing, fitted to its end.
+
+    Nor is kept what stands at an end of its range: a size that is no answer, and moves those that are.
+    """
     least = _LEAST_KEPT * search.case.machine.weighing.model_error
-    shares, accepted = {part.name: part.share for part in whole.parts}, set(accepted)
-    kept = [n for n in whole.explanation.names if n in accepted or shares.get(n, 0.0) > least]
+    accepted = set(accepted)
+    small = {part.name for part in whole.parts if part.share > least and part.by_name < 1}
+    kept = [n for n in whole.explanation.names if n in accepted | small]
     if judging.late(search):
         return whole.explanation
     return search.finished(search.by_these(kept, whole.explanation))

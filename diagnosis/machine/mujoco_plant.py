@@ -68,6 +68,8 @@ _FORCED = 0.05
 # Of the rate at which an inverted joint falls.
 _HELD = 1.5
 _KEPT, _KEPT_PATHS = 8, 60
+# By how much slopes of the stated model may miss what a start does in another one; starts that are simulated.
+_OF_SLOPES, _RESTARTS = 0.3, 2
 # Samples of a parabola whose begin is a start; it is off by more than noise from so many deviations on.
 _SMOOTHED_FROM, _AS_NOISE = (4, 5, 7, 9, 12, 16, 21, 28), 2.0
 _UNITS = {"hinge": ("Nm", "rad", "kg_m2"), "slide": ("N", "m", "kg")}
@@ -552,7 +554,9 @@ class MujocoArm:
             self.dt_s,
             inactive={**self._untried(every), **dict.fromkeys(silent, "records in which it shows")},
             settled=simulation.settled,
-            untracked=Simulation(replace(self, tracking_rad_s=0.0), every, noise, _starts=simulation._starts),
+            untracked=Simulation(
+                replace(self, tracking_rad_s=0.0), every, noise, False, _starts=simulation._starts
+            ),
         )
 
     def _untried(self, every: Mapping[str, Quantity]) -> dict[str, str]:
@@ -566,11 +570,12 @@ class MujocoArm:
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """parameters, effects, inputs (T, U + Y) -> outputs (T, Y)."""
+    """parameters, effects, inputs (T, U + Y) -> outputs (T, Y). settles : they are meant for `settled`."""
 
     arm: MujocoArm
     quantities: Mapping[str, Quantity]
     noise: Real
+    settles: bool = True
     _models: dict[Any, tuple[Any, Any]] = field(default_factory=dict, repr=False)
     _paths: dict[Any, tuple[Real, Real]] = field(default_factory=dict, repr=False)
     _starts: dict[Any, _Start] = field(default_factory=dict, repr=False)
@@ -587,8 +592,23 @@ class Simulation:
     ) -> Real:
         values = {**parameters, **{name: next(iter(size.values())) for name, size in effects.items()}}
         changed = {k: v for k, v in values.items() if v != self.quantities[k].value}
-        model = self._model(changed)
-        return self._run(model, values, inputs, self._start(inputs).state)
+        model, start = self._model(changed), self._start(inputs)
+        found = self._run(model, values, inputs, start.state)
+        measured = inputs[:, len(self.arm.inputs) :]
+        if not (self.settles and start.state.size and np.all(np.isfinite(found))):
+            return found
+        # What `settled` adds is of the stated model: simulated where it may miss most of what is left.
+        moved = np.zeros(start.state.size)
+        for _ in range(_RESTARTS):
+            shift = start.shift(measured - found)
+            left = _rms(measured - found - start.adds(shift))
+            missed = _OF_SLOPES * _rms(start.adds(shift - moved)) / np.hypot(left, self.noise)
+            weight = float(np.clip(np.max(missed) - 1, 0.0, 1.0))
+            if weight == 0:
+                break
+            again = self._run(model, values, inputs, start.state + shift) - start.adds(shift)
+            found, moved = found + weight * (again - found), moved + weight * (shift - moved)
+        return found
 
     def _model(self, changed: Mapping[str, float]) -> tuple[Any, Any]:
         return _remembered(
@@ -686,7 +706,7 @@ class Simulation:
         if not start.state.size:
             return outputs
         shift = start.shift(inputs[:, len(self.arm.inputs) :] - outputs)
-        return np.asarray(outputs + np.tensordot(shift, start.slopes, 1))
+        return np.asarray(outputs + start.adds(shift))
 
 
 @dataclass(frozen=True, eq=False)
@@ -703,9 +723,13 @@ class _Start:
     slopes: Real
     noise: Real
 
+    def adds(self, shift: Real) -> Real:
+        """(T, Y) of the outputs by a move of the start, in the stated model and to first order."""
+        return np.asarray(np.tensordot(shift, self.slopes, 1))
+
     def shift(self, left: Real) -> Real:
         """(S,) by which the start moves that fits best where measured - model is left (T, Y)."""
-        level = np.sqrt(np.maximum(np.mean(left**2, axis=0), self.noise**2))
+        level = np.maximum(_rms(left), self.noise)
         A = (self.slopes / level).reshape(len(self.state), left.size)
         H = A @ A.T + np.diag(self.spread**-2.0)
         return np.asarray(
@@ -726,6 +750,11 @@ def _refuse_free_base(model: Any, output: str) -> None:
             f"the base {name!r} moves freely, and no log says where it is: take its <freejoint/> out if it "
             "was held; else give only logs of a held machine"
         )
+
+
+def _rms(signals: Real) -> Real:
+    """(T, Y) -> (Y,)"""
+    return np.asarray(np.sqrt(np.mean(signals**2, axis=0)))
 
 
 def _remembered(

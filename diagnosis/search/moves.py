@@ -14,7 +14,7 @@ from scipy.signal import find_peaks
 
 from diagnosis.fit.descent import Descent, best_following, descend, refined, scanned
 from diagnosis.fit.records import Records, Start
-from diagnosis.fit.starts import Point, beside, point_of, points_of
+from diagnosis.fit.starts import Point, beside, point_of, points_of, superposed
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.search.explanation import Weighed, best_of_sets
@@ -38,6 +38,11 @@ _ALIKE = 3
 _PULLED, _BEYOND_BELIEF = 1.8, 2.0
 # Fits in windows: effects tried beside the best, and sets of one and of two continued in free runs.
 _BESIDE_IN_WINDOWS, _FREED = 4, (2, 3)
+# Effects that are descended on alone.
+_DESCENDED = 36
+# Effects of which points are simulated beside a set: of more, those of which superposition leaves least. And
+# so many times as many as usual are fitted beside values that are pulled.
+_SIMULATED, _OF_PULLED = 24, 2
 # Frequencies tried beside others.
 _FREQUENCIES = 3
 # Loss that an effect beside others gains once all else has followed, or its set is not descended on; unless
@@ -52,7 +57,7 @@ _TOUCHING, _TOUCHING_ITERATIONS, _UNLIKELY = 2, 5, 150.0
 
 @dataclass(frozen=True, eq=False)
 class Alone(Move):
-    """An effect alone, from the best of its starts."""
+    """Where an effect alone may start."""
 
     candidate: Candidate
 
@@ -67,13 +72,33 @@ class Alone(Move):
         return [cls(candidate) for candidate in spaces if candidate.kind.contains is None]
 
     def apply(self, search: SearchLoop[Any]) -> None:
-        around = search.base.end
-        points = points_of(search.records, around, self.candidate)
+        points = points_of(search.records, search.base.end, self.candidate)
         if points:
             candidate, points = search.looked_for(self.candidate, points)
         if points:
             search.points.append((candidate, points))
-            search.rough.append((descended(search, around, candidate, points, around.jacobian), points))
+
+
+@dataclass(frozen=True, eq=False)
+class FromPoints(Move):
+    """An effect alone, from the best of its starts."""
+
+    candidate: Candidate
+    points: list[Point]
+
+    @property
+    def what(self) -> str:
+        return self.candidate.effect
+
+    @classmethod
+    def proposed(cls, search: SearchLoop[Any]) -> list[FromPoints]:
+        """Of many those whose starts leave least; the others are still tried beside these."""
+        return [cls(*one) for one in sorted(search.points, key=lambda one: one[1][0].loss)[:_DESCENDED]]
+
+    def apply(self, search: SearchLoop[Any]) -> None:
+        around = search.base.end
+        end = descended(search, around, self.candidate, self.points, around.jacobian)
+        search.rough.append((end, self.points))
 
 
 def descended(
@@ -190,7 +215,7 @@ class Beside(Move):
         chosen: dict[tuple[str, float], tuple[Candidate, Point]] = {}
         for candidate, point in trials:
             pulled = candidate.kind.multiplies is not None and np.any(np.abs(parent.deviations) > _PULLED)
-            if len(chosen) < self.most or pulled:
+            if len(chosen) < self.most * (_OF_PULLED if pulled else 1):
                 # Beside contacts that switch, and values pulled far, the one side may look better and the
                 # other be so.
                 side = candidate.axes[0].low if parent.non_smooth or pulled else 0.0
@@ -207,9 +232,14 @@ class Beside(Move):
     def _trials(self, search: SearchLoop[Any]) -> Iterator[tuple[Candidate, Point]]:
         """The best point of every candidate beside the parent."""
         held = {name for c in self.parent.candidates for name in (c.effect, c.kind.contains)} - {None}
-        for candidate, points in search.points:
-            if candidate.effect in held or candidate.kind.contains in held:
-                continue
+        listed = [(c, p) for c, p in search.points if not {c.effect, c.kind.contains} & held]
+        if len(listed) > _SIMULATED:
+
+            def left(one: tuple[Candidate, list[Point]]) -> float:
+                return min((p.loss for p in superposed(search.records, self.parent, one[1])), default=-np.inf)
+
+            listed = sorted(listed, key=left)[:_SIMULATED]
+        for candidate, points in listed:
             # A frequency, and a zero that no other output tells, may be any other beside another effect.
             anew = candidate.kind.harmonic is not None or _turned(search, candidate)
             candidate, near = search.looked_at_beside(self.parent, candidate, points[:1] if anew else points)

@@ -15,7 +15,17 @@ from diagnosis.fit.windows import Windows
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.search.explanation import Explanation
 from diagnosis.search.loop import DECISIVE, SUBSTANTIAL, Progress, SearchLoop
-from diagnosis.search.moves import FINISHED, Alone, Beside, Enlarge, FromContacts, InWindows, LookAlike, Scan
+from diagnosis.search.moves import (
+    FINISHED,
+    Alone,
+    Beside,
+    Enlarge,
+    FromContacts,
+    FromPoints,
+    InWindows,
+    LookAlike,
+    Scan,
+)
 from diagnosis.search.settled import settled
 from plant.effects.search_space import Candidate
 
@@ -71,7 +81,8 @@ class Search(SearchLoop[Explanation]):
         nothing = np.zeros(self.records.nominal.count)
         start, _ = settled(self.records, nothing, (), self.records.at_rest())
         self.add(descend(self.records, (), nothing, np.zeros(0), start, iterations=12))
-        self.tried(Alone.proposed(self), 0.05, 0.4)
+        self.tried(Alone.proposed(self), 0.05, 0.1)
+        self.tried(FromPoints.proposed(self), 0.15, 0.3)
         self.finish()
         self.tried(Enlarge.proposed(self, self.found), 0.45)
         for count in range(2, self.case.machine.weighing.most_effects + 1):

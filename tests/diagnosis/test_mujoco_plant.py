@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 
 import numpy as np
 import pytest
@@ -106,9 +107,34 @@ def test_the_true_model_leaves_the_noise_of_a_log_that_begins_in_motion(integrat
     plant = arm.plant(logs, np.full(2, noise))
     for log in logs:
         left = plant.simulator(())(log.input) - log.output
-        # What the tracking makes of the noise of the path is up to as much again.
-        assert np.max(np.sqrt(np.mean(left**2, axis=0))) < 2 * noise
+        # What the tracking makes of the noise of the path: more, the faster it is.
+        most = 1.5 if tracking_rad_s < 10 else 2.0
+        assert np.max(np.sqrt(np.mean(left**2, axis=0))) < most * noise
         assert np.std(log.output, axis=0).min() > 200 * noise
+
+
+@pytest.mark.parametrize("integrator", ["RK4", "implicitfast"])
+@pytest.mark.parametrize(
+    ("name", "stated", "factor"),
+    [
+        ("one.armature", 'armature="0.02"', 4.0),
+        ("one.damping", 'damping="0.3"', 4.0),
+        ("body1.mass", 'mass="1.2" diaginertia="0.01 0.01 0.01"', 1.5),
+    ],
+)
+def test_a_start_in_motion_is_fitted_with_the_values_that_are_tried(integrator, name, stated, factor):
+    """Far from the stated model, whose slopes alone leave up to 1.4 times the noise."""
+    noise, xml = 2e-4, two_links(integrator, 0.005)
+    true = re.sub(r"[\d.]+", lambda number: str(float(number[0]) * factor), stated)
+    logs = [in_motion(xml.replace(stated, true), noise, seed) for seed in range(2)]
+    arm = MujocoArm(mujoco.MjSpec.from_string(xml), ("one", "two"), DT_S, 9.0)
+    plant = arm.plant(logs, np.full(2, noise))
+    for log in logs:
+        stated_left, left = (
+            np.max(np.sqrt(np.mean((one.simulator(())(log.input) - log.output) ** 2, axis=0)))
+            for one in (plant, plant.scaled({name: factor}))
+        )
+        assert left < 1.2 * noise < 20 * noise < stated_left
 
 
 @pytest.mark.parametrize("kind", ["motor", "cart", "lag"])

@@ -99,9 +99,7 @@ def write_pendulum_log(
 @pytest.mark.parametrize(
     ("integrator", "load_kg", "friction_Nm"),
     [
-        pytest.param(
-            "implicitfast", 0.15, 0.12, marks=pytest.mark.xfail(reason="a gain is named for the load")
-        ),
+        ("implicitfast", 0.15, 0.12),
         ("RK4", 0.2, 0.0),
         ("implicit", 0.0, 0.1),
     ],
@@ -109,7 +107,8 @@ def write_pendulum_log(
 def test_a_load_and_friction_of_a_pendulum_without_a_site_are_found(
     tmp_path, flexlink, integrator, load_kg, friction_Nm
 ):
-    """A load, weight and the gain of the drive look alike: what is not ruled out is said to be open."""
+    """A load, weight and the gain of the drive look alike: what is not ruled out is said to be open. Friction
+    of 2 % of the motion is named, or in the repaired model as an effect below the threshold."""
     pytest.importorskip("mujoco")
     (tmp_path / "pend.xml").write_text(PENDULUM.format(integrator=integrator))
     arguments = ["--mjcf", str(tmp_path / "pend.xml")]
@@ -124,10 +123,11 @@ def test_a_load_and_friction_of_a_pendulum_without_a_site_are_found(
         if size == 0:
             assert found["probability"] < 0.5
             continue
-        assert found["probability"] > 0.2
         (low, high) = next(iter(found["intervals"].values()))
         assert low <= size <= high
-        if name not in case["combination"]:
+        if name not in case["shares"]["small"]:
+            assert found["probability"] > 0.2
+        if name not in (*case["combination"], *case["shares"]["small"]):
             assert name in case["ambiguous_with"]
     wrong = {*case["combination"]} - {name for name, size in sizes.items() if size}
     assert not wrong or case["probability"] < 0.8

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import re
 import runpy
 import warnings
@@ -26,11 +27,13 @@ from ident.data.roles import time_of
 from ident.data.table import Table
 from ident.data.time_grid import TimeGrid, sampling_time
 from ident.data.units import written_unit
+from plant.effects.search_space import geometric
 from workflow.config.settings import Section, check
 from workflow.diagnose.case_settings import CaseName, Column, ColumnChoice
 from workflow.engine import storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import hash_of
+from workflow.text.formats import listing
 from workflow.text.names import unit_of
 
 _KINDS = ("mjcf", "fmu", "python")
@@ -65,6 +68,13 @@ class SimulatorSettings(Section):
         {}, description="output -> standard deviation; default: estimated"
     )
     tolerances: dict[str, PositiveFloat] = Field({}, description="parameter -> relative standard deviation")
+    candidates: tuple[str, ...] = Field(
+        ("*",), description="what may be wrong or missing, * for any part of a name; all else is as stated"
+    )
+    exclude: tuple[str, ...] = Field((), description="what is as stated all the same")
+    bounds: dict[str, tuple[PositiveFloat, PositiveFloat]] = Field(
+        {}, description="effect -> smallest and largest size, in its unit"
+    )
     model_error: float = Field(0.05, ge=0, lt=1, description="share of the motion that the model may miss")
     tracking_rad_s: float | None = Field(None, ge=0, description="MJCF: see docs/simulators.md; 0: free run")
     motion: Literal["position", "speed"] | None = Field(
@@ -144,6 +154,7 @@ def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) 
                 f"{', '.join(plant.parameters)}"
             )
         plant = replace(plant, tolerances={**plant.tolerances, **settings.tolerances})
+        plant = _chosen(plant, settings)
         case = PlantCase(name, plant, experiments)
     hashes = [storage.sha256_of_file(path) for path in (model, *paths)]
     return SimulatorCase(
@@ -152,6 +163,43 @@ def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) 
         hash_of({"settings": settings.model_dump(mode="json"), "files": hashes}),
         repaired,
         (settings, folder, source),
+    )
+
+
+def _chosen(plant: Plant, settings: SimulatorSettings) -> Plant:
+    """With the candidates that a case file leaves, each within its bounds; all else is as stated."""
+    there = [*(effect.name for effect in plant.effects), *plant.tolerances]
+    for key in ("candidates", "exclude"):
+        for pattern in getattr(settings, key):
+            if not fnmatch.filter(there, pattern):
+                raise ValueError(f"{key}: {pattern!r} matches nothing; there are {listing(there)}")
+
+    def taken(name: str) -> bool:
+        def within(patterns: Sequence[str]) -> bool:
+            return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
+
+        return within(settings.candidates) and not within(settings.exclude)
+
+    effects = {effect.name: effect for effect in plant.effects if taken(effect.name)}
+    for name, (low, high) in settings.bounds.items():
+        if name not in effects:
+            raise ValueError(
+                f"bounds: {name!r} is no effect that is tried; of a stated value give tolerances; there are "
+                f"{listing(list(effects))}"
+            )
+        size, *rest = effects[name].parameters
+        bounded = replace(size, low=low, high=high, starts=tuple(geometric(low, high, 8)[1:-1]))
+        effects[name] = replace(effects[name], parameters=(bounded, *rest))
+    left = {name: "the case file to allow it (candidates, exclude)" for name in there if not taken(name)}
+    tolerances = {name: value for name, value in plant.tolerances.items() if taken(name)}
+    return replace(
+        plant,
+        effects=tuple(effects.values()),
+        tolerances=tolerances,
+        inactive={
+            **plant.inactive,
+            **{f"wrong_{n}" if n in plant.tolerances else n: why for n, why in left.items()},
+        },
     )
 
 
