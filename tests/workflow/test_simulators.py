@@ -239,6 +239,39 @@ def test_a_name_that_two_things_have_is_asked_for(tmp_path, motor, hinge, sensor
     assert np.array_equal(first.output, rows[: len(first.output), measured])
 
 
+def test_candidates_are_chosen_excluded_and_bounded(tmp_path):
+    pytest.importorskip("mujoco")
+    (tmp_path / "arm.xml").write_text(HINGE)
+    write_log(tmp_path / "one.csv", 0, 0.1)
+
+    def plant_of(more: str):
+        settings = settings_of(tomllib.loads(f'mjcf = "arm.xml"\nlog = "one.csv"\n{more}'), "case.toml")
+        return load_simulator_case(settings, tmp_path, "case.toml").case.plant
+
+    every = plant_of("")
+    chosen = plant_of(
+        'candidates = ["hinge.*", "*.mass"]\nexclude = ["*.sensor_*", "hinge.backlash"]\n'
+        'bounds = {"hinge.frictionloss" = [0.05, 0.2]}'
+    )
+    assert [*chosen.tolerances] == ["hinge.damping", "hinge.armature", "rod.mass"]
+    assert [effect.name for effect in chosen.effects] == ["hinge.frictionloss", "hinge.stiffness"]
+    (friction,) = chosen.effects[0].parameters
+    assert (friction.low, friction.high) == (0.05, 0.2)
+    assert len(chosen.missing) + sum("candidates" in why for why in chosen.inactive.values()) == len(
+        every.missing
+    )
+    # What is left out keeps its stated value.
+    assert chosen.parameters == every.parameters
+    for more, complaint in (
+        ('candidates = ["elbow.*"]', "candidates: 'elbow.*' matches nothing"),
+        ('exclude = ["hinge.drag"]', "exclude: 'hinge.drag' matches nothing"),
+        ('bounds = {"rod.mass" = [0.5, 2.0]}', "bounds: 'rod.mass' is no effect that is tried"),
+        ('bounds = {"hinge.frictionloss" = [0.2, 0.1]}', "needs low < high; got 0.2 and 0.1"),
+    ):
+        with pytest.raises(InputError, match=re.escape(complaint)):
+            plant_of(more)
+
+
 def rewritten(path: Path, kind: str) -> str:
     """The same log as somebody else writes it; TOML that it needs."""
     rows = np.loadtxt(path, delimiter=",", skiprows=1)
