@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from workflow.config.settings import ModelT
     from workflow.console import TerminalProgress
-    from workflow.tasks.summary import RunSummary
+    from workflow.text.templates import RunSummary
 
 _MANIFESTS = ("manifest.json", "study.json", "diagnose.json", "blind.json")  # of what can be continued
 

@@ -20,7 +20,7 @@ from workflow.engine import interrupts, progress
 from workflow.engine.errors import printable
 
 if TYPE_CHECKING:
-    from workflow.tasks.summary import RunSummary
+    from workflow.text.templates import RunSummary
 
 
 FIRST_LINE_S, LINE_EVERY_S = 0.4, 10.0

@@ -595,8 +595,20 @@ class Simulation:
         model, start = self._model(changed), self._start(inputs)
         found = self._run(model, values, inputs, start.state)
         measured = inputs[:, len(self.arm.inputs) :]
-        if not (self.settles and start.state.size and np.all(np.isfinite(found))):
+        if not (self.settles and np.all(np.isfinite(found))):
             return found
+        # Commands before a record, of which a lag or delay that the model lacks still feels something.
+        before = inputs[0, : len(self.arm.inputs)].copy()
+        if late := self._late(model[0]):
+            spread = np.array([np.std(inputs[:, u]) or 1.0 for u in late])
+            moved_by = [
+                before + size * (np.arange(before.size) == u) for u, size in zip(late, spread, strict=True)
+            ]
+            runs = [self._run(model, values, inputs, start.state, one) for one in moved_by]
+            slopes = np.array([(run - found) / size for run, size in zip(runs, spread, strict=True)])
+            own = start.beside(spread, slopes).shift(measured - found)[start.state.size :]
+            before[late] += own
+            found = found + np.tensordot(own, slopes, 1)
         # What `settled` adds is of the stated model: simulated where it may miss most of what is left.
         moved = np.zeros(start.state.size)
         for _ in range(_RESTARTS):
@@ -606,7 +618,7 @@ class Simulation:
             weight = float(np.clip(np.max(missed) - 1, 0.0, 1.0))
             if weight == 0:
                 break
-            again = self._run(model, values, inputs, start.state + shift) - start.adds(shift)
+            again = self._run(model, values, inputs, start.state + shift, before) - start.adds(shift)
             found, moved = found + weight * (again - found), moved + weight * (shift - moved)
         return found
 
@@ -626,9 +638,27 @@ class Simulation:
         model = spec.compile()
         return model, mujoco.MjData(model)
 
-    def _run(self, compiled: tuple[Any, Any], values: Mapping[str, float], inputs: Real, start: Real) -> Real:
-        """start: (S,), see `_Start`."""
+    def _late(self, model: Any) -> list[int]:
+        """Actuators with a lag or delay that the stated model does not have."""
+        stated = self.arm.nominal
+        pairs = [(one.actuator_actadr >= 0, one.actuator_history[:, 0] > 0) for one in (model, stated)]
+        return [
+            u
+            for u in range(len(self.arm.inputs))
+            if any(now[u] > then[u] for now, then in zip(*pairs, strict=True))
+        ]
+
+    def _run(
+        self,
+        compiled: tuple[Any, Any],
+        values: Mapping[str, float],
+        inputs: Real,
+        start: Real,
+        before: Real | None = None,
+    ) -> Real:
+        """start: (S,), see `_Start`. before: (U,) commands before the first row; None: as in that."""
         arm, (model, data) = self.arm, compiled
+        before = inputs[0, : len(arm.inputs)] if before is None else before
         U, T = len(arm.inputs), len(inputs)
         h = model.opt.timestep
         steps = round(arm.dt_s / h)
@@ -646,12 +676,12 @@ class Simulation:
             if omega:
                 target = omega**2 * (path - offset[k]) + 2 * omega * speed
                 control[:, U + j] = inertia / gain[k] * target
-        _start_filters(model, data, inputs[0, :U])
+        _start_filters(model, data, before)
         data.act[model.actuator_actadr[list(arm.filtered)]] = start[2 * len(arm.tracked) :]
         for u in range(U):
             n = model.actuator_history[u, 0]
             if n:
-                mujoco.mj_initCtrlHistory(model, data, u, None, np.full((n, 1), inputs[0, u]))
+                mujoco.mj_initCtrlHistory(model, data, u, None, np.full((n, 1), before[u]))
         if model.nhistory:
             mujoco.mj_forward(model, data)
             for s in range(model.nsensor):
@@ -722,6 +752,17 @@ class _Start:
     spread: Real
     slopes: Real
     noise: Real
+
+    def beside(self, spread: Real, slopes: Real) -> _Start:
+        """With further states (L,) that are zero as far as anybody knows, slopes (L, T, Y)."""
+        nothing = np.zeros(spread.size)
+        return replace(
+            self,
+            state=np.append(self.state, nothing),
+            guess=np.append(self.guess, nothing),
+            spread=np.append(self.spread, spread),
+            slopes=np.concatenate([self.slopes, slopes]),
+        )
 
     def adds(self, shift: Real) -> Real:
         """(T, Y) of the outputs by a move of the start, in the stated model and to first order."""

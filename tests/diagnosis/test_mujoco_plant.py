@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -66,6 +67,11 @@ def test_tracking_leaves_a_machine_that_is_the_model_where_it_is(tracking_rad_s)
     found = plant.simulated(())(inputs)[:, 0]
     assert np.std(angle) > 0.1
     np.testing.assert_allclose(found, angle, rtol=0, atol=0.01 * np.std(angle))
+
+
+def as_begun(plant):
+    """Without a fit of what was before the first row: the commands were as in that."""
+    return replace(plant, simulation=replace(plant.simulation, settles=False))
 
 
 def two_links(integrator: str, step_s: float, kind: str = "motor") -> str:
@@ -137,6 +143,28 @@ def test_a_start_in_motion_is_fitted_with_the_values_that_are_tried(integrator, 
         assert left < 1.2 * noise < 20 * noise < stated_left
 
 
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.parametrize("kind", ["lag", "delay", "servo delay"])
+def test_commands_before_a_record_are_fitted(integrator, kind):
+    """What a lag or delay that the model lacks still feels of them, where the log begins in motion."""
+    noise, late_s, drive = 2e-4, 0.05, kind.split()[0] if "servo" in kind else "motor"
+    true = two_links(integrator, 0.005, "lag" if kind == "lag" else drive)
+    true = true.replace('dyntype="filter"', 'dyntype="filterexact" actearly="true"')
+    log = in_motion(true, noise, 0, drive == "servo").input
+    if kind != "lag":
+        rows = round(late_s / DT_S)
+        log = np.column_stack([log[rows:, :2], log[:-rows, 2:]])
+    stated = mujoco.MjSpec.from_string(two_links(integrator, 0.005, drive))
+    e = PlantExperiment("log", "estimation", log, log[:, 2:])
+    plant = MujocoArm(stated, ("one", "two"), DT_S, 9.0).plant([e], np.full(2, noise))
+    name, size = ("lag", "time_constant_s") if kind == "lag" else ("delay", "delay_s")
+    late = [Change(f"m{k}.{name}", {size: late_s}) for k in (1, 2)]
+    left = plant.simulator(late)(log) - log[:, 2:]
+    assert np.max(np.sqrt(np.mean(left**2, axis=0))) < 2 * noise
+    without = plant.simulator(())(log) - log[:, 2:]
+    assert np.max(np.sqrt(np.mean(without**2, axis=0))) > 20 * noise
+
+
 @pytest.mark.parametrize("kind", ["motor", "cart", "lag"])
 def test_steps_that_are_coarser_than_the_machine_leave_little_of_it(kind):
     """The machine at a twentieth of the model's steps: classical Runge-Kutta leaves nothing."""
@@ -169,6 +197,7 @@ def test_an_effect_is_what_its_name_says(effect, value, inertia, damping):
 def test_delay_and_lag_of_the_actuator_and_the_sensor_s_zero():
     torque = steps()
     plant, inputs = plant_of(rod(), torque, turned(torque))
+    plant = as_begun(plant)
     late = plant.simulated((Change("motor.delay", {"delay_s": 0.03}),))(inputs)[:, 0]
     torque_later = np.concatenate([np.full(3, torque[0]), torque[:-3]])
     np.testing.assert_allclose(late, turned(torque_later), rtol=0, atol=5e-3)
@@ -223,7 +252,7 @@ def test_the_repaired_file_does_in_mujoco_what_the_diagnosis_simulated():
     repaired = plant.scaled({"hinge.damping": 1.5})
     text = arm.repaired(plant, repaired, changes)
     known = [c for c in changes if c.id != "hinge.sensor_offset"]
-    expected = repaired.simulated(known)(inputs)[:, 0]
+    expected = as_begun(repaired).simulated(known)(inputs)[:, 0]
     # MuJoCo alone, from the text alone; commands were as in the first row before it.
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)

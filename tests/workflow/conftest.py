@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.workflow.command import FAST_ARM, draw_nothing
-from workflow.tasks.summary import RunSummary
+from workflow.text.templates import RunSummary
 
 
 @pytest.fixture(scope="session")

@@ -14,8 +14,7 @@ import pytest
 
 from tests.workflow.command import ROOT
 from workflow import console
-from workflow.tasks.summary import RunSummary
-from workflow.text.templates import Row, Section
+from workflow.text.templates import Row, RunSummary, Section
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from workflow.study.settings import load_study
 from workflow.study.work import run_study
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.results import RunResults
-from workflow.tasks.summary import RunSummary
+from workflow.text.templates import RunSummary
 
 
 @pytest.fixture(scope="module")

@@ -41,7 +41,7 @@ from workflow.engine.executor import Failure, LocalProcesses
 from workflow.engine.progress import Progress
 from workflow.engine.storage import read_json, sha256_of_file, write_bytes, write_json, write_text
 from workflow.engine.store import Store
-from workflow.tasks.summary import RunSummary
+from workflow.text.templates import RunSummary
 
 _FORMAT = "flexlink-blind-1"
 # Expected seconds per case: they shape the progress bar only.

@@ -14,8 +14,7 @@ from markupsafe import Markup
 
 from validation.blind.truth import LISTED
 from workflow.figures import style
-from workflow.tasks.summary import RunSummary
-from workflow.text.templates import Row, Section, environment
+from workflow.text.templates import Row, RunSummary, Section, environment
 
 _SLICES = ("all", "exact", "uncertain")
 _CPU = "CPU per case [s]"

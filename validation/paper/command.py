@@ -34,8 +34,7 @@ from workflow.engine.run_directory import package_versions
 from workflow.engine.store import Store
 from workflow.figures.style import Picture, render
 from workflow.report.rendering import embedded
-from workflow.tasks.summary import RunSummary
-from workflow.text.templates import Row, Section, environment
+from workflow.text.templates import Row, RunSummary, Section, environment
 
 PAGE = "paper.html"
 TABLE_CSV, TABLE_JSON = "table.csv", "table.json"

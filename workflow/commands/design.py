@@ -26,8 +26,7 @@ from workflow.tasks.design import (
 from workflow.tasks.design_source import load_sources
 from workflow.tasks.exports import SUFFIXES, filter_file, targets, write_controller
 from workflow.tasks.results import AchievablePerformance, CertifyResult, DesignResult, ReferenceFilterResult
-from workflow.tasks.summary import RunSummary
-from workflow.text.templates import rows_of, said
+from workflow.text.templates import RunSummary, rows_of, said
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from workflow.engine import codec, storage
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.experiment import Limits, PlannedExperiment, plan_experiment
 from workflow.tasks.reference_plan import plan_reference
-from workflow.tasks.summary import RunSummary
-from workflow.text.templates import rows_of
+from workflow.text.templates import RunSummary, rows_of
 
 PLAN_FILE, PAGE_FILE = "plan.json", "plan.html"
 

@@ -20,10 +20,10 @@ from workflow.tasks.log_identification import LogIdentification, identify_record
 from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
 from workflow.tasks.results import IdentifiedPlant
 from workflow.tasks.simulated_rig import beside, truth_beside
-from workflow.tasks.summary import RunSummary, model_numbers, uncertainty_numbers
+from workflow.tasks.summary import model_numbers, uncertainty_numbers
 from workflow.text.formats import count
 from workflow.text.options import speaking
-from workflow.text.templates import rows_of, words
+from workflow.text.templates import RunSummary, rows_of, words
 
 
 def identify_logs(

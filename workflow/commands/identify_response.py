@@ -19,9 +19,8 @@ from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
 from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
 from workflow.tasks.results import IdentifiedPlant
-from workflow.tasks.summary import RunSummary
 from workflow.text.formats import count
-from workflow.text.templates import rows_of, words
+from workflow.text.templates import RunSummary, rows_of, words
 
 _EXPORTED_POINTS = 400
 

@@ -27,8 +27,7 @@ from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.tasks.draft import Draft, draft_of
 from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
-from workflow.tasks.summary import RunSummary
-from workflow.text.templates import environment, rows_of
+from workflow.text.templates import RunSummary, environment, rows_of
 
 _SHORT = 60  # letters of a log's name
 _NEARLY_ALL = 0.99  # rows of a held log: one may be missing

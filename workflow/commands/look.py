@@ -8,8 +8,7 @@ from pathlib import Path
 from ident.data.finding import FindingKind
 from workflow.engine import codec, storage
 from workflow.tasks.log_look import LogLook, look_at
-from workflow.tasks.summary import RunSummary
-from workflow.text.templates import rows_of, said
+from workflow.text.templates import RunSummary, rows_of, said
 
 
 def look(

@@ -16,7 +16,7 @@ from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory, default_directory
 
 if TYPE_CHECKING:
-    from workflow.tasks.summary import RunSummary
+    from workflow.text.templates import RunSummary
 
 
 def run_from_files(

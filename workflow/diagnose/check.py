@@ -22,9 +22,8 @@ from workflow.diagnose.simulator_case import (
 from workflow.diagnose.words import FILTERS
 from workflow.engine import codec
 from workflow.engine.errors import InputError
-from workflow.tasks.summary import RunSummary
 from workflow.text.formats import listing
-from workflow.text.templates import rows_of
+from workflow.text.templates import RunSummary, rows_of
 
 # Groups that are shown, those that are most alike.
 _MOST_SHOWN = 8

@@ -39,8 +39,7 @@ from workflow.engine.errors import (
 from workflow.engine.executor import Failure, LocalProcesses
 from workflow.engine.progress import Progress
 from workflow.report.rendering import render_page
-from workflow.tasks.summary import RunSummary
-from workflow.text.templates import rows_of
+from workflow.text.templates import RunSummary, rows_of
 
 _Failed = tuple[str, Failure]  # case, why it has no answer
 _CASE_S, _OVERVIEW_S = 30.0, 1.0  # expected: they shape the progress bar only

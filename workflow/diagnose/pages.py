@@ -25,7 +25,7 @@ from workflow.diagnose.following import Following, following
 from workflow.diagnose.words import FILTERS
 from workflow.engine import storage
 from workflow.report.rendering import render_page
-from workflow.tasks.summary import RunSummary
+from workflow.text.templates import RunSummary
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,8 +21,8 @@ from workflow.study.columns import COLUMNS, Column, Number, numbers_of
 from workflow.study.points import Combination, Point, short
 from workflow.study.settings import Axis, ParetoPlot, StudyConfig
 from workflow.tasks.results import RunResults
-from workflow.tasks.summary import RunSummary, verdict_of
-from workflow.text.templates import render_text, rows_of, said
+from workflow.tasks.summary import verdict_of
+from workflow.text.templates import RunSummary, render_text, rows_of, said
 
 State = Literal["certified", "does not settle", "keeps moving", "not certified", "impossible", "failed"]
 

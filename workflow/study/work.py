@@ -34,7 +34,7 @@ from workflow.study.task import Done, Task
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage
-from workflow.tasks.summary import RunSummary
+from workflow.text.templates import RunSummary
 
 _PLANT_S, _POINT_S, _PAGE_S = 6.0, 12.0, 4.0  # expected: they shape the progress bar only
 

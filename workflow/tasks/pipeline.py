@@ -22,8 +22,8 @@ from workflow.tasks.exports import write_controller
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage, StageInput
 from workflow.tasks.stages import STAGES
-from workflow.tasks.summary import RunSummary, summarise
-from workflow.text.templates import said
+from workflow.tasks.summary import summarise
+from workflow.text.templates import RunSummary, said
 
 
 def run_pipeline(

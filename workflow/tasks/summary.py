@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,38 +21,7 @@ from workflow.tasks.results import (
     RunResults,
     UncertainChannel,
 )
-from workflow.text.templates import Section, rows_of, said, words
-
-
-@dataclass(frozen=True)
-class RunSummary:
-    """Rows to read, `numbers` (JSON-able) to compute with, and the verdict in one line.
-
-    `certified` is False when the specification is missed or the certificate fails; the verdict then says by
-    how much and at which frequencies. None: nothing was to be certified.
-    """
-
-    title: str
-    sections: Sequence[Section]
-    numbers: Mapping[str, Any] = field(default_factory=dict)
-    certified: bool | None = None
-    verdict: str = ""
-    report_path: str | None = None
-
-    def to_document(self) -> dict[str, Any]:
-        """JSON-able."""
-        return {
-            "title": self.title,
-            **({} if self.certified is None else {"certified": self.certified}),
-            "verdict": self.verdict,
-            "report": self.report_path,
-            "numbers": dict(self.numbers),
-            "table": [
-                {"section": section.title, "label": row.label, "value": row.value}
-                for section in self.sections
-                for row in section.rows
-            ],
-        }
+from workflow.text.templates import RunSummary, rows_of, said, words
 
 
 def summarise(results: RunResults, config: RunConfig) -> RunSummary:

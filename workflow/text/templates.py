@@ -8,7 +8,8 @@ import importlib.util
 import marshal
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -85,6 +86,37 @@ class Row(NamedTuple):
 class Section(NamedTuple):
     title: str
     rows: Sequence[Row]
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """Rows to read, `numbers` (JSON-able) to compute with, and the verdict in one line.
+
+    `certified` is False when the specification is missed or the certificate fails; the verdict then says by
+    how much and at which frequencies. None: nothing was to be certified.
+    """
+
+    title: str
+    sections: Sequence[Section]
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+    certified: bool | None = None
+    verdict: str = ""
+    report_path: str | None = None
+
+    def to_document(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {
+            "title": self.title,
+            **({} if self.certified is None else {"certified": self.certified}),
+            "verdict": self.verdict,
+            "report": self.report_path,
+            "numbers": dict(self.numbers),
+            "table": [
+                {"section": section.title, "label": row.label, "value": row.value}
+                for section in self.sections
+                for row in section.rows
+            ],
+        }
 
 
 def rows_of(
