@@ -40,8 +40,8 @@ _PULLED, _BEYOND_BELIEF = 1.8, 2.0
 _BESIDE_IN_WINDOWS, _FREED = 4, (2, 3)
 # Effects that are descended on alone.
 _DESCENDED = 36
-# Effects of which points are simulated beside a set: of more, those of which superposition leaves least. And
-# so many times as many as usual are fitted beside values that are pulled.
+# Of more effects than that, those of which superposition leaves least are simulated beside a set, and so many
+# times as many as usual are fitted beside values that are pulled.
 _SIMULATED, _OF_PULLED = 24, 2
 # Frequencies tried beside others.
 _FREQUENCIES = 3
@@ -212,10 +212,11 @@ class Beside(Move):
     def apply(self, search: SearchLoop[Any]) -> None:
         parent = self.parent
         trials = sorted(self._trials(search), key=lambda trial: trial[1].loss)
+        most_pulled = _OF_PULLED * self.most if len(search.points) > _DESCENDED else len(trials)
         chosen: dict[tuple[str, float], tuple[Candidate, Point]] = {}
         for candidate, point in trials:
             pulled = candidate.kind.multiplies is not None and np.any(np.abs(parent.deviations) > _PULLED)
-            if len(chosen) < self.most * (_OF_PULLED if pulled else 1):
+            if len(chosen) < self.most or (pulled and len(chosen) < most_pulled):
                 # Beside contacts that switch, and values pulled far, the one side may look better and the
                 # other be so.
                 side = candidate.axes[0].low if parent.non_smooth or pulled else 0.0
@@ -233,7 +234,7 @@ class Beside(Move):
         """The best point of every candidate beside the parent."""
         held = {name for c in self.parent.candidates for name in (c.effect, c.kind.contains)} - {None}
         listed = [(c, p) for c, p in search.points if not {c.effect, c.kind.contains} & held]
-        if len(listed) > _SIMULATED:
+        if len(search.points) > _DESCENDED:
 
             def left(one: tuple[Candidate, list[Point]]) -> float:
                 return min((p.loss for p in superposed(search.records, self.parent, one[1])), default=-np.inf)
