@@ -25,8 +25,8 @@ from workflow.engine.errors import InputError
 from workflow.text.formats import listing
 from workflow.text.templates import RunSummary, rows_of
 
-# Groups that are shown, those that are most alike.
-_MOST_SHOWN = 8
+# Groups that are shown, those that are most alike; candidates of every list; what a next record needs.
+_MOST_SHOWN, _MOST_LISTED, _MOST_ADVICE = 8, 20, 6
 # A command with more values than these that is at an end of its range for this share of the time may be cut.
 _VALUES, _LIMITED = 20, 0.02
 _INERTIAL = ("mass", "inertia", "armature", "damping", "payload", "frictionloss")
@@ -55,11 +55,13 @@ def of_case(case: PlantCase, found: Telling) -> RunSummary:
         "logs": logs,
         "dt_s": case.dt_s,
         "telling": first,
+        "shows": [name for name in shown if name not in found.hidden],
+        "most": _MOST_LISTED,
         "more": len(alike) - len(first.alike),
         "sizes": {effect.name: effect.parameters[0].name for effect in case.plant.effects},
         "values": dict(case.plant.parameters),
         "untried": dict(case.plant.inactive),
-        "advice": list(dict.fromkeys(_advice(first))),
+        "advice": list(dict.fromkeys(_advice(first)))[:_MOST_ADVICE],
     }
     return RunSummary(
         title=case.name,
