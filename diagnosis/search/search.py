@@ -65,8 +65,10 @@ class Search(SearchLoop[Explanation]):
 
     @cached_property
     def horizon(self) -> Windows | None:
-        """Windows in which no drift grows; None for a machine that forgets its inputs."""
-        return self.windows or Windows.of(self.case)
+        """Windows in which no drift grows; None for a machine that forgets its inputs, or whose simulation is
+        held near the records and fits their starts itself."""
+        settles = getattr(self.case.machine, "settled", None) is not None
+        return self.windows or (None if settles else Windows.of(self.case))
 
     def anew(self, case: CaseOfMachine) -> Search:
         """Of the same records in another form."""

@@ -165,6 +165,44 @@ def test_commands_before_a_record_are_fitted(integrator, kind):
     assert np.max(np.sqrt(np.mean(without**2, axis=0))) > 20 * noise
 
 
+@pytest.mark.parametrize("load_kg", [0.0, 1.0])
+def test_a_stiff_servo_that_saturates_under_steps_is_followed(load_kg):
+    """An arm with the gains of a public model and a force limit that every step meets."""
+    servo = 'kp="4500" kv="450" forcerange="-87 87"'
+    xml = f"""<mujoco><option integrator="implicitfast"/>
+    <default><joint axis="0 0 1" armature="0.1" damping="1"/></default>
+    <worldbody><body pos="0 0 0.3"><joint name="one"/><inertial pos="0 0 0" mass="5"
+    diaginertia="0.7 0.7 0.01"/><body name="arm" quat="1 -1 0 0"><joint name="two"/><inertial
+    pos="0 -0.03 0" mass="0.65" diaginertia="0.02 0.03 0.03"/><site pos="0 -0.3 0"/>LOAD</body></body>
+    </worldbody><actuator><position joint="one" {servo}/><position joint="two" {servo}/></actuator>
+    </mujoco>"""
+    load = (
+        f'<body pos="0 -0.3 0"><inertial pos="0 0 0" mass="{load_kg}" diaginertia="1e-9 1e-9 1e-9"/></body>'
+    )
+    true = mujoco.MjModel.from_xml_string(xml.replace("LOAD", load if load_kg else ""))
+    noise, rng, data = 1e-4, np.random.default_rng(0), mujoco.MjData(true)
+    rows, limited = [], 0
+    for goal in rng.uniform(-0.6, 0.6, (6, 2)).repeat(60, axis=0):
+        rows.append([*goal, *(data.qpos + noise * rng.standard_normal(2))])
+        data.ctrl[:] = goal
+        mujoco.mj_step(true, data, 5)
+        limited += int(np.any(np.abs(data.actuator_force) > 86.9))
+    assert limited > 30
+    log = np.array(rows)[30:]
+    e = PlantExperiment("log", "estimation", log, log[:, 2:])
+    arm = MujocoArm(mujoco.MjSpec.from_string(xml.replace("LOAD", "")), ("one", "two"), DT_S)
+    plant = replace(arm, tracking_rad_s=arm.tracking([e])).plant([e], np.full(2, noise), model_error=0.05)
+    interests = plant.model_error * np.std(e.output, axis=0)
+
+    def left(*changes):
+        return np.sqrt(np.mean((plant.simulator(changes)(log) - e.output) ** 2, axis=0))
+
+    assert np.all(
+        left(*([Change("arm.payload", {"mass_kg": load_kg})] if load_kg else [])) < 0.15 * interests
+    )
+    assert not load_kg or np.any(left() > interests)
+
+
 @pytest.mark.parametrize("kind", ["motor", "cart", "lag"])
 def test_steps_that_are_coarser_than_the_machine_leave_little_of_it(kind):
     """The machine at a twentieth of the model's steps: classical Runge-Kutta leaves nothing."""
