@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Boolean, Complex, Real
+from control_design.plants.multivariable import MultivariablePlant
 from control_design.plants.plant_set import Mode, UncertainPlant, count_integrators, delayed, modes_of
 
 _GAINS = 16  # steps of the root locus; halved up to _HALVINGS times where poles come near one another
@@ -23,21 +24,24 @@ _LOST = 0.02  # share of its damping; two digits show no less
 class NominalLoop:
     """One nominal plant with the computational delay at its input, ready to be closed many times."""
 
-    def __init__(self, plant: UncertainPlant, delay_samples: int) -> None:
+    def __init__(self, plant: UncertainPlant | MultivariablePlant, delay_samples: int) -> None:
         system = delayed(plant.nominal, delay_samples)
-        self._a, self._b, self._c = (np.asarray(getattr(system, m), dtype=np.float64) for m in "ABC")
-        self._d = float(np.asarray(system.D)[0, 0])
+        self._a, self._b, self._c, self._d = (np.asarray(getattr(system, m), dtype=float) for m in "ABCD")
 
     def poles(self, a: Real, b: Real, c: Real, d: Real) -> Complex:
         """Poles (n,) with the controller a, b, c, d (without delay); one infinite pole for an algebraic
-        loop, 1 + D_K D_G = 0."""
-        loop = 1.0 + float(d[0, 0]) * self._d
+        loop, det(1 + D_K D_G) = 0."""
         n = self._a.shape[0]
-        if not (abs(loop) > 1e-12 and np.all(np.isfinite(a)) and np.all(np.isfinite(c))):
+        if not (np.all(np.isfinite(a)) and np.all(np.isfinite(c))):
             return np.array([np.inf + 0j])
-        # u = (c x_k - d C x)/loop, e = -(C x + D u)
-        u = np.hstack([(-float(d[0, 0]) / loop) * self._c, c / loop])
-        e = -self._d * u
+        # u = (1 + D_K D_G)^-1 (c x_k - d C x), e = -(C x + D u)
+        u = np.hstack([-d @ self._c, c])
+        if np.any(self._d):
+            loop = np.eye(d.shape[0]) + d @ self._d
+            if not abs(np.linalg.det(loop)) > 1e-12:
+                return np.array([np.inf + 0j])
+            u = np.linalg.solve(loop, u)
+        e = -self._d @ u
         e[:, :n] -= self._c
         closed = np.vstack([self._b @ u, b @ e])
         closed[:n, :n] += self._a

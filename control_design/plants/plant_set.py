@@ -131,7 +131,12 @@ class Channel:
 
 
 def frequency_response(system: control.StateSpace, omega_rad_s: Real) -> Complex:
-    """C (zI - A)^-1 B + D on z = e^{j omega dt}, (F,), for a SISO discrete system.
+    """`matrix_response` (F,) of a SISO discrete system."""
+    return matrix_response(system, omega_rad_s)[:, 0, 0]
+
+
+def matrix_response(system: control.StateSpace, omega_rad_s: Real) -> Complex:
+    """C (zI - A)^-1 B + D on z = e^{j omega dt}, (F, Y, U), for a discrete system.
 
     zI - A is formed as (z - 1) I - (A - I) with z - 1 = expm1(j omega dt): at 1e-4 rad/s and 1 kHz the plain
     difference would keep only nine digits, and slow poles live there. Solved batchwise (no polynomial, no
@@ -140,35 +145,36 @@ def frequency_response(system: control.StateSpace, omega_rad_s: Real) -> Complex
     a = np.asarray(system.A, dtype=np.float64)
     b = np.asarray(system.B, dtype=np.float64)
     c = np.asarray(system.C, dtype=np.float64)
-    d = float(np.asarray(system.D)[0, 0])
-    omega = np.asarray(omega_rad_s, dtype=np.float64)
+    d = np.asarray(system.D, dtype=np.float64)
+    omega = np.atleast_1d(np.asarray(omega_rad_s, dtype=np.float64))
     n = a.shape[0]
+    response = np.empty((*omega.shape, *d.shape), dtype=np.complex128)
+    response[:] = d
     if n == 0:
-        return np.full(omega.shape, complex(d))
+        return response
     theta = omega * float(system.dt)
     z_minus_1 = -2.0 * np.sin(theta / 2) ** 2 + 1j * np.sin(theta)
-    response = np.empty(omega.shape, dtype=np.complex128)
     shifted = a - np.eye(n)
     for start in range(0, omega.size, 2048):  # bounds the memory of the batch
         part = z_minus_1[start : start + 2048]
         matrices = part[:, None, None] * np.eye(n) - shifted
-        states = np.linalg.solve(matrices, np.broadcast_to(b, (part.size, n, 1)))
-        response[start : start + 2048] = (c @ states)[:, 0, 0] + d
+        states = np.linalg.solve(matrices, np.broadcast_to(b, (part.size, *b.shape)))
+        response[start : start + 2048] += c @ states
     return response
 
 
 def delayed(system: control.StateSpace, samples: int) -> control.StateSpace:
-    """A SISO discrete system behind a delay of whole samples; the delay's states come after its own."""
+    """A discrete system behind a delay of whole samples of every input, whose states come after its own."""
     if samples == 0:
         return system
     import control
 
     a, b, c, d = (np.asarray(getattr(system, name), dtype=np.float64) for name in "ABCD")
     for _ in range(samples):
-        n = a.shape[0]
-        a = np.block([[a, b], [np.zeros((1, n + 1))]])
-        b = np.vstack([np.zeros((n, 1)), np.ones((1, 1))])
-        c, d = np.hstack([c, d]), np.zeros((1, 1))
+        n, inputs = b.shape
+        a = np.block([[a, b], [np.zeros((inputs, n + inputs))]])
+        b = np.vstack([np.zeros((n, inputs)), np.eye(inputs)])
+        c, d = np.hstack([c, d]), np.zeros_like(d)
     return control.ss(a, b, c, d, system.dt)
 
 
