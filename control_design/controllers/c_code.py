@@ -9,11 +9,14 @@ from importlib.resources import files
 from string import Template
 from typing import TYPE_CHECKING, Literal, get_args
 
+import numpy as np
+
 if TYPE_CHECKING:
     from control_design.controllers.controller import Controller
     from control_design.plants.ellipses import Real
 
 Number = Literal["double", "float"]
+_NO_LIMIT = 3e38  # written for an actuator without a limit beside others that have one; fits a float
 
 
 @dataclass(frozen=True)
@@ -58,8 +61,9 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
 
     `<prefix>_step(&state, error)` returns the command for the error at this sample. One call every `dt_s`;
     order n costs (n + 1)^2 multiplications. A controller with limits has them and the anti-windup in
-    the code, and its state keeps in `limited` whether one was active. With a friction feed-forward it is
-    `<prefix>_step(&state, error, reference)`.
+    the code, and its state keeps in `limited` whether one was active. A controller of Y errors and U commands
+    has `<prefix>_step(&state, error, command)` with arrays of these lengths. With a friction feed-forward it
+    is `<prefix>_step(&state, error, reference)`.
 
     Raises ValueError if the prefix is no C identifier, or the number is neither.
 
@@ -97,19 +101,28 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
             "excess": literal(given.excess),
             "fall": literal(given.fall * controller.dt_s),
         }
+    one = controller.D.size == 1
+
+    def table(matrix: Real) -> str:
+        return ",\n    ".join(vector(row) for row in matrix) or vector(np.zeros(matrix.shape[1]))
+
+    def limits(name: str, factor: float) -> str:
+        most = np.minimum(factor * controller.limits(name), _NO_LIMIT)
+        return literal(float(most[0])) if one else vector(most)
+
     if controller.input_limit is not None:
-        values["input_limit"] = literal(controller.input_limit)
+        values["input_limit"] = limits("input_limit", 1.0)
     if controller.rate_limit is not None:
-        values["largest_change"] = literal(controller.rate_limit * controller.dt_s)
+        values["largest_change"] = limits("rate_limit", controller.dt_s)
     return _filled(
         "controller.c.in",
         controller,
         header=c_header(controller, prefix, number),
-        A=",\n    ".join(vector(row) for row in controller.A) or vector(controller.C[0]),
-        B=vector(controller.B[:, 0]),
-        C=vector(controller.C[0]),
-        D=literal(float(controller.D[0, 0])),
-        M=vector(controller.anti_windup_gain[:, 0]),
+        A=table(controller.A) if controller.order else vector(controller.C[0]),
+        B=vector(controller.B[:, 0]) if one else table(controller.B),
+        C=vector(controller.C[0]) if one else table(controller.C),
+        D=literal(float(controller.D[0, 0])) if one else table(controller.D),
+        M=vector(controller.anti_windup_gain[:, 0]) if one else table(controller.anti_windup_gain),
         name=prefix,
         number=number,
         **values,
@@ -126,6 +139,7 @@ def _filled(template: str, controller: Controller, **values: object) -> str:
         "limits": controller.input_limit is not None or controller.rate_limit is not None,
         "friction": given is not None,
         "breakaway": given is not None and given.excess > 0,
+        "matrix": controller.D.size > 1,
     }
     lines = []
     for line in _template(template):
@@ -133,7 +147,13 @@ def _filled(template: str, controller: Controller, **values: object) -> str:
         if all(has[tag.lstrip("!")] is not tag.startswith("!") for tag in tags.split(",") if tag):
             lines.append(text)
     # C has no arrays of length zero.
-    shape = {"order": controller.order, "size": max(controller.order, 1)}
+    commands, errors = controller.D.shape
+    shape = {
+        "order": controller.order,
+        "size": max(controller.order, 1),
+        "commands": commands,
+        "errors": errors,
+    }
     return Template("".join(lines)).substitute(values, **shape)
 
 

@@ -18,12 +18,19 @@ if TYPE_CHECKING:
     import control
 
 
+if TYPE_CHECKING:
+    Limit = Any  # whoever has one loop reads a number
+else:
+    Limit = float | tuple[float | None, ...] | None
+
+
 @dataclass(frozen=True, eq=False)
 class Controller(Law):
-    """u = K (r - y): x+ = A x + B e + M (u_limited - u), u = C x + D e, all SISO.
+    """u = K (r - y): x+ = A x + B e + M (u_limited - u), u = C x + D e, of Y errors and U commands.
 
-    A (n, n), B (n, 1), C (1, n), D (1, 1); dt_s > 0. input_limit, rate_limit: saturation (both signs) and
-    largest change per second of the command, or None. anti_windup_gain M (n, 1): back-calculation in observer
+    A (n, n), B (n, Y), C (U, n), D (U, Y); dt_s > 0. input_limit, rate_limit: saturation (both signs) and
+    largest change per second of the command, or None; with U > 1 a tuple of these, one per actuator.
+    anti_windup_gain M (n, U): back-calculation in observer
     form; the controller state then follows A - M C while the command is limited, so M must make that stable;
     None = `observer_gain(A, B, C, D)`. computational_delay_samples: the command computed from the measurement
     at t_k is applied from t_{k + delay} on. feedforward: joins u before it is limited, or None.
@@ -33,8 +40,8 @@ class Controller(Law):
     equations = "u = C x + D e; x+ = A x + B e + M (u_limited - u); e = reference - measurement"
 
     computational_delay_samples: int = 1
-    input_limit: float | None = None
-    rate_limit: float | None = None
+    input_limit: Limit = None
+    rate_limit: Limit = None
     anti_windup_gain: Real | None = None
     name: str = "controller"
     feedforward: FrictionFeedforward | None = None
@@ -46,16 +53,25 @@ class Controller(Law):
             raise ValueError(
                 f"computational_delay_samples must not be negative; got {self.computational_delay_samples}"
             )
+        inputs = self.D.shape[0]
         for name in ("input_limit", "rate_limit"):
             value = getattr(self, name)
-            if value is not None and not value > 0:
+            if isinstance(value, tuple | list):
+                value = tuple(value)
+                object.__setattr__(self, name, value)
+            each = value if isinstance(value, tuple) else (value,)
+            if (isinstance(value, tuple) or (value is not None and inputs > 1)) and len(each) != inputs:
+                raise ValueError(f"{name} needs one value for each of {inputs} actuators; got {value}")
+            if not all(one is None or one > 0 for one in each):
                 raise ValueError(f"{name} must be positive or None; got {value}")
+        if self.feedforward is not None and self.D.size > 1:
+            raise ValueError("a friction feed-forward is for one loop; got a controller of several")
         gain = self.anti_windup_gain
         gain = (
             observer_gain(self.A, self.B, self.C, self.D) if gain is None else np.asarray(gain, dtype=float)
         )
-        if gain.shape != (n, 1) or not np.all(np.isfinite(gain)):
-            raise ValueError(f"anti_windup_gain must be finite and ({n}, 1); got shape {gain.shape}")
+        if gain.shape != (n, inputs) or not np.all(np.isfinite(gain)):
+            raise ValueError(f"anti_windup_gain must be finite and ({n}, {inputs}); got shape {gain.shape}")
         object.__setattr__(self, "anti_windup_gain", gain)
         lock(self, "anti_windup_gain")
         if n and (self.input_limit is not None or self.rate_limit is not None):
@@ -71,12 +87,19 @@ class Controller(Law):
         return cls(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[gain]]), dt_s, **settings)
 
     def response(self, omega_rad_s: Real, *, with_delay: bool = True) -> Complex:
-        """K(e^{j omega dt}), (F,), times z^-delay unless with_delay is False."""
+        """K(e^{j omega dt}), (F,) or (F, U, Y), times z^-delay unless with_delay is False."""
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         value = super().response(omega)
         if with_delay:
-            value = value * np.exp(-1j * omega * self.dt_s * self.computational_delay_samples)
+            late = np.exp(-1j * omega * self.dt_s * self.computational_delay_samples)
+            value = value * (late if value.ndim == 1 else late[:, None, None])
         return value
+
+    def limits(self, name: str) -> Real:
+        """input_limit or rate_limit of every actuator (U,), infinite where there is none."""
+        value = getattr(self, name)
+        each = value if isinstance(value, tuple) else (value,) * self.D.shape[0]
+        return np.array([np.inf if one is None else one for one in each], dtype=np.float64)
 
     def to_control(self, *, include_delay: bool = False) -> control.StateSpace:
         """Linear part as `control.StateSpace`; with include_delay the delay's states come after K's."""
@@ -95,8 +118,12 @@ class Controller(Law):
         return super().from_dict({**data, "feedforward": made})
 
     def stepper(self) -> ControllerStepper:
-        """A fresh machine-side instance at rest."""
+        """A fresh machine-side instance of one loop at rest."""
         return ControllerStepper(self)
+
+    def matrix_stepper(self) -> MatrixStepper:
+        """The same of several commands: `step` takes Y errors."""
+        return MatrixStepper(self)
 
 
 class ControllerStepper:
@@ -112,9 +139,8 @@ class ControllerStepper:
         self._a, self._b = np.array(controller.A), np.array(controller.B[:, 0])
         self._c, self._d = np.array(controller.C[0]), float(controller.D[0, 0])
         self._m = np.array(controller.anti_windup_gain[:, 0])
-        self._limit = np.inf if controller.input_limit is None else controller.input_limit
-        rate = np.inf if controller.rate_limit is None else controller.rate_limit
-        self._change = rate * controller.dt_s
+        self._limit = float(controller.limits("input_limit")[0])
+        self._change = float(controller.limits("rate_limit")[0]) * controller.dt_s
         self._given = controller.feedforward
         self._share = 0.0 if self._given is None else self._given.share(controller.dt_s)
         self.reset()
@@ -145,8 +171,32 @@ class ControllerStepper:
         return command
 
 
+class MatrixStepper:
+    """`ControllerStepper` of Y errors and U commands, without a friction feed-forward; each command is
+    limited by itself."""
+
+    def __init__(self, controller: Controller) -> None:
+        self._k = controller
+        self._limit = controller.limits("input_limit")
+        self._change = controller.limits("rate_limit") * controller.dt_s
+        self._x, self._last = np.zeros(controller.order), np.zeros(controller.D.shape[0])
+        self.limited = np.zeros(self._last.size, dtype=bool)
+
+    def step(self, error: Real) -> Real:
+        """Commands (U,) for the errors (Y,) at this sample."""
+        k = self._k
+        assert k.anti_windup_gain is not None
+        wanted = k.C @ self._x + k.D @ error
+        command = np.clip(wanted, self._last - self._change, self._last + self._change)
+        command = np.clip(command, -self._limit, self._limit)
+        self.limited = command != wanted
+        self._x = k.A @ self._x + k.B @ error + k.anti_windup_gain @ (command - wanted)
+        self._last = command
+        return np.asarray(command)
+
+
 def observer_gain(A: Real, B: Real, C: Real, D: Real) -> Real:
-    """Back-calculation gain M (n, 1) with A - M C stable: a Kalman gain for state noise through B and output
+    """Back-calculation gain M (n, U) with A - M C stable: a Kalman gain for state noise through B and output
     noise D.
 
     For D != 0 and a minimum-phase controller the conditioning technique would take M = B/D, which places A -
@@ -157,22 +207,22 @@ def observer_gain(A: Real, B: Real, C: Real, D: Real) -> Real:
 
     n = A.shape[0]
     if n == 0:
-        return np.zeros((0, 1))
+        return np.zeros((0, C.shape[0]))
     # States and output in units of their own, in which the equation is the same and well scaled.
     state_unit = float(np.linalg.norm(B)) or 1.0
-    output_unit = float(np.linalg.norm(C)) * state_unit or abs(float(D[0, 0])) or 1.0
+    output_unit = float(np.linalg.norm(C)) * state_unit or float(np.linalg.norm(D)) or 1.0
     B, C, D = B / state_unit, C * (state_unit / output_unit), D / output_unit
     size = float(np.linalg.norm(B)) ** 2 or 1.0
     state_noise = B @ B.T + 1e-6 * size * np.eye(n)
-    scale = float((C @ state_noise @ C.T).item()) or 1.0
-    output_noise = np.array([[float(D[0, 0]) ** 2 + 1e-4 * scale]])
+    scale = float(np.trace(C @ state_noise @ C.T)) or 1.0
+    output_noise = D @ D.T + 1e-4 * scale * np.eye(C.shape[0])
     try:
         p = solve_discrete_are(A.T, C.T, state_noise, output_noise)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ValueError(
             "no anti-windup gain found: the controller has a marginal mode that its output does not show"
         ) from error
-    gain = A @ p @ C.T / (C @ p @ C.T + output_noise) * (state_unit / output_unit)
+    gain = np.linalg.solve(C @ p @ C.T + output_noise, (A @ p @ C.T).T).T * (state_unit / output_unit)
     return np.asarray(gain, dtype=np.float64)
 
 

@@ -1,4 +1,4 @@
-"""What controller and reference filter have in common: a checked SISO state space, kept as JSON."""
+"""What controller and reference filter have in common: a checked state space, kept as JSON."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from control_design.plants.ellipses import Complex, Real
-from control_design.plants.plant_set import frequency_response
+from control_design.plants.plant_set import matrix_response
 from ident.data.arrays import lock
 from ident.data.json_text import json_value
 
@@ -24,7 +24,7 @@ _ARRAYS = ("A", "B", "C", "D", "anti_windup_gain")
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """x+ = A x + B e, C x + D e: A (n, n), B (n, 1), C (1, n), D (1, 1), read-only; dt_s > 0."""
+    """x+ = A x + B e, C x + D e: A (n, n), B (n, Y), C (U, n), D (U, Y), read-only; dt_s > 0."""
 
     kind: ClassVar[str]
     equations: ClassVar[str]
@@ -39,8 +39,9 @@ class Law:
         lock(self, *"ABCD")
         n = self.A.shape[0]
         shapes = {name: getattr(self, name).shape for name in ("A", "B", "C", "D")}
-        if shapes != {"A": (n, n), "B": (n, 1), "C": (1, n), "D": (1, 1)}:
-            raise ValueError(f"{self.kind} needs A (n, n), B (n, 1), C (1, n), D (1, 1); got {shapes}")
+        u, y = self.D.shape if self.D.ndim == 2 and self.D.size else (1, 1)
+        if shapes != {"A": (n, n), "B": (n, y), "C": (u, n), "D": (u, y)}:
+            raise ValueError(f"{self.kind} needs A (n, n), B (n, Y), C (U, n), D (U, Y); got {shapes}")
         for name in ("A", "B", "C", "D"):
             if not np.all(np.isfinite(getattr(self, name))):
                 raise ValueError(f"{self.kind} matrix {name} has a value that is not finite")
@@ -65,8 +66,9 @@ class Law:
         return control.ss(np.array(self.A), np.array(self.B), np.array(self.C), np.array(self.D), self.dt_s)
 
     def response(self, omega_rad_s: Real) -> Complex:
-        """Response at z = e^{j omega dt}, (F,)."""
-        return frequency_response(self.to_control(), np.asarray(omega_rad_s, dtype=np.float64))
+        """Response at z = e^{j omega dt}, (F,) of one loop, else (F, U, Y)."""
+        found = matrix_response(self.to_control(), np.asarray(omega_rad_s, dtype=np.float64))
+        return found[:, 0, 0] if self.D.size == 1 else found
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; `from_dict` restores it exactly (floats are written with all their digits)."""
@@ -92,8 +94,9 @@ class Law:
             raise ValueError(f"{cls.kind} file lacks the key {missing[0]!r}")
         hints = get_type_hints(cls)
         values = {field.name: cls._read(field.name, hints[field.name], data) for field in fields(cls)}
-        n = values["C"].size
-        shapes = {"A": (n, n), "B": (n, 1), "C": (1, n), "D": (1, 1), "anti_windup_gain": (n, 1)}
+        u, y = values["D"].shape if values["D"].ndim == 2 and values["D"].size else (1, 1)
+        n = values["C"].size // u
+        shapes = {"A": (n, n), "B": (n, y), "C": (u, n), "D": (u, y), "anti_windup_gain": (n, u)}
         for name in shapes.keys() & values.keys():
             if values[name].size != np.prod(shapes[name]):
                 raise ValueError(f"{cls.kind} file: {name} has {values[name].size} numbers, C has {n}")
@@ -119,8 +122,8 @@ class Law:
         return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
 
     def to_mat(self) -> bytes:
-        """MATLAB 5 file of all fields; a limit that is None is infinite, a feed-forward that is None is left
-        out."""
+        """MATLAB 5 file of all fields; a limit that is None is infinite (one per actuator: a row), a
+        feed-forward that is None is left out."""
         import scipy.io  # here: few use such files, and every command would wait for it
 
         values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -128,6 +131,9 @@ class Law:
         if given is not None:
             values["feedforward"] = vars(given)
         stream: Any = io.BytesIO()  # scipy takes streams, its stubs know paths only
+        for name, value in values.items():
+            if isinstance(value, tuple):
+                values[name] = np.array([np.inf if one is None else one for one in value])
         scipy.io.savemat(stream, {k: np.inf if value is None else value for k, value in values.items()})
         return bytes(stream.getvalue())
 
