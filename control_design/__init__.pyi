@@ -6,6 +6,11 @@ from .analysis.closed_loop import (
     simulate as simulate,
     step_metrics as step_metrics,
 )
+from .analysis.multivariable_certificate import (
+    DiskMargin as DiskMargin,
+    MultivariableCertificate as MultivariableCertificate,
+    certify_multivariable as certify_multivariable,
+)
 from .controllers.c_code import c_source as c_source
 from .controllers.controller import Controller as Controller
 from .convex.convex_options import (
@@ -16,11 +21,18 @@ from .convex.reference_filter import design_reference_filter as design_reference
 from .convex.youla import youla_bracket as youla_bracket
 from .plants.ellipses import Ellipses as Ellipses
 from .plants.guards import Guard as Guard
+from .plants.multivariable import MultivariablePlant as MultivariablePlant, ResponseBall as ResponseBall
 from .plants.plant_set import Channel as Channel, UncertainPlant as UncertainPlant
 from .plants.weights import RationalWeight as RationalWeight
 from .specification import Specification as Specification, SpecificationError as SpecificationError
+from .specification.multivariable import MultivariableSpecification as MultivariableSpecification
 from .specification.requirement import LoopFunction as LoopFunction
 from .synthesis.joint_synthesis import synthesise_jointly as synthesise_jointly
+from .synthesis.multivariable import (
+    MultivariableOptions as MultivariableOptions,
+    MultivariableResult as MultivariableResult,
+    synthesise_multivariable as synthesise_multivariable,
+)
 from .synthesis.synthesis import synthesise as synthesise
 from .synthesis.synthesis_options import SynthesisOptions as SynthesisOptions
 from .synthesis.synthesis_result import (

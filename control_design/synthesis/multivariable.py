@@ -1,0 +1,329 @@
+"""Synthesis of one controller for plants with several inputs and outputs: fixed order and structure.
+
+A stable static gain is grown by modal blocks whose output matrix is zero at first, the best of several random
+ones each time, and every size is taken down to a local minimum of the worst case (`MatrixDescent`), with the
+frequencies that a dense check finds violated added as it goes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from control_design.analysis.stability import NominalLoop
+from control_design.controllers.controller import Controller
+from control_design.plants.ellipses import Real
+from control_design.plants.frequency_grid import frequency_grid, local_maxima, lowest_rad_s
+from control_design.plants.multivariable import MultivariablePlant, tustin_s
+from control_design.plants.plant_set import Mode, modes_of
+from control_design.plants.scaled_bound import scaled_bound
+from control_design.specification.multivariable import MultivariableSpecification
+from control_design.specification.specification import SpecificationError
+from control_design.synthesis.modal_controller import ModalForm
+from control_design.synthesis.multivariable_descent import MatrixDescent, StackedRows, stacked_rows
+from control_design.synthesis.synthesis_result import BlockingPoint, Outcome
+
+_LIGHT = 0.3  # poles of loop and controller damped less have frequencies of their own in every check
+_AROUND = np.array([-3, -1.5, -0.7, -0.3, 0, 0.3, 0.7, 1.5, 3])  # in half-widths of such a pole
+_EXCESS = 5e-4  # accepted of the dense check over the programme
+_MOST = 15  # violated frequencies added in a round
+
+
+class MultivariableOptions(BaseModel):
+    """Effort of the search."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    starts: int = Field(default=1, ge=1, le=50, description="controllers grown; the best counts")
+    candidates: int = Field(
+        default=3, ge=1, le=20, description="random blocks tried wherever the order grows"
+    )
+    renewals: int = Field(
+        default=0, ge=0, le=100, description="blocks replaced by random ones at the full order"
+    )
+    growth_steps: int = Field(default=12, ge=1, le=200, description="steps of each candidate")
+    rounds: int = Field(default=12, ge=1, le=100, description="rounds of the last descent, with exchange")
+    steps: int = Field(default=12, ge=1, le=200, description="steps of a round")
+    grid_points: int = Field(default=60, ge=20, le=2000, description="logarithmic points of the programme")
+    mode_points: int = Field(
+        default=15, ge=5, le=500, description="points around each mode or zero of the plant"
+    )
+    dense_points: int = Field(
+        default=600, ge=100, le=20_000, description="logarithmic points of the dense check"
+    )
+    sufficient_gamma: float = Field(default=0.0, ge=0, description="stop at this worst case; 0 = the best")
+
+
+@dataclass(frozen=True)
+class MultivariableResult:
+    """gamma: largest worst case over plants, requirements and the dense grid (at most 1: met). worst: by
+    name of the requirement. blocking: where gamma is reached, worst first. steps of the descents in all.
+    Certify with `certify_multivariable` before use."""
+
+    outcome: Outcome
+    controller: Controller
+    gamma: float
+    worst: dict[str, float]
+    blocking: tuple[BlockingPoint, ...]
+    steps: int
+
+
+def synthesise_multivariable(
+    plants: MultivariablePlant | Sequence[MultivariablePlant],
+    specification: MultivariableSpecification,
+    rng: np.random.Generator,
+    options: MultivariableOptions | None = None,
+    *,
+    progress: Callable[[float, str], None] | None = None,
+) -> MultivariableResult:
+    """One controller u = -K y of fixed order and structure with the smallest worst case over the plants'
+    uncertainty; all plants (operating points) share dt, U and Y.
+
+    The worst case is the largest singular value of each weighted function by itself, over every ball and
+    block of the plants, at every frequency of a grid: `scaled_bound`. A local minimum is found, the best of
+    `options.starts`. Neglected: scheduling over operating points; one controller serves all.
+
+    Raises SpecificationError if the plants do not fit one another or the structure, or no static gain of the
+    structure stabilises them.
+    """
+    options = options or MultivariableOptions()
+    listed = (plants,) if isinstance(plants, MultivariablePlant) else tuple(plants)
+    programme = Programme(listed, specification, options)
+    tell = progress or (lambda fraction, message: None)
+    best: tuple[float, ModalForm, Real] | None = None
+    for start in range(options.starts):
+        tell(start / options.starts, f"controller {start + 1} of {options.starts}")
+        gamma, form, x = programme.grown(rng)
+        if best is None or gamma < best[0]:
+            best = gamma, form, x
+        if gamma <= options.sufficient_gamma:
+            break
+    assert best is not None
+    tell(1.0, "synthesis")
+    return programme.result(*best)
+
+
+class Programme:
+    """Plants and specification on a lean grid to begin with and on a dense one."""
+
+    def __init__(
+        self,
+        plants: tuple[MultivariablePlant, ...],
+        specification: MultivariableSpecification,
+        options: MultivariableOptions,
+    ) -> None:
+        first = plants[0]
+        for plant in plants[1:]:
+            if (plant.inputs, plant.outputs, plant.dt_s) != (first.inputs, first.outputs, first.dt_s):
+                raise SpecificationError(
+                    f"plants {first.name!r} and {plant.name!r} differ in dt, inputs or outputs"
+                )
+        self.plants, self.spec, self.options, self.dt_s = plants, specification, options, first.dt_s
+        self.pattern = specification.pattern(first.inputs, first.outputs)
+        self.names = tuple(specification.weights(first.inputs, first.outputs))
+        corners = [
+            abs(root)
+            for _, weights in specification.weights(first.inputs, first.outputs).values()
+            for weight in weights
+            if weight is not None
+            for root in np.roots(weight.denominator)
+            if root
+        ]
+        slow = 0.1 * min(corners, default=np.inf)
+        self.lowest_rad_s = min(slow, *(lowest_rad_s(self.dt_s, plant.poles) for plant in plants))
+        delay = specification.computational_delay_samples
+        self.loops = [NominalLoop(plant, delay) for plant in plants]
+        self.lean = [self._grid(plant, options.grid_points, options.mode_points) for plant in plants]
+        dense = [self._grid(plant, options.dense_points, 5 * options.mode_points) for plant in plants]
+        self.dense = stacked_rows(plants, specification, dense)
+        self.scale_rad_s = self._scale()
+        self.steps = 0
+        self.form(specification.controller_order)  # refuses an order that no form has
+
+    def _grid(self, plant: MultivariablePlant, points: int, around: int) -> Real:
+        if plant.own_grid is not None:
+            return plant.own_grid[plant.own_grid < np.pi / self.dt_s]
+        modes = [*plant.modes, *modes_of(plant.zeros, self.dt_s)]
+        modes = [
+            Mode(m.omega_rad_s, max(abs(m.zeta), 1e-4)) for m in modes if m.omega_rad_s < np.pi / self.dt_s
+        ]
+        low, top = self.lowest_rad_s, 0.9999 * np.pi / self.dt_s
+        return frequency_grid(top, modes, omega_min_rad_s=low, n_log=points, n_mode=around * len(modes))
+
+    def _scale(self) -> float:
+        """Around which frequency the controller has to act: the geometric mean of the bandwidths, or where
+        the tracking weights fall to one."""
+        found = [joint.bandwidth_rad_s for joint in self.spec.joints if joint.bandwidth_rad_s is not None]
+        omega = np.geomspace(1e-5, 0.99, 400) * np.pi / self.dt_s
+        for joint in self.spec.joints:
+            weight = joint.sensitivity_weight
+            if weight is not None and np.any(above := np.abs(weight.at(tustin_s(omega, self.dt_s))) > 1.0):
+                found.append(float(omega[above][-1]))
+        return float(np.exp(np.mean(np.log(found)))) if found else 0.1 * float(np.pi / self.dt_s)
+
+    def form(self, order: int) -> ModalForm:
+        """Parameters of a controller with so many states."""
+        integrates = np.array([joint.integrator for joint in self.spec.joints[: self.plants[0].outputs]])
+        return ModalForm(
+            self.pattern, order, integrates, 2 * self.scale_rad_s, 2 * self.lowest_rad_s, self.dt_s,
+            self.spec.controller_damping,
+        )  # fmt: skip
+
+    def static(self) -> tuple[ModalForm, Real]:
+        """Order as low as it gets, from a static gain that stabilises all nominal loops: the real part of a
+        pseudo-inverse of the plant at the scale, as large as it may be for a factor of two to -1."""
+        form = self.form(sum(joint.integrator for joint in self.spec.joints[: self.plants[0].outputs]))
+        descent = MatrixDescent(form, stacked_rows(self.plants, self.spec, self.lean), self.loops)
+        found: list[tuple[float, Real]] = []
+        for factor in (1.0, 0.3, 0.1):
+            G = self.plants[0].blocks(np.array([factor * self.scale_rad_s]))[0][0]
+            for lag in (0.0, 0.25, 0.5):  # in half turns: plants that integrate are turned by a half of one
+                D = np.where(self.pattern, np.linalg.pinv(G * np.exp(1j * np.pi * lag)).real, 0.0)
+                D = D / (np.linalg.norm(G @ D, 2) or 1.0)
+                for gain in 2.0 ** np.arange(1.0, -14.0, -1.0):
+                    slow = 0.02 * self.scale_rad_s * gain * D[:, form.integrates]
+                    x = form.join(*(np.zeros(0),) * 2, *form.no_blocks(), gain * D, slow)
+                    if descent.stable(x):
+                        bound = descent.bound(x, None)
+                        if bound is not None:
+                            found.append((float(np.max(bound.gamma)), x))
+                            break
+        if not found:
+            raise SpecificationError(
+                "no static gain of this structure stabilises the plant robustly; allow more entries of K "
+                "(structure), or close a stabilising loop first and design around it"
+            )
+        return form, min(found, key=lambda each: each[0])[1]
+
+    def grown(self, rng: np.random.Generator) -> tuple[float, ModalForm, Real]:
+        """(worst case on the dense grid, form, parameters) of the asked order, from random blocks."""
+        options, target = self.options, self.spec.controller_order
+        form, x = self.static()
+        x, gamma = self.improved(form, x, 2 if form.order < target else options.rounds)
+        while form.order < target:
+            larger = self.form(form.order + 2)
+            x = self._best_of([larger.extended(form, x, rng) for _ in range(options.candidates)], larger)
+            form = larger
+            x, gamma = self.improved(form, x, 2 if form.order < target else options.rounds)
+        for _ in range(options.renewals if form.blocks else 0):
+            if gamma <= options.sufficient_gamma:
+                break
+            # A block whose loss hurts least makes room for another one.
+            without = [self.worst(form, form.renewed(x, block, rng)) for block in range(form.blocks)]
+            least = np.argsort(without, kind="stable")[: 1 + form.blocks // 3]
+            starts = [form.renewed(x, int(rng.choice(least)), rng) for _ in range(options.candidates)]
+            other, reached = self.improved(form, self._best_of(starts, form), options.rounds)
+            if reached < gamma:
+                x, gamma = other, reached
+        return gamma, form, x
+
+    def _best_of(self, starts: list[Real], form: ModalForm) -> Real:
+        """The best of several starts after a few steps; the first as it is where none is stable on the dense
+        grid: a candidate may hide an unstable plant of the set between the points of the lean one."""
+        stack = stacked_rows(self.plants, self.spec, self._with_light(form, starts[0]))
+        tried = []
+        for start in starts:
+            end, reached, steps = MatrixDescent(form, stack, self.loops).run(start, self.options.growth_steps)
+            self.steps += steps
+            tried.append((reached, end))
+        tried.sort(key=lambda each: each[0])
+        return next((end for _, end in tried if np.isfinite(self.worst(form, end))), starts[0])
+
+    def improved(self, form: ModalForm, x: Real, rounds: int) -> tuple[Real, float]:
+        """Descents in rounds, with violated frequencies added: best parameters and their worst case on the
+        dense grid."""
+        grids = list(self.lean)
+        best, least = x, self.worst(form, x)
+        for _ in range(rounds):
+            grids = [np.union1d(grid, light) for grid, light in zip(grids, self._light(form, x), strict=True)]
+            descent = MatrixDescent(form, stacked_rows(self.plants, self.spec, grids), self.loops)
+            end, reached, steps = descent.run(x, self.options.steps)
+            self.steps += steps
+            if not np.isfinite(reached):
+                break
+            checked = self.check(form, end)
+            worst = max(float(np.max(value)) for _, value in checked)
+            gain = least / worst - 1.0 if np.isfinite(least) else np.inf
+            if worst < least:
+                best, least = end, worst
+            if np.isfinite(worst):
+                x = end  # else once more from the same point, with the frequencies that were missing
+            done = worst <= reached * (1 + _EXCESS) and (steps < self.options.steps or gain < _EXCESS / 2)
+            if done or least <= self.options.sufficient_gamma:
+                break
+            limit = reached * (1 + 0.5 * _EXCESS)
+            for i, (omega, value) in enumerate(checked):
+                violated = omega[[k for k in local_maxima(value) if value[k] > limit][:_MOST]]
+                grids[i] = np.union1d(grids[i], violated)
+                if not np.isfinite(worst):
+                    self.lean[i] = np.union1d(self.lean[i], violated)
+        return best, least
+
+    def worst(self, form: ModalForm, x: Real) -> float:
+        """Worst case on the dense grid; inf for an unstable nominal loop."""
+        a, b, c, d = form.discrete(x)
+        if not all(np.all(np.abs(loop.poles(a, b, c, d)) < 1.0) for loop in self.loops):
+            return float("inf")
+        return max(float(np.max(value)) for _, value in self.check(form, x))
+
+    def check(self, form: ModalForm, x: Real) -> list[tuple[Real, Real]]:
+        """Of every plant: frequencies (F,) of the dense check and of light poles, worst case (F,) there."""
+        light = self._light(form, x)
+        found = [(self.dense, self._gamma(form, x, self.dense))]
+        if any(each.size for each in light):
+            more = stacked_rows(self.plants, self.spec, light)
+            found.append((more, self._gamma(form, x, more)))
+        checked = []
+        for number in range(len(self.plants)):
+            omega = np.concatenate([stack.omega_rad_s[stack.plant == number] for stack, _ in found])
+            gamma = np.concatenate([value[stack.plant == number] for stack, value in found])
+            unique, inverse = np.unique(omega, return_inverse=True)
+            worst = np.zeros(unique.size)
+            np.maximum.at(worst, inverse, gamma)
+            checked.append((unique, worst))
+        return checked
+
+    @staticmethod
+    def _gamma(form: ModalForm, x: Real, stack: StackedRows) -> Real:
+        return scaled_bound(stack.rows, form.response(x[None], stack.s)[0], accuracy=1e-6).gamma
+
+    def _with_light(self, form: ModalForm, x: Real) -> list[Real]:
+        return [np.union1d(grid, light) for grid, light in zip(self.lean, self._light(form, x), strict=True)]
+
+    def _light(self, form: ModalForm, x: Real) -> list[Real]:
+        """Frequencies around lightly damped poles of every loop and of the controller."""
+        abcd = form.discrete(x)
+        own = np.linalg.eigvals(abcd[0])
+        found = []
+        for plant, loop in zip(self.plants, self.loops, strict=True):
+            modes = modes_of(np.concatenate([own, loop.poles(*abcd)]), self.dt_s, zeta_below=_LIGHT)
+            points = [m.omega_rad_s * (1 + max(abs(m.zeta), 1e-5) * _AROUND) for m in modes]
+            omega = np.unique(np.concatenate([np.zeros(0), *points]))
+            inside = (omega > 0) & (omega < 0.9999 * np.pi / self.dt_s) & (plant.own_grid is None)
+            found.append(omega[inside])
+        return found
+
+    def result(self, gamma: float, form: ModalForm, x: Real) -> MultivariableResult:
+        """The controller and what is known of it."""
+        stack, value = self.dense, self._gamma(form, x, self.dense)
+        worst, blocking = {}, []
+        for which, name in enumerate(self.names):
+            rows = np.flatnonzero(stack.requirement == which)
+            if rows.size:
+                at = rows[np.argmax(value[rows])]
+                worst[name] = float(value[at])
+                plant = self.plants[int(stack.plant[at])].name
+                blocking.append(BlockingPoint(plant, name, float(stack.omega_rad_s[at]), float(value[at])))
+        limits, rates = self.spec.limits(form.inputs)
+        a, b, c, d = form.discrete(x)
+        controller = Controller(
+            a, b, c, d, self.dt_s,
+            computational_delay_samples=self.spec.computational_delay_samples,
+            input_limit=None if not any(limits) else limits, rate_limit=None if not any(rates) else rates,
+        )  # fmt: skip
+        outcome = Outcome.NOT_CONVERGED if not np.isfinite(gamma) else Outcome.NOT_MET
+        outcome = Outcome.MET_ON_GRID if gamma <= 1.0 else outcome
+        blocking.sort(key=lambda point: -point.value)
+        return MultivariableResult(outcome, controller, gamma, worst, tuple(blocking), self.steps)
