@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
+from scipy.special import expit, logit
 
 from ident.basis.mimo_model import residue_columns
 from ident.basis.poles import NO_POLES, Poles
@@ -345,7 +346,7 @@ def _start(mode: Mode, sizes: RealArray) -> RealArray:
     largest, which is one."""
     pole, residue = mode.pole, mode.residue
     head = [np.log(-np.log(abs(pole)))] if mode.moves else []
-    head += [-np.log(np.pi / np.angle(pole) - 1)] if mode.moves and mode.is_pair else []
+    head += [logit(np.angle(pole) / np.pi)] if mode.moves and mode.is_pair else []
     if mode.rank_one:
         left, size, right = np.linalg.svd(residue * sizes)
         b = right[0] / sizes
@@ -368,7 +369,7 @@ def _unpacked(mode: Mode, x: RealArray) -> tuple[complex, ComplexArray, list[Com
     if mode.moves:
         size, x = np.exp(-np.exp(np.clip(x[0], *_LOG_DECAY))), x[1:]
         if mode.is_pair:
-            pole, x = size * np.exp(1j * np.pi / (1 + np.exp(-x[0]))), x[1:]
+            pole, x = size * np.exp(1j * np.pi * expit(x[0])), x[1:]
         else:
             pole = complex(np.copysign(size, mode.pole.real))
     outputs, inputs = mode.residue.shape

@@ -9,6 +9,7 @@ import numpy as np
 
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
+from ident.data.arrays import ComplexArray
 from ident.fit.least_squares import EXPLAINED
 from ident.fit.problem import PoleProblem
 from ident.fit.refinement import Refined
@@ -23,7 +24,7 @@ _EXCHANGES = 4
 _LIKELIER = 2.0
 # Damping ratio above which a pair does what real poles do, and how far apart two of them begin.
 _NO_OVERSHOOT, _APART = 0.9, 1.5
-# Real poles have met if their decays differ by less than this share.
+# Poles have met if they differ by less than this share of their distance from one.
 _MET = 1e-4
 
 
@@ -128,21 +129,25 @@ class OrderSelection:
         return self._apart(best)
 
     def _apart(self, best: Refined) -> Refined:
-        """Without real poles that have met: a descent does not part them, and they have no residue each. One
-        in place of two, or both from further apart, whichever fits better."""
-        first = self.search.fixed.real.size
-        real = best.poles.real[first:]
-        order = np.argsort(real)
-        met = np.flatnonzero(np.diff(real[order]) <= _MET * (1 - real[order][1:]))
-        if not met.size or self.options.n_real is not None:
+        """Without poles that have met: a descent does not part them, and they have no residue each. One in
+        place of two, or two real poles further apart, whichever fits better."""
+        fixed, poles = self.search.fixed, best.poles
+        if self.options.n_real is not None or self.options.n_pairs is not None:
             return best
-        slow, fast = first + order[met[0] + 1], first + order[met[0]]
-        one = best.poles.without_real(max(slow, fast)).without_real(min(slow, fast))
-        decay = -np.log(best.poles.real[slow])
-        trials = [
-            one.appended(Poles(np.exp(-decay * np.array(apart)))) for apart in ([1.0], [1 / _APART, _APART])
-        ]
-        ends = [self._noted(self.search.descend(trial, "real poles apart")) for trial in trials]
+        real = _met(poles.real[fixed.real.size :].astype(complex))
+        pairs = _met(poles.pairs[fixed.pairs.size :])
+        if real is not None:
+            one = poles.without_real(fixed.real.size + real)
+            none = one.without_real(int(np.argmin(np.abs(one.real - poles.real[fixed.real.size + real]))))
+            rate = -np.log(poles.real[fixed.real.size + real])
+        elif pairs is not None:
+            one = poles.without_pair(fixed.pairs.size + pairs)
+            met = poles.pairs[fixed.pairs.size + pairs]
+            none, rate = one.without_pair(int(np.argmin(np.abs(one.pairs - met)))), abs(np.log(met))
+        else:
+            return best
+        two = none.appended(Poles(np.exp(-rate * np.array([1 / _APART, _APART]))))
+        ends = [self._noted(self.search.descend(trial, "poles apart")) for trial in (one, two)]
         criterion = self._criterion(best)
         return min(ends, key=lambda end: criterion(end.rss, end.poles.order))
 
@@ -230,3 +235,10 @@ class OrderSelection:
         key = self._counts(end)
         self._tried[key] = min(end.rss, self._tried.get(key, np.inf))
         return end
+
+
+def _met(poles: ComplexArray) -> int | None:
+    """Index of a pole that another has met; None where all are apart."""
+    near = np.abs(poles[:, None] - poles[None, :]) <= _MET * np.abs(1 - poles)
+    at = np.flatnonzero((near & ~np.eye(poles.size, dtype=bool)).any(axis=1))
+    return int(at[0]) if at.size else None
