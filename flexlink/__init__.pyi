@@ -45,7 +45,7 @@ from .models import (
     identify_frf as identify_frf,
     identify_mimo as identify_mimo,
     identify_miso as identify_miso,
-    matrix_uncertainty as matrix_uncertainty,
+    matrix_posterior as matrix_posterior,
     pole_intervals as pole_intervals,
     regressor as regressor,
     uncertainty as uncertainty,

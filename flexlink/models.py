@@ -30,7 +30,7 @@ from ident.one_input import identify as identify_records, identify_miso
 from ident.search.error_surface import ErrorSurface, error_surface as surface_of
 from ident.several_outputs import identify_mimo
 from ident.uncertainty.embedding import tangent
-from ident.uncertainty.matrix_response import matrix_uncertainty
+from ident.uncertainty.matrix_response import matrix_posterior
 from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals
 from plant.rig import one_line
@@ -53,7 +53,7 @@ __all__ = [
     "identify_frf",
     "identify_mimo",
     "identify_miso",
-    "matrix_uncertainty",
+    "matrix_posterior",
     "pole_intervals",
     "regressor",
     "uncertainty",

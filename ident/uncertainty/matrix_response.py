@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2
 
+from ident.basis.mimo_model import MimoModel
 from ident.basis.structure import front_response
 from ident.data.arrays import ComplexArray, RealArray, lock
 from ident.data.record import Record
@@ -64,14 +65,44 @@ class MatrixUncertainty:
         return np.asarray(self.distance(response) <= 1)
 
 
-def matrix_uncertainty(
-    records: Sequence[Record],
-    identification: MimoIdentification,
-    omega_rad_s: RealArray,
-    *,
-    level: float = 0.95,
-) -> MatrixUncertainty:
-    """Balls of the matrix response at omega (F,), up to pi/dt (above 0 with integrators).
+@dataclass(frozen=True, eq=False)
+class MatrixPosterior:
+    """What records say of a matrix response, at any frequency: `at`.
+
+    model; output_factor Lo (Y, Y); modes, on outputs made white by it; covariance_factor of their numbers;
+    level: probability of holding the response, frequency by frequency.
+    """
+
+    model: MimoModel
+    output_factor: RealArray
+    modes: ModalFit
+    covariance_factor: RealArray
+    level: float
+
+    @property
+    def dt_s(self) -> float:
+        return self.model.dt_s
+
+    def at(self, omega_rad_s: RealArray) -> MatrixUncertainty:
+        """Balls at omega (F,), up to pi/dt (above 0 with integrators)."""
+        omega, model = np.asarray(omega_rad_s, dtype=np.float64), self.model
+        front = front_response(omega, model.dt_s, model.integrators, model.input_delay_samples)
+        columns = self.modes.response_columns(omega) @ self.covariance_factor * front[:, None, None, None]
+        covariance = np.einsum("fyup,fyvp->fuv", columns.conj(), columns) / len(model.outputs)
+        upper = np.linalg.cholesky(covariance).conj().swapaxes(1, 2)
+        turned = np.einsum("fyup,fuv->fyvp", columns, np.linalg.inv(upper))
+        flat = turned.reshape(omega.size, -1, turned.shape[-1])
+        weights = np.linalg.svd(np.concatenate([flat.real, flat.imag], axis=1), compute_uv=False) ** 2
+        squares = np.random.default_rng(0).standard_normal((_DRAWS, weights.shape[1])) ** 2
+        radius: RealArray = np.sqrt(np.quantile(squares @ weights.T, self.level, axis=0)).astype(np.float64)
+        centre = model.frequency_response(omega)
+        return MatrixUncertainty(omega, centre, self.output_factor, upper, radius, model.dt_s, self.level)
+
+
+def matrix_posterior(
+    records: Sequence[Record], identification: MimoIdentification, *, level: float = 0.95
+) -> MatrixPosterior:
+    """Posterior of the matrix response.
 
     records, identification: of `identify_mimo`. First order in the noise, which is taken as white in time,
     and for the order and the shapes that were chosen: nothing is added for modes that the records did not
@@ -90,15 +121,15 @@ def matrix_uncertainty(
     own = np.einsum("xy,yub->xub", white, model.coefficients)
     modes = modes_of(model.poles, own, identification.n_fixed, identification.rank_one or None)
     fit = ModalFit(data, modes)
-    omega = np.asarray(omega_rad_s, dtype=np.float64)
-    front = front_response(omega, model.dt_s, model.integrators, model.input_delay_samples)
-    columns = fit.response_columns(omega) @ fit.covariance_factor() * front[:, None, None, None]
-    covariance = np.einsum("fyup,fyvp->fuv", columns.conj(), columns) / len(model.outputs)
-    upper = np.linalg.cholesky(covariance).conj().swapaxes(1, 2)
-    turned = np.einsum("fyup,fuv->fyvp", columns, np.linalg.inv(upper))
-    flat = turned.reshape(omega.size, -1, turned.shape[-1])
-    both = np.concatenate([flat.real, flat.imag], axis=1)
-    weights = np.linalg.svd(both, compute_uv=False) ** 2
-    squares = np.random.default_rng(0).standard_normal((_DRAWS, weights.shape[1])) ** 2
-    radius: RealArray = np.sqrt(np.quantile(squares @ weights.T, level, axis=0)).astype(np.float64)
-    return MatrixUncertainty(omega, model.frequency_response(omega), factor, upper, radius, model.dt_s, level)
+    return MatrixPosterior(model, factor, fit, fit.covariance_factor(), level)
+
+
+def matrix_uncertainty(
+    records: Sequence[Record],
+    identification: MimoIdentification,
+    omega_rad_s: RealArray,
+    *,
+    level: float = 0.95,
+) -> MatrixUncertainty:
+    """`matrix_posterior` at omega (F,); raises ValueError as that."""
+    return matrix_posterior(records, identification, level=level).at(omega_rad_s)
