@@ -101,6 +101,13 @@ def followed(one: Machine, folder: Path, line: str) -> bool | None:
         text = config.read_text().replace('response = "without friction"', 'response = "as recorded"')
         config = work / "followed.toml"
         config.write_text(text)
+    elif meets := re.search(r"(\w+) = ([\d.e+-]+) would meet it", line):
+        config = work / "followed.toml"
+        key = re.escape(meets[1])
+        text = re.sub(rf"(?m)^{key} = \S+", f"{meets[1]} = {meets[2]}", (work / "my.toml").read_text())
+        if meets[1] == "bandwidth_rad_s":  # the value that was left open is now stated
+            text = re.sub(r"(?m)^lowest_bandwidth_rad_s = .*\n", "", text)
+        config.write_text(text)
     elif "controller_order" in line:
         config = work / "followed.toml"
         text = (work / "my.toml").read_text()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -23,6 +24,7 @@ from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import Outcome
 from ident.uncertainty import FrequencyUncertainty
 from tests.compiler import compiled, needs_compiler
+from tests.control_design.plants import uncertain_hub
 from tests.workflow.report_examples import (
     DT_S,
     achievable,
@@ -194,6 +196,23 @@ def test_calibration_is_designed_for(monkeypatch):
     assert find_design([plant()], spec(), how, kept, rng).jointly is None
     # The joint design begins with the plain one.
     assert asked == ["plain", "jointly", "plain", "plain"]
+
+
+def test_a_missed_specification_says_what_would_meet_it():
+    """A modulus margin near one leaves no bandwidth: the reason names a smaller one, and it is met."""
+    asked = {"effort_limit": 1.5, "modulus_margin": 0.95, "controller_order": 3}
+    specification = Specification.model_validate(asked | {"bandwidth_rad_s": 2.0})
+    how, options = SynthesisOptions(), CertificateOptions.model_validate({})
+
+    def found(wish):
+        return find_design([uncertain_hub(0.03)], wish, how, options, np.random.default_rng(0))
+
+    missed = found(specification)
+    assert not missed.met
+    key, value = re.search(r"; (\w+) = ([\d.]+) would meet it", missed.reason).groups()
+    met = found(specification.model_copy(update={key: float(value)}))
+    assert met.met
+    assert "would meet" not in met.reason
 
 
 def test_words_of_sampled_responses():

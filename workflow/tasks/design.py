@@ -21,7 +21,7 @@ from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import RationalWeight, Specification, SpecificationError
 from control_design.synthesis.bandwidth import synthesise_widest
 from control_design.synthesis.joint_synthesis import synthesise_jointly
-from control_design.synthesis.synthesis import part_of
+from control_design.synthesis.synthesis import part_of, synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from ident.uncertainty import ResponsePosterior
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
@@ -46,6 +46,9 @@ UNKNOWN_TO_BRACKET = (
     "input_limit",
     "rate_limit",
 )
+
+# Worst case of a quick design that the whole design then meets, too.
+_CLEARLY = 0.97
 
 
 def find_design(
@@ -83,7 +86,35 @@ def find_design(
             jointly = None
     except SpecificationError as impossible:
         return DesignResult(None, met=False, reason=str(impossible), specification=specification)
-    return DesignResult(result, result.gamma <= 1.0, said("outcome", result), jointly, specification)
+    reason = said("outcome", result)
+    if 1.0 < result.gamma < math.inf:
+        reason += said("would_meet", would_meet(plants, specification, result.gamma, synthesis, rng))
+    return DesignResult(result, result.gamma <= 1.0, reason, jointly, specification)
+
+
+def would_meet(
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    gamma: float,
+    synthesis: SynthesisOptions,
+    rng: np.random.Generator,
+) -> tuple[str, float] | None:
+    """A key of the specification, and the first value of it with which a quick design meets the rest: a
+    larger effort_limit, else a smaller bandwidth_rad_s; None where none of a few does. gamma: worst case."""
+    root = int(rng.integers(2**63))
+    quick = synthesis.model_copy(update={"sufficient_gamma": _CLEARLY})
+    for key, factors in (("effort_limit", (1.5 * gamma, 3 * gamma)), ("bandwidth_rad_s", (0.5, 0.25))):
+        stated = getattr(specification, key)
+        for factor in factors if stated is not None else ():
+            value = float(f"{factor * stated:.2g}")
+            asked = specification.model_copy(update={key: value, "lowest_bandwidth_rad_s": None})
+            try:
+                found = synthesise(plants, asked, quick, rng=np.random.default_rng(root), thorough=False)
+            except SpecificationError:
+                continue
+            if found.gamma <= _CLEARLY:
+                return key, value
+    return None
 
 
 def certify_asked(
