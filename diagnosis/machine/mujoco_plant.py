@@ -464,7 +464,8 @@ class MujocoArm:
             more = e.input.copy()
             more[:, free] += _FORCED * (more[:, free] - np.mean(more[:, free], axis=0))
             start = simulation._start(e.input).state
-            by_forces = simulation._run(forced, stated, more, start) - simulation(stated, {}, e.input)
+            by_forces = simulation._run(forced, stated, more, start)
+            by_forces -= simulation._run(simulation._model({}), stated, e.input, start)
             made += float(np.sum(np.var(by_forces / _FORCED, axis=0) / np.var(e.output, axis=0)))
             moved += len(self.outputs)
         return float(min(np.sqrt(made / moved), 1.0))
