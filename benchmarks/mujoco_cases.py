@@ -381,11 +381,13 @@ def answer(number: int, seed: int) -> Answer:
         stated = case.plant.parameters.get(key, 1.0)
         covers = min(abs(low), abs(high)) * stated <= truth.value <= max(abs(low), abs(high)) * stated
     source = "equations" if _by_equations(number) else "MuJoCo"
-    size = "" if none else f"{truth.value:.4g}, found {100 * off:+.1f} %"
+    size = (
+        "" if none else f"{truth.value:.4g}, found {100 * off:+.1f} %{' (in its interval)' if covers else ''}"
+    )
     line = (
         f"{number:3d} {source:9s} {truth.integrator:12s} {truth.drive:5s} "
         f"{'moving' if truth.moving else 'rest':6s} "
-        f"{truth.n} {truth.name:26s} {size:24s} -> {', '.join(found.combination) or found.verdict} "
+        f"{truth.n} {truth.name:26s} {size:42s} -> {', '.join(found.combination) or found.verdict} "
         f"{found.probability:.3f} (gap {found.gap_refit:.1f} to {found.gap_after:.1f}, {cpu_s:.0f} s)"
     )
     sure = not exact and found.probability > 0.8 and found.verdict != "unknown"
@@ -397,9 +399,12 @@ def run(out: Print, *, seed: int = 15, first: int = 0, cases: int = 80, jobs: in
     numbers = order[first : first + cases]
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         answers = []
-        for one in pool.map(answer, numbers, [seed] * len(numbers)):
-            out(one.line)
-            answers.append(one)
+        try:
+            for one in pool.map(answer, numbers, [seed] * len(numbers)):
+                out(one.line)
+                answers.append(one)
+        except KeyboardInterrupt:  # what there is counts
+            pool.shutdown(wait=False, cancel_futures=True)
     effects = [one for one in answers if not one.none]
     named = [one for one in effects if one.first]
     out()
