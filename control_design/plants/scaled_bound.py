@@ -110,10 +110,13 @@ class _Point(NamedTuple):
         return np.asarray(lower)
 
 
-def scaled_bound(rows: Rows, K: Array, log_t: Array | None = None, *, accuracy: float = 1e-9) -> Bound:
+def scaled_bound(
+    rows: Rows, K: Array, log_t: Array | None = None, *, accuracy: float = 1e-9, within: float = np.inf
+) -> Bound:
     """Smallest bound over the scalings for controller values K (R, U, Y), to a relative accuracy of gamma.
 
-    log_t (R, N): where to begin; None: from the sizes of the blocks. Neglected: rounding.
+    log_t (R, N): where to begin; None: from the sizes of the blocks. within: rows whose log gamma^2 stays by
+    more than this below the largest keep a bound that is not the smallest. Neglected: rounding.
     """
     outputs = K.shape[2]
     S = np.linalg.inv(np.eye(outputs) + rows.G @ K)
@@ -132,7 +135,17 @@ def scaled_bound(rows: Rows, K: Array, log_t: Array | None = None, *, accuracy: 
         if log_t is not None and np.any(lost):
             t[lost] = problem.begin()[lost]
             point = problem.at(t)
-        t, point = problem.lower(t, point, accuracy)
+        left = np.isfinite(point.value)
+        while np.any(left):
+            most = np.max(point.value, where=np.isfinite(point.value), initial=-np.inf)
+            index = np.flatnonzero(left & (point.value > most - within))
+            if not index.size:
+                break
+            few = _Point(point.value[index], point.slope[index], point.x[index], point.share[index])
+            lowest, few = problem.part(index).lower(t[index], few, accuracy)
+            for whole, part in zip((t, *point), (lowest, *few), strict=True):
+                whole[index] = part
+            left[index] = False
     gamma = np.sqrt(np.exp(point.value))
     x = point.x
     y = apply(K, x)

@@ -28,6 +28,7 @@ from control_design.synthesis.synthesis_result import BlockingPoint, Outcome
 
 _LIGHT = 0.3  # poles of loop and controller damped less have frequencies of their own in every check
 _AROUND = np.array([-3, -1.5, -0.7, -0.3, 0, 0.3, 0.7, 1.5, 3])  # in half-widths of such a pole
+_SEEN = 0.5  # log gamma^2 below the largest within which the dense check is exact
 _EXCESS = 5e-4  # accepted of the dense check over the programme
 _MOST = 15  # violated frequencies added in a round
 
@@ -286,8 +287,10 @@ class Programme:
         return checked
 
     @staticmethod
-    def _gamma(form: ModalForm, x: Real, stack: StackedRows) -> Real:
-        return scaled_bound(stack.rows, form.response(x[None], stack.s)[0], accuracy=1e-6).gamma
+    def _gamma(form: ModalForm, x: Real, stack: StackedRows, within: float = _SEEN) -> Real:
+        return scaled_bound(
+            stack.rows, form.response(x[None], stack.s)[0], accuracy=1e-6, within=within
+        ).gamma
 
     def _with_light(self, form: ModalForm, x: Real) -> list[Real]:
         return [np.union1d(grid, light) for grid, light in zip(self.lean, self._light(form, x), strict=True)]
@@ -307,7 +310,7 @@ class Programme:
 
     def result(self, gamma: float, form: ModalForm, x: Real) -> MultivariableResult:
         """The controller and what is known of it."""
-        stack, value = self.dense, self._gamma(form, x, self.dense)
+        stack, value = self.dense, self._gamma(form, x, self.dense, np.inf)
         worst, blocking = {}, []
         for which, name in enumerate(self.names):
             rows = np.flatnonzero(stack.requirement == which)

@@ -22,7 +22,7 @@ from control_design.synthesis.minimax_step import minimax_step
 from control_design.synthesis.modal_controller import ModalForm
 
 _SHIFT = 1e-5  # of a parameter, in natural units, in the difference quotient of slopes
-_ACCURACY = 1e-7  # of gamma in a step
+_ACCURACY = 1e-6  # of gamma in a step
 _FIRST_BOX, _LARGEST_BOX, _SMALLEST_BOX = 0.3, 1.0, 1e-4
 _LEAST_GAIN = 2e-6  # predicted fall of log gamma^2 that is not worth a step
 _FAR_BELOW = 2.0  # rows so far below the worst (log gamma^2) cannot become it within one step
@@ -110,7 +110,7 @@ class MatrixDescent:
         if not self.stable(x):
             return None
         K = self.form.response(x[None], self.stack.s)[0]
-        found = scaled_bound(self.stack.rows, K, log_t, accuracy=_ACCURACY)
+        found = scaled_bound(self.stack.rows, K, log_t, accuracy=_ACCURACY, within=_FAR_BELOW)
         return found if np.all(np.isfinite(found.gamma)) else None
 
     def run(self, start: Real, steps: int) -> tuple[Real, float, int]:
