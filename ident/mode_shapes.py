@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 from scipy.special import expit, logit
@@ -266,6 +267,55 @@ class ModalFit:
                     column[:, k, j] = part
                     columns.append(column)
         return np.stack(columns, axis=-1)
+
+    def response_states(self) -> tuple[RealArray, RealArray, RealArray]:
+        """The same as a state space: A (n, n), B (n, U), and C (P, Y, n + U) that takes states and inputs to
+        what each number changes. Every input drives states of its own."""
+        n_outputs, n_inputs = self.y.shape[0], self.u.shape[0]
+        blocks: list[RealArray] = [np.zeros((1, 1))]  # one sample later, for the integrators' columns
+        rows: list[tuple[int, ComplexArray, int]] = []  # first state of an input, its (Y, U) changes, power
+        at = 1
+        for mode, (pole, residue), slopes in self._unpacked():
+            own = (
+                np.array([[pole.real, -pole.imag], [pole.imag, pole.real]])
+                if mode.is_pair
+                else np.array([[pole.real]])
+            )
+            size = len(own)
+            block = np.zeros((2 * size, 2 * size))
+            block[:size, :size] = block[size:, size:] = own
+            block[size:, :size] = np.eye(size)
+            blocks.append(block)
+            if mode.moves:
+                rows += [(at, step * residue, 2) for step in _pole_steps(mode, pole)]
+            rows += [(at, slope, 1) for slope in slopes]
+            at += 2 * size
+        one = block_diag(*blocks)
+        drive = np.zeros((at, 1))
+        drive[0] = 1.0
+        starts = np.cumsum([0, *(len(block) for block in blocks)])[:-1]
+        drive[starts[1:]] = 1.0
+        columns = []
+        for first, change, power in rows:
+            size = len(blocks[int(np.searchsorted(starts, first))]) // 2
+            state = first + (power - 1) * size
+            column = np.zeros((n_outputs, n_inputs, at + 1))
+            column[:, :, state] = change.real * (2 if size == 2 else 1)
+            if size == 2:
+                column[:, :, state + 1] = -2 * change.imag
+            columns.append(column)
+        parts = [0] if self.structure.integrators else []
+        parts += [at] if self.structure.feedthrough else []
+        for k in range(n_outputs):
+            for part in parts:
+                for j in range(n_inputs):
+                    column = np.zeros((n_outputs, n_inputs, at + 1))
+                    column[k, j, part] = 1.0
+                    columns.append(column)
+        both = np.array(columns)  # (P, Y, U, states and input of one)
+        seen = np.concatenate([both[..., :at].reshape(len(both), n_outputs, -1), both[..., at]], axis=2)
+        eye = np.eye(n_inputs)
+        return np.asarray(np.kron(eye, one)), np.asarray(np.kron(eye, drive)), np.asarray(seen)
 
     def _unpacked(self) -> Iterator[tuple[Mode, tuple[complex, ComplexArray], list[ComplexArray]]]:
         at = 0

@@ -14,6 +14,7 @@ from control_design.plants.plant_set import Mode, delayed, matrix_response, mode
 from control_design.plants.scaled_bound import conjugate
 from control_design.plants.weights import RationalWeight
 from ident.data.arrays import lock
+from ident.uncertainty.matrix_response import MatrixPosterior
 
 if TYPE_CHECKING:
     import control
@@ -33,7 +34,7 @@ class ResponseBall:
     Lo : (Y, P). Li : stable discrete `control.StateSpace` with U inputs and any number of outputs, or an
     array (F, Q, U) at omega_rad_s (F,) [rad/s]: then nothing is known, or certified, between these. radius :
     for a Kronecker covariance Lo Lo^H (x) Li^H Li of a complex Gaussian, sqrt(chi^2 quantile / 2) with 2 U Y
-    degrees of freedom.
+    degrees of freedom. `of` makes a ball of an identified response.
 
     Raises ValueError for shapes that do not fit. The smallest destabilising Delta has rank one, so taking
     the ball for a norm-bounded block loses nothing.
@@ -64,6 +65,15 @@ class ResponseBall:
             raise ValueError(f"Li must be finite and ({omega.size}, Q, U); got shape {values.shape}")
         if omega.size < 2 or not (omega[0] > 0 and np.all(np.diff(omega) > 0)):
             raise ValueError("omega_rad_s needs at least two ascending positive frequencies")
+
+    @classmethod
+    def of(cls, posterior: MatrixPosterior, lowest_rad_s: float) -> ResponseBall:
+        """Of an identified matrix response, from lowest_rad_s on: Li is exact, the radius the largest of all
+        frequencies."""
+        import control  # here, because it brings a plotting library with it
+
+        li = control.ss(*posterior.input_factor(lowest_rad_s), posterior.dt_s, remove_useless_states=False)
+        return cls(posterior.output_factor, li, posterior.largest_radius(lowest_rad_s))
 
     def gram(self, omega_rad_s: Real) -> Complex:
         """radius^2 Li^H Li (F, U, U)."""

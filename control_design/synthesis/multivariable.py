@@ -18,7 +18,7 @@ from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Real
 from control_design.plants.frequency_grid import frequency_grid, local_maxima, lowest_rad_s
 from control_design.plants.multivariable import MultivariablePlant, tustin_s
-from control_design.plants.plant_set import Mode, modes_of
+from control_design.plants.plant_set import Mode, matrix_response, modes_of
 from control_design.plants.scaled_bound import scaled_bound
 from control_design.specification.multivariable import MultivariableSpecification
 from control_design.specification.specification import SpecificationError
@@ -179,7 +179,7 @@ class Programme:
         descent = MatrixDescent(form, stacked_rows(self.plants, self.spec, self.lean), self.loops)
         found: list[tuple[float, Real]] = []
         for factor in (1.0, 0.3, 0.1):
-            G = self.plants[0].blocks(np.array([factor * self.scale_rad_s]))[0][0]
+            G = matrix_response(self.plants[0].nominal, np.array([factor * self.scale_rad_s]))[0]
             for lag in (0.0, 0.25, 0.5):  # in half turns: plants that integrate are turned by a half of one
                 D = np.where(self.pattern, np.linalg.pinv(G * np.exp(1j * np.pi * lag)).real, 0.0)
                 D = D / (np.linalg.norm(G @ D, 2) or 1.0)

@@ -25,6 +25,7 @@ from ident.fit.several_outputs import prepare_outputs, whitened
 from ident.identification import MimoIdentification
 from ident.mode_shapes import ModalFit, modes_of
 
+_RADII = 400  # frequencies whose largest radius stands for all
 _DRAWS = 20_000  # of the sum of squares: its 95 % quantile then is right to about 1 %
 
 
@@ -82,6 +83,29 @@ class MatrixPosterior:
     @property
     def dt_s(self) -> float:
         return self.model.dt_s
+
+    def input_factor(self, lowest_rad_s: float) -> tuple[RealArray, RealArray, RealArray, RealArray]:
+        """Stable state space (A, B, C, D) of Li without its radius, exact at all frequencies: Li^H Li = P.
+
+        An integrator is one down to a thousandth of lowest_rad_s; below, its uncertainty stays as there.
+        """
+        a, b, rows = self.modes.response_states()
+        rows = np.einsum("pyn,pq->qyn", rows, self.covariance_factor).reshape(-1, rows.shape[2])
+        triangle: RealArray = np.asarray(np.linalg.qr(rows / np.sqrt(len(self.model.outputs)), mode="r"))
+        n, n_inputs = b.shape
+        c, d = triangle[:, :n], triangle[:, n:]
+        for _ in range(self.model.integrators):
+            # s+ = (1 - small) s + u, out = (1 - small) s + u: z/(z - 1 + small) in front of every input.
+            kept = 1 - 1e-3 * lowest_rad_s * self.dt_s
+            a = np.block([[a, kept * b], [np.zeros((n_inputs, n)), kept * np.eye(n_inputs)]])
+            b, c = np.vstack([b, np.eye(n_inputs)]), np.hstack([c, kept * d])
+            n += n_inputs
+        return a, b, c, d
+
+    def largest_radius(self, lowest_rad_s: float) -> float:
+        """Of the balls from lowest_rad_s to the Nyquist frequency."""
+        grid = np.geomspace(lowest_rad_s, 0.999 * np.pi / self.dt_s, _RADII)
+        return float(np.max(self.at(grid).radius))
 
     def at(self, omega_rad_s: RealArray) -> MatrixUncertainty:
         """Balls at omega (F,), up to pi/dt (above 0 with integrators)."""

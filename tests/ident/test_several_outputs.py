@@ -17,7 +17,7 @@ from ident.basis.poles import Poles
 from ident.data.record import Record
 from ident.one_input import identify
 from ident.several_outputs import identify_mimo
-from ident.uncertainty.matrix_response import matrix_uncertainty
+from ident.uncertainty.matrix_response import matrix_posterior, matrix_uncertainty
 
 DT_S = 0.01
 OMEGA = np.geomspace(0.5, 300, 60)
@@ -123,6 +123,21 @@ def test_balls_hold_the_response_as_often_as_they_say():
     assert 0.88 < np.mean(held) < 0.995
     assert np.all(balls.enclosure > 0.8)
     assert not np.any(balls.holds(2 * truth))
+
+
+@pytest.mark.parametrize("integrators", [0, 1])
+def test_the_rational_factor_is_that_of_the_balls(integrators):
+    system = structure()
+    if integrators:
+        system = control.ss(np.eye(2), np.eye(2), DT_S * np.eye(2), np.zeros((2, 2)), DT_S) * system
+    item = record(system, 5)
+    posterior = matrix_posterior([item], identify_mimo([item], IdentOptions(integrators=integrators)))
+    factor = control.ss(*posterior.input_factor(0.01), DT_S, remove_useless_states=False)
+    assert np.max(np.abs(factor.poles())) < 1
+    values, own = response(factor), posterior.at(OMEGA).input_factor
+    np.testing.assert_allclose(
+        values.conj().swapaxes(1, 2) @ values, own.conj().swapaxes(1, 2) @ own, rtol=1e-4, atol=1e-14
+    )
 
 
 def test_one_input_and_one_output_are_those_of_the_plain_fit():
