@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import scipy.linalg
@@ -14,7 +14,6 @@ from control_design.plants.plant_set import Mode, delayed, matrix_response, mode
 from control_design.plants.scaled_bound import conjugate
 from control_design.plants.weights import RationalWeight
 from ident.data.arrays import lock
-from ident.uncertainty.matrix_response import MatrixPosterior
 
 if TYPE_CHECKING:
     import control
@@ -25,6 +24,17 @@ def tustin_s(omega_rad_s: Real, dt_s: float) -> Complex:
     with np.errstate(over="ignore"):
         size = 2.0 / dt_s * np.tan(np.asarray(omega_rad_s, dtype=np.float64) * dt_s / 2)
     return 1j * np.where(np.abs(size) > 1e9 / dt_s, 1e9 / dt_s, size)
+
+
+class IdentifiedMatrix(Protocol):
+    """What is asked of an identified matrix response (`ident.uncertainty.matrix_response.MatrixPosterior`)."""
+
+    @property
+    def dt_s(self) -> float: ...
+    @property
+    def output_factor(self) -> Real: ...
+    def input_factor(self, lowest_rad_s: float) -> tuple[Real, Real, Real, Real]: ...
+    def largest_radius(self, lowest_rad_s: float) -> float: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +77,7 @@ class ResponseBall:
             raise ValueError("omega_rad_s needs at least two ascending positive frequencies")
 
     @classmethod
-    def of(cls, posterior: MatrixPosterior, lowest_rad_s: float) -> ResponseBall:
+    def of(cls, posterior: IdentifiedMatrix, lowest_rad_s: float) -> ResponseBall:
         """Of an identified matrix response, from lowest_rad_s on: Li is exact, the radius the largest of all
         frequencies."""
         import control  # here, because it brings a plotting library with it
