@@ -27,7 +27,7 @@ def tustin_s(omega_rad_s: Real, dt_s: float) -> Complex:
 
 
 class IdentifiedMatrix(Protocol):
-    """What is asked of an identified matrix response (`ident.uncertainty.matrix_response.MatrixPosterior`)."""
+    """What a ball needs of an identified matrix response (`ident.uncertainty` has it)."""
 
     @property
     def dt_s(self) -> float: ...
