@@ -189,9 +189,7 @@ def _verdict(
             if worst[name] <= 1.0 < level:
                 level = max(1.0, worst[name] * (1 + 1e-5))
             system, sizes = _scaled_loop(controller, plant, of, each)
-            stopped = _covered(
-                system, sizes, level, np.abs(s), scalings[name], rows(of, each), K, start * 1.0
-            )
+            stopped = _covered(system, sizes, level, np.abs(s), scalings[name], start)
             bounds[name] = level if stopped is None else float("inf")
             if stopped is not None:
                 obstacle = f"{name}: no bound found beyond {stopped:.4g} rad/s"
@@ -350,8 +348,6 @@ def _covered(
     level: float,
     size_s: Real,
     log_t: Real,
-    rows: Rows,
-    K: Complex,
     start: float,
 ) -> float | None:
     """Where the bound `level` could not be continued, |s|; None if it holds from `start` to infinity.
@@ -369,20 +365,22 @@ def _covered(
     _, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
     A, B, C = A * scale / scale[:, None], B / scale[:, None], C * scale
 
-    def free(at: int) -> tuple[float, float]:
-        """Interval around a dense frequency without a crossing, with the scalings of that frequency."""
-        left = np.append(np.exp(-0.5 * log_t[at]), 1.0)[z]
-        right = np.append(np.exp(0.5 * log_t[at]), 1.0 / level)[w]
+    def free(here: float) -> tuple[float, float]:
+        """Interval around |s| = here without a crossing, with scalings between those of its neighbours."""
+        log = [np.interp(np.log(here), np.log(size_s), column) for column in log_t.T]
+        left = np.append(np.exp(-0.5 * np.array(log)), 1.0)[z]
+        right = np.append(np.exp(0.5 * np.array(log)), 1.0 / level)[w]
         b, c, d = B * right, C * left[:, None], D * left[:, None] * right
         inner = np.linalg.inv(np.eye(d.shape[1]) - d.T @ d)
         top = A + b @ inner @ d.T @ c
         hamiltonian = np.block(
             [[top, b @ inner @ b.T], [-c.T @ (np.eye(d.shape[0]) + d @ inner @ d.T) @ c, -top.T]]
         )
+        gain = c @ np.linalg.solve(1j * here * np.eye(A.shape[0]) - A, b) + d
+        if not np.linalg.norm(gain, 2) < 1.0:
+            return here, here
         found = scipy.linalg.eigvals(hamiltonian)
         crossing = np.abs(found.imag[np.abs(found.real) <= _CROSSES * np.abs(found)])
-        here = size_s[at]
-        # The scalings belong to a value under the level: the frequency itself has no crossing.
         return float(np.max(crossing[crossing < here], initial=0.0)), float(
             np.min(crossing[crossing > here], initial=np.inf)
         )
@@ -392,16 +390,16 @@ def _covered(
         first = int(np.searchsorted(size_s, covered))
         if first >= size_s.size:
             first = size_s.size - 1
-        while True:
-            at = min(first + stride, size_s.size - 1)
-            low, high = free(at)
+        trials = [size_s[min(first + each, size_s.size - 1)] for each in (stride, stride // 4, 0)]
+        trials += [covered + share * (size_s[first] - covered) for share in (0.3, 0.1, 0.03, 0.01)]
+        for number, here in enumerate(trials):
+            low, high = free(float(here))
             pieces += 1
-            if low <= covered and high > covered:
-                covered, stride = high, min(2 * stride, 256)
+            if low <= covered < high:
+                covered, stride = high, min(2 * stride, 256) if number == 0 else max(stride // 2, 4)
                 break
-            if stride == 0:
-                return covered
-            stride //= 2
+        else:
+            return covered
         if not np.isfinite(covered):
             return None
     return covered
