@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numba import njit
 from scipy.signal import lfilter
 
 from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.motion_effects import followed
 from diagnosis.machine.plant_effect import EffectParameter
 from plant.effects.search_space import Dependence, geometric
 
@@ -109,17 +109,7 @@ def _shifted(signal: Real, values: Values, dt_s: float, before: float) -> Real:
 
 
 def _with_play(signal: Real, values: Values, dt_s: float, before: float) -> Real:
-    return np.asarray(_play(np.ascontiguousarray(signal), 0.5 * values["gap"], before))
-
-
-@njit(cache=True)
-def _play(signal: Real, half: float, at: float) -> Real:
-    """Follows at a distance of `half`, from the middle."""
-    followed = np.empty_like(signal)
-    for k in range(signal.size):
-        at = min(max(at, signal[k] - half), signal[k] + half)
-        followed[k] = at
-    return followed
+    return np.asarray(followed(np.ascontiguousarray(signal), 0.5 * values["gap"], before))
 
 
 def _stribeck(values: Values) -> dict[str, float]:
@@ -227,6 +217,17 @@ KINDS: dict[str, Kind] = {
         dependence="continuous",
         check="raise the input slowly from rest, once in each direction",
     ),
+    "friction_behind_play": Kind(
+        "body",
+        lambda v: {"coulomb": v["force"], "gap": v["gap"]},
+        lambda s: (
+            _log("force", s.force, 1e-5, 1.0, 3e-4, 0.6, 8),
+            _log("gap", s.position, 1e-5, 2.0, 3e-3, 0.3, 3),
+        ),
+        dependence="continuous",
+        contains="coulomb_friction",
+        check="move to and fro slowly and note the input: after each turn it rises only beyond the play",
+    ),
     "viscous_friction": Kind(
         "body",
         lambda v: {"viscous": v["coefficient"]},
@@ -259,6 +260,15 @@ KINDS: dict[str, Kind] = {
         lambda v: {"linear": v["stiffness"]},
         lambda s: (_log("stiffness", s.force / s.position, 1e-5, 30.0, 1e-4, 3.0, 8),),
         check="let the machine go away from zero with the input off: it should stay where it is",
+    ),
+    "eccentric_mass": Kind(
+        "body",
+        lambda v: {"weight": v["torque"], "turned": v["angle_rad"]},
+        lambda s: (
+            _log("torque", s.force, 1e-5, 30.0, 1e-3, 3.0, 8),
+            EffectParameter("angle_rad", -np.pi, np.pi, (-2.4, -0.8, 0.8, 2.4), "linear"),
+        ),
+        check="let the machine hang free in several angles: it should stay where it is",
     ),
     "hardening_spring": Kind(
         "body",

@@ -44,6 +44,8 @@ _FITTED = 100
 # Imaginary part of a real pole; largest pole; radians of a swing in a part of a sample, and the largest
 # power of two of parts.
 _REAL, _UNSTABLE, _TURNED, _MOST_PARTS = 1e-9, 1.1, 0.1, 4
+# Of a half play, at its end.
+_NEARLY = 1 - 1e-9
 # What no filter of a response of one comes to; far below what overflows.
 _GROWS = 1e100
 
@@ -57,8 +59,9 @@ class BodyForces:
     """Forces on a body against its motion, SI or whatever units force and motion have.
 
     Dry friction of size coulomb + excess exp(-|v| / stribeck_velocity), with `up` more while v > 0 and `down`
-    more while v < 0, at rest up to coulomb + excess; load times the force that is commanded, as dry friction;
-    viscous v + asymmetry |v| + drag v |v|; linear x + cubic x^3, x from zero.
+    more while v < 0, at rest up to coulomb + excess; load times the force that is commanded, as dry friction.
+    All of that rubs behind a play of `gap`: where the body has gone through it. viscous v + asymmetry |v|
+    + drag v |v|; linear x + cubic x^3, x from zero; weight (sin(x + turned) - sin(turned)), x an angle.
     """
 
     coulomb: float = 0.0
@@ -72,13 +75,20 @@ class BodyForces:
     asymmetry: float = 0.0
     drag: float = 0.0
     load: float = 0.0
+    gap: float = 0.0
+    weight: float = 0.0
+    turned: float = 0.0
 
     def overcome(self, x: Real, v: Real, rest: Real) -> Real:
         """Force (T,) that a known motion takes against them, and a rest (T,) without them."""
         level = self.coulomb + self.excess * np.exp(-np.abs(v) / self.stribeck_velocity)
         dry = np.where(v > 0, level + self.up, np.where(v < 0, -level - self.down, 0.0))
+        if self.gap > 0:
+            behind = followed(np.ascontiguousarray(x), 0.5 * self.gap, float(x[0]))
+            dry = np.where(v * (x - behind) >= _NEARLY * 0.5 * self.gap * np.abs(v), dry, 0.0)
+        unbalanced = self.weight * (np.sin(x + self.turned) - np.sin(self.turned))
         smooth = (self.viscous + self.drag * np.abs(v)) * v + self.asymmetry * np.abs(v)
-        whole = rest + dry + smooth + self.linear * x + self.cubic * x**3
+        whole = rest + dry + smooth + self.linear * x + self.cubic * x**3 + unbalanced
         # The commanded force is the whole one: more of it is lost where it drives than where it brakes.
         return np.asarray(whole / (1 - self.load * np.sign(v) * np.sign(whole)) - rest)
 
@@ -89,7 +99,7 @@ class BodyForces:
     @property
     def smooth(self) -> bool:
         """Whether there are some that change little within a sample."""
-        return any((self.viscous, self.linear, self.cubic, self.asymmetry, self.drag))
+        return any((self.viscous, self.linear, self.cubic, self.asymmetry, self.drag, self.weight))
 
 
 def _logarithm(matrix: Real) -> Real:
@@ -164,7 +174,7 @@ class LinearBody:
         if not forces.smooth:
             return 1
         swing, gx, gv = self.turns
-        stiffness = abs(forces.linear) + 3 * abs(forces.cubic) * largest**2
+        stiffness = abs(forces.linear) + 3 * abs(forces.cubic) * largest**2 + abs(forces.weight)
         turned = np.hypot(swing, np.sqrt(2 * abs(gx) * stiffness))
         rubbed = (abs(forces.viscous) + abs(forces.asymmetry)) * abs(gv)
         finer = max(turned, rubbed, _TURNED) / _TURNED
@@ -389,7 +399,7 @@ def _solve(
     T = position.size
     f, x, v = held.copy(), position.copy(), speed.copy()
     change = np.zeros(T)
-    gx, gv = hx[ahead], hv[ahead]
+    gx, gv, at, half = hx[ahead], hv[ahead], 0.0, 0.5 * sizes[11]
     for k in range(T - ahead):
         n = k + ahead
         dx, dv = 0.0, 0.0
@@ -398,7 +408,9 @@ def _solve(
             dv += hv[n - j] * change[j]
         ax, av = position[n] + dx - gx * held[k], speed[n] + dv - gv * held[k]
         x0, v0 = (x[n - 1], v[n - 1]) if n > 0 else (ax, av)
-        f[k], x[n], v[n] = _acted(ax, av, x0, v0, gx, gv, command[k], sizes)
+        at = x0 if k == 0 else at
+        f[k], x[n], v[n] = _acted(ax, av, x0, v0, gx, gv, command[k], at, sizes)
+        at = min(max(at, x[n] - half), x[n] + half)
         change[k] = f[k] - held[k]
     return f, x, v
 
@@ -412,30 +424,59 @@ def _acted(
     gx: float,
     gv: float,
     command: float,
+    at: float,
     sizes: tuple[float, ...],
 ) -> tuple[float, float, float]:
     """Mean force over a sample or a part of one, position and speed at its end.
 
-    ax, av : there without the forces; x0, v0 : at its start; gx, gv : what a unit force adds.
+    ax, av : there without the forces; x0, v0 : at its start; gx, gv : what a unit force adds; at : where what
+    rubs behind the play stands.
     """
-    coulomb, excess, falls, up, down, viscous, linear, cubic, asymmetry, drag, load = sizes
+    coulomb, excess, falls, up, down, viscous, linear, cubic, asymmetry, drag, load, gap, weight, turned = (
+        sizes
+    )
     coulomb += load * abs(command)
+    rubs_up, rubs_down = _beyond(x0, ax, at, 0.5 * gap), _beyond(-x0, -ax, -at, 0.5 * gap)
     f, x1, end, level = 0.0, x0, v0, coulomb
-    for _ in range(2 if excess > 0 or cubic > 0 or asymmetry != 0 or drag > 0 else 1):
-        # Smooth forces by the trapezoidal rule, the cubic one by its tangent at the end.
-        stiffness = linear + 3 * cubic * x1 * x1
+    for _ in range(2 if excess > 0 or cubic > 0 or asymmetry != 0 or drag > 0 or weight != 0 else 1):
+        # Smooth forces by the trapezoidal rule, those not linear by their tangents at the end.
+        stiffness = linear + 3 * cubic * x1 * x1 + weight * np.cos(x1 + turned)
         middle = 0.5 * (v0 + end)
         slope = viscous + asymmetry * np.sign(middle) + drag * abs(middle)
         divisor = 1 + 0.5 * (slope * gv + stiffness * gx)
         smooth = -0.5 * (slope * (v0 + av) + linear * x0 + stiffness * ax)
         smooth += cubic * (x1**3 - 0.5 * x0**3)
+        if weight != 0:
+            sines = np.sin(x0 + turned) + np.sin(x1 + turned) - 2 * np.sin(turned)
+            smooth -= 0.5 * weight * (sines - np.cos(x1 + turned) * x1)
         a, g = av + gv * smooth / divisor, gv / divisor
         if excess > 0:
             level = coulomb + excess * np.exp(-0.5 * (abs(v0) + abs(end)) / falls)
-        end, dry = _dry(v0, a, g, level + up, level + down, excess + coulomb - level)
+        held = (excess + coulomb - level) * max(rubs_up, rubs_down)
+        end, dry = _dry(v0, a, g, (level + up) * rubs_up, (level + down) * rubs_down, held)
         f = (smooth + dry) / divisor
         x1 = ax + gx * f
     return f, x1, end
+
+
+@njit(cache=True)
+def _beyond(x0: float, ax: float, at: float, half: float) -> float:
+    """Share of the way from x0 to ax on which a body has taken what rubs along, upwards."""
+    if half <= 0.0:
+        return 1.0
+    if ax <= x0:
+        return 1.0 if x0 >= at + half else 0.0
+    return min(max((ax - at - half) / (ax - x0), 0.0), 1.0)
+
+
+@njit(cache=True)
+def followed(signal: Real, half: float, at: float) -> Real:
+    """(T,) what follows a signal (T,) at a distance of `half`, from the middle."""
+    found = np.empty_like(signal)
+    for k in range(signal.size):
+        at = min(max(at, signal[k] - half), signal[k] + half)
+        found[k] = at
+    return found
 
 
 @njit(cache=True)
@@ -494,8 +535,9 @@ def _through(
     for i in range(N):
         gx += of_x[i] * pushed[i]
         gv += of_v[i] * pushed[i]
-    travelled = 0.0
+    travelled, half = 0.0, 0.5 * sizes[11]
     x0, v0 = (0.0, beyond[0]) if of_speed else (beyond[0], slopes[0] / dt_s)
+    at = x0
     if ahead == 1:
         x[0], v[0] = x0, v0
     for k in range(T - ahead):
@@ -519,7 +561,8 @@ def _through(
                     moved[i] += step[i, j] * state[j]
                 ax += of_x[i] * moved[i]
                 av += of_v[i] * moved[i]
-            f, x1, end = _acted(ax, av, x0, v0, gx, gv, command[k], sizes)
+            f, x1, end = _acted(ax, av, x0, v0, gx, gv, command[k], at, sizes)
+            at = min(max(at, x1 - half), x1 + half)
             for i in range(N):
                 state[i] = moved[i] + pushed[i] * f
             mean[k] += f / parts

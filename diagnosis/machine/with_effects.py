@@ -27,17 +27,26 @@ _NEEDS = {"input": "a command among the inputs", "body": "motion: the output tha
 _GROUPS = {"input": "actuator", "body": "body", "output": "sensor"}
 # What no record of one output can tell from its twin at the input where the machine is linear.
 _TWINS = ("output_lag", "output_delay", "output_gain")
-# A play of a force is rare; friction one way looks like an offset beside friction both ways, and so does one
-# in proportion to speed or load in a few records.
+# A play of a force is rare, and one before friction; a mass off its axis needs an angle; friction one way
+# looks like an offset beside friction both ways, and so does one in proportion to speed or load.
 _BY_NAME_ONLY = (
     "input_backlash",
     "one_sided_friction",
     "viscous_asymmetry",
     "quadratic_drag",
     "load_friction",
+    "friction_behind_play",
+    "eccentric_mass",
     "output_saturation",
 )
-_SMOOTH = ("viscous_friction", "viscous_asymmetry", "quadratic_drag", "spring", "hardening_spring")
+_SMOOTH = (
+    "viscous_friction",
+    "viscous_asymmetry",
+    "quadratic_drag",
+    "spring",
+    "hardening_spring",
+    "eccentric_mass",
+)
 _SMOOTHED = 11  # samples, of a measured position whose speed is asked
 
 

@@ -300,6 +300,49 @@ def test_friction_in_proportion_to_the_force_that_is_commanded(motion):
     assert np.all(_missed(found, truth, simulation({}, {}, force[:, None])) < 1e-3)
 
 
+@njit
+def _behind(force, dt_s, mass, level, gap, weight, turned):
+    """Position and speed (T, 2): friction on what follows a body behind a play, a weight off the axis."""
+    x, v, at, parts, found = 0.0, 0.0, 0.0, 2000, np.zeros((force.size, 2))
+    h = dt_s / parts
+    for k in range(force.size):
+        found[k] = x, v
+        for _ in range(parts):
+            pull = force[k] - weight * (np.sin(x + turned) - np.sin(turned))
+            free, rubs = v + h * pull / mass, 0.0
+            if (free > 0 and x >= at + gap / 2) or (free < 0 and x <= at - gap / 2):
+                rubs = level
+            v = np.sign(free) * max(abs(free) - h * rubs / mass, 0.0)
+            x += h * v
+            at = min(max(at, x - gap / 2), x + gap / 2)
+    return found
+
+
+@pytest.mark.parametrize("motion", ["x", "v"])
+@pytest.mark.parametrize(
+    ("name", "values", "inside"),
+    [
+        ("friction_behind_play", {"force": 0.8, "gap": 0.05}, (0.8, 0.05, 0.0, 0.0)),
+        ("eccentric_mass", {"torque": 1.5, "angle_rad": 0.7}, (0.0, 0.0, 1.5, 0.7)),
+    ],
+)
+def test_friction_behind_a_play_and_a_mass_off_the_axis(motion, name, values, inside):
+    force, simulation = _force(DT_S), _Counted("mass", DT_S)
+    truth = _behind(force, DT_S, 2.0, *inside)
+    plant = _wrapped(simulation, force, [name], DT_S, motion)
+    found = plant.simulated([Change(name, values)])(force[:, None])
+    # The first is crossed inside a part of a sample.
+    assert np.all(_missed(found, truth, simulation({}, {}, force[:, None])) < 2e-2)
+
+
+def test_friction_behind_a_play_that_a_known_motion_takes():
+    x = np.array([0.0, 0.03, 0.1, 0.09, 0.04, 0.0])
+    forces = BodyForces(coulomb=2.0, gap=0.1)
+    taken = forces.overcome(x, np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0]), np.zeros(6))
+    # Half the play from the middle, the whole one where it turns round.
+    np.testing.assert_allclose(taken, [0.0, 0.0, 2.0, 0.0, 0.0, -2.0])
+
+
 def test_forces_that_a_known_motion_takes():
     x, v, rest = np.array([0.3, -0.2, 0.1]), np.array([2.0, -1.0, 0.5]), np.array([4.0, -3.0, -2.0])
     forces = BodyForces(asymmetry=0.3, drag=0.2)
