@@ -124,6 +124,7 @@ class MeasuredBody:
 
 
 AnyBody = Body | MeasuredBody
+Where = Literal["input", "output", "body"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +212,7 @@ class Acts:
     at_rest_before : an input was zero before its first row; else, and every output, as in that row.
     """
 
-    where: Literal["input", "output", "body"]
+    where: Where
     on: int | AnyBody | Drive
     change: Callable[..., Any]
     dt_s: float

@@ -8,18 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
 
+from diagnosis.machine.around import Where
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.motion_effects import followed
-from diagnosis.machine.plant_effect import EffectParameter
-from plant.effects.search_space import Dependence, geometric
+from diagnosis.machine.plant_effect import EffectParameter, PlantEffect
+from plant.effects.search_space import geometric
 
 Values = Mapping[str, float]
-Where = Literal["input", "output", "body"]
 
 _SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.5, 0.8), "linear")
 
@@ -43,23 +43,6 @@ def _log(name: str, unit: float, low: float, high: float, first: float, last: fl
     """A range and starts, in multiples of a magnitude."""
     starts = tuple(geometric(first * unit, min(last * unit, high * unit), count))
     return EffectParameter(name, low * unit, high * unit, starts)
-
-
-@dataclass(frozen=True)
-class Kind:
-    """An effect of the list: where it acts, what it does, its parameters with their ranges.
-
-    check: what anybody can do to see whether it is there; a command in a sentence.
-    """
-
-    where: Where
-    change: Callable[..., Any]
-    parameters: Callable[[Sizes], tuple[EffectParameter, ...]]
-    check: str
-    signed: bool = False
-    grows: bool = True
-    dependence: Dependence = "smooth"
-    contains: str | None = None
 
 
 def _delayed(signal: Real, values: Values, dt_s: float, before: float) -> Real:
@@ -134,194 +117,249 @@ def _gains(s: Sizes) -> tuple[EffectParameter, ...]:
 
 
 # Effects of the actuator act in this order, then those of the body, then those of the sensor.
-KINDS: dict[str, Kind] = {
-    "input_delay": Kind(
-        "input",
-        _delayed,
-        _delays,
+KINDS: dict[str, Callable[[str, Sizes], PlantEffect]] = {
+    "input_delay": lambda name, s: PlantEffect(
+        name,
+        _delays(s),
+        where="input",
+        change=_delayed,
         check="log the input at the actuator beside the command and compare when they step",
+        group="actuator",
     ),
-    "actuator_gain": Kind(
-        "input",
-        _scaled,
-        _gains,
+    "actuator_gain": lambda name, s: PlantEffect(
+        name,
+        _gains(s),
+        where="input",
+        change=_scaled,
         signed=True,
         check="hold two steady commands and measure what the actuator gives",
+        group="actuator",
     ),
-    "input_offset": Kind(
-        "input",
-        _shifted,
-        lambda s: (_log("offset", s.input, 1e-5, 1.0, 1e-3, 0.3, 8),),
+    "input_offset": lambda name, s: PlantEffect(
+        name,
+        (_log("offset", s.input, 1e-5, 1.0, 1e-3, 0.3, 8),),
+        where="input",
+        change=_shifted,
         signed=True,
         check="command zero and measure what the actuator gives; on a force, level the machine",
+        group="actuator",
     ),
-    "input_drift": Kind(
-        "input",
-        _drifting,
-        lambda s: (_log("rate_per_s", s.input / s.duration_s, 1e-5, 3.0, 1e-3, 1.0, 8),),
+    "input_drift": lambda name, s: PlantEffect(
+        name,
+        (_log("rate_per_s", s.input / s.duration_s, 1e-5, 3.0, 1e-3, 1.0, 8),),
+        where="input",
+        change=_drifting,
         signed=True,
         check="hold a steady command for some minutes and measure what the actuator gives",
+        group="actuator",
     ),
-    "input_backlash": Kind(
-        "input",
-        _with_play,
-        lambda s: (_log("gap", s.input, 1e-4, 1.5, 1e-3, 1.0, 20),),
+    "input_backlash": lambda name, s: PlantEffect(
+        name,
+        (_log("gap", s.input, 1e-4, 1.5, 1e-3, 1.0, 20),),
+        where="input",
+        change=_with_play,
         dependence="non-smooth",
         check="command slow ramps up and down: the width between the two ways is the play",
+        group="actuator",
     ),
-    "actuator_dead_zone": Kind(
-        "input",
-        _dead,
-        lambda s: (_log("width", s.input, 1e-5, 1.0, 1e-3, 0.5, 12),),
+    "actuator_dead_zone": lambda name, s: PlantEffect(
+        name,
+        (_log("width", s.input, 1e-5, 1.0, 1e-3, 0.5, 12),),
+        where="input",
+        change=_dead,
         dependence="continuous",
         check="raise the command slowly from zero and note where something begins to follow",
+        group="actuator",
     ),
-    "actuator_saturation": Kind(
-        "input",
-        _clipped,
-        lambda s: (_log("limit", s.input, 0.05, 1.0, 0.1, 0.99, 24),),
+    "actuator_saturation": lambda name, s: PlantEffect(
+        name,
+        (_log("limit", s.input, 0.05, 1.0, 0.1, 0.99, 24),),
+        where="input",
+        change=_clipped,
         grows=False,
         dependence="continuous",
         check="command the largest input and measure what arrives",
+        group="actuator",
     ),
-    "actuator_lag": Kind(
-        "input",
-        _lagged,
-        _lags,
+    "actuator_lag": lambda name, s: PlantEffect(
+        name,
+        _lags(s),
+        where="input",
+        change=_lagged,
         check="step the command and look at what the actuator gives: it should step as well",
+        group="actuator",
     ),
-    "coulomb_friction": Kind(
-        "body",
-        lambda v: {"coulomb": v["force"]},
-        lambda s: (_log("force", s.force, 1e-5, 1.0, 3e-4, 0.6, 14),),
+    "coulomb_friction": lambda name, s: PlantEffect(
+        name,
+        (_log("force", s.force, 1e-5, 1.0, 3e-4, 0.6, 14),),
+        where="body",
+        change=lambda v: {"coulomb": v["force"]},
         dependence="continuous",
         check="raise the input slowly from rest and note where motion begins, in both directions",
+        group="body",
     ),
-    "stribeck_friction": Kind(
-        "body",
-        _stribeck,
-        lambda s: (
+    "stribeck_friction": lambda name, s: PlantEffect(
+        name,
+        (
             _log("static_force", s.force, 1e-5, 2.0, 3e-4, 0.6, 8),
             _SHARE,
             _log("velocity", s.speed, 0.01, 2.0, 0.012, 0.3, 3),
         ),
+        where="body",
+        change=_stribeck,
         dependence="continuous",
         contains="coulomb_friction",
         check="creep at several slow, steady speeds and note the input that each takes",
+        group="body",
     ),
-    "one_sided_friction": Kind(
-        "body",
-        lambda v: {"up" if v["force"] > 0 else "down": abs(v["force"])},
-        lambda s: (_log("force", s.force, 1e-5, 1.0, 1e-3, 0.6, 8),),
+    "one_sided_friction": lambda name, s: PlantEffect(
+        name,
+        (_log("force", s.force, 1e-5, 1.0, 1e-3, 0.6, 8),),
+        where="body",
+        change=lambda v: {"up" if v["force"] > 0 else "down": abs(v["force"])},
         signed=True,
         dependence="continuous",
         check="raise the input slowly from rest, once in each direction",
+        group="body",
     ),
-    "friction_behind_play": Kind(
-        "body",
-        lambda v: {"coulomb": v["force"], "gap": v["gap"]},
-        lambda s: (
+    "friction_behind_play": lambda name, s: PlantEffect(
+        name,
+        (
             _log("force", s.force, 1e-5, 1.0, 3e-4, 0.6, 8),
             _log("gap", s.position, 1e-5, 2.0, 3e-3, 0.3, 3),
         ),
+        where="body",
+        change=lambda v: {"coulomb": v["force"], "gap": v["gap"]},
         dependence="continuous",
         contains="coulomb_friction",
         check="move to and fro slowly and note the input: after each turn it rises only beyond the play",
+        group="body",
     ),
-    "viscous_friction": Kind(
-        "body",
-        lambda v: {"viscous": v["coefficient"]},
-        lambda s: (_log("coefficient", s.force / s.speed, 1e-5, 30.0, 1e-4, 3.0, 8),),
+    "viscous_friction": lambda name, s: PlantEffect(
+        name,
+        (_log("coefficient", s.force / s.speed, 1e-5, 30.0, 1e-4, 3.0, 8),),
+        where="body",
+        change=lambda v: {"viscous": v["coefficient"]},
         check="move at several steady speeds and note the input: it should grow in proportion",
+        group="body",
     ),
-    "viscous_asymmetry": Kind(
-        "body",
-        lambda v: {"asymmetry": v["coefficient"]},
-        lambda s: (_log("coefficient", s.force / s.speed, 1e-5, 30.0, 1e-4, 3.0, 8),),
+    "viscous_asymmetry": lambda name, s: PlantEffect(
+        name,
+        (_log("coefficient", s.force / s.speed, 1e-5, 30.0, 1e-4, 3.0, 8),),
+        where="body",
+        change=lambda v: {"asymmetry": v["coefficient"]},
         signed=True,
         dependence="continuous",
         check="move at the same steady speeds both ways: one way takes more, in proportion to speed",
+        group="body",
     ),
-    "quadratic_drag": Kind(
-        "body",
-        lambda v: {"drag": v["coefficient"]},
-        lambda s: (_log("coefficient", s.force / s.speed**2, 1e-5, 30.0, 1e-3, 3.0, 8),),
+    "quadratic_drag": lambda name, s: PlantEffect(
+        name,
+        (_log("coefficient", s.force / s.speed**2, 1e-5, 30.0, 1e-3, 3.0, 8),),
+        where="body",
+        change=lambda v: {"drag": v["coefficient"]},
         check="move at several steady speeds: twice the speed should take four times the input",
+        group="body",
     ),
-    "load_friction": Kind(
-        "body",
-        lambda v: {"load": v["share"]},
-        lambda s: (EffectParameter("share", 1e-4, 0.9, (1e-3, 0.01, 0.05, 0.15, 0.3, 0.6)),),
+    "load_friction": lambda name, s: PlantEffect(
+        name,
+        (EffectParameter("share", 1e-4, 0.9, (1e-3, 0.01, 0.05, 0.15, 0.3, 0.6)),),
+        where="body",
+        change=lambda v: {"load": v["share"]},
         dependence="continuous",
         check="move slowly without and with a heavy load and compare what each takes beyond the load",
+        group="body",
     ),
-    "spring": Kind(
-        "body",
-        lambda v: {"linear": v["stiffness"]},
-        lambda s: (_log("stiffness", s.force / s.position, 1e-5, 30.0, 1e-4, 3.0, 8),),
+    "spring": lambda name, s: PlantEffect(
+        name,
+        (_log("stiffness", s.force / s.position, 1e-5, 30.0, 1e-4, 3.0, 8),),
+        where="body",
+        change=lambda v: {"linear": v["stiffness"]},
         check="let the machine go away from zero with the input off: it should stay where it is",
+        group="body",
     ),
-    "eccentric_mass": Kind(
-        "body",
-        lambda v: {"weight": v["torque"], "turned": v["angle_rad"]},
-        lambda s: (
+    "eccentric_mass": lambda name, s: PlantEffect(
+        name,
+        (
             _log("torque", s.force, 1e-5, 30.0, 1e-3, 3.0, 8),
             EffectParameter("angle_rad", -np.pi, np.pi, (-2.4, -0.8, 0.8, 2.4), "linear"),
         ),
+        where="body",
+        change=lambda v: {"weight": v["torque"], "turned": v["angle_rad"]},
         check="let the machine hang free in several angles: it should stay where it is",
+        group="body",
     ),
-    "hardening_spring": Kind(
-        "body",
-        lambda v: {"cubic": v["cubic"]},
-        lambda s: (_log("cubic", s.force / s.position**3, 1e-7, 1e3, 1e-5, 10.0, 12),),
+    "hardening_spring": lambda name, s: PlantEffect(
+        name,
+        (_log("cubic", s.force / s.position**3, 1e-7, 1e3, 1e-5, 10.0, 12),),
+        where="body",
+        change=lambda v: {"cubic": v["cubic"]},
         check="push by hand at small and at large distances and look for cables and hoses",
+        group="body",
     ),
-    "backlash": Kind(
-        "output",
-        _with_play,
-        lambda s: (_log("gap", s.output, 1e-4, 1.0, 1e-3, 0.5, 20),),
+    "backlash": lambda name, s: PlantEffect(
+        name,
+        (_log("gap", s.output, 1e-4, 1.0, 1e-3, 0.5, 20),),
+        where="output",
+        change=_with_play,
         dependence="non-smooth",
         check="hold the drive and move the load to and fro by hand: the free play is the backlash",
+        group="sensor",
     ),
-    "output_saturation": Kind(
-        "output",
-        _clipped,
-        lambda s: (_log("limit", s.reading, 0.05, 1.0, 0.3, 0.999, 16),),
+    "output_saturation": lambda name, s: PlantEffect(
+        name,
+        (_log("limit", s.reading, 0.05, 1.0, 0.3, 0.999, 16),),
+        where="output",
+        change=_clipped,
         grows=False,
         dependence="continuous",
         check="move slowly through the whole range: the reading should not stop before the machine does",
+        group="sensor",
     ),
-    "output_lag": Kind(
-        "output",
-        _lagged_sensor,
-        _lags,
+    "output_lag": lambda name, s: PlantEffect(
+        name,
+        _lags(s),
+        where="output",
+        change=_lagged_sensor,
         check="tap against the machine and compare when the sensors answer",
+        group="sensor",
     ),
-    "output_delay": Kind(
-        "output",
-        _delayed,
-        _delays,
+    "output_delay": lambda name, s: PlantEffect(
+        name,
+        _delays(s),
+        where="output",
+        change=_delayed,
         check="tap against the machine and compare when the sensors answer",
+        group="sensor",
     ),
-    "output_gain": Kind(
-        "output",
-        _scaled,
-        _gains,
+    "output_gain": lambda name, s: PlantEffect(
+        name,
+        _gains(s),
+        where="output",
+        change=_scaled,
         signed=True,
         check="move by a known distance and compare the reading",
+        group="sensor",
     ),
-    "output_offset": Kind(
-        "output",
-        _shifted,
-        lambda s: (_log("offset", s.output, 1e-6, 3.0, 1e-4, 0.5, 8),),
+    "output_offset": lambda name, s: PlantEffect(
+        name,
+        (_log("offset", s.output, 1e-6, 3.0, 1e-4, 0.5, 8),),
+        where="output",
+        change=_shifted,
         signed=True,
         check="go to a known position and compare the reading",
+        group="sensor",
     ),
-    "output_drift": Kind(
-        "output",
-        _drifting,
-        lambda s: (_log("rate_per_s", s.output / s.duration_s, 1e-6, 3.0, 1e-4, 1.0, 8),),
+    "output_drift": lambda name, s: PlantEffect(
+        name,
+        (_log("rate_per_s", s.output / s.duration_s, 1e-6, 3.0, 1e-4, 1.0, 8),),
+        where="output",
+        change=_drifting,
         signed=True,
         check="log the sensor for some minutes with the machine held",
+        group="sensor",
     ),
 }
+
+# Where each acts.
+WHERE: dict[str, Where] = {name: kind(name, Sizes()).where or "body" for name, kind in KINDS.items()}

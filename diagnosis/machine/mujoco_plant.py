@@ -147,7 +147,6 @@ class Quantity:
     signed: bool = False
     dependence: Dependence = "smooth"
     group: str = ""
-    everywhere: bool = False
 
     @property
     def effect(self) -> PlantEffect:
@@ -160,7 +159,6 @@ class Quantity:
             self.signed,
             dependence=self.dependence,
             group=self.group,
-            everywhere=self.everywhere,
         )
 
 
@@ -296,7 +294,6 @@ class MujocoArm:
                 (1e-4, most),
                 dependence=dependence,
                 group="joint",
-                everywhere=key == "frictionloss",
             )
         if joint.armature > 0:
             yield Quantity(
@@ -319,9 +316,7 @@ class MujocoArm:
         if {int(one.gaintype), int(one.biastype)} <= set(_FORCES):
             yield Quantity(f"{one.name}.gain", 1.0, partial(_put_gain, one.name))
         if one.dyntype in _LAGS:
-            yield late(
-                f"{one.name}.lag", lag, partial(_put_lag, one.name), "time_constant_s", everywhere=True
-            )
+            yield late(f"{one.name}.lag", lag, partial(_put_lag, one.name), "time_constant_s")
         put = partial(_put_delay, "actuator", one.name, self.spec.option.timestep)
         yield late(f"{one.name}.delay", float(one.delay), put, "delay_s")
 
@@ -386,7 +381,6 @@ class MujocoArm:
                     _STANDARD_GRAVITY,
                     signed=True,
                     group="link",
-                    everywhere=True,
                 )
 
     def _of_sensor(self, name: str, swing: float) -> Iterator[Quantity]:

@@ -31,7 +31,7 @@ from diagnosis.machine.machine_protocol import (
     Weighing,
     check_record,
 )
-from diagnosis.machine.plant_effect import Change, PlantEffect, WrongValue
+from diagnosis.machine.plant_effect import Change, PlantEffect, wrong_values
 from ident.data.arrays import lock
 from plant.effects.search_space import Candidate
 
@@ -132,9 +132,9 @@ class Plant:
                 raise ValueError(f"plant: effect {name} is listed twice")
 
     @property
-    def missing(self) -> tuple[PlantEffect | WrongValue, ...]:
+    def missing(self) -> tuple[PlantEffect, ...]:
         """Everything that may be named."""
-        return (*self.effects, *WrongValue.all_of(self.tolerances))
+        return (*self.effects, *wrong_values(self.tolerances))
 
     @cached_property
     def weighing(self) -> Weighing:
@@ -198,7 +198,7 @@ class Plant:
         Raises ValueError, one line: a shape that does not fit, an error of the simulation that is not
         numerical (those it raises as they are).
         """
-        wrong = {kind.id: kind.multiplies for kind in WrongValue.all_of(self.tolerances)}
+        wrong = {kind.id: str(kind.multiplies) for kind in wrong_values(self.tolerances)}
         ratios = {wrong[e.id]: e.values["ratio"] for e in effects if e.id in wrong}
         if ratios:
             return self.scaled(ratios).simulated([e for e in effects if e.id not in wrong], states)

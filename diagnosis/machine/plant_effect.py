@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from types import MappingProxyType
@@ -10,8 +10,8 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from diagnosis.machine.around import Acts
-from plant.effects.base import EFFECTS, ratio_candidates
+from diagnosis.machine.around import Acts, Where
+from plant.effects.base import ratio_candidates
 from plant.effects.search_space import Axis, Candidate, Dependence, Harmonic
 
 _STEPS = {"smooth": 1e-5, "continuous": 1e-3, "non-smooth": 5e-3}
@@ -86,11 +86,11 @@ class PlantEffect:
         continuous (dry friction); neither (backlash, rounding), which takes grids in place of slopes.
     group : str. Where it acts (actuator, joint, sensor, ...); only shown.
     contains : str or None. Simpler effect that it is with its further parameters at an end of their ranges.
-    everywhere : bool or None
-        Every machine has some of it (dry friction, a lag); None: as the listed effect of that name has it.
     check : str. What to do to see whether it is there: a command in a sentence; "" says nothing.
     acts : Acts or None
         What it does to a simulation that does not know it (`with_effects`); None: the simulation is told.
+    where, change : of a listed effect, what `Acts` says of it before it has a place.
+    multiplies : str or None. Stated value that its only parameter, a ratio, multiplies (`wrong_value`).
     """
 
     name: str
@@ -101,19 +101,16 @@ class PlantEffect:
     group: str = ""
     contains: str | None = None
     acts: Acts | None = None
-    everywhere: bool | None = None
     check: str = ""
-    # Which of its own parameters an effect multiplies nobody said.
-    multiplies: ClassVar[str | None] = None
+    where: Where | None = None
+    change: Callable[..., Any] = dict
+    multiplies: str | None = None
     harmonic: ClassVar[Harmonic | None] = None
     adds_to: ClassVar[str | None] = None
     absolute_angle: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", tuple(self.parameters))
-        if self.everywhere is None:
-            listed = EFFECTS.get(self.name.rpartition(".")[2])
-            object.__setattr__(self, "everywhere", listed is not None and listed.everywhere)
         if not self.parameters:
             raise ValueError(f"effect {self.name}: needs at least one parameter")
         if self.name in ("none", "unknown"):
@@ -122,17 +119,22 @@ class PlantEffect:
             raise ValueError(f"effect {self.name}: dependence must be one of {', '.join(_STEPS)}")
 
     def candidates(self) -> tuple[Candidate, ...]:
+        if self.multiplies:
+            # At its end a ratio wants to go on: the value is not the cause, or nowhere near.
+            return tuple(
+                replace(side, axes=(replace(side.axes[0], edge="high" if side.grows else "low"),))
+                for side in ratio_candidates(self, self.parameters[0].low, self.parameters[0].high)
+            )
         axes = tuple(p.axis(self.dependence) for p in self.parameters)
         counts = [8, *[3] * (len(axes) - 1)]
         values = [p.start_coordinates(n) for p, n in zip(self.parameters, counts, strict=True)]
-        starts = tuple(product(*values))
         signs = (1, -1) if self.signed else (1,)
-        return tuple(Candidate(self, axes, starts, sign, self.grows) for sign in signs)
+        return tuple(Candidate(self, axes, tuple(product(*values)), sign, self.grows) for sign in signs)
 
     def from_search(self, values: Mapping[str, float], sign: int) -> Change:
         """The effect at these values, the size (the first parameter) with its sign."""
         size = self.parameters[0].name
-        signed = {**values, size: sign * values[size]}
+        signed = {**values, size: values[size] if self.multiplies else sign * values[size]}
         return Change(self.name, MappingProxyType(signed))
 
     @property
@@ -146,33 +148,10 @@ _LARGEST_RATIO = 10.0
 _KNOWS_NOTHING = 1.0
 
 
-@dataclass(frozen=True)
-class WrongValue:
-    """A stated parameter that is wrong by several of its tolerances: a finding, no matter of tolerances."""
-
-    multiplies: str
-    tolerance: float
-    dependence: ClassVar[Dependence] = "smooth"
-    everywhere: ClassVar[bool] = False
-    harmonic: ClassVar[Harmonic | None] = None
-    adds_to: ClassVar[str | None] = None
-    contains: ClassVar[str | None] = None
-    absolute_angle: ClassVar[bool] = False
-
-    @classmethod
-    def all_of(cls, tolerances: Mapping[str, float]) -> tuple[WrongValue, ...]:
-        return tuple(cls(key, value) for key, value in tolerances.items() if value < _KNOWS_NOTHING)
-
-    @property
-    def id(self) -> str:
-        return f"wrong_{self.multiplies}"
-
-    def candidates(self) -> tuple[Candidate, ...]:
-        # At its end a ratio wants to go on: the value is not the cause, or nowhere near.
-        return tuple(
-            replace(side, axes=(replace(side.axes[0], edge="high" if side.grows else "low"),))
-            for side in ratio_candidates(self, self.tolerance, _LARGEST_RATIO)
-        )
-
-    def from_search(self, values: Mapping[str, float], sign: int) -> Change:
-        return Change(self.id, MappingProxyType(dict(values)))
+def wrong_values(tolerances: Mapping[str, float]) -> tuple[PlantEffect, ...]:
+    """Stated values that may be wrong by several of their tolerances: findings, no matter of tolerances."""
+    return tuple(
+        PlantEffect(f"wrong_{key}", (EffectParameter("ratio", tolerance, _LARGEST_RATIO),), multiplies=key)
+        for key, tolerance in tolerances.items()
+        if tolerance < _KNOWS_NOTHING
+    )

@@ -13,18 +13,16 @@ from typing import Literal
 import numpy as np
 from scipy.signal import savgol_filter
 
-from diagnosis.machine.around import Acts, AnyBody, Body, Drive, MeasuredBody
-from diagnosis.machine.listed_effects import KINDS, Sizes, Where
+from diagnosis.machine.around import Acts, AnyBody, Body, Drive, MeasuredBody, Where
+from diagnosis.machine.listed_effects import KINDS, WHERE, Sizes
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.own_plant import Plant, PlantExperiment
-from diagnosis.machine.plant_effect import PlantEffect
 
 _MISSING = {
     "input": "changes a command, and the stated input is none or zero in every record",
     "body": "needs motion=, the output that is the body's position or speed",
 }
 _NEEDS = {"input": "a command among the inputs", "body": "motion: the output that is the body's motion"}
-_GROUPS = {"input": "actuator", "body": "body", "output": "sensor"}
 # What no record of one output can tell from its twin at the input where the machine is linear.
 _TWINS = ("output_lag", "output_delay", "output_gain")
 # A play of a force is rare, and one before friction; a mass off its axis needs an angle; friction one way
@@ -138,29 +136,17 @@ def with_effects(
     own = {effect.name for effect in plant.effects}
     chosen = [n for n in _applying(plant, places) if prefix + n not in own] if names == "all" else names
     for name in chosen:
-        kind, place = KINDS[name], places[KINDS[name].where]
-        if place is None or (kind.where == "input" and not sizes.input > 0):
-            raise ValueError(f"plant: {name} {_MISSING[kind.where]}")
-        simpler = None if kind.contains is None else prefix + kind.contains
-        found.append(
-            PlantEffect(
-                prefix + name,
-                kind.parameters(sizes),
-                signed=kind.signed,
-                grows=kind.grows,
-                dependence=kind.dependence,
-                group=_GROUPS[kind.where],
-                contains=simpler,
-                acts=Acts(kind.where, place, kind.change, dt_s, at_rest_before),
-                check=kind.check,
-            )
-        )
+        where = WHERE[name]
+        place = places[where]
+        if place is None or (where == "input" and not sizes.input > 0):
+            raise ValueError(f"plant: {name} {_MISSING[where]}")
+        effect = KINDS[name](prefix + name, sizes)
+        acts = Acts(where, place, effect.change, dt_s, at_rest_before)
+        found.append(replace(effect, contains=effect.contains and prefix + effect.contains, acts=acts))
     there = {effect.name for effect in found}
     inactive = dict(plant.inactive)
     if names == "all":
-        inactive |= {
-            prefix + n: _NEEDS[KINDS[n].where] for n in _of_all(plant) if places[KINDS[n].where] is None
-        }
+        inactive |= {prefix + n: _NEEDS[WHERE[n]] for n in _of_all(plant) if places[WHERE[n]] is None}
     inactive = {name: needs for name, needs in inactive.items() if name not in there}
     equipped = replace(plant, effects=tuple(found), dt_s=dt_s, inactive=inactive)
     _try(equipped, experiments[0], body)
@@ -180,7 +166,7 @@ def _of_all(plant: Plant) -> list[str]:
 
 
 def _applying(plant: Plant, places: Mapping[Where, object]) -> list[str]:
-    return [name for name in _of_all(plant) if places[KINDS[name].where] is not None]
+    return [name for name in _of_all(plant) if places[WHERE[name]] is not None]
 
 
 def _column(plant: Plant, output: str) -> int:

@@ -82,7 +82,6 @@ class ActuatorLag(Effect):
     id = "actuator_lag"
     words = "a lag of the actuator"
     check = "step the command and look at the voltage at the motor: it should step as well"
-    everywhere = True
     sought = Sought((2e-4, 200), (0.02, 40, 10), "dt_s")
 
     time_constant_s: NotNegative = Field(description="time constant T; 0 is none")

@@ -51,7 +51,6 @@ class Effect(BaseModel, ABC):
     dependence : str
         How the outputs depend on the parameters: smooth (differentiable), continuous, or non-smooth.
     environment : bool. It comes from outside the machine.
-    everywhere : bool. Every machine has some of it, and a drift of its records enlarges what a fit finds.
     friction : bool
         It takes energy at the joint: closed loops are also tried without it and with twice its torques.
     multiplies : str or None
@@ -77,7 +76,6 @@ class Effect(BaseModel, ABC):
     neutral: ClassVar[Mapping[str, float] | None] = MappingProxyType({})
     dependence: ClassVar[Dependence] = "smooth"
     environment: ClassVar[bool] = False
-    everywhere: ClassVar[bool] = False
     friction: ClassVar[bool] = False
     multiplies: ClassVar[str | None] = None
     harmonic: ClassVar[Harmonic | None] = None

@@ -50,7 +50,6 @@ class CoulombFriction(Effect):
     id = "coulomb_friction"
     words = "dry (Coulomb) friction"
     check = "raise the voltage slowly from rest and note where the hub starts to turn, in both directions"
-    everywhere = True
     friction = True
     dependence = "continuous"
     sought = Sought((1e-5, 1), (3e-4, 0.6, 14), "torque_Nm", 1e-3)
@@ -69,7 +68,6 @@ class StribeckFriction(Effect):
     id = "stribeck_friction"
     words = "dry friction that falls with speed (Stribeck)"
     check = "let the hub creep at several slow, steady speeds and note the voltage that each takes"
-    everywhere = True
     contains = "coulomb_friction"
     friction = True
     neutral = MappingProxyType({"stribeck_velocity_rad_s": 0.1})
@@ -224,7 +222,6 @@ class TorqueRipple(Effect):
     id = "torque_ripple"
     words = "torque ripple over the hub angle"
     check = "turn the hub slowly by hand with the motor off and feel for places where it sticks"
-    everywhere = True
     harmonic = "hub_angle"
 
     amplitude_Nm: NotNegative = Field(description="amplitude a")

@@ -71,7 +71,6 @@ class Gravity(Effect):
     check = "put a spirit level on the base, and let the arm go with the motor off: it should stay"
     beside = "a linear spring from hub to ground, while motions are small; larger ones"
     environment = True
-    everywhere = True
     absolute_angle = True
     sought = Sought((1e-4, 20), (1e-3, 10, 12))
 

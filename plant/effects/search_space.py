@@ -100,9 +100,6 @@ class EffectKind(Protocol):
     def dependence(self) -> Dependence: ...
 
     @property
-    def everywhere(self) -> bool | None: ...
-
-    @property
     def multiplies(self) -> str | None: ...
 
     @property

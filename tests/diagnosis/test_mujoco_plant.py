@@ -14,7 +14,7 @@ mujoco = pytest.importorskip("mujoco")
 from benchmarks import mujoco_cases as cases  # noqa: E402
 from diagnosis import PlantExperiment, diagnose  # noqa: E402
 from diagnosis.machine.mujoco_plant import MujocoArm  # noqa: E402
-from diagnosis.machine.plant_effect import Change, EffectParameter, PlantEffect  # noqa: E402
+from diagnosis.machine.plant_effect import Change  # noqa: E402
 
 DT_S = 0.01
 # A rod on a hinge that lies flat; the force on it does all that moves it.
@@ -260,17 +260,6 @@ def test_values_of_the_file_are_parameters_with_tolerances_and_the_rest_effects(
     assert {"rod.payload", "gravity.x", "gravity.y"} <= names
     # A hinge that stands upright feels neither gravity nor where its zero is.
     assert not {"gravity.z", "hinge.sensor_offset"} & names
-    little = {effect.name for effect in plant.effects if effect.everywhere}
-    assert little == {"hinge.frictionloss", "motor.lag", "gravity.x", "gravity.y"}
-
-
-@pytest.mark.parametrize(
-    ("name", "little"), [("arm.coulomb_friction", True), ("tip_payload", False), ("mine", False)]
-)
-def test_an_effect_of_one_s_own_is_as_common_as_the_listed_one_of_its_name(name, little):
-    size = EffectParameter("size", 0.1, 1.0)
-    assert PlantEffect(name, (size,)).everywhere is little
-    assert PlantEffect(name, (size,), everywhere=not little).everywhere is not little
 
 
 def test_the_repaired_file_does_in_mujoco_what_the_diagnosis_simulated():

@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
 from diagnosis.answer import Diagnosis
-from diagnosis.machine.listed_effects import KINDS
+from diagnosis.machine.listed_effects import WHERE
 from diagnosis.machine.machine_protocol import Real, check_count
 from diagnosis.machine.own_plant import Plant, PlantCase, PlantExperiment
 from diagnosis.machine.with_effects import with_effects
@@ -350,7 +350,7 @@ def _with_all(
                 raise
             plant = around(plant, "all")
         there = {effect.name for effect in plant.effects}
-        kinds = {place: [k for k in KINDS if k in there and KINDS[k].where == place] for place in _PLACES}
+        kinds = {place: [k for k in WHERE if k in there and WHERE[k] == place] for place in _PLACES}
         for column, name in enumerate(inputs[1:], start=1):
             plant = around(plant, kinds["input"], input=column, prefix=f"{name}_")
         for name in outputs[1:]:
