@@ -71,6 +71,18 @@ SECTIONS = {
             "{} % of frequencies; classical covariance of an order-4 fit: {} %",
         ),
         Row(
+            "Two motors and two sensors of a two-link arm: error of the worst channel, median; beside N4SID",
+            "several_outputs",
+            r"^links:.*?shared poles[^:]*: +[\d.]+ +([\d.]+).*?nfoursid[^:]*: +[\d.]+ +([\d.]+)",
+            "{} % of the gain up to 200 rad/s; {} %",
+        ),
+        Row(
+            "The same: 95 % ball holds the response matrix",
+            "several_outputs",
+            r"^links:.*?ball holds.*?all ([\d.]+)",
+            "{} % of frequencies",
+        ),
+        Row(
             "First mode under dry friction, as recorded: largest error, and 95 % interval holds the truth",
             "readme_identify",
             r"response: as recorded.*?largest error: ([\d.]+) %.*?holds the mode: \[(\d+), \d+\] of (\d+)",
