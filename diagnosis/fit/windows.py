@@ -31,8 +31,8 @@ _DIRECTION, _MOST_STATES, _SHIFTS = 1e-3, 12, 24
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """samples : length of a window. responses : (>= samples + 1, Y, S) outputs over noise (Y,) after states
-    at its start."""
+    """samples : largest length of a window. responses : (>= samples, Y, S) outputs over noise (Y,) after
+    states at its start."""
 
     samples: int
     responses: Real
@@ -59,7 +59,7 @@ class Windows:
 
     def parts(self, samples: int) -> list[tuple[slice, int, int]]:
         """Of a record: rows of windows of one length, their number and length."""
-        count = max(samples // self.samples, 1)
+        count = -(-samples // self.samples)
         length, longer = divmod(samples, count)
         first = longer * (length + 1)
         found = [(slice(0, first), longer, length + 1), (slice(first, samples), count - longer, length)]

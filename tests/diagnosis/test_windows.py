@@ -118,7 +118,12 @@ def test_what_a_state_does_is_left_out_but_for_the_first_window():
     assert windows is not None
     # Three time constants at least, and the shorter the more windows.
     assert 3 * 0.2 / DT_S - 1 <= windows.samples <= SAMPLES // 3
-    assert sum(count * length for _, count, length in windows.parts(SAMPLES)) == SAMPLES
+    # No window is longer than what states are known to do, of a record of any length.
+    for samples in (20, windows.samples + 1, 2 * windows.samples - 1, SAMPLES):
+        parts = windows.parts(samples)
+        assert sum(count * length for _, count, length in parts) == samples
+        assert max(length for _, _, length in parts) <= windows.samples
+        assert windows.seen(np.ones((samples, 1))).shape == (samples, 1)
     t = np.arange(SAMPLES) * DT_S
     free = (1.0 + 2.0 * np.exp(-t / 0.2))[:, None]
     left = windows.unseen(windows.seen(free))
