@@ -61,7 +61,7 @@ class Controller(Law):
                 object.__setattr__(self, name, value)
             each = value if isinstance(value, tuple) else (value,)
             if (isinstance(value, tuple) or (value is not None and inputs > 1)) and len(each) != inputs:
-                raise ValueError(f"{name} needs one value for each of {inputs} actuators; got {value}")
+                raise ValueError(f"{name} needs one value for each of {inputs} actuators; got {value!r:.80}")
             if not all(one is None or one > 0 for one in each):
                 raise ValueError(f"{name} must be positive or None; got {value}")
         if self.feedforward is not None and self.D.size > 1:

@@ -31,7 +31,7 @@ _DIRECTION, _MOST_STATES, _SHIFTS = 1e-3, 12, 24
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """samples : largest length of a window. responses : (>= samples, Y, S) outputs over noise (Y,) after
+    """samples : usual length of a window. responses : (>= samples, Y, S) outputs over noise (Y,) after
     states at its start."""
 
     samples: int
@@ -59,7 +59,8 @@ class Windows:
 
     def parts(self, samples: int) -> list[tuple[slice, int, int]]:
         """Of a record: rows of windows of one length, their number and length."""
-        count = -(-samples // self.samples)
+        # Of about this length, and none longer than what states are known to do.
+        count = max(samples // self.samples, -(-samples // len(self.responses)))
         length, longer = divmod(samples, count)
         first = longer * (length + 1)
         found = [(slice(0, first), longer, length + 1), (slice(first, samples), count - longer, length)]
