@@ -16,7 +16,7 @@ Counts = dict[str, tuple[int, int]]
 WHOLE = "verdict and set right, every case"
 ROW = re.compile(r"^(\S.*?)\s{2,}\d+ % \[\d+, \d+\] \((\d+)/(\d+)\)", re.MULTILINE)
 END = "baseline:"
-# What machines without an effect were called, name and count each.
+# What machines without an effect were called, name and count each; pairs called so stand further down.
 NONE, CALLED = re.compile(r"^  none: (.+)$", re.MULTILINE), re.compile(r"(\w+) (\d+)")
 NAMED = "no effect, but one named"
 # Series that are counted apart too: the latest.
@@ -47,7 +47,7 @@ def all_series() -> dict[str, Counts]:
 
 def counts(text: str) -> Counts:
     """What one results file of `flexlink blind` counts."""
-    called = [(name, int(count)) for name, count in CALLED.findall("".join(NONE.findall(text)))]
+    called = [(name, int(count)) for name, count in CALLED.findall("".join(NONE.findall(text)[:1]))]
     named = sum(count for name, count in called if name not in ("none", "unknown"))
     rows = {what: (int(right), int(asked)) for what, right, asked in ROW.findall(text)}
     return {NAMED: (named, sum(count for _, count in called))} | rows
