@@ -26,7 +26,7 @@ from scipy.signal import dlsim
 from benchmarks.harness import Print, main, timed
 from ident import IdentOptions, Record, identify_miso
 from ident.several_outputs import identify_mimo
-from ident.uncertainty.matrix_response import matrix_uncertainty
+from ident.uncertainty.matrix_response import matrix_posterior
 from plant import prbs
 from validation.example_arms import two_link_operating_point
 
@@ -124,7 +124,7 @@ def _plant(out: Print, name: str, seeds: range) -> None:
         alone = [identify_miso([record.only(k)], options).model for k in range(2)]
         noted("channel by channel", np.stack([one.frequency_response(ERRORS) for one in alone], axis=1))
         states.append(len(result.model.state_space()[0]))
-        balls = matrix_uncertainty([record], result, BALLS)
+        balls = matrix_posterior([record], result).at(BALLS)
         held.append(balls.holds(response(plant, BALLS)))
         enclosure.append(float(np.median(balls.enclosure)))
         for peer, fit in PEERS.items():

@@ -239,70 +239,44 @@ class ModalFit:
         return self._linearised(self.x, linear=False)[1]
 
     def response_columns(self, omega_rad_s: RealArray) -> ComplexArray:
-        """Change of the response with each number of `covariance_factor`, (F, Y, U, P); inputs as they drive
-        the modes, without integrator and delay."""
+        """Change of the response with each number of `covariance_factor`, (F, Y, U, P)."""
+        a, b, seen = self._one_input()
         z = np.exp(1j * np.asarray(omega_rad_s) * self.data.dt_s)
-        n_outputs, n_inputs = self.y.shape[0], self.u.shape[0]
-        columns: list[ComplexArray] = []
-        for mode, (pole, residue), slopes in self._unpacked():
-
-            def shown(
-                change: ComplexArray, power: int, mode: Mode = mode, pole: complex = pole
-            ) -> ComplexArray:
-                first: ComplexArray = np.asarray(change / (z[:, None, None] - pole) ** power)
-                if not mode.is_pair:
-                    return first
-                second = np.conj(change) / (z[:, None, None] - np.conj(pole)) ** power
-                return np.asarray(first + second)
-
-            if mode.moves:
-                columns += [shown(step * residue, 2) for step in _pole_steps(mode, pole)]
-            columns += [shown(slope, 1) for slope in slopes]
-        parts = [1 / z] if self.structure.integrators else []
-        parts += [np.ones_like(z)] if self.structure.feedthrough else []
-        for k in range(n_outputs):
-            for part in parts:
-                for j in range(n_inputs):
-                    column = np.zeros((z.size, n_outputs, n_inputs), dtype=np.complex128)
-                    column[:, k, j] = part
-                    columns.append(column)
-        return np.stack(columns, axis=-1)
+        states = np.linalg.solve(z[:, None, None] * np.eye(len(a)) - a, b)[..., 0]
+        both = np.concatenate([states, np.ones((z.size, 1))], axis=1)
+        return np.asarray(np.einsum("pyum,fm->fyup", seen, both))
 
     def response_states(self) -> tuple[RealArray, RealArray, RealArray]:
         """The same as a state space: A (n, n), B (n, U), and C (P, Y, n + U) that takes states and inputs to
         what each number changes. Every input drives states of its own."""
+        a, b, seen = self._one_input()
+        eye, size = np.eye(self.u.shape[0]), len(a)
+        rows = [seen[..., :size].reshape(*seen.shape[:2], -1), seen[..., size]]
+        return np.asarray(np.kron(eye, a)), np.asarray(np.kron(eye, b)), np.concatenate(rows, axis=2)
+
+    def _one_input(self) -> tuple[RealArray, RealArray, RealArray]:
+        """State space of what one input drives, A (m, m), B (m, 1), and (P, Y, U, m + 1): what each number
+        of `covariance_factor` changes, seen from the states and the input itself. Inputs as they drive the
+        modes, without integrator and delay."""
         n_outputs, n_inputs = self.y.shape[0], self.u.shape[0]
-        blocks: list[RealArray] = [np.zeros((1, 1))]  # one sample later, for the integrators' columns
-        rows: list[tuple[int, ComplexArray, int]] = []  # first state of an input, its (Y, U) changes, power
-        at = 1
+        blocks, drive = [np.zeros((1, 1))], [1.0]  # one sample later, for the integrators' columns
+        seen: list[
+            tuple[int, ComplexArray, bool]
+        ] = []  # first state, change (Y, U), whether it has a conjugate
         for mode, (pole, residue), slopes in self._unpacked():
-            own = (
-                np.array([[pole.real, -pole.imag], [pole.imag, pole.real]])
-                if mode.is_pair
-                else np.array([[pole.real]])
-            )
-            size = len(own)
-            block = np.zeros((2 * size, 2 * size))
-            block[:size, :size] = block[size:, size:] = own
-            block[size:, :size] = np.eye(size)
-            blocks.append(block)
+            turn = np.array([[0.0, -pole.imag], [pole.imag, 0.0]]) if mode.is_pair else np.zeros((1, 1))
+            own, size, at = pole.real * np.eye(len(turn)) + turn, len(turn), len(drive)
+            blocks.append(np.block([[own, np.zeros_like(own)], [np.eye(size), own]]))
+            drive += [1.0] + [0.0] * (2 * size - 1)
             if mode.moves:
-                rows += [(at, step * residue, 2) for step in _pole_steps(mode, pole)]
-            rows += [(at, slope, 1) for slope in slopes]
-            at += 2 * size
-        one = block_diag(*blocks)
-        drive = np.zeros((at, 1))
-        drive[0] = 1.0
-        starts = np.cumsum([0, *(len(block) for block in blocks)])[:-1]
-        drive[starts[1:]] = 1.0
-        columns = []
-        for first, change, power in rows:
-            size = len(blocks[int(np.searchsorted(starts, first))]) // 2
-            state = first + (power - 1) * size
+                seen += [(at + size, step * residue, mode.is_pair) for step in _pole_steps(mode, pole)]
+            seen += [(at, slope, mode.is_pair) for slope in slopes]
+        at, columns = len(drive), []
+        for state, change, is_pair in seen:
             column = np.zeros((n_outputs, n_inputs, at + 1))
-            column[:, :, state] = change.real * (2 if size == 2 else 1)
-            if size == 2:
-                column[:, :, state + 1] = -2 * change.imag
+            column[:, :, state] = change.real
+            if is_pair:  # twice the real part of change times the complex state
+                column[:, :, state : state + 2] = 2 * np.stack([change.real, -change.imag], axis=-1)
             columns.append(column)
         parts = [0] if self.structure.integrators else []
         parts += [at] if self.structure.feedthrough else []
@@ -312,10 +286,7 @@ class ModalFit:
                     column = np.zeros((n_outputs, n_inputs, at + 1))
                     column[k, j, part] = 1.0
                     columns.append(column)
-        both = np.array(columns)  # (P, Y, U, states and input of one)
-        seen = np.concatenate([both[..., :at].reshape(len(both), n_outputs, -1), both[..., at]], axis=2)
-        eye = np.eye(n_inputs)
-        return np.asarray(np.kron(eye, one)), np.asarray(np.kron(eye, drive)), np.asarray(seen)
+        return np.asarray(block_diag(*blocks)), np.array(drive)[:, None], np.array(columns)
 
     def _unpacked(self) -> Iterator[tuple[Mode, tuple[complex, ComplexArray], list[ComplexArray]]]:
         at = 0

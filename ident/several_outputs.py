@@ -198,7 +198,7 @@ def _described(
     model = _model(records[0], data.structure, poles, options, *own_units)
     noise = residual @ residual.T / (residual.shape[1] * (1 - unknowns / data.n_samples))
     own, segments = back @ residual, data.each[0].segments
-    measured = np.stack([one.y for one in prepare_outputs(records, data.structure).each])
+    measured = back @ np.stack([one.y for one in data.each])
     fits_percent = [
         [_fit_percent(own[k, part], y[part]) for k, y in enumerate(measured)] for part in segments
     ]

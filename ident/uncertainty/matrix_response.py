@@ -25,7 +25,7 @@ from ident.fit.several_outputs import prepare_outputs, whitened
 from ident.identification import MimoIdentification
 from ident.mode_shapes import ModalFit, modes_of
 
-_RADII = 400  # frequencies whose largest radius stands for all
+_RADII, _AROUND = 400, 41  # frequencies, and those around a mode, whose largest radius stands for all
 _DRAWS = 20_000  # of the sum of squares: its 95 % quantile then is right to about 1 %
 
 
@@ -103,9 +103,14 @@ class MatrixPosterior:
         return a, b, c, d
 
     def largest_radius(self, lowest_rad_s: float) -> float:
-        """Of the balls from lowest_rad_s to the Nyquist frequency."""
-        grid = np.geomspace(lowest_rad_s, 0.999 * np.pi / self.dt_s, _RADII)
-        return float(np.max(self.at(grid).radius))
+        """Of the balls from lowest_rad_s to the Nyquist frequency, on a grid with points around modes."""
+        poles, nyquist = self.model.poles, 0.999 * np.pi / self.dt_s
+        around = [
+            omega * (1 + zeta * np.linspace(-5, 5, _AROUND))
+            for omega, zeta in zip(poles.omega_rad_s(self.dt_s), poles.zeta(), strict=True)
+        ]
+        grid = np.unique(np.concatenate([np.geomspace(lowest_rad_s, nyquist, _RADII), *around]))
+        return float(np.max(self.at(grid[(grid >= lowest_rad_s) & (grid <= nyquist)]).radius))
 
     def at(self, omega_rad_s: RealArray) -> MatrixUncertainty:
         """Balls at omega (F,), up to pi/dt (above 0 with integrators)."""
@@ -146,14 +151,3 @@ def matrix_posterior(
     modes = modes_of(model.poles, own, identification.n_fixed, identification.rank_one or None)
     fit = ModalFit(data, modes)
     return MatrixPosterior(model, factor, fit, fit.covariance_factor(), level)
-
-
-def matrix_uncertainty(
-    records: Sequence[Record],
-    identification: MimoIdentification,
-    omega_rad_s: RealArray,
-    *,
-    level: float = 0.95,
-) -> MatrixUncertainty:
-    """`matrix_posterior` at omega (F,); raises ValueError as that."""
-    return matrix_posterior(records, identification, level=level).at(omega_rad_s)

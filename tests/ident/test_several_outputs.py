@@ -17,7 +17,7 @@ from ident.basis.poles import Poles
 from ident.data.record import Record
 from ident.one_input import identify
 from ident.several_outputs import identify_mimo
-from ident.uncertainty.matrix_response import matrix_posterior, matrix_uncertainty
+from ident.uncertainty.matrix_response import matrix_posterior
 
 DT_S = 0.01
 OMEGA = np.geomspace(0.5, 300, 60)
@@ -118,7 +118,7 @@ def test_balls_hold_the_response_as_often_as_they_say():
     truth, held = response(structure()), []
     for seed in range(24):
         item = record(structure(), 100 + seed, samples=1500)
-        balls = matrix_uncertainty([item], identify_mimo([item]), OMEGA)
+        balls = matrix_posterior([item], identify_mimo([item])).at(OMEGA)
         held.append(np.mean(balls.holds(truth)))
     assert 0.88 < np.mean(held) < 0.995
     assert np.all(balls.enclosure > 0.8)
