@@ -17,8 +17,6 @@ from ident.data.arrays import lock
 if TYPE_CHECKING:
     import control
 
-
-if TYPE_CHECKING:
     Limit = Any  # whoever has one loop reads a number
 else:
     Limit = float | tuple[float | None, ...] | None

@@ -63,6 +63,7 @@ def test_small_phrases():
     assert frequency(2 * np.pi) == "6.28 rad/s (1 Hz)"
     assert sentence("hub: it is") == "hub: it is."
     assert sentence("integrators = 1 accepted") == "integrators = 1 accepted."
+    assert sentence("elbow.damping is large") == "elbow.damping is large."
     assert sentence("stop!") == "Stop!"
     assert sentence(" two \n lines ") == "Two lines."
     assert sentence(Markup("<b>x</b> ")) == Markup("<b>x</b>.")
