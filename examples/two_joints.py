@@ -60,7 +60,7 @@ def run(folder: Path, seed: int = 0) -> None:
     ball = ResponseBall.of(matrix_posterior([record], found), LOWEST_RAD_S)
     plant = MultivariablePlant("arm", found.model.to_control(), ball)
     asked = MultivariableSpecification(joints=JOINTS, controller_order=6)
-    design = synthesise_multivariable(plant, asked, rng)
+    design = synthesise_multivariable(plant, asked)
     certificate = certify_multivariable(design.controller, plant, asked)
     verdict = certificate.verdicts[0]
     print(f"worst case {certificate.gamma:.3f} (at most 1 is needed), certified: {certificate.met}")

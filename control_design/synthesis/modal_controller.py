@@ -81,26 +81,33 @@ class ModalForm:
         """C and B of a form without modal blocks."""
         return np.zeros((0, self.inputs, 2)), np.zeros((0, 2, self.outputs))
 
-    def extended(self, smaller: ModalForm, x: Real, rng: np.random.Generator) -> Real:
-        """The controller x of a smaller form, with random blocks that do nothing yet: their C is zero."""
+    def no_input(self) -> Real:
+        """B of a block without effect."""
+        return np.zeros((2, self.outputs))
+
+    def extended(self, smaller: ModalForm, x: Real) -> Real:
+        """The controller x of a smaller form, its further blocks without effect: their C and B are zero."""
         parts = [part[0] for part in smaller.split(x[None])]
         more = self.blocks - smaller.blocks
         shapes = [(more,), (more,), (more, self.inputs, 2), (more, 2, self.outputs)]
         grown = [
             np.concatenate([part, np.zeros(shape)]) for part, shape in zip(parts[:4], shapes, strict=True)
         ]
-        found = self.join(*grown, *parts[4:])
-        for block in range(smaller.blocks, self.blocks):
-            found = self.renewed(found, block, rng)
-        return found
+        return self.join(*grown, *parts[4:])
 
-    def renewed(self, x: Real, block: int, rng: np.random.Generator) -> Real:
-        """The controller x with one block replaced by a random one that does nothing yet."""
-        log_w, log_z, C, B, D, C_0 = (part[0].copy() for part in self.split(x[None]))
-        log_w[block] = np.log(0.5 * self.scale * 10 ** rng.uniform(-1.5, 1.5))
-        log_z[block] = np.log(10 ** rng.uniform(-1, 0.5))
-        C[block], B[block] = 0.0, rng.standard_normal((2, self.outputs))
-        return self.join(log_w, log_z, C, B, D, C_0)
+    def replaced(self, x: Real, block: int, omega_rad_s: float, zeta: float, B: Real) -> Real:
+        """The controller x with one block replaced by another, B (2, Y), that does nothing yet: its C is
+        zero."""
+        log_w, log_z, C, inputs, D, C_0 = (part[0].copy() for part in self.split(x[None]))
+        log_w[block], log_z[block], C[block], inputs[block] = np.log(omega_rad_s), np.log(zeta), 0.0, B
+        return self.join(log_w, log_z, C, inputs, D, C_0)
+
+    def masks(self, block: int) -> tuple[Boolean, Boolean]:
+        """Rows (U,) and columns (Y,) of K that a block may reach."""
+        return (
+            np.isin(np.arange(self.inputs), self._c[1][self._c[0] == block]),
+            np.isin(np.arange(self.outputs), self._b[2][self._b[0] == block]),
+        )
 
     def bounds(self) -> tuple[Real, Real]:
         low, high = np.full(self.parameters, -np.inf), np.full(self.parameters, np.inf)

@@ -1,8 +1,8 @@
 """Synthesis of one controller for plants with several inputs and outputs: fixed order and structure.
 
-A stable static gain is grown by modal blocks whose output matrix is zero at first, the best of several random
-ones each time, and every size is taken down to a local minimum of the worst case (`MatrixDescent`), with the
-frequencies that a dense check finds violated added as it goes.
+A stable static gain is grown by modal blocks whose output matrix is zero at first: those that promise the
+steepest fall of the worst case (`next_block`). Every order is taken down to a local minimum of the worst case
+(`MatrixDescent`), with the frequencies that a dense check finds violated added as it goes. Nothing is random.
 """
 
 from __future__ import annotations
@@ -23,13 +23,16 @@ from control_design.plants.scaled_bound import scaled_bound
 from control_design.specification.multivariable import MultivariableSpecification
 from control_design.specification.specification import SpecificationError
 from control_design.synthesis.modal_controller import ModalForm
-from control_design.synthesis.multivariable_descent import MatrixDescent, StackedRows, stacked_rows
+from control_design.synthesis.multivariable_descent import MatrixDescent, Pull, StackedRows, stacked_rows
+from control_design.synthesis.next_block import best_blocks
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome
 
 _LIGHT = 0.3  # poles of loop and controller damped less have frequencies of their own in every check
 _AROUND = np.array([-3, -1.5, -0.7, -0.3, 0, 0.3, 0.7, 1.5, 3])  # in half-widths of such a pole
 _SEEN = 0.5  # log gamma^2 below the largest within which the dense check is exact
 _EXCESS = 5e-4  # accepted of the dense check over the programme
+_AT = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1)  # of the scale: where a static gain inverts the plant
+_SAME = 1e-3  # relative difference of worst cases below which two static gains count as one
 _MOST = 15  # violated frequencies added in a round
 
 
@@ -37,15 +40,17 @@ class MultivariableOptions(BaseModel):
     """Effort of the search."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-    starts: int = Field(default=1, ge=1, le=50, description="controllers grown; the best counts")
-    candidates: int = Field(
-        default=3, ge=1, le=20, description="random blocks tried wherever the order grows"
-    )
-    renewals: int = Field(
-        default=0, ge=0, le=100, description="blocks replaced by random ones at the full order"
-    )
+    starts: int = Field(default=1, ge=1, le=50, description="static gains to grow from; the best counts")
+    candidates: int = Field(default=3, ge=1, le=20, description="blocks tried wherever the order grows")
     growth_steps: int = Field(default=12, ge=1, le=200, description="steps of each candidate")
-    rounds: int = Field(default=12, ge=1, le=100, description="rounds of the last descent, with exchange")
+    growth_rounds: int = Field(default=4, ge=1, le=100, description="rounds of descent at each lower order")
+    renewals: int = Field(
+        default=1,
+        ge=0,
+        le=100,
+        description="blocks replaced at the full order, while the worst case is above 1",
+    )
+    rounds: int = Field(default=40, ge=1, le=100, description="rounds of the last descent, with exchange")
     steps: int = Field(default=12, ge=1, le=200, description="steps of a round")
     grid_points: int = Field(default=60, ge=20, le=2000, description="logarithmic points of the programme")
     mode_points: int = Field(
@@ -74,7 +79,6 @@ class MultivariableResult:
 def synthesise_multivariable(
     plants: MultivariablePlant | Sequence[MultivariablePlant],
     specification: MultivariableSpecification,
-    rng: np.random.Generator,
     options: MultivariableOptions | None = None,
     *,
     progress: Callable[[float, str], None] | None = None,
@@ -84,7 +88,8 @@ def synthesise_multivariable(
 
     The worst case is the largest singular value of each weighted function by itself, over every ball and
     block of the plants, at every frequency of a grid: `scaled_bound`. A local minimum is found, the best of
-    `options.starts`. Neglected: scheduling over operating points; one controller serves all.
+    `options.starts`, the same every time. Neglected: scheduling over operating points; one controller serves
+    all.
 
     Raises SpecificationError if the plants do not fit one another or the structure, or no static gain of the
     structure stabilises them.
@@ -94,9 +99,10 @@ def synthesise_multivariable(
     programme = Programme(listed, specification, options)
     tell = progress or (lambda fraction, message: None)
     best: tuple[float, ModalForm, Real] | None = None
-    for start in range(options.starts):
-        tell(start / options.starts, f"controller {start + 1} of {options.starts}")
-        gamma, form, x = programme.grown(rng)
+    static = programme.static()[: options.starts]
+    for start, (_, gains) in enumerate(static):
+        tell(start / len(static), f"controller {start + 1} of {len(static)}")
+        gamma, form, x = programme.grown(gains)
         if best is None or gamma < best[0]:
             best = gamma, form, x
         if gamma <= options.sufficient_gamma:
@@ -172,65 +178,86 @@ class Programme:
             self.spec.controller_damping,
         )  # fmt: skip
 
-    def static(self) -> tuple[ModalForm, Real]:
-        """Order as low as it gets, from a static gain that stabilises all nominal loops: the real part of a
-        pseudo-inverse of the plant at the scale, as large as it may be for a factor of two to -1."""
-        form = self.form(sum(joint.integrator for joint in self.spec.joints[: self.plants[0].outputs]))
+    def static(self) -> list[tuple[float, Real]]:
+        """Worst cases and parameters of static gains of the lowest order, best first: the real part of a
+        pseudo-inverse of the plant at a frequency around the scale, with the best factor that is stable."""
+        form = self.lowest_form()
         descent = MatrixDescent(form, stacked_rows(self.plants, self.spec, self.lean), self.loops)
         found: list[tuple[float, Real]] = []
-        for factor in (1.0, 0.3, 0.1):
-            G = matrix_response(self.plants[0].nominal, np.array([factor * self.scale_rad_s]))[0]
+        for omega in self.scale_rad_s * np.array(_AT):
+            G = matrix_response(self.plants[0].nominal, np.array([omega]))[0]
             for lag in (0.0, 0.25, 0.5):  # in half turns: plants that integrate are turned by a half of one
                 D = np.where(self.pattern, np.linalg.pinv(G * np.exp(1j * np.pi * lag)).real, 0.0)
                 D = D / (np.linalg.norm(G @ D, 2) or 1.0)
-                for gain in 2.0 ** np.arange(1.0, -14.0, -1.0):
-                    slow = 0.02 * self.scale_rad_s * gain * D[:, form.integrates]
+                best: tuple[float, Real] | None = None
+                for gain in 2.0 ** np.arange(4.0, -14.0, -1.0):
+                    slow = 0.1 * omega * gain * D[:, form.integrates]
                     x = form.join(*(np.zeros(0),) * 2, *form.no_blocks(), gain * D, slow)
-                    if descent.stable(x):
-                        bound = descent.bound(x, None)
-                        if bound is not None:
-                            found.append((float(np.max(bound.gamma)), x))
-                            break
+                    bound = descent.bound(x, None)
+                    if bound is None and best is None:
+                        continue
+                    gamma = np.inf if bound is None else float(np.max(bound.gamma))
+                    if best is not None and gamma > best[0]:
+                        break
+                    best = gamma, x
+                found += [best] if best is not None else []
         if not found:
             raise SpecificationError(
                 "no static gain of this structure stabilises the plant robustly; allow more entries of K "
                 "(structure), or close a stabilising loop first and design around it"
             )
-        return form, min(found, key=lambda each: each[0])[1]
+        found.sort(key=lambda each: each[0])
+        before = [0.0, *(gamma for gamma, _ in found)]  # one gain may be found at several frequencies
+        return [each for each, last in zip(found, before, strict=False) if each[0] > (1 + _SAME) * last]
 
-    def grown(self, rng: np.random.Generator) -> tuple[float, ModalForm, Real]:
-        """(worst case on the dense grid, form, parameters) of the asked order, from random blocks."""
+    def lowest_form(self) -> ModalForm:
+        """Of a controller with integrators only."""
+        return self.form(sum(joint.integrator for joint in self.spec.joints[: self.plants[0].outputs]))
+
+    def grown(self, start: Real) -> tuple[float, ModalForm, Real]:
+        """(worst case on the dense grid, form, parameters) of the asked order, from a static gain."""
         options, target = self.options, self.spec.controller_order
-        form, x = self.static()
-        x, gamma = self.improved(form, x, 2 if form.order < target else options.rounds)
+        form, x = self.lowest_form(), start
+        x, gamma = self.improved(form, x, options.growth_rounds if form.order < target else options.rounds)
         while form.order < target:
             larger = self.form(form.order + 2)
-            x = self._best_of([larger.extended(form, x, rng) for _ in range(options.candidates)], larger)
+            pull = MatrixDescent(form, self.stack(form, x), self.loops).pull(x)
+            x = self._with_block(larger, larger.extended(form, x), larger.blocks - 1, pull)
             form = larger
-            x, gamma = self.improved(form, x, 2 if form.order < target else options.rounds)
-        for _ in range(options.renewals if form.blocks else 0):
-            if gamma <= options.sufficient_gamma:
-                break
-            # A block whose loss hurts least makes room for another one.
-            without = [self.worst(form, form.renewed(x, block, rng)) for block in range(form.blocks)]
-            least = np.argsort(without, kind="stable")[: 1 + form.blocks // 3]
-            starts = [form.renewed(x, int(rng.choice(least)), rng) for _ in range(options.candidates)]
-            other, reached = self.improved(form, self._best_of(starts, form), options.rounds)
-            if reached < gamma:
-                x, gamma = other, reached
+            more = options.growth_rounds if form.order < target else options.rounds
+            x, gamma = self.improved(form, x, more)
+        gamma, x = self.renewed(gamma, form, x)
         return gamma, form, x
 
-    def _best_of(self, starts: list[Real], form: ModalForm) -> Real:
-        """The best of several starts after a few steps; the first as it is where none is stable on the dense
-        grid: a candidate may hide an unstable plant of the set between the points of the lean one."""
-        stack = stacked_rows(self.plants, self.spec, self._with_light(form, starts[0]))
+    def renewed(self, gamma: float, form: ModalForm, x: Real) -> tuple[float, Real]:
+        """Better, if one of the blocks that matter least has a better one in its place."""
+        without = [form.replaced(x, block, form.scale, 1.0, form.no_input()) for block in range(form.blocks)]
+        worst = [self.worst(form, less) for less in without]
+        for block in np.argsort(worst, kind="stable")[: self.options.renewals]:
+            if gamma <= max(1.0, self.options.sufficient_gamma) or not np.isfinite(worst[block]):
+                break
+            less, _ = self.improved(form, without[block], 1)
+            pull = MatrixDescent(form, self.stack(form, less), self.loops).pull(less)
+            tried = self._with_block(form, less, int(block), pull)
+            other, reached = self.improved(form, tried, self.options.rounds)
+            if reached < gamma:
+                gamma, x = reached, other
+        return gamma, x
+
+    def _with_block(self, form: ModalForm, x: Real, block: int, pull: Pull | None) -> Real:
+        """The best of several blocks in one place, after a few steps; as it is where none is stable on the
+        dense grid: a candidate may hide an unstable plant of the set between the points of the lean one."""
+        if pull is None:
+            return x
+        stack = self.stack(form, x)
         tried = []
-        for start in starts:
+        for each in best_blocks(form, block, pull, self.options.candidates):
+            start = form.replaced(x, block, each.omega_rad_s, each.zeta, each.B)
             end, reached, steps = MatrixDescent(form, stack, self.loops).run(start, self.options.growth_steps)
             self.steps += steps
             tried.append((reached, end))
         tried.sort(key=lambda each: each[0])
-        return next((end for _, end in tried if np.isfinite(self.worst(form, end))), starts[0])
+        return next((end for _, end in tried if np.isfinite(self.worst(form, end))), x)
 
     def improved(self, form: ModalForm, x: Real, rounds: int) -> tuple[Real, float]:
         """Descents in rounds, with violated frequencies added: best parameters and their worst case on the
@@ -292,8 +319,11 @@ class Programme:
             stack.rows, form.response(x[None], stack.s)[0], accuracy=1e-6, within=within
         ).gamma
 
-    def _with_light(self, form: ModalForm, x: Real) -> list[Real]:
-        return [np.union1d(grid, light) for grid, light in zip(self.lean, self._light(form, x), strict=True)]
+    def stack(self, form: ModalForm, x: Real) -> StackedRows:
+        """On the lean grid and around light poles."""
+        light = self._light(form, x)
+        grids = [np.union1d(grid, more) for grid, more in zip(self.lean, light, strict=True)]
+        return stacked_rows(self.plants, self.spec, grids)
 
     def _light(self, form: ModalForm, x: Real) -> list[Real]:
         """Frequencies around lightly damped poles of every loop and of the controller."""

@@ -28,6 +28,8 @@ _LEAST_GAIN = 2e-6  # predicted fall of log gamma^2 that is not worth a step
 _FAR_BELOW = 2.0  # rows so far below the worst (log gamma^2) cannot become it within one step
 _REACH = 0.5  # of the sum of all slopes: how far a row is taken to rise in a box
 _SCALING_BOX = 3.0  # box of log t in that of the parameters
+_SMALL_BOX = 0.02  # of the step whose multipliers weigh the rows
+_NEAR = 0.3  # log gamma^2 below the worst, of the rows that a new block must not raise
 _CUTS, _MISSED = 4, 0.05  # rounds of adding directions; share of the predicted fall that may be missed
 _ACTIVE = 1e-4  # share of the largest multiplier below which a row bends nothing
 
@@ -86,6 +88,18 @@ class _Local:
     in_t: Complex
     basis: Complex
     top: Real
+
+
+@dataclass(frozen=True, eq=False)
+class Pull:
+    """What a change dK of the controller does to first order where a descent ended, at r frequencies s (r,):
+    the worst log gamma^2 changes by the sum of 2 Re tr(on_K dK), on_K (r, Y, U), and that of one row by
+    2 Re(left^H dK right), left (r, U), right (r, Y)."""
+
+    s: Complex
+    on_K: Complex
+    left: Complex
+    right: Complex
 
 
 class MatrixDescent:
@@ -150,6 +164,24 @@ class MatrixDescent:
             elif actual < 0.25 * predicted:
                 box *= 0.35
         return x, float(np.exp(0.5 * best)), taken
+
+    def pull(self, x: Real) -> Pull | None:
+        """Multipliers of a small step give the weights of the rows; None without stability or a step."""
+        bound = self.bound(x, None)
+        if bound is None:
+            return None
+        local = self._local(x, bound)
+        steepest = np.max(np.abs(local.slope[:, 0].real), axis=0)
+        unit = np.minimum(self.form.units(x), 1.0 / np.maximum(steepest, 1e-12))
+        step = self._step(x, local, np.zeros((x.size, x.size)), unit, _SMALL_BOX)
+        if step is None:
+            return None
+        rows, s = self.stack.rows.part(local.index), self.stack.s[local.index]
+        found = expansion(rows, self.form.response(x[None], s)[0], bound.log_t[local.index])
+        left, right = found.left @ local.basis, found.right @ local.basis / local.top[:, None, None]
+        on_K = right @ step[2] @ conjugate(left)
+        near = local.block[:, 0, 0].real > np.max(local.block[:, 0, 0].real) - _NEAR
+        return Pull(s[near], on_K[near], left[near, :, 0], right[near, :, 0])
 
     def _local(self, x: Real, bound: Bound) -> _Local:
         log = 2 * np.log(bound.gamma)

@@ -20,8 +20,11 @@ from control_design import (
     synthesise_multivariable,
 )
 from control_design.synthesis.modal_controller import ModalForm
+from control_design.synthesis.multivariable import Programme
+from control_design.synthesis.multivariable_descent import MatrixDescent
+from control_design.synthesis.next_block import best_blocks
 
-QUICK = MultivariableOptions(rounds=4, candidates=2, growth_steps=6, steps=6)
+QUICK = MultivariableOptions(rounds=4, candidates=2, growth_steps=6, growth_rounds=2, steps=6, renewals=0)
 
 
 @pytest.mark.parametrize(
@@ -49,24 +52,64 @@ def test_values_and_slopes_of_the_modal_form(pattern):
         np.testing.assert_allclose(slopes[:, k], expected, rtol=1e-6, atol=1e-7 * np.max(np.abs(slopes)))
 
 
-def test_more_states_never_change_the_response_they_start_from():
+def test_blocks_do_nothing_until_they_have_an_output():
     rng = np.random.default_rng(4)
     small = ModalForm(np.ones((2, 2), bool), 2, np.zeros(2, bool), 10.0, 1e-3, 0.01, 0.02)
     large = ModalForm(np.ones((2, 2), bool), 6, np.zeros(2, bool), 10.0, 1e-3, 0.01, 0.02)
     x = rng.standard_normal(small.parameters)
     before = x.copy()
     s = 1j * np.geomspace(0.1, 100, 9)
-    np.testing.assert_allclose(
-        large.response(large.extended(small, x, rng)[None], s), small.response(x[None], s), rtol=1e-12
-    )
-    large.renewed(large.extended(small, x, rng), 0, rng)
+    grown = large.replaced(large.extended(small, x), 2, 3.0, 0.5, rng.standard_normal((2, 2)))
+    np.testing.assert_allclose(large.response(grown[None], s), small.response(x[None], s), rtol=1e-12)
+    bare = large.replaced(grown, 0, 3.0, 0.5, large.no_input())
+    direct = small.split(x[None])[4][0]
+    np.testing.assert_allclose(large.response(bare[None], s)[0], np.tile(direct, (9, 1, 1)), rtol=1e-12)
     np.testing.assert_array_equal(x, before)
+
+
+@pytest.mark.parametrize("structure", ["full", "decentralised"])
+def test_new_blocks_change_rows_as_said_and_the_list_is_in_order(structure):
+    """Left and right of every row near the worst, against a difference quotient of its value."""
+    plant, specification = plant_t(), specification_t(4, structure)
+    programme = Programme((plant,), specification, QUICK)
+    form, x = programme.lowest_form(), programme.static()[0][1]
+    x, _ = programme.improved(form, x, 20)
+    stack = programme.stack(form, x)
+    pull = MatrixDescent(form, stack, programme.loops).pull(x)
+    larger = programme.form(2)
+    blocks = best_blocks(larger, 0, pull, 3)
+    merits = [each.merit for each in blocks]
+    assert merits == sorted(merits, reverse=True)
+    assert 0 < merits[0] <= 1 + 1e-9  # the worst changes by no more than the row that changes most
+    corners = np.log([each.omega_rad_s for each in blocks])
+    assert np.min(np.abs(np.subtract.outer(corners, corners))[np.triu_indices(3, 1)]) > 0.3
+
+    descent = MatrixDescent(larger, stack, programme.loops)
+    start = larger.replaced(larger.extended(form, x), 0, blocks[0].omega_rad_s, blocks[0].zeta, blocks[0].B)
+    log = 2 * np.log(descent.bound(start, None).gamma)
+    near = np.flatnonzero(log > log.max() - 0.3)
+    assert near.size == pull.s.size > 2
+    outputs = larger.split(start[None])[2][0] != 0  # C is zero: no entry
+    assert not outputs.any()
+    step = np.random.default_rng(0).standard_normal((1, 2, 2)) * programme.pattern[:, [0], None]
+    parts = [part[0] for part in larger.split(start[None])]
+    moved = larger.join(*parts[:2], 1e-6 * step, *parts[3:])
+    change = (2 * np.log(descent.bound(moved, None).gamma)[near] - log[near]) / 1e-6
+    dK = (larger.response(moved[None], pull.s)[0] - larger.response(start[None], pull.s)[0]) / 1e-6
+    said = 2 * np.einsum("ru,ruy,ry->r", pull.left.conj(), dK, pull.right).real
+    np.testing.assert_allclose(said, change, rtol=1e-2, atol=1e-2 * np.max(np.abs(change)))
+
+
+def test_the_same_design_every_time():
+    first, second = (synthesise_multivariable(plant_t(), specification_t(4), QUICK) for _ in range(2))
+    assert first.gamma == second.gamma
+    np.testing.assert_array_equal(first.controller.A, second.controller.A)
 
 
 @pytest.mark.parametrize("structure", ["full", "decentralised", ((True, True), (False, True))])
 def test_a_design_is_what_the_judge_and_the_certificate_say(structure):
     plant, specification = plant_t(), specification_t(4, structure)
-    result = synthesise_multivariable(plant, specification, np.random.default_rng(0), QUICK)
+    result = synthesise_multivariable(plant, specification, QUICK)
     # The judge begins at 1e-3 rad/s, the synthesis below; elsewhere the two grids agree within 2e-3.
     assert 0.98 * result.gamma < judged("T", result.controller) < 1.002 * result.gamma
     verdict = certify_multivariable(result.controller, plant, specification).verdicts[0]
@@ -88,13 +131,16 @@ def test_the_example_of_the_docs_is_certified(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_full_order_six_of_the_two_joints():
-    plant, specification = plant_t(), specification_t(6)
-    best = min(
-        judged("T", synthesise_multivariable(plant, specification, np.random.default_rng(seed)).controller)
-        for seed in range(3)
-    )
-    assert best < 1.03  # a decentralised start with finite differences ends at 1.0285
+@pytest.mark.parametrize(
+    ("order", "structure", "ball", "most"),
+    [(6, "full", 1.0, 0.978), (8, "decentralised", 1.0, 1.1), (8, "full", 3.0, 1.083)],
+)
+def test_designs_of_the_two_joints(order, structure, ball, most):
+    """D-K iteration with 33 states: .978; with the ball three times as large 1.083. Direct search over
+    decentralised controllers ends at 1.208."""
+    plant, specification = plant_t(ball), specification_t(order, structure)
+    controller = synthesise_multivariable(plant, specification).controller
+    assert judged("T" if ball == 1.0 else "T, ball x 3", controller) < most
 
 
 def test_joints_that_integrate_and_an_integrator_in_the_controller():
@@ -106,7 +152,7 @@ def test_joints_that_integrate_and_an_integrator_in_the_controller():
     plant = MultivariablePlant("two motors", mixed)
     asked = Specification(bandwidth_rad_s=2.0, integrator=True, effort_limit=200.0, input_limit=24.0)
     specification = MultivariableSpecification(joints=(asked, asked), controller_order=4)
-    result = synthesise_multivariable(plant, specification, np.random.default_rng(0), QUICK)
+    result = synthesise_multivariable(plant, specification, QUICK)
     assert np.sum(np.abs(result.controller.poles - 1) < 1e-9) == 2
     assert result.controller.input_limit == (24.0, 24.0)
     verdict = certify_multivariable(result.controller, plant, specification).verdicts[0]
@@ -118,7 +164,7 @@ def test_joints_that_integrate_and_an_integrator_in_the_controller():
 def test_two_operating_points_share_one_controller():
     light, heavy = plant_t(), plant_t(2.0)
     specification = specification_t(4)
-    result = synthesise_multivariable((light, heavy), specification, np.random.default_rng(0), QUICK)
+    result = synthesise_multivariable((light, heavy), specification, QUICK)
     certificate = certify_multivariable(result.controller, (light, heavy), specification)
     assert certificate.gamma == pytest.approx(result.gamma, rel=2e-3)
 
@@ -134,7 +180,7 @@ def test_two_operating_points_share_one_controller():
 def test_specifications_that_do_not_fit_are_refused(changes, message):
     given = MultivariableSpecification(**{**dict(specification_t(4)), **changes})
     with pytest.raises((SpecificationError, ValueError), match=message):
-        synthesise_multivariable(plant_t(), given, np.random.default_rng(0), QUICK)
+        synthesise_multivariable(plant_t(), given, QUICK)
 
 
 def test_keys_no_matrix_design_reads_are_refused():
@@ -148,4 +194,4 @@ def test_a_structure_that_cannot_stabilise_is_refused():
     asked = Specification(bandwidth_rad_s=1.0)
     given = MultivariableSpecification(joints=(asked, asked), structure="decentralised", controller_order=2)
     with pytest.raises(SpecificationError, match="structure"):
-        synthesise_multivariable(plant, given, np.random.default_rng(0), QUICK)
+        synthesise_multivariable(plant, given, QUICK)
