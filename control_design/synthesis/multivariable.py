@@ -1,8 +1,9 @@
 """Synthesis of one controller for plants with several inputs and outputs: fixed order and structure.
 
-A stable static gain is grown by modal blocks whose output matrix is zero at first: those that promise the
-steepest fall of the worst case (`next_block`). Every order is taken down to a local minimum of the worst case
-(`MatrixDescent`), with the frequencies that a dense check finds violated added as it goes. Nothing is random.
+A stable static gain is grown by modal blocks whose output matrix is zero at first: those with the steepest
+predicted fall of the worst case (`next_block`). Every order is taken down to a local minimum of the worst
+case (`MatrixDescent`), with the frequencies that a dense check finds violated added as it goes. Nothing is
+random.
 """
 
 from __future__ import annotations
