@@ -14,6 +14,7 @@ mujoco = pytest.importorskip("mujoco")
 from benchmarks import mujoco_cases as cases  # noqa: E402
 from diagnosis import PlantExperiment, diagnose  # noqa: E402
 from diagnosis.machine.mujoco_plant import MujocoArm  # noqa: E402
+from diagnosis.machine.mujoco_quantities import Quantities  # noqa: E402
 from diagnosis.machine.plant_effect import Change  # noqa: E402
 
 DT_S = 0.01
@@ -506,7 +507,9 @@ def test_the_force_on_a_joint_is_what_its_actuators_do_whatever_lies_between(dri
     arm, _ = link(PLAIN, motor=f"{motor}</actuator>{tendon}<actuator>")
     torque = steps()
     measured = PlantExperiment("one", "estimation", np.column_stack([torque, torque]), torque[:, None])
-    assert arm._sizes((measured,))["hinge"][0] == pytest.approx(4 * np.max(np.abs(torque)), rel=1e-9)
+    assert Quantities(arm, (measured,)).sizes()["hinge"][0] == pytest.approx(
+        4 * np.max(np.abs(torque)), rel=1e-9
+    )
 
 
 @pytest.mark.parametrize(

@@ -218,7 +218,8 @@ def _needs(package: str, extra: str) -> None:
 
 def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s: float) -> Any:
     _needs("mujoco", "mujoco")
-    from diagnosis.machine.mujoco_plant import MujocoArm, names
+    from diagnosis.machine.mujoco_model import names
+    from diagnosis.machine.mujoco_plant import MujocoArm
 
     there = names(str(model))
     kinds: dict[str, list[str]] = {}

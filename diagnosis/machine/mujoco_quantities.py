@@ -1,0 +1,234 @@
+"""Everything of a MuJoCo model that may be off or missing, with ranges that its records say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import mujoco
+import numpy as np
+from scipy.signal import savgol_filter
+
+from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.mujoco_edits import (
+    FORCES,
+    LAGS,
+    Quantity,
+    put_backlash,
+    put_delay,
+    put_first,
+    put_gain,
+    put_gravity,
+    put_inertia,
+    put_lag,
+    put_mass,
+    put_number,
+    put_payload,
+)
+from diagnosis.machine.mujoco_model import MujocoModel
+from diagnosis.machine.mujoco_simulation import start_filters
+from diagnosis.machine.own_plant import PlantExperiment
+from plant.effects.search_space import Dependence
+
+_SMOOTHED = 9  # samples, of a measured angle whose speed is asked
+# Numbers of a file have no more digits than this.
+_NO_LEVER_M = 1e-6
+_UNITS = {"hinge": ("Nm", "rad", "kg_m2"), "slide": ("N", "m", "kg")}
+_STANDARD_GRAVITY = 9.81
+
+
+@dataclass(frozen=True, eq=False)
+class Quantities:
+    """Those of a model that moves as in experiments."""
+
+    model: MujocoModel
+    experiments: Sequence[PlantExperiment]
+
+    def by_name(self) -> dict[str, Quantity]:
+        """Everything that may be off or missing, by name."""
+        model, experiments, sizes = self.model, self.experiments, self.sizes()
+        spec = model.spec
+        longest = 0.2 * max(len(e.input) for e in experiments)
+        swings = [max(float(np.ptp(e.output[:, k])) for e in experiments) for k in range(len(model.outputs))]
+        found = [
+            *(one for joint in spec.joints for one in self._of_joint(joint, *sizes[joint.name])),
+            *(one for actuator in spec.actuators for one in self._of_actuator(actuator, longest)),
+            *(one for body in spec.bodies for one in self._of_link(body)),
+            *self._of_gravity(),
+            *(one for y in zip(model.outputs, swings, strict=True) for one in self._of_sensor(*y)),
+        ]
+        return {one.name: one for one in found}
+
+    def _of_joint(self, joint: Any, force: float, travel: float, speed: float) -> Iterator[Quantity]:
+        kinds = {mujoco.mjtJoint.mjJNT_HINGE: "hinge", mujoco.mjtJoint.mjJNT_SLIDE: "slide"}
+        if joint.type not in kinds:
+            return
+        F, x, m = _UNITS[kinds[joint.type]]
+        inertia = float(self.model.nominal.dof_M0[self.model.nominal.joint(joint.name).dofadr[0]])
+        parts: tuple[tuple[str, str, float, float, Dependence], ...] = (
+            ("frictionloss", f"level_{F}", force, 1.0, "continuous"),
+            ("damping", f"coefficient_{F}s_{x}", force / speed, 10.0, "smooth"),
+            ("armature", f"inertia_{m}", inertia, 10.0, "smooth"),
+            ("stiffness", f"stiffness_{F}_{x}", force / travel, 10.0, "smooth"),
+        )
+        for key, parameter, unit, most, dependence in parts:
+            value = float(np.ravel(getattr(joint, key))[0])
+            yield Quantity(
+                f"{joint.name}.{key}",
+                value,
+                partial(put_first, joint.name, key),
+                parameter,
+                unit,
+                (1e-4, most),
+                dependence=dependence,
+                group="joint",
+            )
+        if joint.armature > 0:
+            yield Quantity(
+                f"{joint.name}.backlash",
+                0.0,
+                partial(put_backlash, joint.name),
+                f"gap_{x}",
+                travel,
+                (1e-3, 0.5),
+                dependence="non-smooth",
+                group="joint",
+            )
+
+    def _of_actuator(self, one: Any, longest: float) -> Iterator[Quantity]:
+        """longest : of a lag or delay, in samples."""
+        lag = 0.0 if one.dyntype == mujoco.mjtDyn.mjDYN_NONE else float(one.dynprm[0])
+        late = partial(
+            Quantity,
+            unit=self.model.dt_s,
+            span=(0.02, longest),
+            starts=(0.2, min(20.0, longest)),
+            group="actuator",
+        )
+        if {int(one.gaintype), int(one.biastype)} <= set(FORCES):
+            yield Quantity(f"{one.name}.gain", 1.0, partial(put_gain, one.name))
+        if one.dyntype in LAGS:
+            yield late(f"{one.name}.lag", lag, partial(put_lag, one.name), "time_constant_s")
+        put = partial(put_delay, "actuator", one.name, self.model.spec.option.timestep)
+        yield late(f"{one.name}.delay", float(one.delay), put, "delay_s")
+
+    def _of_link(self, body: Any) -> Iterator[Quantity]:
+        model = self.model.nominal
+        k = model.body(body.name).id
+        if not model.body_weldid[k]:
+            return
+        if model.body_weldid[k] == k and (at := self._load_place(k)):
+            put = partial(put_payload, *at)
+            # Of all that moves with it: what a robot carries is no multiple of its last link.
+            mass = float(model.body_subtreemass[model.body_rootid[k]])
+            yield Quantity(f"{body.name}.payload", 0.0, put, "mass_kg", mass, (1e-3, 10.0), group="link")
+        if not body.mass > 0:
+            return
+        yield Quantity(f"{body.name}.mass", float(body.mass), partial(put_mass, body.name))
+        # Of a link on one hinge in the world, inertia is what armature is.
+        if model.body_weldid[model.body_parentid[model.body_weldid[k]]]:
+            yield Quantity(f"{body.name}.inertia", 1.0, partial(put_inertia, body.name))
+
+    def _load_place(self, k: int) -> tuple[str, tuple[float, ...]] | None:
+        """Body and place in it of a payload of link k with all that is fixed to it: the first site.
+
+        Without a site, of a last link the far end: where the line from its joint through its centre of mass
+        leaves its geoms' boxes and bodies. None: a link between others, or one that turns about its centre.
+        """
+        model, data = self.model.nominal, mujoco.MjData(self.model.nominal)
+        link = np.flatnonzero(model.body_weldid == k)
+        for site in range(model.nsite):
+            if model.site_bodyid[site] in link:
+                return model.body(model.site_bodyid[site]).name, tuple(model.site_pos[site])
+        if any(model.body_weldid[model.body_parentid[c]] == k for c in set(model.body_weldid) - {0, k}):
+            return None
+        mujoco.mj_kinematics(model, data)
+        joint = data.xanchor[model.body_jntadr[k]]
+        lever = np.average(data.xipos[link], axis=0, weights=model.body_mass[link]) - joint
+        length = float(np.linalg.norm(lever))
+        if length < _NO_LEVER_M:
+            return None
+        along = lever / length
+        far = float(np.max((np.vstack([data.xpos[link], data.xipos[link]]) - joint) @ along))
+        for g in np.flatnonzero(np.isin(model.geom_bodyid, link)):
+            turn, box = data.geom_xmat[g].reshape(3, 3), model.geom_aabb[g]
+            centre = data.geom_xpos[g] + turn @ box[:3] - joint
+            far = max(far, float(along @ centre + np.abs(along @ turn) @ box[3:]))
+        at = joint + far * along - data.xpos[k]
+        return model.body(k).name, tuple(data.xmat[k].reshape(3, 3).T @ at)
+
+    def _of_gravity(self) -> Iterator[Quantity]:
+        """Its direction: the largest component follows from the others and the size, unless it is released by
+        a tolerance of its own."""
+        gravity = np.array(self.model.spec.option.gravity)
+        main = int(np.argmax(np.abs(gravity)))
+        for k, axis in enumerate("xyz"):
+            name, turned = f"gravity.{axis}", k != main and gravity[main] != 0
+            if k != main or not gravity[main] or self.model.number(f"tolerance.{name}", 0.0) > 0:
+                yield Quantity(
+                    name,
+                    float(gravity[k]),
+                    partial(put_gravity, k, main if turned else k),
+                    "acceleration_m_s2",
+                    _STANDARD_GRAVITY,
+                    signed=True,
+                    group="link",
+                )
+
+    def _of_sensor(self, name: str, swing: float) -> Iterator[Quantity]:
+        sensor = self.model.spec.sensor(name)
+        gain, offset = self.model.number(f"{name}.gain", 1.0), self.model.number(f"{name}.offset", 0.0)
+        yield Quantity(f"{name}.sensor_gain", gain, partial(put_number, f"{name}.gain"))
+        put = partial(put_number, f"{name}.offset")
+        yield Quantity(f"{name}.sensor_offset", offset, put, "offset", swing, signed=True, group="sensor")
+        put = partial(put_delay, "sensor", name, self.model.spec.option.timestep)
+        late = ((0.02, 100.0), (0.2, 10.0))
+        yield Quantity(
+            f"{name}.sensor_delay",
+            float(sensor.delay),
+            put,
+            "delay_s",
+            self.model.dt_s,
+            *late,
+            group="sensor",
+        )
+
+    def sizes(self) -> dict[str, tuple[float, float, float]]:
+        """Largest force of its actuators, travel and speed of every joint; of one not measured, of all."""
+        columns = [k for k, _, _ in self.model.tracked]
+        joints = [self.model.nominal.joint(joint) for _, joint, _ in self.model.tracked]
+        dofs = [int(joint.dofadr[0]) for joint in joints]
+        biggest = np.zeros((len(columns), 3))
+        for e in self.experiments:
+            q = e.output[:, columns]
+            v = savgol_filter(q, _SMOOTHED, 2, deriv=1, delta=self.model.dt_s, axis=0)
+            forces = self._forces(e.input[:, : len(self.model.inputs)], q, v)[:, dofs]
+            here = [np.max(np.abs(forces), axis=0), np.ptp(q, axis=0), np.max(np.abs(v), axis=0)]
+            biggest = np.maximum(biggest, np.transpose(here))
+        seen = {joint.name: tuple(map(float, row)) for joint, row in zip(joints, biggest, strict=True)}
+        usual = tuple(max((one[k] for one in seen.values()), default=0.0) or 1.0 for k in range(3))
+        return {
+            joint.name: tuple(s or u for s, u in zip(seen.get(joint.name, (0.0,) * 3), usual, strict=True))  # type: ignore[misc]
+            for joint in self.model.spec.joints
+        }
+
+    def _forces(self, commands: Real, q: Real, v: Real) -> Real:
+        """(T, DOF) what the actuators do to every joint at measured positions and speeds, without delay."""
+        spec = self.model.spec.copy()
+        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+        for one in spec.actuators:
+            one.delay, one.nsample = 0.0, 0
+        model = spec.compile()
+        data, joints = mujoco.MjData(model), [model.joint(joint) for _, joint, _ in self.model.tracked]
+        at, dofs = [j.qposadr[0] for j in joints], [j.dofadr[0] for j in joints]
+        forces = np.zeros((len(q), model.nv))
+        for k, command in enumerate(commands):
+            data.qpos[at], data.qvel[dofs], data.ctrl[:] = q[k], v[k], command
+            start_filters(model, data, command)
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            mujoco.mj_fwdActuation(model, data)
+            forces[k] = data.qfrc_actuator
+        return forces
