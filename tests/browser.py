@@ -87,9 +87,13 @@ class Browser:
 
     def open(self, page: Path, width: int = 1280, height: int = 800, *, dark: bool = False) -> None:
         """Load a file at a size of window [px]; returns once it is laid out."""
+        self.go(page.resolve().as_uri(), width, height, dark=dark)
+
+    def go(self, url: str, width: int = 1280, height: int = 800, *, dark: bool = False) -> None:
+        """The same by address."""
         self.resize(width, height, dark=dark)
         self.events.clear()
-        self.call("Page.navigate", url=page.resolve().as_uri())
+        self.call("Page.navigate", url=url)
         while not any(event["method"] == "Page.loadEventFired" for event in self.events):
             self._next()
 

@@ -14,7 +14,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
@@ -603,6 +603,42 @@ def design(
         summary = design_controller(source, file, out=out, seed=seed, dialect=dialect, progress=progress)
     _show(summary, as_json)
     _leave(summary)
+
+
+@app.command(short_help="A page with sliders: designs as you move them.")
+def tune(
+    source: Annotated[
+        list[Path] | None,
+        typer.Argument(help="As of `flexlink design`: a finished run directory, or another description."),
+    ] = None,
+    specification: Annotated[
+        Path | None,
+        typer.Option(
+            "--spec", "--specification", help="Design file to begin with; for a run directory its own."
+        ),
+    ] = None,
+    demo: Annotated[bool, typer.Option("--demo", help="Tune the built-in arm, identified first.")] = False,
+    out: Annotated[Path, typer.Option(help="Saved designs go below this directory.")] = Path("runs/tuned"),
+    seed: Annotated[int, typer.Option(min=0, help="Root of the random starts.")] = 2006,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0: any that is free.")] = 0,
+    browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
+    time_limit: TimeLimit = None,
+    quiet: Quiet = False,
+) -> None:
+    """Tune a specification by hand on a page of this machine; Ctrl-C ends it."""
+    if demo == bool(source):
+        raise InputError("flexlink tune needs either a source (run directory or plant file) or --demo")
+    need(*(source or ()), specification)
+    with ExitStack() as held:
+        with _watched(quiet) as progress:
+            from workflow.config.design_file import read_design_file
+
+            file = None if specification is None else read_design_file(specification)
+            from workflow.commands.tune import serve, tuning
+
+            made = tuning(source or [], file, out=out, seed=seed, port=port, progress=progress)
+            server = held.enter_context(made)
+        serve(server, typer.echo, browser=browser)
 
 
 @app.command(short_help="Write report.html of a run again.")

@@ -151,7 +151,7 @@ class SampledLoop:
 
     def __init__(self, controller: Controller, plant: UncertainPlant, specification: Specification) -> None:
         self.plant, self.controller, self.specification = plant, controller, specification
-        self.draw = _drawn(plant.channel)
+        self.draw = drawn(plant.channel)
         poles = closed_loop_poles(controller, plant)
         modes = (*plant.modes, *modes_of(poles, plant.dt_s), *modes_of(controller.poles, plant.dt_s))
         light = [
@@ -210,7 +210,7 @@ class SampledLoop:
 
     def gamma(self, rng: np.random.Generator, draws: int) -> SampledGamma:
         """Draw posterior samples and evaluate them (a Monte Carlo check)."""
-        other = None if self.plant.performance is None else _drawn(self.plant.performance)
+        other = None if self.plant.performance is None else drawn(self.plant.performance)
         asked = any(each.channel is not None and np.any(each.own > 0) for each in self.data.weightings)
         gamma, stable, distance = np.zeros(draws), np.zeros(draws, dtype=bool), np.zeros(draws)
         for here, count in _chunks(draws):
@@ -262,7 +262,7 @@ def _chunks(draws: int) -> Iterator[tuple[slice, int]]:
         yield slice(start, start + count), count
 
 
-def _drawn(channel: Channel) -> Draw:
+def drawn(channel: Channel) -> Draw:
     """How posterior samples of a channel are drawn; ValueError where they cannot be."""
     uncertainty: Any = channel.uncertainty
     if uncertainty is None:

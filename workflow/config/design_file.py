@@ -24,7 +24,9 @@ class PlantSection(Section):
 
     integrators: int = Field(0, ge=0, le=2, description="known poles of the plant at z = 1")
     dt_s: float | None = Field(None, gt=0, description="sampling period of a measured response [s]")
-    level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse of a measured response")
+    level: float = Field(
+        0.95, gt=0.5, lt=1, description="confidence of each ellipse of a measured response or of a posterior"
+    )
     ellipses: Literal["measured", "fitted"] = Field(
         "measured",
         description="uncertainty of a measured response: its covariances at its frequencies, or the "

@@ -58,8 +58,11 @@ def find_design(
     options: CertificateOptions,
     rng: np.random.Generator,
     progress: Callable[[float, str], None] | None = None,
+    *,
+    advise: bool = True,
 ) -> DesignResult:
-    """One controller for all plants; `reason` says in one line how it stands against the specification.
+    """One controller for all plants; `reason` says in one line how it stands against the specification, with
+    `advise` also what would be met instead.
 
     With `calibrate`, and plants to draw from, one whose sampled responses are stable as often as the
     certificate then asks. A specification that no controller can meet is a result, not an error: the report
@@ -87,7 +90,7 @@ def find_design(
     except SpecificationError as impossible:
         return DesignResult(None, met=False, reason=str(impossible), specification=specification)
     reason = said("outcome", result)
-    if 1.0 < result.gamma < math.inf:
+    if advise and 1.0 < result.gamma < math.inf:
         reason += said("would_meet", would_meet(plants, specification, result.gamma, synthesis, rng))
     return DesignResult(result, result.gamma <= 1.0, reason, jointly, specification)
 

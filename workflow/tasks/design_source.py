@@ -17,6 +17,7 @@ from typing import Any
 import control
 import numpy as np
 
+from control_design.analysis.joint_coverage import ResponseDraws, at_level
 from control_design.plants.plant_set import UncertainPlant, count_integrators, frequency_response
 from control_design.plants.stated_uncertainty import StatedDiscs
 from ident.basis.model_files import FORMAT
@@ -25,7 +26,7 @@ from ident.data.frf_records import FrfRepeats
 from ident.data.record_files import READERS, read_table
 from ident.data.response_columns import has_response
 from ident.frequency_fit import identify_frf
-from ident.uncertainty import FrequencyUncertainty
+from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from workflow.config.design_file import DesignFile
 from workflow.config.run_config import RunConfig
 from workflow.engine import codec
@@ -56,6 +57,12 @@ class DesignSource:
 def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource]:
     """All plants, by different names and with one sampling time. Raises InputError naming the file."""
     sources = [load_source(path, design) for path in paths]
+    if "level" in design.plant.model_fields_set:
+        level = design.plant.level
+        sources = [
+            replace(source, plant=at_level(source.plant, level)) if level_can_change(source.plant) else source
+            for source in sources
+        ]
     stated = [source for source in sources if isinstance(source.plant.uncertainty, StatedDiscs)]
     if design.uncertainty is not None and not stated:
         raise InputError(
@@ -78,6 +85,11 @@ def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource
         replace(source, plant=replace(source.plant, name=name))
         for source, name in zip(sources, names, strict=True)
     ]
+
+
+def level_can_change(plant: UncertainPlant) -> bool:
+    """Whether its ellipses are known at every level: those of a posterior."""
+    return isinstance(plant.uncertainty, ResponsePosterior | ResponseDraws)
 
 
 def load_source(path: Path, design: DesignFile) -> DesignSource:

@@ -1,0 +1,416 @@
+"""`flexlink tune`: designs of the page are those of `flexlink design`; nobody but the page is served."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+
+from control_design.analysis.closed_loop import LinearMachine, simulate
+from control_design.plants.plant_set import UncertainPlant
+from tests.browser import PROGRAM, Browser
+from tests.workflow import report_examples as example
+from tests.workflow.command import start_flexlink
+from tests.workflow.test_design_sources import DT_S, QUICK, WISH, arm, document, write_json
+from workflow.commands import tuning
+from workflow.commands.tune import TuneServer
+from workflow.commands.tuning import SupersededError, TuningSession, toml_of
+from workflow.config.design_file import read_design_file
+from workflow.engine import codec
+from workflow.tasks.results import IdentifiedPlant
+
+UNCERTAIN = "\n[uncertainty]\nmultiplicative = 0.05\n"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("tune")
+    write_json(path / "arm.json", document(arm()))
+    write_json(path / "stiff.json", document(arm(mode_rad_s=18.0)))
+    (path / "spec.toml").write_text(WISH + QUICK + UNCERTAIN)
+    return path
+
+
+@pytest.fixture(scope="module")
+def session(folder) -> TuningSession:
+    """With a first design."""
+    file = read_design_file(folder / "spec.toml")
+    found = TuningSession([folder / "arm.json"], file, folder / "saved", 2006)
+    assert found.design({})["certified"]
+    return found
+
+
+@pytest.fixture
+def posterior_session(tmp_path) -> TuningSession:
+    model = example.model()
+    found = IdentifiedPlant(model, example.posterior(model), 0.9)
+    np.savez(tmp_path / "plant.npz", **codec.to_arrays(found))
+    spec = "bandwidth_rad_s = 1.0\nmodulus_margin = 0.4\ncontroller_order = 2\n"
+    (tmp_path / "spec.toml").write_text(spec + QUICK)
+    file = read_design_file(tmp_path / "spec.toml")
+    return TuningSession([tmp_path / "plant.npz"], file, tmp_path / "saved", 1)
+
+
+@pytest.fixture
+def server(session) -> Iterator[TuneServer]:
+    made = TuneServer(session)
+    thread = threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.02})
+    thread.start()
+    yield made
+    made.shutdown()
+    made.server_close()
+    thread.join()
+
+
+def ask(server: TuneServer, path: str, content: Any = None, **headers: str) -> tuple[int, Any, Any]:
+    """Status, content and headers; a POST where there is content."""
+    link = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
+    body = content if content is None or isinstance(content, bytes) else json.dumps(content).encode()
+    link.request("GET" if content is None else "POST", path, body, headers)
+    answer = link.getresponse()
+    text = answer.read().decode()
+    link.close()
+    kind = answer.headers["Content-Type"]
+    return answer.status, json.loads(text) if kind.startswith("application/json") else text, answer.headers
+
+
+# -- designs -------------------------------------------------------------------------------------------------
+
+
+def test_what_is_saved_is_what_flexlink_design_writes(session, folder, flexlink):
+    values = {"bandwidth_rad_s": 0.6, "effort_limit": 15.0}
+    shown = session.design(values)
+    saved = session.save(values, "first")
+    directory = Path(saved["directory"])
+    assert {path.name for path in directory.iterdir()} >= {"design.toml", "controller.json", "controller.c"}
+    again = folder / "again"
+    again.mkdir()
+    call = ["design", folder / "arm.json", "--spec", directory / "design.toml", "--out", again, "--json"]
+    gamma = flexlink(*call, "--quiet").document()["numbers"]["design"]["synthesis"]["gamma"]
+    for name in ("controller.json", "controller.c", "controller.h"):
+        assert (again / name).read_bytes() == (directory / name).read_bytes()
+    assert shown["gamma"] == pytest.approx(gamma, rel=1e-3)  # on the certificate's grid and on the design's
+    law = json.loads((directory / "controller.json").read_text())
+    assert np.array_equal(law["A"], session._last.A)
+    assert np.array_equal(law["C"], session._last.C)
+
+
+def test_settings_change_the_design(session):
+    tight, wide = (session.design({"effort_limit": limit}) for limit in (2.0, 40.0))
+    session.design({})
+    assert tight["gamma"] > 1.05 * wide["gamma"]
+    assert tight["items"] != wide["items"]
+
+
+def test_a_newer_design_ends_the_one_that_runs(session, monkeypatch):
+    begun = threading.Event()
+    real = tuning.find_design
+
+    def slow(*given, **more):
+        still = given[5]
+        begun.set()
+        while True:  # ends by what `still` raises
+            still(0.0, "")
+            time.sleep(0.005)
+
+    monkeypatch.setattr(tuning, "find_design", slow)
+    raised: list[BaseException] = []
+
+    def first() -> None:
+        try:
+            session.design({"effort_limit": 30.0})
+        except SupersededError as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=first)
+    thread.start()
+    assert begun.wait(10)
+    monkeypatch.setattr(tuning, "find_design", real)
+    assert session.design({})["certified"]
+    thread.join(10)
+    assert len(raised) == 1
+
+
+def test_the_scaled_design_is_the_last_one_times_a_gain(session):
+    session.design({})
+    found = session.scaled({"effort_limit": 5.0})
+    assert found["certified"] is None
+    curves = found["plants"][0]["gains"]
+    omega = np.array(curves[0]["x"])
+    loop = found["gain"] * session._last.response(omega) * arm()(np.exp(1j * omega * DT_S))
+    assert np.allclose(curves[0]["nominal"], np.abs(1 / (1 + loop)), rtol=1e-3)
+    assert np.allclose(curves[2]["nominal"], np.abs(loop / (1 + loop)), rtol=1e-3)
+    limit = np.array(curves[1]["limit"], dtype=float)
+    assert np.allclose(limit[np.isfinite(limit)], 5.0, rtol=1e-3)
+    # A smaller gain suits a smaller effort.
+    assert found["gain"] < session.scaled({"effort_limit": 50.0})["gain"]
+
+
+def test_the_step_is_that_of_the_loop(session):
+    session.design({})
+    step = session.scaled({})["plants"][0]["step"]
+    gain = session.scaled({})["gain"]
+    law = replace(
+        session._last,
+        C=gain * session._last.C,
+        D=gain * session._last.D,
+        anti_windup_gain=None,
+        input_limit=None,
+    )
+    time_s = np.array(step["x"])
+    whole = simulate(law, LinearMachine(arm()), np.ones(int(time_s[-1] / DT_S) + 2)).measured
+    # Of an impulse response that has fallen to a thousandth, what is left wraps around.
+    assert np.allclose(step["nominal"], whole[np.rint(time_s / DT_S).astype(int)], atol=5e-3)
+    assert step["samples"] == []
+
+
+def test_confidence_is_kept_with_the_design(posterior_session):
+    session = posterior_session
+    names = {one["name"] for one in session.settings()}
+    assert "confidence" in names
+    assert session.settings()[-1]["value"] == 0.9
+    narrow, wide = (session.design({"confidence": level}) for level in (0.6, 0.999))
+    assert wide["gamma"] > narrow["gamma"]
+    assert len(narrow["plants"][0]["step"]["samples"]) == 15
+    saved = session.save({"confidence": 0.999}, "sure")
+    file = read_design_file(Path(saved["directory"]) / "design.toml")
+    assert file.plant.level == 0.999
+    law = json.loads((Path(saved["directory"]) / Path(saved["files"][1]).name).read_text())
+    assert np.array_equal(law["A"], session._last.A)
+
+
+def test_stated_discs_have_no_confidence(session):
+    assert "confidence" not in {one["name"] for one in session.settings()}
+
+
+def test_several_plants_share_a_design(folder):
+    paths = [folder / "arm.json", folder / "stiff.json"]
+    session = TuningSession(paths, read_design_file(folder / "spec.toml"), folder / "two", 3)
+    found = session.design({"bandwidth_rad_s": 0.5})
+    assert [plant["name"] for plant in found["plants"]] == ["arm", "stiff"]
+    assert found["plants"][0]["nyquist"] != found["plants"][1]["nyquist"]
+
+
+def test_a_specification_that_contradicts_itself_is_a_result(session):
+    found = session.design({"bandwidth_rad_s": 60.0, "effort_limit": None})
+    assert found["certified"] is False
+    assert found["reason"]
+    assert found["plants"] == []
+
+
+def test_a_design_file_survives_its_writing(session, tmp_path):
+    asked = session.completed({"effort_limit": 11.5, "effort_rolloff_rad_s": None, "integrator": True})
+    (tmp_path / "design.toml").write_text(toml_of(asked))
+    read = read_design_file(tmp_path / "design.toml")
+    assert read.model_dump() == asked.model_dump()
+    assert read.specification.effort_limit == 11.5
+    assert read.specification.integrator
+
+
+@pytest.mark.parametrize("name", ["", "../up", "a/b", ".hidden", "x" * 90, "a\nb"])
+def test_a_name_leads_nowhere_else(session, name):
+    with pytest.raises(ValueError, match="expected letters"):
+        session.save({}, name)
+
+
+# -- server --------------------------------------------------------------------------------------------------
+
+
+def test_it_listens_here_only(server):
+    assert server.server_address[0] == "127.0.0.1"
+    assert server.url.startswith(f"http://127.0.0.1:{server.server_port}/?token=")
+    assert len(server.token) >= 32
+
+
+def test_others_are_refused(server):
+    content = {"settings": {}}
+    key = {"X-Flexlink-Token": server.token}
+    path = f"/?token={server.token}"
+    for asked in (
+        ask(server, "/"),
+        ask(server, "/?token=guess"),
+        ask(server, path, Host=f"evil.example:{server.server_port}"),
+        ask(server, path, Origin="http://evil.example"),
+        ask(server, "/scaled", content),
+        ask(server, f"/scaled?token={server.token}", content),
+        ask(server, "/scaled", content, **{"X-Flexlink-Token": "é"}),
+        ask(server, "/scaled", content, Origin="http://evil.example", **key),
+        ask(server, "/scaled", content, Origin="null", **key),
+        ask(server, "/scaled", content, Host="evil.example", **key),
+    ):
+        assert asked[0] == 403
+        assert "token" in asked[1]["error"]
+    status, page, headers = ask(server, path)
+    assert status == 200
+    assert "X-Flexlink-Token" in page
+    assert server.token not in page
+    assert "default-src 'none'" in headers["Content-Security-Policy"]
+    assert headers["Referrer-Policy"] == "no-referrer"
+    assert "Access-Control-Allow-Origin" not in headers
+
+
+@pytest.mark.parametrize(
+    ("path", "content", "status", "words"),
+    [
+        ("/scaled", b"{", 400, "Expecting"),
+        ("/scaled", b"\xff", 400, "codec"),
+        ("/scaled", [1], 400, "object"),
+        ("/scaled", {"settings": {"bandwith_rad_s": 1}}, 400, "bandwith_rad_s"),
+        ("/design", {"settings": {"bandwidth_rad_s": -1}}, 400, "greater than 0"),
+        ("/design", {"settings": {"controller_order": "many"}}, 400, "controller_order"),
+        ("/save", {"settings": {}, "name": "../up"}, 400, "expected letters"),
+        ("/save", {"settings": {}, "name": 7}, 400, "expected letters"),
+        ("/nothing", {"settings": {}}, 404, "no such"),
+        ("/scaled", b" " * (1 << 17), 413, "bytes"),
+    ],
+)
+def test_what_is_wrong_is_one_line(server, path, content, status, words):
+    found, said, _ = ask(server, path, content, **{"X-Flexlink-Token": server.token})
+    assert found == status
+    assert words in said["error"]
+    assert "\n" not in said["error"]
+
+
+def test_actions_of_the_page(server):
+    key = {"X-Flexlink-Token": server.token, "Origin": f"http://127.0.0.1:{server.server_port}"}
+    content = {"settings": {"effort_limit": 12.0}}
+    assert ask(server, "/design", content, **key)[1]["certified"]
+    assert ask(server, "/scaled", content, **key)[1]["plants"]
+    bound = ask(server, "/bound", content, **key)[1]
+    assert 0 < bound["reached"] < 1.5
+
+
+def test_it_needs_one_source(refused, folder):
+    assert "--demo" in refused("tune")
+    assert "--demo" in refused("tune", folder / "arm.json", "--demo")
+    assert "no such" in refused("tune", folder / "nothing")
+    assert "--spec" in refused("tune", folder / "arm.json", "--quiet", "--no-browser")
+
+
+def test_ctrl_c_ends_it(folder):
+    spec = ["--spec", folder / "spec.toml", "--no-browser", "--quiet"]
+    process = start_flexlink("tune", folder / "arm.json", *spec)
+    assert process.stdout is not None
+    address = process.stdout.readline().decode()
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]+\n", address)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert out == b"stopped\n"
+    assert err == b""
+
+
+@pytest.mark.slow
+def test_the_demo_is_the_built_in_arm(tmp_path):
+    process = start_flexlink("tune", "--demo", "--no-browser", "--quiet", "--out", tmp_path / "saved")
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith(b"http://127.0.0.1:")
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert process.returncode == 0
+
+
+# -- page ----------------------------------------------------------------------------------------------------
+
+
+def designed(browser: Browser, number: int) -> None:
+    for _ in range(1200):
+        if browser.ask("document.body?.dataset.designed") == str(number):
+            return
+        time.sleep(0.05)
+    raise AssertionError(browser.ask("document.getElementById('state').textContent"))
+
+
+def text(browser: Browser, name: str) -> str:
+    return str(browser.ask(f"document.getElementById('{name}').textContent"))
+
+
+@pytest.mark.skipif(PROGRAM is None, reason="chromium is not installed")
+def test_the_page_by_keyboard(server, browser):
+    browser.go(server.url)
+    designed(browser, 1)
+    assert text(browser, "headline") == "Certified"
+    assert browser.ask("document.querySelectorAll('.panels svg').length") == 6
+    first = browser.ask("document.querySelector('.panels .nominal').getAttribute('d')")
+    stated = browser.ask("document.getElementById('c-effort_limit').getAttribute('aria-valuetext')")
+    browser.ask("document.getElementById('c-effort_limit').focus()")
+    browser.press("p")
+    assert text(browser, "pin") == "Unpin"
+    for _ in range(40):
+        browser.press("ArrowLeft")
+    designed(browser, 2)
+    moved = browser.ask("document.getElementById('c-effort_limit').getAttribute('aria-valuetext')")
+    assert float(moved) < 0.6 * float(stated)
+    assert browser.ask("document.querySelector('.panels .nominal').getAttribute('d')") != first
+    assert browser.ask("document.querySelectorAll('.panels .pinned').length") >= 6
+    assert browser.ask("Number(document.body.dataset.scaled)") > 0
+    browser.press("u")
+    assert browser.ask("document.getElementById('c-effort_limit').getAttribute('aria-valuetext')") == stated
+    assert browser.ask("document.querySelector('.panels .nominal').getAttribute('d')") == first
+    assert browser.ask("document.getElementById('undo').disabled")
+    for width, dark in ((400, False), (1280, True)):
+        browser.resize(width, dark=dark)
+        assert browser.ask("document.documentElement.scrollWidth") <= width
+    own = f"request: http://127.0.0.1:{server.server_port}/"
+    assert [said for said in browser.complaints() if not said.startswith(own)] == []
+    named = "e.labels?.length || e.ariaLabel || e.textContent"
+    inputs = "[...document.querySelectorAll('input, select, button')]"
+    assert browser.ask(f"{inputs}.every(e => {named})")
+
+
+@pytest.mark.skipif(PROGRAM is None, reason="chromium is not installed")
+def test_the_page_saves_and_says_what_is_wrong(server, browser, session):
+    browser.go(server.url)
+    designed(browser, 1)
+    browser.ask(
+        "document.getElementById('name').value = 'by-hand-3'; document.getElementById('save').click()"
+    )
+    for _ in range(600):
+        if text(browser, "state").startswith("saved"):
+            break
+        time.sleep(0.05)
+    assert (session.out / "by-hand-3" / "controller.json").is_file()
+    assert browser.ask("document.getElementById('name').value") == "by-hand-4"
+    box = "document.querySelector('#c-modulus_margin + input')"
+    browser.ask(f"{box}.value = 3; {box}.dispatchEvent(new Event('change'))")
+    for _ in range(600):
+        if "less than 1" in text(browser, "state"):
+            return
+        time.sleep(0.05)
+    raise AssertionError(text(browser, "state"))
+
+
+def test_controls_are_made_of_the_specification(session):
+    known = {one["name"]: one for one in session.settings()}
+    assert known["modulus_margin"]["lt"] == 1
+    assert known["controller_order"]["kind"] == "count"
+    assert known["controller_order"]["le"] == 16
+    assert known["effort_limit"]["optional"]
+    assert known["structure"]["choices"] == ["biquads", "pi_d_notch"]
+    assert known["integrator"]["kind"] == "switch"
+    assert "mode_band_rad_s" not in known
+
+
+def test_a_plant_of_its_own_grid_has_curves_on_it(session):
+    omega = np.geomspace(0.2, 50.0, 40)
+    nominal = arm()
+
+    class Known:
+        omega_rad_s, level = omega, 0.95
+        centre = nominal(np.exp(1j * omega * DT_S))
+        covariance = 1e-6 * np.broadcast_to(np.eye(2), (40, 2, 2))
+
+    plant = UncertainPlant("known", control.ss(nominal), Known())
+    gains = tuning._gains(session._last, plant, session.specification)
+    assert len(gains[0]["x"]) == 40

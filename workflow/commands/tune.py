@@ -1,0 +1,192 @@
+"""`flexlink tune`: a page on this machine, with sliders for the specification.
+
+The server listens on the loopback address only. A page of another site may know the port: every request
+needs the token of the page's address, as a header that browsers send to their own origin only, and names
+this server as its host (a name that somebody points to 127.0.0.1 is another).
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+import tempfile
+import webbrowser
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from workflow.commands.tuning import Handler, SupersededError, TuningSession
+from workflow.config.design_file import DesignFile
+from workflow.config.run_config import built_in_config
+from workflow.engine.errors import InputError, one_line
+from workflow.engine.progress import Progress
+from workflow.tasks.pipeline import identify_only
+from workflow.text.templates import environment
+
+HOST = "127.0.0.1"
+_MOST_BYTES = 1 << 16  # of a request
+
+
+class TuneServer(ThreadingHTTPServer):
+    """Serves one session; `url` is the page's address with its token."""
+
+    daemon_threads = True
+
+    def __init__(self, session: TuningSession, port: int = 0) -> None:
+        try:
+            super().__init__((HOST, port), _Request)
+        except (OSError, OverflowError) as error:
+            raise InputError(f"--port {port}: cannot be listened on ({error}); choose another") from error
+        self.session, self.token = session, secrets.token_urlsafe(24)
+        self.hosts = tuple(f"{name}:{self.server_port}" for name in (HOST, "localhost"))
+        self.actions: dict[str, Handler] = {
+            "/scaled": lambda asked: session.scaled(asked["settings"]),
+            "/design": lambda asked: session.design(asked["settings"]),
+            "/bound": lambda asked: session.bound(asked["settings"]),
+            "/save": lambda asked: session.save(asked["settings"], asked["name"]),
+        }
+
+    @property
+    def url(self) -> str:
+        return f"http://{HOST}:{self.server_port}/?token={self.token}"
+
+    def page(self, nonce: str) -> str:
+        session = self.session
+        settings = json.dumps(session.settings()).replace("<", "\\u003c")
+        return (
+            environment()
+            .get_template("tune.html.j2")
+            .render(
+                title=f"Tune {', '.join(str(path) for path in session.paths)}",
+                settings=settings,
+                nonce=nonce,
+                fixed=[
+                    name
+                    for name, value in session.specification.model_dump(exclude_none=True).items()
+                    if isinstance(value, dict | tuple)
+                ],
+                out=session.out,
+            )
+        )
+
+
+class _Request(BaseHTTPRequestHandler):
+    server: TuneServer
+    protocol_version = "HTTP/1.1"
+    timeout = 60
+    server_version, sys_version = "flexlink", ""
+
+    def do_GET(self) -> None:
+        asked = urlsplit(self.path)
+        token = (parse_qs(asked.query).get("token") or [""])[0]
+        if asked.path != "/":
+            self._refuse(HTTPStatus.NOT_FOUND, "no such page")
+        elif self._allowed(token):
+            nonce = secrets.token_urlsafe(16)
+            self._answer(HTTPStatus.OK, self.server.page(nonce), "text/html", nonce)
+
+    def do_POST(self) -> None:
+        if not self._allowed(self.headers.get("X-Flexlink-Token", "")):
+            return
+        action = self.server.actions.get(self.path)
+        length = self.headers.get("Content-Length", "")
+        if action is None:
+            self._refuse(HTTPStatus.NOT_FOUND, "no such action")
+        elif not length.isdigit() or int(length) > _MOST_BYTES:
+            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"expected at most {_MOST_BYTES} bytes")
+        else:
+            self._act(action, self.rfile.read(int(length)))
+
+    def _act(self, action: Handler, content: bytes) -> None:
+        try:
+            asked = json.loads(content)
+            if not isinstance(asked, dict) or not isinstance(asked.get("settings"), dict):
+                raise InputError("expected a JSON object with settings")
+            answer = action({"name": "", **asked})
+        except SupersededError:
+            self._refuse(HTTPStatus.CONFLICT, "superseded")
+        except (InputError, UnicodeError, json.JSONDecodeError) as error:
+            self._refuse(HTTPStatus.BAD_REQUEST, one_line(error))
+        except Exception as error:  # the page goes on, whatever a library raises
+            said = f"internal error: {type(error).__name__}: {one_line(error)}"
+            self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, said)
+        else:
+            self._answer(HTTPStatus.OK, json.dumps(answer, allow_nan=False), "application/json")
+
+    def _allowed(self, token: str) -> bool:
+        """Whether the request comes from our own page; refused where not."""
+        origin = self.headers.get("Origin")
+        ours = self.headers.get("Host", "") in self.server.hosts
+        ours &= origin is None or origin in {f"http://{host}" for host in self.server.hosts}
+        if ours and secrets.compare_digest(token.encode(), self.server.token.encode()):
+            return True
+        self._refuse(HTTPStatus.FORBIDDEN, "open the address that flexlink tune printed, token included")
+        return False
+
+    def _refuse(self, status: HTTPStatus, said: str) -> None:
+        self.close_connection = True  # its content may not have been read
+        self._answer(status, json.dumps({"error": said}), "application/json")
+
+    def _answer(self, status: HTTPStatus, text: str, kind: str, nonce: str = "") -> None:
+        content = text.encode()
+        policy = "default-src 'none'; style-src 'unsafe-inline'; connect-src 'self'; img-src data:; "
+        policy += f"base-uri 'none'; form-action 'none'; frame-ancestors 'none'; script-src 'nonce-{nonce}'"
+        self.send_response(status)
+        for name, value in {
+            "Content-Type": f"{kind}; charset=utf-8",
+            "Content-Length": str(len(content)),
+            "Content-Security-Policy": policy,
+            "Cache-Control": "no-store",
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+            **({"Connection": "close"} if self.close_connection else {}),
+        }.items():
+            self.send_header(name, value)
+        self.end_headers()
+        try:
+            self.wfile.write(content)
+        except (BrokenPipeError, ConnectionResetError):
+            self.close_connection = True  # whoever asked has left
+
+    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
+        """Nothing: the terminal has the address and errors only."""
+
+
+@contextmanager
+def tuning(
+    paths: Sequence[Path],
+    file: DesignFile | None,
+    *,
+    out: Path,
+    seed: int,
+    port: int = 0,
+    progress: Progress | None = None,
+) -> Iterator[TuneServer]:
+    """A server for these plants (none: the built-in arm, identified afresh), not serving yet."""
+    progress = progress or Progress()
+    with tempfile.TemporaryDirectory(prefix="flexlink-") as scratch:
+        if not paths:
+            paths = [Path(scratch) / "default_arm"]
+            config, text = built_in_config()
+            identify_only(config, paths[0], config_text=text, progress=progress)
+        server = TuneServer(TuningSession(paths, file or DesignFile(), out, seed), port)
+        try:
+            yield server
+        finally:
+            server.session.cancel()
+            server.server_close()
+
+
+def serve(server: TuneServer, tell: Callable[[str], None], *, browser: bool) -> None:
+    """Say the address and serve until Ctrl-C, which is no error."""
+    try:
+        tell(server.url)
+        if browser:
+            webbrowser.open(server.url)
+        server.serve_forever(poll_interval=0.2)
+    except KeyboardInterrupt:
+        tell("stopped")

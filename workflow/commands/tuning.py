@@ -1,0 +1,379 @@
+"""What `flexlink tune` computes: settings of the page into designs, their curves and files."""
+
+from __future__ import annotations
+
+import math
+import re
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import tomlkit
+from pydantic.fields import FieldInfo
+
+from control_design.analysis.certificate import Certificate, certify
+from control_design.analysis.joint_coverage import at_level, drawn
+from control_design.analysis.stability import closed_loop_poles
+from control_design.analysis.worst_case import PlantData, worst_of
+from control_design.controllers.controller import Controller
+from control_design.plants.ellipses import Complex, Real
+from control_design.plants.frequency_grid import checked_grid
+from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
+from control_design.specification import Specification
+from control_design.synthesis.synthesis_result import SynthesisResult
+from workflow.commands.design import design_controller
+from workflow.config.design_file import DesignFile, PlantSection, read_design_file
+from workflow.config.settings import check
+from workflow.engine import storage
+from workflow.engine.errors import InputError
+from workflow.engine.randomness import stage_rng
+from workflow.figures.sensitivity import sensitivity_curves
+from workflow.tasks.design import bracket_numbers, find_bracket, find_design
+from workflow.tasks.design_source import level_can_change, load_sources
+from workflow.text.templates import said
+
+CONFIDENCE = "confidence"  # a setting beside those of the specification: level of the ellipses
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,60}")
+_GAINS = np.geomspace(0.25, 4.0, 33)  # of the last controller, tried for settings that have no design yet
+_SAMPLES = 15  # posterior samples whose steps are shown
+_LONGEST = 1 << 14  # samples of a step response
+_SHOWN = 1e-4  # share of the Nyquist frequency where pictures over frequency begin, or lower
+_NEAR = 3.0  # distance from 0 up to which the Nyquist curve is shown
+_ELLIPSES, _CORNERS = 60, 24
+
+
+Handler = Callable[[Mapping[str, Any]], dict[str, Any]]
+
+
+class SupersededError(Exception):
+    """A newer design was asked for."""
+
+
+class TuningSession:
+    """Plants as read, and the last design. Settings are keys of the specification by name, and `confidence`.
+
+    A design is that of `flexlink design` with the same settings and seed. One runs at a time: a newer one
+    ends it. Everything returned is JSON-able.
+    """
+
+    def __init__(self, paths: Sequence[Path], file: DesignFile, out: Path, seed: int) -> None:
+        self.paths, self.out, self.seed = tuple(paths), out, seed
+        sources = load_sources(paths, file)
+        asked = file.completed(sources[0].config)
+        if len(paths) > 1:
+            asked = asked.model_copy(update={"specification": file.specification})
+        if asked.specification is None:
+            raise InputError(f"{', '.join(map(str, paths))}: no specification: give --spec FILE")
+        known = asked.specification.model_dump(include=set(Specification.model_fields))
+        self.specification = Specification.model_validate(known)
+        self.file = asked
+        self._plants = [source.plant for source in sources]
+        self.drawable = all(level_can_change(plant) for plant in self._plants)
+        self._last: Controller | None = None
+        self._newest, self._designing = 0, threading.Lock()
+
+    # -- settings --------------------------------------------------------------------------------------------
+
+    def settings(self) -> list[dict[str, Any]]:
+        """What the page has a control for: name, kind, description, value, range."""
+        fields = Specification.model_fields
+        found = [_control(name, field, getattr(self.specification, name)) for name, field in fields.items()]
+        if self.drawable:
+            level = {"ge": 0.5, "lt": 0.9999}
+            words = "confidence of each ellipse: share of the probability inside"
+            found.append(
+                {
+                    "name": CONFIDENCE,
+                    "kind": "number",
+                    "words": words,
+                    "value": self._plants[0].level,
+                    **level,
+                }
+            )
+        return [one for one in found if one is not None]
+
+    def _read(self, values: Mapping[str, Any]) -> tuple[Specification, list[UncertainPlant], float | None]:
+        stated = dict(values)
+        level = stated.pop(CONFIDENCE, None) if self.drawable else None
+        if level is not None:
+            level = check(PlantSection, {"level": level}, source=CONFIDENCE).level
+        document = self.specification.model_dump(mode="json") | stated
+        specification = check(Specification, document, source="settings")
+        plants = self._plants if level is None else [at_level(plant, level) for plant in self._plants]
+        return specification, plants, level
+
+    def completed(self, values: Mapping[str, Any]) -> DesignFile:
+        """The design file of these settings. Raises InputError: one line naming the key."""
+        specification, _, level = self._read(values)
+        plant = self.file.plant
+        if level is not None:
+            plant = PlantSection.model_validate(
+                plant.model_dump(exclude_unset=True) | {"level": level}, context={"base": Path()}
+            )
+        return self.file.model_copy(update={"specification": specification, "plant": plant})
+
+    # -- designs ---------------------------------------------------------------------------------------------
+
+    def scaled(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """The last controller, times the gain that suits these settings best; nothing is certified."""
+        specification, plants, _ = self._read(values)
+        if (last := self._last) is None:
+            raise InputError("no design yet: wait for the first")
+        data = [PlantData.build(p, specification, _grid(p, last, 120, 20)) for p in plants]
+        k = [last.response(one.ellipses.omega_rad_s, with_delay=False) for one in data]
+
+        def gamma(gain: float) -> float:
+            worst = [worst_of(d.weighted(gain * v)) for d, v in zip(data, k, strict=True)]
+            return max(float(np.max(one)) for one in worst)
+
+        ranked = sorted((gamma(gain), abs(math.log(gain)), gain) for gain in _GAINS.tolist())
+        for found, _, gain in ranked:
+            law = replace(last, C=gain * last.C, D=gain * last.D, anti_windup_gain=None)
+            if all(np.all(np.abs(closed_loop_poles(law, plant)) < 1) for plant in plants):
+                numbers = {"gain": gain, "gamma": found, "certified": None}
+                return {**_finite(numbers), "plants": self._curves(law, plants, specification)}
+        raise InputError("no gain keeps the last controller stable with these settings")
+
+    def design(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """A new design with its certificate. Raises SupersededError where a newer one is asked for."""
+        asked = self.completed(values)
+        specification, plants, _ = self._read(values)
+        self._newest += 1
+        number = self._newest
+
+        def still(*_: object) -> None:
+            if number != self._newest:
+                raise SupersededError
+
+        with self._designing:
+            still()
+            options = asked.synthesis.model_copy(update={"jobs": 1})
+            rng = stage_rng(self.seed, "design")
+            found = find_design(plants, specification, options, asked.certificate, rng, still, advise=False)
+            still()
+            law, used = found.controller, found.specification or specification
+            numbers: dict[str, Any] = {"certified": False, "gamma": None, "reason": found.reason}
+            if found.synthesis is not None:
+                numbers |= _of_synthesis(found.synthesis)
+            if law is None:
+                return {**_finite(numbers), "plants": []}
+            between = asked.plant.between_points
+            certificate = certify(law, plants, used, between_own_points=between)
+            still()
+            self._last = law
+        return {**_finite(numbers | _of(certificate)), "plants": self._curves(law, plants, used)}
+
+    def bound(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """What a controller of any order could reach with these settings."""
+        specification, plants, _ = self._read(values)
+        found = bracket_numbers(find_bracket(plants, specification, self.file.achievable_performance), None)
+        return _finite({name: found[name] for name in ("reached", "floor", "reason")})
+
+    def save(self, values: Mapping[str, Any], name: str) -> dict[str, Any]:
+        """Design file and controller files into `out`/name, the latter by `flexlink design`.
+
+        Raises InputError for a name that is none, or one that is taken.
+        """
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            raise InputError(f"name {str(name)[:40]!r}: expected letters, digits, '.', '_' and '-'")
+        directory = self.out / name
+        asked = self.completed(values)
+        if directory.exists():
+            raise InputError(f"{directory}: already there; choose another name")
+        path = directory / "design.toml"
+        directory.mkdir(parents=True)
+        storage.write_text(path, toml_of(asked))
+        with self._designing:
+            done = design_controller(self.paths, read_design_file(path), out=directory, seed=self.seed)
+        files = [str(path), *done.numbers["files"]]
+        return {"directory": str(directory), "files": files, "certified": done.certified}
+
+    def cancel(self) -> None:
+        """End a design that runs, at its next step."""
+        self._newest += 1
+
+    # -- curves ----------------------------------------------------------------------------------------------
+
+    def _curves(
+        self, law: Controller, plants: Sequence[UncertainPlant], specification: Specification
+    ) -> list[dict[str, Any]]:
+        return [
+            {
+                "name": plant.name,
+                "gains": _gains(law, plant, specification),
+                "nyquist": _nyquist(law, plant),
+                "step": self._step(law, plant),
+            }
+            for plant in plants
+        ]
+
+    def _step(self, law: Controller, plant: UncertainPlant) -> dict[str, Any]:
+        """Unit step of the reference: nominal, and models drawn from the posterior where there are any."""
+        radius = float(np.max(np.abs(closed_loop_poles(law, plant)), initial=0.0))
+        if not radius < 1.0:
+            return {}
+        needed = math.log(1e-3) / math.log(max(radius, 1e-3))
+        n = min(max(256, 1 << math.ceil(math.log2(needed + 1))), _LONGEST)
+        omega = np.linspace(0.0, plant.nyquist_rad_s, n // 2 + 1)
+        omega[0] = 1e-6 * plant.nyquist_rad_s
+        loop = law.response(omega) * np.vstack([plant.channel.nominal_response(omega), self._drawn(plant, n)])
+        steps = np.cumsum(np.fft.irfft(loop / (1.0 + loop), n, axis=1), axis=1)
+        away = np.flatnonzero(np.abs(steps[0] - steps[0, -1]) > 0.01 * max(abs(steps[0, -1]), 1e-300))
+        shown = min(n, max(40, int(1.5 * (away[-1] + 1)) if away.size else 40))
+        at = np.unique(np.linspace(0, shown - 1, 300).astype(int))
+        return {
+            "x": _short(at * plant.dt_s),
+            "nominal": _short(steps[0, at]),
+            "samples": [_short(one[at]) for one in steps[1:]],
+        }
+
+    def _drawn(self, plant: UncertainPlant, n: int) -> Complex:
+        """Responses (D, n/2 + 1) drawn from the posterior, the same at every call; none where none can be."""
+        number = next(k for k, known in enumerate(self._plants) if known.name == plant.name)
+        if not self.drawable:
+            return np.empty((0, n // 2 + 1), dtype=np.complex128)
+        return _samples(self._plants[number], n, self.seed)
+
+
+@lru_cache(maxsize=8)
+def _samples(plant: UncertainPlant, n: int, seed: int) -> Complex:
+    omega = np.linspace(0.0, plant.nyquist_rad_s, n // 2 + 1)
+    omega[0] = 1e-6 * plant.nyquist_rad_s
+    return np.asarray(drawn(plant.channel)(stage_rng(seed, "tune"), _SAMPLES)(omega))
+
+
+def _grid(plant: UncertainPlant, law: Controller, n_log: int, per_mode: int) -> Real:
+    """Frequencies that show a loop: denser around its modes; a plant's own where it is known there only."""
+    if plant.own_grid is not None:
+        return plant.own_grid[plant.own_grid > 0]
+    modes = (*plant.modes, *modes_of(closed_loop_poles(law, plant), plant.dt_s))
+    light = [Mode(m.omega_rad_s, max(abs(m.zeta), 1e-3)) for m in modes if m.zeta < 0.3]
+    return checked_grid(plant, [m for m in light if m.omega_rad_s < plant.nyquist_rad_s], n_log, per_mode)
+
+
+def _gains(law: Controller, plant: UncertainPlant, specification: Specification) -> list[dict[str, Any]]:
+    omega = _grid(plant, law, 150, 12)
+    lowest = min(_SHOWN * plant.nyquist_rad_s, (specification.bandwidth_rad_s or math.inf) / 30)
+    curves = sensitivity_curves(plant, law, specification, omega[omega >= lowest])
+    return [
+        {
+            "symbol": one.symbol,
+            "meaning": one.meaning,
+            "x": _short(one.omega_rad_s),
+            "nominal": _short(one.nominal),
+            "worst": _short(np.where(one.worst < 1e200, one.worst, np.nan)),
+            "limit": _short(one.limit),
+        }
+        for one in curves
+    ]
+
+
+def _nyquist(law: Controller, plant: UncertainPlant) -> dict[str, Any]:
+    """Loop K G of the centres and outlines of its ellipses, as far as they are near the origin."""
+    grid = _grid(plant, law, 400, 30)
+    ellipses, k = plant.at(grid), law.response(grid)
+    loop = k * ellipses.centre
+    near = np.flatnonzero(np.abs(loop) < _NEAR)
+    at = near[np.unique(np.linspace(0, near.size - 1, _ELLIPSES).astype(int))] if near.size else near
+    turn = np.exp(2j * np.pi * np.arange(_CORNERS) / _CORNERS)
+    part = ellipses.subset(at)
+    major, minor = part.semi_major[:, None] * turn.real, part.semi_minor[:, None] * turn.imag
+    outline = k[at, None] * (part.centre[:, None] + part.direction[:, None] * (major + 1j * minor))
+    line = np.where(np.abs(loop) < 2 * _NEAR, loop, np.nan)
+    return {
+        "re": _short(line.real),
+        "im": _short(line.imag),
+        "ellipses": [[_short(one.real), _short(one.imag)] for one in outline],
+    }
+
+
+def _of(certificate: Certificate) -> dict[str, Any]:
+    """Verdict, worst margins and requirements of a certificate."""
+    plants = certificate.plants
+    worst = [verdict.worst_margins for verdict in plants]
+    return {
+        "certified": certificate.certified,
+        "gamma": certificate.gamma,
+        "proved": certificate.gamma_bound,
+        "reason": said("certificate_reason", certificate),
+        "modulus": min(one.modulus for one in worst),
+        "gain_margin": min(one.gain_up for one in worst),
+        "phase_deg": math.degrees(min(one.phase_rad for one in worst)),
+        "delay_ms": 1e3 * min(one.delay_s for one in worst),
+        "bandwidth": min(verdict.bandwidth_rad_s for verdict in plants),
+        "items": [
+            {
+                "requirement": item.requirement + (f" ({item.plant})" if len(plants) > 1 else ""),
+                "required": ("≥ " if item.at_least else "≤ ") + f"{item.required:.4g} {item.unit}".strip(),
+                "achieved": f"{item.achieved:.4g} {item.unit}".strip(),
+                "met": item.met,
+            }
+            for item in certificate.items
+        ],
+    }
+
+
+def _of_synthesis(result: SynthesisResult) -> dict[str, Any]:
+    active = result.blocking[0] if result.blocking else None
+    words = "" if active is None else f"{active.weight} of {active.plant} at {active.omega_rad_s:.4g} rad/s"
+    return {"gamma": result.gamma, "active": words, "order": result.controller.order}
+
+
+def _control(name: str, field: FieldInfo, value: Any) -> dict[str, Any] | None:
+    """The page's control of a field; None for a pair or a weight, which stays as it is stated."""
+    words, optional = str(field.description), type(None) in _kinds(field.annotation)
+    kinds = [kind for kind in _kinds(field.annotation) if kind is not type(None)]
+    found: dict[str, Any] = {"name": name, "words": words, "value": value, "optional": optional}
+    if kinds == [bool]:
+        return {**found, "kind": "switch"}
+    if kinds and all(isinstance(kind, str) for kind in kinds):
+        return {**found, "kind": "choice", "choices": kinds}
+    if kinds not in ([int], [float]):
+        return None
+    limits = {
+        key: getattr(m, key)
+        for m in _constraints(field)
+        for key in ("ge", "gt", "le", "lt")
+        if hasattr(m, key)
+    }
+    return {**found, "kind": "count" if kinds == [int] else "number", **limits}
+
+
+def _kinds(annotation: Any) -> list[Any]:
+    """Types of a union, choices of a literal; what an annotation is about."""
+    if hasattr(annotation, "__metadata__"):
+        return _kinds(annotation.__origin__)
+    inner = get_args(annotation)
+    if not inner or getattr(annotation, "__origin__", None) is tuple:
+        return [annotation]
+    return [kind for one in inner for kind in ([one] if isinstance(one, str) else _kinds(one))]
+
+
+def _constraints(field: FieldInfo) -> list[Any]:
+    """Limits of a number, those of an inner type too."""
+    inner = [one for part in get_args(field.annotation) for one in getattr(part, "__metadata__", ())]
+    return [*field.metadata, *(m for one in inner for m in getattr(one, "metadata", [one]))]
+
+
+def toml_of(file: DesignFile) -> str:
+    """A design file as TOML; `read_design_file` reads the same settings back."""
+    document = tomlkit.document()
+    for name in DesignFile.model_fields:
+        section = getattr(file, name)
+        if section is not None:
+            # A section that is left out would be the run's own: it stands here even where all is default.
+            document[name] = section.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
+    return tomlkit.dumps(document)
+
+
+def _short(values: Real) -> list[float | None]:
+    """Five digits; None where a value is not finite."""
+    return [float(f"{v:.5g}") if math.isfinite(v) else None for v in np.asarray(values, dtype=float).tolist()]
+
+
+def _finite(numbers: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in numbers.items()}

@@ -1,0 +1,276 @@
+// Sliders to settings, settings to the server, its curves into panels. While a slider moves, the last design is scaled;
+// once it is let go, a new one is made, and the one before it is given up.
+(() => {
+const NS = "http://www.w3.org/2000/svg", TOKEN = new URLSearchParams(location.search).get("token");
+const $ = id => document.getElementById(id);
+const make = (tag, parent, words = "", about = {}) => {
+  const element = document.createElement(tag);
+  element.textContent = words;
+  for (const [name, value] of Object.entries(about)) element.setAttribute(name, value);
+  parent.append(element);
+  return element;
+};
+const draw = (tag, parent, about, words = "") => {
+  const element = document.createElementNS(NS, tag);
+  for (const [name, value] of Object.entries(about)) element.setAttribute(name, value);
+  element.textContent = words;
+  parent.append(element);
+  return element;
+};
+const digits = (v, n = 4) => v == null ? "–" : String(Number(v.toPrecision(n))).replace("-", "−");
+const post = async (path, more) => {
+  const answer = await fetch(path, {method: "POST", headers: {"X-Flexlink-Token": TOKEN}, body: JSON.stringify(more)});
+  const found = await answer.json();
+  if (!answer.ok) throw Object.assign(new Error(found.error), {status: answer.status});
+  return found;
+};
+
+// -- controls: {name: {get, set}} --
+const controls = {};
+const STEPS = 200;
+for (const one of SETTINGS) {
+  const stated = one.value != null && (one.kind !== "switch" || one.value) && one.kind !== "choice";
+  const row = make("div", $(stated || one.name === "controller_order" ? "stated" : "further"), "", {class: "control"});
+  make("label", row, one.name.replace(/_rad_s$/, " [rad/s]").replace(/_s$/, " [s]").replaceAll("_", " "), {for: "c-" + one.name, title: one.words});
+  const line = make("div", row), id = "c-" + one.name;
+  if (one.kind === "switch" || one.kind === "choice") {
+    const box = one.kind === "switch" ? make("input", line, "", {type: "checkbox", id}) : make("select", line, "", {id});
+    for (const choice of one.choices ?? []) make("option", box, choice);
+    controls[one.name] = one.kind === "switch" ? {get: () => box.checked, set: v => box.checked = v}
+      : {get: () => box.value, set: v => box.value = v};
+    controls[one.name].set(one.value);
+    box.addEventListener("change", () => design());
+    continue;
+  }
+  const whole = one.kind === "count", top = one.le ?? one.lt, bottom = one.ge ?? one.gt ?? 0;
+  const guess = one.value ?? (one.name.includes("rad_s") ? 10 : one.name.includes("_s") ? .01 : top === 1 ? .5 : 10);
+  const log = !whole && !(top <= 1 && bottom < 1 && guess > .02), room = top === undefined ? guess * 20 : top;
+  const [low, high] = whole ? [bottom, room] : log ? [guess / 20, Math.min(guess * 20, room)]
+    : [bottom + (one.ge === undefined ? .01 : 0), room - (one.le === undefined ? .005 * (room - bottom) : 0)];
+  const count = whole ? high - low : STEPS;
+  const at = k => whole ? low + k : log ? low * (high / low) ** (k / count) : low + (high - low) * k / count;
+  const place = v => Math.round(log ? Math.log(v / low) / Math.log(high / low) * count : (v - low) / (high - low) * count);
+  const asked = make("input", line, "", {type: "checkbox", "aria-label": one.name + " is asked"});
+  const slider = make("input", line, "", {type: "range", id, min: 0, max: count, step: 1});
+  const box = make("input", line, "", {type: "number", step: "any", "aria-label": one.name});
+  if (!one.optional) asked.style.visibility = "hidden";
+  const get = () => one.optional && !asked.checked ? null : Number(box.value);
+  const set = v => {
+    asked.checked = v != null;
+    box.value = v ?? Number(guess.toPrecision(3));
+    slider.value = place(Number(box.value));
+    slider.setAttribute("aria-valuetext", box.value);
+  };
+  controls[one.name] = {get, set};
+  set(one.value);
+  slider.addEventListener("input", () => { set(Number(at(Number(slider.value)).toPrecision(3))); scale(); });
+  slider.addEventListener("change", () => design());
+  box.addEventListener("change", () => {
+    if (!Number.isFinite(parseFloat(box.value))) return $("state").textContent = one.name + ": expected a number";
+    set(Number(box.value));
+    design();
+  });
+  asked.addEventListener("change", () => design());
+}
+const settings = () => Object.fromEntries(Object.entries(controls).map(([name, one]) => [name, one.get()]));
+const restore = values => Object.entries(values).forEach(([name, v]) => controls[name].set(v));
+
+// -- designs --
+let shown = null, pinned = null, past = [], number = 0, busy = 0, timer = 0, waiting = false, scaling = false;
+const scale = async () => {
+  if (scaling) { waiting = true; return; }
+  const mine = number;
+  scaling = true;
+  try {
+    const started = performance.now(), found = await post("/scaled", {settings: settings()});
+    if (mine === number) {
+      show({...shown, ...found, stale: true});
+      $("state").textContent = `last design × ${digits(found.gain, 3)} for these settings, not certified`;
+      document.body.dataset.scaled = Math.round(performance.now() - started);
+    }
+  } catch (error) { if (mine === number) $("state").textContent = error.message; }
+  scaling = false;
+  if (waiting) { waiting = false; scale(); }
+};
+const design = () => {
+  clearTimeout(timer);
+  timer = setTimeout(run, 120);  // arrows come in a row
+};
+const run = async () => {
+  const mine = ++number, values = settings(), started = performance.now();
+  busy++;
+  $("state").textContent = "designing …";
+  if (shown) scale();
+  try {
+    const found = await post("/design", {settings: values});
+    if (mine !== number) return;
+    if (shown?.settings) past.push({...shown, stale: false, ...shown.whole});
+    const whole = {...found, settings: values, bound: null};
+    show({...whole, whole});
+    const s = ((performance.now() - started) / 1000).toFixed(1);
+    $("state").textContent = `designed and certified in ${s} s`;
+    document.body.dataset.designed = mine;
+    document.body.dataset.seconds = s;
+    const bound = await post("/bound", {settings: values});
+    if (mine !== number) return;
+    shown.bound = shown.whole.bound = bound.reached;
+    numbers();
+  } catch (error) {
+    if (mine !== number || error.status === 409) return;
+    if (shown) show({...shown, ...shown.whole, stale: true});
+    $("state").textContent = error.status ? error.message : "flexlink tune has stopped: start it again";
+    document.body.dataset.failed = mine;
+  } finally { busy--; }
+};
+const undo = () => {
+  const before = past.pop();
+  if (!before) return;
+  number++;
+  clearTimeout(timer);
+  restore(before.settings);
+  show(before);
+  $("state").textContent = "undone";
+};
+const pin = () => {
+  pinned = pinned ? null : shown;
+  $("pin").setAttribute("aria-pressed", String(!!pinned));
+  $("pin").textContent = pinned ? "Unpin" : "Pin this design";
+  show(shown);
+};
+$("undo").addEventListener("click", undo);
+$("pin").addEventListener("click", pin);
+$("save").addEventListener("click", async () => {
+  $("save").disabled = true;
+  $("state").textContent = "saving …";
+  try {
+    const found = await post("/save", {settings: settings(), name: $("name").value});
+    $("state").textContent = `saved in ${found.directory}${found.certified ? "" : " (not certified)"}`;
+    $("name").value = $("name").value.replace(/\d*$/, n => n ? Number(n) + 1 : "-2");
+  } catch (error) { $("state").textContent = error.message; }
+  $("save").disabled = false;
+});
+$("controls").addEventListener("submit", event => event.preventDefault());
+addEventListener("keydown", event => {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target === $("name")) return;
+  const act = {u: undo, p: pin}[event.key.toLowerCase()];
+  if (act && !(act === pin && !shown)) { event.preventDefault(); act(); }
+});
+
+// -- the page --
+const show = found => {
+  shown = found;
+  $("undo").disabled = !past.length;
+  $("pin").disabled = !shown.plants?.length || (shown.stale && !pinned);
+  $("panels").classList.toggle("stale", !!shown.stale);
+  numbers();
+  const names = (shown.plants ?? []).map(one => one.name), chosen = Math.max(0, $("plant").selectedIndex);
+  $("plant").hidden = names.length < 2;
+  $("plant").replaceChildren();
+  names.forEach((name, k) => make("option", $("plant"), name).selected = k === chosen);
+  panels();
+};
+$("plant").addEventListener("change", () => panels());
+const numbers = () => {
+  const state = shown.certified;
+  $("verdict").className = "verdict" + (state ? " certified" : state == null ? " plain" : "");
+  $("headline").textContent = state ? "Certified" : state == null ? "Not certified yet" : "Not certified";
+  $("numbers").replaceChildren();
+  const rows = [
+    ["worst case γ", "gamma", 4], ["γ of any order, bound", "bound", 4], ["modulus margin", "modulus", 3], ["phase margin, deg", "phase_deg", 3],
+    ["gain margin, factor", "gain_margin", 3], ["delay margin, ms", "delay_ms", 3], ["bandwidth, rad/s", "bandwidth", 4],
+  ];
+  for (const [words, key, n] of rows) {
+    const box = make("div", $("numbers")), old = shown.stale && key !== "gamma";
+    make("dt", box, words);
+    const value = make("dd", box, old ? "…" : digits(shown[key], n));
+    if (pinned) make("small", value, "pinned: " + digits(pinned[key], n));
+  }
+  const box = make("div", $("numbers"));
+  make("dt", box, "active constraint");
+  make("dd", box, shown.stale ? "…" : shown.active || shown.reason || "–");
+  $("items").replaceChildren();
+  for (const item of shown.stale ? [] : shown.items ?? []) {
+    const row = make("tr", $("items"), "", {class: item.met ? "yes" : "no"});
+    for (const [head, words] of [["requirement", item.requirement], ["required", item.required], ["achieved", item.achieved], ["met", item.met ? "yes" : "no"]])
+      make("td", row, words, {"data-head": head});
+  }
+};
+// One panel: x and y as [low, high, log]; returns places and the group for curves, cut at the frame.
+const panel = (title, [xl, xh, xlog], [yl, yh, ylog], xwords) => {
+  const box = make("div", $("panels"));
+  make("h3", box, title);
+  const w = Math.max(box.clientWidth, 240), h = 225, [l, r, t, b] = [46, 8, 8, 34], name = "clip" + $("panels").childElementCount;
+  const svg = draw("svg", box, {viewBox: `0 0 ${w} ${h}`, role: "img", "aria-label": title});
+  const to = (v, low, high, log) => log ? Math.log(v / low) / Math.log(high / low) : (v - low) / (high - low);
+  const x = v => l + (w - l - r) * to(v, xl, xh, xlog), y = v => h - b - (h - t - b) * to(v, yl, yh, ylog);
+  draw("rect", draw("clipPath", svg, {id: name}), {x: l, y: t, width: w - l - r, height: h - t - b});
+  for (const [low, high, log, across] of [[xl, xh, xlog, true], [yl, yh, ylog, false]]) for (const v of ticks(low, high, log)) {
+    const p = across ? x(v) : y(v);
+    draw("path", svg, {class: "tick", d: across ? `M${p} ${t}V${h - b}` : `M${l} ${p}H${w - r}`});
+    const far = across ? {x: Math.min(p, w - 14), y: h - b + 14, "text-anchor": "middle"} : {x: l - 5, y: p + 4, "text-anchor": "end"};
+    draw("text", svg, far, digits(v, 3));
+  }
+  draw("rect", svg, {class: "frame", x: l, y: t, width: w - l - r, height: h - t - b});
+  draw("text", svg, {x: (l + w - r) / 2, y: h - 4, "text-anchor": "middle"}, xwords);
+  return [x, y, draw("g", svg, {"clip-path": `url(#${name})`})];
+};
+const ticks = (low, high, log) => {
+  const found = [];
+  if (log) {
+    const step = Math.max(1, Math.ceil(Math.log10(high / low) / 6));
+    for (let e = Math.ceil(Math.log10(low) - 1e-9); e <= Math.log10(high) + 1e-9; e += step) found.push(10 ** e);
+    if (found.length > 1) return found;
+    return ticks(low, high, false);
+  }
+  const raw = (high - low) / 5, ten = 10 ** Math.floor(Math.log10(raw)), step = [1, 2, 5, 10].find(m => m * ten >= raw) * ten;
+  for (let k = Math.ceil(low / step); k * step <= high; k++) found.push(k * step);
+  return found;
+};
+const path = (xs, ys, x, y) => {
+  let d = "", pen = "M";
+  xs.forEach((v, k) => {
+    if (v == null || ys[k] == null || !(Number.isFinite(y(ys[k])))) { pen = "M"; return; }
+    d += `${pen}${x(v).toFixed(1)} ${y(ys[k]).toFixed(1)}`;
+    pen = "L";
+  });
+  return d;
+};
+const panels = () => {
+  const at = Math.max(0, $("plant").selectedIndex), plant = shown.plants?.[at], other = pinned?.plants?.[at];
+  const top = scrollY;
+  $("panels").replaceChildren();
+  if (!plant) return;
+  plant.gains.forEach((one, k) => {
+    const seen = [...one.nominal, ...one.worst, ...one.limit].filter(v => v > 0), most = 2 * Math.max(...one.nominal, ...one.worst.filter(v => v < 300 * Math.max(...one.nominal)));
+    const ys = [Math.max(Math.min(...seen) / 1.5, most * 1e-5), most, true];
+    const [x, y, group] = panel(`${one.symbol}: ${one.meaning}`, [one.x[0], one.x.at(-1), true], ys, "frequency [rad/s]");
+    const back = [...one.x].reverse(), low = path(back, [...one.nominal].reverse(), x, y).replace("M", "L");
+    draw("path", group, {class: "band", d: path(one.x, one.worst.map(v => v ?? most), x, y) + low + "Z"});
+    if (other) draw("path", group, {class: "curve pinned", d: path(other.gains[k].x, other.gains[k].worst, x, y)});
+    for (const kind of ["worst", "nominal", "limit"]) draw("path", group, {class: "curve " + kind, d: path(one.x, one[kind], x, y)});
+  });
+  const size = 2.2, [nx, ny, group] = panel("Nyquist: K G and its ellipses", [-2.6, 1.8, false], [-size, size / 2, false], "real part");
+  const radius = controls.modulus_margin?.get() ?? 0, turn = [...Array(61).keys()].map(k => k * Math.PI / 30);
+  draw("path", group, {class: "curve limit", d: path(turn.map(v => radius * Math.cos(v) - 1), turn.map(v => radius * Math.sin(v)), nx, ny)});
+  for (const [re, im] of plant.nyquist.ellipses) draw("path", group, {class: "band", d: path(re, im, nx, ny) + "Z"});
+  if (other) draw("path", group, {class: "curve pinned", d: path(other.nyquist.re, other.nyquist.im, nx, ny)});
+  draw("path", group, {class: "curve nominal", d: path(plant.nyquist.re, plant.nyquist.im, nx, ny)});
+  draw("circle", group, {class: "point", cx: nx(-1), cy: ny(0), r: 3});
+  const step = plant.step;
+  if (step.x) {
+    const all = [...step.nominal, ...step.samples.flat(), 0], end = step.x.at(-1);
+    const [x, y, inside] = panel("Step of the reference, models from the posterior", [0, end, false], [Math.min(...all) - .05, Math.max(...all) * 1.08 + .01, false], "time [s]");
+    for (const one of step.samples) draw("path", inside, {class: "curve thin", d: path(step.x, one, x, y)});
+    if (other?.step.x) draw("path", inside, {class: "curve pinned", d: path(other.step.x, other.step.nominal, x, y)});
+    draw("path", inside, {class: "curve nominal", d: path(step.x, step.nominal, x, y)});
+  }
+  scrollTo(scrollX, top);
+};
+for (const [look, words] of [["nominal", "nominal"], ["worst", "largest over the ellipses"], ["limit", "specification"], ["pinned", "pinned design (largest over the ellipses; nominal loop and step)"]]) {
+  const entry = make("span", $("key"));
+  draw("path", draw("svg", entry, {viewBox: "0 0 26 9", "aria-hidden": "true"}), {class: look, d: "M0 5H26"});
+  entry.append(words);
+}
+addEventListener("resize", () => shown && panels());
+run();
+})();
