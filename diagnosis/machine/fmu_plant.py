@@ -78,6 +78,14 @@ class Fmu:
         return tuple(self._of("output"))
 
     @property
+    def units(self) -> dict[str, str]:
+        """Output -> unit, where the file declares one, of its own or of its type."""
+        declared = {
+            name: v.unit or getattr(v.declaredType, "unit", None) for name, v in self._of("output").items()
+        }
+        return {name: unit for name, unit in declared.items() if unit}
+
+    @property
     def parameters(self) -> dict[str, float]:
         """Start values that are not zero."""
         started = {name: float(v.start or 0.0) for name, v in self._of("parameter").items()}

@@ -173,6 +173,11 @@ class RecordedCase(ABC, Generic[Record]):
         return self.machine.noise
 
     @property
+    def units(self) -> Mapping[str, str]:
+        """Output -> unit, of outputs whose names do not end with it."""
+        return {}
+
+    @property
     def estimation(self) -> tuple[Record, ...]:
         return tuple(e for e in self.experiments if e.role == "estimation")
 

@@ -14,6 +14,23 @@ import numpy as np
 from diagnosis.machine.mujoco_edits import LAGS, put_compiled
 
 _LONGEST_MODEL = 2**26  # bytes
+_SENSORS = mujoco.mjtSensor
+# Units of sensors whose object says nothing more; of those of a joint or tendon, along a line or about it.
+_SENSOR_UNITS = {
+    **dict.fromkeys((_SENSORS.mjSENS_ACCELEROMETER, _SENSORS.mjSENS_FRAMELINACC), "m/s²"),
+    **dict.fromkeys((_SENSORS.mjSENS_GYRO, _SENSORS.mjSENS_FRAMEANGVEL), "rad/s"),
+    **dict.fromkeys((_SENSORS.mjSENS_VELOCIMETER, _SENSORS.mjSENS_FRAMELINVEL), "m/s"),
+    **dict.fromkeys((_SENSORS.mjSENS_FRAMEPOS, _SENSORS.mjSENS_TENDONPOS), "m"),
+    **dict.fromkeys((_SENSORS.mjSENS_FORCE, _SENSORS.mjSENS_TOUCH), "N"),
+    _SENSORS.mjSENS_TENDONVEL: "m/s",
+    _SENSORS.mjSENS_TORQUE: "N m",
+}
+_JOINT_UNITS = {
+    _SENSORS.mjSENS_JOINTPOS: ("rad", "m"),
+    _SENSORS.mjSENS_JOINTVEL: ("rad/s", "m/s"),
+    _SENSORS.mjSENS_JOINTACTFRC: ("N m", "N"),
+    _SENSORS.mjSENS_JOINTLIMITFRC: ("N m", "N"),
+}
 
 
 def names(path: str) -> dict[str, list[str]]:
@@ -140,6 +157,19 @@ class MujocoModel:
                 dof = self.nominal.joint(sensor.objname).dofadr[0]
                 found.append((k, sensor.objname, float(self.nominal.dof_M0[dof])))
         return tuple(found)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Output -> unit, of sensors that say what they measure."""
+        found = {}
+        for name in self.outputs:
+            sensor = self.spec.sensor(name)
+            if sensor.type in _JOINT_UNITS:
+                slides = self.spec.joint(sensor.objname).type == mujoco.mjtJoint.mjJNT_SLIDE
+                found[name] = _JOINT_UNITS[sensor.type][slides]
+            elif sensor.type in _SENSOR_UNITS:
+                found[name] = _SENSOR_UNITS[sensor.type]
+        return found
 
     @cached_property
     def filtered(self) -> tuple[int, ...]:

@@ -148,6 +148,7 @@ class MujocoArm(MujocoModel):
             untracked=Simulation(
                 replace(self, tracking_rad_s=0.0), every, noise, False, _starts=simulation._starts
             ),
+            units=self.units,
         )
 
     def _untried(self, every: Mapping[str, Quantity]) -> dict[str, str]:

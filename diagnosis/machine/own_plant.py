@@ -81,6 +81,7 @@ class Plant:
         in these inputs, where a simulation knows that itself; every fit and every residual is of these.
     untracked : the simulation without what holds it near a record, which is in these inputs; None: nothing
         does.
+    units : output -> unit, of outputs whose names do not end with it.
     """
 
     simulation: Simulate
@@ -95,12 +96,13 @@ class Plant:
     inactive: Mapping[str, str] = field(default_factory=dict)
     settled: Callable[[Real, Real], Real] | None = None
     untracked: Simulate | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         lock(self, "noise")
         object.__setattr__(self, "effects", tuple(self.effects))
         object.__setattr__(self, "output_names", tuple(self.output_names))
-        for key in ("parameters", "tolerances", "start", "inactive"):
+        for key in ("parameters", "tolerances", "start", "inactive", "units"):
             object.__setattr__(self, key, MappingProxyType(dict(getattr(self, key))))
         for name, spread in self.start.items():
             if not 0 < spread < np.inf:
@@ -304,6 +306,10 @@ class PlantCase(RecordedCase[PlantExperiment]):
     @property
     def outputs(self) -> tuple[str, ...]:
         return self.plant.output_names
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        return self.plant.units
 
     def without_model_error(self) -> PlantCase:
         """The same with a simulation that is stated to be as good as the sensors."""

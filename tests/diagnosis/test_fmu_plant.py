@@ -59,6 +59,7 @@ def exact(force: np.ndarray, mass: float, spring: float, damper: float) -> np.nd
 def test_values_of_the_file_are_parameters_and_what_is_zero_an_effect(carriage: Path) -> None:
     fmu = Fmu(carriage, DT_S)
     assert (fmu.inputs, fmu.outputs) == (("force",), ("position",))
+    assert fmu.units == {"position": "m"}
     assert fmu.parameters == {"mass": 2.0, "spring": 80.0, "damper": 3.0}
     assert [(e.name, e.parameters[0].high) for e in fmu.effects] == [("drag", 100.0)]
 

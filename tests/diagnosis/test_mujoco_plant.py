@@ -32,6 +32,20 @@ def rod(**settings: float) -> MujocoArm:
     return MujocoArm(mujoco.MjSpec.from_string(ROD), ("hinge",), DT_S, **settings)
 
 
+def test_outputs_have_the_units_of_their_joints_and_sensors():
+    text = ROD.replace(
+        '<site name="tip"', '<body><joint name="slide" type="slide"/><geom size=".1"/></body><site name="tip"'
+    ).replace(
+        "<custom>",
+        '<sensor><jointvel name="rate" joint="slide"/>'
+        '<jointactuatorfrc name="push" joint="hinge"/></sensor><custom>',
+    )
+    arm = MujocoArm(mujoco.MjSpec.from_string(text), ("hinge", "slide", "rate", "push"), DT_S)
+    assert arm.units == {"hinge": "rad", "slide": "m", "rate": "m/s", "push": "N m"}
+    torque = steps()
+    assert plant_of(rod(), torque, turned(torque))[0].units == {"hinge": "rad"}
+
+
 def steps(seed: int = 0, count: int = 200) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1, 1, count // 20).repeat(20)
 

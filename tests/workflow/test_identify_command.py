@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,14 @@ def test_more_samples_than_memory_are_refused(logs, refused, monkeypatch):
     line = refused("identify", logs / "first.csv", *COLUMNS)
     assert line.startswith("flexlink: first: ")
     assert "at most 100 are identified together" in line
+
+
+def test_unclear_columns_offer_a_command_with_every_log(tmp_path, refused):
+    u, y = np.random.default_rng(0).standard_normal((2, 40))
+    paths = [write_log(tmp_path / f"{k} a.csv", u, y, tip_2_m=-y) for k in range(2)]
+    line = refused("identify", *paths)
+    words = shlex.split(line.split("type: flexlink ")[1])
+    assert words[:3] == ["identify", *map(str, paths)]
 
 
 def identify_first(logs, **written):

@@ -270,6 +270,23 @@ def test_a_design_that_takes_damping_from_a_mode_says_so(undrawn, tmp_path):
         assert (lost in design) == told
 
 
+def test_a_mode_of_several_plants_is_named_once_where_it_loses_most(tmp_path):
+    run = example.build_run(tmp_path / "run", example.config())
+    results = RunResults(run)
+    certificate = results.certify.certificate
+    changes = [
+        ModeChange(Mode(2 * np.pi * 12.6, 0.02), Mode(2 * np.pi * 13.0, after))
+        for after in (0.015, 0.004, 0.01)
+    ]
+    plants = [
+        replace(certificate.plants[0], plant=f"load {k}", mode_changes=(change, change))
+        for k, change in enumerate(changes)
+    ]
+    said_of = said("design_verdict", results.design, replace(certificate, plants=tuple(plants)), "")
+    assert said_of.count("the mode at 12.6 Hz loses damping") == 1
+    assert "load 1: the mode at 12.6 Hz loses damping: 0.02 in open loop, 0.004 in closed loop" in said_of
+
+
 def test_one_channel_alone(undrawn, tmp_path):
     page = page_for(tmp_path, example.config(channels=1))
     assert "Channel hub" not in page.text

@@ -61,9 +61,9 @@ def read_logs(
     """
     if input_name is None or output_name is None or (time is None and dt_s is None):
         with naming(str(logs[0])):
-            table, log = read_table(logs[0]).with_decimal(decimal), shlex.quote(str(logs[0]))
+            table, typed = read_table(logs[0]).with_decimal(decimal), shlex.join(map(str, logs))
             roles = roles_with_reference(
-                table, log, "identify", input=input_name, output=output_name, time=time, reference=reference
+                table, typed, "identify", input=input_name, output=output_name, time=time, reference=reference
             )
         input_name, output_name, found = roles.input, roles.output, roles.reference
         if found and all(found in read_table(path).names for path in (*logs[1:], *validation)):

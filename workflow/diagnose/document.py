@@ -73,6 +73,7 @@ def document_of(
         "held_out_decided": found.held_out_decided,
         "unlisted": [effect.to_dict() for effect in found.unlisted],
         "replayed": found.replayed,
+        "units": found.case.units,
         "gap_closed": found.gap_closed,
         "gap_closed_interval": found.gap_closed_interval,
         "gap_by_experiment": found.gap_by_experiment,

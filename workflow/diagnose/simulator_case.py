@@ -339,7 +339,15 @@ def _with_all(
     def finish(experiments: Sequence[PlantExperiment], noise: Real) -> tuple[Plant, None]:
         every = {name: tolerances.get(name, _TOLERANCE) for name in parameters}
         plant = Plant(
-            simulation, parameters, every, tuple(outputs), noise, effects, settings.model_error, dt_s
+            simulation,
+            parameters,
+            every,
+            tuple(outputs),
+            noise,
+            effects,
+            settings.model_error,
+            dt_s,
+            units=getattr(simulation, "units", {}),
         )
         around = partial(with_effects, experiments=experiments, dt_s=dt_s, at_rest_before=False)
         motion, motion_is = (outputs[0], settings.motion) if settings.motion else _motion(inputs, outputs)

@@ -34,7 +34,7 @@ def draw_measured_beside_simulated(found: Diagnosis) -> Figure:
     )
     for column, output in enumerate(case.outputs):
         words, unit, _ = gap_style.look_of(output)
-        unit = style.plain(unit, 16) or "as logged"
+        unit = style.plain(unit or case.units.get(output, ""), 16) or "as logged"
         (above, below), measured = grid[:, column], worst.output[:, column]
         # Broad and pale: a model that fits lies on top of it.
         above.plot(*outline(time, measured, _TRACE_BINS), color=gap_style.PALE, lw=3.0, label="measured")
