@@ -12,7 +12,8 @@ from diagnosis.evidence.confirmation import confronted
 from diagnosis.evidence.hypotheses import DISAGREEMENT, Hypothesis, Probabilities, probabilities
 from diagnosis.evidence.search import WhiteSearch
 from diagnosis.fit.coordinates import parameter_intervals
-from diagnosis.fit.descent import FINE, Descent, descend
+from diagnosis.fit.descent import FINE, Descent
+from diagnosis.fit.likelihood import SUBSTANTIAL
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine
@@ -26,10 +27,6 @@ from diagnosis.next_experiment.discrimination import (
 from diagnosis.search.loop import Progress
 from plant.effects import LOOK_ALIKES
 from plant.effects.search_space import Candidate
-
-# Difference of the cost that the records do not tell apart (chi-square, 95 %, two parameters).
-_AS_GOOD = 6.0
-_DRAWS = 4000
 
 
 def without_error(
@@ -107,8 +104,8 @@ def without_error(
 def _as_good(hypotheses: Sequence[Hypothesis], accepted: Hypothesis) -> tuple[str, ...]:
     """Effects of sets of the same number that fit as well as the accepted one."""
     rivals = [h for h in hypotheses if accepted.names and len(h.names) == len(accepted.names)]
-    near = [h for h in rivals if h.fit.cost <= accepted.fit.cost + _AS_GOOD]
-    return tuple(name for h in sorted(near, key=lambda h: h.fit.cost) for name in h.names)
+    near = [h for h in rivals if h.fit.loss <= accepted.fit.loss + SUBSTANTIAL]
+    return tuple(name for h in sorted(near, key=lambda h: h.fit.loss) for name in h.names)
 
 
 def _to_part(
@@ -137,15 +134,7 @@ def _accepted(hypotheses: Sequence[Hypothesis], answer: str) -> Hypothesis:
 def _refined(model: ResidualModel, end: Descent) -> Descent:
     if not end.candidates and not end.deviations.size:
         return end
-    last = descend(
-        model,
-        end.candidates,
-        end.deviations,
-        end.coordinates,
-        model.start,
-        **FINE,
-    )
-    return last if last.loss <= end.loss else end
+    return min(end.on(model, model.start, **FINE), end, key=lambda one: one.loss)
 
 
 def _fitted(
@@ -204,7 +193,7 @@ def _intervals(
         * max(1.0, end.rms**2)
         * _solver_variance(end, samples_per_record)
     )
-    return parameter_intervals(candidate, end.coordinates_of(k), covariance, rng, _DRAWS)
+    return parameter_intervals(candidate, end.coordinates_of(k), covariance, rng)
 
 
 def _solver_variance(end: Descent, samples_per_record: float) -> float:

@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diagnosis.evidence.hypotheses import STILL_POSSIBLE, Hypothesis, disagreement_gain
+from diagnosis.evidence.hypotheses import Hypothesis, disagreement_gain
 from diagnosis.fit.coordinates import box, effects_at, quotients
 from diagnosis.fit.descent import Descent, steps_of
 from diagnosis.fit.discrepancy import Discrepancy, discrepancy
+from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import solver_spread, without_drift
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.search.loop import SUBSTANTIAL
 
 
 def confronted(
@@ -42,7 +42,7 @@ def confronted(
     seen = {
         k: first if h is leading else _prediction(model, h.fit)
         for k, h in enumerate(hypotheses)
-        if h.evidence > best - STILL_POSSIBLE
+        if h.evidence > best - DECISIVE
     }
     # All others stay behind the best prediction by what they were behind before.
     least = _Prediction(max(p.gain for p in seen.values()), 0.0, 0.0)
@@ -61,7 +61,7 @@ def _contradicted(
     return any(
         h.weight + _prediction(model, h.fit).gain > ahead
         for h in close.values()
-        if h is not leading and h.weight > leading.log_weight - STILL_POSSIBLE
+        if h is not leading and h.weight > leading.log_weight - DECISIVE
     )
 
 

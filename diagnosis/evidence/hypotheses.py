@@ -15,34 +15,20 @@ from scipy.special import log_ndtr
 
 from diagnosis.fit.descent import Descent
 from diagnosis.fit.discrepancy import Discrepancy
+from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL
 from diagnosis.fit.solver_spread import NO_DRIFT, Drift
 from plant.effects import EFFECTS
 
 # Solver disagreement in noise deviations (half-normal scale); 0.2 between two solvers of backlash.
 DISAGREEMENT = {"smooth": 0.03, "continuous": 0.06, "non-smooth": 0.25}
 # Prior probabilities by number of effects; they are shared equally among the sets of that size.
-_PRIOR_NONE, PRIOR_UNKNOWN = 0.25, 0.1
-_PRIOR_COUNT = {1: 0.5, 2: 0.14, 3: 0.01}
+_PRIOR_COUNT, PRIOR_UNKNOWN = {0: 0.25, 1: 0.5, 2: 0.14, 3: 0.01}, 0.1
+# How probable a cause beyond the list is that looks like an effect, beside the effect.
+UNLISTED = 1 / 3
 PRIORS = (_PRIOR_COUNT[1], _PRIOR_COUNT[2] + _PRIOR_COUNT[3], PRIOR_UNKNOWN)
 _UNKNOWN = ("unknown",)
 # An unknown cause beside a set of effects, relative to that set alone.
-_UNKNOWN_BESIDE = float(np.log(PRIOR_UNKNOWN / _PRIOR_NONE))
-# Where contacts switch, what two correct solvers disagree about is not white: further effects beside a
-# non-smooth one can follow some of it, so they have to gain more (in log weight) to be believed.
-BESIDE_NON_SMOOTH = 20.0
-# log prior density lost per squared deviation beyond three: no evidence pays for that.
-_CUT = 1e3
-# Something unknown may have any size over four decades; what solvers of backlash disagree about has one known
-# to a factor of three: the log of the ratio of these ranges (in their logarithms).
-_KNOWN_SIZE = 2.0
-# An answer this far behind the best in log weight is none any more.
-STILL_POSSIBLE = 20.0
-# An effect whose period the records never complete is that effect only by name.
-_AT_EDGE = 2.0
-# What every parameter beyond an effect's size has to gain. The evidence charges only for parameters that the
-# records determine: an effect that contains another (Stribeck and Coulomb friction) costs nothing where it
-# looks like it, and the simpler name is the better one then.
-_PER_PARAMETER = 1.0
+_UNKNOWN_BESIDE = float(np.log(PRIOR_UNKNOWN / _PRIOR_COUNT[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,23 +82,25 @@ class Hypothesis:
     ) -> Hypothesis:
         """left: what the fit leaves over, of residuals without the drift of correct solvers."""
         beside = len(fit.names) - 1
-        allowed = BESIDE_NON_SMOOTH * beside if fit.non_smooth else 0.0
+        # Where contacts switch, what two correct solvers disagree about is not white, and further effects can
+        # follow some of it.
+        allowed = DECISIVE * beside if fit.non_smooth else 0.0
         further = sum(len(candidate.axes) - 1 for candidate in fit.candidates)
-        prior = log_prior(fit.names, len(listed)) - _PER_PARAMETER * further
+        # The evidence charges only for parameters that the records determine: an effect that contains another
+        # (Stribeck and Coulomb friction) costs nothing where it looks like it; the simpler name is better.
+        prior = log_prior(fit.names, len(listed)) - further
         evidence = log_evidence(fit) + drift.log_gain
         exactly = evidence + disagreement_gain(fit, left) + prior - allowed
         besides = evidence + left.log_gain_some + prior - allowed + _UNKNOWN_BESIDE
         if any(c.at_edge(fit.coordinates_of(k)) for k, c in enumerate(fit.candidates)):
-            # Something is described well, but not by what the effect is.
-            return cls(fit, exactly - _AT_EDGE, max(besides, exactly + _UNKNOWN_BESIDE), listed)
+            # Something is described well, but not by what the effect is: a period is never completed.
+            return cls(fit, exactly - SUBSTANTIAL, max(besides, exactly + _UNKNOWN_BESIDE), listed)
         return cls(fit, exactly, besides, listed)
 
 
 def log_prior(names: Sequence[str], n: int | None = None) -> float:
     """log prior probability of exactly this set of effects out of n that are listed (None: the registry)."""
     n = len(EFFECTS) if n is None else n
-    if not names:
-        return float(np.log(_PRIOR_NONE))
     count = len(names)
     sets = np.prod([(n - i) / (i + 1) for i in range(count)])
     return float(np.log(_PRIOR_COUNT.get(count, 1e-3)) - np.log(sets))
@@ -125,8 +113,10 @@ def disagreement_gain(fit: Descent, left: Discrepancy) -> float:
     """
     solvers = [DISAGREEMENT["smooth"], *(DISAGREEMENT[c.dependence] for c in fit.candidates)]
     z = left.size / max(solvers)
-    expected = _KNOWN_SIZE if fit.non_smooth else 0.0
-    return max(0.0, left.log_gain - 0.5 * z**2 - _CUT * max(z - 3.0, 0.0) ** 2 + expected)
+    # Something unknown may have any size over four decades; this one is known to a factor of three: the log
+    # of the ratio of these ranges (in their logarithms).
+    expected = SUBSTANTIAL if fit.non_smooth else 0.0
+    return max(0.0, left.log_gain - 0.5 * z**2 + expected) if z < 3 else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,13 +184,8 @@ class Probabilities:
 
 
 def best_of_sets(hypotheses: Sequence[Hypothesis]) -> dict[tuple[str, ...], Hypothesis]:
-    """Sorted effect names -> the hypothesis of this set with the largest weight, in order of appearance."""
-    best: dict[tuple[str, ...], Hypothesis] = {}
-    for hypothesis in hypotheses:
-        key = tuple(sorted(hypothesis.names))
-        if key not in best or hypothesis.log_weight > best[key].log_weight:
-            best[key] = hypothesis
-    return best
+    """Sorted effect names -> the hypothesis of this set with the largest weight."""
+    return {tuple(sorted(h.names)): h for h in sorted(hypotheses, key=lambda h: h.log_weight)}
 
 
 def probabilities(hypotheses: Sequence[Hypothesis]) -> Probabilities:

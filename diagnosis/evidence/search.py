@@ -9,39 +9,27 @@ import numpy as np
 
 from diagnosis.evidence.hypotheses import (
     DISAGREEMENT,
-    PRIOR_UNKNOWN,
-    STILL_POSSIBLE,
+    UNLISTED,
     Hypothesis,
-    log_prior,
 )
 from diagnosis.fit.descent import FINE, Descent, descend, refined
 from diagnosis.fit.discrepancy import discrepancy
+from diagnosis.fit.likelihood import DECISIVE, WORTH_IT
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
-from diagnosis.fit.starts import Point, beside, point_at, superposed
+from diagnosis.fit.starts import Point, beside, superposed
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
-from diagnosis.search.loop import Progress, SearchLoop
+from diagnosis.search.loop import NEAREST, SEVERAL, Progress, SearchLoop
 from diagnosis.search.moves import Alone, Beside, Enlarge, FromPoints, InPlaceOf, LookAlike
 from plant.effects.search_space import Candidate
 
 # An effect that changes no record by more than this many noise deviations (RMS) is not looked for: alone, and
 # beside others, where two dozen further effects have as many chances to follow noise and solver errors.
-SMALLEST_SIZE_RATIO, SMALLEST_SIZE_BESIDE = 0.06, 0.2
-# A further effect has a smaller prior (7 in log weight): what gains less roughly is not finished.
-_LEAST_GAIN = 5.0
-# Starts of a further effect that are simulated beside a parent, of all that superposition looks at.
-_SIMULATED = 4
+_SMALLEST, _SMALLEST_BESIDE = 0.06, 0.2
 # Where two effects leave more than this share of the gap, a third would only follow something unknown.
 _HOPELESS = 0.1
-# Sets whose members are tried without one of them.
-_SETS_TO_REDUCE = 3
-_MOST_EFFECTS = 3
 # Sizes of non-smooth effects are refined where no more than this share of the gap, or this energy, is left.
-_NEAR, _NEAR_FLOOR = 0.25, 0.3
-# Grids around the best size of an effect on which the loss does not depend smoothly: points, reach.
-_ZOOMS = ((24, 0.25), (16, 0.02))
-# Of unknown causes this share is a look-alike of an effect: a third as probable as the effect itself.
-_LOOK_ALIKE_SHARE = 0.06
+_NEAR = 0.25
 
 
 def fitted_to(
@@ -75,13 +63,13 @@ class WhiteSearch(SearchLoop[Hypothesis]):
         self.finish()
         self.tried(Enlarge.proposed(self, self.found), 0.5)
         self.tried(InPlaceOf.proposed(self, self.base.end), 0.55)
-        for count in range(2, _MOST_EFFECTS + 1):
+        for count in range(2, self.case.machine.weighing.most_effects + 1):
             moves = Beside.proposed(self, count)
             if not moves or (count > 2 and self._hopeless(moves[0].parent)):
                 break
             pulled = [m for move in moves for m in InPlaceOf.proposed(self, move.parent)]
             self.tried([*moves, *pulled], 0.4 + 0.1 * count, 0.1)
-            for one in sorted(self.found, key=lambda h: -h.log_weight)[:_SETS_TO_REDUCE]:
+            for one in sorted(self.found, key=lambda h: -h.log_weight)[:NEAREST]:
                 if self._near(one.end) and len(one.names) > 1:
                     self.simpler(one)
                     for k in range(len(one.names)):
@@ -104,33 +92,19 @@ class WhiteSearch(SearchLoop[Hypothesis]):
         return float(np.mean(e**2)) - 1.0 < max(DISAGREEMENT["non-smooth"], drift.size) ** 2
 
     def looked_for(self, candidate: Candidate, points: list[Point]) -> tuple[Candidate, list[Point]]:
-        """From the size on at which it changes a record; where contacts switch, on finer grids."""
-        smallest = smallest_size(candidate, points, SMALLEST_SIZE_RATIO)
+        """From the size on at which it changes a record."""
+        smallest = smallest_size(candidate, points, _SMALLEST)
         if smallest is None:
             return candidate, []
-        around, N = self.base.end, self.base.end.left.size
-        if candidate.dependence == "non-smooth" and points[0].cost - N < 0.5 * (around.cost - N):
-            points = self._zoomed(candidate, points)
         return candidate.from_size(smallest), points
-
-    def _zoomed(self, candidate: Candidate, points: list[Point]) -> list[Point]:
-        found = list(points)
-        for count, reach in _ZOOMS:
-            centre = min(found, key=lambda start: start.loss).coordinates
-            for shift in np.linspace(-reach, reach, count):
-                x = np.clip(centre + np.eye(centre.size)[0] * shift, *candidate.box)
-                start = point_at(self.records, self.base.end, candidate, x, self.records.start)
-                if start is not None:
-                    found.append(start)
-        return sorted(found, key=lambda start: start.loss)
 
     def looked_at_beside(
         self, parent: Descent, candidate: Candidate, points: Sequence[Point]
     ) -> tuple[Candidate, list[Point]]:
-        smallest = smallest_size(candidate, points, SMALLEST_SIZE_BESIDE)
+        smallest = smallest_size(candidate, points, _SMALLEST_BESIDE)
         if smallest is not None:
             candidate = candidate.from_size(smallest)
-        near = superposed(self.records, parent, points)[:_SIMULATED]
+        near = superposed(self.records, parent, points)[:SEVERAL]
         return candidate, beside(self.records, parent, candidate, near or points[:1])
 
     def polished(self, end: Descent, rank: int, around: Descent) -> Descent:
@@ -139,7 +113,7 @@ class WhiteSearch(SearchLoop[Hypothesis]):
         best = min(h.fit.loss for h in self.found)
         smooth = all(c.dependence == "smooth" for c in end.candidates)
         faint = smooth and not around.candidates
-        close = end.loss < best + STILL_POSSIBLE and (faint or end.loss < around.loss - _LEAST_GAIN)
+        close = end.loss < best + DECISIVE and (faint or end.loss < around.loss - WORTH_IT)
         # A backlash that only looks like something else takes as long as everything besides.
         if not (close or rank == 0) or (rank > 0 and end.non_smooth and not self._near(end)):
             return end
@@ -149,7 +123,7 @@ class WhiteSearch(SearchLoop[Hypothesis]):
 
     def _near(self, end: Descent) -> bool:
         """Whether backlash or the like may be the answer; beside much of a gap jumps do not matter."""
-        return _beyond_noise(end) < max(_NEAR * _beyond_noise(self.found[0].fit), _NEAR_FLOOR)
+        return _beyond_noise(end) < max(_NEAR * _beyond_noise(self.found[0].fit), _NEAR)
 
     def explained(self, end: Descent) -> Hypothesis:
         """With its log weights; a cause beyond the list is no answer but part of what is unknown."""
@@ -159,13 +133,9 @@ class WhiteSearch(SearchLoop[Hypothesis]):
         segments = [len(experiment.output) for experiment in self.case.estimation]
         left, listed = discrepancy(e, segments, self.case.noise.size), self.case.machine.weighing.listed
         found = Hypothesis.of(end, left, drift, listed)
-        beyond = [c.kind for c in end.candidates if c.effect not in listed]
-        if not beyond:
+        if {*end.names} <= {*listed}:
             return found
-        # As probable as a set with the effect would be, times what an unknown cause is beside a listed one.
-        alike = (str(getattr(beyond[0], "look_alike_of", "")),)
-        unlisted = float(np.log(PRIOR_UNKNOWN * _LOOK_ALIKE_SHARE)) - log_prior(alike)
-        return replace(found, log_weight=-np.inf, unknown_weight=found.log_weight + unlisted)
+        return replace(found, log_weight=-np.inf, unknown_weight=found.log_weight + float(np.log(UNLISTED)))
 
 
 def _beyond_noise(end: Descent) -> float:

@@ -15,21 +15,23 @@ from typing import Any
 import numpy as np
 
 from diagnosis.fit.coordinates import box, effects_at, non_smooth, quotients, solved
+from diagnosis.fit.likelihood import WORTH_IT
 from diagnosis.fit.nominal import prior_cost, prior_curvature, prior_slope
 from diagnosis.fit.records import RecordsToFit, Start, StartColumns
 from diagnosis.machine.machine_protocol import Real
 from plant.effects.search_space import Candidate
 
-_DEVIATION_STEP, _SMALLEST_STEP = 1e-3, 1e-4
+# Of difference quotients by deviations, and the smallest by coordinates of effects: known far better where
+# nothing but noise is left.
+_STEP, _SMALLEST_STEP = 1e-3, 1e-4
 # The same where contacts switch, deviations as logarithms: the loss is jagged below it, and how one contact
 # fell says nothing of where the others lead.
 _COARSE_STEP = {"log": 0.1, "angle": 0.1, "linear": 0.0125}
-_LARGEST_STEP, _LARGEST_MOVE = 2.0, 1.5
+# Of a coordinate or deviation in one iteration.
+_LARGEST_STEP = 2.0
 # Grids around a size on which the loss does not depend smoothly: how far, points of each.
-_REACHES, _POINTS = (0.1, 0.03), 9
+_NEAR = tuple(np.linspace(-reach, reach, 9) for reach in (0.1, 0.03))
 _FAR = np.array([-3.0, -2.0, -1.2, -0.6, -0.25, -0.08, 0.08, 0.25, 0.6, 1.2, 2.0, 3.0])
-# Above the loss of an end, that of a start which leads to no better one.
-_HOPELESS = 5.0
 # To an end, along flat valleys too.
 FINE: dict[str, Any] = {"iterations": 40, "tolerance": 0.02}
 # The Jacobian by the deviations, of the nominal or of a point nearby, is renewed at every third iteration,
@@ -95,6 +97,11 @@ class Descent:
     def normal(self, records: RecordsToFit) -> NormalEquations:
         """Of its linearisation."""
         return _normal_at(self, records)
+
+    def on(self, records: RecordsToFit, start: Start | None = None, **settings: Any) -> Descent:
+        """Descended on, from another start where one is given."""
+        start = self.start if start is None else start
+        return descend(records, self.candidates, self.deviations, self.coordinates, start, **settings)
 
     def precision(self, records: RecordsToFit) -> Real:
         """(P + A, P + A) of deviations and coordinates, whatever the starts and zeros are."""
@@ -212,7 +219,7 @@ def descend(
             step = np.zeros(g.size)
             step[free] = -solved(damped[np.ix_(free, free)], g[free])
             d2 = records.nominal.within(d + np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP))
-            x2 = np.clip(x + np.clip(step[P : P + A], -_LARGEST_MOVE, _LARGEST_MOVE), low, high)
+            x2 = np.clip(x + np.clip(step[P : P + A], -_LARGEST_STEP, _LARGEST_STEP), low, high)
             start2 = columns.moved(start, step[P + A :])
             e2 = left(d2, x2, start2)
             loss2, prior2 = loss_at(records, e2, d2, start2)
@@ -240,7 +247,7 @@ def _moved_on(jacobian: Real, function: Callable[[Real], Real], at: Real, start:
     """Whether derivatives (N, P) of a function (P,) -> (N,) are others at a point: along a direction of
     random signs in which every column counts alike, so that the difference is the mean of theirs."""
     sizes = np.linalg.norm(jacobian, axis=0)
-    if at.size < _AGAIN or step != _DEVIATION_STEP or not np.any(sizes):
+    if at.size < _AGAIN or step != _STEP or not np.any(sizes):
         return True
     v = np.random.default_rng(0).choice([-1.0, 1.0], at.size) / np.maximum(sizes, 1e-2 * np.max(sizes))
     v *= step / np.max(np.abs(v))
@@ -252,7 +259,7 @@ def steps_of(candidates: Sequence[Candidate]) -> tuple[float, Real]:
     """Of difference quotients: by every deviation, and along all coordinates (A,)."""
     coarse = _COARSE_STEP if non_smooth(candidates) else {}
     steps = [max(axis.step, coarse.get(axis.scale, _SMALLEST_STEP)) for c in candidates for axis in c.axes]
-    return coarse.get("log", _DEVIATION_STEP), np.array(steps)
+    return coarse.get("log", _STEP), np.array(steps)
 
 
 def refined(records: RecordsToFit, end: Descent) -> Descent:
@@ -260,8 +267,8 @@ def refined(records: RecordsToFit, end: Descent) -> Descent:
     following, and descended from the best of each."""
     first = 0
     for candidate in end.candidates:
-        for reach in _REACHES if candidate.dependence == "non-smooth" else ():
-            end = _sought(records, end, first, np.linspace(-reach, reach, _POINTS))
+        for shifts in _NEAR if candidate.dependence == "non-smooth" else ():
+            end = _sought(records, end, first, shifts)
         first += len(candidate.axes)
     return end
 
@@ -284,7 +291,7 @@ def _sought(records: RecordsToFit, end: Descent, k: int, shifts: Real) -> Descen
         x[k] = np.clip(x[k] + shift, low[k], high[k])
         trials.append(x)
     loss, d, x = best_following(records, end, end.candidates, trials)
-    if loss > end.loss + _HOPELESS:
+    if loss > end.loss + WORTH_IT:
         return end
     again = descend(
         records,

@@ -13,6 +13,10 @@ import numpy as np
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.quantisation_grid import cell_residual
 
+# Log odds that are worth a look (7 to 1), that pay for a further effect, and that decide (3 million to 1):
+# before a fit has ended its loss may be off by several.
+SUBSTANTIAL, WORTH_IT, DECISIVE = 2.0, 5.0, 15.0
+
 
 class Likelihood(Protocol):
     """Of coefficients e (N,) of all records together."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -11,24 +12,24 @@ from diagnosis.machine.machine_protocol import Machine, Real
 
 # Up to so many tolerances the prior is Gaussian. Beyond them it falls faster: a value that far off gets
 # noticed before it gets stated.
-_EDGE, _STIFFNESS = 2.0, 15.0
+EDGE, _STIFFNESS = 2.0, 15.0
 
 
 def prior_cost(deviations: Real) -> float:
     """-2 log of the prior density of the deviations (P,), up to a constant: |d|^2 within two tolerances."""
-    beyond = np.maximum(np.abs(deviations) - _EDGE, 0.0)
+    beyond = np.maximum(np.abs(deviations) - EDGE, 0.0)
     return float(deviations @ deviations + _STIFFNESS * (beyond @ beyond))
 
 
 def prior_slope(deviations: Real) -> Real:
     """Half the gradient of `prior_cost` (P,)."""
-    beyond = np.maximum(np.abs(deviations) - _EDGE, 0.0)
+    beyond = np.maximum(np.abs(deviations) - EDGE, 0.0)
     return np.asarray(deviations + _STIFFNESS * np.copysign(beyond, deviations))
 
 
 def prior_curvature(deviations: Real) -> Real:
     """Half the second derivatives of `prior_cost` (P,)."""
-    return np.where(np.abs(deviations) > _EDGE, 1.0 + _STIFFNESS, 1.0)
+    return np.where(np.abs(deviations) > EDGE, 1.0 + _STIFFNESS, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,15 @@ class NominalParameters:
         """The machine whose nominal parameters are off by these deviations (P,)."""
         if not self.count:
             return self.stated
-        return self.stated.scaled(self.factors(deviations))
+        # Once for all effects that are tried at the same values.
+        if (key := deviations.tobytes()) not in self._last:
+            self._last.clear()
+            self._last[key] = self.stated.scaled(self.factors(deviations))
+        return self._last[key]
+
+    @cached_property
+    def _last(self) -> dict[bytes, Machine]:
+        return {}
 
     def factors(self, deviations: Real) -> dict[str, float]:
         """Key -> true value over stated value."""

@@ -74,6 +74,8 @@ class RecordsToFit:
         self.before_each: Callable[[], None] = lambda: None
         ends = np.cumsum([e.output.size for e in experiments])
         self.parts = [slice(int(b - e.output.size), int(b)) for b, e in zip(ends, experiments, strict=True)]
+        self._firsts = [part.start // case.noise.size for part in self.parts]
+        self._lengths = np.array([[len(e.output)] for e in experiments])
         lacking = [list(getattr(e, "missing", ())) for e in experiments]
         self._missing = [
             (rows, np.setdiff1d(np.arange(len(e.output)), rows))
@@ -125,13 +127,9 @@ class RecordsToFit:
 
     def size_of(self, change: Real) -> float:
         """Largest RMS, over records and outputs, of a change of the coefficients (N,)."""
-        outputs = self.case.noise.size
-        return float(
-            max(
-                np.sqrt(np.max(np.mean(change[part].reshape(-1, outputs) ** 2, axis=0)))
-                for part in self.parts
-            )
-        )
+        squares = np.square(change).reshape(-1, self.case.noise.size)
+        energies = np.add.reduceat(squares, self._firsts)
+        return float(np.sqrt(np.max(energies / self._lengths)))
 
     def residuals_of(self, e: Real) -> tuple[Real, ...]:
         """measured - model (T, Y) of every record from their coefficients (N,)."""

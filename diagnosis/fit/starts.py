@@ -41,10 +41,6 @@ class Point:
     size: float = 0.0
     change: npt.NDArray[np.float32] | None = None
 
-    @property
-    def cost(self) -> float:
-        return 2 * self.loss
-
     def far_from(self, other: Point) -> bool:
         moved = np.max(np.abs(self.coordinates - other.coordinates))
         turned = np.max(np.abs(self.start.zeros - other.start.zeros), initial=0.0)

@@ -22,12 +22,6 @@ from diagnosis.search.loop import Progress
 from diagnosis.search.search import Search
 from plant.effects.search_space import Candidate
 
-_DRAWS = 1000
-# Small effects stay in the repaired model from this share of the model error on.
-_LEAST_KEPT = 0.3
-# Share of the stated model error that may act as an effect does: one standard deviation (set on 40 generated
-# cases, where dry friction and cogging of the background added to what was found).
-_ALIKE = 0.25
 # What closes less than this share of the held-out gap, or leaves as much of the motion, is not put into the
 # model where the cause is unknown.
 _MOST_OF_IT = 0.5
@@ -139,7 +133,7 @@ def _kept(search: Search, whole: judging.Judged, accepted: Iterable[str]) -> Exp
 
     Nor is kept what stands at an end of its range: a size that is no answer, and moves those that are.
     """
-    least = _LEAST_KEPT * search.case.machine.weighing.model_error
+    least = judging.LITTLE * search.case.machine.weighing.model_error
     accepted = set(accepted)
     small = {part.name for part in whole.parts if part.share > least and part.by_name < 1}
     kept = [n for n in whole.explanation.names if n in accepted | small]
@@ -247,11 +241,11 @@ def _intervals(
     rows = slice(first, first + len(candidate.axes))
     inverse = np.asarray(np.linalg.pinv(end.normal(search.records).hessian, hermitian=True), dtype=np.float64)
     rest = judging.best_without(best_of_sets(search.found), explanation, explanation.names[k])
-    alike = _ALIKE * search.case.machine.weighing.model_error
+    alike = judging.LITTLE * search.case.machine.weighing.model_error
     share = max(judging.share_beside(rest, explanation), alike)
     sizes = alike / share * np.array([_size(candidate, i, x) for i, x in enumerate(coordinates)])
     covariance = judging.TEMPER * inverse[rows, rows] + np.outer(sizes, sizes)
-    return parameter_intervals(candidate, coordinates, covariance, rng, _DRAWS)
+    return parameter_intervals(candidate, coordinates, covariance, rng)
 
 
 def _size(candidate: Candidate, i: int, x: float) -> float:

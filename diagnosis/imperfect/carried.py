@@ -10,16 +10,17 @@ from typing import Any
 import numpy as np
 
 from diagnosis.answer import BLOCK, Shares
+from diagnosis.fit.coordinates import DRAWS
 from diagnosis.fit.records import Records
 from diagnosis.imperfect.verdict import is_silent, late
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.rounding import rounding_effect
 from diagnosis.search.explanation import Explanation
+from diagnosis.search.loop import SEVERAL
 from diagnosis.search.search import Search
 
-# Draws of the bootstrap; partial answers that are told.
-_DRAWS, _MOST_TOLD = 1000, 5
-_LEAST_CLOSED, _WORTH_A_THIRD = 0.02, 0.1
+# A further effect of a partial answer closes so much more, a third one twice that.
+_CLOSES = 0.05
 
 
 def shares_of(
@@ -51,7 +52,7 @@ def shares_of(
         chosen: min(_blocks(search, explanation), nothing, key=np.sum)
         for chosen, explanation in subsets.items()
     }
-    drawn = rng.integers(0, blocks[()].size, (_DRAWS, blocks[()].size))
+    drawn = rng.integers(0, blocks[()].size, (DRAWS, blocks[()].size))
     carried = {}
     for name in names if in_time else ():
         value = _shapley(name, names, {c: b.sum(keepdims=True) for c, b in blocks.items()})[0]
@@ -60,7 +61,7 @@ def shares_of(
         carried[name] = (float(value), float(low), float(high))
     ranked = sorted(search.found, key=lambda e: e.evidence)
     closed = {e.key: closed_by(search, e, nominal) for e in ranked if e.names}
-    told = sorted(((c, key) for key, c in closed.items() if _tells(key, closed)), reverse=True)[:_MOST_TOLD]
+    told = sorted(((c, key) for key, c in closed.items() if _tells(key, closed)), reverse=True)[:SEVERAL]
     return Shares(
         names=tuple(search.case.machine.output_names),
         before=tuple(map(float, held.shares(nominal.left_held_out))),
@@ -84,7 +85,7 @@ def closed_by(search: Search, explanation: Explanation, nominal: Explanation) ->
 def _tells(key: tuple[str, ...], closed: Mapping[tuple[str, ...], float]) -> bool:
     """Whether a set closes more than any part of it does."""
     parts = [closed[rest] for rest in combinations(key, len(key) - 1) if rest in closed]
-    more = _LEAST_CLOSED if len(key) < 3 else _WORTH_A_THIRD
+    more = _CLOSES if len(key) < 3 else 2 * _CLOSES
     return closed[key] > max([0.0, *parts]) + more
 
 

@@ -18,58 +18,52 @@ import numpy as np
 from scipy.special import expit, softmax
 from scipy.stats import norm
 
-from diagnosis.evidence.hypotheses import Probabilities
+from diagnosis.evidence.hypotheses import UNLISTED, Probabilities
+from diagnosis.fit.coordinates import DRAWS
+from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL
+from diagnosis.fit.nominal import EDGE
 from diagnosis.fit.records import Records, mean_square_left
 from diagnosis.machine.machine_protocol import Real, Weighing
 from diagnosis.machine.rounding import Rounding, rounding_effect
 from diagnosis.search.explanation import Explanation, best_of_sets
-from diagnosis.search.loop import SUBSTANTIAL
+from diagnosis.search.loop import MANY, SEVERAL
 from diagnosis.search.search import Search
 from plant.effects import LOOK_ALIKES
 
 # Log likelihoods count this much less than independent coefficients would (calibrated on generated cases:
 # `flexlink blind --workshop`); prior densities of stated values count whole.
 TEMPER = 4.0
-_VOLUME = 0.25
 # Prior by number of effects, small ones included, which every machine has: shared among sets of that size.
 _PRIOR_COUNT = (0.2, 0.35, 0.3, 0.1, 0.035, 0.015)
-# The one significance threshold, of every effect: the stated model error. It is soft, its width in natural
-# logarithms.
+# The one significance threshold, of every effect: the stated model error. It is soft, as what is left is
+# uncertain: the width in natural logarithms.
 _SOFT = 0.06
-# Held-out records of which an effect changes less than this (model errors) say nothing about it.
-_SILENT = 0.25
+# Share of the stated model error that is little: held-out records of which an effect changes less say nothing
+# about it, and one standard deviation of it may act as an effect does (set on 40 generated cases, where dry
+# friction and cogging of the background added to what was found).
+LITTLE = 0.25
 # A wrong stated value interests from this many tolerances on.
 _FAR_OFF = 4.4
-# And is none within this many.
-_WITHIN = 2.0
 # What a complete answer leaves, and what an unknown cause does: medians in model errors, widths (logarithms
 # of shares of the motion, normal; any size above its median for an unknown cause), prior of the latter.
 _IMPERFECTIONS, _IMPERFECTIONS_WIDTH = 0.6, 0.65
 _UNKNOWN, _UNKNOWN_WIDTH, _PRIOR_UNKNOWN = 2.2, 0.6, 0.15
-# Share of the motion that is nothing, and how uncertain one is at least (logarithm).
-_LEAST_LEFT, _LEFT_WIDTH = 1e-4, 0.1
+# Share of the motion that is nothing.
+_NOTHING = 1e-4
 # How far off (logarithm) the usual model error may be which stands for one nobody has stated: a judgement.
 _UNSTATED_WIDTH = 0.9
 # After a contact that comes a little early all goes another way: what imperfections leave is more.
 _AFTER_CONTACTS = 2.0
-# A set is out that leaves so much more of the held-out records, in model errors too, than a part of it.
-_WORSE, _WORSE_BY = 1.15, 0.2
+# A set is out that leaves so much more of the held-out records, and more by a little, than a part of it.
+_WORSE = 1.15
 # Beside something unlisted an effect may only stand in for that: as probable as not where it carries nearly
 # as much as is left beside it (the best stand-in of five unlisted causes of labelled cases: .7; documented
 # effects of real and of made machines: from .85 on). Width in logarithms.
 _STANDS_IN, _STANDS_IN_WIDTH = 0.9, 0.3
-# How probable a cause beyond the list is that looks like an effect, beside the effect.
-_UNLISTED = 1 / 3
-# A change is constant that varies by less than this share of itself, the accuracy of difference quotients.
-_CONSTANT = 1e-3
 # Operating points are one where they leave no more of a constant's energy than this, as error bars of a third
 # of them do.
 _SAME_POINT = 0.1
 _LISTED_AS = {name: str(kind.look_alike_of) for name, kind in LOOK_ALIKES.items()}
-# Draws of the Bayesian bootstrap over records.
-_DRAWS = 400
-# Sets this far behind in score take no part.
-_BEHIND, _MOST_SETS, _PASSES = 8.0, 8, 3
 
 
 @dataclass(frozen=True)
@@ -149,10 +143,10 @@ def _gain(explanation: Explanation, listed: Sequence[str]) -> float:
     return (
         explanation.log_likelihood / TEMPER
         + explanation.log_prior
-        + _VOLUME * explanation.log_volume
+        + explanation.log_volume / TEMPER
         + float(np.log(_PRIOR_COUNT[len(candidates)] / comb(len(listed), len(candidates))))
         - further
-        + float(np.log(_UNLISTED)) * sum(name not in listed for name in explanation.names)
+        + float(np.log(UNLISTED)) * sum(name not in listed for name in explanation.names)
     )
 
 
@@ -160,7 +154,7 @@ def judged(search: Search) -> Verdict:
     """The answer from everything that a search has fitted; fits the best set without each of its effects, and
     with simpler ones. What that finds is weighed with all others."""
     nominal = min(search.base, search.stated(), key=lambda e: e.pooled_held_out(search.case.noise))
-    for _ in range(_PASSES):
+    for _ in range(SEVERAL):
         known = len(search.found)
         sets = _weighed(search, nominal)
         if late(search):
@@ -240,7 +234,7 @@ def _weighed(search: Search, nominal: Explanation) -> tuple[Judged, ...]:
     }
     ranked = sorted((best[key] for key in score), key=lambda e: -score[e.key])
     top = score[ranked[0].key]
-    chosen = [e for e in ranked[:_MOST_SETS] if score[e.key] > top - _BEHIND]
+    chosen = [e for e in ranked[:MANY] if score[e.key] > top - DECISIVE]
     in_time = not late(search)
     return tuple(_judged(search, e, best, nominal, fit=in_time and k == 0) for k, e in enumerate(chosen))
 
@@ -250,7 +244,7 @@ def _contradicted(explanation: Explanation, others: Iterable[Explanation], model
     the other records and true of none."""
     left, listed = float(np.max(explanation.shares[1])), _as_listed(explanation)
     parts = [float(np.max(e.shares[1])) for e in others if _as_listed(e) < listed]
-    return bool(parts) and left > max(_WORSE * min(parts), min(parts) + _WORSE_BY * model_error)
+    return bool(parts) and left > max(_WORSE * min(parts), min(parts) + LITTLE * model_error)
 
 
 def _as_listed(explanation: Explanation) -> set[str]:
@@ -318,7 +312,7 @@ def _by_name(search: Search, explanation: Explanation, k: int) -> float:
     added = [-records.likelihood.unseen(column[part], search.case.noise.size) for part in records.parts]
     constant = np.array([np.mean(a, axis=0) for a in added])
     if not np.any(constant) or any(
-        np.ptp(a) > _CONSTANT * np.max(np.abs(a)) for signal in added for a in signal.T if np.any(a)
+        np.ptp(a) > 1e-3 * np.max(np.abs(a)) for signal in added for a in signal.T if np.any(a)
     ):
         return 0.0
     pairs = zip(records.experiments, explanation.left, strict=True)
@@ -326,7 +320,7 @@ def _by_name(search: Search, explanation: Explanation, k: int) -> float:
     point = np.where(constant, point, 0.0)
     share = np.sum(constant * point) / (np.sum(point**2) or 1.0)
     same = np.sum((constant - share * point) ** 2) < _SAME_POINT * np.sum(constant**2)
-    return _UNLISTED / (1 + _UNLISTED) if same and abs(share) < 1 else 0.0
+    return UNLISTED / (1 + UNLISTED) if same and abs(share) < 1 else 0.0
 
 
 def best_without(
@@ -356,7 +350,7 @@ def _part(
     share = float(min(np.sqrt(estimated * held_out), held_out))
     if share < model_error < estimated and is_silent(search, explanation, name):
         share = estimated
-    elif estimated < held_out and score_of(explanation, weighing) > _BEHIND + score_of(rest, weighing):
+    elif estimated < held_out and score_of(explanation, weighing) > DECISIVE + score_of(rest, weighing):
         # Without it the others fit the records they were fitted to as well, with values that others refute.
         share = held_out
     share = max(share, seen.share if seen else 0.0)
@@ -368,14 +362,14 @@ def _part(
         preferred = float(expit(_gain(explanation, listed) - _gain(rest, listed)))
         matters = max(matters, preferred * _soft(off / _FAR_OFF))
         # An effect and a deviation that cancel each other are no finding, whatever a fit without it left.
-        matters *= _soft(off / _WITHIN)
+        matters *= _soft(off / EDGE)
     return Part(name, share, matters)
 
 
 def is_silent(search: Search, explanation: Explanation, name: str) -> bool:
     """Whether held-out records say nothing about an effect: it does nothing there."""
     acts = search.acts_on_held_out(explanation, explanation.names.index(name))
-    return acts < _SILENT * search.case.machine.weighing.model_error
+    return acts < LITTLE * search.case.machine.weighing.model_error
 
 
 def share_beside(rest: Explanation, explanation: Explanation) -> float:
@@ -422,9 +416,9 @@ def below_threshold(search: Search, explanation: Explanation) -> float:
         parts = [fitted.energies(explanation.left), held.energies(explanation.left_held_out)]
         shares = [np.max(mean_square_left(part)) for part in parts]
         energies = np.concatenate(parts, axis=1)
-        logs = np.log(np.maximum(np.max(np.sqrt(energies[0] / energies[1]), axis=1), _LEAST_LEFT))
-        width = np.hypot(_LEFT_WIDTH, np.std(logs) / np.sqrt(logs.size))
-        left = max(float(np.sqrt(np.mean(shares))), _LEAST_LEFT)
+        logs = np.log(np.maximum(np.max(np.sqrt(energies[0] / energies[1]), axis=1), _NOTHING))
+        width = np.hypot(_SOFT, np.std(logs) / np.sqrt(logs.size))
+        left = max(float(np.sqrt(np.mean(shares))), _NOTHING)
         found.append(float(norm.cdf(np.log(case.machine.weighing.model_error / left) / width)))
     return max(found)
 
@@ -451,7 +445,7 @@ def _enough(left: float, weighing: Weighing) -> float:
 def _remaining(left: float, model_error: float, uncertain: float = 0.0) -> tuple[float, float]:
     """Densities of a share of the motion that is left by a complete answer, and beside an unknown cause."""
     width = np.hypot(_IMPERFECTIONS_WIDTH, uncertain)
-    size = np.log(max(left / model_error, 1e-3))
+    size = np.log(max(left / model_error, _NOTHING))
     z = max(size - np.log(_IMPERFECTIONS), 0.0) / width
     u = min(size - np.log(_UNKNOWN), 0.0) / _UNKNOWN_WIDTH
     enough = (1 - _PRIOR_UNKNOWN) / width * np.exp(-0.5 * z**2)
@@ -459,7 +453,7 @@ def _remaining(left: float, model_error: float, uncertain: float = 0.0) -> tuple
 
 
 def _soft(ratio: float, width: float = _SOFT) -> float:
-    return float(expit(np.log(max(ratio, 1e-6)) / width))
+    return float(expit(np.log(max(ratio, _NOTHING)) / width))
 
 
 def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: float) -> Probabilities:
@@ -513,7 +507,7 @@ def _genuine(part: Part, one: Judged) -> float:
     """Probability that an effect of a set is no stand-in for what that leaves; two that only make up for each
     other carry no more than the set does."""
     share = min(part.share, one.carries)
-    return (1 - part.by_name) * _soft(share / _STANDS_IN / max(one.left, 1e-9), _STANDS_IN_WIDTH)
+    return (1 - part.by_name) * _soft(share / _STANDS_IN / max(one.left, _NOTHING), _STANDS_IN_WIDTH)
 
 
 def subsets(items: Iterable[int]) -> list[tuple[int, ...]]:
@@ -530,6 +524,6 @@ def _weights(sets: Sequence[Judged]) -> Real:
     """
     likelihoods = np.array([s.explanation.log_likelihoods for s in sets]) / TEMPER
     count = likelihoods.shape[1]
-    draws = count * np.random.default_rng(0).dirichlet(np.ones(count), _DRAWS)
+    draws = count * np.random.default_rng(0).dirichlet(np.ones(count), DRAWS)
     scores = np.array([s.score for s in sets]) + (draws - 1) @ likelihoods.T
     return np.asarray(np.mean(softmax(scores, axis=1), axis=0))

@@ -10,6 +10,7 @@ from typing import Any, Generic
 import numpy as np
 
 from diagnosis.fit.descent import Descent, best_following, descend
+from diagnosis.fit.likelihood import DECISIVE
 from diagnosis.fit.records import RecordsToFit
 from diagnosis.fit.starts import Point, point_of
 from diagnosis.machine.machine_protocol import CaseOfMachine
@@ -18,9 +19,9 @@ from plant.effects.search_space import Candidate
 
 Progress = Callable[[float, str], None]
 
-# Log odds that are worth a look (7 to 1), and that decide (3 million to 1): before a fit has ended its loss
-# may be off by several.
-SUBSTANTIAL, DECISIVE = 2.0, 15.0
+# How many of what is ranked are followed: what takes many simulations each (ends refined where contacts
+# switch, scans), sets, and effects alone or beside another.
+NEAREST, SEVERAL, MANY = 2, 4, 6
 
 
 class Move(ABC):

@@ -13,46 +13,24 @@ import numpy as np
 from scipy.signal import find_peaks
 
 from diagnosis.fit.descent import Descent, best_following, descend, refined, scanned
+from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL, WORTH_IT
+from diagnosis.fit.nominal import EDGE
 from diagnosis.fit.records import Records, Start
 from diagnosis.fit.starts import Point, beside, point_of, points_of, superposed
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.search.explanation import Weighed, best_of_sets
-from diagnosis.search.loop import DECISIVE, SUBSTANTIAL, Move, SearchLoop
+from diagnosis.search.loop import MANY, NEAREST, SEVERAL, Move, SearchLoop
 from diagnosis.search.settled import settled
 from diagnosis.search.windows import in_windows
 from plant.effects import LOOK_ALIKES, Effect
 from plant.effects.search_space import Candidate
 
-# Starts descended from alone; further ones, local minima of a grid of one value, whatever they leave;
-# iterations of each (with five the serial link's first stage ends 5 % higher).
-_ALONE, _LOCAL_MINIMA, _ITERATIONS = 2, 1, 9
-# Parents extended, and effects fitted beside each: pairs, larger sets.
-_PARENTS, _TRIED = (3, 1), (6, 4)
-# Ends of effects alone that are finished, and sets in which what looks like an effect takes its place.
-FINISHED = 6
-# Sets of an effect in which what looks like it takes its place.
-_ALIKE = 3
-# Beside values pulled this far (tolerances), effects that multiply one are tried as well; pulled farther, in
-# place of the value.
-_PULLED, _BEYOND_BELIEF = 1.8, 2.0
-# Fits in windows: effects tried beside the best, and sets of one and of two continued in free runs.
-_BESIDE_IN_WINDOWS, _FREED = 4, (2, 3)
-# Effects that are descended on alone.
-_DESCENDED = 36
-# Of more effects than that, those of which superposition leaves least are simulated beside a set, and so many
-# times as many as usual are fitted beside values that are pulled.
-_SIMULATED, _OF_PULLED = 24, 2
-# Frequencies tried beside others.
-_FREQUENCIES = 3
-# Loss that an effect beside others gains once all else has followed, or its set is not descended on; unless
-# it is so much worse that the linearisation says nothing (set on 44 generated cases: of 325 in between, one
-# ended more than 15 below).
-_PROMISING, _ASTRAY = 3.0, 20.0
-# Scans of sets with contacts, each of the likeliest that is left or has gained since its last.
-_SCANS = 2
-# Sets of each size with contacts whose starts feel them, and how far behind in evidence they may be.
-_TOUCHING, _TOUCHING_ITERATIONS, _UNLIKELY = 2, 5, 150.0
+# Iterations from each start (with five the serial link's first stage ends 5 % higher).
+_ITERATIONS = 9
+# Effects that are descended on alone; of more, those of which superposition leaves least that are simulated
+# beside a set.
+_DESCENDED, _SIMULATED = 36, 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,14 +83,14 @@ def descended(
     search: SearchLoop[Any], around: Descent, candidate: Candidate, points: Sequence[Point], nominal: Real
 ) -> Descent:
     """The best end of a candidate beside a fit, from its best points that are apart."""
-    chosen, most = [points[0]], 2 * _ALONE if _turned(search, candidate) else _ALONE
+    chosen, most = [points[0]], SEVERAL if _turned(search, candidate) else NEAREST
     for point in points[1:]:
-        if len(chosen) == most or point.loss > search.base.end.loss + 5:
+        if len(chosen) == most or point.loss > search.base.end.loss + WORTH_IT:
             break
         if all(point.far_from(other) for other in chosen):
             chosen.append(point)
     further = [point for point in _local_minima(points) if all(map(point.far_from, chosen))]
-    chosen += further[:_LOCAL_MINIMA]
+    chosen += further[:1]
     ends = [_from(search, around, candidate, point, nominal) for point in chosen]
     return min(ends, key=lambda end: end.loss)
 
@@ -176,7 +154,7 @@ class Enlarge(Move):
                 inner.start,
                 nominal_jacobian=inner.jacobian[:, : inner.deviations.size],
                 columns=inner.columns,
-                iterations=6,
+                iterations=_ITERATIONS,
             )
             for further in self.starts
         ]
@@ -204,28 +182,30 @@ class Beside(Move):
         then those as likely as the likeliest of all sets: a small effect beside one of two that look alike
         decides between them. What interests is unknown where nobody has stated it."""
         pool = list(best_of_sets(search.found).values())
-        parents = [e for e in pool if len(e.names) == count - 1][: _PARENTS[count > 2]]
+        parents = [e for e in pool if len(e.names) == count - 1][: 3 if count == 2 else 1]
         if search.case.machine.weighing.stated and not search.unexplained:
             parents = [e for e in parents if e.evidence > pool[0].evidence - DECISIVE]
-        return [cls(parent.end, _TRIED[count > 2]) for parent in parents]
+        return [cls(parent.end, MANY if count == 2 else SEVERAL) for parent in parents]
 
     def apply(self, search: SearchLoop[Any]) -> None:
         parent = self.parent
         trials = sorted(self._trials(search), key=lambda trial: trial[1].loss)
-        most_pulled = _OF_PULLED * self.most if len(search.points) > _DESCENDED else len(trials)
+        most_pulled = NEAREST * self.most if len(search.points) > _DESCENDED else len(trials)
         chosen: dict[tuple[str, float], tuple[Candidate, Point]] = {}
         for candidate, point in trials:
-            pulled = candidate.kind.multiplies is not None and np.any(np.abs(parent.deviations) > _PULLED)
+            pulled = candidate.kind.multiplies is not None and np.any(np.abs(parent.deviations) > EDGE)
             if len(chosen) < self.most or (pulled and len(chosen) < most_pulled):
                 # Beside contacts that switch, and values pulled far, the one side may look better and the
                 # other be so.
                 side = candidate.axes[0].low if parent.non_smooth or pulled else 0.0
                 chosen.setdefault((candidate.effect, side), (candidate, point))
         nominal = parent.jacobian[:, : parent.deviations.size]
+        # What is not worth it once all else has followed is not descended on; unless it is so much worse that
+        # the linearisation says nothing (of 325 in between, one ended more than 15 below).
         ends = [
             _from(search, parent, candidate, point, nominal)
             for candidate, point in chosen.values()
-            if not -_ASTRAY < parent.loss - point.loss < _PROMISING
+            if not -DECISIVE < parent.loss - point.loss < WORTH_IT
         ]
         for k, end in enumerate(sorted(ends, key=lambda end: end.loss)):
             search.add(search.polished(end, k, parent))
@@ -245,7 +225,7 @@ class Beside(Move):
             anew = candidate.kind.harmonic is not None or _turned(search, candidate)
             candidate, near = search.looked_at_beside(self.parent, candidate, points[:1] if anew else points)
             if anew:
-                further = points_of(search.records, self.parent, candidate, every=2)[:_FREQUENCIES]
+                further = points_of(search.records, self.parent, candidate, every=2)[:SEVERAL]
                 if candidate.kind.harmonic is not None:
                     # Their losses are a linear arm's; where it is not, they may leave less than it would.
                     further += beside(search.records, self.parent, candidate, further)
@@ -271,7 +251,7 @@ class InPlaceOf(Move):
         nominal, listed = search.records.nominal, [candidate for candidate, _ in search.points]
         factors = nominal.factors(parent.deviations)
         for k, key in enumerate(nominal.keys):
-            if abs(parent.deviations[k]) < _BEYOND_BELIEF:
+            if abs(parent.deviations[k]) < EDGE:
                 continue
             found = in_place_of(key, factors[key], listed)
             if found is not None and found[0].effect not in parent.names:
@@ -314,7 +294,7 @@ class InWindows(Move):
         windows = search.anew(in_windows(search.case))
         assert isinstance(windows.records, Records)
         start, _ = settled(windows.records, base.deviations, (), windows.records.at_rest())
-        windows.add(descend(windows.records, (), base.deviations, base.coordinates, start))
+        windows.add(base.on(windows.records, start))
         around = windows.base.end
         for candidate in self.acting:
             points = points_of(windows.records, around, candidate)
@@ -325,13 +305,12 @@ class InWindows(Move):
         if best.loss > around.loss - DECISIVE:
             return
         if not search.late(self.what):
-            Beside(best, _BESIDE_IN_WINDOWS).apply(windows)
-        for count, most in enumerate(_FREED, start=1):
+            Beside(best, SEVERAL).apply(windows)
+        for count in (1, 2):
             of_count = [e.end for e in windows.found if len(e.names) == count]
-            for end in sorted(of_count, key=lambda end: end.loss)[:most]:
+            for end in sorted(of_count, key=lambda end: end.loss)[:NEAREST]:
                 start = Start(end.start.states[:, :states], end.start.zeros)
-                freed = descend(search.records, end.candidates, end.deviations, end.coordinates, start)
-                search.add(refined(search.records, freed))
+                search.add(refined(search.records, end.on(search.records, start)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,7 +327,7 @@ class Scan(Move):
     def proposed(cls, search: SearchLoop[Any]) -> Iterator[Scan]:
         """The likeliest that is left, or has gained since its last."""
         done: dict[tuple[str, ...], float] = {}
-        for _ in range(_SCANS):
+        for _ in range(NEAREST):
             likeliest = (
                 e
                 for key, e in best_of_sets(search.found).items()
@@ -382,24 +361,15 @@ class FromContacts(Move):
         search.touching = True
         sets = [e for e in best_of_sets(search.found).values() if e.end.non_smooth]
         for count in range(1, search.case.machine.weighing.most_effects + 1):
-            for e in [e for e in sets if len(e.names) == count][:_TOUCHING]:
-                if e.evidence >= search.likeliest.evidence - _UNLIKELY:
-                    yield cls(e.end)
+            for e in [e for e in sets if len(e.names) == count][:NEAREST]:
+                yield cls(e.end)
 
     def apply(self, search: SearchLoop[Any]) -> None:
         end = self.end
         assert isinstance(search.records, Records)
         start, _ = settled(search.records, end.deviations, end.effects, end.start, touching=True)
-        again = descend(
-            search.records,
-            end.candidates,
-            end.deviations,
-            end.coordinates,
-            start,
-            nominal_jacobian=end.jacobian[:, : end.deviations.size],
-            touching=True,
-            iterations=_TOUCHING_ITERATIONS,
-        )
+        nominal = end.jacobian[:, : end.deviations.size]
+        again = end.on(search.records, start, nominal_jacobian=nominal, touching=True, iterations=_ITERATIONS)
         search.add(min(end, again, key=lambda one: one.loss))
 
 
@@ -421,9 +391,9 @@ class LookAlike(Move):
         if not isinstance(search.case, Case):
             return
         best = best_of_sets(search.found)
-        likeliest = list(best.values())[:FINISHED]
+        likeliest = list(best.values())[:MANY]
         for kind in LOOK_ALIKES.values():
-            sets = [e for e in likeliest if kind.look_alike_of in e.names][:_ALIKE]
+            sets = [e for e in likeliest if kind.look_alike_of in e.names][:SEVERAL]
             alone = [e for e in best.values() if e.names == (kind.look_alike_of,) and e not in sets]
             yield from (cls(e.end, kind) for e in (*sets, *alone))
 

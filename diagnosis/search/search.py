@@ -9,14 +9,14 @@ from functools import cached_property
 import numpy as np
 
 from diagnosis.fit.descent import FINE, Descent, descend, loss_at, occam, refined
+from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL
 from diagnosis.fit.records import Records, Start, mean_square_left
 from diagnosis.fit.starts import Point, beside
 from diagnosis.fit.windows import Windows
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.search.explanation import Explanation
-from diagnosis.search.loop import DECISIVE, SUBSTANTIAL, Progress, SearchLoop
+from diagnosis.search.loop import MANY, NEAREST, SEVERAL, Progress, SearchLoop
 from diagnosis.search.moves import (
-    FINISHED,
     Alone,
     Beside,
     Enlarge,
@@ -28,11 +28,6 @@ from diagnosis.search.moves import (
 )
 from diagnosis.search.settled import settled
 from plant.effects.search_space import Candidate
-
-# Of every candidate's points, that are tried beside others: the best, and as many of the rest.
-_BESIDE_POINTS = 4
-# Ends beside a set that are refined where contacts switch.
-_REFINED = 2
 
 
 class Search(SearchLoop[Explanation]):
@@ -117,17 +112,17 @@ class Search(SearchLoop[Explanation]):
         self, parent: Descent, candidate: Candidate, points: Sequence[Point]
     ) -> tuple[Candidate, list[Point]]:
         """The best and, because beside another effect any size may be right, some of the rest."""
-        rest = points[_BESIDE_POINTS:]
-        some = [*points[:_BESIDE_POINTS], *rest[:: max(1, len(rest) // _BESIDE_POINTS)]]
+        rest = points[SEVERAL:]
+        some = [*points[:SEVERAL], *rest[:: max(1, len(rest) // SEVERAL)]]
         return candidate, beside(self.records, parent, candidate, some)
 
     def polished(self, end: Descent, rank: int, around: Descent) -> Descent:
         alone = not around.candidates
-        if rank >= (FINISHED if alone else _REFINED):
+        if rank >= (MANY if alone else NEAREST):
             return end
         if alone:
             # Slopes of the nominal lead to an end that need not be one by slopes of its own.
-            end = descend(self.records, end.candidates, end.deviations, end.coordinates, end.start, **FINE)
+            end = end.on(self.records, **FINE)
         return refined(self.records, self.begun(end))
 
     def begun(self, end: Descent) -> Descent:
@@ -139,7 +134,7 @@ class Search(SearchLoop[Explanation]):
         loss, _ = loss_at(self.records, e, end.deviations, start)
         if loss > end.loss - SUBSTANTIAL:
             return end
-        return descend(self.records, end.candidates, end.deviations, end.coordinates, start)
+        return end.on(self.records, start)
 
     def acts_on_held_out(self, explanation: Explanation, k: int) -> float:
         """Share of the motion that the k-th effect changes of held-out records, all else as it is; of the
@@ -158,17 +153,7 @@ class Search(SearchLoop[Explanation]):
 
     def finished(self, explanation: Explanation) -> Explanation:
         """Descended to its end."""
-        end = explanation.end
-        return self.add(
-            descend(
-                self.records,
-                end.candidates,
-                end.deviations,
-                end.coordinates,
-                end.start,
-                **FINE,
-            )
-        )
+        return self.add(explanation.end.on(self.records, **FINE))
 
     def stated(self, of: Explanation | None = None) -> Explanation:
         """With nominal values as stated, effects as they are: only the starts are fitted."""
@@ -183,9 +168,7 @@ class Search(SearchLoop[Explanation]):
     def left_by(self, other: Explanation) -> Real:
         """(2, Y) shares of the motion here that the same effects leave, descended on from where another
         search ended."""
-        end = other.end
-        here = descend(self.records, end.candidates, end.deviations, end.coordinates, end.start)
-        return np.sqrt(self.explained(here).mean_squares)
+        return np.sqrt(self.explained(other.end.on(self.records)).mean_squares)
 
     def explained(self, end: Descent) -> Explanation:
         """With what it predicts of the held-out records, their starts fitted (`settled`)."""

@@ -49,9 +49,9 @@ class ArmInWindows(FlexibleArm):
             return found.ravel()
 
         def responses(effects: Sequence[Effect], samples: int) -> list[Real]:
-            whole = []
+            whole, each = [], once.responses(effects, L) if once.responses else ()
             for first in range(0, self.windows * L, L):
-                for response in once.responses(effects, L) if once.responses else ():
+                for response in each:
                     placed = np.zeros((samples, response.shape[1]))
                     placed[first : first + L] = response[: max(samples - first, 0)]
                     whole.append(placed)

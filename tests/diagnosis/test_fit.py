@@ -80,7 +80,7 @@ def test_few_of_many_frequencies_have_the_best_among_them(tmp_path, monkeypatch,
     assert len(everywhere) > 200
     best, *others = points_of(model, base, space)
     assert len(others) == 39
-    assert (best.cost, best.coordinates[1]) == (everywhere[0].cost, everywhere[0].coordinates[1])
+    assert (best.loss, best.coordinates[1]) == (everywhere[0].loss, everywhere[0].coordinates[1])
 
 
 # On seed 6 a thousandth of the gap changes a record by 0.6 noise deviations: quotients over steps of half a
