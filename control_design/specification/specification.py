@@ -104,7 +104,11 @@ class Specification(BaseModel):
     rate_limit: _Positive | None = Field(
         default=None, description="largest change of the command, input unit per second"
     )
-    controller_order: int = Field(default=4, ge=1, le=16, description="number of controller states")
+    controller_order: Annotated[int, Field(ge=1, le=16)] | Literal["auto"] = Field(
+        default=4,
+        description="number of controller states; auto: the lowest within 2 % of what a controller of any "
+        "order reaches",
+    )
     structure: Literal["biquads", "pi_d_notch"] = Field(
         default="biquads",
         description="biquads: free cascade; pi_d_notch: integrator (if set), lead/lag and free notches",
@@ -147,6 +151,10 @@ class Specification(BaseModel):
                 raise ValueError("mode_band_rad_s needs mode_peak_ratio or mode_damping")
         if self.mode_damping is not None and self.mode_band_rad_s is None:
             raise ValueError("mode_damping needs mode_band_rad_s: the band whose modes are meant")
+        if self.controller_order == "auto":
+            if self.structure != "biquads":
+                raise ValueError("controller_order = 'auto' needs structure 'biquads'; give a number")
+            return self
         smallest = 1 if self.structure == "biquads" else 1 + int(self.integrator)
         if self.controller_order < smallest:
             raise ValueError(
@@ -162,6 +170,10 @@ class Specification(BaseModel):
 
     def sections(self) -> tuple[SectionKind, ...]:
         """Section kinds of the cascade, integrator first."""
+        if self.controller_order == "auto":
+            raise SpecificationError(
+                "controller_order = 'auto': the synthesis chooses it; give a number here"
+            )
         head: list[SectionKind] = ["integrator"] if self.integrator else []
         rest = self.controller_order - len(head)
         real: list[SectionKind] = ["first_order"] * (1 if self.structure == "pi_d_notch" else rest % 2)

@@ -37,7 +37,8 @@ def synthesise_widest(
     options, tell = options or SynthesisOptions(), progress or (lambda fraction, message: None)
     top, lowest = specification.bandwidth_rad_s, specification.lowest_bandwidth_rad_s
     if top is None or lowest is None:
-        return specification, synthesise(plants, specification, options, rng=rng, progress=progress)
+        found = synthesise(plants, specification, options, rng=rng, progress=progress)
+        return with_order(specification, found), found
     count = 1 + int(np.ceil(np.log(top / lowest) / np.log(_RATIO)))
     tried = [stated(specification, value) for value in np.geomspace(top, lowest, max(count, 2)).tolist()]
     root, quick = int(rng.integers(2**63)), options.model_copy(update=_QUICK)
@@ -57,7 +58,14 @@ def synthesise_widest(
         found = synthesise(plants, one, options, rng=np.random.default_rng(root), progress=progress)
         if found.gamma <= 1.0:
             break
-    return one, found
+    return with_order(one, found), found
+
+
+def with_order(specification: Specification, found: SynthesisResult) -> Specification:
+    """The specification with the order that was chosen where "auto" was asked and a design found."""
+    if specification.controller_order != "auto" or not found.controller.order:
+        return specification
+    return specification.model_copy(update={"controller_order": found.controller.order})
 
 
 def stated(specification: Specification, bandwidth_rad_s: float) -> Specification:

@@ -121,6 +121,17 @@ class OrderSearch:
         gamma = result.best.gamma
         return result, self._enough([result.best]) or near(gamma) or agreed(gamma)
 
+    def fits_only(self, free: FreeControllers, enough: float) -> OrderResult:
+        """From one fit of each controller of any order; without exchange where that leaves more than
+        `enough`."""
+        found = list(self._done([self._task(x) for x in self._fits(free, 0)]))
+        if min((c.gamma_grid for c in found), default=np.inf) > enough:
+            found = [c for c in found if np.isfinite(c.gamma)]
+            best = min(found, key=lambda c: c.gamma, default=None)
+            return OrderResult(best, tuple(self.reports), () if best is None else (best.gamma,))
+        ends = self._retrieved(found)
+        return self._exchange(ends, hops=False) if ends else OrderResult(None, tuple(self.reports), ())
+
     def _fits(self, free: FreeControllers, turn: int) -> list[Real]:
         """Stable fits of the controllers of any order; from the second turn on with random weights."""
         damping = max(1.01 * (self.spec.controller_damping or 0.0), _NO_RESONANCE)

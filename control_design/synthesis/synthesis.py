@@ -9,11 +9,12 @@ import numpy as np
 
 from control_design.controllers.biquads import Cascade, SectionKind
 from control_design.controllers.controller import Controller
+from control_design.convex.convex_options import YoulaOptions
 from control_design.plants.ellipses import Real, scale_to_minus_one
 from control_design.plants.frequency_grid import local_maxima
 from control_design.plants.guards import Guard
 from control_design.plants.plant_set import UncertainPlant
-from control_design.specification import Specification
+from control_design.specification import Specification, SpecificationError
 from control_design.synthesis.order_search import OrderResult, OrderSearch
 from control_design.synthesis.problem import Problem
 from control_design.synthesis.starts import with_cancelling_section
@@ -34,6 +35,10 @@ ROBUST = "stability over the ellipse"
 DELAYED = "stability with the extra delay"
 GUARDED = "stability of a sampled response"
 DAMPING = "damping of the controller's own poles"
+
+_WITHIN = 1.02  # of the Youla bound: what the order "auto" may leave
+_GAINS = 0.99  # two more states that leave more than this of gamma end the search for "auto"
+_MIDDLE, _HIGHEST = 5, 12  # orders that "auto" tries: the first, and the last
 
 _PLACES = 5  # named of each plant
 
@@ -57,7 +62,8 @@ def synthesise(
 
     thorough : search from many starts where those from the Youla bound do not settle it.
 
-    Raises SpecificationError if specification and plants contradict each other (before optimising).
+    Raises SpecificationError if specification and plants contradict each other (before optimising), and for
+    the order "auto" where no bound is known. "auto": see `_of_lowest_order`.
 
     Controllers of the Youla bound, fitted by ones of the asked order, are improved first. They mostly end
     near the bound, or agree: see `OrderSearch.quick`. Otherwise many starts follow. Every controller of order
@@ -70,6 +76,8 @@ def synthesise(
     specification = _seen_by_the_data(specification, plants)
     tell = progress or (lambda fraction, message: None)
     problem = Problem(tuple(plants), specification, options, tuple(guards))
+    if specification.controller_order == "auto":
+        return _of_lowest_order(problem, int(rng.integers(2**63)), tell)
     own_damping = max(0.8, 1.01 * (specification.controller_damping or 0.0))
     root = int(rng.integers(2**63))
     cascade = Cascade(specification.sections(), problem.dt_s, problem.scale_rad_s)
@@ -87,17 +95,77 @@ def synthesise(
             found = _climbed(workshop, pool, ladder, root, own_damping, result.best, rest, reports)
             worse = result.best is None or (found.best and found.best.gamma <= result.best.gamma)
             result = found if worse else result
+    return _told(problem, cascade, result, tuple(reports), tell)
+
+
+def _of_lowest_order(problem: Problem, root: int, tell: Progress) -> SynthesisResult:
+    """The lowest order within `_WITHIN` of the Youla bound, as far as fits of the bound's controllers tell.
+
+    Orders are tried from a middle one upwards, or downwards where that is enough, each from these fits alone:
+    a longer search may reach the bound with one state less. Where none reaches it, the lowest within as much
+    of the best order tried. Several plants may have bounds that no common controller reaches; a damping asked
+    of the controller is not part of the bound.
+    """
+    specification, limit = problem.spec, problem.options.sufficient_gamma
+    tell(0.0, "bound for any order")
+    free = free_controllers(problem.plants, specification, YoulaOptions())
+    if not free.each:
+        raise SpecificationError(
+            "controller_order = 'auto' needs the Youla bound, which this plant has not; give a number"
+        )
+    enough = max(_WITHIN * free.gamma if np.isfinite(free.gamma) else 0.0, limit)
+    workshop, reports = Workshop(problem), list[StartReport]()
+    found: dict[int, tuple[float, OrderResult]] = {}
+    with WorkPool(workshop, problem.options.jobs) as pool:
+
+        def search(order: int) -> OrderSearch:
+            sections = specification.model_copy(update={"controller_order": order}).sections()
+            cascade = Cascade(sections, problem.dt_s, problem.scale_rad_s)
+            part = part_of(tell, len(found), _HIGHEST, f"order {order}: ")
+            return OrderSearch(workshop, pool, cascade, np.random.default_rng([root, order]), part)
+
+        def gamma(order: int) -> float:
+            own = search(order)
+            own.tell(0.0, "fits of the bound")
+            result = own.fits_only(free, enough)
+            reports.extend(own.reports)
+            found[order] = np.inf if result.best is None else result.best.gamma, result
+            return found[order][0]
+
+        order, within = _MIDDLE, enough
+        while gamma(order) > enough and order < _HIGHEST:
+            if order - 2 in found and found[order][0] > _GAINS * found[order - 2][0]:
+                break
+            order += 1
+        if found[order][0] > enough:
+            within = _WITHIN * min(value for value, _ in found.values())
+            order = min(number for number, (value, _) in found.items() if value <= within)
+        if order == _MIDDLE:
+            while order > 1 and gamma(order - 1) <= within:
+                order -= 1
+        own = search(order)
+        result = found[order][1]
+        if found[order][0] > enough:
+            result, _ = own.quick(free)
+            reports += own.reports
+        cascade = own.cascade
+    return _told(problem, cascade, result, tuple(reports), tell)
+
+
+def _told(
+    problem: Problem, cascade: Cascade, result: OrderResult, reports: tuple[StartReport, ...], tell: Progress
+) -> SynthesisResult:
     best = result.best
     if best is None or best.gamma >= _MEANINGLESS:
         nearest = result.nearest if best is None else best.parameters
-        return _nothing_stable(problem, cascade, nearest, best, tuple(reports))
+        return _nothing_stable(problem, cascade, nearest, best, reports)
     tell(1.0, f"gamma {best.gamma:.4g}")
     return SynthesisResult(
         outcome=Outcome.MET_ON_GRID if best.gamma <= 1.0 else Outcome.NOT_MET,
         controller=problem.controller(cascade, best.parameters),
         gamma=best.gamma,
         blocking=_blocking(problem, cascade, best),
-        starts=tuple(reports),
+        starts=reports,
         gamma_history=result.history,
         grid_points=sum(grid.size for grid in problem.grids),
     )

@@ -51,13 +51,15 @@ class FreeControllers:
     gamma: float
 
 
-def free_controllers(plants: Sequence[UncertainPlant], specification: Specification) -> FreeControllers:
-    """Controllers of the Youla bound on a small basis, one plant after the other."""
+def free_controllers(
+    plants: Sequence[UncertainPlant], specification: Specification, options: YoulaOptions = _SMALL
+) -> FreeControllers:
+    """Controllers of the Youla bound, on a small basis if not told otherwise, one plant after the other."""
     found: list[FreeController] = []
     gamma = 0.0
     for plant in plants:
         try:
-            problem = BracketProblem(plant, specification, _SMALL, accuracy=_ACCURACY)
+            problem = BracketProblem(plant, specification, options, accuracy=_ACCURACY)
         except (ValueError, ArithmeticError):  # no factorisation: the bound does not know such a plant
             return FreeControllers(tuple(found), np.inf)
         answers = problem.answers()

@@ -399,7 +399,12 @@ def test_controls_are_made_of_the_specification(session):
     assert known["effort_limit"]["optional"]
     assert known["structure"]["choices"] == ["biquads", "pi_d_notch"]
     assert known["integrator"]["kind"] == "switch"
+    assert known["controller_order"]["unasked"] == "auto"
     assert "mode_band_rad_s" not in known
+
+
+def test_an_order_of_its_own_choice(session):
+    assert 1 <= session.design({"controller_order": "auto"})["order"] <= 12
 
 
 def test_a_plant_of_its_own_grid_has_curves_on_it(session):

@@ -107,7 +107,8 @@ def design_controller(
     with progress.stage("design") as update:
         done = _design(plants, specification, asked, seed, update)
     certificate, certified = done.certify.certificate, done.certify.certified
-    controller, order = done.design.controller, specification.controller_order
+    controller = done.design.controller
+    order = (done.design.specification or specification).controller_order
     files: list[Path] = []
     if out is not None and controller is not None:
         found = done.reference_filter.filter

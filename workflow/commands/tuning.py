@@ -328,6 +328,8 @@ def _control(name: str, field: FieldInfo, value: Any) -> dict[str, Any] | None:
     words, optional = str(field.description), type(None) in _kinds(field.annotation)
     kinds = [kind for kind in _kinds(field.annotation) if kind is not type(None)]
     found: dict[str, Any] = {"name": name, "words": words, "value": value, "optional": optional}
+    if kinds == [int, "auto"]:
+        found["optional"], found["unasked"], kinds = True, kinds.pop(), [int]
     if kinds == [bool]:
         return {**found, "kind": "switch"}
     if kinds and all(isinstance(kind, str) for kind in kinds):

@@ -50,7 +50,7 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
             certify,
             loop,
             achievable,
-            config.specification.controller_order,
+            (design.specification or config.specification).controller_order,
             untold_below_rad_s(results.uncertainty.channels[config.control_index].frequency),
         ),
         report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
@@ -62,7 +62,7 @@ def verdict_of(
     certify: CertifyResult,
     loop: ClosedLoopResult,
     achievable: AchievablePerformance | None = None,
-    order: int | None = None,
+    order: int | str | None = None,
     untold_rad_s: float = 0.0,
 ) -> str:
     """One line: certified, or what is missed, by how much and at which frequency; where the achievable

@@ -31,7 +31,7 @@ const STEPS = 200;
 for (const one of SETTINGS) {
   const stated = one.value != null && (one.kind !== "switch" || one.value) && one.kind !== "choice";
   const row = make("div", $(stated || one.name === "controller_order" ? "stated" : "further"), "", {class: "control"});
-  make("label", row, one.name.replace(/_rad_s$/, " [rad/s]").replace(/_s$/, " [s]").replaceAll("_", " "), {for: "c-" + one.name, title: one.words});
+  make("label", row, one.name.replace(/_rad_s$/, " [rad/s]").replace(/_s$/, " [s]").replaceAll("_", " ") + (one.unasked ? `, or ${one.unasked}` : ""), {for: "c-" + one.name, title: one.words});
   const line = make("div", row), id = "c-" + one.name;
   if (one.kind === "switch" || one.kind === "choice") {
     const box = one.kind === "switch" ? make("input", line, "", {type: "checkbox", id}) : make("select", line, "", {id});
@@ -43,7 +43,8 @@ for (const one of SETTINGS) {
     continue;
   }
   const whole = one.kind === "count", top = one.le ?? one.lt, bottom = one.ge ?? one.gt ?? 0;
-  const guess = one.value ?? (one.name.includes("rad_s") ? 10 : one.name.includes("_s") ? .01 : top === 1 ? .5 : 10);
+  const value = one.value === one.unasked ? null : one.value;
+  const guess = value ?? (one.name.includes("rad_s") ? 10 : one.name.includes("_s") ? .01 : top === 1 ? .5 : whole ? 5 : 10);
   const log = !whole && !(top <= 1 && bottom < 1 && guess > .02), room = top === undefined ? guess * 20 : top;
   const [low, high] = whole ? [bottom, room] : log ? [guess / 20, Math.min(guess * 20, room)]
     : [bottom + (one.ge === undefined ? .01 : 0), room - (one.le === undefined ? .005 * (room - bottom) : 0)];
@@ -54,10 +55,10 @@ for (const one of SETTINGS) {
   const slider = make("input", line, "", {type: "range", id, min: 0, max: count, step: 1});
   const box = make("input", line, "", {type: "number", step: "any", "aria-label": one.name});
   if (!one.optional) asked.style.visibility = "hidden";
-  const get = () => one.optional && !asked.checked ? null : Number(box.value);
+  const get = () => one.optional && !asked.checked ? one.unasked ?? null : Number(box.value);
   const set = v => {
-    asked.checked = v != null;
-    box.value = v ?? Number(guess.toPrecision(3));
+    asked.checked = v != null && v !== one.unasked;
+    if (asked.checked || !box.value) box.value = asked.checked ? v : Number(guess.toPrecision(3));
     slider.value = place(Number(box.value));
     slider.setAttribute("aria-valuetext", box.value);
   };
@@ -177,7 +178,7 @@ const numbers = () => {
   $("numbers").replaceChildren();
   const rows = [
     ["worst case γ", "gamma", 4], ["γ of any order, bound", "bound", 4], ["modulus margin", "modulus", 3], ["phase margin, deg", "phase_deg", 3],
-    ["gain margin, factor", "gain_margin", 3], ["delay margin, ms", "delay_ms", 3], ["bandwidth, rad/s", "bandwidth", 4],
+    ["gain margin, factor", "gain_margin", 3], ["delay margin, ms", "delay_ms", 3], ["bandwidth, rad/s", "bandwidth", 4], ["controller order", "order", 3],
   ];
   for (const [words, key, n] of rows) {
     const box = make("div", $("numbers")), old = shown.stale && key !== "gamma";
@@ -196,10 +197,11 @@ const numbers = () => {
   }
 };
 // One panel: x and y as [low, high, log]; returns places and the group for curves, cut at the frame.
-const panel = (title, [xl, xh, xlog], [yl, yh, ylog], xwords) => {
+const panel = (title, [xl, xh, xlog], [yl, yh, ylog], xwords, even = false) => {
   const box = make("div", $("panels"));
   make("h3", box, title);
   const w = Math.max(box.clientWidth, 240), h = 225, [l, r, t, b] = [46, 8, 8, 34], name = "clip" + $("panels").childElementCount;
+  if (even) [xl, xh] = [-1, 1].map(side => (xl + xh) / 2 + side * (yh - yl) * (w - l - r) / (h - t - b) / 2);
   const svg = draw("svg", box, {viewBox: `0 0 ${w} ${h}`, role: "img", "aria-label": title});
   const to = (v, low, high, log) => log ? Math.log(v / low) / Math.log(high / low) : (v - low) / (high - low);
   const x = v => l + (w - l - r) * to(v, xl, xh, xlog), y = v => h - b - (h - t - b) * to(v, yl, yh, ylog);
@@ -208,7 +210,7 @@ const panel = (title, [xl, xh, xlog], [yl, yh, ylog], xwords) => {
     const p = across ? x(v) : y(v);
     draw("path", svg, {class: "tick", d: across ? `M${p} ${t}V${h - b}` : `M${l} ${p}H${w - r}`});
     const far = across ? {x: Math.min(p, w - 14), y: h - b + 14, "text-anchor": "middle"} : {x: l - 5, y: p + 4, "text-anchor": "end"};
-    draw("text", svg, far, digits(v, 3));
+    draw("text", svg, far, Math.abs(v) > 0 && Math.abs(v) < 1e-3 ? v.toExponential(0).replace("-", "−") : digits(v, 3));
   }
   draw("rect", svg, {class: "frame", x: l, y: t, width: w - l - r, height: h - t - b});
   draw("text", svg, {x: (l + w - r) / 2, y: h - 4, "text-anchor": "middle"}, xwords);
@@ -249,7 +251,7 @@ const panels = () => {
     if (other) draw("path", group, {class: "curve pinned", d: path(other.gains[k].x, other.gains[k].worst, x, y)});
     for (const kind of ["worst", "nominal", "limit"]) draw("path", group, {class: "curve " + kind, d: path(one.x, one[kind], x, y)});
   });
-  const size = 2.2, [nx, ny, group] = panel("Nyquist: K G and its ellipses", [-2.6, 1.8, false], [-size, size / 2, false], "real part");
+  const size = 2.2, [nx, ny, group] = panel("Nyquist: K G and its ellipses", [-2.6, 1.8, false], [-size, size / 2, false], "real part", true);
   const radius = controls.modulus_margin?.get() ?? 0, turn = [...Array(61).keys()].map(k => k * Math.PI / 30);
   draw("path", group, {class: "curve limit", d: path(turn.map(v => radius * Math.cos(v) - 1), turn.map(v => radius * Math.sin(v)), nx, ny)});
   for (const [re, im] of plant.nyquist.ellipses) draw("path", group, {class: "band", d: path(re, im, nx, ny) + "Z"});

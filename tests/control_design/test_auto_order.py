@@ -1,0 +1,88 @@
+"""`controller_order = "auto"`: the lowest order near what a controller of any order reaches."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+
+from control_design.convex.youla import youla_bracket
+from control_design.plants.plant_set import UncertainPlant
+from control_design.plants.stated_uncertainty import StatedDiscs
+from control_design.plants.weights import RationalWeight
+from control_design.specification import Specification, SpecificationError
+from control_design.synthesis.bandwidth import synthesise_widest
+from control_design.synthesis.synthesis import synthesise
+from validation.example_plants import flexible_link, flexible_link_specification
+
+
+def auto(specification: Specification, **more) -> Specification:
+    return Specification.model_validate(specification.model_dump() | {"controller_order": "auto"} | more)
+
+
+def lag(seconds: float, name: str = "lag", gain: float = 1.0) -> UncertainPlant:
+    """First order, sampled at 20 Hz, with 5 % around it."""
+    nominal = control.sample_system(control.ss(control.tf([gain], [seconds, 1.0])), 0.05)
+    discs = StatedDiscs(nominal, RationalWeight(numerator=(0.05,), denominator=(1.0,)), "multiplicative")
+    return UncertainPlant(name, nominal, discs)
+
+
+WISH = Specification(bandwidth_rad_s=2.0, modulus_margin=0.5, effort_limit=10.0, integrator=True)
+
+
+@pytest.mark.parametrize("size", ["A", "C"])
+def test_the_order_is_enough_and_one_less_is_not_by_fits(size):
+    plant, asked = flexible_link(size), flexible_link_specification(5)
+    bound = youla_bracket(plant, asked).ellipse
+    found = synthesise([plant], auto(asked), rng=np.random.default_rng(1))
+    assert found.gamma <= 1.02 * bound * 1.001  # the bound itself to 0.1 %
+    order = found.controller.order
+    below = asked.model_copy(update={"controller_order": order - 2})
+    less = synthesise([plant], below, rng=np.random.default_rng(1), thorough=False)
+    assert less.gamma > 1.02 * bound
+
+
+def test_a_simple_plant_has_a_simple_controller():
+    simple = synthesise([lag(0.5)], auto(WISH), rng=np.random.default_rng(1))
+    flexible = synthesise(
+        [flexible_link("A")], auto(flexible_link_specification(5)), rng=np.random.default_rng(1)
+    )
+    assert 1 <= simple.controller.order < flexible.controller.order
+
+
+def test_same_generator_same_design():
+    one, other = (synthesise([lag(0.5)], auto(WISH), rng=np.random.default_rng(7)) for _ in range(2))
+    assert np.array_equal(one.controller.A, other.controller.A)
+    assert one.gamma == other.gamma
+
+
+@pytest.mark.slow
+def test_plants_whose_bounds_no_common_controller_reaches():
+    plants = [lag(0.3, "light"), lag(1.5, "heavy", gain=3.0)]
+    found = synthesise(plants, auto(WISH), rng=np.random.default_rng(1))
+    assert np.isfinite(found.gamma)
+    higher = WISH.model_copy(update={"controller_order": 7})
+    best = synthesise(plants, higher, rng=np.random.default_rng(1), thorough=False).gamma
+    assert found.gamma <= 1.03 * best
+
+
+def test_the_order_that_was_chosen_is_stated():
+    stated, found = synthesise_widest([lag(0.5)], auto(WISH), rng=np.random.default_rng(1))
+    assert stated.controller_order == found.controller.order
+    wide = auto(WISH, bandwidth_rad_s=40.0, lowest_bandwidth_rad_s=1.0)
+    stated, found = synthesise_widest([lag(0.5)], wide, rng=np.random.default_rng(1))
+    assert stated.controller_order == found.controller.order
+    assert stated.bandwidth_rad_s < 40.0
+
+
+@pytest.mark.parametrize("order", ["automatic", 0, 17, 2.5])
+def test_other_words_and_numbers_are_refused(order):
+    with pytest.raises(ValueError, match="controller_order"):
+        Specification.model_validate({"controller_order": order})
+
+
+def test_what_has_no_auto_says_so():
+    with pytest.raises(ValueError, match="biquads"):
+        Specification(controller_order="auto", structure="pi_d_notch")
+    with pytest.raises(SpecificationError, match="give a number"):
+        auto(WISH).sections()
