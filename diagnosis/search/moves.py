@@ -205,7 +205,7 @@ class Beside(Move):
         ends = [
             _from(search, parent, candidate, point, nominal)
             for candidate, point in chosen.values()
-            if not -DECISIVE < parent.loss - point.loss < WORTH_IT
+            if not -DECISIVE < parent.loss - point.loss < SUBSTANTIAL
         ]
         for k, end in enumerate(sorted(ends, key=lambda end: end.loss)):
             search.add(search.polished(end, k, parent))
