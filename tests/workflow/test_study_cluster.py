@@ -19,8 +19,8 @@ import pytest
 
 from tests.workflow.command import ROOT, finish, start_flexlink, wait_until
 from tests.workflow.study_examples import SMALL_STUDY, TWO_POINTS, assert_same_study, write_study
-from workflow.engine.cluster import SILENT_S, DaskCluster
 from workflow.engine.errors import StageError
+from workflow.engine.executor import SILENT_S, DaskCluster
 from workflow.study.settings import load_study
 from workflow.study.work import run_study
 
@@ -125,9 +125,7 @@ def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, tmp
     assert process.returncode == 1
     assert out == b""
     lines = [line for line in complaint.decode().splitlines() if not re.match(r"flexlink: \d+ s: ", line)]
-    assert lines == [
-        f"flexlink: the Dask scheduler at {cluster.address} was lost; --resume continues the study"
-    ]
+    assert lines == [f"flexlink: the Dask scheduler at {cluster.address} was lost; --resume continues it"]
     done = finished_points(tmp_path / "out")
     assert 1 <= done < 6
     run_study(load_study(study), tmp_path / "out", resume=True, jobs=2)
@@ -153,7 +151,7 @@ class Sleep:
 def test_a_network_that_stalls(cluster, monkeypatch, who, words):
     """A process that is stopped keeps its connections and says nothing, as behind a dead switch."""
     for name, seconds in {"SILENT_S": 8, "WITHOUT_WORKERS_S": 8, "ANSWER_S": 2, "_ASK_S": 0.2}.items():
-        monkeypatch.setattr(f"workflow.engine.cluster.{name}", seconds)
+        monkeypatch.setattr(f"workflow.engine.executor.{name}", seconds)
     cluster.add_worker()
     with closing(DaskCluster(cluster.address)) as far:
         found = far.run([Sleep(0.0), Sleep(300.0)])
@@ -161,7 +159,7 @@ def test_a_network_that_stalls(cluster, monkeypatch, who, words):
         stalled = cluster.scheduler if who == "scheduler" else cluster.workers[0]
         stalled.send_signal(signal.SIGSTOP)
         began_s = time.monotonic()
-        with pytest.raises(StageError, match=f"{words}; --resume continues the study"):
+        with pytest.raises(StageError, match=f"{words}; --resume continues it"):
             next(found)
     assert time.monotonic() - began_s < 30
 
@@ -173,7 +171,7 @@ def test_a_stalled_study_goes_on_elsewhere(cluster, near, tmp_path):
     assert SILENT_S + 20 <= 60
     cluster.add_worker()
     study, call = far_study(tmp_path, cluster.address)
-    patience = "from workflow.engine import cluster; cluster.SILENT_S, cluster.ANSWER_S = 8.0, 2.0"
+    patience = "from workflow.engine import executor; executor.SILENT_S, executor.ANSWER_S = 8.0, 2.0"
     process = start_flexlink(*call, first=patience)
     wait_until(lambda: finished_points(tmp_path / "out") >= 1, process)
     cluster.scheduler.send_signal(signal.SIGSTOP)
@@ -181,8 +179,7 @@ def test_a_stalled_study_goes_on_elsewhere(cluster, near, tmp_path):
     said = finish(process, 1, seconds=120)
     assert time.monotonic() - began_s < 8 + 20
     assert said == (
-        f"flexlink: the Dask scheduler at {cluster.address} has not answered for 8 s; "
-        "--resume continues the study\n"
+        f"flexlink: the Dask scheduler at {cluster.address} has not answered for 8 s; --resume continues it\n"
     )
     run_study(load_study(study), tmp_path / "out", resume=True, jobs=2)
     assert_same_study(near, tmp_path / "out")
@@ -208,7 +205,7 @@ def test_another_version_on_the_worker(cluster, tmp_path, flexlink):
 
 
 def test_scheduler_without_workers(cluster, refused, tmp_path, monkeypatch):
-    monkeypatch.setattr("workflow.engine.cluster.WITHOUT_WORKERS_S", 0.5)
+    monkeypatch.setattr("workflow.engine.executor.WITHOUT_WORKERS_S", 0.5)
     line = refused(*far_study(tmp_path, cluster.address)[1])
     assert "no worker within" in line
     assert f"dask worker {cluster.address}" in line
@@ -219,7 +216,7 @@ def test_nobody_at_the_address(refused, tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed", reason="the extra 'distributed' is not installed")
     # A client left half made is closed whenever it is collected: that could hang the next one.
     monkeypatch.setattr(distributed, "Client", lambda *_, **__: pytest.fail("a client was made"))
-    monkeypatch.setattr("workflow.engine.cluster.CONNECT_S", 1.0)
+    monkeypatch.setattr("workflow.engine.executor.CONNECT_S", 1.0)
     address = f"tcp://127.0.0.1:{free_port()}"
     line = refused(*far_study(tmp_path, address)[1])
     assert line == f"flexlink: --scheduler {address}: no Dask scheduler answers there\n"
@@ -229,7 +226,7 @@ def test_nobody_at_the_address(refused, tmp_path, monkeypatch):
 @pytest.mark.parametrize("address", ["", "nonsense://127.0.0.1:1", "127.0.0.1:nine"])
 def test_an_address_that_is_none(refused, tmp_path, address, monkeypatch):
     pytest.importorskip("distributed", reason="the extra 'distributed' is not installed")
-    monkeypatch.setattr("workflow.engine.cluster.CONNECT_S", 1.0)
+    monkeypatch.setattr("workflow.engine.executor.CONNECT_S", 1.0)
     line = refused(*far_study(tmp_path, address)[1])
     assert "--scheduler" in line
     assert not (tmp_path / "out").exists()

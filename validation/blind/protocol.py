@@ -13,7 +13,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,7 @@ from validation.blind.workshop.cases import SHARES
 from validation.blind.workshop.score import FAMILIES
 from workflow.engine.codec import plain_text
 from workflow.engine.errors import InputError
-from workflow.engine.executor import Failure, LocalProcesses
+from workflow.engine.executor import Failure, workers
 from workflow.engine.progress import Progress
 from workflow.engine.storage import read_json, sha256_of_file, write_bytes, write_json, write_text
 from workflow.engine.store import Store
@@ -164,8 +163,10 @@ def _predict(out: Path, names: Sequence[str], jobs: int, diagnose: Diagnose, pro
     todo = [name for name in names if not (folder / f"{name}.json").is_file()]
     done = len(names) - len(todo)
     work = [BlindCase(out / "cases" / name, out.resolve(), diagnose) for name in todo]
-    processes = LocalProcesses(jobs, preload=["validation.blind.worker"])
-    with closing(processes), progress.stage("diagnosis", taken_up=not todo) as update:
+    with (
+        workers(jobs, preload=["validation.blind.worker"]) as processes,
+        progress.stage("diagnosis", taken_up=not todo) as update,
+    ):
         for index, found in processes.run(work):
             document = failed(todo[index], found.reason) if isinstance(found, Failure) else found
             write_json(folder / f"{todo[index]}.json", document)

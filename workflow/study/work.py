@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from workflow.engine import codec, storage
-from workflow.engine.cluster import DaskCluster
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import InputError, StageError
-from workflow.engine.executor import Executor, Failure, LocalProcesses
+from workflow.engine.executor import Executor, Failure, workers
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.report.rendering import render_page
@@ -72,10 +71,8 @@ def run_study(
     processes = jobs or os.cpu_count() or 1
     # A cluster that does not answer is found out before anything is written.
     with ExitStack() as stack:
-        here = stack.enter_context(closing(LocalProcesses(processes, preload=["workflow.study.task"])))
-        executor: Executor = here
-        if scheduler is not None:
-            executor = stack.enter_context(closing(DaskCluster(scheduler)))
+        here = stack.enter_context(workers(processes, preload=["workflow.study.task"]))
+        executor = here if scheduler is None else stack.enter_context(workers(processes, scheduler))
         with StudyDirectory(out).writing(resume=resume, replace=replace):
             directory = StudyDirectory.begin(out, text=file.text, base=base, resume=resume, replace=replace)
             share = _POINT_S * count / executor.width
@@ -107,7 +104,7 @@ class _Work:
     base: Base
     base_point: Point
     executor: Executor
-    here: LocalProcesses
+    here: Executor
     progress: Progress
     count: int
     broken_plants: dict[str, str] = field(default_factory=dict)
