@@ -96,6 +96,12 @@ def _described(field: FieldInfo, own_default: object) -> str:
 Jobs = Annotated[
     int | None, typer.Option(min=1, help="Processes on this machine [default: one per processor]")
 ]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        help="Compute on the workers of a Dask cluster, e.g. tcp://host:8786 (extra 'distributed')."
+    ),
+]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Continue what is in --out; what is finished there is kept.")
 ]
@@ -667,12 +673,7 @@ def study(
     config: Annotated[Path, typer.Option(help="TOML file of the study (see examples/study.toml).")],
     out: Annotated[Path, typer.Option(help="Directory of the study, new or empty.")],
     jobs: Jobs = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            help="Compute the points on a Dask cluster, e.g. tcp://host:8786 (extra 'distributed')."
-        ),
-    ] = None,
+    scheduler: Scheduler = None,
     resume: Resume = False,
     replace: Replace = False,
     time_limit: TimeLimit = None,
@@ -681,8 +682,7 @@ def study(
 ) -> None:
     """Controller tuning study: specification, ellipses, synthesis or payload varied over one plant."""
     need(config)
-    if jobs is not None and scheduler is not None:
-        raise InputError("--jobs and --scheduler contradict each other: the cluster's workers set the number")
+    _one_of(jobs, scheduler)
     with _watched(quiet) as progress:
         from workflow.study.settings import load_study
 
@@ -765,6 +765,7 @@ def diagnose(
         ),
     ] = None,
     jobs: Jobs = None,
+    scheduler: Scheduler = None,
     resume: Resume = False,
     replace: Replace = False,
     controller: Annotated[
@@ -792,6 +793,7 @@ def diagnose(
     if of_logs and not model:
         option = f"--{next(iter(of_logs)).replace('_', '-')}"
         raise InputError(f"diagnose: {option} is of --mjcf, --fmu or --python; a case file says it itself")
+    _one_of(jobs, scheduler)
     case = case or []
     need(*([Path(name) for name in (*model.values(), *(log or []))] if model else []))
     if case and not any(place.exists() for place in case):
@@ -813,6 +815,7 @@ def diagnose(
             out,
             rig=rig,
             jobs=jobs,
+            scheduler=scheduler,
             resume=resume,
             replace=replace,
             controller=controller,
@@ -827,6 +830,11 @@ def diagnose(
         _complain(line, found.exit_code)
     if found.exit_code != EXIT_OK:
         raise typer.Exit(found.exit_code)
+
+
+def _one_of(jobs: int | None, scheduler: str | None) -> None:
+    if jobs is not None and scheduler is not None:
+        raise InputError("--jobs and --scheduler contradict each other: the cluster's workers set the number")
 
 
 def _watched(quiet: bool) -> TerminalProgress:

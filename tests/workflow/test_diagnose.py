@@ -7,6 +7,7 @@ import re
 import shutil
 import time
 import tomllib
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 
@@ -40,7 +41,9 @@ QUESTIONS = (
 
 def made(folder, engine, *, rig=None, controller=False):
     """Files of one case, computed here."""
-    files, _ = Work(load_case(folder, rig), {"controller": controller}, "code", engine).run(lambda f, m: None)
+    files, _ = Work(load_case(folder, rig), {"options": {"controller": controller}}, engine).run(
+        lambda f, m: None
+    )
     return files
 
 
@@ -167,7 +170,7 @@ def test_doubts_are_said_on_the_page_and_in_the_terminal(folder, undrawn, tmp_pa
     page = " ".join(re.sub(r"<[^>]+>", " ", files["arm.html"].decode()).split())
     for doubt, end in zip(doubts, (".", ""), strict=True):
         assert f"This makes the answer doubtful: {doubt}{end}" in page
-    shown = command._summary([json.loads(files["arm.json"])], [], tmp_path).sections
+    shown = command._summary([json.loads(files["arm.json"])], [], [], tmp_path).sections
     rows = [row for section in shown for row in section.rows if row[0] == "doubtful"]
     assert [row[1] for row in rows] == list(doubts)
 
@@ -306,7 +309,7 @@ def here(monkeypatch):
             for index, one in enumerate(tasks):
                 yield index, attempt(partial(one.run, partial(watch, index)))
 
-    monkeypatch.setattr(command, "LocalProcesses", Here)
+    monkeypatch.setattr(command, "workers", lambda jobs, *_: closing(Here(jobs)))
     monkeypatch.setattr(outputs, "case_page", lambda content, report: "<html></html>\n")
 
 

@@ -44,7 +44,7 @@ def check(request, monkeypatch):
 
 
 def _page(folder, engine):
-    files, _ = Work(load_case(folder), {"controller": False}, "code", engine).run(lambda f, m: None)
+    files, _ = Work(load_case(folder), {"options": {"controller": False}}, engine).run(lambda f, m: None)
     return files, re.sub("<[^>]*>", "", files["arm.html"].decode())
 
 

@@ -242,7 +242,7 @@ def outputs_replayed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str,
 
     def name(task: Any) -> str:
         points = getattr(task, "points", None)
-        return task.loaded.case.name if points is None else f"{task.stages} of {points[0].name}"
+        return task.name if points is None else f"{task.stages} of {points[0].name}"
 
     def keep(self: LocalProcesses, tasks: Sequence[Any], watch: Any = None) -> Iterator[tuple[int, Any]]:
         for index, found in compute(self, tasks, watch):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace as changed
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from workflow.config.settings import repeated
 from workflow.diagnose.case_files import LoadedCase, load_case
 from workflow.diagnose.case_settings import CASE_FILE, case_document
 from workflow.diagnose.directory import DiagnosisDirectory
+from workflow.diagnose.fleet import Machine, csv_text, groups, trends
 from workflow.diagnose.outputs import Work
 from workflow.diagnose.simulator_case import (
     SimulatorCase,
@@ -24,7 +25,7 @@ from workflow.diagnose.simulator_case import (
     load_simulator_case,
     settings_of,
 )
-from workflow.diagnose.words import FILTERS, closure_words, short_answer
+from workflow.diagnose.words import FILTERS, short_answer
 from workflow.engine import codec
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import (
@@ -36,20 +37,22 @@ from workflow.engine.errors import (
     StageError,
     one_line,
 )
-from workflow.engine.executor import Failure, LocalProcesses
+from workflow.engine.executor import Executor, Failure, Report, workers
 from workflow.engine.progress import Progress
 from workflow.report.rendering import render_page
 from workflow.text.templates import RunSummary, rows_of
 
 _Failed = tuple[str, Failure]  # case, why it has no answer
 _CASE_S, _OVERVIEW_S = 30.0, 1.0  # expected: they shape the progress bar only
+# Of more cases the terminal shows groups alone, and the overview draws no line for each.
+_MOST_SHOWN = 20
 
 
 @dataclass(frozen=True, eq=False)
 class DiagnosisRun:
     """What a call left behind: the JSON answers in the order asked for, cases without one, the exit code."""
 
-    documents: tuple[Mapping[str, Any], ...]
+    documents: Answers
     failures: tuple[_Failed, ...]
     summary: RunSummary
 
@@ -86,6 +89,7 @@ def diagnose_cases(
     *,
     rig: str | None = None,
     jobs: int | None = None,
+    scheduler: str | None = None,
     resume: bool = False,
     replace: bool = False,
     controller: bool = True,
@@ -97,64 +101,133 @@ def diagnose_cases(
 
     places: case folders or files, or what a simulator's case file says, with files in the current folder.
     rig: file in each case folder that is read in place of the one its case file names. jobs: processes
-    (default: one per processor). time_limit_s: see `diagnosis.diagnose`, in whose place tests put a quick
+    (default: one per processor). scheduler: address of a Dask scheduler whose workers see the same files.
+    time_limit_s: see `diagnosis.diagnose`, in whose place tests put a quick
     `engine`. A case that fails does not lose the others; one that fails alone raises InputError or
     StageError. Raises InputError (one line, nothing written) if no case can be read, two have one name, or
     `out` cannot be used.
     """
     progress = progress or Progress()
-    loaded, unreadable = _load(places, rig)
     code = code_digest("diagnosis", drawing=True)
     limits: dict[str, Any] = {} if time_limit_s is None else {"time_limit_s": time_limit_s}
     options, engine = {"controller": controller, **limits}, partial(engine or diagnose, **limits)
-    work = [Work(one, options, code, engine) for one in loaded]
-    with DiagnosisDirectory(out).writing(resume=resume, replace=replace):
+    work, unreadable = _load(places, lambda place: PlacedCase(place, rig, Path.cwd(), options, code, engine))
+    width = max(1, min(jobs or os.cpu_count() or 1, len(work)))
+    preload = ["diagnosis.diagnosis", "workflow.diagnose.command"]
+    with (
+        workers(width, scheduler, preload) as executor,
+        DiagnosisDirectory(out).writing(resume=resume, replace=replace),
+    ):
         directory = DiagnosisDirectory.begin(
             out,
-            inputs={one.case.name: one.input_sha256 for one in loaded},
+            inputs={one.name: one.input_sha256 for one in work},
             options=options,
             resume=resume,
             replace=replace,
         )
-        documents, failures = _compute(directory, work, jobs or os.cpu_count() or 1, progress)
+        machines, failures = _compute(directory, work, executor, progress)
         failures = [*unreadable, *failures]
         if len(places) == 1 and failures:
             directory.discard_if_empty()
             failure = failures[0][1]
             raise (InputError if failure.bad_input else StageError)(failure.reason)
-        page = out / f"{loaded[0].case.name}.html"
+        documents = Answers(directory, [one.name for one in machines])
+        page = out / f"{work[0].name}.html"
         if len(places) > 1:
             page = out / "index.html"
             with progress.stage("overview"):
-                directory.write("index.html", _overview(documents, failures).encode())
-    return DiagnosisRun(tuple(documents), tuple(failures), _summary(documents, failures, page))
+                failed = {case: failure.reason for case, failure in failures}
+                directory.write("index.html", _overview(machines, failed).encode())
+                directory.write("fleet.csv", csv_text(machines, failed).encode())
+        summary = _summary(documents, machines, failures, page)
+    return DiagnosisRun(documents, tuple(failures), summary)
 
 
 _Loaded = LoadedCase | SimulatorCase
 
 
-def _load(places: Sequence[Path | SimulatorSettings], rig: str | None) -> tuple[list[_Loaded], list[_Failed]]:
-    loaded: list[_Loaded] = []
+@dataclass(frozen=True)
+class Answers(Sequence[Mapping[str, Any]]):
+    """JSON answers, read when they are looked at: a thousand would not fit."""
+
+    directory: DiagnosisDirectory
+    names: Sequence[str]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: Any) -> Any:
+        name = self.names[index]
+        return self.directory.answer(name) if isinstance(name, str) else Answers(self.directory, name)
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedCase:
+    """A case by its place, read where it is done: whoever has a thousand of them holds no record.
+
+    folder: of relative places. See `Work` for the others.
+    """
+
+    place: Path | SimulatorSettings
+    rig: str | None
+    folder: Path
+    options: Mapping[str, Any]
+    code_sha256: str
+    diagnose: Callable[..., Diagnosis]
+    name: str = ""
+    input_sha256: str = ""
+
+    def read(self) -> PlacedCase:
+        """With name and hash of what stands there. Raises InputError."""
+        loaded = _loaded(self.place, self.rig)
+        return changed(self, name=loaded.case.name, input_sha256=loaded.input_sha256)
+
+    @property
+    def made_from(self) -> dict[str, Any]:
+        """See `Work`."""
+        return {
+            "input_sha256": self.input_sha256,
+            "code_sha256": self.code_sha256,
+            "options": {**self.options},
+        }
+
+    def run(self, report: Report) -> tuple[dict[str, bytes], float]:
+        """See `Work`. Raises StageError: other code or files than where the work was given out."""
+        if self.code_sha256 != code_digest("diagnosis", drawing=True):
+            raise StageError(
+                "the code of the worker is not that of the diagnosis: another version, or edited"
+            )
+        place = self.folder / self.place if isinstance(self.place, Path) else self.place
+        loaded = _loaded(place, self.rig, self.folder)
+        if loaded.input_sha256 != self.input_sha256:
+            raise StageError(f"case {self.name}: its files changed meanwhile; run the command again")
+        return Work(loaded, self.made_from, self.diagnose).run(report)
+
+
+def _load(
+    places: Sequence[Path | SimulatorSettings], task: Callable[[Path | SimulatorSettings], PlacedCase]
+) -> tuple[list[PlacedCase], list[_Failed]]:
+    loaded: list[PlacedCase] = []
     failures: list[_Failed] = []
     for place in places:
         try:
-            loaded.append(_loaded(place, rig))
+            loaded.append(task(place).read())
         except InputError as error:
             named = place.resolve() if isinstance(place, Path) else Path(place.model)
             failures.append((named.name, Failure(str(error), bad_input=True)))
     if not loaded:
         more = f" (and {len(failures) - 1} more cases cannot be read)" if len(failures) > 1 else ""
         raise InputError(failures[0][1].reason + more)
-    if (name := repeated([one.case.name for one in loaded])) is not None:
+    if (name := repeated([one.name for one in loaded])) is not None:
         raise InputError(
             f"two cases are called {name!r}: give one another name in its {CASE_FILE} (key 'case')"
         )
     return loaded, failures
 
 
-def _loaded(place: Path | SimulatorSettings, rig: str | None) -> _Loaded:
+def _loaded(place: Path | SimulatorSettings, rig: str | None, folder: Path = Path()) -> _Loaded:
     if isinstance(place, SimulatorSettings):
-        return load_simulator_case(place, Path(), "--log")
+        return load_simulator_case(place, folder, "--log")
     file, document = case_document(place)
     if not is_simulator(document):
         return load_case(place, rig)
@@ -164,14 +237,12 @@ def _loaded(place: Path | SimulatorSettings, rig: str | None) -> _Loaded:
 
 
 def _compute(
-    directory: DiagnosisDirectory, work: Sequence[Work], jobs: int, progress: Progress
-) -> tuple[list[dict[str, Any]], list[_Failed]]:
-    order = [one.loaded.case.name for one in work]
-    there = {name: directory.finished(name, one.made_from) for name, one in zip(order, work, strict=True)}
-    answers = {name: known for name, known in there.items() if known is not None}
-    todo = {name: one for name, one in zip(order, work, strict=True) if name not in answers}
-    names, several = list(todo), len(work) > 1
-    width = max(1, min(jobs, len(todo)))
+    directory: DiagnosisDirectory, work: Sequence[PlacedCase], executor: Executor, progress: Progress
+) -> tuple[list[Machine], list[_Failed]]:
+    there = {one.name: directory.finished(one.name, one.made_from) for one in work}
+    answers = {name: Machine.of(known) for name, known in there.items() if known is not None}
+    todo = {one.name: one for one in work if one.name not in answers}
+    names, several, width = list(todo), len(work) > 1, executor.width
     progress.plan(
         [("cases", _CASE_S * len(todo) / width), *((("overview", _OVERVIEW_S),) if several else ())]
     )
@@ -185,9 +256,8 @@ def _compute(
         words = f"{done} of {len(work)} done, {names[index]}: {message}" if several else message
         progress.update("cases", sum(shares) / len(todo), words)
 
-    processes = LocalProcesses(width, preload=["diagnosis.diagnosis", "workflow.diagnose.outputs"])
     with progress.stage("cases", taken_up=not todo):
-        for index, found in processes.run(list(todo.values()), watch):
+        for index, found in executor.run(list(todo.values()), watch):
             name = names[index]
             if isinstance(found, Failure):
                 failures[name] = found
@@ -195,30 +265,42 @@ def _compute(
                 files, cpu_s = found
                 timings[name] = {"cpu_s": round(cpu_s, 3)}
                 directory.save(name, {**files, "timings.json": codec.plain_text(timings).encode()})
-                answers[name] = json.loads(files[f"{name}.json"])
+                answers[name] = Machine.of(json.loads(files[f"{name}.json"]))
             watch(index, 1.0, "done")
     return (
-        [answers[name] for name in order if name in answers],
-        [(name, failures[name]) for name in order if name in failures],
+        [answers[one.name] for one in work if one.name in answers],
+        [(one.name, failures[one.name]) for one in work if one.name in failures],
     )
 
 
-def _overview(documents: Sequence[Mapping[str, Any]], failures: Sequence[_Failed]) -> str:
-    """The page of several cases: a picture, a table with links, and what failed."""
-    failed = {case: failure.reason for case, failure in failures}
-    cases = [
-        {**answer, "name": answer["case"], "answer": short_answer(answer), "closed": closure_words(answer)}
-        for answer in documents
-    ]
-    page = "diagnosis/overview.html.j2"
-    return render_page(page, filters=FILTERS.items(), title="Gap diagnosis", cases=cases, failed=failed).html
+def _overview(machines: Sequence[Machine], failed: Mapping[str, str]) -> str:
+    """The page of several cases: groups of one cause, trends, a picture, a table with links, what failed."""
+    return render_page(
+        "diagnosis/overview.html.j2",
+        filters=FILTERS.items(),
+        title="Gap diagnosis",
+        cases=machines,
+        groups=groups(machines),
+        trends=trends(machines),
+        drawn=len(machines) <= _MOST_SHOWN,
+        failed=failed,
+    ).html
 
 
-def _summary(documents: Sequence[Mapping[str, Any]], failures: Sequence[_Failed], page: Path) -> RunSummary:
-    count, table = len(documents), "diagnosis/summary.j2"
+def _summary(
+    documents: Answers, machines: Sequence[Machine], failures: Sequence[_Failed], page: Path
+) -> RunSummary:
+    count, several = len(documents), len(documents) > 1
     return RunSummary(
         title="Gap diagnosis",
-        sections=rows_of(table, FILTERS.items(), documents=documents, failures=failures),
+        sections=rows_of(
+            "diagnosis/summary.j2",
+            FILTERS.items(),
+            documents=documents if count <= _MOST_SHOWN else (),
+            groups=groups(machines) if several else (),
+            trends=trends(machines) if several else (),
+            failures=failures,
+        ),
         verdict=short_answer(documents[0])
         if count == 1 and not failures
         else f"{count} of {count + len(failures)} cases answered",

@@ -5,7 +5,7 @@
     <case>.rig.toml            repaired rig; <case>.effects.toml the effects to add, where there are any
     <case>.xml                 repaired MuJoCo model, of a case that names one
     <case>.next.csv            voltage of the experiment to run next, where one is proposed
-    index.html                 overview of several cases
+    index.html fleet.csv       overview of several cases; a row with everything for each
     timings.json               seconds per case; the only file that differs from run to run
 
 The JSON file of a case is written last and names the hashes of the others and of itself: a case whose JSON
@@ -43,7 +43,7 @@ class DiagnosisDirectory(Store):
 
     what = "diagnosis"
     manifest_name = MANIFEST
-    own_files = ("index.html", "timings.json")
+    own_files = ("index.html", "fleet.csv", "timings.json")
 
     def own_entries(self) -> Sequence[str]:
         """Files of the cases that the manifest names, and the overview."""
@@ -101,6 +101,10 @@ class DiagnosisDirectory(Store):
             if not file.is_file() or storage.sha256_of_file(file) != digest:
                 return None
         return document
+
+    def answer(self, case: str) -> dict[str, Any]:
+        """Of a case that is done."""
+        return storage.read_json(self.path / f"{case}.json")
 
     def timings(self) -> dict[str, Any]:
         """Seconds per case so far."""

@@ -34,22 +34,12 @@ _DIAGNOSED, _WHERE, _NEXT, _CONTROLLER = 0.75, 0.8, 0.85, 0.9
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """One case to do, here or in a process of its own. options: what else the answer depends on, of which
-    `controller` says whether the controllers are compared; diagnose: `diagnosis.diagnose` with the others."""
+    """One case to do. made_from: what the answer depends on (equal entries, equal answer); of its `options`
+    `controller` says whether the controllers are compared. diagnose: `diagnosis.diagnose` with the others."""
 
     loaded: LoadedCase | SimulatorCase
-    options: Mapping[str, float]
-    code_sha256: str
+    made_from: Mapping[str, Any]
     diagnose: Callable[..., Diagnosis]
-
-    @property
-    def made_from(self) -> dict[str, Any]:
-        """What the answer depends on: equal entries, equal answer."""
-        return {
-            "input_sha256": self.loaded.input_sha256,
-            "code_sha256": self.code_sha256,
-            "options": dict(self.options),
-        }
 
     def run(self, report: Report) -> tuple[dict[str, bytes], float]:
         """File name -> content, and the CPU time of the process so far [s].
@@ -68,7 +58,9 @@ class Work:
             report(_WHERE, "next experiment")
             coming = following(found)
             report(_NEXT, "controller")
-            check, no_check = _control(found) if self.options["controller"] else (None, "not_asked")
+            check, no_check = (
+                _control(found) if self.made_from["options"]["controller"] else (None, "not_asked")
+            )
         rig_name, effects_name = f"{case.name}.rig.toml", f"{case.name}.effects.toml"
         effects = effects_text(found) if found.repair else ""
         rig = rig_text(

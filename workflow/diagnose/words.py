@@ -80,6 +80,21 @@ def closure_words(document: Mapping[str, Any]) -> str:
     return f"{number(100 * closed, 4)} % ({number(low, 4)} to {number(high, 4)})"
 
 
+def trend_words(found: Any) -> str:
+    """A `fleet.Trend` in one sentence."""
+    what = (
+        f"{in_words(found.effect)}: {name_words(found.parameter)}"
+        if found.effect
+        else key_words(found.parameter)
+    )
+    grows = "grows" if found.tau > 0 else "falls"
+    slope = si(abs(found.per_number), unit_of(found.parameter), 3)
+    return (
+        f"{what} {grows} with the number in the name, by {slope} per number (Kendall's tau {found.tau:.2f}, "
+        f"p = {found.p:.1g}, {found.machines} machines)"
+    )
+
+
 FILTERS: Mapping[str, Callable[..., str]] = {
     "effect": in_words,
     "parameter_unit": unit_of,
@@ -92,4 +107,5 @@ FILTERS: Mapping[str, Callable[..., str]] = {
     "sureness": sureness,
     "short_answer": short_answer,
     "closure": closure_words,
+    "trend": trend_words,
 }

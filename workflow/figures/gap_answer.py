@@ -3,7 +3,7 @@ what to do with it: the proposed experiment, what the gap means for a loop."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -102,18 +102,18 @@ def _bars(
 
 
 @style.drawing("gap_overview")
-def draw_case_gaps(cases: Sequence[Mapping[str, Any]]) -> Figure:
-    """One line per case, from its JSON answer with `name` and `answer` in words: RMS over noise with the
-    nominal parameters, and with the effects added."""
-    before, after = ([case[key] for case in cases] for key in ("gap_before", "gap_after"))
-    at, floor = np.arange(len(cases)), float(np.median([case["noise_floor"] for case in cases]))
+def draw_case_gaps(cases: Sequence[Any]) -> Figure:
+    """One line per case (`fleet.Machine`): RMS over noise with the nominal parameters, and with the effects
+    added."""
+    before, after = ([case.numbers[key] for case in cases] for key in ("gap_before", "gap_after"))
+    at, floor = np.arange(len(cases)), float(np.median([case.numbers["noise_floor"] for case in cases]))
     figure, axes = style.panels(1.5 + 0.32 * len(cases))
     axes.plot([before, after], [at, at], color="#999999", lw=1.0, zorder=1)
     for model, values in (("stated", before), ("repaired", after)):
         axes.plot(values, at, _LOOKS[model][0], ms=7, **_label(model))
     axes.axvline(floor, **gap_style.FLOOR, zorder=0)
     axes.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(2 * floor, *before)))
-    axes.set_yticks(at, [f"{style.plain(c['name'], 34)}: {style.plain(c['answer'], 44)}" for c in cases])
+    axes.set_yticks(at, [f"{style.plain(c.name, 34)}: {style.plain(c.answer, 44)}" for c in cases])
     axes.set(ylim=(len(cases) - 0.5, -0.5), xlabel=f"held-out {gap_style.RESIDUAL_AXIS}")
     axes.set_title("How far each gap shrinks")
     return figure
