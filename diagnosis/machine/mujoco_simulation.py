@@ -94,6 +94,30 @@ class Simulation:
             found, moved = found + weight * (again - found), moved + weight * (shift - moved)
         return found
 
+    def stick_figure(self, outputs: Real) -> Real | None:
+        """(F, Y) -> (F, L, 2, 3) [m] ends of lines: from body to body, of a last one to its
+        first site, else to its centre of mass. None where a joint is not measured."""
+        model, data = self.arm.nominal, mujoco.MjData(self.arm.nominal)
+        if len(self.arm.tracked) < model.njnt:
+            return None
+        mujoco.mj_resetData(model, data)
+        bodies = [k for k in range(1, model.nbody) if model.body_weldid[k]]
+        sites = {int(model.site_bodyid[s]): s for s in reversed(range(model.nsite))}
+        found = []
+        for row in outputs:
+            for k, joint, _ in self.arm.tracked:
+                data.joint(joint).qpos[0] = row[k]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            lines = []
+            for k in bodies:
+                lines.append((data.xpos[model.body_parentid[k]].copy(), data.xpos[k].copy()))
+                if k not in model.body_parentid:
+                    end = data.site_xpos[sites[k]] if k in sites else data.xipos[k]
+                    lines.append((data.xpos[k].copy(), end.copy()))
+            found.append(lines)
+        return np.array(found)
+
     def _model(self, changed: Mapping[str, float]) -> tuple[Any, Any]:
         return _remembered(
             self._models, tuple(changed.items()), lambda: self._compiled(self.edited(changed)), _KEPT

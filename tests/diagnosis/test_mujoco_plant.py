@@ -46,6 +46,16 @@ def test_outputs_have_the_units_of_their_joints_and_sensors():
     assert plant_of(rod(), torque, turned(torque))[0].units == {"hinge": "rad"}
 
 
+def test_a_stick_figure_stands_where_its_joint_says():
+    torque = steps()
+    plant, _ = plant_of(rod(), torque, turned(torque))
+    angles = np.array([0.0, 0.4, -1.2])
+    lines = plant.untracked.stick_figure(angles[:, None])
+    tips = np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+    np.testing.assert_allclose(lines[:, -1, 1], tips, atol=1e-12)
+    np.testing.assert_allclose(lines[:, -1, 0], 0 * tips, atol=1e-12)
+
+
 def steps(seed: int = 0, count: int = 200) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1, 1, count // 20).repeat(20)
 

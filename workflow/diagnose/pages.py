@@ -22,6 +22,7 @@ from plant.effects import EFFECTS
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.controller_check import ControllerCheck
 from workflow.diagnose.following import Following, following
+from workflow.diagnose.stick_figures import moving_figures
 from workflow.diagnose.words import FILTERS
 from workflow.engine import storage
 from workflow.report.rendering import render_page
@@ -73,6 +74,7 @@ def plant_page(found: Diagnosis, coming: Following, told: RunSummary | None = No
         "remains": remains_of(found),
         "next_experiment": coming,
         "told": told,
+        "moving": moving_figures(found),
         "numbers": json.dumps(numbers, indent=1),
     }
     return _rendered("diagnosis/plant.html.j2", found, page=page)

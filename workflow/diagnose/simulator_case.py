@@ -108,13 +108,8 @@ class SimulatorCase:
     rig_file: str
     input_sha256: str
     repaired: Callable[[Diagnosis], str] | None
-    made_of: tuple[SimulatorSettings, Path, str] = field(repr=False)
     descriptions: Mapping[str, str] = field(default_factory=dict)
     suspected: tuple[str, ...] = ()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """A simulator lives in one process: another one loads it again."""
-        return load_simulator_case, self.made_of
 
 
 def is_simulator(document: Mapping[str, Any]) -> bool:
@@ -162,7 +157,6 @@ def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) 
         model.name,
         hash_of({"settings": settings.model_dump(mode="json"), "files": hashes}),
         repaired,
-        (settings, folder, source),
     )
 
 
