@@ -57,6 +57,7 @@ def identify_mimo(
     options: IdentOptions | None = None,
     *,
     free_shapes: bool = False,
+    start: Poles | None = None,
     progress: Progress | None = None,
 ) -> MimoIdentification:
     """Fit one model with shared poles to all inputs and outputs of all records together.
@@ -68,6 +69,8 @@ def identify_mimo(
         As for `identify`, the same for every channel: integrators (at most one in a row; each joint has its
         own), delay and direct terms. A relative degree is refused, and what you know is not tested.
     free_shapes : leave every residue free, instead of giving modes one shape where the records let them
+    start : Poles, optional. Of the same machine at a neighbouring operating point: the search begins at them,
+        and still decides on the order.
     progress : callable, optional. Called with a fraction 0..1 and a short message.
 
     Raises ValueError, one line, if a record cannot be used: an output that stands still or is another one
@@ -89,7 +92,6 @@ def identify_mimo(
     report = progress or silent
     _refuse_outputs(records, options)
     white = np.diag(1 / np.std(np.concatenate([record.output for record in records]), axis=0))
-    start: Poles | None = None
     for turn in range(_ROUNDS):
         share = partial(_part, report, turn)
         found = _searched(whitened(records, white), options, share, start)

@@ -15,6 +15,7 @@ from .excitation import (
 )
 from .experiment_plan import ExperimentPlan as ExperimentPlan
 from .modal import linear_arm as linear_arm
-from .presets import paper_link as paper_link
+from .presets import paper_link as paper_link, two_link_arm as two_link_arm
 from .rig import Rig as Rig, parameter_keys as parameter_keys
 from .simulation import SampledArm as SampledArm, Trajectory as Trajectory, simulate as simulate
+from .two_link import TwoLinkArm as TwoLinkArm, TwoLinkMachine as TwoLinkMachine

@@ -1,8 +1,9 @@
-"""An arm to start from: the paper's link with a motor of our choosing."""
+"""Arms to start from: the paper's link with a motor of our choosing, and two such links."""
 
 from __future__ import annotations
 
 from plant.rig import Hub, Link, Motor, Payload, Rig, Sampling, Sensors
+from plant.two_link import TwoLinkArm
 
 
 def paper_link() -> Rig:
@@ -29,4 +30,32 @@ def paper_link() -> Rig:
         payload=Payload(mass_kg=0.0),
         sensors=Sensors(hub_angle_noise_rad=0.001, tip_noise_m=0.0005),
         sampling=Sampling(dt_s=0.005),
+    )
+
+
+def two_link_arm(
+    payload_kg: float = 0.05,
+    coulomb_Nm: tuple[float, float] = (0.0, 0.0),
+    gravity_m_s2: float = 0.0,
+    n_modes: int = 1,
+) -> TwoLinkArm:
+    """Two aluminium links with motors of our choosing. Link 2 is the paper's, half as long; link 1 is twice
+    as thick."""
+    far = paper_link().link.model_copy(update={"length_m": 0.5, "kelvin_voigt_s": 0.0003})
+    near = far.model_copy(update={"thickness_m": 2 * far.thickness_m})
+    return TwoLinkArm(
+        links=(near, far),
+        hubs=(
+            Hub(inertia_kg_m2=0.03, radius_m=0.0, viscous_friction_Nms=0.02),
+            Hub(inertia_kg_m2=0.004, radius_m=0.0, viscous_friction_Nms=0.005),
+        ),
+        motors=(
+            Motor(torque_constant_Nm_A=0.036, back_emf_Vs_rad=0.036, resistance_ohm=1.7, gear_ratio=40.0),
+            Motor(torque_constant_Nm_A=0.02, back_emf_Vs_rad=0.02, resistance_ohm=2.5, gear_ratio=26.0),
+        ),
+        elbow_mass_kg=0.25,
+        payload_kg=payload_kg,
+        coulomb_Nm=coulomb_Nm,
+        gravity_m_s2=gravity_m_s2,
+        n_modes=n_modes,
     )

@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from plant.beam import clamped_free_modes
-from plant.presets import paper_link
-from plant.rig import Hub, Link, Motor
+from plant.presets import two_link_arm
+from plant.rig import Hub, Link
 
 Real = npt.NDArray[np.float64]
 
@@ -119,19 +119,13 @@ def two_link_operating_point(elbow_angle_rad: float = np.pi / 3, n_modes: int = 
     """Two aluminium links with motors of our choosing, as a continuous-time python-control model.
 
     Inputs shoulder_voltage_V, elbow_voltage_V; outputs shoulder_angle_rad, elbow_angle_rad (change from the
-    operating angle) and tip_m (across link 2). Link 2 is the paper's, half as long; link 1 is twice as thick.
+    operating angle) and tip_m (across link 2). Values of `plant.two_link_arm`.
     """
-    far = paper_link().link.model_copy(update={"length_m": 0.5, "kelvin_voigt_s": 0.0003})
-    near = far.model_copy(update={"thickness_m": 2 * far.thickness_m})
-    hubs = (
-        Hub(inertia_kg_m2=0.03, radius_m=0.0, viscous_friction_Nms=0.02),
-        Hub(inertia_kg_m2=0.004, radius_m=0.0, viscous_friction_Nms=0.005),
+    arm = two_link_arm()
+    motors = arm.motors
+    mass, damping, stiffness, tip = two_link_matrices(
+        arm.links, arm.hubs, arm.elbow_mass_kg, arm.payload_kg, elbow_angle_rad, n_modes
     )
-    motors = (
-        Motor(torque_constant_Nm_A=0.036, back_emf_Vs_rad=0.036, resistance_ohm=1.7, gear_ratio=40.0),
-        Motor(torque_constant_Nm_A=0.02, back_emf_Vs_rad=0.02, resistance_ohm=2.5, gear_ratio=26.0),
-    )
-    mass, damping, stiffness, tip = two_link_matrices((near, far), hubs, 0.25, 0.05, elbow_angle_rad, n_modes)
     n = mass.shape[0]
     joints, zero = np.eye(n)[:2], np.zeros((n, n))
     damping[:2, :2] += np.diag([motor.back_emf_damping_Nms for motor in motors])

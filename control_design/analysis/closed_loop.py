@@ -174,6 +174,43 @@ def simulate(
     )
 
 
+class JointsMachine(Protocol):
+    """A machine with several commands and measurements, as `SampledMachine` has one command."""
+
+    @property
+    def dt_s(self) -> float: ...
+    def reset(self) -> None: ...
+    def measure(self) -> Real: ...
+    def advance(self, u: Real, /) -> None: ...
+
+
+def simulate_joints(
+    controller: Controller, machine: JointsMachine, reference: Real, input_disturbance: Real | None = None
+) -> tuple[Real, Real]:
+    """Run u = K (r - y) from rest for references (T, Y): measured outputs (T, Y), applied commands (T, U).
+
+    As `simulate`; input_disturbance (T, U) is added to what is applied. Raises ValueError if sampling times
+    or shapes do not match.
+    """
+    if not np.isclose(machine.dt_s, controller.dt_s, rtol=1e-9, atol=0):
+        raise ValueError(f"controller and machine differ in dt_s: {controller.dt_s} and {machine.dt_s}")
+    inputs, outputs = controller.D.shape
+    if reference.ndim != 2 or reference.shape[1] != outputs:
+        raise ValueError(f"reference must be (T, {outputs}); got {reference.shape}")
+    n = reference.shape[0]
+    added = np.zeros((n, inputs)) if input_disturbance is None else input_disturbance
+    machine.reset()
+    stepper = controller.matrix_stepper()
+    queue = [np.zeros(inputs)] * controller.computational_delay_samples
+    output, command = np.empty((n, outputs)), np.empty((n, inputs))
+    for k in range(n):
+        output[k] = machine.measure()
+        queue.append(stepper.step(reference[k] - output[k]))
+        command[k] = queue.pop(0)
+        machine.advance(command[k] + added[k])
+    return output, command
+
+
 def _signal(name: str, value: npt.ArrayLike | None, n: int | None) -> Real:
     if value is None:
         return np.zeros(n or 0)

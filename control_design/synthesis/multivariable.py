@@ -26,6 +26,7 @@ from control_design.specification.specification import SpecificationError
 from control_design.synthesis.modal_controller import ModalForm
 from control_design.synthesis.multivariable_descent import MatrixDescent, Pull, StackedRows, stacked_rows
 from control_design.synthesis.next_block import best_blocks
+from control_design.synthesis.synthesis import part_of
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome
 
 _LIGHT = 0.3  # poles of loop and controller damped less have frequencies of their own in every check
@@ -60,7 +61,9 @@ class MultivariableOptions(BaseModel):
     dense_points: int = Field(
         default=600, ge=100, le=20_000, description="logarithmic points of the dense check"
     )
-    sufficient_gamma: float = Field(default=0.0, ge=0, description="stop at this worst case; 0 = the best")
+    sufficient_gamma: float = Field(
+        default=0.0, ge=0, description="stop at this worst case, at a lower order too; 0 = the best"
+    )
 
 
 @dataclass(frozen=True)
@@ -102,8 +105,7 @@ def synthesise_multivariable(
     best: tuple[float, ModalForm, Real] | None = None
     static = programme.static()[: options.starts]
     for start, (_, gains) in enumerate(static):
-        tell(start / len(static), f"controller {start + 1} of {len(static)}")
-        gamma, form, x = programme.grown(gains)
+        gamma, form, x = programme.grown(gains, part_of(tell, start, len(static)))
         if best is None or gamma < best[0]:
             best = gamma, form, x
         if gamma <= options.sufficient_gamma:
@@ -215,18 +217,23 @@ class Programme:
         """Of a controller with integrators only."""
         return self.form(sum(joint.integrator for joint in self.spec.joints[: self.plants[0].outputs]))
 
-    def grown(self, start: Real) -> tuple[float, ModalForm, Real]:
-        """(worst case on the dense grid, form, parameters) of the asked order, from a static gain."""
+    def grown(
+        self, start: Real, tell: Callable[[float, str], None] = lambda fraction, message: None
+    ) -> tuple[float, ModalForm, Real]:
+        """(worst case on the dense grid, form, parameters) of the asked order, or a lower one that suffices,
+        from a static gain."""
         options, target = self.options, self.spec.controller_order
         form, x = self.lowest_form(), start
         x, gamma = self.improved(form, x, options.growth_rounds if form.order < target else options.rounds)
-        while form.order < target:
+        while form.order < target and gamma > options.sufficient_gamma:
+            tell(0.5 * form.order / target, f"order {form.order}: worst case {gamma:.3g}")
             larger = self.form(form.order + 2)
             pull = MatrixDescent(form, self.stack(form, x), self.loops).pull(x)
             x = self._with_block(larger, larger.extended(form, x), larger.blocks - 1, pull)
             form = larger
             more = options.growth_rounds if form.order < target else options.rounds
             x, gamma = self.improved(form, x, more)
+        tell(0.8, f"order {form.order}: worst case {gamma:.3g}")
         gamma, x = self.renewed(gamma, form, x)
         return gamma, form, x
 

@@ -76,7 +76,17 @@ def test_page_and_pictures_are_written(drawn):
     names = {path.name for path in drawn.figures_path.iterdir()}
     families = {re.sub(r"(-\d.*)?\.(svg|png)$", "", name) for name in names}
     # Other pages have the rest; distortion is drawn of periodic records.
-    elsewhere = ("gap_", "pareto", "excitation", "distortion", "log", "response")
+    elsewhere = (
+        "gap_",
+        "pareto",
+        "excitation",
+        "distortion",
+        "log",
+        "response",
+        "joint-",
+        "matrix-",
+        "mode-",
+    )
     assert families == {name for name in drawings() if not name.startswith(elsewhere)}
     text = drawn.report_path.read_text(encoding="utf-8")
     page = Page(text)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Iterable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from workflow.config.run_config import SimulatedSource, built_in_config, load_config, load_simulation
+from workflow.config.joints_config import JointsConfig, TwoJointSource, is_for_joints, load_joints
+from workflow.config.run_config import (
+    RunConfig,
+    SimulatedSource,
+    built_in_config,
+    load_config,
+    load_simulation,
+)
 from workflow.engine import storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
@@ -37,18 +42,19 @@ def run_from_files(
         raise InputError(
             f"{'--resume' if resume else '--replace'} needs --out DIR, the directory of the earlier run"
         )
+    config: RunConfig | JointsConfig
     if config_path is not None:
-        config, text = load_config(config_path)
+        config, text = (load_joints if is_for_joints(config_path) else load_config)(config_path)
     elif resume and out is not None and (out / "manifest.json").is_file():
-        from workflow.tasks.pipeline import config_of
+        from workflow.tasks.pipeline import any_config_of
 
-        config, text = config_of(RunDirectory.open(out)), ""
+        config, text = any_config_of(RunDirectory.open(out)), ""
     elif resume and not replace:
         raise InputError(f"{out}: no run is there to resume; start one without --resume")
     else:
         config, text = built_in_config()
     # Here: what computes takes seconds to load, and a configuration that is refused does not need it.
-    from workflow.report.pages import REPORT
+    from workflow.report.pages import page_of
     from workflow.tasks.pipeline import run_pipeline
 
     return run_pipeline(
@@ -56,7 +62,7 @@ def run_from_files(
         out if out is not None else default_directory(config.run.name),
         config_text=text,
         called=str(config_path or "default arm"),
-        page=REPORT,
+        page=page_of(config),
         resume=resume,
         replace=replace,
         c_code=c_code,
@@ -71,10 +77,10 @@ def rebuild_report(
 
     also: kinds of file for its pictures beside SVG, pdf or png.
     """
-    from workflow.report.pages import REPORT, write_page
-    from workflow.tasks.pipeline import rebuild_page
+    from workflow.report.pages import page_of
+    from workflow.tasks.pipeline import any_config_of, rebuild_page
 
-    return rebuild_page(run, dataclasses.replace(REPORT, run=partial(write_page, also=also)), progress)
+    return rebuild_page(run, page_of(any_config_of(run), also), progress)
 
 
 def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
@@ -83,6 +89,8 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
     Columns time_s, reference_rad (of a loop), voltage_V, hub_angle_rad, tip_m, so that the files can be read
     back as a log. Raises InputError.
     """
+    if config_path is not None and is_for_joints(config_path):
+        return _simulate_joints(config_path, out)
     config = load_simulation(config_path) if config_path is not None else built_in_config()[0]
     if not isinstance(config.source, SimulatedSource):
         raise InputError(f"{config_path}: source.kind is 'files'; simulating needs kind = 'simulated'")
@@ -109,4 +117,21 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
         safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", entry.name)
         texts[f"{index + 1:02d}_{safe}.csv"] = storage.csv_text({"time_s": record.time_s, **signals})
     texts[TRUTH_FILE] = truth_of(config.source).model_dump_json(indent=1) + "\n"
+    return storage.write_new_directory(out, texts)
+
+
+def _simulate_joints(config_path: Path, out: Path) -> list[Path]:
+    config = load_joints(config_path)[0]
+    if not isinstance(config.source, TwoJointSource):
+        raise InputError(f"{config_path}: source.kind is 'files'; simulating needs kind = 'two_joint_arm'")
+    RunDirectory(out).refuse_unless_free()
+    from workflow.tasks.joints import simulate_point
+
+    texts = {}
+    for index, point in enumerate(config.source.points):
+        record = simulate_point(config, config.source, point)
+        names = (*record.input_names, *record.output_names)
+        signals = dict(zip(names, [*record.input.T, *record.output.T], strict=True))
+        safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", point.name)
+        texts[f"{index + 1:02d}_{safe}.csv"] = storage.csv_text({"time_s": record.time_s, **signals})
     return storage.write_new_directory(out, texts)

@@ -296,13 +296,16 @@ def _unpack_plain(document: Any, arrays: Mapping[str, AnyArray], at: str) -> Any
 
 
 def _member(union: Any, document: Any, at: str) -> Any:
-    """The member of a union that a document is of: by null, by its tag, else the only one left."""
+    """The member of a union that a document is of: null, by its tag, a tuple for a list, else the first
+    whose type fits."""
     members = tuple(_members(union))
     if document is None and type(None) in members:
         return type(None)
     rest = [member for member in members if member is not type(None)]
     if isinstance(document, dict) and _TYPE in document:
         rest = [member for member in rest if getattr(member, "__name__", None) == document[_TYPE]]
+    elif isinstance(document, list):
+        rest = [member for member in rest if get_origin(member) is tuple] or rest
     elif len(rest) > 1:
         rest = [m for m in rest if isinstance(m, type) and isinstance(document, m)] or rest
     if not rest:

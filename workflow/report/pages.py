@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
+from workflow.config.joints_config import JointsConfig
 from workflow.config.run_config import RunConfig
 from workflow.engine import documents, storage
+from workflow.engine.run_directory import RunDirectory
+from workflow.figures.joints import JointsView
 from workflow.figures.subjects import RunView, log_channel
-from workflow.report.rendering import render_page
+from workflow.report.rendering import RenderedPage, render_page
+from workflow.tasks.joints import JOINT_STAGES
 from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.results import ReportResult, RunRecord, RunResults
 from workflow.tasks.stage import Stage, StageInput
@@ -32,8 +38,7 @@ def write_report(
     Raises InputError when a stage the report cannot do without is missing, or the disk refuses.
     """
     run = results.run
-    text = run.path / "config.toml"
-    view = RunView(config, results, documents.read_text(text) if text.is_file() else "", run.manifest())
+    view = RunView(config, results, _text_of(run), run.manifest())
     study = (run.path.parent.parent / "study.html").is_file()  # of which this run is a point
     page = render_page(
         "report.html.j2",
@@ -44,6 +49,16 @@ def write_report(
         study=study,
         certified=summarise(results, config).certified,
     )
+    return _write(run, page)
+
+
+def _text_of(run: RunDirectory) -> str:
+    """The configuration as the user wrote it."""
+    text = run.path / "config.toml"
+    return documents.read_text(text) if text.is_file() else ""
+
+
+def _write(run: RunDirectory, page: RenderedPage) -> Path:
     run.figures_path.mkdir(exist_ok=True)
     files = {
         run.figures_path / f"{name}.{kind}": content
@@ -63,6 +78,30 @@ def write_page(stage: StageInput, also: Iterable[str] = ()) -> ReportResult:
     return ReportResult(storage.sha256_of_file(path))
 
 
+def write_joints_page(stage: StageInput, also: Iterable[str] = ()) -> ReportResult:
+    """The same of a run for several joints."""
+    config: Any = stage.config
+    results: Any = stage.results
+    run = results.run
+    page = render_page(
+        "joints.html.j2",
+        partial(stage.progress.update, "report"),
+        also=also,
+        title=config.run.title or config.run.name,
+        run=JointsView(config, results, _text_of(run), run.manifest()),
+    )
+    return ReportResult(storage.sha256_of_file(_write(run, page)))
+
+
+def page_of(config: RunConfig | JointsConfig, also: Iterable[str] = ()) -> Stage:
+    """The stage that writes the page of a run. also: kinds of file for its pictures beside SVG."""
+    if isinstance(config, JointsConfig):
+        return (
+            JOINTS_REPORT if not also else replace(JOINTS_REPORT, run=partial(write_joints_page, also=also))
+        )
+    return REPORT if not also else replace(REPORT, run=partial(write_page, also=also))
+
+
 REPORT = Stage(
     "report",
     tuple(stage.name for stage in STAGES),
@@ -70,6 +109,15 @@ REPORT = Stage(
     expected_s=7.0,
     # Words that appear on the page and nowhere before.
     uses={"run": True, "notes": True, "specification": True},
+    also_writes=lambda run: (run.report_path,),
+)
+
+JOINTS_REPORT = Stage(
+    "report",
+    tuple(stage.name for stage in JOINT_STAGES),
+    write_joints_page,
+    expected_s=5.0,
+    uses={"run": True, "joints": True},
     also_writes=lambda run: (run.report_path,),
 )
 

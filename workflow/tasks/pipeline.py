@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from control_design.controllers.c_code import Dialect
+from workflow.config.joints_config import JointsConfig
 from workflow.config.run_config import RunConfig
 from workflow.engine import interrupts, storage
 from workflow.engine.code_version import code_digest
@@ -19,15 +20,27 @@ from workflow.engine.errors import CommandInterruptedError, InputError, naming, 
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import CONTROLLER_FILES, LAYOUT_VERSION, RunDirectory, hash_of
 from workflow.tasks.exports import write_controller
+from workflow.tasks.joints import JOINT_STAGES, JointsResults
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage, StageInput
 from workflow.tasks.stages import STAGES
-from workflow.tasks.summary import summarise
+from workflow.tasks.summary import summarise, summarise_joints
 from workflow.text.templates import RunSummary, said
 
 
+@dataclass(frozen=True)
+class Kind:
+    """What differs between runs of one loop and of several joints: stages before the page, what reads their
+    results, the controller's files, the table."""
+
+    stages: tuple[Stage, ...]
+    results: Callable[[RunDirectory], Any]
+    keep_controller: Callable[[Any, Any, Dialect], list[Path]]
+    summarise: Callable[[Any, Any], RunSummary]
+
+
 def run_pipeline(
-    config: RunConfig,
+    config: RunConfig | JointsConfig,
     out: Path,
     *,
     config_text: str = "",
@@ -50,8 +63,8 @@ def run_pipeline(
     then, unless identification had already been paid for. Raises StageError when a computation fails.
     """
     progress = progress or Progress()
-    run = RunDirectory(Path(out))
-    existed, given = run.path.exists(), StageInput(config, RunResults(run), progress, called)
+    run, kind = RunDirectory(Path(out)), kind_of(config)
+    existed, given = run.path.exists(), _given(config, run, progress, called)
     run.refuse_unless_free(resume=resume, replace=replace)
     inputs = {str(path): storage.sha256_of_file(path) for path in config.input_files}
     # Records are read before anything is written: a bad log leaves no directory behind.
@@ -59,7 +72,7 @@ def run_pipeline(
     if not (resume and existed):
         started = time.monotonic()
         with threadpool_limits(1):
-            ready = STAGES[0].run(given), time.monotonic() - started
+            ready = kind.stages[0].run(given), time.monotonic() - started
     # More threads round otherwise.
     with run.writing(resume=resume, replace=replace), threadpool_limits(1):
         RunDirectory.begin(
@@ -73,13 +86,16 @@ def run_pipeline(
         )
         dialect = _dialect(run, c_code or {})
         run.record_status("running", c_code=asdict(dialect))
-        stages = STAGES if page is None else (*STAGES, page)
+        stages = kind.stages if page is None else (*kind.stages, page)
         progress.plan([(stage.name, stage.expected_s) for stage in stages])
         try:
             for stage in stages:
-                _perform(stage, given, inputs, ready if stage is STAGES[0] else None)
-            _keep_controller(given.results, config, dialect)
-            summary = summarise(given.results, config)
+                _perform(stage, given, inputs, ready if stage is stages[0] else None)
+            written = kind.keep_controller(given.results, config, dialect)
+            for name in CONTROLLER_FILES:  # none of an earlier design stay
+                if run.path / name not in written:
+                    (run.path / name).unlink(missing_ok=True)
+            summary = kind.summarise(given.results, config)
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt) or interrupts.came():  # a library may make anything of it
                 with suppress(InputError):  # a full disk, a directory that is gone
@@ -109,11 +125,19 @@ def identify_only(
 
 def rebuild_page(run: RunDirectory, page: Stage, progress: Progress | None = None) -> RunSummary:
     """Perform the last stage again on a finished run. Raises InputError when a stage is missing."""
-    given = StageInput(config_of(run), RunResults(run), progress or Progress())
+    config = any_config_of(run)
+    given = _given(config, run, progress or Progress())
     given.progress.plan([(page.name, page.expected_s)])
     with run.locked():
         _perform(page, given, {}, always=True)
-    return summarise(given.results, given.config)
+    return kind_of(config).summarise(given.results, config)
+
+
+def _given(
+    config: RunConfig | JointsConfig, run: RunDirectory, progress: Progress, called: str = "the configuration"
+) -> StageInput:
+    given: Any = config
+    return StageInput(given, kind_of(config).results(run), progress, called)
 
 
 def certified_for(results: RunResults, config: RunConfig) -> str:
@@ -126,6 +150,14 @@ def certified_for(results: RunResults, config: RunConfig) -> str:
 def config_of(run: RunDirectory) -> RunConfig:
     """The configuration a run was begun with."""
     return RunConfig.from_document(run.config_document(), source=str(run.path / "config.json"))
+
+
+def any_config_of(run: RunDirectory) -> RunConfig | JointsConfig:
+    """The same, of a run for several joints too."""
+    document = run.config_document()
+    if "joints" in document:
+        return JointsConfig.from_document(document, source=str(run.path / "config.json"))
+    return config_of(run)
 
 
 def _perform(
@@ -178,18 +210,32 @@ def _dialect(run: RunDirectory, stated: Mapping[str, Any]) -> Dialect:
     return replace(before, **stated)
 
 
-def _keep_controller(results: RunResults, config: RunConfig, dialect: Dialect) -> None:
-    """controller.json, .c and .h in the run directory; none of an earlier design stay."""
-    written: list[Path] = []
-    if (controller := results.design.controller) is not None:
-        second, certified = results.reference_filter, results.certify.certified
-        law, about = second.law(controller), certified_for(results, config)
-        written = write_controller(
-            results.run.path, law, second.filter, certified=certified, about=about, dialect=dialect
-        )
-    for name in CONTROLLER_FILES:
-        if results.run.path / name not in written:
-            (results.run.path / name).unlink(missing_ok=True)
+def _keep_controller(results: RunResults, config: RunConfig, dialect: Dialect) -> list[Path]:
+    """controller.json, .c and .h in the run directory, and those of its reference filter."""
+    if (controller := results.design.controller) is None:
+        return []
+    second, certified = results.reference_filter, results.certify.certified
+    law, about = second.law(controller), certified_for(results, config)
+    return write_controller(
+        results.run.path, law, second.filter, certified=certified, about=about, dialect=dialect
+    )
+
+
+def _keep_joints_controller(results: JointsResults, config: JointsConfig, dialect: Dialect) -> list[Path]:
+    if (law := results.design.controller) is None:
+        return []
+    about = f"{len(results.identify.points)} operating points"
+    certified = results.certify.certified
+    return write_controller(results.run.path, law, None, certified=certified, about=about, dialect=dialect)
+
+
+_ONE_LOOP = Kind(STAGES, RunResults, _keep_controller, summarise)
+_JOINTS = Kind(JOINT_STAGES, JointsResults, _keep_joints_controller, summarise_joints)
+
+
+def kind_of(config: RunConfig | JointsConfig) -> Kind:
+    """Of one loop, or of several joints."""
+    return _JOINTS if isinstance(config, JointsConfig) else _ONE_LOOP
 
 
 def _fail(run: RunDirectory, error: BaseException, *, created: bool) -> None:

@@ -592,7 +592,7 @@ class ReportResult:
     report_sha256: str
 
 
-class _Stage(Generic[T]):
+class StageResult(Generic[T]):
     """The result of the stage that the attribute is named after, read when it is first asked for."""
 
     def __init__(self, kind: type[T]) -> None:
@@ -601,26 +601,30 @@ class _Stage(Generic[T]):
     def __set_name__(self, owner: type, name: str) -> None:
         self._name = name
 
-    def __get__(self, results: RunResults, owner: type) -> T:
+    def __get__(self, results: StageResults, owner: type) -> T:
         if self._name not in results.read:
             results.read[self._name] = results.run.load_stage(self._name, self._kind)
         found: T = results.read[self._name]
         return found
 
 
-class RunResults:
+class StageResults:
     """Results of a run directory, each read once; `read` holds those that were."""
-
-    records = _Stage(RecordsResult)
-    identify = _Stage(IdentifyResult)
-    uncertainty = _Stage(UncertaintyResult)
-    design = _Stage(DesignResult)
-    achievable_performance = _Stage(AchievablePerformance)
-    certify = _Stage(CertifyResult)
-    amplitude_cost = _Stage(AmplitudeCost)
-    reference_filter = _Stage(ReferenceFilterResult)
-    closed_loop = _Stage(ClosedLoopResult)
 
     def __init__(self, run: RunDirectory) -> None:
         self.run = run
         self.read: dict[str, Any] = {}
+
+
+class RunResults(StageResults):
+    """Of one loop."""
+
+    records = StageResult(RecordsResult)
+    identify = StageResult(IdentifyResult)
+    uncertainty = StageResult(UncertaintyResult)
+    design = StageResult(DesignResult)
+    achievable_performance = StageResult(AchievablePerformance)
+    certify = StageResult(CertifyResult)
+    amplitude_cost = StageResult(AmplitudeCost)
+    reference_filter = StageResult(ReferenceFilterResult)
+    closed_loop = StageResult(ClosedLoopResult)

@@ -8,9 +8,11 @@ import numpy as np
 
 from ident.data.finding import Finding
 from ident.uncertainty import FrequencyUncertainty
+from workflow.config.joints_config import JointsConfig
 from workflow.config.run_config import RunConfig
 from workflow.engine import codec
 from workflow.tasks.design import bracket_numbers, joint_numbers
+from workflow.tasks.joints import JointsResults
 from workflow.tasks.results import (
     AchievablePerformance,
     AmplitudeCost,
@@ -53,6 +55,28 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
             (design.specification or config.specification).controller_order,
             untold_below_rad_s(results.uncertainty.channels[config.control_index].frequency),
         ),
+        report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
+    )
+
+
+def summarise_joints(results: JointsResults, config: JointsConfig) -> RunSummary:
+    """The table of a run for several joints."""
+    design, certify, loop = results.design, results.certify, results.closed_loop
+    settled, points = loop.settled_points()
+    return RunSummary(
+        title=config.run.title or config.run.name,
+        sections=rows_of("summary/joints.j2", config=config, results=results),
+        numbers={
+            "points": [codec.plain(point, arrays=False) for point in results.identify.points],
+            "design": {
+                "gamma": None if design.found is None else design.found.gamma,
+                "reason": design.reason,
+            },
+            "certificate": codec.plain(certify.certificate),
+            "closed_loop": codec.plain(loop, arrays=False),
+        },
+        certified=certify.certified and settled == points,
+        verdict=said("joints_verdict", design, certify, settled, points),
         report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
     )
 

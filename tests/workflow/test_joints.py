@@ -1,0 +1,198 @@
+"""Runs for several joints: the simulated arm, its logs, and what cannot be used."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from control_design.controllers.controller import Controller
+from workflow.cli import main
+from workflow.config.joints_config import JointsConfig, load_joints
+
+_JOINTS = """
+[[joints]]
+input = "shoulder_V"
+output = "shoulder_rad"
+bandwidth_rad_s = 3.0
+effort_limit = 100.0
+input_limit = 24.0
+
+[[joints]]
+input = "elbow_V"
+output = "elbow_rad"
+bandwidth_rad_s = 5.0
+effort_limit = 100.0
+input_limit = 24.0
+"""
+_REST = """
+[identification]
+n_real = 3
+n_pairs = 2
+
+[design]
+controller_order = 4
+"""
+_SOURCE = """
+[run]
+name = "two"
+
+[source]
+kind = "two_joint_arm"
+samples = 3000
+points = [{ name = "bent", elbow_rad = 1.6 }]
+"""
+
+
+def test_the_example_is_valid():
+    """Its run takes half a minute."""
+    config, _ = load_joints(Path(__file__).parents[2] / "examples" / "two_joint_arm.toml")
+    assert len(config.source.points) == 9
+    assert JointsConfig.from_document(config.to_document(), source="x") == config
+
+
+def _written(folder: Path, text: str, name: str = "arm.toml") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def run_of_the_arm(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("joints")
+    config = _written(folder, _SOURCE + _JOINTS + _REST)
+    assert main(["run", "--config", str(config), "--out", str(folder / "run"), "--quiet"]) == 0
+    return folder / "run"
+
+
+def test_a_run_ends_with_a_certified_controller_and_a_page(run_of_the_arm):
+    law = Controller.from_json((run_of_the_arm / "controller.json").read_text())
+    assert law.D.shape == (2, 2)
+    assert law.input_limit == (24.0, 24.0)
+    assert "controller_step" in (run_of_the_arm / "controller.c").read_text()
+    page = (run_of_the_arm / "report.html").read_text()
+    assert "Certified: every requirement is met, and the loop settles at 1 of 1 operating point" in page
+    for picture in ("joint-steps", "joint-requirements", "matrix-response", "mode-shapes"):
+        assert (run_of_the_arm / "figures" / f"{picture}.svg").is_file()
+    status = json.loads((run_of_the_arm / "manifest.json").read_text())["status"]
+    assert status == "complete"
+
+
+def test_a_report_and_a_resumed_run_say_the_same(run_of_the_arm, capsys):
+    page = (run_of_the_arm / "report.html").read_bytes()
+    assert main(["report", str(run_of_the_arm), "--quiet", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["certified"]
+    assert document["numbers"]["design"]["gamma"] <= 1
+    assert (run_of_the_arm / "report.html").read_bytes() == page
+    assert main(["run", "--resume", "--out", str(run_of_the_arm), "--quiet"]) == 0
+    assert (run_of_the_arm / "report.html").read_bytes() == page
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("logs")
+    config = _written(folder, _SOURCE)
+    config.write_text(_SOURCE + _JOINTS, encoding="utf-8")
+    assert main(["simulate", "--config", str(config), "--out", str(folder / "csv")]) == 0
+    return next((folder / "csv").glob("*.csv"))
+
+
+def _from_log(folder: Path, log: Path, source: str = 'time = "time_s"') -> Path:
+    head = f'[source]\nkind = "files"\n{source}\nrecords = [{{ path = "{log}", condition = "bent" }}]\n'
+    return _written(folder, head + _JOINTS + _REST)
+
+
+def test_logs_give_the_same_model_as_the_arm(logs, run_of_the_arm, tmp_path, capsys):
+    config = _from_log(tmp_path, logs)
+    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["numbers"]
+    assert main(["report", str(run_of_the_arm), "--quiet", "--json"]) == 0
+    own = json.loads(capsys.readouterr().out)["numbers"]
+    assert found["points"][0]["radius"] == pytest.approx(own["points"][0]["radius"], rel=1e-3)
+    assert found["design"]["gamma"] == pytest.approx(own["design"]["gamma"], rel=1e-2)
+    assert found["closed_loop"]["machine"] == "identified"
+
+
+def _twice(table):
+    return table.assign(elbow_rad=table["shoulder_rad"])
+
+
+def _never_moved(table):
+    return table.assign(elbow_V=0.0)
+
+
+def _one_signal(table):
+    return table.assign(elbow_V=2 * table["shoulder_V"])
+
+
+def _short(table):
+    return table.head(20)
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "words"),
+    [
+        (_twice, "same sensor twice"),
+        (_never_moved, "elbow_V"),
+        (_one_signal, "linearly dependent"),
+        (_short, "samples"),
+    ],
+)
+def test_logs_that_tell_too_little_are_refused_in_one_line(spoilt, words, logs, tmp_path, capfd):
+    log = tmp_path / "log.csv"
+    spoilt(pd.read_csv(logs)).to_csv(log, index=False)
+    config = _from_log(tmp_path, log)
+    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    said = capfd.readouterr().err.strip()
+    assert words in said
+    assert "\n" not in said
+    assert len(said) < 300
+    assert not (tmp_path / "run").exists()
+
+
+def test_logs_of_different_sampling_are_refused(logs, tmp_path, capfd):
+    table = pd.read_csv(logs)
+    slow = table.iloc[::2].reset_index(drop=True)
+    slow.to_csv(tmp_path / "slow.csv", index=False)
+    records = ", ".join(
+        f'{{ path = "{path}", condition = "bent" }}' for path in (logs, tmp_path / "slow.csv")
+    )
+    text = f'[source]\nkind = "files"\ntime = "time_s"\nrecords = [{records}]\n' + _JOINTS + _REST
+    config = _written(tmp_path, text)
+    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert "differ in sampling time" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("input_limit = 24.0\n\n[[joints]]", "\n[[joints]]", "input_limit"),
+        ('output = "elbow_rad"', 'output = "shoulder_rad"', "two joints have the output"),
+        ("bandwidth_rad_s = 5.0", "bandwidth_rad_s = 5.0\ndelay_margin_s = 0.01", "delay_margin_s"),
+        ("bandwidth_rad_s = 5.0", "bandwith_rad_s = 5.0", "bandwidth_rad_s"),
+        ("controller_order = 4", "controller_order = 5", "two per modal block"),
+        ("elbow_rad = 1.6", "elbow_deg = 90", "elbow_rad"),
+    ],
+)
+def test_configurations_that_do_not_fit_are_refused(old, new, words, tmp_path, capfd):
+    text = _SOURCE + _JOINTS + _REST
+    assert old in text
+    config = _written(tmp_path, text.replace(old, new))
+    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    said = capfd.readouterr().err.strip()
+    assert words in said
+    assert "\n" not in said
+
+
+def test_what_cannot_be_met_is_a_result_with_exit_code_one(tmp_path, capfd):
+    text = (_SOURCE + _JOINTS + _REST).replace("effort_limit = 100.0", "effort_limit = 0.5")
+    config = _written(tmp_path, text.replace("controller_order = 4", "controller_order = 0"))
+    code = main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"])
+    assert code not in (0, 2)
+    assert "not certified" in capfd.readouterr().err
+    assert "Not certified" in (tmp_path / "run" / "report.html").read_text()
+    assert np.isfinite(Controller.from_json((tmp_path / "run" / "controller.json").read_text()).D).all()

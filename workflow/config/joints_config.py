@@ -1,0 +1,168 @@
+"""`JointsConfig`: a run for several joints at once, from one TOML file with a table [[joints]]."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from control_design.specification import Specification
+from control_design.specification.multivariable import MultivariableSpecification
+from control_design.synthesis.multivariable import MultivariableOptions
+from workflow.config.renamed_keys import with_current_keys
+from workflow.config.run_config import FileSource, Name, RunSection
+from workflow.config.settings import Section, check, read_toml, repeated
+
+Two = tuple[float, float]
+
+
+class OperatingPoint(Section):
+    """Where the arm rests while its joints are moved a little."""
+
+    name: Name = Field(description="name of the plant")
+    elbow_rad: float = Field(description="angle of link 2 against link 1")
+    shoulder_rad: float = Field(0.0, description="angle of link 1; matters under gravity")
+    payload_kg: float = Field(0.05, ge=0, description="point mass at the tip")
+
+
+class TwoJointSource(Section):
+    kind: Literal["two_joint_arm"] = Field(description="records come from the simulated arm of two joints")
+    points: tuple[OperatingPoint, ...] = Field(min_length=1, description="operating points, one plant each")
+    dt_s: float = Field(0.002, gt=0, description="sampling period")
+    samples: int = Field(8000, ge=500, description="length of a record")
+    rms_V: Two = Field((1.0, 1.0), description="size of the multisine at each motor")
+    band_Hz: Two = Field((0.1, 60.0), description="band of the multisines")
+    noise_rad: float = Field(1e-4, ge=0, description="standard deviation of the angle sensors")
+    coulomb_Nm: Two = Field((0.0, 0.0), description="dry friction of each joint while records are made")
+    gravity_m_s2: float = Field(0.0, ge=0, description="0: the arm moves in a horizontal plane")
+
+
+Source = Annotated[TwoJointSource | FileSource, Field(discriminator="kind")]
+
+
+class Joint(Specification):
+    """One actuator and one sensor, with what is asked of them: keys of [specification]."""
+
+    input: str = Field(min_length=1, description="column of the command")
+    output: str = Field(min_length=1, description="column of the measured angle")
+
+    def asked(self) -> Specification:
+        """What is asked, without the columns."""
+        return Specification(**self.model_dump(include=self.model_fields_set - {"input", "output"}))
+
+
+class JointsIdentification(Section):
+    """Model of each operating point, on shared poles."""
+
+    integrators: int = Field(1, ge=0, le=1, description="1: joints that turn freely")
+    input_delay_samples: int = Field(0, ge=0, description="dead time of every channel")
+    n_real: int | None = Field(None, ge=0, description="real poles; default: the data decide")
+    n_pairs: int | None = Field(None, ge=0, description="pole pairs; default: the data decide")
+    increments: bool = Field(
+        True, description="fit differences between samples: same response, less weight on drift"
+    )
+    level: float = Field(0.95, gt=0, lt=1, description="probability of the balls, at a frequency")
+    lowest_rad_s: float = Field(0.3, gt=0, description="from where on the balls are taken over")
+    gain_error: float = Field(
+        0.0, ge=0, lt=1, description="share by which each actuator's gain may be off beyond the balls"
+    )
+
+
+class JointsDesign(Section):
+    controller_order: int = Field(6, ge=0, le=40, description="number of controller states")
+    structure: Literal["full", "decentralised"] = Field("full", description="decentralised: K is diagonal")
+    controller_damping: float = Field(0.02, gt=0, le=1, description="smallest of the controller's pole pairs")
+    search: MultivariableOptions = Field(
+        default_factory=lambda: MultivariableOptions(sufficient_gamma=0.97),
+        description="effort of the search, which ends at a worst case of 0.97",
+    )
+
+
+class JointsLoop(Section):
+    """The loop on the nonlinear machine, or on the identified models where records are logs."""
+
+    step: tuple[float, ...] | None = Field(
+        None, description="reference step of each joint, in units of its output; default: 0.1 each"
+    )
+    duration_s: float | None = Field(
+        None, gt=0, description="length of a run; default: 20 over the bandwidth"
+    )
+    extra_payload_kg: tuple[float, ...] = Field((), description="further payloads at every operating point")
+    coulomb_Nm: Two | None = Field(None, description="dry friction of each joint in further runs")
+
+
+class JointsConfig(Section):
+    """A whole run for several joints. Load with `load_joints`."""
+
+    run: RunSection = Field(default_factory=RunSection)
+    source: Source
+    joints: tuple[Joint, ...] = Field(min_length=2)
+    identification: JointsIdentification = Field(
+        default_factory=lambda: JointsIdentification.model_validate({})
+    )
+    design: JointsDesign = Field(default_factory=lambda: JointsDesign.model_validate({}))
+    closed_loop: JointsLoop = Field(default_factory=lambda: JointsLoop.model_validate({}))
+
+    @model_validator(mode="after")
+    def _fit_together(self) -> Self:
+        for kind in ("input", "output"):
+            if (name := repeated([getattr(joint, kind) for joint in self.joints])) is not None:
+                raise ValueError(f"two joints have the {kind} {name!r}: each needs its own")
+        for number, joint in enumerate(self.joints):
+            if joint.input_limit is None:
+                raise ValueError(
+                    f"joints[{number}] has no input_limit: state what its actuator gives at most, in the "
+                    "unit of its input"
+                )
+        if isinstance(self.source, TwoJointSource):
+            if len(self.joints) != 2:
+                raise ValueError(f"the simulated arm has two joints; got {len(self.joints)}")
+            if (name := repeated([point.name for point in self.source.points])) is not None:
+                raise ValueError(f"two operating points are called {name!r}: give them different names")
+        elif not any(record.role == "estimation" for record in self.source.records):
+            raise ValueError("no record has role 'estimation': there is nothing to identify from")
+        if self.closed_loop.step is not None and len(self.closed_loop.step) != len(self.joints):
+            raise ValueError(f"closed_loop.step needs one value for each of {len(self.joints)} joints")
+        self.specification()  # refuses keys that no design of several joints reads
+        return self
+
+    def specification(self) -> MultivariableSpecification:
+        """What is asked of the whole."""
+        return MultivariableSpecification(
+            joints=tuple(joint.asked() for joint in self.joints),
+            structure=self.design.structure,
+            controller_order=self.design.controller_order,
+            controller_damping=self.design.controller_damping,
+        )
+
+    @property
+    def input_files(self) -> list[Path]:
+        """Every file the run reads besides its configuration."""
+        source = self.source
+        return sorted({record.path for record in source.records}) if isinstance(source, FileSource) else []
+
+    def to_document(self) -> dict[str, Any]:
+        """JSON-able, every default filled in, but for keys of a joint that were not given."""
+        document = self.model_dump(mode="json")
+        document["joints"] = [joint.model_dump(mode="json", exclude_unset=True) for joint in self.joints]
+        return document
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], *, source: str) -> JointsConfig:
+        """Inverse of `to_document`."""
+        document = with_current_keys(copy.deepcopy(dict(document)), source)
+        return check(cls, document, source=source, context={"may_be_gone": True})
+
+
+def is_for_joints(path: Path) -> bool:
+    """Whether a file describes a run for several joints. Raises InputError as `load_joints`."""
+    return "joints" in read_toml(path)[1]
+
+
+def load_joints(path: Path) -> tuple[JointsConfig, str]:
+    """Configuration and its text. Raises InputError: file, dotted key and what was expected in one line."""
+    text, document = read_toml(path)
+    return check(JointsConfig, document, source=str(path), context={"base": path.absolute().parent}), text

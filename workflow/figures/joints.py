@@ -1,0 +1,179 @@
+"""Pictures of a run for several joints: steps, matrix response with its balls, worst cases, mode shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from control_design.plants.multivariable import tustin_s
+from control_design.plants.scaled_bound import Rows, scaled_bound
+from control_design.specification.multivariable import gram
+from workflow.config.joints_config import JointsConfig
+from workflow.figures import style
+from workflow.figures.bands import Real, envelope, outline
+from workflow.tasks.joints import JointsResults, JointsRun
+
+_LOW = 1e-3  # smallest frequency of the singular values, of the Nyquist frequency
+
+
+@dataclass(frozen=True, eq=False)
+class JointsView:
+    """A run for several joints whose stages are all there."""
+
+    config: JointsConfig
+    results: JointsResults
+    config_text: str
+    manifest: Mapping[str, Any]
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Outputs, as the columns are called."""
+        return tuple(joint.output for joint in self.config.joints)
+
+    def unit(self, name: str) -> str:
+        """Unit of a column, empty where nobody stated it."""
+        return self.results.records.unit(name)
+
+    @cached_property
+    def worst(self) -> tuple[Real, dict[str, Real]]:
+        """Frequencies (F,) [rad/s], and by requirement the largest worst case over the plants there (F,)."""
+        law = self.results.design.controller
+        assert law is not None
+        asked = self.config.specification()
+        top = 0.999 * np.pi / law.dt_s
+        omega = np.geomspace(_LOW * top, top, 300)
+        s, K = tustin_s(omega, law.dt_s), law.response(omega, with_delay=False)
+        found: dict[str, Real] = {}
+        for point in self.results.identify.points:
+            plant = point.plant(self.config.identification.gain_error)
+            G, seen, entering = plant.blocks(omega, law.computational_delay_samples)
+            for name, (of, weights) in asked.weights(plant.inputs, plant.outputs).items():
+                size = gram(weights, s)
+                none = np.zeros_like(size)
+                on_y, on_u = (size, none) if of == "y" else (none, size)
+                gamma = scaled_bound(Rows(G, seen, entering, on_y, on_u, False), K).gamma
+                found[name] = np.maximum(found.get(name, np.zeros(omega.size)), gamma)
+        return omega, found
+
+
+_MEANING = {
+    "tracking": "tracking: weighted S",
+    "effort": "effort: weighted K S",
+    "modulus": "modulus margin times S",
+}
+
+
+@style.drawing("joint-steps")
+def draw_joint_steps(run: JointsView) -> Figure | None:
+    """Outputs and commands of every joint: the operating points as identified as lines, all others as their
+    range."""
+    loop = run.results.closed_loop
+    if loop.time_s is None or loop.reference is None:
+        return None
+    first = [each for each in loop.runs if each.condition == loop.runs[0].condition]
+    joints = run.config.joints
+    figure, grid = style.panels(4.6, 2, len(joints), squeeze=False, sharex="col")
+    for k, joint in enumerate(joints):
+        _draw_runs(grid[0, k], loop.time_s, [one.output[:, k] for one in loop.runs], "all runs")
+        _draw_runs(grid[1, k], loop.time_s, [one.command[:, k] for one in loop.runs], "all runs")
+        for number, one in enumerate(first):
+            label = "as identified" if number == 0 else None
+            for row, signal in ((0, one.output), (1, one.command)):
+                line = outline(loop.time_s, signal[:, k], 150)
+                grid[row, k].plot(*line, **style.ACHIEVED_LINE, label=label)
+        steps = outline(loop.time_s, loop.reference[:, k], 150)
+        grid[0, k].plot(*steps, **style.REFERENCE_STEPS, label="reference")
+        _draw_limit(grid[1, k], joint.input_limit, loop.runs, k)
+        for row, name in ((0, joint.output), (1, joint.input)):
+            grid[row, k].set_ylabel(style.two_lines(name, run.unit(name)))
+        grid[1, k].set_xlabel("time [s]")
+    return figure
+
+
+def _draw_runs(axes: Any, time_s: Real, lines: list[Real], label: str) -> None:
+    axes.fill_between(*envelope(time_s, np.stack(lines)), **style.ACHIEVED_BAND, label=label)
+
+
+def _draw_limit(axes: Any, limit: float | None, runs: tuple[JointsRun, ...], k: int) -> None:
+    largest = max(float(np.max(np.abs(one.command[:, k]))) for one in runs)
+    if limit is not None and largest > 0.5 * limit:
+        axes.axhline(limit, **style.LIMIT_LINE, label="limit of the actuator")
+        axes.axhline(-limit, **style.LIMIT_LINE)
+
+
+@style.drawing("matrix-response")
+def draw_matrix_response(run: JointsView) -> Figure:
+    """Size of every channel with its ball, one curve per operating point."""
+    points = run.results.identify.points
+    joints = run.config.joints
+    n = len(joints)
+    figure, grid = style.panels(2.1 * n + 0.5, n, n, squeeze=False, sharex=True)
+    for i, output in enumerate(joints):
+        for j, source in enumerate(joints):
+            axes = grid[i, j]
+            for number, point in enumerate(points):
+                shown = point.shown
+                size = np.abs(shown.centre[:, i, j])
+                # Every member of the ball deviates in this channel by at most that much.
+                off = (
+                    shown.radius
+                    * np.linalg.norm(shown.output_factor[i])
+                    * np.linalg.norm(shown.input_factor[:, :, j], axis=1)
+                )
+                axes.fill_between(
+                    shown.omega_rad_s, np.maximum(size - off, 1e-2 * size), size + off, **style.BAND,
+                    label=None if number else "ball",
+                )  # fmt: skip
+                axes.plot(
+                    shown.omega_rad_s, size, **style.MODEL_LINE, label=None if number else "model, per point"
+                )
+            axes.set(xscale="log", yscale="log", xlim=(shown.omega_rad_s[0], shown.omega_rad_s[-1]))
+            axes.set_title(f"{source.input} to {output.output}", fontsize=9.5)
+            unit = style.ratio_unit(run.unit(output.output), run.unit(source.input))
+            if j == 0:
+                axes.set_ylabel(f"|G| [{style.plain(unit, 16)}]")
+            if i == n - 1:
+                axes.set_xlabel("frequency [rad/s]")
+    return figure
+
+
+@style.drawing("joint-requirements")
+def draw_joint_requirements(run: JointsView) -> Figure | None:
+    """Largest singular value of every weighted function, the worst over balls and operating points."""
+    if run.results.design.controller is None:
+        return None
+    omega, found = run.worst
+    figure, grid = style.panels(2.9, 1, 1, squeeze=False)
+    axes = grid[0, 0]
+    colours = (style.MODEL, style.PREDICTED, style.ACHIEVED)
+    for (name, gamma), colour in zip(found.items(), colours, strict=False):
+        finite = np.where(np.isfinite(gamma), gamma, np.nan)
+        axes.plot(omega, finite, color=colour, lw=1.4, label=_MEANING.get(name, name))
+    axes.axhline(1.0, **style.LIMIT_LINE, label="stay below")
+    axes.set(xscale="log", xlim=(omega[0], omega[-1]), ylim=(0, None))
+    axes.set_xlabel("frequency [rad/s]")
+    axes.set_ylabel("worst case [1]")
+    return figure
+
+
+@style.drawing("mode-shapes")
+def draw_mode_shapes(run: JointsView) -> Figure | None:
+    """Which joint moves how much in each mode of the first operating point."""
+    point = run.results.identify.points[0]
+    shaped = [(omega, zeta, moved) for omega, zeta, moved in point.modes if moved is not None]
+    if not shaped:
+        return None
+    figure, panels = style.small_multiples(len(shaped), min(len(shaped), 3), 2.1, 0.6, sharey=True)
+    for axes, (omega, zeta, moved) in zip(panels, shaped, strict=True):
+        axes.bar(np.arange(moved.size), moved, color=style.MODEL, width=0.5)
+        axes.axhline(0.0, color="#444444", lw=0.8)
+        axes.set_xticks(np.arange(moved.size), [style.plain(name, 16) for name in run.joint_names])
+        axes.set_title(f"{omega / (2 * np.pi):.3g} Hz, damping {zeta:.2g}", fontsize=9.5)
+        axes.set_ylim(-1.15, 1.15)
+    panels[0].set_ylabel("motion [largest = 1]")
+    return figure

@@ -1,0 +1,415 @@
+"""The stages of a run for several joints: records, models with their balls, one controller, its certificate,
+the loop on the nonlinear machine at every operating point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from control_design.analysis.closed_loop import simulate_joints
+from control_design.analysis.multivariable_certificate import MultivariableCertificate, certify_multivariable
+from control_design.controllers.controller import Controller
+from control_design.plants.multivariable import MultivariablePlant, ResponseBall
+from control_design.plants.weights import RationalWeight
+from control_design.specification import SpecificationError
+from control_design.synthesis.multivariable import MultivariableResult, synthesise_multivariable
+from ident.basis.mimo_model import MimoModel
+from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
+from ident.data.record import Record
+from ident.identification import MimoIdentification
+from ident.several_outputs import identify_mimo
+from ident.uncertainty.matrix_response import MatrixUncertainty, matrix_posterior
+from plant import TwoLinkMachine, multisine, multisine_lines, two_link_arm
+from workflow.config.joints_config import JointsConfig, OperatingPoint, TwoJointSource
+from workflow.engine.errors import InputError, naming
+from workflow.engine.randomness import stage_rng
+from workflow.tasks.records import read_record, refuse_constant_input, with_common_sampling_time
+from workflow.tasks.results import RecordsResult, RunRecord, StageResult, StageResults
+from workflow.tasks.stage import Stage, StageInput
+
+Real = npt.NDArray[np.float64]
+
+_SETTLED = 0.1  # of the step: how far from it an output may be at the end of a run
+_SHOWN = 400  # frequencies of the pictures
+
+
+@dataclass(frozen=True, eq=False)
+class PointModel:
+    """What the records of one operating point say: model, ball (the factor Li as a state space of Li_a to
+    Li_d, radius), fits in per cent (records, outputs), whether each mode has one shape, balls for pictures.
+    """
+
+    name: str
+    model: MimoModel
+    noise_std: Real
+    fit_percent: Real
+    rank_one: tuple[bool, ...]
+    Lo: Real
+    Li_a: Real
+    Li_b: Real
+    Li_c: Real
+    Li_d: Real
+    radius: float
+    shown: MatrixUncertainty
+
+    @property
+    def shaped(self) -> bool:
+        """Every mode has one shape."""
+        return all(moved is not None for _, _, moved in self.modes)
+
+    @property
+    def states(self) -> int:
+        """Order of the state space."""
+        return len(self.model.state_space()[0])
+
+    def plant(self, gain_error: float) -> MultivariablePlant:
+        """For design and certificate."""
+        import control  # here, because it brings a plotting library with it
+
+        Li = control.ss(
+            self.Li_a, self.Li_b, self.Li_c, self.Li_d, self.model.dt_s, remove_useless_states=False
+        )
+        off: tuple[RationalWeight, ...] = ()
+        if gain_error:
+            weight = RationalWeight(numerator=(gain_error,), denominator=(1.0,))
+            off = (weight,) * len(self.model.input_names)
+        return MultivariablePlant(
+            self.name, self.model.to_control(), ResponseBall(self.Lo, Li, self.radius), input_error=off
+        )
+
+    @property
+    def modes(self) -> tuple[tuple[float, float, Real | None], ...]:
+        """Frequency [rad/s], damping ratio, and motion of the outputs, largest 1, of every pole pair below
+        the Nyquist frequency that has one shape (None: it has not)."""
+        found = []
+        residues, dt_s = self.model.residues(), self.model.dt_s
+        for pole, residue in zip(residues.poles, residues.pole, strict=True):
+            if not pole.imag:
+                continue
+            s = np.log(pole) / dt_s
+            left, sizes, _ = np.linalg.svd(residue)
+            one = sizes.size == 1 or sizes[1] < 1e-6 * sizes[0]
+            moved = left[:, 0] / left[np.argmax(np.abs(left[:, 0])), 0]
+            found.append((float(abs(s)), float(-s.real / abs(s)), moved.real if one else None))
+        return tuple(sorted(found, key=lambda mode: mode[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class PointModels:
+    """One per operating point."""
+
+    points: tuple[PointModel, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class JointsDesignResult:
+    """The controller, if any, its worst case over plants and requirements, and one line about it."""
+
+    found: MultivariableResult | None
+    reason: str
+
+    @property
+    def controller(self) -> Controller | None:
+        return None if self.found is None else self.found.controller
+
+
+@dataclass(frozen=True, eq=False)
+class JointsCertificate:
+    """None where there is no controller."""
+
+    certificate: MultivariableCertificate | None
+
+    @property
+    def certified(self) -> bool:
+        return self.certificate is not None and self.certificate.met
+
+
+@dataclass(frozen=True, eq=False)
+class JointsRun:
+    """A step of all joints at an operating point. output (T, Y), command (T, U); settled: every output ends
+    within a tenth of its step; overshoot (Y,) over the step; limited: share of samples at a limit."""
+
+    point: str
+    condition: str
+    output: Real
+    command: Real
+    settled: bool
+    overshoot: Real
+    limited: float
+
+
+@dataclass(frozen=True, eq=False)
+class JointsLoopResult:
+    """machine: what ran; time_s (T,), reference (T, Y); skipped: why nothing ran."""
+
+    machine: Literal["simulated", "identified"] = "identified"
+    time_s: Real | None = None
+    reference: Real | None = None
+    runs: tuple[JointsRun, ...] = ()
+    skipped: str | None = None
+
+    def settled_points(self) -> tuple[int, int]:
+        """Operating points where every run settles, and their number."""
+        points = dict.fromkeys(run.point for run in self.runs)
+        good = [all(run.settled for run in self.runs if run.point == point) for point in points]
+        return sum(good), len(good)
+
+
+class JointsResults(StageResults):
+    """Of several joints."""
+
+    records = StageResult(RecordsResult)
+    identify = StageResult(PointModels)
+    design = StageResult(JointsDesignResult)
+    certify = StageResult(JointsCertificate)
+    closed_loop = StageResult(JointsLoopResult)
+
+
+def _of(stage: StageInput) -> tuple[JointsConfig, JointsResults]:
+    config: Any = stage.config
+    results: Any = stage.results
+    return config, results
+
+
+def make_records(stage: StageInput) -> RecordsResult:
+    """Records of every operating point: simulated, or log files, whose `condition` names the point."""
+    config, _ = _of(stage)
+    source = config.source
+    if isinstance(source, TwoJointSource):
+        records = []
+        for number, point in enumerate(source.points):
+            stage.progress.update("records", number / len(source.points), point.name)
+            records.append(
+                RunRecord(simulate_point(config, source, point), "estimation", point.name, "", "multisine")
+            )
+        return RecordsResult(tuple(records))
+    channels: Any = config.joints
+    read = [read_record(source, entry, channels) for entry in source.records]
+    found = RecordsResult(
+        tuple(
+            RunRecord(record.limited(source.input_limit or np.inf), entry.role, entry.condition, entry.remark)
+            for entry, record in zip(source.records, with_common_sampling_time(read), strict=True)
+        )
+    )
+    for item in found.of_role("estimation"):
+        if all(np.ptp(column) == 0 for column in item.record.input.T):
+            refuse_constant_input(item.record)
+    return found
+
+
+def simulate_point(config: JointsConfig, source: TwoJointSource, point: OperatingPoint) -> Record:
+    """The record of an operating point: independent multisines at both motors, from rest."""
+    draw = partial(stage_rng, config.run.seed, "records", point.name)
+    machine = machine_at(source, point, draw("noise"), coulomb_Nm=source.coulomb_Nm)
+    period, rng = source.samples, draw("excitation")
+    lines = multisine_lines(period, source.dt_s, source.band_Hz)
+    u = np.column_stack([multisine(lines, period, rms, rng) for rms in source.rms_V])
+    inputs, outputs = ([getattr(joint, kind) for joint in config.joints] for kind in ("input", "output"))
+    return Record(
+        point.name, u, machine.run(u), source.dt_s, tuple(inputs), tuple(outputs), input_units=("V",) * 2,
+        output_units=("rad",) * 2,
+    )  # fmt: skip
+
+
+def machine_at(
+    source: TwoJointSource,
+    point: OperatingPoint,
+    rng: np.random.Generator,
+    *,
+    coulomb_Nm: tuple[float, float],
+    extra_kg: float = 0.0,
+) -> TwoLinkMachine:
+    """The simulated arm around an operating point."""
+    arm = two_link_arm(point.payload_kg + extra_kg, coulomb_Nm, source.gravity_m_s2)
+    return TwoLinkMachine(arm, (point.shoulder_rad, point.elbow_rad), source.dt_s, source.noise_rad, rng)
+
+
+def identify_points(stage: StageInput) -> PointModels:
+    """A model and its ball for every operating point; each search begins at the poles of the point before."""
+    config, results = _of(stage)
+    options = config.identification
+    asked = IdentOptions(
+        integrators=options.integrators,
+        input_delay_samples=options.input_delay_samples,
+        n_real=options.n_real,
+        n_pairs=options.n_pairs,
+    )
+    items = results.records.of_role("estimation")
+    names = list(dict.fromkeys(item.condition or "arm" for item in items))
+    found: list[PointModel] = []
+    start: Poles | None = None
+    for number, name in enumerate(names):
+
+        def report(fraction: float, message: str, number: int = number, name: str = name) -> None:
+            stage.progress.update("identify", (number + fraction) / len(names), f"{name}: {message}")
+
+        records = [item.record for item in items if (item.condition or "arm") == name]
+        if options.increments:
+            records = [_increments(record) for record in records]
+        with naming(f"operating point {name!r}"):
+            one = identify_mimo(records, asked, start=start, progress=report)
+            found.append(_described(name, records, one, options.level, options.lowest_rad_s))
+        start = one.model.poles
+    return PointModels(tuple(found))
+
+
+def _increments(record: Record) -> Record:
+    return replace(
+        record, input=np.diff(record.input, axis=0), output=np.diff(record.output, axis=0), reference=None,
+        reference_names=(),
+    )  # fmt: skip
+
+
+def _described(
+    name: str, records: list[Record], found: MimoIdentification, level: float, lowest_rad_s: float
+) -> PointModel:
+    posterior = matrix_posterior(records, found, level=level)
+    Li = posterior.input_factor(lowest_rad_s)
+    top = np.pi / found.model.dt_s
+    shown = posterior.at(np.geomspace(lowest_rad_s, 0.999 * top, _SHOWN))
+    return PointModel(
+        name, found.model, np.sqrt(np.diag(found.noise_covariance)), found.output_fit_percent, found.rank_one,
+        posterior.output_factor, *Li, posterior.largest_radius(lowest_rad_s), shown,
+    )  # fmt: skip
+
+
+def design_joints(stage: StageInput) -> JointsDesignResult:
+    """One controller for all operating points."""
+    config, results = _of(stage)
+    plants = _plants(config, results)
+    with naming("design"):
+        try:
+            found = synthesise_multivariable(
+                plants,
+                config.specification(),
+                config.design.search,
+                progress=partial(stage.progress.update, "design"),
+            )
+        except SpecificationError as impossible:
+            return JointsDesignResult(None, str(impossible))
+    first = found.blocking[0]
+    return JointsDesignResult(
+        found,
+        f"worst case {found.gamma:.3f} (at most 1 is needed), of {first.weight} of {first.plant} at "
+        f"{first.omega_rad_s:.3g} rad/s",
+    )
+
+
+def _plants(config: JointsConfig, results: JointsResults) -> list[MultivariablePlant]:
+    return [point.plant(config.identification.gain_error) for point in results.identify.points]
+
+
+def certify_joints(stage: StageInput) -> JointsCertificate:
+    """Checked independently of the synthesis, for all frequencies."""
+    config, results = _of(stage)
+    law = results.design.controller
+    if law is None:
+        return JointsCertificate(None)
+    return JointsCertificate(certify_multivariable(law, _plants(config, results), config.specification()))
+
+
+def run_loops(stage: StageInput) -> JointsLoopResult:
+    """A step of all joints at every operating point: on the nonlinear machine as identified and under further
+    payloads and friction, or on the models where records are logs."""
+    config, results = _of(stage)
+    law, source = results.design.controller, config.source
+    if law is None:
+        return JointsLoopResult(skipped=results.design.reason)
+    bandwidth = min((joint.bandwidth_rad_s for joint in config.joints if joint.bandwidth_rad_s), default=1.0)
+    samples = int(np.ceil((config.closed_loop.duration_s or 20.0 / bandwidth) / law.dt_s))
+    step = np.array(config.closed_loop.step or (0.1,) * len(config.joints))
+    reference = np.tile(step, (samples, 1))
+    reference[: samples // 20] = 0.0
+    runs: list[JointsRun] = []
+    machines = _machines(config, results, stage)
+    for number, (point, condition, machine) in enumerate(machines):
+        stage.progress.update("closed_loop", number / len(machines), f"{point}, {condition}")
+        output, command = simulate_joints(law, machine(), reference)
+        runs.append(_judged(point, condition, output, command, step, law))
+    kind: Literal["simulated", "identified"] = (
+        "simulated" if isinstance(source, TwoJointSource) else "identified"
+    )
+    return JointsLoopResult(kind, np.asarray(np.arange(samples) * law.dt_s), reference, tuple(runs))
+
+
+def _judged(
+    point: str, condition: str, output: Real, command: Real, step: Real, law: Controller
+) -> JointsRun:
+    late = output[-max(1, len(output) // 20) :]
+    settled = bool(np.all(np.isfinite(output)) and np.all(np.abs(late - step) < _SETTLED * np.abs(step)))
+    limits = law.limits("input_limit")
+    return JointsRun(
+        point, condition, output, command, settled, np.max(output / step, axis=0) - 1.0,
+        float(np.mean(np.any(np.abs(command) >= limits * (1 - 1e-9), axis=1))),
+    )  # fmt: skip
+
+
+def _machines(
+    config: JointsConfig, results: JointsResults, stage: StageInput
+) -> list[tuple[str, str, Callable[[], Any]]]:
+    source, options = config.source, config.closed_loop
+    if not isinstance(source, TwoJointSource):
+        return [
+            (point.name, "identified model", partial(_ModelMachine, point.model))
+            for point in results.identify.points
+        ]
+    found: list[tuple[str, str, Callable[[], Any]]] = []
+    for point in source.points:
+        at = partial(machine_at, source, point, stage.rng("closed_loop", point.name))
+        found.append((point.name, "as identified", partial(at, coulomb_Nm=source.coulomb_Nm)))
+        for extra in options.extra_payload_kg:
+            words = f"payload {point.payload_kg + extra:g} kg"
+            found.append((point.name, words, partial(at, coulomb_Nm=source.coulomb_Nm, extra_kg=extra)))
+        if options.coulomb_Nm is not None:
+            words = f"dry friction {options.coulomb_Nm[0]:g} and {options.coulomb_Nm[1]:g} N m"
+            found.append((point.name, words, partial(at, coulomb_Nm=options.coulomb_Nm)))
+    return found
+
+
+class _ModelMachine:
+    """An identified model as a machine."""
+
+    def __init__(self, model: MimoModel) -> None:
+        self._a, self._b, self._c, d = model.state_space()
+        if np.any(d):
+            raise InputError("a model with a direct term cannot run in a loop of sampled commands")
+        self.dt_s = model.dt_s
+        self.reset()
+
+    def reset(self) -> None:
+        self._x = np.zeros(len(self._a))
+
+    def measure(self) -> Real:
+        return np.asarray(self._c @ self._x)
+
+    def advance(self, u: Real) -> None:
+        self._x = self._a @ self._x + self._b @ u
+
+
+JOINT_STAGES: tuple[Stage, ...] = (
+    Stage(
+        "records", (), make_records, 3.0, uses={"source": True, "joints": {"__all__": {"input", "output"}}}
+    ),
+    Stage("identify", ("records",), identify_points, 15.0, uses={"identification": True}),
+    Stage(
+        "design",
+        ("identify",),
+        design_joints,
+        20.0,
+        uses={"joints": True, "design": True, "identification": True},
+    ),
+    Stage("certify", ("identify", "design"), certify_joints, 5.0, uses={"joints": True, "design": True}),
+    Stage(
+        "closed_loop",
+        ("identify", "design"),
+        run_loops,
+        5.0,
+        uses={"closed_loop": True, "source": True, "joints": True},
+    ),
+)
