@@ -109,6 +109,10 @@ def put_gain(name: str, spec: Any, factor: float) -> None:
             put_component(one, key, k, factor * getattr(one, key)[k])
 
 
+def put_forcerange(name: str, limits: tuple[float, float], spec: Any, factor: float) -> None:
+    spec.actuator(name).forcerange = factor * np.array(limits)
+
+
 def put_lag(name: str, spec: Any, value: float) -> None:
     one = spec.actuator(name)
     if one.dyntype == mujoco.mjtDyn.mjDYN_NONE:

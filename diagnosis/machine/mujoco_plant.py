@@ -39,6 +39,7 @@ TOLERANCES = {
     "armature": 0.1,
     "stiffness": 0.05,
     "gain": 0.02,
+    "forcerange": 0.1,
     "lag": 0.2,
     "delay": 0.2,
 }

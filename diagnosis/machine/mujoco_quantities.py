@@ -19,6 +19,7 @@ from diagnosis.machine.mujoco_edits import (
     put_backlash,
     put_delay,
     put_first,
+    put_forcerange,
     put_gain,
     put_gravity,
     put_inertia,
@@ -109,6 +110,11 @@ class Quantities:
         )
         if {int(one.gaintype), int(one.biastype)} <= set(FORCES):
             yield Quantity(f"{one.name}.gain", 1.0, partial(put_gain, one.name))
+        limits = self.model.nominal.actuator(one.name)
+        if limits.forcelimited[0]:
+            yield Quantity(
+                f"{one.name}.forcerange", 1.0, partial(put_forcerange, one.name, tuple(limits.forcerange))
+            )
         if one.dyntype in LAGS:
             yield late(f"{one.name}.lag", lag, partial(put_lag, one.name), "time_constant_s")
         put = partial(put_delay, "actuator", one.name, self.model.spec.option.timestep)

@@ -12,7 +12,7 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 
 from benchmarks import mujoco_cases as cases  # noqa: E402
-from diagnosis import PlantExperiment, diagnose  # noqa: E402
+from diagnosis import PlantCase, PlantExperiment, diagnose  # noqa: E402
 from diagnosis.machine.mujoco_plant import MujocoArm  # noqa: E402
 from diagnosis.machine.mujoco_quantities import Quantities  # noqa: E402
 from diagnosis.machine.plant_effect import Change  # noqa: E402
@@ -54,6 +54,24 @@ def test_a_stick_figure_stands_where_its_joint_says():
     tips = np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
     np.testing.assert_allclose(lines[:, -1, 1], tips, atol=1e-12)
     np.testing.assert_allclose(lines[:, -1, 0], 0 * tips, atol=1e-12)
+
+
+@pytest.mark.parametrize(("limit", "stated"), [(0.4, 0.8), (0.7, 0.35)])
+def test_a_force_limit_that_is_stated_wrong_is_named(limit, stated):
+    text = ROD.replace(
+        'joint="hinge"/></actuator>', f'joint="hinge" forcerange="-{stated} {stated}"/></actuator>'
+    )
+    arm = MujocoArm(mujoco.MjSpec.from_string(text), ("hinge",), DT_S)
+    records = []
+    for seed, role in enumerate(("estimation", "held_out")):
+        torque = steps(seed)
+        angle = turned(np.clip(torque, -limit, limit)) + 1e-4 * np.random.default_rng(9).standard_normal(200)
+        records.append(PlantExperiment(role, role, np.column_stack([torque, angle]), angle[:, None]))
+    plant = arm.plant(records, np.array([1e-4]), model_error=0.01)
+    found = diagnose(PlantCase("rod", plant, tuple(records)))
+    assert found.combination == ("wrong_motor.forcerange",)
+    (change,) = found.repair
+    assert change.values["ratio"] * stated == pytest.approx(limit, rel=0.03)
 
 
 def steps(seed: int = 0, count: int = 200) -> np.ndarray:
