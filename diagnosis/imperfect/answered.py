@@ -48,14 +48,14 @@ def looked_at_again(
     at where the records leave no gap that interests, nor where the first answer leaves none, in them either;
     they are not taken where they only add to what was named.
     """
-    # A rig's unlisted causes act within windows too: what is named of it in a free run stands.
-    sought = answer.verdict != "none" if isinstance(answer.case, PlantCase) else answer.verdict == "unknown"
-    windows = first.horizon if sought else None
+    # Unlisted causes act within windows too: what a free run leaves unknown stays so, and what it names of a
+    # rig stands.
+    named = set(answer.combination)
+    windows = first.horizon if named and isinstance(answer.case, PlantCase) else None
     if windows is None:
         return answer
     search = Search(answer.case, progress, deadline_s, windows)
-    named = set(answer.combination)
-    holding = [e for e in first.found if named and named <= set(e.names)]
+    holding = [e for e in first.found if named <= set(e.names)]
     if holding:
         named_alone = first.by_these(answer.combination, max(holding, key=lambda e: e.evidence))
         left = search.left_by(named_alone)
