@@ -111,7 +111,15 @@ class Browser:
         return found["result"].get("value")
 
     def press(self, key: str) -> None:
-        codes = {"Enter": 13, "Escape": 27, "Tab": 9, "ArrowRight": 39, "ArrowLeft": 37, " ": 32}
+        codes = {
+            "Enter": 13,
+            "Escape": 27,
+            "Tab": 9,
+            "ArrowRight": 39,
+            "ArrowLeft": 37,
+            "PageDown": 34,
+            " ": 32,
+        }
         text = {"Enter": "\r", " ": " "}.get(key, key if len(key) == 1 else "")
         more = {"text": text} if text else {}
         for kind in ("keyDown", "keyUp"):

@@ -21,7 +21,7 @@ from control_design.synthesis.starts import with_cancelling_section
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
 from control_design.synthesis.work_pool import Candidate, WorkPool, Workshop
-from control_design.synthesis.youla_starts import free_controllers
+from control_design.synthesis.youla_starts import FreeController, FreeControllers, free_controllers
 
 Progress = Callable[[float, str], None]
 
@@ -150,6 +150,36 @@ def _of_lowest_order(problem: Problem, root: int, tell: Progress) -> SynthesisRe
             reports += own.reports
         cascade = own.cascade
     return _told(problem, cascade, result, tuple(reports), tell)
+
+
+def synthesise_near(
+    controller: Controller,
+    plants: Sequence[UncertainPlant],
+    specification: Specification,
+    options: SynthesisOptions | None = None,
+    *,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+) -> SynthesisResult:
+    """As `synthesise`, from one controller alone: several times faster, and in the valley that it is in.
+
+    controller : of any order, e.g. for a specification somewhat different; fitted by one of the asked order,
+    or for "auto" of its own.
+
+    Raises SpecificationError if specification and plants contradict each other.
+    """
+    if specification.controller_order == "auto":
+        specification = specification.model_copy(update={"controller_order": max(controller.order, 1)})
+    specification.check_against(plants)
+    tell = progress or (lambda fraction, message: None)
+    problem = Problem(tuple(plants), _seen_by_the_data(specification, plants), options or SynthesisOptions())
+    cascade, workshop = Cascade(problem.spec.sections(), problem.dt_s, problem.scale_rad_s), Workshop(problem)
+    omega = problem.grids[0]
+    known = FreeController(omega, controller.response(omega, with_delay=False))
+    with WorkPool(workshop, problem.options.jobs) as pool:
+        search = OrderSearch(workshop, pool, cascade, rng, tell)
+        result = search.fits_only(FreeControllers((known,), np.inf), np.inf)
+    return _told(problem, cascade, result, result.reports, tell)
 
 
 def _told(

@@ -12,7 +12,7 @@ from control_design.plants.stated_uncertainty import StatedDiscs
 from control_design.plants.weights import RationalWeight
 from control_design.specification import Specification, SpecificationError
 from control_design.synthesis.bandwidth import synthesise_widest
-from control_design.synthesis.synthesis import synthesise
+from control_design.synthesis.synthesis import synthesise, synthesise_near
 from validation.example_plants import flexible_link, flexible_link_specification
 
 
@@ -86,3 +86,15 @@ def test_what_has_no_auto_says_so():
         Specification(controller_order="auto", structure="pi_d_notch")
     with pytest.raises(SpecificationError, match="give a number"):
         auto(WISH).sections()
+
+
+@pytest.mark.parametrize("order", [5, 6, "auto"])
+def test_from_a_controller_for_other_requirements(order):
+    plant, asked = flexible_link("A"), flexible_link_specification(5)
+    rng = np.random.default_rng(1)
+    other = synthesise([plant], asked, rng=rng, thorough=False)
+    harder = auto(asked, modulus_margin=1.05 * asked.modulus_margin, controller_order=order)
+    near = synthesise_near(other.controller, [plant], harder, rng=rng)
+    whole = synthesise([plant], auto(harder, controller_order=near.controller.order), rng=rng)
+    assert near.controller.order == (5 if order == "auto" else order)
+    assert near.gamma <= 1.03 * whole.gamma

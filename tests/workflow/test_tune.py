@@ -142,6 +142,18 @@ def test_a_newer_design_ends_the_one_that_runs(session, monkeypatch):
     assert len(raised) == 1
 
 
+def test_near_designs_are_soon_there_and_hardly_worse(session):
+    session.design({})
+    wanted = {"effort_limit": 12.0, "bandwidth_rad_s": 0.8}
+    near = session.near(wanted)
+    started = session.design(wanted)
+    assert near["gamma"] == pytest.approx(started["gamma"], rel=0.02)
+    assert near["items"][0]["requirement"] == started["items"][0]["requirement"]
+    assert session.near({"bandwidth_rad_s": 60.0, "effort_limit": None}) == {}
+    assert session.near({"lowest_bandwidth_rad_s": 0.3}) == {}
+    session.design({})
+
+
 def test_the_scaled_design_is_the_last_one_times_a_gain(session):
     session.design({})
     found = session.scaled({"effort_limit": 5.0})
@@ -347,8 +359,7 @@ def test_the_page_by_keyboard(server, browser):
     browser.ask("document.getElementById('c-effort_limit').focus()")
     browser.press("p")
     assert text(browser, "pin") == "Unpin"
-    for _ in range(40):
-        browser.press("ArrowLeft")
+    browser.press("PageDown")  # a tenth of the range
     designed(browser, 2)
     moved = browser.ask("document.getElementById('c-effort_limit').getAttribute('aria-valuetext')")
     assert float(moved) < 0.6 * float(stated)

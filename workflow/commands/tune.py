@@ -45,6 +45,7 @@ class TuneServer(ThreadingHTTPServer):
         self.hosts = tuple(f"{name}:{self.server_port}" for name in (HOST, "localhost"))
         self.actions: dict[str, Handler] = {
             "/scaled": lambda asked: session.scaled(asked["settings"]),
+            "/near": lambda asked: session.near(asked["settings"]),
             "/design": lambda asked: session.design(asked["settings"]),
             "/bound": lambda asked: session.bound(asked["settings"]),
             "/save": lambda asked: session.save(asked["settings"], asked["name"]),

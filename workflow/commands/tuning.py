@@ -23,7 +23,8 @@ from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.frequency_grid import checked_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
-from control_design.specification import Specification
+from control_design.specification import Specification, SpecificationError
+from control_design.synthesis.synthesis import synthesise_near
 from control_design.synthesis.synthesis_result import SynthesisResult
 from workflow.commands.design import design_controller
 from workflow.config.design_file import DesignFile, PlantSection, read_design_file
@@ -34,6 +35,7 @@ from workflow.engine.randomness import stage_rng
 from workflow.figures.sensitivity import sensitivity_curves
 from workflow.tasks.design import bracket_numbers, find_bracket, find_design
 from workflow.tasks.design_source import level_can_change, load_sources
+from workflow.tasks.results import DesignResult
 from workflow.text.templates import said
 
 CONFIDENCE = "confidence"  # a setting beside those of the specification: level of the ellipses
@@ -138,8 +140,20 @@ class TuningSession:
                 return {**_finite(numbers), "plants": self._curves(law, plants, specification)}
         raise InputError("no gain keeps the last controller stable with these settings")
 
+    def near(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """As `design`, from the last controller alone: soon, and seldom worse. Empty where that leads
+        nowhere, or the bandwidth is to be found."""
+        specification, _, _ = self._read(values)
+        if self._last is None or specification.lowest_bandwidth_rad_s or self.file.certificate.calibrate:
+            return {}
+        found = self._designed(values, self._last)
+        return found if found["plants"] else {}
+
     def design(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """A new design with its certificate. Raises SupersededError where a newer one is asked for."""
+        return self._designed(values, None)
+
+    def _designed(self, values: Mapping[str, Any], like: Controller | None) -> dict[str, Any]:
         asked = self.completed(values)
         specification, plants, _ = self._read(values)
         self._newest += 1
@@ -153,7 +167,16 @@ class TuningSession:
             still()
             options = asked.synthesis.model_copy(update={"jobs": 1})
             rng = stage_rng(self.seed, "design")
-            found = find_design(plants, specification, options, asked.certificate, rng, still, advise=False)
+            if like is None:
+                found = find_design(
+                    plants, specification, options, asked.certificate, rng, still, advise=False
+                )
+            else:
+                try:
+                    near = synthesise_near(like, plants, specification, options, rng=rng, progress=still)
+                except SpecificationError as impossible:
+                    return {"certified": False, "gamma": None, "reason": str(impossible), "plants": []}
+                found = DesignResult(near, near.gamma <= 1.0, "")
             still()
             law, used = found.controller, found.specification or specification
             numbers: dict[str, Any] = {"certified": False, "gamma": None, "reason": found.reason}
