@@ -5,13 +5,18 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import control
 import numpy as np
 import pandas as pd
 import pytest
 
 from control_design.controllers.controller import Controller
+from control_design.plants.plant_set import matrix_response
+from plant import two_link_arm
 from workflow.cli import main
 from workflow.config.joints_config import JointsConfig, load_joints
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.joints import JointsResults
 
 _JOINTS = """
 [[joints]]
@@ -79,6 +84,20 @@ def test_a_run_ends_with_a_certified_controller_and_a_page(run_of_the_arm):
         assert (run_of_the_arm / "figures" / f"{picture}.svg").is_file()
     status = json.loads((run_of_the_arm / "manifest.json").read_text())["status"]
     assert status == "complete"
+
+
+def test_the_ball_holds_the_response_of_small_motions(run_of_the_arm):
+    """Linearised by automatic differentiation, not identified."""
+    run = RunDirectory.open(run_of_the_arm)
+    (point,) = JointsResults(run).identify.points
+    a, b = two_link_arm(0.05).linear(1.6)
+    true = control.c2d(control.ss(a, b, np.eye(2, len(a)), np.zeros((2, 2))), point.model.dt_s)
+    inside = point.shown.distance(matrix_response(true, point.shown.omega_rad_s)) <= 1
+    assert np.mean(inside) > 0.9
+    modes = sorted(omega for omega, zeta, _ in point.modes if zeta < 0.3)
+    poles = np.linalg.eigvals(a)
+    light = np.sort(np.abs(poles[(poles.imag > 0) & (-poles.real < 0.3 * np.abs(poles))]))
+    np.testing.assert_allclose(modes, light, rtol=0.01)
 
 
 def test_a_report_and_a_resumed_run_say_the_same(run_of_the_arm, capsys):

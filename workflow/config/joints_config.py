@@ -33,9 +33,11 @@ class TwoJointSource(Section):
     points: tuple[OperatingPoint, ...] = Field(min_length=1, description="operating points, one plant each")
     dt_s: float = Field(0.002, gt=0, description="sampling period")
     samples: int = Field(8000, ge=500, description="length of a record")
-    rms_V: Two = Field((1.0, 1.0), description="size of the multisine at each motor")
+    rms_V: Two = Field(
+        (0.2, 0.2), description="size of the multisine at each motor; the response is that of small motions"
+    )
     band_Hz: Two = Field((0.1, 60.0), description="band of the multisines")
-    noise_rad: float = Field(1e-4, ge=0, description="standard deviation of the angle sensors")
+    noise_rad: float = Field(2e-5, ge=0, description="standard deviation of the angle sensors")
     coulomb_Nm: Two = Field((0.0, 0.0), description="dry friction of each joint while records are made")
     gravity_m_s2: float = Field(0.0, ge=0, description="0: the arm moves in a horizontal plane")
 
