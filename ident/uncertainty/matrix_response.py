@@ -118,7 +118,14 @@ class MatrixPosterior:
         front = front_response(omega, model.dt_s, model.integrators, model.input_delay_samples)
         columns = self.modes.response_columns(omega) @ self.covariance_factor * front[:, None, None, None]
         covariance = np.einsum("fyup,fyvp->fuv", columns.conj(), columns) / len(model.outputs)
-        upper = np.linalg.cholesky(covariance).conj().swapaxes(1, 2)
+        try:
+            upper = np.linalg.cholesky(covariance).conj().swapaxes(1, 2)
+        except np.linalg.LinAlgError:
+            least = omega[np.argmin(np.linalg.eigvalsh(covariance)[:, 0])]
+            raise ValueError(
+                f"at {least:.3g} rad/s the model leaves some input without uncertainty: poles that nearly "
+                "cancel, mostly below the excited band; give n_real and n_pairs, or excite lower frequencies"
+            ) from None
         turned = np.einsum("fyup,fuv->fyvp", columns, np.linalg.inv(upper))
         flat = turned.reshape(omega.size, -1, turned.shape[-1])
         weights = np.linalg.svd(np.concatenate([flat.real, flat.imag], axis=1), compute_uv=False) ** 2
