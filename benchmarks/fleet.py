@@ -1,6 +1,6 @@
 """A fleet on two Dask workers, one killed midway: bytes against local processes, time, memory of the parent.
 
-    python -m benchmarks.fleet --cases 40 --out /tmp/fleet [--kill]
+    python -m benchmarks.fleet --cases 40 --out runs/fleet [--kill]
 
 Machines are carriages on a rail: force in, position out, one candidate (dry friction), which grows with the
 number of the machine from a tenth of the force to a third. The model is a Python file, so that a case takes
