@@ -31,7 +31,6 @@ _FINISHING = 10  # rounds for the best alone, until dense check and grid agree
 _AGREE = 1.001
 _NO_RESONANCE = 0.3  # damping that fits begin with: a narrow one of their own hides between grid points
 _WEIGHTED = 3  # rounds of fits with random weights
-_TURNS = 2  # of fits at each order where many are tried; the second with random weights
 # Of the worst case that the small Youla problem reaches, and how far that lies above the default one's at
 # most: a design below both shows that it has ended in a valley, and is no bound.
 _NEAR, _FAIR, _FINER = 1.03, 1.05, 1.1
@@ -132,25 +131,6 @@ class OrderSearch:
             return OrderResult(best, tuple(self.reports), () if best is None else (best.gamma,))
         ends = self._retrieved(found)
         return self._exchange(ends, hops=False) if ends else OrderResult(None, tuple(self.reports), ())
-
-    def within_reach(self, free: FreeControllers, limit: float) -> OrderResult:
-        """From fits of controllers of any order: the first worst case at or below a limit, else the best
-        end as it is. Fits with random weights follow where the plain ones come near; only what lies below
-        the limit on its own grid is taken through the exchange."""
-        found: list[Candidate] = []
-        for turn in range(_TURNS):
-            for end in self._done([self._task(x) for x in self._fits(free, turn)]):
-                found.append(end)
-                if end.gamma <= limit:
-                    return OrderResult(end, tuple(self.reports), (end.gamma,))
-            least = min((c.gamma_grid for c in found), default=np.inf)
-            if least <= limit or least > _NEAR * limit:
-                break
-        stable = sorted((c for c in found if np.isfinite(c.gamma)), key=lambda c: c.gamma)
-        if stable and least <= limit:
-            return self._exchange(stable, hops=False)
-        best = stable[0] if stable else None
-        return OrderResult(best, tuple(self.reports), (), self._nearest(found) if found else None)
 
     def _fits(self, free: FreeControllers, turn: int) -> list[Real]:
         """Stable fits of the controllers of any order; from the second turn on with random weights."""

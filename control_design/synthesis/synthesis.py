@@ -10,7 +10,6 @@ import numpy as np
 from control_design.controllers.biquads import Cascade, SectionKind
 from control_design.controllers.controller import Controller
 from control_design.convex.convex_options import YoulaOptions
-from control_design.convex.youla import youla_bracket
 from control_design.plants.ellipses import Real, scale_to_minus_one
 from control_design.plants.frequency_grid import local_maxima
 from control_design.plants.guards import Guard
@@ -41,7 +40,6 @@ _WITHIN = 1.02  # of the Youla bound: what the order "auto" may leave
 _GAINS = 0.99  # two more states that leave more than this of gamma end the search for "auto"
 _MIDDLE, _HIGHEST = 5, 12  # orders that "auto" tries: the first, and the last
 
-_HIGHEST_ORDER = 10  # tried for the cheapest: above it a plain search of one order takes longer than all
 _PLACES = 5  # named of each plant
 
 
@@ -185,63 +183,6 @@ def synthesise_near(
 
 
 def _told(
-    problem: Problem, cascade: Cascade, result: OrderResult, reports: tuple[StartReport, ...], tell: Progress
-) -> SynthesisResult:
-    return _answer(problem, cascade, result, tuple(reports), tell)
-
-
-def synthesise_cheapest(
-    plants: Sequence[UncertainPlant],
-    specification: Specification,
-    options: SynthesisOptions | None = None,
-    *,
-    rng: np.random.Generator,
-    within: float = 1.02,
-    progress: Progress | None = None,
-) -> tuple[Specification, SynthesisResult]:
-    """Design the controller of lowest order whose gamma is at most `within` times the Youla bound's.
-
-    The bound is the largest of the plants' own, with the default basis; one controller for several plants
-    may not reach it at any order. Orders are tried upwards from controllers of the bound only (`OrderSearch.
-    within_reach`): a lower order that only a search from many starts finds is missed. Where no order reaches
-    it, the best design met is returned. Returns the specification with the order, and the result.
-
-    Raises SpecificationError as `synthesise`, ValueError for notches, which are not fitted, and where the
-    bound is not known.
-    """
-    options = options or SynthesisOptions()
-    specification.check_against(plants)
-    if specification.structure != "biquads":
-        raise ValueError("an order is chosen for structure 'biquads' only; give controller_order")
-    asked = _seen_by_the_data(specification, plants)
-    bound = max(youla_bracket(plant, asked, YoulaOptions()).ellipse for plant in plants)
-    if not np.isfinite(bound):
-        raise ValueError("no Youla bound of these plants, so no order near it; give controller_order")
-    free, root = free_controllers(plants, asked), int(rng.integers(2**63))
-    tell = progress or (lambda fraction, message: None)
-    best: tuple[Specification, SynthesisResult] | None = None
-    workshop = Workshop(problem := Problem(tuple(plants), asked, options))
-    grids = list(problem.grids)
-    with WorkPool(workshop, options.jobs) as pool:
-        for order in range(1, _HIGHEST_ORDER + 1):
-            problem.grids[:] = grids
-            told = specification.model_copy(update={"controller_order": order})
-            cascade = Cascade(told.sections(), problem.dt_s, problem.scale_rad_s)
-            part = part_of(tell, order - 1, _HIGHEST_ORDER, f"order {order}: ")
-            search = OrderSearch(workshop, pool, cascade, np.random.default_rng([root, order]), part)
-            found = search.within_reach(free, within * bound)
-            if found.best is None and best is not None:
-                continue
-            answer = told, _answer(problem, cascade, found, tuple(search.reports), tell)
-            if best is None or answer[1].gamma < best[1].gamma:
-                best = answer
-            if answer[1].gamma <= within * bound:
-                return answer
-    assert best is not None
-    return best
-
-
-def _answer(
     problem: Problem, cascade: Cascade, result: OrderResult, reports: tuple[StartReport, ...], tell: Progress
 ) -> SynthesisResult:
     best = result.best

@@ -8,14 +8,11 @@ import pytest
 
 from control_design import Specification, SynthesisOptions, UncertainPlant, certify, synthesise
 from control_design.controllers.biquads import Cascade
-from control_design.convex.convex_options import YoulaOptions
-from control_design.convex.youla import youla_bracket
 from control_design.plants.ellipses import distance_to_minus_one, largest_disturbance_gain
 from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.descent import MinimaxDescent, _Boundary
 from control_design.synthesis.problem import Problem
 from control_design.synthesis.starts import StartMaker, with_cancelling_section
-from control_design.synthesis.synthesis import synthesise_cheapest
 from validation.example_plants import flexible_link, flexible_link_specification
 
 from .plants import RelativeDisc
@@ -193,22 +190,3 @@ def test_active_damping_agrees_between_seeds_and_gains_with_order():
         for system in (control.feedback(plant, controller), plant)
     )
     assert closed <= 0.3 * result.gamma * opened * 1.01
-
-
-@pytest.mark.parametrize("scenario", ["A", "C"])
-def test_the_cheapest_order_within_reach_of_the_bound(scenario: str) -> None:
-    """Certified within 2 % of the bound, and the same search one order lower is not."""
-    plant, asked = flexible_link(scenario), flexible_link_specification(1)
-    bound = youla_bracket(plant, asked, YoulaOptions()).ellipse
-    chosen, result = synthesise_cheapest([plant], asked, rng=np.random.default_rng(0))
-    assert certify(result.controller, [plant], chosen).gamma <= 1.02 * bound
-    assert result.controller.A.shape[0] == chosen.controller_order
-    lower = chosen.model_copy(update={"controller_order": chosen.controller_order - 1})
-    below = synthesise([plant], lower, rng=np.random.default_rng(0))
-    assert below.gamma > 1.02 * bound
-
-
-def test_no_order_is_chosen_for_notches() -> None:
-    asked = flexible_link_specification(5).model_copy(update={"structure": "pi_d_notch"})
-    with pytest.raises(ValueError, match="give controller_order"):
-        synthesise_cheapest([flexible_link("A")], asked, rng=np.random.default_rng(0))
