@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -78,14 +79,14 @@ def stacked_rows(
 
 @dataclass(frozen=True, eq=False)
 class _Local:
-    """Rows near the worst at a point, each a Hermitian 2 x 2 block in the two largest eigenvectors of H over
-    its largest eigenvalue: block (r, 2, 2) complex, its logarithmic value; slopes (r, 3, n): first and second
-    diagonal entry and the entry above them (complex); in_t (r, 3, N) alike. basis (r, Y, 2), top (r,)."""
+    """Rows near the worst at a point, each the Hermitian matrix of log H in its eigenvectors, w = Y of them,
+    largest first, as real numbers (`_entries`): value (r, w^2), slope (r, w^2, n), in_t (r, w^2, N). basis
+    (r, Y, w), top (r,)."""
 
     index: Integer
-    block: Complex
-    slope: Complex
-    in_t: Complex
+    value: Real
+    slope: Real
+    in_t: Real
     basis: Complex
     top: Real
 
@@ -106,8 +107,8 @@ class MatrixDescent:
     """From any controller with stable nominal loops to a local minimum of the worst case on a grid.
 
     Largest eigenvalues meet where the worst case is smallest, and have kinks there: a step therefore bounds
-    the linearised 2 x 2 block of the two largest (a second-order cone), with the scalings as unknowns, and
-    one common curvature, that of the blocks' sum weighted by their multipliers. Loops stay stable.
+    the largest eigenvalue of the linearised matrix, by cuts, with the scalings as unknowns, and one common
+    curvature, that of the matrices' sum weighted by their multipliers. Loops stay stable.
     """
 
     def __init__(self, form: ModalForm, stack: StackedRows, loops: Sequence[NominalLoop]) -> None:
@@ -140,7 +141,7 @@ class MatrixDescent:
         while taken < steps and box > _SMALLEST_BOX:
             if local is None:
                 local = self._local(x, bound)
-                steepest = np.max(np.abs(local.slope[:, 0].real), axis=0)
+                steepest = np.max(np.abs(local.slope[:, 0]), axis=0)
                 unit = np.minimum(self.form.units(x), 1.0 / np.maximum(steepest, 1e-12))
                 curvature = self._curvature(x, bound, local, weights, unit)
             taken += 1
@@ -155,7 +156,8 @@ class MatrixDescent:
             after = self.bound(trial, bound.log_t)
             actual = -np.inf if after is None else best - 2 * float(np.log(np.max(after.gamma)))
             if after is not None and actual > 0.02 * predicted:
-                weights = np.zeros((self.stack.s.size, 2, 2), dtype=np.complex128)
+                outputs = local.basis.shape[1]
+                weights = np.zeros((self.stack.s.size, outputs, outputs), dtype=np.complex128)
                 # Multipliers in coordinates of the outputs: eigenvectors turn from step to step.
                 weights[local.index] = local.basis @ multipliers @ conjugate(local.basis)
                 x, bound, best, local = trial, after, best - actual, None
@@ -171,7 +173,7 @@ class MatrixDescent:
         if bound is None:
             return None
         local = self._local(x, bound)
-        steepest = np.max(np.abs(local.slope[:, 0].real), axis=0)
+        steepest = np.max(np.abs(local.slope[:, 0]), axis=0)
         unit = np.minimum(self.form.units(x), 1.0 / np.maximum(steepest, 1e-12))
         step = self._step(x, local, np.zeros((x.size, x.size)), unit, _SMALL_BOX)
         if step is None:
@@ -180,7 +182,7 @@ class MatrixDescent:
         found = expansion(rows, self.form.response(x[None], s)[0], bound.log_t[local.index])
         left, right = found.left @ local.basis, found.right @ local.basis / local.top[:, None, None]
         on_K = right @ step[2] @ conjugate(left)
-        near = local.block[:, 0, 0].real > np.max(local.block[:, 0, 0].real) - _NEAR
+        near = local.value[:, 0] > np.max(local.value[:, 0]) - _NEAR
         return Pull(s[near], on_K[near], left[near, :, 0], right[near, :, 0])
 
     def _local(self, x: Real, bound: Bound) -> _Local:
@@ -190,25 +192,23 @@ class MatrixDescent:
         K = self.form.response(x[None], s)[0]
         found = expansion(rows, K, bound.log_t[index])
         sizes, vectors = np.linalg.eigh(found.H)
-        width = min(2, sizes.shape[1])
-        basis, top = vectors[:, :, ::-1][:, :, :width], sizes[:, -1]
-        block = np.zeros((index.size, width, width), dtype=np.complex128)
-        for i in range(width):
-            block[:, i, i] = log[index] + sizes[:, -1 - i] / top - 1.0
+        sizes, basis, top = sizes[:, ::-1], vectors[:, :, ::-1], sizes[:, -1]
+        width = sizes.shape[1]
         left, right = found.left @ basis, found.right @ basis
 
         def slopes(i: int, j: int) -> Complex:
             return np.asarray(self.form.slopes(x[None], s, left[None, :, :, i], right[None, :, :, j])[0])
 
+        above = list(combinations(range(width), 2))
+        slope = [2 * slopes(i, i).real for i in range(width)]
+        for i, j in above:
+            entry = slopes(i, j) + np.conj(slopes(j, i))
+            slope += [entry.real, entry.imag]
         turned = conjugate(basis)[:, None] @ found.in_t @ basis[:, None] / top[:, None, None, None]
-        slope: list[Any] = [2 * slopes(0, 0).real]
-        in_t: list[Any] = [turned[:, :, 0, 0].real]
-        if width == 2:
-            slope += [2 * slopes(1, 1).real, slopes(0, 1) + np.conj(slopes(1, 0))]
-            in_t += [turned[:, :, 1, 1].real, turned[:, :, 0, 1]]
-        return _Local(
-            index, block, np.stack(slope, axis=1) / top[:, None, None], np.stack(in_t, axis=1), basis, top
-        )
+        value = np.zeros((index.size, width**2))
+        value[:, :width] = log[index][:, None] + sizes / top[:, None] - 1.0
+        in_t = np.moveaxis(_entries(turned), 1, 2)
+        return _Local(index, value, np.stack(slope, axis=1) / top[:, None, None], in_t, basis, top)
 
     def _curvature(self, x: Real, bound: Bound, local: _Local, weights: Complex | None, unit: Real) -> Real:
         """Of the blocks' sum weighted by the multipliers of the step before, in natural units (n, n)."""
@@ -244,90 +244,105 @@ class MatrixDescent:
     def _step(
         self, x: Real, local: _Local, curvature: Real, unit: Real, box: float
     ) -> tuple[Real, float, Complex] | None:
-        """Step (n,) in natural units, predicted fall of log gamma^2, multipliers (r, 2, 2); None where it
-        fails. Rows are u^H block u for directions u of every block; the worst are added in rounds."""
-        block, slope = local.block, local.slope * unit
-        wide = slope.shape[1] == 3
-        best = float(np.max(block[:, 0, 0].real))
-        # Entries (r, 3 or 1) as real numbers: half the trace, and the Bloch vector m of the block.
-        value = (
-            _bloch(block[:, 0, 0], block[:, 1, 1], block[:, 0, 1]) if wide else block[:, 0, 0].real[:, None]
-        )
-        change = _bloch(slope[:, 0], slope[:, 1], slope[:, 2]) if wide else slope.real
-        reach = _REACH * box * np.sum(np.abs(slope), axis=2)
-        near = np.flatnonzero(block[:, 0, 0].real + reach[:, 0] > best - box)
-        pairs, fall = near[:0], np.zeros((0, 4, 0))
-        rows, directions = near, np.zeros((near.size, 0))
-        if wide:
-            fall = _bloch(local.in_t[:, 0], local.in_t[:, 1], local.in_t[:, 2])  # (r, 4, N)
-            second = block[:, 1, 1].real + reach[:, 1] + 2 * reach[:, 2] > best - box
-            pairs = near[second[near]]
-            rows = np.concatenate([near, *[pairs] * 4])
-            sides = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
-            directions = np.vstack(
-                [np.tile([0.0, 0, 1], (near.size, 1)), np.repeat(sides, pairs.size, axis=0)]
-            )
+        """Step (n,) in natural units, predicted fall of log gamma^2, multipliers (r, w, w); None where it
+        fails. Rows are u^H M u for directions u of every matrix; the worst are added in rounds."""
+        value, change, fall = local.value, local.slope * unit, local.in_t
+        width = local.basis.shape[2]
+        best = float(np.max(value[:, 0]))
+        reach = _REACH * box * np.sum(np.abs(change), axis=2)
+        near = np.flatnonzero(value[:, 0] + reach[:, 0] > best - box)
+        rows, sides = [near], [np.eye(width, dtype=np.complex128)[np.zeros(near.size, dtype=int)]]
+        for number, (i, j) in enumerate(combinations(range(width), 2)):
+            apart = change[:, width + 2 * number : width + 2 * number + 2]
+            off = 2 * _REACH * box * np.sum(np.hypot(apart[:, 0], apart[:, 1]), axis=1)
+            both = near[(value[:, j] + reach[:, j] + off > best - box)[near]]
+            for factor in (1.0, -1.0, 1j, -1j):
+                u = np.zeros(width, dtype=np.complex128)
+                u[i], u[j] = np.sqrt(0.5), np.sqrt(0.5) * factor
+                rows.append(both)
+                sides.append(np.tile(u, (both.size, 1)))
+        at, u = np.concatenate(rows), np.concatenate(sides)
+        pairs = np.unique(at[near.size :])
         low, high = np.maximum(-box, (self._low - x) / unit), np.minimum(box, (self._high - x) / unit)
         none = np.zeros((0, x.size)), np.zeros(0)
         found = None
         room = _SCALING_BOX * box  # for each log t in the same step
         for _ in range(_CUTS if pairs.size else 1):
-            factors = np.hstack([np.ones((rows.size, 1)), 0.5 * directions])
-            at = np.einsum("ri,ri->r", factors, value[rows])
-            if wide:  # the scalings lower a row as far as they may
-                at -= room * np.sum(np.abs(np.einsum("ri,rin->rn", factors, fall[rows])), axis=1)
-            slopes = np.einsum("ri,rin->rn", factors, change[rows])
-            found = minimax_step(at, slopes, curvature, low, high, *none)
+            factors = _weights(u)
+            level = np.einsum("ri,ri->r", factors, value[at])
+            if width > 1:  # the scalings lower a row as far as they may
+                level -= room * np.sum(np.abs(np.einsum("ri,rin->rn", factors, fall[at])), axis=1)
+            found = minimax_step(
+                level, np.einsum("ri,rin->rn", factors, change[at]), curvature, low, high, *none
+            )
             if found is None or not pairs.size:
                 break
-            m = value[pairs] + change[pairs] @ found.step
-            worst, turned = _lowered(m, fall[pairs], room)
+            worst, turned = _lowered(value[pairs] + change[pairs] @ found.step, fall[pairs], room, width)
             cut = worst - found.level > _MISSED * max(best - found.level, 0.0)
             if not np.any(cut):
                 break
-            rows, directions = np.concatenate([rows, pairs[cut]]), np.vstack([directions, turned[cut]])
+            at, u = np.concatenate([at, pairs[cut]]), np.vstack([u, turned[cut]])
         if found is None:
             return None
-        d = found.step
-        multipliers = np.zeros(block.shape, dtype=np.complex128)
-        given = found.multipliers
-        rows = rows[: given.size]
-        if wide:
-            v = directions[: given.size]
-            below = v[:, 0] + 1j * v[:, 1]
-            entries = np.stack([1 + v[:, 2], np.conj(below), below, 1 - v[:, 2]], axis=1).reshape(-1, 2, 2)
-            np.add.at(multipliers, rows, 0.5 * given[:, None, None] * entries)
-        else:
-            multipliers[rows, 0, 0] = given
+        d, given = found.step, found.multipliers
+        used = u[: given.size]
+        multipliers = np.zeros((value.shape[0], width, width), dtype=np.complex128)
+        np.add.at(
+            multipliers, at[: given.size], given[:, None, None] * used[:, :, None] * np.conj(used[:, None, :])
+        )
         return d, best - found.level - 0.5 * float(d @ curvature @ d), multipliers
 
 
-def _bloch(first: Complex, second: Complex, above: Complex) -> Real:
-    """Half the trace and Bloch vector m, on axis 1: u^H block u = half trace + v m / 2 with v the Bloch
-    vector of u."""
-    parts = (first + second) / 2, 2 * above, 2j * above, first - second
-    return np.stack(parts, axis=1).real
+def _entries(matrix: Complex) -> Real:
+    """Hermitian matrices (..., w, w) as real numbers (..., w^2): diagonal, then real and imaginary part of
+    each entry above it."""
+    width = matrix.shape[-1]
+    found = [matrix[..., i, i].real for i in range(width)]
+    for i, j in combinations(range(width), 2):
+        found += [matrix[..., i, j].real, matrix[..., i, j].imag]
+    return np.stack(found, axis=-1)
 
 
-def _lowered(m: Real, fall: Real, room: float) -> tuple[Real, Real]:
-    """Largest eigenvalue (r,) of blocks half trace + Bloch vector m (r, 4), lowered by moves within +-room
-    along fall (r, 4, N), and the direction (r, 3) of its eigenvector: sections of one scaling at a time."""
-    shift = np.zeros((m.shape[0], fall.shape[2]))
+def _weights(u: Complex) -> Real:
+    """Of `_entries` in u^H M u, (r, w^2) for directions u (r, w)."""
+    width = u.shape[1]
+    found = [np.abs(u[:, i]) ** 2 for i in range(width)]
+    for i, j in combinations(range(width), 2):
+        product = 2 * np.conj(u[:, i]) * u[:, j]
+        found += [product.real, -product.imag]
+    return np.stack(found, axis=1)
 
-    def moved(by: Real) -> Real:
-        return np.asarray(m + np.einsum("rin,rn->ri", fall, by))
+
+def _matrix(entries: Real, width: int) -> Complex:
+    """Inverse of `_entries`."""
+    found = np.zeros((*entries.shape[:-1], width, width), dtype=np.complex128)
+    for i in range(width):
+        found[..., i, i] = entries[..., i]
+    for number, (i, j) in enumerate(combinations(range(width), 2)):
+        entry = entries[..., width + 2 * number] + 1j * entries[..., width + 2 * number + 1]
+        found[..., i, j], found[..., j, i] = entry, np.conj(entry)
+    return found
+
+
+def _lowered(value: Real, fall: Real, room: float, width: int) -> tuple[Real, Complex]:
+    """Largest eigenvalue (r,) of matrices with entries value (r, w^2), lowered by moves within +-room along
+    fall (r, w^2, N), and its eigenvector (r, w): sections of one scaling at a time."""
+    shift = np.zeros((value.shape[0], fall.shape[2]))
 
     def largest(by: Real) -> Real:
-        at = moved(by)
-        return np.asarray(at[:, 0] + 0.5 * np.linalg.norm(at[:, 1:], axis=1))
+        at = value + np.einsum("rin,rn->ri", fall, by)
+        if width == 2:
+            apart = np.hypot(at[:, 0] - at[:, 1], 2 * np.hypot(at[:, 2], at[:, 3]))
+            return np.asarray(0.5 * (at[:, 0] + at[:, 1] + apart))
+        return np.asarray(np.linalg.eigvalsh(_matrix(at, width))[:, -1])
 
     for i in list(range(shift.shape[1])) * (1 if shift.shape[1] == 1 else 2):
-        low, high = np.full(m.shape[0], -room), np.full(m.shape[0], room)
+        low, high = np.full(value.shape[0], -room), np.full(value.shape[0], room)
         for _ in range(14):
             left, right = shift.copy(), shift.copy()
             left[:, i], right[:, i] = low + 0.45 * (high - low), low + 0.55 * (high - low)
             smaller = largest(left) < largest(right)
             low, high = np.where(smaller, low, left[:, i]), np.where(smaller, right[:, i], high)
         shift[:, i] = 0.5 * (low + high)
-    at = moved(shift)[:, 1:]
-    return largest(shift), at / np.maximum(np.linalg.norm(at, axis=1), 1e-300)[:, None]
+    sizes, axes = np.linalg.eigh(_matrix(value + np.einsum("rin,rn->ri", fall, shift), width))
+    return sizes[:, -1], axes[:, :, -1]
