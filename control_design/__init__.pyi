@@ -29,12 +29,14 @@ from .specification.multivariable import MultivariableSpecification as Multivari
 from .specification.requirement import LoopFunction as LoopFunction
 from .synthesis.joint_synthesis import synthesise_jointly as synthesise_jointly
 from .synthesis.multivariable import (
-    MultivariableOptions as MultivariableOptions,
     MultivariableResult as MultivariableResult,
     synthesise_multivariable as synthesise_multivariable,
 )
 from .synthesis.synthesis import synthesise as synthesise
-from .synthesis.synthesis_options import SynthesisOptions as SynthesisOptions
+from .synthesis.synthesis_options import (
+    MultivariableOptions as MultivariableOptions,
+    SynthesisOptions as SynthesisOptions,
+)
 from .synthesis.synthesis_result import (
     Outcome as Outcome,
     SynthesisError as SynthesisError,

@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from control_design.analysis.stability import NominalLoop
 from control_design.controllers.controller import Controller
@@ -27,6 +26,7 @@ from control_design.synthesis.modal_controller import ModalForm
 from control_design.synthesis.multivariable_descent import MatrixDescent, Pull, StackedRows, stacked_rows
 from control_design.synthesis.next_block import best_blocks
 from control_design.synthesis.synthesis import part_of
+from control_design.synthesis.synthesis_options import MultivariableOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome
 
 _LIGHT = 0.3  # poles of loop and controller damped less have frequencies of their own in every check
@@ -36,34 +36,6 @@ _EXCESS = 5e-4  # accepted of the dense check over the programme
 _AT = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1)  # of the scale: where a static gain inverts the plant
 _SAME = 1e-3  # relative difference of worst cases below which two static gains count as one
 _MOST = 15  # violated frequencies added in a round
-
-
-class MultivariableOptions(BaseModel):
-    """Effort of the search."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-    starts: int = Field(default=1, ge=1, le=50, description="static gains to grow from; the best counts")
-    candidates: int = Field(default=3, ge=1, le=20, description="blocks tried wherever the order grows")
-    growth_steps: int = Field(default=12, ge=1, le=200, description="steps of each candidate")
-    growth_rounds: int = Field(default=4, ge=1, le=100, description="rounds of descent at each lower order")
-    renewals: int = Field(
-        default=1,
-        ge=0,
-        le=100,
-        description="blocks replaced at the full order, while the worst case is above 1",
-    )
-    rounds: int = Field(default=40, ge=1, le=100, description="rounds of the last descent, with exchange")
-    steps: int = Field(default=12, ge=1, le=200, description="steps of a round")
-    grid_points: int = Field(default=60, ge=20, le=2000, description="logarithmic points of the programme")
-    mode_points: int = Field(
-        default=15, ge=5, le=500, description="points around each mode or zero of the plant"
-    )
-    dense_points: int = Field(
-        default=600, ge=100, le=20_000, description="logarithmic points of the dense check"
-    )
-    sufficient_gamma: float = Field(
-        default=0.0, ge=0, description="stop at this worst case, at a lower order too; 0 = the best"
-    )
 
 
 @dataclass(frozen=True)

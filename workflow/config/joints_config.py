@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from control_design.specification import Specification
 from control_design.specification.multivariable import MultivariableSpecification
-from control_design.synthesis.multivariable import MultivariableOptions
+from control_design.synthesis.synthesis_options import MultivariableOptions
 from workflow.config.renamed_keys import with_current_keys
 from workflow.config.run_config import FileSource, Name, RunSection
 from workflow.config.settings import Section, check, read_toml, repeated

@@ -229,13 +229,11 @@ def _keep_joints_controller(results: JointsResults, config: JointsConfig, dialec
     return write_controller(results.run.path, law, None, certified=certified, about=about, dialect=dialect)
 
 
-_ONE_LOOP = Kind(STAGES, RunResults, _keep_controller, summarise)
-_JOINTS = Kind(JOINT_STAGES, JointsResults, _keep_joints_controller, summarise_joints)
-
-
 def kind_of(config: RunConfig | JointsConfig) -> Kind:
     """Of one loop, or of several joints."""
-    return _JOINTS if isinstance(config, JointsConfig) else _ONE_LOOP
+    if isinstance(config, JointsConfig):
+        return Kind(JOINT_STAGES, JointsResults, _keep_joints_controller, summarise_joints)
+    return Kind(STAGES, RunResults, _keep_controller, summarise)
 
 
 def _fail(run: RunDirectory, error: BaseException, *, created: bool) -> None:
