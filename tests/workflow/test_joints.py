@@ -173,6 +173,23 @@ def test_logs_that_tell_too_little_are_refused_in_one_line(spoilt, words, logs, 
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ('time = "time_s"\nreferences = ["shoulder_rad"]', "closed loop"),
+        ('dt_s = 0.002\ntime = "time_s"', "not both"),
+    ],
+)
+def test_logs_that_are_not_taken_say_why(source, words, logs, tmp_path, capfd):
+    config = _from_log(tmp_path, logs, source)
+    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert words in capfd.readouterr().err
+    text = config.read_text().replace('condition = "bent"', 'condition = "bent", role = "validation"')
+    config.write_text(text.replace(source, 'time = "time_s"'), encoding="utf-8")
+    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert "each record is fitted" in capfd.readouterr().err
+
+
 def test_logs_of_different_sampling_are_refused(logs, tmp_path, capfd):
     table = pd.read_csv(logs)
     slow = table.iloc[::2].reset_index(drop=True)

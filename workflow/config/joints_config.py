@@ -124,8 +124,18 @@ class JointsConfig(Section):
                 raise ValueError(f"the simulated arm has two joints; got {len(self.joints)}")
             if (name := repeated([point.name for point in self.source.points])) is not None:
                 raise ValueError(f"two operating points are called {name!r}: give them different names")
-        elif not any(record.role == "estimation" for record in self.source.records):
-            raise ValueError("no record has role 'estimation': there is nothing to identify from")
+        else:
+            for number, record in enumerate(self.source.records):
+                if record.role != "estimation":
+                    raise ValueError(
+                        f"source.records[{number}] has role {record.role!r}: with several joints each record "
+                        "is fitted; leave role out"
+                    )
+                if self.source.references or record.references:
+                    raise ValueError(
+                        "references: logs of a closed loop are not identified for several joints yet; give "
+                        "logs of the open loop, or one joint at a time in a run of one loop"
+                    )
         if self.closed_loop.step is not None and len(self.closed_loop.step) != len(self.joints):
             raise ValueError(f"closed_loop.step needs one value for each of {len(self.joints)} joints")
         self.specification()  # refuses keys that no design of several joints reads
