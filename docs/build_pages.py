@@ -169,7 +169,7 @@ CONFIGURATION = {
     ),
     "closed_loop": ("A run: closed loop and notes", "A run", ("closed_loop", "notes")),
     "design": ("A design file", "A design file", ("", "plant", "uncertainty")),
-    "study": ("A study", "A study", ("", "study", "axes", "search", "pareto")),
+    "study": ("A study", "A study", ("", "study", "axes", "pareto")),
 }
 
 

@@ -346,8 +346,12 @@ def test_killed_worker_is_replaced(small_study, tmp_path):
         ('label = "effects"', 'label = "asked"', "two axes have the same label 'asked'"),
         ('title = "small"', 'titel = "small"', "unknown key study.titel (did you mean title?)"),
         (str(FAST_ARM), "nowhere.toml", "study.base: no such file or run directory"),
-        ("[study]", '[search]\nobjectives = ["speed"]\n[study]', "search.objectives[0]: no column 'speed'"),
-        ("[study]", "[search]\nmethod = 'random'\n[study]", "search.method"),
+        (
+            "[study]",
+            "[[pareto]]\nx = 'speed'\ny = 'modulus_margin'\n[study]",
+            "pareto[0].x: no column 'speed'",
+        ),
+        ("[study]", "[search]\nmethod = 'optuna'\n[study]", "unknown key search"),
     ],
 )
 def test_bad_studies_are_refused(refused, tmp_path, was, now, expected):

@@ -1,11 +1,10 @@
-"""Parts of the study: keys, TOML, ranges, fronts, the search, the picture."""
+"""Parts of the study: keys, TOML, ranges, fronts, the picture."""
 
 from __future__ import annotations
 
 import math
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -28,7 +27,6 @@ from control_design.plants.plant_set import Mode
 from control_design.specification import Specification
 from tests.workflow.command import FAST_ARM, ROOT
 from tests.workflow.report_examples import achievable, build_run, config as example_config, sampled_responses
-from tests.workflow.study_examples import PLAIN, assert_same_study, write_study
 from workflow.config.run_config import RunConfig, built_in_config, load_config
 from workflow.config.settings import check
 from workflow.engine.errors import StageError
@@ -41,7 +39,6 @@ from workflow.study.page import PointRow, StudyView, draw_pareto, pareto_front, 
 from workflow.study.points import Point, short
 from workflow.study.settings import Axis, ParetoPlot, last_name, load_study, parse_key, tidy, with_values
 from workflow.study.task import Task
-from workflow.study.work import run_study
 from workflow.tasks.results import (
     AchievablePerformance,
     CertifyResult,
@@ -328,64 +325,6 @@ def test_an_interrupt_while_a_process_begins_is_no_traceback(tmp_path):
     assert (ended.returncode, ended.stderr) == (128 + signal.SIGALRM, b"")
 
 
-SEARCH = (
-    PLAIN
-    + """
-[search]
-method = "optuna"
-trials = 5
-batch = 2
-startup_trials = 3
-objectives = ["bandwidth_rad_s", "modulus_margin"]
-[[axes]]
-key = "specification.bandwidth_rad_s"
-from = 0.5
-to = 3.0
-log = true
-[[axes]]
-key = "specification.controller_order"
-from = 1
-to = 2
-[[axes]]
-key = "specification.modulus_margin"
-values = [0.4, 0.5]
-"""
-)
-
-
-@pytest.mark.slow
-def test_search_gives_the_same_points_whatever_runs_them(tmp_path):
-    pytest.importorskip("optuna", reason="the extra 'optuna' is not installed")
-    study = write_study(tmp_path, SEARCH)
-    first = run_study(load_study(study), tmp_path / "one", jobs=2)
-    points = first.numbers["points"]
-    assert len(points) == 5
-    assert len({point["name"] for point in points}) > 3
-    for point in points:
-        assert 0.5 <= point["values"]["specification.bandwidth_rad_s"] <= 3.0
-        assert point["values"]["specification.controller_order"] in (1, 2)
-    # A resumed search asks the same questions: two points are gone, three are taken up.
-    other = tmp_path / "other"
-    keep_only(tmp_path / "one", other, [point["name"] for point in points[:3]])
-    run_study(load_study(study), other, jobs=1, resume=True)
-    assert_same_study(tmp_path / "one", other)
-
-
-def keep_only(finished: Path, out: Path, names: list[str]) -> None:
-    """A copy of a finished study with only these points left."""
-    shutil.copytree(finished, out)
-    for point in (out / "points").iterdir():
-        if point.name not in names:
-            shutil.rmtree(point)
-    (out / "table.csv").unlink()
-
-
-def test_search_without_its_extra(refused, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "optuna", None)
-    line = refused("study", "--config", write_study(tmp_path, SEARCH), "--out", tmp_path / "out")
-    assert "needs the extra 'optuna': pip install 'flexlink[optuna]'" in line
-
-
 def test_tables_show_what_was_asked_for_and_no_empty_column():
     axis = Axis.model_validate({"key": "specification.bandwidth_rad_s", "label": "asked", "values": [1.0]})
     numbers = dict.fromkeys(COLUMNS) | {
@@ -397,8 +336,7 @@ def test_tables_show_what_was_asked_for_and_no_empty_column():
         "draws": 2,
     }
     row = PointRow(1, "a", {axis.key: 1.0}, "keeps moving", "why", numbers)
-    search = SimpleNamespace(method="grid")
-    config: Any = SimpleNamespace(axes=(axis,), pareto=(), search=search)
+    config: Any = SimpleNamespace(axes=(axis,), pareto=())
     view = StudyView("a study", config, "[study]", "the arm", [row], {})
     page = render_page("study.html.j2", title="a study", study=view).html
     tables = re.findall(r"<thead>(.*?)</thead>\s*<tbody>(.*?)</tbody>", page, re.DOTALL)

@@ -51,7 +51,7 @@ class StudyDirectory(Store):
         place.
 
         Raises InputError: not writable, not empty, holding something else, or begun with another base (axes
-        and search may change: points are found again by their content). With `replace` also where the base
+        may change: points are found again by their content). With `replace` also where the base
         is a run of the study that would be deleted, or another process is writing it.
         """
         study = cls(Path(path))

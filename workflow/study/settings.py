@@ -1,4 +1,4 @@
-"""`StudyConfig`: base, axes and search of a study, from one TOML file; and its dotted keys
+"""`StudyConfig`: base and axes of a study, from one TOML file; and its dotted keys
 (`closed_loop.effects[0].mass_kg`)."""
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
@@ -103,25 +103,6 @@ def tidy(value: float) -> float:
     return float(f"{value:.{_DIGITS}g}")
 
 
-class Search(Section):
-    """Choice of the points."""
-
-    method: Literal["grid", "optuna"] = Field(
-        "grid", description="grid: every combination; optuna: a tree-structured Parzen search (extra optuna)"
-    )
-    trials: int = Field(30, ge=1, le=MOST_POINTS, description="points of a search")
-    batch: int = Field(
-        4,
-        ge=1,
-        le=200,
-        description="points chosen at a time; the number that run at once does not change the results",
-    )
-    startup_trials: int = Field(8, ge=1, description="points drawn at random before the search learns")
-    objectives: tuple[Judged, ...] = Field(
-        ("worst_gamma",), min_length=1, max_length=3, description="columns of the table to improve"
-    )
-
-
 class ParetoPlot(Section):
     """Two columns of the table, plotted against each other."""
 
@@ -163,7 +144,6 @@ class StudyConfig(Section):
         default_factory=dict, description="dotted keys of the base with other values for every point"
     )
     axes: tuple[Axis, ...] = Field(min_length=1, max_length=12)
-    search: Search = Field(default_factory=Search)
     pareto: tuple[ParetoPlot, ...] = Field(_DEFAULT_PLOTS, min_length=1, max_length=4)
 
     @model_validator(mode="after")
@@ -176,13 +156,12 @@ class StudyConfig(Section):
                 raise ValueError(f"two axes have the same {kind[:-1]} {name!r}: give different {kind}")
         if self.study.seed is not None and any(axis.key == "run.seed" for axis in self.axes):
             raise ValueError("study.seed and an axis over run.seed contradict each other")
-        if self.search.method == "grid":
-            for index, axis in enumerate(self.axes):
-                if axis.values is None and axis.points is None and not axis.whole:
-                    raise ValueError(f"axes[{index}] ({axis.key}): a grid over a range needs points")
-            count = math.prod(len(axis.grid()) for axis in self.axes)
-            if count > MOST_POINTS:
-                raise ValueError(f"the grid has {count} points, more than {MOST_POINTS}")
+        for index, axis in enumerate(self.axes):
+            if axis.values is None and axis.points is None and not axis.whole:
+                raise ValueError(f"axes[{index}] ({axis.key}): a grid over a range needs points")
+        count = math.prod(len(axis.grid()) for axis in self.axes)
+        if count > MOST_POINTS:
+            raise ValueError(f"the grid has {count} points, more than {MOST_POINTS}")
         return self
 
 

@@ -27,7 +27,6 @@ from workflow.study.points import (
     load_base,
     shared_stages,
 )
-from workflow.study.search import ParzenSearch
 from workflow.study.settings import StudyFile
 from workflow.study.task import Done, Task
 from workflow.tasks.pipeline import config_of
@@ -62,12 +61,7 @@ def run_study(
     study, progress = file.config, progress or Progress()
     base = load_base(study, file.path, file.base)
     maker = PointMaker(study, file.path, base)
-    count, search = study.search.trials, None
-    if study.search.method == "optuna":
-        search = ParzenSearch(study, maker, base.config.run.seed)
-    else:
-        points = maker.grid()
-        count = len(points)
+    points = maker.grid()
     processes = jobs or os.cpu_count() or 1
     # A cluster that does not answer is found out before anything is written.
     with ExitStack() as stack:
@@ -75,13 +69,13 @@ def run_study(
         executor = here if scheduler is None else stack.enter_context(workers(processes, scheduler))
         with StudyDirectory(out).writing(resume=resume, replace=replace):
             directory = StudyDirectory.begin(out, text=file.text, base=base, resume=resume, replace=replace)
-            share = _POINT_S * count / executor.width
+            share = _POINT_S * len(points) / executor.width
             progress.plan([("plant", _PLANT_S), ("points", share), ("page", _PAGE_S)])
-            work = _Work(directory, base, maker.base_point(), executor, here, progress, count)
+            work = _Work(directory, base, maker.base_point(), executor, here, progress, len(points))
             try:
                 work.make_base_plant()
                 with progress.stage("points"):
-                    rows = work.compute(points) if search is None else search.run(work.compute)
+                    rows = work.compute(points)
             except InputError:
                 directory.discard_if_empty()
                 raise
@@ -123,7 +117,7 @@ class _Work:
                 raise InputError(f"the base cannot be identified: {reason}")
 
     def compute(self, points: Sequence[Point | Contradiction]) -> list[PointRow]:
-        """The rows of a batch: what is finished is kept, what shares a controller goes together."""
+        """The rows of the points: what is finished is kept, what shares a controller goes together."""
         rows = {
             point.name: row_without_run(point, "impossible", point.refusal)
             for point in points
@@ -151,7 +145,7 @@ class _Work:
                     self.directory.save_point(point, done)
                     rows[point.name] = row_of(point, self.directory.point(point))
             self._report([rows[point.name] for point, _ in found])
-        # The same point may be asked for twice by a search: each time under its own number.
+        # Two combinations may be the same point: each has its own number.
         return [replace(rows[point.name], number=point.number) for point in points]
 
     def _plants(self, wanted: Sequence[tuple[Point, Mapping[str, bytes]]]) -> None:
