@@ -16,7 +16,7 @@ from plant import two_link_arm
 from workflow.cli import main
 from workflow.config.joints_config import JointsConfig, load_joints
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.joints import JointsResults
+from workflow.tasks.joints import JointsResults, _judged
 
 _JOINTS = """
 [[joints]]
@@ -188,6 +188,11 @@ def test_logs_that_are_not_taken_say_why(source, words, logs, tmp_path, capfd):
     config.write_text(text.replace(source, 'time = "time_s"'), encoding="utf-8")
     assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) == 2
     assert "each record is fitted" in capfd.readouterr().err
+    _from_log(tmp_path, logs)
+    with config.open("a", encoding="utf-8") as file:
+        file.write("\n[closed_loop]\ncoulomb_Nm = [0.1, 0.1]\n")
+    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert "simulated arm only" in capfd.readouterr().err
 
 
 def test_logs_of_different_sampling_are_refused(logs, tmp_path, capfd):
@@ -212,6 +217,7 @@ def test_logs_of_different_sampling_are_refused(logs, tmp_path, capfd):
         ("bandwidth_rad_s = 5.0", "bandwith_rad_s = 5.0", "bandwidth_rad_s"),
         ("controller_order = 4", "controller_order = 5", "two per modal block"),
         ("elbow_rad = 1.6", "elbow_deg = 90", "elbow_rad"),
+        ("[design]", "[closed_loop]\nstep = [0.0, 0.0]\n\n[design]", "at least one"),
     ],
 )
 def test_configurations_that_do_not_fit_are_refused(old, new, words, tmp_path, capfd):
@@ -222,6 +228,16 @@ def test_configurations_that_do_not_fit_are_refused(old, new, words, tmp_path, c
     said = capfd.readouterr().err.strip()
     assert words in said
     assert "\n" not in said
+
+
+def test_a_joint_may_rest_while_another_moves(run_of_the_arm):
+    law = Controller.from_json((run_of_the_arm / "controller.json").read_text())
+    step = np.array([-0.2, 0.0])
+    output = np.tile(step, (100, 1)) + np.array([-0.01, 0.015])
+    judged = _judged("bent", "by hand", output, np.zeros((100, 2)), step, law)
+    assert judged.settled
+    np.testing.assert_allclose(judged.overshoot, [0.05, 0.075])
+    assert not _judged("bent", "by hand", output + 0.02, np.zeros((100, 2)), step, law).settled
 
 
 def test_what_cannot_be_met_is_a_result_with_exit_code_one(tmp_path, capfd):

@@ -125,6 +125,11 @@ class JointsConfig(Section):
             if (name := repeated([point.name for point in self.source.points])) is not None:
                 raise ValueError(f"two operating points are called {name!r}: give them different names")
         else:
+            if self.closed_loop.extra_payload_kg or self.closed_loop.coulomb_Nm is not None:
+                raise ValueError(
+                    "closed_loop.extra_payload_kg and closed_loop.coulomb_Nm act on the simulated arm only: "
+                    "where records are logs, the loop runs on the identified models"
+                )
             for number, record in enumerate(self.source.records):
                 if record.role != "estimation":
                     raise ValueError(
@@ -138,6 +143,8 @@ class JointsConfig(Section):
                     )
         if self.closed_loop.step is not None and len(self.closed_loop.step) != len(self.joints):
             raise ValueError(f"closed_loop.step needs one value for each of {len(self.joints)} joints")
+        if self.closed_loop.step is not None and not any(self.closed_loop.step):
+            raise ValueError("closed_loop.step is zero for every joint: give at least one a step")
         self.specification()  # refuses keys that no design of several joints reads
         return self
 

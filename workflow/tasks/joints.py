@@ -342,10 +342,12 @@ def _judged(
     point: str, condition: str, output: Real, command: Real, step: Real, law: Controller
 ) -> JointsRun:
     late = output[-max(1, len(output) // 20) :]
-    settled = bool(np.all(np.isfinite(output)) and np.all(np.abs(late - step) < _SETTLED * np.abs(step)))
+    size = np.where(step, np.abs(step), np.max(np.abs(step)))  # of a joint that is to rest: the others' step
+    settled = bool(np.all(np.isfinite(output)) and np.all(np.abs(late - step) < _SETTLED * size))
+    beyond = np.max(np.where(step < 0, -1.0, 1.0) * (output - step) / size, axis=0)
     limits = law.limits("input_limit")
     return JointsRun(
-        point, condition, output, command, settled, np.max(output / step, axis=0) - 1.0,
+        point, condition, output, command, settled, beyond,
         float(np.mean(np.any(np.abs(command) >= limits * (1 - 1e-9), axis=1))),
     )  # fmt: skip
 
