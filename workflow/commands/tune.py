@@ -62,7 +62,7 @@ class TuneServer(ThreadingHTTPServer):
             environment()
             .get_template("tune.html.j2")
             .render(
-                title=f"Tune {', '.join(str(path) for path in session.paths)}",
+                title=f"Tune {', '.join(path.stem for path in session.paths)}",
                 settings=settings,
                 nonce=nonce,
                 fixed=[
