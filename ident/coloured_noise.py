@@ -38,8 +38,8 @@ Identify = Callable[[Sequence[Record], IdentOptions, float, float], Identificati
 _ARX_ORDERS = (4, 8, 12, 16, 20, 24, 30)
 # Rows of the shortest record per order of the noise model.
 _ROWS_PER_ORDER = 13
-_RESIDUAL_ORDER = 12
-_LINES = 25
+_RESIDUAL_ORDER = 12  # BIC takes 1 to 6 of it for drift and friction beside sensor noise
+_LINES = 25  # power of white noise, averaged over 25 lines, scatters by a fifth
 
 
 def identify_in_noise(records: Sequence[Record], options: IdentOptions, identify: Identify) -> Identification:

@@ -25,10 +25,9 @@ from ident.data.arrays import ComplexArray, RealArray
 from ident.fit.least_squares import project
 from ident.fit.several_outputs import OutputRegressions
 
-_MOST_EVALUATIONS = 40
-_ENOUGH = (
-    1e-7  # relative change of the residual's power: a thousandth of a degree of freedom in 10 000 samples
-)
+_MOST_EVALUATIONS = 40  # limit of work: it begins at the best free residues, near its end
+# Relative change of the residual's power: a thousandth of a degree of freedom in 10 000 samples.
+_ENOUGH = 1e-7
 _LOG_DECAY = -25.0, 6.0  # of a sample: poles stay inside the circle, and off zero
 Refused = Callable[[float, int], bool]
 

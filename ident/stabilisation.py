@@ -30,14 +30,14 @@ from ident.identification import Identification
 from ident.search.order_selection import Progress
 from ident.search.pole_search import PoleSearch
 
-FREQUENCY_TOLERANCE = 0.01
-DAMPING_TOLERANCE = 0.05
+FREQUENCY_TOLERANCE = 0.01  # Peeters and De Roeck, see above
+DAMPING_TOLERANCE = 0.05  # the same
 
-_BEYOND_CHOSEN = 3
+_BEYOND_CHOSEN = 3  # pairs: stable in two fits beyond the model's shows in these
 # More samples than this say no more about which modes stay, and a dozen fits of order 20 take their time.
 _MOST_SAMPLES = 10_000
-_MOST_PAIRS = 12
-_FEWEST_ORDERS = 2
+_MOST_PAIRS = 12  # as many as `IdentOptions.n_pairs` takes
+_FEWEST_ORDERS = 2  # in one alone nothing has stayed
 
 
 class StableMode(NamedTuple):

@@ -27,13 +27,13 @@ from ident.search.pole_search import PoleSearch
 
 # Numbers of real poles and pairs that are tried; the criterion of the order chooses.
 _STRUCTURES = ((2, 0), (2, 1), (2, 2), (2, 3), (2, 4))
-_ROUNDS = 10
-_ROUGH = 1e-4
+_ROUNDS = 10  # limit of work: the best one counts
+_ROUGH = 1e-4  # a share of J: these poles are a start, or are judged with five deviations to spare
 # Standard deviations beyond the circle: one in a million stable plants.
 _BEYOND = 5.0
 # Slower than one time constant in the longest record, growth is no other than an integrator and drift.
 _TIME_CONSTANTS = 1.0
-_ON_CIRCLE = 1 - 1e-7
+_ON_CIRCLE = 1 - 1e-7  # a time constant of ten million samples
 
 
 def find_unstable(records: Sequence[Record], options: IdentOptions | None = None) -> Poles:

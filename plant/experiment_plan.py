@@ -19,7 +19,7 @@ from plant.rig import one_line
 
 # Periods as multiples of that of the lower band edge: odd, so that the edge is an excited line.
 _MULTIPLES = range(15, 0, -2)
-_LEVEL = 0.95
+_LEVEL = 0.95  # of the ellipses, as everywhere
 
 
 class ExperimentPlan(BaseModel):

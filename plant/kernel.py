@@ -16,8 +16,8 @@ from plant.machine import CUBIC, QUADRATIC, SINE, STRIBECK, Integer, Real
 _F = TypeVar("_F", bound=Callable[..., object])
 
 FRICTION, CONTACT = 0, 1  # elements that switch
-_NOTHING = 1e-100
-_SLACK_RAD = 1e-13
+_NOTHING = 1e-100  # far above 2e-308, below which numbers lose digits and take long
+_SLACK_RAD = 1e-13  # rounding of some hundred steps of a radian
 # Nodes of a step; of Python's own integers numba compiles a version of the called function for each value.
 _AT_START: Any = np.int64(0)
 _IN_THE_MIDDLE: Any = np.int64(1)

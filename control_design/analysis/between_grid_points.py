@@ -40,7 +40,7 @@ from control_design.specification.requirement import WeightedRequirement
 
 _EXCESS = 0.002  # asked of every bound over the dense maximum; 0.005 is promised
 _LEAST_EXCESS = 1e-5  # where a dense maximum lies this close under its limit
-_MOST_INTERVALS = 60_000
+_MOST_INTERVALS = 60_000  # limit of work, and of memory: a proof that needs more is given up
 _PARTS = 3  # an interval that is not good enough is cut in so many
 _MODEL_ERROR = 1e-6  # largest relative disagreement of zeros and poles with the state space
 

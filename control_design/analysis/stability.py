@@ -16,7 +16,7 @@ from control_design.plants.multivariable import MultivariablePlant
 from control_design.plants.plant_set import Mode, UncertainPlant, count_integrators, delayed, modes_of
 
 _GAINS = 16  # steps of the root locus; halved up to _HALVINGS times where poles come near one another
-_HALVINGS = 6
+_HALVINGS = 6  # the smallest step is then a thousandth of the way: 16 * 2^6 = 1024
 _NEAR = 1.2  # ratio of frequencies within which a lighter pole of the loop is heard as the mode
 _LOST = 0.02  # share of its damping; two digits show no less
 

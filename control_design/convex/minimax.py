@@ -23,7 +23,7 @@ from control_design.plants.frequency_grid import with_violations
 # Radii of the rounding of |.| at its kink. An active numerator is as large as gamma m, of which the rounding
 # is a thousandth: it changes the row by 5e-7. Sharper kinks of inactive rows only slow Newton down.
 _ROUND_NUMERATOR = 1e-3
-_ROUND_REACH = 1e-4
+_ROUND_REACH = 1e-4  # denominators are about one: off by at most 1e-4, at the kink alone
 _ROUND_FEASIBILITY = 1e-2  # while denominators are being made positive: their maximum may sit on the kink
 _EXCESS = 5e-4  # relative; accepted of the dense check over the programme
 _MOST_STEPS = 200  # of the interior point in one round; 5 to 40 are usual

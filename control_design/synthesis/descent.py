@@ -26,7 +26,7 @@ from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.angle_program import Rows, parameter_bounds
 from control_design.synthesis.minimax_step import MinimaxStep, minimax_step
 
-_BOUNDARY = 40
+_BOUNDARY = 40  # every 9 degrees; parabola and Newton steps go on from the worst
 _FIRST_BOX, _LARGEST_BOX, _SMALLEST_BOX = 0.3, 1.0, 1e-4
 _PATIENCE, _SLOW = 15, 1e-3  # give up where so many steps gain less than this share
 _LEAST_GAIN = 1e-7  # predicted gain of a step, in the logarithm, not worth taking

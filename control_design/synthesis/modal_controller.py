@@ -15,7 +15,7 @@ import numpy as np
 from control_design.plants.ellipses import Boolean, Complex, Real
 
 _FASTEST = 60.0  # corner of a block, in units of the scale
-_MOST_DAMPED = 50.0
+_MOST_DAMPED = 50.0  # two real poles (2 zeta)^2 = 10^4 apart: any pair of real poles, nearly
 
 
 class ModalForm:

@@ -16,7 +16,7 @@ from control_design.plants.ellipses import Real
 from control_design.synthesis.modal_controller import ModalForm
 from control_design.synthesis.multivariable_descent import Pull
 
-_FREQUENCIES = 60
+_FREQUENCIES = 60  # over three decades three of them within `_APART`
 _DAMPINGS = (0.1, 0.3, 0.6, 1.0, 3.0)
 _FASTEST = 30.0  # in units of the scale
 _APART = 0.35  # of log w between two blocks on the list

@@ -21,14 +21,14 @@ Told = Callable[[float, str], None]
 
 _DRAWS = 200  # shaped loops drawn; each costs 1 ms
 _EASED = 4  # with tracking: low-gain starts given to the interior point first
-_SHAPED_TRACKING = 3
+_SHAPED_TRACKING = 3  # with tracking: best shaped loops that are started from, as many as are carried
 _CARRIED = 3  # candidates carried through the exchange
 _HOPS, _LATER_HOPS = 4, 2
 _HALVINGS = 20  # natural units of a section far from the loop's crossover are far too large
 _RETRIEVALS = 3  # rounds for ends that are good on the grid and not robustly stable between its points
 _RETREAT, _RETREATS = 0.8, 20  # factor on their gain, and how often, until they are stable on the finer grid
 _FINISHING = 10  # rounds for the best alone, until dense check and grid agree
-_AGREE = 1.001
+_AGREE = 1.001  # gammas that differ by less than a thousandth are of one optimum
 _NO_RESONANCE = 0.3  # damping that fits begin with: a narrow one of their own hides between grid points
 _WEIGHTED = 3  # rounds of fits with random weights
 # Of the worst case that the small Youla problem reaches, and how far that lies above the default one's at

@@ -30,7 +30,7 @@ _SMALL = YoulaOptions(
 _ACCURACY = 1e-3  # relative, of the small problems
 _RELOCATIONS = 12  # of the poles; the fifth already moves them by less than a per cent
 _SPREAD = 1.5  # standard deviation of the logarithms of random weights, at `_KNOTS` frequencies
-_KNOTS = 8
+_KNOTS = 8  # over four decades of frequency two a decade: weights bend, and do not jitter
 _HIGHEST = 1e6  # |p| towards Nyquist, where nothing of the fit is left
 
 

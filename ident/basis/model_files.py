@@ -25,7 +25,7 @@ from ident.data.json_text import json_value
 from ident.data.mat_files import mat_variables
 
 FORMAT = "flexlink GOBF model"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 1  # the first; files of another one are refused
 
 # The state matrices are computed anew on reading; another machine may round differently.
 _STATE_TOLERANCE = 1e-9

@@ -29,14 +29,14 @@ _WEAK_INPUT = 1e-2
 # it, over what the model leaves, times the number of spectral lines there is at least 10; never below this
 # share of its largest density, where windows leak.
 _TOLD = 10.0
-_LEAKAGE = 1e-6
+_LEAKAGE = 1e-6  # -60 dB: side lobes of a Hann window from its seventh line on
 # A rate of decay within this factor either way (95 %) is known; beyond, the record does not tell it.
 _KNOWN_WITHIN = 2.0
 # Real poles with time constants above this share of the record count as slow; others have their own advice.
 _SLOW = 0.5
 # A straight line has to be this much of a residual's power, and this improbable, to be called a drift.
 _DRIFT_SHARE = 0.2
-_DRIFT_LEVEL = 1e-5
+_DRIFT_LEVEL = 1e-5  # one false alarm in 100 000 records
 # A line serves as well as a slow pole if it leaves at most this much more.
 _AS_WELL = 1.05
 # Inputs are one signal if a combination of them, each scaled to unit length, has less of the power.

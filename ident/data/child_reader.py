@@ -18,13 +18,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-LARGEST_BYTES = 2**30
-CPU_SECONDS = 120
+LARGEST_BYTES = 2**30  # as in `foreign_files`, which a script run alone does not import
+CPU_SECONDS = 120  # less than `foreign_files` waits, so that the limit here ends it
+# The file, its columns, the archive of them, and copies that the libraries make.
 _MEMORY_BYTES = 8 * LARGEST_BYTES
 _NUMBERS = "fiub"
 _LONGEST_FIELD = 256  # longer ones are pictures and point clouds
 _LARGEST_SHEETS = 2**28  # of XML: a million rows of four numbers
-_MOST_CELLS = 20_000_000
+_MOST_CELLS = 20_000_000  # of twenty characters each: 400 MB of text
 _EMPTY_CELLS = 500_000  # in one piece: a sheet that somebody formatted to its end, or a trap
 
 

@@ -38,7 +38,7 @@ _EXCITED, _SILENT = 1e-2, 1e-4
 _SAME = 0.02
 # Noise is averaged over this many harmonics to each side, fewer next to zero.
 _SMOOTHING = 10
-_ROUNDS = 6
+_ROUNDS = 6  # of weights and distortion in turns: more move it by less than 2 % of its interval
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from enum import Enum, auto
 
 import numpy as np
 
-Value = float | bool | int | str
+Value = float | bool | int | str  # what a sentence is made with
 
 # Level of the tests of what is stated as known.
 TEST_LEVEL = 0.99

@@ -21,9 +21,9 @@ LARGEST_BYTES = 2**30
 """Of a file, and of what it unpacks to: some hundred channels at 1 kHz for twenty minutes as doubles."""
 
 _SCRIPT = Path(__file__).with_name("child_reader.py")
-_SECONDS = 150
+_SECONDS = 150  # 30 more than the processor time that `child_reader` allows itself
 _REFUSED, _NO_LIBRARY = 2, 3
-_ENCRYPTED = 0x1
+_ENCRYPTED = 0x1  # bit 0 of the flags of a zip entry (APPNOTE 4.4.4)
 
 
 @dataclass(frozen=True)

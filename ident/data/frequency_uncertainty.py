@@ -14,10 +14,9 @@ from ident.data.ellipses import Ellipses, chi2_radius, ellipse_distance, relativ
 from ident.data.record_files import read_table
 from ident.data.response_columns import read_response
 
-# A covariance computed as a product of factors can miss symmetry or semidefiniteness by rounding, not by
-# more.
 # Of a gain in any units; its square is still a number.
 _LARGEST = 1e100
+# A product of factors can miss symmetry or semidefiniteness by rounding, not by more.
 _PSD_TOLERANCE = 1e-9
 
 _COLUMNS = ("real", "imag", "variance_real", "variance_imag")

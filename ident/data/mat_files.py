@@ -22,9 +22,9 @@ _TEXT = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18:
 _INT8, _INT32, _UINT32, _MATRIX, _COMPRESSED = 1, 5, 6, 14, 15
 _CELL, _STRUCT, _OBJECT, _CHAR, _SPARSE, _FUNCTION, _OPAQUE = 1, 2, 3, 4, 5, 16, 17
 _NUMERIC_CLASSES = range(6, 16)
-_COMPLEX_FLAG = 0x08
-_HEADER_BYTES = 128
-_DEEPEST = 16
+_COMPLEX_FLAG = 0x08  # MAT-File Format, figure 1-3: bit 3 of the flags
+_HEADER_BYTES = 128  # MAT-File Format, figure 1-1
+_DEEPEST = 16  # of structs in structs: far from Python's own limit
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}")
 
 

@@ -29,7 +29,7 @@ _HALF_WIDTH = 2
 _LEVEL = 0.99
 # Bands in which it is looked for, a decade.
 _PER_DECADE = 8
-_FEWEST = 3
+_FEWEST = 3  # frequencies in a band: of fewer there is no slope beside its mean
 
 
 @dataclass(frozen=True)

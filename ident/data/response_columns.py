@@ -30,7 +30,7 @@ def _of_decibels(values: RealArray) -> RealArray:
     return np.asarray(10 ** (values / 20), dtype=np.float64)
 
 
-_RPM = 2 * np.pi / 60
+_RPM = 2 * np.pi / 60  # rad/s of a turn a minute
 _UNITS: Mapping[str, Mapping[str, Convert]] = {
     "frequency": {
         **dict.fromkeys(("hz", "1/s", "cycles/s"), _times(2 * np.pi)),

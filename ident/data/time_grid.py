@@ -23,18 +23,18 @@ TIME_TOLERANCE = 0.01
 LARGEST_JITTER = 0.2
 # Below this they count as on it: an output changes by a thousandth of its step from row to row.
 _ON_GRID = 1e-3
-_MOST_LOST_ROWS = 5
-_MOST_LOST_SHARE = 0.05
+_MOST_LOST_ROWS = 5  # a spline over such a gap is right to 1 % up to a twentieth of the Nyquist frequency
+_MOST_LOST_SHARE = 0.05  # ellipses come out too narrow by 2.6 % at most: 1 / sqrt(0.95)
 
 # Angular frequency times spacing at which a cubic spline is wrong by 1 % of a sine: 5/384 (omega h)^4.
 _FAITHFUL = (0.01 * 384 / 5) ** 0.25
 # The same of a straight line between readings, (omega h)^2 / 8, and of an input that is averaged over a step
 # and held for the next: 1 - sinc(omega h / 2)^2 = (omega h)^2 / 12.
 _FAITHFUL_LINE = (0.01 * 8) ** 0.5
-_FAITHFUL_MEAN = (0.01 * 12) ** 0.5
-# A coarser grid that is proposed has about as many readings in each of its steps.
+_FAITHFUL_MEAN = (0.01 * 12) ** 0.5  # of 1 - sinc^2, see above
 # In so many parts of a log the mean step is compared with that of the whole.
 _PARTS = 10
+# A coarser grid that is proposed has about as many readings in each of its steps.
 _READINGS = 3
 
 

@@ -21,8 +21,8 @@ _DAY = r"(?:(\d{4})([-/])(\d\d?)\2(\d\d?)|(\d\d?)([./])(\d\d?)\6(\d{4}))"
 _CLOCK = r"(\d{1,4}):(\d\d)(?::(\d\d))?(?:[.,](\d{1,9}))?\s*([AaPp][Mm])?"
 _ZONE = r"(?:Z|([+-])(\d\d):?(\d\d))"
 _STAMP = re.compile(rf"(?:{_DAY}(?:T|\s+|$))?(?:{_CLOCK})?\s*{_ZONE}?")
-_DAY_NS = 86_400 * 10**9
-_MINUTES_NS = 3600 * 10**9
+_DAY_NS = 86_400 * 10**9  # a clock time begins again
+_MINUTES_NS = 3600 * 10**9  # minutes and seconds begin again
 
 
 def is_stamp(cell: str) -> bool:

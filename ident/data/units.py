@@ -75,7 +75,7 @@ _AFTER = re.compile(r"\sin\s+(\S+)\s*$|^\w+\s*/\s*(\w+)\s*$")
 
 # A log of more samples than this, with steps of at least so many seconds, is rather one in milliseconds.
 _MANY_SAMPLES = 1000
-_LONG_STEP_S = 0.5
+_LONG_STEP_S = 0.5  # machines are logged faster than twice a second
 # Seconds since 1970 of the years 2001 and 2100: stamps in between, in whatever unit, are dates.
 _DATES_S = (978_307_200.0, 4_102_444_800.0)
 # No clock counts 3000 years.

@@ -24,8 +24,8 @@ from ident.data.arrays import ComplexArray, IntArray, RealArray, kernel_array
 # Below this fraction of |y|^2 the products of the candidates' columns know nothing; a refinement sees the
 # true residual.
 _FLOOR = 1e-13
-_LAGS_OF_WHITENESS = 25
-_LEVEL = 0.99
+_LAGS_OF_WHITENESS = 25  # as `ident.checks.residual_tests.whiteness_test`
+_LEVEL = 0.99  # of that test
 
 
 class Linearisation(NamedTuple):

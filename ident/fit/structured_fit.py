@@ -22,7 +22,7 @@ from ident.fit.least_squares import LinearFit, Projection, Regression, block_sta
 from ident.fit.problem import Linearisation
 from ident.fit.refinement import Bounds, Refined, free_optimality, refine
 
-_RANK_TOLERANCE = 1e-12
+_RANK_TOLERANCE = 1e-12  # rounding of doubles, times the condition of a basis of close poles
 # Fastest real pole: decayed to this part within a sample. One at 0 or below has no continuous counterpart.
 _FASTEST = 0.01
 

@@ -45,11 +45,11 @@ from ident.friction.arm import FASTEST_POLE, SteppedArm
 from ident.friction.gauss_newton import FrictionFit
 from ident.friction.posterior import BehindFriction
 
-_TERMS = 4
+_TERMS = 4  # N is a cubic in j omega, see above
 _REALISATIONS, _AMPLITUDES, _DRAWS = 128, 5, 400
 # The first period dies out from rest, the second is in steady state.
 _PERIODS = 2
-_CHANGE_OF_LEVEL = 0.02
+_CHANGE_OF_LEVEL = 0.02  # for a derivative between runs of equal phases: small, and far above rounding
 # An amplitude this close to the end of what was recorded counts as recorded.
 _SAME = 1e-3
 # Largest multiple of the scatter between amplitudes that ellipses are made of.
@@ -60,7 +60,7 @@ _OF_DRAWS = 0.01
 _THINNED = 5
 # A line of the spectrum counts as excited above this share of the largest.
 _EXCITED = 1e-3
-_N_GRID = 300
+_N_GRID = 300  # frequencies: over five decades 30 in every half decade that is counted
 # Of how much larger N is at the strongest line, what stays open of N at every line, in size and in phase.
 _UNEVEN = 0.25
 _HALF_WIDTHS = np.array([-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0])

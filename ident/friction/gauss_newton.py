@@ -24,7 +24,7 @@ from ident.uncertainty.embedding_algebra import triangle_of
 
 # Standard deviation of the logarithms in the law (pre-sliding deflection, Stribeck speed), a priori.
 STD_LOG = 1.5
-_HELD = 1e4
+_HELD = 1e4  # over the deviation of a logarithm that is to stay: 1e-4
 # How well a joint's friction repeats from record to record at best, as a share of its level.
 _REPEATS = 1e-3
 # Gauss-Newton steps at most; a step, and its parts where the whole does not lower the residual.

@@ -78,7 +78,7 @@ _LOWEST_PAIR, _ABOVE_NOISE = 0.4, 1.2
 _FALLS, _EXCESS, _STRIBECK_STEPS = (0.03, 0.1, 0.3), 0.1, 6
 # Directions of a start (columns of unit length) below this are left out; as few of the parameters.
 _NUISANCE_RANK, _RANK = 1e-10, 1e-9
-_NOISE_ORDER = 32
+_NOISE_ORDER = 32  # as `EmbeddingOptions.max_ar_order` where 8 leave residuals that are not white
 # Variance between parts of the logs over that of their noise: fits of machines of ten kinds that were right
 # had 1 to 9, one that was wrong 35 000.
 _CONTRADICTORY = 100.0

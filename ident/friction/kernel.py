@@ -29,7 +29,7 @@ import numpy as np
 from ident.data.arrays import INSIDE
 
 _STRIDES, _STEPS = 2, 16  # strides of a sample, steps of a stride
-_ALL = _STRIDES * _STEPS
+_ALL = _STRIDES * _STEPS  # steps of a sample
 _OVER = 8.0  # speeds, in units of `fall`, from which on the excess is gone
 _TINY = np.finfo(np.float64).tiny
 

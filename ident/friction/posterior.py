@@ -28,7 +28,7 @@ from ident.friction.inverse_dynamics import rms_speed, smoothed
 from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
 
-_NOISE_ORDER = 32
+_NOISE_ORDER = 32  # as in `ident.friction.in_loop`
 # No law is exact. One that was not found in a log may still be there to this share of the level, and as much
 # of the friction, rms, may look like a linear force, which shows in no residual (standard deviation).
 _SHAPE = 0.05

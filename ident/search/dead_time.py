@@ -31,7 +31,7 @@ from ident.search.pole_search import Fitted, PoleSearch
 
 # Lags of output and input of the long model, as far as the shortest record has this many rows for each.
 _OUTPUT_LAGS, _INPUT_LAGS = 30, 100
-_ROWS_PER_LAG = 20
+_ROWS_PER_LAG = 20  # the lags then take up a twentieth of the noise
 # Lags that are missed less probably than this are missed: what is found here is judged again.
 _MISSED = 1e-3
 # Numbers of samples that are tried from the best one so far: next to it, and over a gap where a band-limited

@@ -38,12 +38,12 @@ _STARTS_TO_AGREE = 3
 _PATIENCE = 5
 # Cost evaluations for one more pair when the rest is frozen: two unknowns.
 _PAIR_EVALUATIONS = 240
-_REAL_GRID = 9
+_REAL_GRID = 9  # levels of a real pole: two a decade over the box of a record of 10 000 samples
 _PAIR_GRID = (40, 2)
 # Ends of rough descents are one optimum if they differ in J by no more than what such descents leave, in a
 # pole by no more than this fraction; of rates below the box's slowest nothing is told anyway.
 _SAME_COST = 3 * ROUGH
-_SAME_POLE = 0.1
+_SAME_POLE = 0.1  # see `_SAME_COST`
 # Share of the output's power up to which a residual counts as little: with more noise than that many minima
 # lie close together, and a whiteness test does not tell them apart.
 _LITTLE_NOISE = 0.02

@@ -25,7 +25,7 @@ from ident.data.arrays import ComplexArray, RealArray, lock
 # Points of the circle on which the two coefficients are read off; 16 determine a Laurent series to rounding
 # when the next pole is three radii away (1/3^15 = 7e-8 of it is left, far below any interval).
 _POINTS = 16
-_SHARE_OF_DISTANCE = 1 / 3
+_SHARE_OF_DISTANCE = 1 / 3  # see `_POINTS`
 
 
 @dataclass(frozen=True, eq=False)

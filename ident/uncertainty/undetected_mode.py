@@ -41,7 +41,7 @@ from ident.uncertainty.embedding_rows import Rows
 _ZETA = (0.01, 0.03)
 # A candidate's own decay over the record, in time constants, is at least this.
 _DECAY = 2.0
-_FEWEST_PERIODS = 6.0
+_FEWEST_PERIODS = 6.0  # the damping that `_DECAY` asks for is then light: 2 / (2 pi 6) = 0.053
 # Highest frequency, rad/sample.
 _HIGHEST = 0.9 * np.pi
 # Neighbours in frequency are this many half bandwidths apart: a mode half way loses a tenth of its energy.
@@ -49,13 +49,14 @@ _SPACING = 1.5
 # A missed mode around a frequency is averaged over from this probability on (the level of the confidence
 # regions that it could belong to); of the pairs that stand for it at most so many are kept.
 _LEAST_PROBABILITY = 0.05
+# Of some hundred pairs that are left out for it: together less than `_LEAST_PROBABILITY`.
 _NEGLIGIBLE = 1e-4
-_MOST_PAIRS = 12
+_MOST_PAIRS = 12  # 24 columns of the posterior beside the 150 of its kernel
 # Samples that are held at a time: a few megabytes, whatever the length of the records.
 _BLOCK = 512
 # Shares of a pair's columns (in energy) that are rounding, and that make it a hypothesis of its own.
 _ROUNDING = 1e-9
-_DISTINGUISHABLE = 1e-6
+_DISTINGUISHABLE = 1e-6  # a thousandth of the amplitude
 
 
 @dataclass(frozen=True, eq=False)
