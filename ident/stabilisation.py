@@ -45,7 +45,6 @@ class StableMode(NamedTuple):
 
     omega_rad_s: float
     zeta: float
-    n_orders: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +96,7 @@ class Stabilisation:
             here = np.flatnonzero((chain == start) & self.stable & self.needed)
             if here.size >= _FEWEST_ORDERS:
                 omega, zeta = np.mean(self.omega_rad_s[here]), np.mean(self.zeta[here])
-                modes.append(StableMode(float(omega), float(zeta), int(here.size)))
+                modes.append(StableMode(float(omega), float(zeta)))
         return tuple(sorted(modes))
 
 

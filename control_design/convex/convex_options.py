@@ -19,10 +19,6 @@ class YoulaOptions(GridOptions):
         default=100, ge=0, le=1000, description="points spread around the flexible modes"
     )
     exchange_rounds: int = Field(default=6, ge=0, le=20, description="rounds of adding violated frequencies")
-    hull: bool = Field(
-        default=False,
-        description="also compute a lower bound from hulls at every frequency; takes some seconds",
-    )
 
 
 class ReferenceFilterOptions(GridOptions):

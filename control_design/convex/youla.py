@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import linprog
 
 from control_design.analysis.worst_case import Grids, PlantData, worst_of
 from control_design.convex.convex_options import YoulaOptions
@@ -34,39 +33,26 @@ from control_design.convex.youla_basis import (
     stable_loop,
     with_constant,
 )
-from control_design.plants.ellipses import Complex, Real, nearest_distance, quotient
+from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import UncertainPlant, delayed
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction
-from ident.data.arrays import factor_matrices, real_rows
+from ident.data.arrays import factor_matrices
 
 _ELLIPSE_ROUNDS = 20  # turns of angles and Q
 Region = Literal["inscribed", "ellipse", "enclosing"]
-_DIRECTIONS = 24  # half-planes of every hull
-_ANGLES, _RADII = 300, 60  # samples of the disc that is known to contain R
-_KEPT = 1e-9  # singular values below this fraction are no directions of the programme
-_STEPS = 8  # of the bisection in gamma
 
 
 @dataclass(frozen=True)
 class PlantBracket:
     """Values for one plant, each the largest on the dense grid; inf where nothing was found to be robustly
-    stable.
-
-    inscribed_grid: value of the inscribed problem on the programme's own grid, a lower bound within the basis
-    however coarse the grid. exact_centre: the parametrisation is about the ellipses'
-    centres themselves (stable plants, or centre = nominal); otherwise `inscribed` is a local optimum too.
-    hull: the tighter lower bound of `hull_bound`, None if not asked for or without exact_centre.
-    """
+    stable. Of unstable plants whose ellipses are not about the nominal response `inscribed` is a local
+    optimum."""
 
     plant: str
     inscribed: float
     ellipse: float
     enclosing: float
-    inscribed_grid: float
-    functions: int
-    exact_centre: bool
-    hull: float | None = None
 
 
 @dataclass(frozen=True)
@@ -93,12 +79,8 @@ class YoulaBracket:
 
     @property
     def floor(self) -> float:
-        """The best lower bound: of the hulls where they were asked for, else of the inscribed discs."""
-        return max(plant.inscribed if plant.hull is None else plant.hull for plant in self.plants)
-
-    def excess(self, gamma: float) -> float:
-        """How far gamma lies above the ellipse value, relative: 0.02 = a higher order could buy about 2 %."""
-        return gamma / self.ellipse - 1.0
+        """The best lower bound, that of the inscribed discs."""
+        return self.inscribed
 
 
 def youla_bracket(
@@ -151,35 +133,23 @@ class BracketProblem:
         self.dense_basis = self._basis(self.dense)
 
     def solve(self) -> PlantBracket:
-        (ellipse, _, _), (enclosing, _, _), (inscribed, grid_value, _) = self.answers()
-        offset = np.abs(self.dense.ellipses.centre * self.dense.delay - self.dense_loop.base)
-        exact = bool(np.all(offset <= 1e-6 * np.abs(self.dense_loop.base)))
+        (ellipse, _), (enclosing, _), (inscribed, _) = self.answers()
         ellipse = min(ellipse, enclosing)  # the same Q does no worse on a smaller region
         return PlantBracket(
             self.plant.name,
             min(inscribed, ellipse),
             ellipse,
             enclosing,
-            grid_value,
-            int(self.dense_basis.shape[1]),
-            exact,
-            self._hull(inscribed_grid=grid_value, ellipse=ellipse) if self.options.hull and exact else None,
         )
 
-    def _hull(self, *, inscribed_grid: float, ellipse: float) -> float:
-        if not np.isfinite(ellipse):
-            return inscribed_grid
-        lean = self.grids.lean()[0]
-        return hull_bound(lean, self._loop(lean), self._basis(lean), inscribed_grid, ellipse)
-
-    def answers(self) -> list[tuple[float, float, Real]]:
+    def answers(self) -> list[tuple[float, Real]]:
         """Of ellipses, enclosing and inscribed discs: see `exchanged`."""
         enclosing = self.exchanged("enclosing", None)
         # Where the enclosing discs cannot be stabilised together, the ellipses may be: started from the
         # inscribed.
         inscribed = self.exchanged("inscribed", None)
         start = enclosing if np.isfinite(enclosing[0]) else inscribed
-        return [self.exchanged("ellipse", start[2]), enclosing, inscribed]
+        return [self.exchanged("ellipse", start[1]), enclosing, inscribed]
 
     def controller(self, x: Real) -> tuple[Real, Complex]:
         """Frequencies (F,) of the programme and K (F,) there."""
@@ -188,8 +158,8 @@ class BracketProblem:
         sensitivity = loop.sensitivity + loop.sensitivity_slope * q
         return lean.ellipses.omega_rad_s, (loop.effort + loop.effort_slope * q) / sensitivity
 
-    def exchanged(self, region: Region, start: Real | None) -> tuple[float, float, Real]:
-        """Optimum with violated frequencies added: (value on the dense grid, on the programme's, x)."""
+    def exchanged(self, region: Region, start: Real | None) -> tuple[float, Real]:
+        """Optimum with violated frequencies added: (value on the dense grid, x)."""
 
         def solve(begin: Real | None) -> MinimaxPoint:
             lean = self.grids.lean()[0]
@@ -208,7 +178,7 @@ class BracketProblem:
             start=start,
         )
         x = start if found.x is None else found.x
-        return found.worst, found.gamma, np.zeros(self.dense_basis.shape[1]) if x is None else x
+        return found.worst, np.zeros(self.dense_basis.shape[1]) if x is None else x
 
     def _ellipse(self, data: PlantData, start: Real | None) -> MinimaxPoint:
         basis, loop = self._basis(data), self._loop(data)
@@ -305,92 +275,3 @@ def _best_angles(loop: AffineLoop, data: PlantData, y: Complex) -> Real:
         best = np.take_along_axis(trial, np.argmax(margin, axis=1)[:, None], axis=1)[:, 0]
         width /= 8.0
     return np.asarray(best)
-
-
-def hull_bound(data: PlantData, loop: AffineLoop, basis: Complex, floor: float, ceiling: float) -> float:
-    """Largest gamma in [floor, ceiling] known to be out of reach (floor if none), on the grid of `data`.
-
-    At one frequency the whole requirement on q = K S (of the base plant) is that q lies in a set of the
-    plane, R(gamma) = {q : |1 + D q| >= max(|W1 (1 - G q)|, |W3 q|)/gamma for every G + D in the ellipse}.
-    For elongated ellipses R is not convex, which makes the exact problem hard; its convex hull contains it,
-    and with hulls in place of R the problem is a linear programme in the coefficients of Q. The smallest
-    gamma for which that is feasible is a lower bound. The hull is cut from samples of R, moved outwards by
-    half their spacing: a numerical bound, exact up to details of R finer than that.
-
-    basis (F, n): Q on the grid; floor, ceiling: gammas between which to look, e.g. of inscribed disc and
-    ellipse. Requirements on S and K S count; what is asked of disturbances does not, so that the bound
-    holds with it too.
-    """
-    g = loop.base
-    w1, w3 = data.sensitivity, data.largest(LoopFunction.EFFORT)
-    # The base plant itself is a member (or close to one): |q| <= gamma/W3 and |1 - G q| <= gamma/W1 contain
-    # R.
-    by_effort = quotient(ceiling, w3, np.inf)
-    by_tracking = ceiling / (w1 * np.abs(g))
-    centre = np.where(by_tracking < by_effort, 1.0 / g, 0.0)
-    radius = np.minimum(by_tracking, by_effort)
-    pattern, spacing = _disc_samples()
-    samples = [centre[i] + radius[i] * pattern for i in range(g.size)]
-    worst = np.stack([_worst(data, loop, w1[i], w3[i], q, i) for i, q in enumerate(samples)])
-    turn = np.exp(-2j * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS)
-    projected = np.real(turn[:, None] * pattern)  # (directions, samples)
-    slope = (loop.effort_slope / radius)[:, None] * basis
-    offset = (loop.effort - centre) / radius
-    programme = _Programme(slope, offset, turn)
-    low, high = floor, ceiling
-    for _ in range(_STEPS):
-        middle = 0.5 * (low + high)
-        inside = worst <= middle
-        if not np.all(np.any(inside, axis=1)):
-            low = middle  # at some frequency nothing is left
-            continue
-        support = np.stack([np.max(projected[:, each], axis=1) for each in inside])
-        if programme.feasible(support + spacing):
-            high = middle
-        else:
-            low = middle
-    return low
-
-
-def _disc_samples() -> tuple[Complex, float]:
-    """Points of the unit disc and half their largest spacing."""
-    radii = np.linspace(0.0, 1.0, _RADII)
-    points = radii[:, None] * np.exp(2j * np.pi * np.arange(_ANGLES) / _ANGLES)
-    return points.ravel(), max(0.5 / (_RADII - 1), np.pi / _ANGLES)
-
-
-def _worst(data: PlantData, loop: AffineLoop, w1: float, w3: float, q: Complex, i: int) -> Real:
-    """Smallest gamma that lets q (samples,) into R at frequency i with its weights, (samples,)."""
-    e = data.ellipses
-    size = np.abs(q)
-    direction = e.direction[i] * data.delay[i]
-    moved = 1.0 + (e.centre[i] * data.delay[i] - loop.base[i]) * q
-    turned = quotient(moved * np.conj(q * direction), size, 1.0)
-    distance = nearest_distance(turned, size * e.semi_major[i], size * e.semi_minor[i])
-    asked = np.maximum(w1 * np.abs(1.0 - loop.base[i] * q), w3 * size)
-    return np.asarray(quotient(asked, distance, np.inf))
-
-
-class _Programme:
-    """Is there x with Re(turn_j (offset_k + slope_k x)) <= support_kj for all frequencies and directions?"""
-
-    def __init__(self, slope: Complex, offset: Complex, turn: Complex) -> None:
-        _, sizes, directions = np.linalg.svd(real_rows(slope), full_matrices=False)
-        keep = sizes > _KEPT * sizes[0]
-        scaled = slope @ (directions[keep].T / sizes[keep] * 10.0)
-        rows = np.real(turn[None, :, None] * scaled[:, None, :])
-        self._rows = rows.reshape(-1, rows.shape[2])
-        self._known = np.real(turn[None, :] * offset[:, None]).ravel()
-
-    def feasible(self, support: Real) -> bool:
-        """The smallest common violation is not positive; an unclear answer of the solver counts as
-        feasible."""
-        count = self._rows.shape[1]
-        answer = linprog(
-            np.append(np.zeros(count), 1.0),
-            A_ub=np.hstack([self._rows, -np.ones((self._rows.shape[0], 1))]),
-            b_ub=support.ravel() - self._known,
-            bounds=[(None, None)] * count + [(-1.0, None)],
-            method="highs",
-        )
-        return answer.status != 0 or answer.fun is None or bool(answer.fun <= 1e-9)

@@ -63,7 +63,7 @@ def free_controllers(
         except (ValueError, ArithmeticError):  # no factorisation: the bound does not know such a plant
             return FreeControllers(tuple(found), np.inf)
         answers = problem.answers()
-        found += [FreeController(*problem.controller(x)) for value, _, x in answers if np.isfinite(value)]
+        found += [FreeController(*problem.controller(x)) for value, x in answers if np.isfinite(value)]
         gamma = max(gamma, answers[0][0])
     return FreeControllers(tuple(found), gamma)
 

@@ -132,7 +132,6 @@ class ScatterRow:
 
     omega_low_rad_s: float
     omega_high_rad_s: float
-    n_frequencies: int
     predicted: float
     measured: float
     ratio: float
@@ -193,7 +192,6 @@ def repeat_scatter(
             ScatterRow(
                 float(low),
                 float(high),
-                int(inside.sum()),
                 p,
                 m,
                 _ratio(m, p),

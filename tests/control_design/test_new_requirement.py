@@ -76,10 +76,7 @@ def test_it_is_designed_for_checked_and_proved_between_grid_points():
     assert item.bound is not None
     assert item.achieved <= item.bound <= 1.005 * item.achieved
     assert certificate.plants[0].all_frequencies.proved
-    assert (
-        youla_bracket(plant, spec, YoulaOptions(dense_points=1000, grid_points=40, hull=False)).floor
-        <= result.gamma
-    )
+    assert youla_bracket(plant, spec, YoulaOptions(dense_points=1000, grid_points=40)).floor <= result.gamma
 
 
 def test_slopes_and_curvature_of_its_rows_are_derivatives():

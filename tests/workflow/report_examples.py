@@ -176,9 +176,9 @@ def plant(*, performance: bool = True) -> UncertainPlant:
 
 def scatter_rows() -> list[ScatterRow]:
     return [
-        ScatterRow(0.3, 3.0, 20, 0.11, 0.13, 1.18, 0.2, 1.8),
-        ScatterRow(3.0, 30.0, 20, 0.021, 0.019, 0.9, 0.03, 1.4),
-        ScatterRow(30.0, 300.0, 20, 0.3, 0.41, 1.37, float("nan"), float("nan")),
+        ScatterRow(0.3, 3.0, 0.11, 0.13, 1.18, 0.2, 1.8),
+        ScatterRow(3.0, 30.0, 0.021, 0.019, 0.9, 0.03, 1.4),
+        ScatterRow(30.0, 300.0, 0.3, 0.41, 1.37, float("nan"), float("nan")),
     ]
 
 
@@ -335,9 +335,7 @@ def _save_design(run: RunDirectory, settings: RunConfig, gain: float, impossible
 def achievable(reached: float = 0.8) -> AchievablePerformance:
     """What a controller of any order reaches, made up."""
     return AchievablePerformance(
-        YoulaBracket(
-            (PlantBracket("hub", reached - 0.002, reached, reached + 0.002, reached - 0.003, 57, True),)
-        )
+        YoulaBracket((PlantBracket("hub", reached - 0.002, reached, reached + 0.002),))
     )
 
 

@@ -33,7 +33,7 @@ from workflow.engine import codec, documents, storage
 from workflow.engine.errors import InputError, naming, shortened
 from workflow.engine.store import Store
 
-LAYOUT_VERSION = 5  # 5: how logs of a loop were used, advice of the residual tests
+LAYOUT_VERSION = 6  # 6: results without fields that nobody read
 T = TypeVar("T")
 _INPUT_HASH, _DIGEST = "_input_hash", "_sha256"
 _RESULT = "result"
