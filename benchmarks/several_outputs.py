@@ -24,7 +24,7 @@ import pandas as pd
 from scipy.signal import dlsim
 
 from benchmarks.harness import Print, main, timed
-from ident import IdentOptions, Record, identify_miso
+from ident import IdentOptions, Record
 from ident.several_outputs import identify_mimo
 from ident.uncertainty.matrix_response import matrix_posterior
 from plant import prbs
@@ -121,7 +121,7 @@ def _plant(out: Print, name: str, seeds: range) -> None:
         result, taken = timed(partial(identify_mimo, [record], options))
         seconds.append(taken)
         noted("shared poles", result.model.frequency_response(ERRORS))
-        alone = [identify_miso([record.only(k)], options).model for k in range(2)]
+        alone = [identify_mimo([record.only(k)], options).model.outputs[0] for k in range(2)]
         noted("channel by channel", np.stack([one.frequency_response(ERRORS) for one in alone], axis=1))
         states.append(len(result.model.state_space()[0]))
         balls = matrix_posterior([record], result).at(BALLS)

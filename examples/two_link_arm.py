@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 from scipy.signal import dlsim
 
 from ident import IdentOptions, Record
-from ident.one_input import identify_miso
-from ident.uncertainty.miso_uncertainty import response_uncertainty
+from ident.several_outputs import identify_mimo
+from ident.uncertainty.matrix_response import matrix_posterior
 from plant import prbs
 from validation.example_arms import two_link_operating_point
 
@@ -38,31 +38,32 @@ def experiment(n_samples: int, rng: np.random.Generator) -> tuple[control.StateS
 
 
 def run(n_samples: int = 8000, seed: int = 0):
-    """Identify the arm; returns the identification, the true response (F, 2) and the uncertain channels."""
+    """Identify the arm; returns the identification, the true response (F, 2) and the ball around it."""
     arm, record = experiment(n_samples, np.random.default_rng(seed))
-    result = identify_miso([record], IdentOptions(integrators=1))
+    result = identify_mimo([record], IdentOptions(integrators=1))
     truth = arm(np.exp(1j * OMEGA * DT_S))[0].T
-    return result, truth, response_uncertainty([record], result, OMEGA)
+    return result, truth, matrix_posterior([record], result).at(OMEGA)
 
 
 def report(result, truth) -> None:
     true = sorted((p for p in two_link_operating_point(ELBOW_ANGLE_RAD).poles() if p.imag > 0), key=abs)
     for name, modes in (("true", true), ("found", np.log(result.model.poles.pairs) / DT_S)):
         print(f"{name} modes: " + "; ".join(f"{abs(p):.2f} rad/s, {-p.real / abs(p):.3f}" for p in modes))
-    print(f"states: {result.model.state_space()[0].shape[0]}, noise {1e3 * result.noise_std:.4f} mm")
-    error = np.abs(result.model.frequency_response(OMEGA) / truth - 1)[OMEGA <= 200]
+    print(f"states: {result.model.state_space()[0].shape[0]}, noise {1e3 * np.sqrt(result.noise_covariance[0, 0]):.4f} mm")
+    error = np.abs(result.model.frequency_response(OMEGA)[:, 0] / truth - 1)[OMEGA <= 200]
     for name, value in zip(result.model.input_names, np.sqrt(np.mean(error**2, axis=0)), strict=True):
         print(f"{name} -> tip_m: rms relative error up to 200 rad/s {100 * value:.3f} %")
 
 
-def figure(result, truth, bands) -> Figure:
+def figure(result, truth, ball) -> Figure:
     picture = Figure(figsize=(9, 6.5), layout="constrained")
     gain, phase = picture.subplots(2, 1, sharex=True)
-    model = result.model.frequency_response(OMEGA)
+    model = result.model.frequency_response(OMEGA)[:, 0]
+    # What a channel of a member of the ball is off at most.
+    radii = ball.output_factor[0, 0] * ball.radius[:, None] * np.linalg.norm(ball.input_factor, axis=1)
     for i, (name, colour) in enumerate((("shoulder", "tab:blue"), ("elbow", "tab:orange"))):
-        radius = bands[i].enclosing_radius()
-        low = np.maximum(np.abs(model[:, i]) - radius, 1e-9)
-        gain.fill_between(OMEGA, low, np.abs(model[:, i]) + radius, color=colour, alpha=0.25, lw=0)
+        low = np.maximum(np.abs(model[:, i]) - radii[:, i], 1e-9)
+        gain.fill_between(OMEGA, low, np.abs(model[:, i]) + radii[:, i], color=colour, alpha=0.25, lw=0)
         for axis, show in ((gain, np.abs), (phase, lambda g: np.degrees(np.unwrap(np.angle(g))))):
             axis.semilogx(OMEGA, show(truth[:, i]), "k-" if i else "k:", lw=1, label=f"truth, {name}")
             axis.semilogx(OMEGA, show(model[:, i]), color=colour, lw=2.2, alpha=0.7, label=f"model, {name}")

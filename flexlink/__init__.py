@@ -7,7 +7,7 @@ Names are imported at first use, so `import flexlink` is fast. A result prints a
 it, `to_control()` converts it for python-control. Long computations use one BLAS thread, as the commands do.
 
 Data        `Record`, `FrfRepeats`, `FrequencyUncertainty`, `band_limited`, `empirical_frf`
-Models      `identify`, `identify_frf`, `identify_miso`, `identify_mimo`, `uncertainty`, `matrix_posterior`,
+Models      `identify`, `identify_frf`, `identify_mimo`, `uncertainty`, `matrix_posterior`,
             `GobfModel`, `Poles`, `IdentOptions`, `EmbeddingOptions`, `Identification`, `Uncertainty`,
             `pole_intervals`, `error_surface`
 Basis       `regressor`, `basis_response`

@@ -44,7 +44,6 @@ from .models import (
     identify as identify,
     identify_frf as identify_frf,
     identify_mimo as identify_mimo,
-    identify_miso as identify_miso,
     matrix_posterior as matrix_posterior,
     pole_intervals as pole_intervals,
     regressor as regressor,

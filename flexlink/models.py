@@ -26,7 +26,7 @@ from ident.data.signal_filter import band_limited
 from ident.data.table import Table
 from ident.frequency_fit import identify_frf
 from ident.identification import Identification as Identified
-from ident.one_input import identify as identify_records, identify_miso
+from ident.one_input import identify as identify_records
 from ident.search.error_surface import ErrorSurface, error_surface as surface_of
 from ident.several_outputs import identify_mimo
 from ident.uncertainty.embedding import tangent
@@ -52,7 +52,6 @@ __all__ = [
     "identify",
     "identify_frf",
     "identify_mimo",
-    "identify_miso",
     "matrix_posterior",
     "pole_intervals",
     "regressor",

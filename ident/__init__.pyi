@@ -10,7 +10,7 @@ from .basis.structure import Structure as Structure
 from .data.record import Record as Record
 from .data.signal_filter import band_limited as band_limited
 from .frequency_fit import FrfIdentification as FrfIdentification, identify_frf as identify_frf
-from .identification import Identification as Identification, MisoIdentification as MisoIdentification
-from .one_input import identify as identify, identify_miso as identify_miso
+from .identification import Identification as Identification
+from .one_input import identify as identify
 from .search.error_surface import ErrorSurface as ErrorSurface, error_surface as error_surface
 from .search.pole_search import SearchTrace as SearchTrace

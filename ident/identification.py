@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from ident.basis.mimo_model import MimoModel
-from ident.basis.model import GobfModel, MisoModel
+from ident.basis.model import GobfModel
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray, lock, readonly
 from ident.data.finding import Finding, PriorTest, distinct
@@ -81,14 +81,6 @@ class Identification(FittedRecords):
     """A fitted model of one input, and how well it fits."""
 
     model: GobfModel
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class MisoIdentification(FittedRecords):
-    """A fitted model of several inputs with shared poles, and how well it fits; the criterion of its order
-    table counts 1 + U numbers per pole."""
-
-    model: MisoModel
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,10 +1,4 @@
-"""Records and settings in, a GOBF model with everything needed to judge it out; for one input, and for
-several with shared poles (MISO).
-
-The paper's remark on multi-link manipulators: at an operating point every motor excites the same modes, so
-y = sum_i sum_m c_im L_m(q) u_i + nuisances + v has one set of poles and a row of coefficients per input. A
-mode that one motor hardly moves is found through the others, and all data sharpen every pole.
-"""
+"""Records of one input and output and settings in, a GOBF model with everything needed to judge it out."""
 
 from __future__ import annotations
 
@@ -15,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ident.basis.model import GobfModel, MisoModel
+from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.checks.answer import explains_nothing
-from ident.checks.input_checks import advice, few_samples, least_independence, refuse_unusable
+from ident.checks.input_checks import advice, refuse_unusable
 from ident.checks.plausible_modes import implausible_pairs, pole_warnings
 from ident.checks.prior_tests import (
     NuisanceTest,
@@ -39,19 +33,15 @@ from ident.data.finding import Finding, FindingKind, PriorTest, finding
 from ident.data.record import Record
 from ident.fit.least_squares import Regression, fit
 from ident.fit.refinement import Refined, free_optimality
-from ident.fit.regression import prepare, prepare_inputs, restructured, thinned
+from ident.fit.regression import prepare, restructured, thinned
 from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
-from ident.identification import Identification, MisoIdentification
+from ident.identification import Identification
 from ident.search.dead_time import first_answer, seek
 from ident.search.order_selection import OrderSelection, Progress, silent
 from ident.search.pole_search import Fitted, PoleSearch, PolishedMinimum, SearchTrace
 
 # Initial states that raise the residual of a fit from rest by this factor may have led its search astray.
 _MISLED = 1.2
-# Where a combination of the inputs has less of the power the channels are told apart badly.
-ALIKE_INPUT = 1e-2
-# A residual worth less than this share of its samples is not white.
-_COLOURED = 0.8
 
 
 def identify(
@@ -89,7 +79,7 @@ def untested_model(records: Sequence[Record], options: IdentOptions) -> GobfMode
     data = prepare(records, options.structure())
     refuse_unusable(records, data, least_order(options))
     outcome, _ = searched(records, data, options, silent)
-    return description(records, outcome, fitted_on_all(records, outcome)[0])[0].channel(0)
+    return description(records, outcome, fitted_on_all(records, outcome)[0])[0]
 
 
 def _identified(records: Sequence[Record], options: IdentOptions, report: Progress) -> Identification:
@@ -110,13 +100,12 @@ def _identified(records: Sequence[Record], options: IdentOptions, report: Progre
     if at_once and not options.feedthrough and options.relative_degree is None and fitted.poles.order:
         test = direct_term_test(records, fitted)
         refused += (finding(FindingKind.ANSWERS_AT_ONCE, **test.finding.values),) if test.refused else ()
-    only = model.channel(0)
     report(1.0, "identified")
     return Identification(
-        model=only,
+        model=model,
         verdicts=(*verdicts, *(test.finding for test in tests)),
         prior_tests=tests,
-        advise=partial(_advice, tuple(records), fitted, only, found["residuals"], refused),
+        advise=partial(_advice, tuple(records), fitted, model, found["residuals"], refused),
         **found,
     )
 
@@ -137,7 +126,7 @@ def searched(
     if in_mid_record:
         structure = replace(structure, estimate_initial_state=True)
     if in_mid_record or len(part) < len(records):
-        data = prepare_inputs(part, structure)
+        data = prepare(part, structure)
     outcome = _searched(data, options, lambda f, message: report(0.4 * f, message))
     if options.estimate_initial_state == "auto" and not in_mid_record:
         outcome = _searched_with_initial_state(part, outcome, report)
@@ -225,7 +214,7 @@ def fitted_on_all(records: Sequence[Record], outcome: Outcome) -> tuple[Fitted, 
     if outcome.data.n_samples < sum(record.n_samples - structure.input_delay_samples for record in records):
         if options.estimate_initial_state is False:  # a search in mid-record had to estimate it all the same
             structure = replace(structure, estimate_initial_state=False)
-        here = _moved(outcome, prepare_inputs(records, structure), outcome.poles)
+        here = _moved(outcome, prepare(records, structure), outcome.poles)
     verdicts = []
     for name, key in (("initial state", "estimate_initial_state"), ("offset", "estimate_offset")):
         if getattr(options, key) != "auto":
@@ -326,7 +315,7 @@ def _moved(outcome: Outcome, data: Regression, poles: Poles) -> Fitted:
 
 def description(
     records: Sequence[Record], outcome: Outcome, fitted: Fitted
-) -> tuple[MisoModel, dict[str, Any]]:
+) -> tuple[GobfModel, dict[str, Any]]:
     """The model, and the fields of `ident.identification.FittedRecords` that are read from fit and search."""
     data, search, options = fitted.data, outcome.search, outcome.search.options
     degree = data.structure.relative_degree
@@ -337,12 +326,12 @@ def description(
     else:
         linear = fit(data, poles)
         optimality = free_optimality(data.linearise(*poles.writable()), poles, bounds, search.fixed)
-    model = MisoModel(
+    model = GobfModel(
         poles=poles,
-        coefficients=linear.coefficients,
-        feedthrough=linear.feedthrough,
+        coefficients=linear.coefficients[0],
+        feedthrough=float(linear.feedthrough[0]),
         dt_s=data.dt_s,
-        input_names=records[0].input_names,
+        input_name=records[0].input_names[0],
         output_name=records[0].output_names[0],
         integrators=options.integrators,
         input_delay_samples=options.input_delay_samples,
@@ -384,56 +373,3 @@ def _advice(
         *implausible_pairs(model.poles, fixed, data.dt_s, data.longest * data.dt_s),
         *refused,
     ]
-
-
-def identify_miso(
-    records: Sequence[Record], options: IdentOptions | None = None, *, progress: Progress | None = None
-) -> MisoIdentification:
-    """Fit one model with shared poles to all inputs of all records together.
-
-    records : sequence of records of equal inputs, one output and equal sampling time. Each has its own
-        nuisance columns (offset, initial state). An input may rest in some records, so experiments that
-        excite one motor at a time can be put together; over all records the inputs must be distinguishable.
-    options : IdentOptions
-        As for `identify`, the same for every input: integrators, delay and direct terms. A relative degree is
-        refused, and what you know is not tested.
-    progress : callable, optional. Called with a fraction 0..1 and a short message.
-
-    Raises ValueError if a record cannot be used, the inputs of the records differ or are one signal, the data
-    are too short for the given order, or the options have a relative degree.
-
-    Search, descent and choice of the order are those of `identify` on the joint cost; with one input the
-    results agree. Deterministic: the same records and options give the same numbers.
-    """
-    options = options or IdentOptions()
-    if options.relative_degree is not None:
-        raise ValueError(
-            f"relative_degree = {options.relative_degree} is not available with several inputs; leave it out"
-        )
-    report = progress or silent
-    data = prepare_inputs(records, options.structure())
-    refuse_unusable(records, data, least_order(options))
-    outcome, _ = searched(records, data, options, report)
-    fitted, verdicts = fitted_on_all(records, outcome)
-    model, found = description(records, outcome, fitted)
-    report(1.0, "identified")
-    return MisoIdentification(
-        model=model,
-        verdicts=verdicts,
-        advise=partial(_advice_on_inputs, fitted, model, found["residuals"]),
-        **found,
-    )
-
-
-def _advice_on_inputs(fitted: Fitted, model: MisoModel, residuals: tuple[RealArray, ...]) -> list[Finding]:
-    data, search = fitted.data, fitted.search
-    found = pole_warnings(model, search.fixed, search.bounds)
-    if model.order:
-        found += explains_nothing(data, model.poles, search.fixed, np.concatenate(residuals))
-    found += few_samples(data, model.order)
-    if least_independence(data) < ALIKE_INPUT:
-        found.append(finding(FindingKind.ALIKE_INPUTS, inputs=str(list(model.input_names))))
-    worth = data.colour(np.concatenate(residuals)).effective_samples
-    if worth < _COLOURED * data.n_samples:
-        found.append(finding(FindingKind.COLOURED_RESIDUAL, n_samples=data.n_samples, worth=worth))
-    return found

@@ -1,4 +1,4 @@
-"""Records of several inputs and outputs in, one model with shared poles out (MIMO).
+"""Records of several inputs, of one output or several, in, one model with shared poles out.
 
 The paper's closing remark: at an operating point every motor excites the same modes and every sensor sees
 them. Poles are searched on the joint cost of all outputs, each weighted by its noise; then every mode is
@@ -33,7 +33,7 @@ from ident.fit.regression import thinned
 from ident.fit.several_outputs import OutputRegressions, prepare_outputs, whitened
 from ident.identification import MimoIdentification
 from ident.mode_shapes import one_shape_each
-from ident.one_input import ALIKE_INPUT, in_order, least_order
+from ident.one_input import in_order, least_order
 from ident.search.order_selection import OrderSelection, Progress, silent
 from ident.search.pole_search import PoleSearch, SearchTrace
 
@@ -43,6 +43,10 @@ _ROUNDS = 3
 _WHITE = 0.05
 # Level of the test of one shape per mode.
 _LEVEL = 1e-3
+# Where a combination of the inputs has less of the power the channels are told apart badly.
+_ALIKE_INPUT = 1e-2
+# A residual worth less than this share of its samples is not white.
+_COLOURED = 0.8
 
 
 class _Found(NamedTuple):
@@ -66,8 +70,9 @@ def identify_mimo(
         columns (offset, initial state). An input may rest in some records; over all records the inputs must
         be distinguishable.
     options : IdentOptions
-        As for `identify`, the same for every channel: integrators (at most one in a row; each joint has its
-        own), delay and direct terms. A relative degree is refused, and what you know is not tested.
+        As for `identify`, the same for every channel: integrators (with several outputs at most one in a
+        row; each joint has its own), delay and direct terms. A relative degree is refused, and what you know
+        is not tested.
     free_shapes : leave every residue free, instead of giving modes one shape where the records let them
     start : Poles, optional. Of the same machine at a neighbouring operating point: the search begins at them,
         and still decides on the order.
@@ -84,7 +89,7 @@ def identify_mimo(
         raise ValueError(
             f"relative_degree = {options.relative_degree} is not available with several outputs; leave it out"
         )
-    if options.integrators > 1:
+    if options.integrators > 1 and any(len(record.output_names) > 1 for record in records):
         raise ValueError(
             f"integrators = {options.integrators}: with several outputs at most one in a row; joints that "
             "turn freely have one each, which is integrators = 1"
@@ -263,6 +268,9 @@ def _advice(search: PoleSearch[OutputRegressions], model: MimoModel, residual: R
         for one, rest in zip(data.each, residual, strict=True):
             found += explains_nothing(one, model.poles, search.fixed, rest)
     found += few_samples(data.each[0], model.order)
-    if least_independence(data.each[0]) < ALIKE_INPUT:
+    if least_independence(data.each[0]) < _ALIKE_INPUT:
         found.append(finding(FindingKind.ALIKE_INPUTS, inputs=str(list(model.input_names))))
+    worth = data.colour(residual.ravel()).effective_samples
+    if worth < _COLOURED * data.n_samples:
+        found.append(finding(FindingKind.COLOURED_RESIDUAL, n_samples=data.n_samples, worth=worth))
     return found

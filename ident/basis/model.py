@@ -252,7 +252,7 @@ class MisoModel:
         The transposed cascade: the channels c_i (zI - A)^-1 B + d_i of one lossless cascade share B, so
         B^T (zI - A^T)^-1 [c_1^T ... c_U^T] + d is all of them on n states instead of U n. Integrators and
         delay, common as well, act on the output. Each integrator takes the place of a pole at z = 0 if the
-        first ones are there (`identify_miso` puts them there), so that the zero of z/(z - 1) cancels nothing
+        first ones are there (`identify_mimo` puts them there), so that the zero of z/(z - 1) cancels nothing
         and the realisation stays minimal; else it has a state of its own.
         """
         basis = basis_state_space(self.poles)

@@ -35,10 +35,7 @@ def prepare_inputs(records: Sequence[Record], structure: Structure) -> Regressio
     inputs, outputs, polynomials, starts = [], [], [], [0]
     for record in records:
         if record.output.shape[1] != 1:
-            raise ValueError(
-                f"{record.label}: identification of several inputs takes one output, got "
-                f"{list(record.output_names)}"
-            )
+            raise ValueError(f"{record.label}: expected one output, got {list(record.output_names)}")
         names = record.input_names
         if max(len(names), len(first.input_names)) > 1 and names != first.input_names:
             raise ValueError(

@@ -20,7 +20,8 @@ from threadpoolctl import threadpool_limits
 import ident
 from ident.basis.options import IdentOptions
 from ident.data.arrays import kernel_array
-from ident.one_input import identify, identify_miso
+from ident.one_input import identify
+from ident.several_outputs import identify_mimo
 from ident.uncertainty.embedding import tangent
 from tests.ident.benchmark_plants import p1, p1_friction, p2, p3
 
@@ -69,7 +70,7 @@ def everything_else():
         assert found.model.order > 0
         assert isinstance(found.warnings, tuple)
         tangent(records, found.model)
-    identify_miso([known], FOURTH_ORDER)
+    identify_mimo([known], FOURTH_ORDER)
 
 
 def in_a_fresh_process(cache, code):

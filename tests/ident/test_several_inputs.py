@@ -14,8 +14,9 @@ from ident.data.finding import FindingKind
 from ident.data.record import Record
 from ident.fit.least_squares import fit
 from ident.fit.regression import prepare_inputs
-from ident.one_input import identify, identify_miso
-from ident.uncertainty.miso_uncertainty import response_uncertainty
+from ident.one_input import identify
+from ident.several_outputs import identify_mimo
+from ident.uncertainty.matrix_response import matrix_posterior
 from tests.ident.benchmark_plants import p3
 from tests.ident.findings import kinds
 
@@ -64,7 +65,7 @@ def record(seed, n=3000, noise_std=0.05, system=None, start=None):
 
 @pytest.fixture(scope="module")
 def fitted():
-    return identify_miso([record(0)])
+    return identify_mimo([record(0)])
 
 
 def some_model(integrators=0, delay=0, zeros=None, feedthrough=True):
@@ -80,23 +81,18 @@ def some_model(integrators=0, delay=0, zeros=None, feedthrough=True):
 def test_one_input_is_the_single_input_identification():
     truth = p3(3, 0, 40)
     for options in (
-        IdentOptions(n_real=2, n_pairs=3),
-        IdentOptions(estimate_initial_state=True, max_pairs=3),
+        IdentOptions(estimate_offset=True, n_real=2, n_pairs=3),
+        IdentOptions(estimate_offset=True, estimate_initial_state=True, max_pairs=3),
     ):
-        one, several = identify([truth.record], options), identify_miso([truth.record], options)
+        one, several = identify([truth.record], options), identify_mimo([truth.record], options)
         # Either descent stops when 1e-9 of J is left to gain: within sqrt(1e-9 N) = 1.4e-3 of the poles'
         # standard deviations, the largest of which is a few thousandths.
-        assert several.rss == pytest.approx(one.rss, rel=4e-9)
+        np.testing.assert_allclose(several.noise_covariance[0, 0], one.noise_std**2, rtol=1e-2)
         np.testing.assert_allclose(several.model.poles.values, one.model.poles.values, rtol=0, atol=1e-5)
         scale = np.max(np.abs(one.model.coefficients))
         np.testing.assert_allclose(
-            several.model.coefficients[0], one.model.coefficients, rtol=0, atol=1e-5 * scale
+            several.model.coefficients[0, 0], one.model.coefficients, rtol=0, atol=1e-5 * scale
         )
-        assert several.verdicts == one.verdicts
-        assert [(s.n_real, s.n_pairs) for s in several.order_table] == [
-            (s.n_real, s.n_pairs) for s in one.order_table
-        ]
-        assert several.rss == pytest.approx(one.rss, rel=1e-9)
 
 
 def test_shared_modes_are_found_and_the_invisible_one_too(fitted):
@@ -106,10 +102,10 @@ def test_shared_modes_are_found_and_the_invisible_one_too(fitted):
     np.testing.assert_allclose(poles.omega_rad_s(DT_S), [20.0, 90.0], rtol=2e-3)
     np.testing.assert_allclose(poles.zeta(), [0.03, 0.02], rtol=0.1)
     np.testing.assert_allclose(poles.decay_per_s(DT_S), [DECAY], rtol=0.05)
-    assert fitted.noise_std == pytest.approx(0.05, rel=0.05)
+    assert np.sqrt(fitted.noise_covariance[0, 0]) == pytest.approx(0.05, rel=0.05)
     assert fitted.tangent_optimality < 1e-3
     assert fitted.warnings == ()
-    error = np.abs(fitted.model.frequency_response(OMEGA) - response(sampled()))
+    error = np.abs(fitted.model.frequency_response(OMEGA)[:, 0] - response(sampled()))
     assert np.all(np.sqrt(np.mean(error**2, axis=0)) < 0.02)
 
     # The same channel by itself, the other motor at rest: that mode is not there.
@@ -204,10 +200,10 @@ def test_integrators_and_delay_are_exact():
     late = np.vstack([np.zeros((2, 2)), u[:-2]])
     y = signal.dlsim((A, B, C, D, DT_S), late)[1][:, 0] + 0.01 * rng.normal(size=3000)
     item = Record("arm", u, y[:, None], DT_S, ("a", "b"), ("tip",))
-    result = identify_miso([item], IdentOptions(integrators=1, input_delay_samples=2, n_real=1, n_pairs=2))
+    result = identify_mimo([item], IdentOptions(integrators=1, input_delay_samples=2, n_real=1, n_pairs=2))
     np.testing.assert_allclose(result.model.poles.omega_rad_s(DT_S), [20.0, 90.0], rtol=2e-3)
     truth = response((A, B, C, D)) * np.exp(-2j * OMEGA * DT_S)[:, None]
-    error = np.abs(result.model.frequency_response(OMEGA) - truth) / np.abs(truth).max(axis=0)
+    error = np.abs(result.model.frequency_response(OMEGA)[:, 0] - truth) / np.abs(truth).max(axis=0)
     assert np.max(error) < 0.01
 
 
@@ -218,45 +214,51 @@ def test_one_motor_at_a_time_in_records_of_their_own():
         only[:, i] = record(i, n=2000).input[:, i]
         y = signal.dlsim((*sampled(), DT_S), only)[1] + 0.02 * np.random.default_rng(i).normal(size=(2000, 1))
         items.append(Record(f"motor {i}", only, y, DT_S, ("a", "b"), ("tip",)))
-    result = identify_miso(items)
+    result = identify_mimo(items)
     np.testing.assert_allclose(result.model.poles.omega_rad_s(DT_S), [20.0, 90.0], rtol=2e-3)
     assert len(result.residuals) == 2
 
 
 def test_initial_state_is_noticed():
     start = np.array([3.0, 2.0, 0.0, -1.0, 0.0])
-    result = identify_miso([record(0, start=start)])
+    result = identify_mimo([record(0, start=start)])
     assert result.structure.estimate_initial_state
     np.testing.assert_allclose(result.model.poles.omega_rad_s(DT_S), [20.0, 90.0], rtol=2e-3)
 
 
 def test_a_model_is_locked_and_gives_its_channels(fitted):
     with pytest.raises(ValueError, match="read-only"):
-        fitted.model.coefficients[0, 0] = 1.0
-    assert fitted.model.channel(1).input_name == "motor_2"
+        fitted.model.outputs[0].coefficients[0, 0] = 1.0
+    assert fitted.model.outputs[0].channel(1).input_name == "motor_2"
 
 
 def test_bad_input_is_refused():
     good = record(0, n=300)
     same = Record("same", np.column_stack([good.input[:, 0]] * 2), good.output, DT_S, ("a", "b"), ("y",))
     with pytest.raises(ValueError, match="linearly dependent"):
-        identify_miso([same])
+        identify_mimo([same])
     still = Record("still", good.input * [1, 0], good.output, DT_S, ("a", "b"), ("y",))
     with pytest.raises(ValueError, match="'b' is constant in every record"):
-        identify_miso([still])
+        identify_mimo([still])
     with pytest.raises(ValueError, match="too few"):
-        identify_miso([good.slice(0, 12)], IdentOptions(n_real=1, n_pairs=2))
+        identify_mimo([good.slice(0, 12)], IdentOptions(n_real=1, n_pairs=2))
     with pytest.raises(ValueError, match="relative_degree"):
-        identify_miso([good], IdentOptions(relative_degree=2))
+        identify_mimo([good], IdentOptions(relative_degree=2))
     two = Record("two", good.input, np.repeat(good.output, 2, axis=1), DT_S, ("a", "b"), ("y", "z"))
-    with pytest.raises(ValueError, match="one output"):
-        identify_miso([two])
+    with pytest.raises(ValueError, match="linearly dependent"):
+        identify_mimo([two])
     with pytest.raises(ValueError, match="at least one record"):
-        identify_miso([])
+        identify_mimo([])
     with pytest.raises(ValueError, match="need coefficients"):
         MisoModel(Poles(np.array([0.5])), np.ones((1, 1)), np.zeros(2), DT_S, ("a", "b"))
     with pytest.raises(ValueError, match="finite"):
         MisoModel(Poles(np.array([0.5])), np.array([[np.nan]]), np.zeros(1), DT_S, ("a",))
+
+
+def covariances(records, result, omega):
+    """(F, U, U) of the channels' errors, conj(e_u) e_v, for noise of one."""
+    factor = matrix_posterior(records, result).at(omega).input_factor
+    return factor.conj().swapaxes(1, 2) @ factor
 
 
 def test_uncertainty_with_fixed_poles_is_that_of_linear_least_squares():
@@ -267,15 +269,13 @@ def test_uncertainty_with_fixed_poles_is_that_of_linear_least_squares():
     options = IdentOptions(
         fixed_poles=fixed, n_real=0, n_pairs=0, estimate_offset=False, estimate_initial_state=False
     )
-    result = identify_miso([item], options)
-    bands = response_uncertainty([item], result, OMEGA)
+    result = identify_mimo([item], options)
     functions = [MisoModel(poles, np.eye(5)[[j]], np.zeros(1), DT_S, ("u",)) for j in range(5)]
     phi = np.column_stack([one.simulate(u[:, None]) for u in item.input.T for one in functions])
-    covariance = result.noise_std**2 * np.linalg.inv(phi.T @ phi)[5:, 5:]
+    covariance = np.linalg.inv(phi.T @ phi).reshape(2, 5, 2, 5)
     basis = MisoModel(poles, np.eye(5), np.zeros(5), DT_S, tuple("abcde")).frequency_response(OMEGA)
-    pair = np.stack([basis.real, basis.imag], axis=1)
-    expected = np.einsum("fai,ij,fbj->fab", pair, covariance, pair)
-    np.testing.assert_allclose(bands[1].covariance, expected, rtol=1e-6, atol=1e-12)
+    expected = np.einsum("fi,uivj,fj->fuv", basis.conj(), covariance, basis)
+    np.testing.assert_allclose(covariances([item], result, OMEGA), expected, rtol=1e-6, atol=1e-12)
 
 
 def test_uncertainty_is_that_of_all_unknowns_together():
@@ -291,8 +291,8 @@ def test_uncertainty_is_that_of_all_unknowns_together():
     )  # fmt: skip
     y = truth.simulate(u) + 0.1 * np.random.default_rng(4).normal(size=400)
     item = Record("test", u, y[:, None], DT_S, ("a", "b"), ("y",))
-    result = identify_miso([item], options)
-    model = result.model
+    result = identify_mimo([item], options)
+    (model,) = result.model.outputs
 
     def moved(x):
         poles = Poles(np.array([0.0, x[0]]), np.array([complex(x[1], x[2])]))
@@ -307,17 +307,15 @@ def test_uncertainty_is_that_of_all_unknowns_together():
     for direction in np.eye(best.size):
         up, down = moved(best + step * direction), moved(best - step * direction)
         of_output.append((up.simulate(u) - down.simulate(u))[1:] / (2 * step))
-        change = (up.frequency_response(omega) - down.frequency_response(omega)) / (2 * step)
-        of_response.append(np.stack([change.real, change.imag]))
+        of_response.append((up.frequency_response(omega) - down.frequency_response(omega)) / (2 * step))
     jacobian = np.array(of_output).T
-    covariance = result.noise_std**2 * np.linalg.inv(jacobian.T @ jacobian)
-    # (P, Re/Im, F, U)
-    expected = np.einsum("iafu,ij,jbfu->ufab", of_response, covariance, of_response)
-    for i, band in enumerate(response_uncertainty([item], result, omega)):
-        scale = np.trace(expected[i], axis1=1, axis2=2)[:, None, None]
-        # The residual is orthogonal to the tangent space only to the tolerance of the descent; differences
-        # carry 1e-9 or so.
-        np.testing.assert_allclose(band.covariance / scale, expected[i] / scale, rtol=0, atol=1e-5)
+    columns = np.array(of_response)
+    expected = np.einsum("ifu,ij,jfv->fuv", columns.conj(), np.linalg.inv(jacobian.T @ jacobian), columns)
+    scale = np.trace(expected, axis1=1, axis2=2).real[:, None, None]
+    # The residual is orthogonal to the tangent space only to the tolerance of the descent; differences
+    # carry 1e-9 or so.
+    found = covariances([item], result, omega)
+    np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=1e-5)
 
 
 def test_advice_on_alike_inputs_and_coloured_residuals():
@@ -328,7 +326,7 @@ def test_advice_on_alike_inputs_and_coloured_residuals():
         [1.0], [1.0, -0.97], 0.05 * np.random.default_rng(1).normal(size=(1000, 1)), axis=0
     )
     options = IdentOptions(n_real=1, n_pairs=2)
-    result = identify_miso([Record("alike", nearly, y + noise, DT_S, ("a", "b"), ("tip",))], options)
+    result = identify_mimo([Record("alike", nearly, y + noise, DT_S, ("a", "b"), ("tip",))], options)
     assert {FindingKind.ALIKE_INPUTS, FindingKind.COLOURED_RESIDUAL} <= kinds(result.warnings)
 
 
@@ -341,7 +339,7 @@ def test_two_link_example(tmp_path):
     found = result.model.poles.omega_rad_s(two_link_arm.DT_S)
     np.testing.assert_allclose(found[:2], [132.19, 141.42], rtol=0.01)
     low = two_link_arm.OMEGA <= 200
-    error = np.abs(result.model.frequency_response(two_link_arm.OMEGA) / truth - 1)[low]
+    error = np.abs(result.model.frequency_response(two_link_arm.OMEGA)[:, 0] / truth - 1)[low]
     assert np.all(np.sqrt(np.mean(error**2, axis=0)) < [0.03, 0.01])
     picture = tmp_path / "bode.png"
     two_link_arm.figure(result, truth, bands).savefig(picture)
@@ -349,16 +347,14 @@ def test_two_link_example(tmp_path):
 
 
 @pytest.mark.slow
-def test_ellipses_cover_the_truth():
+def test_balls_cover_the_truth():
     seeds, omega = 100, np.geomspace(0.5, 150.0, 20)
-    truth = response(sampled(), omega)
-    hits = np.zeros((2, omega.size))
+    truth = response(sampled(), omega)[:, None]
+    hits = np.zeros(omega.size)
     for seed in range(seeds):
         item = record(seed, n=2000)
-        result = identify_miso([item], IdentOptions(n_real=1, n_pairs=2))
-        for i, band in enumerate(response_uncertainty([item], result, omega)):
-            hits[i] += band.contains(truth[:, i])
-    # Binomial at one frequency: sd 2.2 of 100, 4 sd for the least of 40. Neighbours are correlated; the mean
-    # over a channel has an sd between 0.5 and 2.2 (measured: means 92.9 and 94.8, least 88).
+        result = identify_mimo([item], IdentOptions(n_real=1, n_pairs=2))
+        hits += matrix_posterior([item], result).at(omega).holds(truth)
+    # Binomial at one frequency: sd 2.2 of 100, 4 sd for the least of 20.
     assert np.all(hits >= 95 - 4 * 2.2)
-    assert np.all(hits.mean(axis=1) >= 91)
+    assert hits.mean() >= 91
