@@ -49,7 +49,8 @@ def report(result, truth) -> None:
     true = sorted((p for p in two_link_operating_point(ELBOW_ANGLE_RAD).poles() if p.imag > 0), key=abs)
     for name, modes in (("true", true), ("found", np.log(result.model.poles.pairs) / DT_S)):
         print(f"{name} modes: " + "; ".join(f"{abs(p):.2f} rad/s, {-p.real / abs(p):.3f}" for p in modes))
-    print(f"states: {result.model.state_space()[0].shape[0]}, noise {1e3 * np.sqrt(result.noise_covariance[0, 0]):.4f} mm")
+    noise_m = np.sqrt(result.noise_covariance[0, 0])
+    print(f"states: {result.model.state_space()[0].shape[0]}, noise {1e3 * noise_m:.4f} mm")
     error = np.abs(result.model.frequency_response(OMEGA)[:, 0] / truth - 1)[OMEGA <= 200]
     for name, value in zip(result.model.input_names, np.sqrt(np.mean(error**2, axis=0)), strict=True):
         print(f"{name} -> tip_m: rms relative error up to 200 rad/s {100 * value:.3f} %")
