@@ -1,14 +1,12 @@
 """Logs taken in closed loop with a known reference: two-stage identification, its output corrected.
 
-Stage one fits r -> u; u_hat, its fit, is what the reference makes of the input, free of the noise v that the
-loop feeds back. With any model G0 of the plant
+Stage one fits r -> u; u_hat, its fit, is free of the noise v that the loop feeds back. With any model G0
 
     y - G0 (u - u_hat) = G u_hat + (G - G0) (u - u_hat) + v,
 
-so the record with input u_hat and this output is one of an open loop: u_hat is independent of all the rest
-(an instrumental variable; Gilson and Van den Hof, Automatica 41(2), 2005). Its noise is v itself, and an
-error of u_hat counts only times that of G0, so that ellipses of the second stage hold it to first order. With
-G0 = 0 it is the method of Van den Hof and Schrama (Automatica 29(6), 1993), where it counts in full.
+an open-loop record with input u_hat (an instrumental variable; Gilson and Van den Hof, Automatica 41(2),
+2005) and noise v. An error of u_hat counts times G - G0 only; with G0 = 0 it is the method of Van den Hof and
+Schrama (Automatica 29(6), 1993), where it counts in full.
 """
 
 from __future__ import annotations

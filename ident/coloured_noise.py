@@ -1,14 +1,9 @@
-"""Poles behind coloured noise: the same search on records that a noise model has whitened.
+"""Poles behind coloured noise (dry friction, drift): the same search on records that a noise model has
+whitened.
 
-Dry friction, drift and encoder steps leave a residual whose power lies at low frequency, often a hundred
-times that of the sensor noise. Least squares weigh it as if it were white: a slow pole pair that follows the
-friction of these records then gains more than a mode of the machine that moves the output by a tenth of a
-millimetre. The remedy is generalised least squares: input and output of every record go through the same
-filter A(q), which leaves the response between them as it is and makes the noise white.
-
-A(q) is that of a long ARX model (Ljung, System Identification, 2nd ed., section 10.4; the model order
-reduction of Wahlberg, IEEE TAC 34(3), 1989). It needs no poles, so a mode that a first fit has missed is not
-taken for noise.
+Generalised least squares: input and output go through one filter A(q), that of a long ARX model (Ljung,
+System Identification, 2nd ed., section 10.4; Wahlberg, IEEE TAC 34(3), 1989). It needs no poles, so that a
+mode which a first fit has missed is not taken for noise.
 """
 
 from __future__ import annotations
@@ -43,11 +38,8 @@ _LINES = 25  # power of white noise, averaged over 25 lines, scatters by a fifth
 
 
 def identify_in_noise(records: Sequence[Record], options: IdentOptions, identify: Identify) -> Identification:
-    """The fit in white noise if its residuals are white, else one behind a noise model.
-
-    Only noise of low frequency counts: half of what the residual has beyond a white floor must lie below the
-    lowest mode found behind the noise model. Above it, a mode for which no pair was left is more likely.
-    """
+    """The fit in white noise if its residuals are white, or if less than half of what they have beyond a
+    white floor lies below the lowest mode found behind a noise model; else the fit behind that model."""
     plain = identify(records, options, 0.0, 0.5)
     options = options.model_copy(update={"input_delay_samples": plain.model.input_delay_samples})
     noise_filter = long_arx_filter(records, options)

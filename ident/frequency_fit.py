@@ -31,25 +31,13 @@ __all__ = ["FrfIdentification", "identify_frf"]
 
 @dataclass(frozen=True, eq=False)
 class FrfIdentification:
-    """A model fitted to a measured frequency response, and how well it fits.
+    """A model fitted to a measured frequency response (F,), and how well it fits.
 
-    model : GobfModel
-    posterior : ResponsePosterior
-        Tangent embedding on the same rows; `posterior.at(omega)` gives ellipses at any frequency.
-    omega_rad_s : (F,) array. Frequencies of the measurement.
-    residual : (F,) complex array. Measured minus fitted response.
-    distance : (F,) array
-        Its length in units of the measurement's own ellipses (at their level; 1 = on the boundary).
-    rss : float. Chi-square: sum of squared residuals, each in units of the given covariance.
-    degrees_of_freedom : int. Measured real numbers minus unknowns.
-    dispersion : float. rss / degrees_of_freedom; near 1 if the covariances explain the residual.
-    decay_std_per_s (R,), omega_std_rad_s (P,), zeta_std (P,) : arrays
-        Standard deviations of the searched poles' decay, natural frequency and damping ratio, to first
-        order; multiplied by sqrt(dispersion) where that is above 1. In the order of the model's poles; known
-        poles (first of each type) have 0.
-    order_table : tuple of OrderStep
-    verdicts : tuple of Finding
-    search : SearchTrace
+    posterior: tangent embedding on the same rows. residual (F,): measured minus fitted; distance (F,): its
+    length in units of the measurement's own ellipses. rss: chi-square; degrees_of_freedom: measured real
+    numbers minus unknowns. decay_std_per_s (R,), omega_std_rad_s (P,), zeta_std (P,): standard deviations of
+    the model's poles, to first order, times sqrt(dispersion) where that is above 1; known poles (first of
+    each type) have 0.
     """
 
     model: GobfModel
@@ -94,23 +82,15 @@ def identify_frf(
 ) -> FrfIdentification:
     """Fit a GOBF model to a measured frequency response, each frequency weighted by its covariance.
 
-    response : FrequencyUncertainty. Measurement with a covariance at every frequency (`from_csv`,
-        `FrfRepeats.mean`, `empirical_frf`). Errors of different frequencies count as independent. Specify an
-        error that all share (amplitude of a run, gain of an amplifier) as shared_gain_std: the residual does
-        not show it.
-    options : IdentOptions. Numbers of poles, integrators, feedthrough, delay and bounds as for records. What
-        only records have (offset, initial state) must be left at "auto" or False.
-    embedding : EmbeddingOptions. fir_length, hyperparameters and prior_no_remainder are used.
-    shared_gain_std : float
-        Relative standard deviation of a real factor common to all frequencies; widens the posterior.
+    response: with a covariance at every frequency, whose errors are independent. options: as for records;
+    offset and initial state must be "auto" or False. embedding: fir_length, hyperparameters and
+    prior_no_remainder count. shared_gain_std: relative standard deviation of a real factor common to all
+    frequencies, which the residual does not show; widens the posterior.
 
-    Raises ValueError if a frequency has no covariance, there are too few frequencies for the given order,
-    or an option asks for an offset, an initial state or a relative degree.
-
-    Poles by DIRECT in log coordinates and Levenberg-Marquardt, pair by pair; a pole is kept if chi-square
-    falls by more than 2 ln Ne, Ne the measured real numbers (two per frequency) as far as the residual is
-    white over frequency, and chi-square divided by its excess over what the covariances explain. The result
-    is deterministic.
+    Raises ValueError for a frequency without covariance, too few frequencies for the given order, or an
+    option for an offset, an initial state or a relative degree. A pole is kept if chi-square, divided by its
+    excess over what the covariances explain, falls by more than 2 ln Ne, Ne the independent real numbers.
+    Deterministic.
     """
     options = options or IdentOptions()
     if options.estimate_offset is True or options.estimate_initial_state is True:

@@ -19,29 +19,15 @@ from ident.search.pole_search import SearchTrace
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FittedRecords:
-    """How well a model with poles fits the records it was made from.
+    """How well a model with poles fits the K records it was made from.
 
-    structure : Structure
-        What the fit assumed around the basis, after the data decided what was left to them.
-    record_names : tuple of str
-    residuals : tuple of (T - delay,) arrays
-        Output minus fitted output (nuisances included) of each record, from sample `input_delay_samples` on.
-    fit_percent : (K,) array. 100 (1 - |residual| / |y - mean y|) of each record.
-    rss : float. Residual sum of squares over all records.
-    noise_std : float. sqrt(rss / (N - number of unknowns)), in units of the output.
-    tangent_optimality : float
-        Share of the residual (0..1) in the tangent space of the poles that are free to move: 0 at an optimum.
-    order_table : tuple of OrderStep. Every structure that was tried, by order.
-    n_fixed : (int, int)
-        Numbers of real poles and pairs that were given (integrators counted); they come first of each type.
-    verdicts : tuple of Finding
-        One for each question that was left to the data, and for each prior that they judged.
-    prior_tests : tuple of PriorTest. The same verdicts on priors with their numbers.
-    search : SearchTrace. Its warnings are those known when the search ended; `warnings` has them all.
-    noise_filter : (n + 1,) array. A(q) behind which poles and coefficients were fitted, input and output of
-        every record sent through it; [1.0] where the noise was taken as white.
-    advise : callable. Gives further warnings when they are first asked for: looking for them takes a good
-        part of the time of a fit of low order.
+    structure: around the basis, after the data decided what was left to them. residuals: (T - delay,) each,
+    nuisances taken off. fit_percent (K,): 100 (1 - |residual| / |y - mean y|). rss; noise_std: sqrt(rss / (N
+    - unknowns)), output units. tangent_optimality: share of the residual (0..1) in the tangent space of the
+    free poles, 0 at an optimum. order_table: every structure tried. n_fixed: real poles and pairs that were
+    given (integrators counted), first of each type. verdicts: on each question left to the data and each
+    prior. noise_filter: A(q) behind which everything was fitted, [1.0] for white noise. advise: further
+    warnings, looked for when they are first asked for.
     """
 
     structure: Structure

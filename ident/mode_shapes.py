@@ -76,9 +76,9 @@ def one_shape_each(
 ) -> Shaped | None:
     """Refit with one shape per mode from a fit with free residues, coefficients (Y, U, B), direct (Y, U).
 
-    n_fixed: real poles and pairs that do not move; those at zero stand for integrators, which every joint has
-    by itself. refused(rss, saved): whether a fit with so much left, and so many numbers fewer, is refused.
-    None where there is nothing to be saved: one input or output, poles that repeat, or all modes refused.
+    n_fixed: real poles and pairs that do not move; those at zero stand for integrators. refused(rss, saved):
+    whether a fit that leaves rss with so many numbers fewer is refused. None with one input or output, poles
+    that repeat, or all modes refused.
     """
     if min(direct.shape) < 2:
         return None

@@ -47,17 +47,11 @@ _MISLED = 1.2
 def identify(
     records: Sequence[Record], options: IdentOptions | None = None, *, progress: Progress | None = None
 ) -> Identification:
-    """Fit one GOBF model to all records together.
+    """Fit one GOBF model to all single-input single-output records (equal sampling time) together.
 
-    records : sequence of single-input single-output records of equal sampling time
-        Each has its own nuisance columns (offset, initial state).
-    options : IdentOptions
-    progress : callable, optional. Called with a fraction 0..1 and a short message.
-
-    Raises ValueError if a record cannot be used (constant signal, several columns, other sampling time) or
-    all of them are too short for the order asked for.
-
-    The result is deterministic: the same records and options give the same numbers.
+    Each has its own nuisance columns (offset, initial state). progress: called with a fraction 0..1 and a
+    short message. Raises ValueError for a record that cannot be used (constant signal, several columns, other
+    sampling time) or too few samples for the order. Deterministic.
     """
     options = options or IdentOptions()
     report = progress or silent
@@ -74,8 +68,8 @@ def identify(
 
 
 def untested_model(records: Sequence[Record], options: IdentOptions) -> GobfModel:
-    """The model of `identify` in white noise before what is stated as known is tested: half the time, for
-    searches that are repeated. No relative degree is imposed. Raises ValueError as `identify`."""
+    """The model of `identify` in white noise, without relative degree, before what is stated as known is
+    tested. Raises ValueError as `identify`."""
     data = prepare(records, options.structure())
     refuse_unusable(records, data, least_order(options))
     outcome, _ = searched(records, data, options, silent)
@@ -136,11 +130,8 @@ def searched(
 
 def _behind_dead_time(records: Sequence[Record], plain: Outcome, report: Progress) -> tuple[Outcome, bool]:
     """The search behind a delay that the data show, where nobody stated one; and whether the output answers
-    in the very sample of the input, which only a direct term does.
-
-    Not where a reference says that a loop was closed: noise that comes back in the input looks like an answer
-    before, and like dead time after.
-    """
+    in the very sample of the input. Not where a reference was recorded: noise that comes back looks like dead
+    time."""
     looped = any(record.reference is not None for record in records)
     if looped or plain.search.options.input_delay_samples:
         return plain, False
@@ -158,11 +149,8 @@ def _behind_dead_time(records: Sequence[Record], plain: Outcome, report: Progres
 
 @dataclass(frozen=True, eq=False)
 class Outcome(Fitted):
-    """A search that has come to an end on one structure.
-
-    `from_rest` is the test that left the initial states out; where it took a descent with them, `free` is its
-    end. dead_time says which delay was found, where nobody stated one.
-    """
+    """A search at its end on one structure. from_rest: the test that left initial states out; free: the end
+    of a descent with them, where it took one; dead_time: the delay that was found."""
 
     selection: OrderSelection
     free: Refined | None = None
@@ -245,11 +233,9 @@ def fitted_on_all(records: Sequence[Record], outcome: Outcome) -> tuple[Fitted, 
 def _priors_judged(
     records: Sequence[Record], part: Sequence[Record], outcome: Outcome, fitted: Fitted
 ) -> tuple[Fitted, tuple[PriorTest, ...]]:
-    """Test what the options state as known, and impose the relative degree.
-
-    Each test starts from a model that the data have not refused yet: where the integrators are refused, the
-    relative degree is judged with slow poles in their place.
-    """
+    """Test what the options state as known, and impose the relative degree. Each test starts from a model
+    that the data have not refused: with integrators refused, relative degree is judged with slow poles in
+    their place."""
     options = outcome.search.options
     stated = options.integrators or options.fixed_poles or options.relative_degree is not None
     delay_stated = not options.delay_left_to_data and outcome.dead_time is None

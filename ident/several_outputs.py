@@ -1,8 +1,7 @@
 """Records of several inputs, of one output or several, in, one model with shared poles out.
 
-The paper's closing remark: at an operating point every motor excites the same modes and every sensor sees
-them. Poles are searched on the joint cost of all outputs, each weighted by its noise; then every mode is
-given one shape (`ident.mode_shapes`) where the records do not refuse it.
+Poles are searched on the joint cost of all outputs, each weighted by its noise; then every mode is given one
+shape (`ident.mode_shapes`) where the records do not refuse it.
 """
 
 from __future__ import annotations
@@ -66,23 +65,15 @@ def identify_mimo(
 ) -> MimoIdentification:
     """Fit one model with shared poles to all inputs and outputs of all records together.
 
-    records : sequence of records of equal inputs, outputs and sampling time. Each has its own nuisance
-        columns (offset, initial state). An input may rest in some records; over all records the inputs must
-        be distinguishable.
-    options : IdentOptions
-        As for `identify`, the same for every channel: integrators (with several outputs at most one in a
-        row; each joint has its own), delay and direct terms. A relative degree is refused, and what you know
-        is not tested.
-    free_shapes : leave every residue free, instead of giving modes one shape where the records let them
-    start : Poles, optional. Of the same machine at a neighbouring operating point: the search begins at them,
-        and still decides on the order.
-    progress : callable, optional. Called with a fraction 0..1 and a short message.
+    records: of equal inputs, outputs and sampling time; each has its own offset and initial state. An input
+    may rest in some records. options: as for `identify`, the same for every channel; with several outputs at
+    most one integrator in a row, for each joint has its own. No relative degree; what you know is not tested.
+    free_shapes: leave every residue free. start: poles at a neighbouring operating point, where the search
+    begins.
 
     Raises ValueError, one line, if a record cannot be used: an output that stands still or is another one
-    again, inputs that differ between records or are one signal, too few samples for the order.
-
-    The noise is taken as white in time; its covariance between outputs is estimated and weights them.
-    Deterministic: the same records and options give the same numbers.
+    again, inputs that differ between records or are one signal, too few samples for the order. Noise is taken
+    as white in time; its covariance between outputs is estimated and weights them. Deterministic.
     """
     options = options or IdentOptions()
     if options.relative_degree is not None:

@@ -1,12 +1,9 @@
-"""Which modes stay when more poles are allowed? The stabilisation plot of modal analysis.
+"""Which modes stay when more poles are allowed: the stabilisation plot of modal analysis.
 
-A pole pair is *stable* when its counterpart in the fit with one pair less lies within 1 % in frequency and
-5 % in damping (Peeters and De Roeck, Mechanical Systems and Signal Processing 13(6), 1999; their third
-criterion, the mode shape, needs several sensors). In that literature each order is a subspace or
-least-squares fit that scatters its superfluous poles, so that staying alone tells a mode from noise. Here
-every order is grown from the one below and polished, and a pair that has settled on a peak of the noise
-stays there too. So each pair is also asked whether the data would miss it: taken out, with the other poles
-where they are, Ne ln(J0/J1) must exceed 4 ln Ne, the criterion by which `identify` chooses the order (design
+A pole pair is stable when its counterpart in the fit with one pair less lies within 1 % in frequency and 5 %
+in damping (Peeters and De Roeck, Mechanical Systems and Signal Processing 13(6), 1999; their mode shapes need
+several sensors). Each order is grown from the one below, so that a pair on a peak of the noise stays, too.
+Hence a pair has to be needed: without it Ne ln(J0/J1) exceeds 4 ln Ne, the criterion of the order (design
 4.3).
 """
 
@@ -49,17 +46,11 @@ class StableMode(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Stabilisation:
-    """Pole pairs of fits with 0, 1, 2 ... pairs.
+    """Pole pairs (K,) of fits with 0, 1, 2 ... pairs (S,), and rss (S,) of each fit.
 
-    rss : (S,) array. Residual sum of squares of each fit, of 0, 1, 2 ... pairs.
-    n_real : int. Real poles of every fit (known ones not counted).
-    chosen : int. Pole pairs of the identified model.
-    n_pairs : (K,) int array. For each pole pair, the number of pairs of the fit it belongs to; ascending.
-    omega_rad_s, zeta : (K,) arrays
-    previous : (K,) int array
-        Index of the counterpart with one pair less, within `FREQUENCY_TOLERANCE`; -1 where there is none.
-    same_damping : (K,) bool array. Whether its damping is within `DAMPING_TOLERANCE` as well.
-    needed : (K,) bool array. Whether the data would miss the pair in that fit.
+    n_real: real poles of every fit, known ones not counted; chosen: pairs of the model. By pole pair: n_pairs
+    of its fit, ascending; omega_rad_s, zeta; previous, index of its counterpart with one pair less within
+    `FREQUENCY_TOLERANCE`, else -1; same_damping, within `DAMPING_TOLERANCE`; needed by the data in that fit.
     """
 
     rss: RealArray
@@ -108,12 +99,10 @@ def stabilisation(
     max_pairs: int | None = None,
     progress: Progress | None = None,
 ) -> Stabilisation:
-    """Fits with 0, 1, ... max_pairs pole pairs around an identification of the same records.
+    """Fits with 0, 1, ... max_pairs pole pairs around an identification `found` of these records and options.
 
-    records and options are those `found` came from; its number of real poles and its structure (offset,
-    initial state) are kept throughout. max_pairs: none given means three more than were chosen, twelve at
-    most; the data may end the growth earlier (too few samples, nothing left to explain). At the chosen number
-    of pairs the poles are those of the model. Long records are thinned as for the search.
+    max_pairs: default three more than were chosen, at most twelve; the data may end it earlier. Real poles
+    and structure are those of the model, at its number of pairs the poles, too. Long records are thinned.
     """
     options = options or IdentOptions()
     records = [prewhitened(record, found.noise_filter) for record in records]

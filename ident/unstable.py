@@ -1,9 +1,9 @@
 """Poles of a plant outside the unit circle, from logs of a loop that is closed around it.
 
-The predictor y = M y + N u + e, M and N on one GOBF basis, is stable whatever the plant is, and unbiased in
-a loop where e is white. G = N / (1 - M): its poles outside the circle are zeros of 1 - M. The poles of the
-basis are those of the noise model. Start: those zeros themselves, mirrored into the circle, over and over
-(Steiglitz and McBride, IEEE TAC 10(4), 1965), which ends at white sensor noise; then by least squares of e.
+The predictor y = M y + N u + e, M and N on one GOBF basis, is stable, and unbiased in a loop where e is
+white. G = N / (1 - M): its poles outside the circle are zeros of 1 - M. The poles of the basis start at those
+zeros, mirrored into the circle, over and over (Steiglitz and McBride, IEEE TAC 10(4), 1965), and end at least
+squares of e.
 """
 
 from __future__ import annotations
@@ -37,13 +37,12 @@ _ON_CIRCLE = 1 - 1e-7  # a time constant of ten million samples
 
 
 def find_unstable(records: Sequence[Record], options: IdentOptions | None = None) -> Poles:
-    """Mirror images 1 / conj(p) of the unstable poles p that these records show; none where they show none.
+    """Mirror images 1 / conj(p) of the unstable poles p that these records of one input and output show.
 
-    records: of one input and output. options: of the fit to come, which `options.with_unstable(...)` then has
-    made with what is found here. A pole is kept if its growth is significant, the residual counted for as
-    many samples as its colour is worth. Raises ValueError as `ident.fit.regression.prepare_inputs`.
-
-    Neglected: what friction in the input does to the noise model; take it off first (`ident.friction`).
+    options: of the fit to come, which takes them by `options.with_unstable`. A pole is kept if its growth is
+    significant for the samples that the residual is worth. Raises ValueError as
+    `ident.fit.regression.prepare_inputs`. Neglected: friction in the input, which `ident.friction` takes off
+    first.
     """
     options = options or IdentOptions()
     both = [_with_output(record, options.input_delay_samples) for record in records]

@@ -1,12 +1,9 @@
 """Generalised orthonormal basis functions as a lossless cascade (design 4.1, paper (5)).
 
-L_m(z) = sqrt(1 - |x_m|^2)/(z - x_m) * prod_{i<m} (1 - conj(x_i) z)/(z - x_i), strictly proper. A conjugate
-pair gets the real two-column Kautz form after the all-pass of the poles before it: sg (z - beta)/D and sg
-sb/D with D = z^2 - beta (1 + gamma) z + gamma, gamma = |x|^2, beta = 2 Re x/(1 + |x|^2), sg = sqrt(1 -
-gamma^2), sb = sqrt(1 - beta^2). FIR (all poles 0), Laguerre (one repeated real pole) and two-parameter
-Kautz (one repeated pair) are nothing but particular poles here: one code path, four names.
-
-Order of the functions: real poles first, then two per pair.
+L_m(z) = sqrt(1 - |x_m|^2)/(z - x_m) * prod_{i<m} (1 - conj(x_i) z)/(z - x_i), strictly proper; real poles
+first. A conjugate pair gets the real two-column Kautz form after the all-pass of the poles before it: sg (z -
+beta)/D and sg sb/D with D = z^2 - beta (1 + gamma) z + gamma, gamma = |x|^2, beta = 2 Re x/(1 + |x|^2), sg =
+sqrt(1 - gamma^2), sb = sqrt(1 - beta^2). FIR, Laguerre and two-parameter Kautz are particular poles.
 """
 
 from __future__ import annotations
@@ -36,13 +33,8 @@ class LosslessCascade(NamedTuple):
 
 
 def block_parameters(poles: Poles) -> RealArray:
-    """The numbers each block of the cascade needs, (R + P, 4): real [a, sqrt(1 - a^2), 0, 0], pair [gamma,
-    beta, sg, sb].
-
-    Nothing here subtracts two numbers close to 1 after squaring: 1 - gamma is formed as (1 - |re|)(1 +
-    |re|) - im^2 from the stored pole, and sb = sqrt((1 - gamma)^2 + 4 im^2)/(1 + gamma), so beta^2 + sb^2 =
-    1 and gamma^2 + sg^2 = 1 hold to rounding however near the circle the pole is.
-    """
+    """Numbers of each block of the cascade, (R + P, 4): real [a, sqrt(1 - a^2), 0, 0], pair [gamma, beta, sg,
+    sb], without cancellation: beta^2 + sb^2 = 1 and gamma^2 + sg^2 = 1 hold to rounding."""
     return np.asarray(_blocks(*poles.writable()))
 
 
@@ -68,10 +60,8 @@ def _blocks(real: Any, pairs: Any) -> Any:
 def basis_state_space(poles: Poles) -> LosslessCascade:
     """Lossless cascade whose states are the basis functions (replaces inverting E in (24)).
 
-    Real block A = a, B = C = sqrt(1 - a^2), D = -a; pair block A = [[gamma beta, -gamma sb], [sb, beta]], B
-    = [sg, 0], C = [-beta sg, sb sg], D = gamma, with gamma = |x|^2 and beta = 2 Re x / (1 + gamma) of the
-    pole x (29), sg = sqrt(1 - gamma^2), sb = sqrt(1 - beta^2); each block is driven by the all-pass output
-    of the one before, real poles first.
+    Real block A = a, B = C = sqrt(1 - a^2), D = -a; pair block A = [[gamma beta, -gamma sb], [sb, beta]], B =
+    [sg, 0], C = [-beta sg, sb sg], D = gamma; each is driven by the all-pass output of the one before.
     """
     n = poles.order
     A, B = np.zeros((n, n)), np.zeros((n, 1))
@@ -196,11 +186,8 @@ def _through(poles: Poles, u: RealArray) -> tuple[RealArray, RealArray]:
 
 
 def free_response(poles: Poles, n_samples: int) -> RealArray:
-    """Free responses of the cascade (T, B): column i is the basis impulse response h_i(k + 1), k = 0..T-1.
-
-    They span every output the poles can give without input, so they are the nuisance columns of an unknown
-    initial state.
-    """
+    """Free responses of the cascade (T, B): column i is h_i(k + 1), k = 0..T-1. Columns of an unknown initial
+    state."""
     rows = np.empty((poles.order, n_samples))
     run_cascade_free(block_parameters(poles), poles.real.size, rows, 0, n_samples)
     return rows.T
@@ -216,12 +203,8 @@ def nuisance_columns(poles: Poles, n_samples: int, n_polynomials: int, free: boo
 @numba.njit(cache=True, forceinline=True, fastmath={"contract"})
 def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, hi: int) -> None:
     """Drive the cascade with w[lo:hi] from rest; rows[row:, lo:hi] receives the states, w the all-pass
-    output.
-
-    One block after the other over the whole signal, so that every row is written once, contiguously. A
-    recursion is a chain of dependent operations, each a few cycles long; it goes two samples at a time,
-    x(k+2) = A^2 x(k) + A B v(k) + B v(k+1), and x(k+1) beside it is no part of the chain.
-    """
+    output. Two samples at a time, x(k+2) = A^2 x(k) + A B v(k) + B v(k+1): a chain of dependent operations
+    half as long."""
     signal = w[lo:hi]
     even = signal.size - signal.size % 2
     for i in range(blocks.shape[0]):
@@ -270,12 +253,8 @@ def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, 
 
 @numba.njit(cache=True)
 def run_cascade_free(blocks: Any, n_real: int, rows: Any, row: int, length: int) -> None:
-    """Free responses A^k B of the whole cascade into rows[row:, :length]: the states after an impulse at k
-    = -1.
-
-    Once a block and its input have died out (1e-30, looked at every 32 samples) the rest is set to zero: far
-    below rounding, it saves time and keeps denormal numbers (slow) away.
-    """
+    """Free responses A^k B of the whole cascade into rows[row:, :length]: the states after an impulse at k =
+    -1. Zero once a block and its input are below 1e-30, which keeps (slow) denormal numbers away."""
     # The all-pass response to the impulse: its value at k = -1 (the direct terms), the signal w from k = 0
     # on.
     impulse = 1.0

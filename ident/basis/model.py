@@ -30,17 +30,9 @@ class GobfModel:
     """G(z) = [sum_i c_i L_i(z) + feedthrough] (z/(z-1))^integrators z^-input_delay_samples, paper (3) and
     (5).
 
-    poles : Poles
-    coefficients : (B,) array. One per basis function, real poles first, then two per pair.
-    dt_s : float. Sampling time in seconds.
-    feedthrough : float. Direct term of the part in brackets.
-    integrators, input_delay_samples : int
-    input_name, output_name : str
-    unstable : Poles
-        Mirror images 1 / conj(p) of poles p outside the circle, each among the poles: G is the above divided
-        by their all-pass B(z), which puts p in the place of its image.
-
-    Raises ValueError if the shapes do not fit, a number is not finite or dt_s is not positive.
+    coefficients (B,): one per basis function, real poles first, then two per pair. unstable: mirror images 1
+    / conj(p) of poles p outside the circle, each among the poles: G is the above divided by their all-pass
+    B(z). Raises ValueError if the shapes do not fit, a number is not finite or dt_s is not positive.
     """
 
     poles: Poles
@@ -110,10 +102,7 @@ class GobfModel:
 
     def state_space(self) -> tuple[RealArray, RealArray, RealArray, RealArray]:
         """(A, B, C, D) of the cascade delay -> integrators -> lossless basis; (n, n), (n, 1), (1, n), (1, 1).
-
-        The basis keeps its orthogonal realisation (no expansion into polynomials, which loses order-12
-        models).
-        """
+        Polynomials would lose models of order 12."""
         # Front end as scalar stages in series; the state vector is [delay line, integrators, basis].
         delay, k, n = self.input_delay_samples, self.integrators, self.order
         size = delay + k + n
@@ -139,12 +128,8 @@ class GobfModel:
         return _unmirrored(A, B, C, self.feedthrough * signal_d, self.unstable)
 
     def zeros(self) -> ComplexArray:
-        """Finite zeros (Z,) of the basis part, by magnitude; those of delay and integrators are at 0 and left
-        out.
-
-        Generalised eigenvalues of the system pencil, so nothing is expanded into polynomials. A zero beyond
-        1e4 is one at infinity that rounding has brought back, and is left out as well.
-        """
+        """Finite zeros (Z,) of the basis part, by magnitude, from the system pencil; those of delay and
+        integrators are at 0 and left out, as are those beyond 1e4, which are at infinity but for rounding."""
         basis = basis_state_space(self.poles)
         n = self.order
         pencil = np.block(
@@ -172,16 +157,8 @@ class GobfModel:
 class MisoModel:
     """y = sum_i G_i u_i, every G_i a `GobfModel` with the same poles, integrators and delay.
 
-    poles : Poles
-    coefficients : (U, B) array. Row i belongs to input i.
-    feedthrough : (U,) array
-    dt_s : float. Sampling time in seconds.
-    input_names : tuple of str. U distinct names.
-    output_name : str
-    integrators, input_delay_samples : int
-    unstable : Poles. As in `GobfModel`.
-
-    Raises ValueError if the shapes do not fit, names repeat, a number is not finite or dt_s is not positive.
+    coefficients (U, B), feedthrough (U,): row i belongs to input i. Raises ValueError as `GobfModel`, or if
+    names repeat.
     """
 
     poles: Poles
@@ -249,11 +226,9 @@ class MisoModel:
     def state_space(self) -> tuple[RealArray, RealArray, RealArray, RealArray]:
         """(A, B, C, D) with the shared poles realised once; (n, n), (n, U), (1, n), (1, U).
 
-        The transposed cascade: the channels c_i (zI - A)^-1 B + d_i of one lossless cascade share B, so
-        B^T (zI - A^T)^-1 [c_1^T ... c_U^T] + d is all of them on n states instead of U n. Integrators and
-        delay, common as well, act on the output. Each integrator takes the place of a pole at z = 0 if the
-        first ones are there (`identify_mimo` puts them there), so that the zero of z/(z - 1) cancels nothing
-        and the realisation stays minimal; else it has a state of its own.
+        The transposed cascade: the channels c_i (zI - A)^-1 B + d_i share B, so that B^T (zI - A^T)^-1 [c_1^T
+        ... c_U^T] + d is all of them. An integrator takes the place of a pole at z = 0 if the first ones are
+        there, else it has a state of its own.
         """
         basis = basis_state_space(self.poles)
         A, C = np.array(basis.A.T), np.array(basis.B.T)

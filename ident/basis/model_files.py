@@ -1,10 +1,8 @@
 """A model as a file that other programs read: JSON, and MATLAB's .mat (version 5, also Octave and SciPy).
 
-Both hold the same fields: `format` and `format_version`; `A`, `B`, `C`, `D` and `dt_s` for whoever simulates
-or designs (in MATLAB: `m = load('model.mat'); G = ss(m.A, m.B, m.C, m.D, m.dt_s)`); poles, coefficients,
-integrators, delay and names, from which the model comes back bit by bit; and, if wanted, the ellipses of its
-response. State matrices and poles that contradict each other are refused on reading: somebody changed one of
-them and would be surprised by the other.
+Both hold `format`, `format_version`; `A`, `B`, `C`, `D`, `dt_s` (in MATLAB: `m = load('model.mat'); G =
+ss(m.A, m.B, m.C, m.D, m.dt_s)`); poles, coefficients, integrators, delay and names, bit by bit; and, if
+wanted, ellipses. State matrices and poles that contradict each other are refused on reading.
 """
 
 from __future__ import annotations

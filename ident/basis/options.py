@@ -24,9 +24,8 @@ Algorithm = Literal[
 class IdentOptions(BaseModel):
     """Settings of the fit and of the pole search (design 4.3).
 
-    What you know (integrators, fixed_poles, input_delay_samples, relative_degree) is kept and tested against
-    the data (`ident.checks.prior_tests`); a warning says if they disagree. The data choose numbers of poles
-    that are None. Record length and sampling time set the box of the search; bounds of yours also bind the
+    What you know is kept and tested against the data (`ident.checks.prior_tests`). The data choose numbers of
+    poles that are None, record length and sampling time the box of the search; bounds of yours also bind the
     refinement.
     """
 

@@ -13,16 +13,11 @@ from ident.data.arrays import ComplexArray, RealArray, lock
 
 @dataclass(frozen=True, eq=False)
 class Poles:
-    """Discrete-time poles: real ones first, then each pair by its pole in the upper half plane.
+    """Discrete-time poles inside the circle: real (R,), then pairs (P,), each by its pole of the upper half
+    plane.
 
-    real : (R,) array. Real poles, -1 < a < 1. Zeros are allowed (FIR).
-    pairs : (P,) complex array. One pole p of each conjugate pair, imag(p) > 0 and |p| < 1.
-
-    Raises ValueError if a pole is not inside the unit circle, not finite, or a pair member is not above the
-    real axis.
-
-    Equal poles are allowed (a basis may repeat a pole); the order is kept, because it fixes the order of the
-    basis functions.
+    Zeros (FIR) and equal poles are allowed; the order is that of the basis functions. Raises ValueError if a
+    pole is not inside the unit circle, not finite, or of a pair and not above the real axis.
     """
 
     real: RealArray = field(default_factory=lambda: np.zeros(0))

@@ -22,16 +22,14 @@ _LARGEST_BATCH = 1_000_000
 
 @dataclass(frozen=True)
 class EmbeddingReport:
-    """How a posterior came about, in numbers a reader can judge.
+    """How a posterior came about.
 
-    noise_std is that of the (whitened, if ar_coefficients is not empty) output noise in output units; alpha
-    and lam are the kernel's scale (relative to the noise variance) and decay per sample at the largest
-    weight; probability_no_remainder the posterior probability that the poles explain everything (prior 1/2);
-    log_evidence the gain in restricted log likelihood of the best kernel over none; n_rows the samples used
-    after nuisance columns; ar_coefficients (a_1 .. a_n) of the noise filter 1 / (1 + a_1 q^-1 + ...).
-    probability_missed_mode is the posterior probability that the poles lack a lightly damped mode, and
-    missed_mode_rad_s where it most probably is (0: nowhere more than a few per mille); n_added_modes counts
-    modes beyond the model's poles that were too plain to be left to a probability.
+    noise_std: of the (whitened, if ar_coefficients is not empty) noise, output units; alpha, lam: scale of
+    the kernel (in noise variances) and decay per sample at the largest weight; probability_no_remainder: that
+    the poles explain everything; log_evidence: of the best kernel over none; n_rows: samples after nuisance
+    columns; ar_coefficients: a_1 .. a_n of 1 / (1 + a_1 q^-1 + ...). probability_missed_mode: that the poles
+    lack a lightly damped mode, most probably at missed_mode_rad_s (0: nowhere); n_added_modes: beyond the
+    model's poles, too plain to be left to a probability.
     """
 
     method: str
@@ -52,13 +50,10 @@ class EmbeddingReport:
 class ResponsePosterior:
     """Gaussian coefficients of G(z) = [sum a_i L_i(z) + d + sum h_k z^-k] (z / (z - 1))^integrators z^-delay.
 
-    poles are those of the basis functions L_i (the doubled ones for the tangent method); has_feedthrough says
-    whether d is among the coefficients; fir_length = L. mean (P,) and covariance_factor S (P,P') with
-    P = poles.order + has_feedthrough + L, in the order a, d, h_1 .. h_L; the covariance is S S^T.
-
-    unstable: mirror images of the poles outside the circle, as in `GobfModel`; G is then divided by their
-    all-pass. How far each image is off (real; real and imaginary part of a pair) are further coefficients,
-    P = .. + unstable.order, to first order in the response.
+    poles: of the L_i (doubled ones for the tangent method); has_feedthrough: whether d is among the
+    coefficients; fir_length L. mean (P,), covariance S S^T of covariance_factor S (P,P'), P = poles.order +
+    has_feedthrough + L, in the order a, d, h_1 .. h_L. unstable: as in `GobfModel`; how far each image is off
+    (real; real and imaginary part of a pair) are further coefficients, to first order.
     """
 
     poles: Poles
@@ -161,12 +156,9 @@ class ResponsePosterior:
     def joint_level(
         self, omega_rad_s: npt.ArrayLike, level: float, rng: np.random.Generator, n_draws: int = 2000
     ) -> float:
-        """Per-frequency level whose ellipses hold the whole response on omega (F,) with probability `level`.
-
-        The (level)-quantile of the largest normalised distance over the grid, from n_draws sampled responses,
-        as a per-frequency level for `at` (squared radius 12 to 13 where that of one alone is 5.99); the
-        sampling error of the joint probability is sqrt(level (1 - level) / n_draws).
-        """
+        """Per-frequency level whose ellipses hold the whole response on omega (F,) with probability `level`:
+        the quantile of the largest normalised distance of n_draws sampled responses. Its error is sqrt(level
+        (1 - level) / n_draws)."""
         median = self.at(omega_rad_s, level=0.5)
         axes, rows = median.ellipse(), self.frequency_rows(omega_rad_s).T
         largest = np.empty(n_draws)

@@ -1,14 +1,13 @@
 """Relative degree of the continuous-time plant as linear conditions on the coefficients (design 4.3).
 
 A plant of relative degree r behind a zero-order hold has C B_c = C A_c B_c = ... = C A_c^(r-2) B_c = 0, where
-[[A_c, B_c], [0, 0]] dt is the logarithm of [[A, B], [0, 1]] and (A, B) are the discrete states: the first
-r - 1 derivatives of its impulse response vanish at t = 0. For given poles each condition is a linear
-functional of the transfer function, so it also acts on the change of it when a pole moves; that is all a
-constrained descent needs (`ident.fit.structured_fit`).
+[[A_c, B_c], [0, 0]] dt is the logarithm of [[A, B], [0, 1]] and (A, B) are the discrete states. For given
+poles each condition is a linear functional of the transfer function, so it also acts on the change of it when
+a pole moves.
 
-The states are [hold, integrators 1/(z - 1)^j, lossless cascade of the other poles], which is block lower
-triangular. A unitary change of the two states of each pair makes it triangular, and the logarithm is taken
-there by repeated square roots and quadrature; scipy's general one takes a hundred times as long.
+The states are [hold, integrators 1/(z - 1)^j, lossless cascade of the other poles]. A unitary change of the
+two states of each pair makes them triangular, and the logarithm is taken there by repeated square roots and
+quadrature; scipy's general one takes a hundred times as long.
 """
 
 from __future__ import annotations
@@ -57,12 +56,9 @@ def conditions(poles: Poles, integrators: int, relative_degree: int) -> RealArra
 def conditions_with_sensitivities(
     poles: Poles, integrators: int, relative_degree: int, coefficients: RealArray, blocks: tuple[Poles, ...]
 ) -> tuple[RealArray, RealArray]:
-    """Rows R as in `conditions`, and the same functionals (r - 1, S) of further blocks behind the model.
-
-    Each entry of `blocks` is one pole (real, or a pair) whose basis functions are driven by the output of the
-    model with the given coefficients (B,); the columns are those functions, in order. They are the directions
-    in which the model moves with that pole (`ident.fit.refinement`).
-    """
+    """Rows R as in `conditions`, and the same functionals (r - 1, S) of further blocks: poles whose basis
+    functions are driven by the output of the model with coefficients (B,), in which the model moves with that
+    pole."""
     if not relative_degree >= 1:
         raise ValueError(f"relative_degree must be at least 1; got {relative_degree}")
     if relative_degree == 1:

@@ -15,12 +15,10 @@ from ident.data.arrays import ComplexArray, RealArray
 class Structure:
     """Fixed structure of y = [sum_i c_i L_i(q) + feedthrough] (1 - q^-1)^-integrators q^-delay u + nuisance.
 
-    The nuisance columns belong to each record by itself: a constant (`estimate_offset`), and with
-    `estimate_initial_state` the free responses of all poles together with the polynomials that the
-    integrators leave free (1, k, ... up to k^(integrators - 1)). `relative_degree` is that of the
-    continuous-time plant behind the hold: 1 asks for nothing beyond the absence of a direct term, more are
-    linear conditions on the coefficients (`ident.basis.relative_degree`). `unstable` are the poles outside
-    the circle, mirrored: the fit is to B(q) y, see `stabilised`.
+    Nuisance of each record: a constant (`estimate_offset`), and with `estimate_initial_state` the free
+    responses of all poles and the polynomials that integrators leave free (1, k, ... k^(integrators - 1)).
+    `relative_degree`: of the continuous plant behind the hold (1: no direct term). `unstable`: mirrored, see
+    `stabilised`.
     """
 
     integrators: int = 0
@@ -61,25 +59,17 @@ def filter_input(u: RealArray, integrators: int, delay_samples: int) -> RealArra
 
 
 def answered(signal: RealArray, delay_samples: int) -> RealArray:
-    """Rows (T - delay, ...) of a signal (T, ...) of a record that answer to its input.
-
-    The first `delay_samples` rows answer to an input that was not recorded. Fit, bounds, validation and
-    residual tests all leave them out, and the initial state acts from the first row that is left. Raises
-    ValueError where none is left.
-    """
+    """Rows (T - delay, ...) of a signal (T, ...) of a record that answer to its recorded input. Raises
+    ValueError where none is left."""
     if not len(signal) > delay_samples:
         raise ValueError(f"{len(signal)} samples, not more than the input delay {delay_samples}")
     return signal[delay_samples:]
 
 
 def stabilised(y: RealArray, unstable: Poles) -> RealArray:
-    """B(q) y (T,), from rest, B the all-pass whose zeros are the unstable poles and whose poles are these,
-    their mirror images 1 / conj(p).
-
-    B G is stable, |B| = 1 on the circle, and B v is white if v is. Where a loop is closed around an unstable
-    plant, B v is even independent of past inputs (the predictor of output-error models of unstable plants;
-    Forssell and Ljung, Automatica 36(1), 2000). What y did before the record is a free response of B.
-    """
+    """B(q) y (T,), from rest, B the all-pass whose zeros are the unstable poles and whose poles are their
+    mirror images 1 / conj(p). B G is stable, B v white if v is, and in a loop independent of past inputs
+    (Forssell and Ljung, Automatica 36(1), 2000)."""
     if not unstable.order:
         return y
     from ident.basis.functions import all_pass_signal  # its compiled code is slow to load; options are not
@@ -94,12 +84,8 @@ def driving_input(u: RealArray, integrators: int, delay_samples: int) -> RealArr
 
 def level_before(u: RealArray) -> float:
     """Input before a record (T,) whose offset and initial state are unknown: zero, unless the input never
-    comes near it; then its first value.
-
-    Both are alike to the basis functions, whose free responses and offset hold the difference. Taps of an
-    impulse response have no free response: a step of the whole operating point at the first sample would be
-    excitation that never was.
-    """
+    comes near it; then its first value. Basis functions hold the difference in their free responses, taps do
+    not."""
     return 0.0 if np.min(u) <= 0 <= np.max(u) else float(u[0])
 
 

@@ -1,10 +1,8 @@
-"""Does the output answer to the input at all? A model that explains no more than chance has no number to
-show.
+"""Does the output answer to the input at all?
 
-Two tests. The fit: what the driven columns explain against the price that the choice of the order asks of any
-pole (`ident.search.order_selection`), beside nuisances that need no input. The ellipses: a response of zero
-inside all of them. Only the second sees that an output which wanders by itself (drift, hum) can be followed
-by slow or undamped poles behind any input; only the first knows that poles were searched.
+By the fit: what the driven columns explain against the price that the choice of the order asks of any pole,
+beside nuisances that need no input. By the ellipses: a response of zero inside all of them, which also sees
+an output that wanders by itself (drift, hum).
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""What the records themselves say about a fit: unusable ones are refused, doubtful ones get advice.
-
-A finding appears only where advice would help: the benchmark plants and the examples are quiet
-(`tests/ident/test_input_checks.py`).
-"""
+"""What the records themselves say about a fit: unusable ones are refused, doubtful ones get advice."""
 
 from __future__ import annotations
 
@@ -296,12 +292,8 @@ def _far_from_zero(records: Sequence[Record], data: Regression) -> list[Finding]
 def excitation_limit_rad_s(
     records: Sequence[Record], model: GobfModel | None = None, residuals: Sequence[RealArray] = ()
 ) -> float:
-    """Highest frequency at which the input of any record is there, rad/s.
-
-    There is: with a hundredth of the density of an evenly spread input of the same power, or where what it
-    drives by the model stands so far above the residual that the response can be told to 30 %. A band that
-    only the plant's own roll-off hides is not blamed on the input.
-    """
+    """Highest frequency [rad/s] at which the input of any record is there: with a hundredth of the density of
+    an evenly spread input of the same power, or where the response can be told to 30 %."""
     highest = 0.0
     for index, record in enumerate(records):
         u = record.input[:, 0]
@@ -320,11 +312,8 @@ def excitation_limit_rad_s(
 
 
 def _spectrum(x: RealArray, segment: int) -> RealArray:
-    """Welch's mean periodogram over half-overlapping stretches, without their means, under a Hann window;
-    unscaled, (segment // 2 + 1,).
-
-    scipy.signal.welch gives the same numbers in ten times the time on short records, a tenth of a whole fit.
-    """
+    """Welch's mean periodogram over half-overlapping stretches under a Hann window, unscaled, (segment // 2 +
+    1,). scipy.signal.welch takes ten times as long on short records, a tenth of a whole fit."""
     window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(segment) / segment)
     pieces = np.lib.stride_tricks.sliding_window_view(x, segment)[:: segment - segment // 2]
     lines = np.abs(np.fft.rfft((pieces - pieces.mean(axis=1, keepdims=True)) * window)) ** 2
@@ -342,13 +331,11 @@ def _smooth(density: RealArray, width: int = 11) -> RealArray:
 
 
 def clipped_share(signal: RealArray) -> float:
-    """Share of samples that stand at an extreme value which is suspiciously frequent, else 0.
+    """Share of samples that stand at a suspiciously frequent extreme value, else 0.
 
-    Suspicious: at least 1 % of the samples, and five times as many as at the next level (a slow sine in a
-    converter's steps has 2.4 times), in more than one stretch unless that one is 5 % of the record (a machine
-    that sticks where it turns does so once). A signal at rest before and after the experiment is not held
-    against it. Signals of a few levels, and those that spend most of their time at both extremes, are binary
-    or multilevel by design and left alone.
+    Suspicious: 1 % of the samples, five times as many as at the next level, in more than one stretch unless
+    that one is 5 % of the record. Rest before and after is left out, as are signals of a few levels and those
+    mostly at both extremes, which are binary by design.
     """
     levels, counts = np.unique(signal, return_counts=True)
     if levels.size < 10 or counts[0] + counts[-1] > 0.5 * signal.size:

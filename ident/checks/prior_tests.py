@@ -1,19 +1,13 @@
 """Tests of what the user says is known: integrators, fixed poles, input delay, relative degree (design 4.3);
 and whether the data ask for a nuisance: an unknown initial state, an offset.
 
-Each is a generalised likelihood ratio Ne ln(J with the prior / J without) against a chi-square quantile, Ne
-being the number of independent samples the residual is worth (`effective_samples`). A pole at z = 1 lies on
-the edge of the stable ones, where the chi-square quantile is on the safe side: a true prior is refused less
-often than in 1 % of all records.
+Generalised likelihood ratios Ne ln(J with the prior / J without) against a chi-square quantile, Ne the
+independent samples the residual is worth. A pole at z = 1 lies on the edge of the stable ones: a true prior
+is refused in less than 1 % of all records. A refused prior is kept, and the finding says so; `relative_degree
+= "auto"` is imposed as far as the data agree.
 
-A refused prior is kept all the same: who gives it may know the machine better than one record does, and a
-model whose structure was changed in silence is the worse surprise. The finding says so. What
-was left to the data (`relative_degree = "auto"`) is imposed only as far as the data agree.
-
-Of a nuisance, J with it takes a descent of the poles. Where the statistic is far from its limit the first
-step of that descent says enough (Rao's score test, which is the likelihood ratio to second order):
-J - g^T H^-1 g on the linearisation with the nuisance columns, at the poles found without them. Ne keeps slow
-disturbances from passing for initial states.
+Far from its limit a nuisance is judged by the first step of a descent alone (Rao's score test): J - g^T H^-1
+g on the linearisation with its columns, at the poles found without them.
 """
 
 from __future__ import annotations
@@ -100,12 +94,9 @@ def fixed_poles_test(
 
 
 def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -> PriorTest:
-    """The input delay against one sample less and one more, on the rows that all three explain.
-
-    Under the relative degree that the model keeps: without it the numerator can take over a sample of delay.
-    The models are not nested; under a true delay the statistic is mostly negative (shown as 0), so one
-    degree of freedom is on the safe side.
-    """
+    """The input delay against one sample less and one more, on the rows that all three explain, under the
+    relative degree that the model keeps. The models are not nested; under a true delay the statistic is
+    mostly negative (shown as 0), so one degree of freedom is on the safe side."""
     if relative_degree > 1:
         given = replace(given, end=best_under_relative_degree(given, relative_degree))
     structure = given.data.structure
@@ -147,11 +138,8 @@ def direct_term_test(records: Sequence[Record], given: Fitted) -> PriorTest:
 
 
 def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest, Refined]:
-    """Relative degree r >= 2 against 1, and the best fit under it.
-
-    `free` is the optimum without the conditions. The descent under them starts there and, because a wrong
-    start can lose a mode, from further optima of the search with as many poles.
-    """
+    """Relative degree r >= 2 against 1 (`free`), and the best fit under it, from there and from further
+    optima of the search: a wrong start can lose a mode."""
     constrained = best_under_relative_degree(free, relative_degree)
     # Nested models: the free fit is at least as good as one that starts from the constrained optimum.
     again = free.search.descend(constrained.poles, "relative degree released")
@@ -209,11 +197,9 @@ def integrators_test(
 ) -> tuple[PriorTest, Fitted]:
     """Integrators against as many free slow poles, order and numerator the same; also the fit with them free.
 
-    `searched` are the records that are searched (see `ident.fit.regression.thinned`) and what is estimated on
-    them. The alternative is searched anew, too: wrong integrators lose a mode, and no descent from there
-    finds it again. An integrator that a zero of the model cancels is refused as well: with enough other poles
-    no freed pole can improve on it, but the model with one integrator and one zero less is as good, while
-    no other pole can be spared. It has to gain what the choice of the order asks of any pole, 2 ln Ne.
+    `searched`: the records that are searched (`thinned`) and their structure, where the alternative is
+    searched anew. An integrator that a zero of the model cancels is refused as well: one integrator and zero
+    less are as good, while no other pole can be spared; it has to gain 2 ln Ne as any pole.
     """
     k = given.data.structure.integrators
     free = _without_integrators(records, searched, given)
@@ -303,10 +289,8 @@ def _spare_integrators(records: Sequence[Record], given: Fitted) -> tuple[int, f
 
 
 def _other_pole_to_spare(given: Fitted, price: float) -> bool:
-    """Is the model as good without one of its searched poles, or pairs (twice the price)?
-
-    Then the pole too many was another one: it can take the place of an integrator, or a pair that of two.
-    """
+    """Is the model as good without one of its searched poles, or pairs (twice the price)? Then that one can
+    take the place of an integrator, or a pair that of two."""
     poles, fixed = given.poles, given.search.fixed
     fewer = [(poles.without_real(i), price) for i in range(fixed.real.size, poles.real.size)]
     fewer += [(poles.without_pair(i), 2 * price) for i in range(fixed.pairs.size, poles.pairs.size)]
@@ -352,11 +336,8 @@ def nuisance_test(name: str, without: Fitted, with_it: Fitted) -> NuisanceTest:
 
 
 def clearly_left_out(name: str, without: Fitted, with_it: Regression) -> NuisanceTest | None:
-    """The score test if it leaves no doubt that the nuisance is not needed, else None: descend and compare.
-
-    No doubt: well below the limit even if each of the N samples counted. The statistic that is shown counts
-    what the residual without the nuisance is worth.
-    """
+    """The score test if the nuisance is not needed even if each of the N samples counted, else None: descend
+    and compare. The statistic shown counts what the residual without it is worth."""
     poles, search = without.poles, without.search
     here = with_it.linearise(*poles.writable())
     share = free_optimality(here, poles, search.bounds, search.fixed)

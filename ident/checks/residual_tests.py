@@ -26,10 +26,10 @@ _SURE = 3.0
 class ResidualTest:
     """One correlation test.
 
-    lags (K,) in samples, correlation (K,) in -1..1, band (K,): |correlation| stays below it with probability
-    `level` at each lag alone if the hypothesis holds. probability is that of correlations as large as these,
-    all lags together, under the hypothesis; passed says that it is at least 1 - level. precedes_input: the
-    residual is found again in a later input, so the record was taken in closed loop.
+    lags (K,) in samples, correlation (K,) in -1..1; band (K,): |correlation| stays below it with probability
+    `level` at each lag alone if the hypothesis holds. probability: of correlations as large as these, all
+    lags together; passed: it is at least 1 - level. precedes_input: the residual is found again in a later
+    input, as in closed loop.
     """
 
     name: str
@@ -67,10 +67,10 @@ class ResidualTest:
 
 
 def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = 25, level: float = 0.99) -> ResidualTest:
-    """Autocorrelation of the residuals at lags 1..max_lag, records pooled; Ljung-Box over all lags together.
+    """Autocorrelation of residuals, one (T,) array per record, at lags 1..max_lag, pooled; Ljung-Box over all
+    lags.
 
-    residuals: one (T,) array per record. The few parameters fitted on many samples are not taken off the
-    degrees of freedom. Records of at most 2 max_lag samples say next to nothing about such lags and are left
+    Fitted parameters are not taken off the degrees of freedom. Records of at most 2 max_lag samples are left
     out. Raises ValueError when none is longer, or the residuals are zero.
     """
     centred = _centred(residuals, max_lag)
@@ -89,10 +89,9 @@ def independence_test(
 ) -> ResidualTest:
     """Cross-correlation of past input and residual at lags -max_lag..max_lag (residual after input: lag > 0).
 
-    Variance of each lag under independence: sum_k r_e(k) r_u(k) / N, so a coloured input or residual does not
-    fail the test by itself. Records of at most 2 max_lag samples are left out. The verdict rests on lags >= 0
-    (dynamics the model lacks) with the level shared over them (Sidak); what stands out at negative lags only
-    says that the output feeds back into the input.
+    Variance of each lag under independence: sum_k r_e(k) r_u(k) / N, so that colour alone does not fail.
+    Records of at most 2 max_lag samples are left out. The verdict rests on lags >= 0, the level shared over
+    them (Sidak); negative lags show feedback.
     """
     if len(inputs) != len(residuals) or any(
         u.size != e.size for u, e in zip(inputs, residuals, strict=False)
@@ -129,12 +128,9 @@ def residual_advice(
     friction: bool = False,
     observer: bool = False,
 ) -> list[Finding]:
-    """What is wrong where a test fails; nothing where both pass.
-
-    noise_order: order of the noise model behind which whiteness was tested, 0 without one. friction: nobody
-    has looked for it, and it could be identified with the arm. observer: whiteness is that of its prediction
-    errors, which need no noise model.
-    """
+    """What is wrong where a test fails. noise_order: of the noise model behind which whiteness was tested.
+    friction: nobody has looked for it, and it could be identified. observer: whiteness is that of its
+    prediction errors."""
     found = []
     if not independence.passed:
         found.append(finding(FindingKind.NOT_INDEPENDENT, lag=independence.largest[0]))
@@ -147,11 +143,11 @@ def residual_advice(
 
 def fed_back(posterior: ResponsePosterior, records: Sequence[Record], level: float = 0.95) -> float:
     """How far what the residuals still have in common with the input would move the response at least, in
-    radii of its ellipses: root mean square over each of a few bands, chance taken off, of all the largest.
+    radii of its ellipses: root mean square over a band, chance taken off, of all bands the largest.
 
     records: those of the posterior, one input and one output. Where a loop feeds noise back, that part is
-    noncausal, of the size of what feedback moves a direct fit by: both are the cross spectrum of noise and
-    input over the input's. Bands that the records say nothing of are left out.
+    noncausal, of the size of what feedback moves a direct fit by. Bands that the records say nothing of are
+    left out.
     """
     shortest = min(record.n_samples for record in records) - posterior.input_delay_samples
     rest = [

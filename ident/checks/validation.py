@@ -27,8 +27,7 @@ class FreshFit:
     """Free run on a record the model was not fitted to.
 
     fit_percent = 100 (1 - |y - y_hat| / |y - mean y|); simulated and residual (T - delay,) in output units,
-    in the rows that answer to the record's input. answers: the response to the input brings the model nearer
-    to the record than a response of zero.
+    in the rows that answer to the record's input. answers: nearer to the record than a response of zero.
     """
 
     name: str
@@ -50,10 +49,9 @@ def fit_on_fresh_data(
 ) -> FreshFit:
     """Free-run simulation of a SISO record, no output fed back.
 
-    With estimate_initial_state the free response of the model's poles (and integrators) at the start is
-    fitted to the record, with estimate_offset a constant; neither touches the response to the input. Of an
-    unstable model the free run is that of B G to B y (`ident.basis.structure.stabilised`), and simulated what
-    it predicts of the output from sample to sample. Raises
+    estimate_initial_state: the free response of poles and integrators at the start is fitted to the record;
+    estimate_offset: a constant. Of an unstable model the free run is that of B G to B y
+    (`ident.basis.structure.stabilised`), and simulated what it predicts from sample to sample. Raises
     ValueError for another sampling time, more than one channel, or a constant output.
     """
     record.refuse_several(model.dt_s)
@@ -89,11 +87,8 @@ def fit_on_fresh_data(
 
 
 def fit_in_windows(model: GobfModel | ResponsePosterior, record: Record) -> FreshFit:
-    """`fit_on_fresh_data` over windows one after the other, each from its own start: for arms that drift,
-    of which a free run over a whole log says nothing.
-
-    Spread and residual are those of the windows; one in which the output stands still counts as simulated.
-    """
+    """`fit_on_fresh_data` over windows one after the other, each from its own start: for arms that drift.
+    Spread and residual are those of the windows; one in which the output stands still counts as simulated."""
     delay, shortest = model.input_delay_samples, _SHORTEST * (model.poles.order + 1)
     count = min(_WINDOWS, max(1, (record.n_samples - delay) // max(shortest, 1)))
     edges = np.linspace(delay, record.n_samples, count + 1).astype(int)
@@ -120,14 +115,12 @@ def fit_in_windows(model: GobfModel | ResponsePosterior, record: Record) -> Fres
 
 @dataclass(frozen=True)
 class ScatterRow:
-    """One band of `repeat_scatter`; radii are RMS over the band, at one standard deviation, relative to |G|.
+    """One band of `repeat_scatter`; radii are RMS over the band, one standard deviation, relative to |G|.
 
-    predicted: of one repeat by its covariance (`repeat_posteriors`: from the others); measured: scatter of
-    the repeats around their mean, unbiased; ratio = measured / predicted, about 1 if the prediction is
-    honest: then it lies between ratio_low and ratio_high in 95 % of experiments like this one (chi-square
-    with degrees_of_freedom, which a few repeats and neighbouring frequencies that move together keep small).
-    between: distance of the groups' means (RMS deviation, unbiased), between_ratio: the same over what noise
-    alone would give; both NaN with one group.
+    predicted: of one repeat by its covariance; measured: scatter of the repeats around their mean, unbiased;
+    ratio = measured / predicted, between ratio_low and ratio_high in 95 % of experiments if the prediction is
+    honest (chi-square with degrees_of_freedom). between: RMS deviation of the groups' means, unbiased;
+    between_ratio: over what noise alone would give; both NaN with one group.
     """
 
     omega_low_rad_s: float
@@ -150,11 +143,10 @@ def repeat_scatter(
 ) -> list[ScatterRow]:
     """Predicted noise ellipses against the scatter between repeats, band by band.
 
-    groups: one sequence per condition (amplitude, day) with the estimate of each repeat, all on one grid;
-    e.g. `repeat_posteriors(...)` evaluated with `.at(omega)`. posterior (of any one repeat) tells how the
-    errors of neighbouring frequencies move together, for the sampling interval of the ratio; without it they
-    count as independent. Bands without a grid frequency are left out. Raises ValueError when a group has
-    fewer than two repeats or the grids differ.
+    groups: one sequence per condition with the estimate of each repeat, all on one grid. posterior (of any
+    repeat) tells how errors of neighbouring frequencies move together; without it they count as independent.
+    Bands without a grid frequency are left out. Raises ValueError for fewer than two repeats, or grids that
+    differ.
     """
     everything = [estimate for group in groups for estimate in group]
     if not everything or any(len(group) < 2 for group in groups):

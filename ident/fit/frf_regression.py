@@ -1,8 +1,8 @@
 """A measured frequency response as a weighted least-squares problem, linear in everything but the poles.
 
-With the response g_f ~ N(G(z_f), Sigma_f) over (Re, Im) the rows of a frequency are its error turned into the
-axes of its ellipse and divided by their standard deviations: two real numbers of unit variance. All rows
-together play the part of the samples in the time domain (design 4.2): thin QR, residual r, J = |r|^2.
+The rows of a frequency are its error, turned into the axes of its ellipse and divided by their standard
+deviations: two real numbers of unit variance. They play the part of the samples in the time domain (design
+4.2): thin QR, residual r, J = |r|^2.
 """
 
 from __future__ import annotations
@@ -30,16 +30,11 @@ _RANK_TOLERANCE = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class FrfRegression:
-    """Everything a fit of a frequency response needs but the poles.
+    """Everything a fit of a frequency response (F,) needs but the poles.
 
-    z : (F,) complex array. exp(j omega dt).
-    common : (F,) complex array. Known factor of the response: integrators (z / (z - 1))^k and delay z^-d.
-    turn, weight : (F,) complex and (2, F) real arrays
-        `turn` rotates into the axes of the ellipse, `weight` is one over the standard deviations there. At 0
-        and at pi/dt both responses are real: the second weight is zero.
-    y : (2 F,) array. The whitened measurement.
-    feedthrough : bool
-    dt_s : float
+    z (F,): exp(j omega dt). common (F,): integrators (z / (z - 1))^k and delay z^-d. turn (F,): into the axes
+    of the ellipse; weight (2, F): one over the standard deviations there, the second 0 at 0 and pi/dt, where
+    both responses are real. y (2 F,): the whitened measurement.
     """
 
     z: ComplexArray
@@ -117,14 +112,9 @@ class FrfRegression:
         return ResidualColour(max(share * self.n_rows, 3.0), found.white)
 
     def criterion(self, rss: float, order: int, worth: float) -> Callable[[float, int], float]:
-        """J / scale + (free numbers) ln Ne, J as far as it is independent.
-
-        J is a chi-square because the covariances are known: one more pole, of two numbers, is kept if J falls
-        by more than 2 ln Ne (a pair: 4 ln Ne, design 4.3), and a fall within the covariances is no reason for
-        one, however small the residual became. Where J stays larger than the covariances explain they are
-        multiplied by its excess. Neighbouring frequencies may share their errors, hence Ne = worth instead of
-        the number of rows.
-        """
+        """J / scale + (free numbers) ln Ne, Ne = worth: a pole, of two numbers, is kept if J falls by more
+        than 2 ln Ne (a pair: 4 ln Ne, design 4.3). J is a chi-square because the covariances are known; where
+        it is larger than they explain, they are multiplied by its excess, the scale."""
         scale = max(1.0, rss / max(self.n_rows - self.n_parameters(order), 1))
         share, price = worth / self.n_rows, float(np.log(worth))
         return lambda rss, order: share * rss / scale + self.n_parameters(order) * price

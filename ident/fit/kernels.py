@@ -1,11 +1,8 @@
 """Compiled inner loops: the cost of candidate poles and the linearisation of a fit, for one or more inputs.
 
-Signals of several records lie one after the other in arrays (N,), record i in starts[i]:starts[i + 1].
-Matrices are kept as rows (columns of the regression), so that every inner loop runs over contiguous memory.
-
-Both kernels work on inner products of the columns. A function whose products and sums may be fused or
-reordered is always compiled into its callers (forceinline): left as a call, the copy of whichever kernel was
-loaded first would be taken, and copies round differently.
+Signals of several records lie one after the other in arrays (N,), record i in starts[i]:starts[i + 1];
+matrices are kept as rows. A function whose products and sums may be fused or reordered is always compiled
+into its callers (forceinline): copies round differently.
 """
 
 from __future__ import annotations
@@ -65,11 +62,8 @@ def _eight_dots(a: Any, b: Any, rows: Any, j: int, last: int, lo: int, hi: int) 
 
 @_called
 def _products(rows: Any, others: Any, lo: int, hi: int, lower: bool, first: int, target: Any) -> None:
-    """target[i, j] = row i times other row j over lo..hi, from row `first` on; `lower`: for j <= i.
-
-    Targets, here and below, are written as slices of both axes even where they are whole arrays: one type,
-    one compilation.
-    """
+    """target[i, j] = row i times other row j over lo..hi, from row `first` on; `lower`: for j <= i. Targets
+    are always slices of both axes: one type, one compilation."""
     for i in range(first, rows.shape[0], 2):
         second = min(i + 1, rows.shape[0] - 1)
         last = second if lower else others.shape[0] - 1
@@ -205,16 +199,13 @@ def cost_of_point(
     local_q: Any,
     free: bool,
 ) -> float:
-    """Residual sum of squares when the blocks of a point (D,) of the unit cube join what is already fitted;
-    low and high are the box of its search space.
+    """Residual sum of squares when the blocks of a point (D,) of the unit cube (box low, high) join what is
+    fitted.
 
-    drive (U, N) are the signals that drive the candidate blocks (the inputs, or what the all-pass of the
-    frozen poles makes of them); frozen (Q + 1, N) are the columns common to all records made orthonormal,
-    then the residual; local_q (L, N) are the columns of single records made orthonormal in each. With `free`
-    the candidate poles also get their free responses per record.
-
-    J = |r|^2 - b^T G^-1 b with the products G of what the new columns add to the frozen ones, b = those with
-    r: good to about 1e-10 of |r|^2, enough to rank candidates.
+    drive (U, N): signals that drive the candidate blocks; frozen (Q + 1, N): columns common to all records
+    made orthonormal, then the residual; local_q (L, N): columns of single records made orthonormal in each.
+    free: the candidate poles get their free responses per record, too. J = |r|^2 - b^T G^-1 b with products G
+    of what the new columns add, b those with r: good to about 1e-10 of |r|^2.
     """
     blocks = blocks_of_point(unit, n_real, low, high, raw)
     n_records, n_inputs, n_total = starts.size - 1, drive.shape[0], drive.shape[1]
@@ -314,17 +305,15 @@ def linearise(
     """Residual sum of squares J of the fit with all blocks, and its Kaufman linearisation; or -1 if the
     columns are too dependent for products.
 
-    u (U, N); y (N,) without its part in polynomials_q (Q, N), the polynomial columns made orthonormal in each
-    record. If J < below, fills normal (B, B) = S^T S and gradient (B,) = S^T r, S the states of each block
-    driven by the fitted output, projected off the regression (see `ident.fit.refinement`).
-
-    With the columns Phi as rows, G = Phi Phi^T and e = y - Phi^T G^-1 Phi y, all that is needed of the
-    projection P off the columns are products: r^T r = e^T e - (Phi e)^T G^-1 (Phi e), and
+    u (U, N); y (N,) without its part in polynomials_q (Q, N), orthonormal in each record. If J < below, fills
+    normal (B, B) = S^T S and gradient (B,) = S^T r, S the states of each block driven by the fitted output,
+    projected off the regression. With the columns Phi as rows, G = Phi Phi^T and e = y - Phi^T G^-1 Phi y,
+    r^T r = e^T e - (Phi e)^T G^-1 (Phi e), and
 
         S P S^T = S S^T - (S Phi^T) G^-1 (Phi S^T),   S r = S e - (S Phi^T) G^-1 (Phi e).
 
     The terms in Phi e, zero but for rounding, are a step of iterative refinement: with the condition of G
-    bounded (`_LEAST_PIVOT`) they bring J and its gradient to the precision of an orthogonal factorisation.
+    bounded (`_LEAST_PIVOT`) they bring the precision of an orthogonal factorisation.
     """
     n, n_inputs, n_total = normal.shape[0], u.shape[0], y.size
     n_columns = n_inputs * (n + (1 if feedthrough else 0))

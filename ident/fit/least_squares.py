@@ -1,8 +1,7 @@
 """Linear least squares of records for given poles by thin QR, with per-record nuisance columns (design 4.2).
 
-One output, one or several inputs: the columns are [Phi(u_1) Phi(u_2) ...]. The numerators of all channels are
-re-fitted, their denominator is one, so modulo these columns moving a pole changes the output by
--(dD_b/dp)/D_b y_hat, y_hat being the fitted output of all channels together.
+One output; with several inputs the columns are [Phi(u_1) Phi(u_2) ...]. Modulo these columns moving a pole
+changes the output by -(dD_b/dp)/D_b y_hat, y_hat being the fitted output of all channels together.
 """
 
 from __future__ import annotations
@@ -33,14 +32,9 @@ EXPLAINED = 1e-18
 class Regression:
     """Records made ready for a fit, one after the other: everything it needs but the poles.
 
-    u : (U, N) array. Inputs after delay and integrators. The first `input_delay_samples` rows of a record are
-        left out: the input they answer to was not recorded.
-    y : (N,) array. Outputs of the same rows.
-    starts : (K + 1,) int array. Record i owns the samples starts[i]:starts[i + 1].
-    polynomials : (Q, N) array
-        Per-record polynomial nuisance columns, as rows (Legendre, degrees 0 .. Q - 1).
-    structure : Structure
-    dt_s : float
+    u (U, N): inputs after delay and integrators, without the first `input_delay_samples` rows of a record; y
+    (N,): outputs of the same rows. starts (K + 1,): record i owns starts[i]:starts[i + 1]. polynomials (Q,
+    N): Legendre columns of each record, degrees 0 .. Q - 1, as rows.
     """
 
     u: RealArray
@@ -171,14 +165,11 @@ def information_criterion(power: float, data: PoleProblem, worth: float) -> Call
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Columns of a regression as rows, and what they leave of the output.
+    """Columns of a regression as rows, and the residual (N,) that they leave of the output.
 
-    local_q : (Ql, N) array. Nuisance columns of each record, orthonormal within each record.
-    shared : (Qs, N) array. Columns common to all records: the basis driven by each input, then the inputs if
-        they have a direct term.
-    shared_q : (Qs, N) array. The same orthonormal to each other and to the local ones.
-    triangle : (Qs, Qs) array. R of the shared columns after the local ones are taken out.
-    residual : (N,) array. The output without its part in all these columns.
+    local_q (Ql, N): nuisance columns, orthonormal within each record. shared (Qs, N): the basis driven by
+    each input, then inputs with a direct term; shared_q (Qs, N): the same orthonormal to each other and to
+    the local ones; triangle (Qs, Qs): R of them.
     """
 
     local_q: RealArray
@@ -217,9 +208,8 @@ def project(data: Regression, shared: Poles, local: Poles | None = None) -> Proj
     """Orthonormalise the columns of a regression; `local` are the poles of the free responses (default: the
     same).
 
-    With `shared` doubled and `local` not, the residual is the one that candidates for a further pole see: all
-    first-order changes of the poles are taken out of it (design 4.3; with several inputs some more, because
-    in the tangent space of shared poles the channels move together).
+    With `shared` doubled and `local` not, all first-order changes of the poles are taken out of the residual,
+    which is what candidates for a further pole see (design 4.3).
     """
     local = shared if local is None else local
     rows = _driven(data, shared, data.u)[0]

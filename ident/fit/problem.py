@@ -1,9 +1,5 @@
-"""What search, order selection and local refinement ask of the data: the cost at given poles, its change;
-and how much a residual is worth.
-
-Records with one or several inputs (`ident.fit.least_squares.Regression`) and measured frequency responses
-(`ident.fit.frf_regression.FrfRegression`) answer; coefficients and nuisances are re-fitted at every question.
-"""
+"""What search, order selection and local refinement ask of the data: the cost at given poles, coefficients
+and nuisances re-fitted, and its change; and how much a residual is worth."""
 
 from __future__ import annotations
 
@@ -29,14 +25,11 @@ _LEVEL = 0.99  # of that test
 
 
 class Linearisation(NamedTuple):
-    """How the residual sum of squares changes with the poles, coefficients re-fitted all the time.
+    """How the residual sum of squares rss changes with the poles, coefficients re-fitted all the time.
 
-    The directions are the states of each block driven by the fitted output (one per real pole, two per pair),
-    projected off the regression: every pole sensitivity is a combination of them and of regression columns.
-
-    rss : float
-    normal : (B, B) array. S^T S of the projected directions: the Gauss-Newton (Kaufman) Hessian.
-    gradient : (B,) array. S^T r.
+    Directions S: the states of each block driven by the fitted output (one per real pole, two per pair),
+    projected off the regression. normal (B, B) = S^T S, the Gauss-Newton (Kaufman) Hessian; gradient (B,) =
+    S^T r.
     """
 
     rss: float
@@ -129,11 +122,9 @@ class PoleProblem(Linearised, Protocol):
 class ResidualColour:
     """What the autocorrelation of a residual says.
 
-    effective_samples: number of independent samples it is worth, N / (1 + 2 sum rho_k^2) over lags to 200 or
-    a tenth. Bartlett: that factor is by how much colour widens the scatter of quadratic forms such as J. With
-    N itself a criterion goes on adding poles that describe noise, friction and the like, without end on long
-    records. white: autocorrelations at lags 1 .. 25 no larger, all together, than those of white noise are 99
-    times in 100 (Box and Pierce).
+    effective_samples: independent samples it is worth, N / (1 + 2 sum rho_k^2) over lags to 200 or a tenth
+    (Bartlett): by that factor colour widens the scatter of J. white: autocorrelations at lags 1 .. 25 are no
+    larger, all together, than those of white noise 99 times in 100 (Box and Pierce).
     """
 
     effective_samples: float

@@ -1,12 +1,9 @@
 """Local refinement of the poles: Levenberg-Marquardt on Kaufman's Jacobian (design 4.2).
 
 Modulo the columns of the regression, moving a pole changes the fitted output y_hat by -(dD_b/dp)/D_b y_hat,
-D_b(z) being the denominator of its block: the numerator is re-fitted anyway. So the sensitivities are
-combinations of the block's own states driven by y_hat, and dJ/dp = -2 r^T s_p holds exactly because r is
-orthogonal to the columns.
-
-The unknowns are decay rates and angles, linear, so that a pole can reach the circle: 1 - a for a real pole,
-(s, f) with p = exp(-s +- j f) for a pair.
+D_b(z) the denominator of its block: sensitivities are combinations of the block's states driven by y_hat, and
+dJ/dp = -2 r^T s_p is exact. Unknowns, so that a pole can reach the circle: 1 - a of a real pole, (s, f) with
+p = exp(-s +- j f) of a pair.
 """
 
 from __future__ import annotations
@@ -96,11 +93,8 @@ def refine(
     tolerance: float = 1e-9,
     damping: float = NEAR,
 ) -> Refined:
-    """Go downhill from the given poles; as many of each type as there are fixed ones come first and stay.
-
-    Stops when the decrease that the linearisation still promises is below `tolerance` of J. damping is that
-    of the first step: `NEAR` an optimum, or `FAR` from one.
-    """
+    """Go downhill from the given poles, fixed ones first of each type, until the linearisation promises a
+    decrease below `tolerance` of J. damping: of the first step, `NEAR` an optimum or `FAR` from one."""
     real, pairs = poles.writable()
     n_fixed, limits = fixed.counts, bounds.array
     x = start(real, pairs, *n_fixed, limits)
@@ -145,10 +139,8 @@ def pole_system(here: Linearisation, poles: Poles, fixed: Poles = NO_POLES) -> t
 
 
 def free_optimality(here: Linearisation, poles: Poles, bounds: Bounds, fixed: Poles = NO_POLES) -> float:
-    """|P r|/|r| over the tangent directions of the poles that are neither fixed nor held by a bound.
-
-    0 at an optimum. With records from rest, nothing fixed and no bound active this is |Phi2^T r|/|r| with
-    orthonormal Phi2 (the basis with every pole doubled), by the tangent identity of design 4.2.
-    """
+    """|P r|/|r| over the tangent directions of the poles that are neither fixed nor held by a bound: 0 at an
+    optimum. With records from rest and nothing held it is |Phi2^T r|/|r|, Phi2 the orthonormal doubled basis
+    (design 4.2)."""
     promised = scaled_system(*poles.writable(), *fixed.counts, bounds.array, here.normal, here.gradient)[-1]
     return float(np.sqrt(max(promised, 0.0) / here.rss)) if here.rss > 0 else 0.0

@@ -1,9 +1,6 @@
 """Records of several outputs made ready for one fit: poles are shared, coefficients are every output's own.
-
-For given poles all outputs have the same regressors, so the best coefficients are those of each output by
-itself and the cost is the sum of theirs. That is the likelihood where the noises of the outputs are
-independent and equally strong, which `whitened` makes them.
-"""
+The cost is the sum of theirs, the likelihood where their noises are independent and equally strong
+(`whitened`)."""
 
 from __future__ import annotations
 

@@ -1,12 +1,10 @@
 """Fit under a known relative degree, and its linearisation for a local refinement: variable projection with
-the conditions of `ident.basis.relative_degree`.
+the conditions R(p) c = 0 of `ident.basis.relative_degree`.
 
-For given poles the coefficients solve a least-squares problem under linear conditions R(p) c = 0. When a pole
-moves, the model at fixed numerator moves along a known direction g_p (`ident.fit.refinement`) that in general
-leaves the conditions; taken back along the basis functions, g_p - L R^+ l(g_p), it is tangent to the
-constrained models, l being the conditions as functionals of a transfer function. Projected off what the
-coefficients can re-fit, these are Kaufman's sensitivities, and the gradient -2 S^T r is exact as without
-conditions. No derivative of R is needed.
+When a pole moves, the model at fixed numerator moves along a known direction g_p (`ident.fit.refinement`).
+Taken back along the basis functions, g_p - L R^+ l(g_p), l being the conditions as functionals, it is tangent
+to the constrained models; projected off what the coefficients can re-fit, these are Kaufman's sensitivities,
+and the gradient -2 S^T r is exact.
 """
 
 from __future__ import annotations

@@ -2,23 +2,18 @@
 
 A nonlinear arm answers a random-phase multisine with its best linear approximation (BLA) and a rest that is
 uncorrelated with the input (Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd
-ed., ch. 3). For dry friction the approximation is an equivalent viscous friction, f = N d theta/dt with N
-nearly a positive number that falls as the amplitude grows (statistical linearisation), so that
+ed., ch. 3). For dry friction it is an equivalent viscous friction, f = N d theta/dt (statistical
+linearisation):
 
     BLA = G / (1 + j omega N G_shaft),
     N(j omega) = n_0 + n_1 j omega + n_2 (j omega)^2 + n_3 (j omega)^3 + n_4 j omega / (j omega + corner),
 
-the last where the shaft has a corner, below which the input moves it at a speed.
+the last where the shaft has a corner, below which the input moves it at a speed. N comes from simulations of
+the identified arm at the amplitudes asked for, G and the level of the friction from their common posterior. N
+at each line is that of a weak one, times `more_at_a_strong_line`; a quarter of the largest of these stays
+uncertain, in size and in phase.
 
-N comes from simulations of the identified arm at the amplitudes asked for, G and the level of the friction
-from their common posterior. So amplitudes that were not measured have a response, too.
-
-A line that makes much of the motion itself meets more friction than the others (twice as much, were it
-alone): N at each line is that of a weak one, times what a sine among Gaussian motion meets more
-(`more_at_a_strong_line`). A quarter of the largest of these stays uncertain, in size and in phase.
-
-Neglected: every other nonlinearity, and how N depends on the arm's coefficients (the speed of the shaft is
-known to parts in a thousand).
+Neglected: every other nonlinearity, and how N depends on the arm's coefficients.
 """
 
 from __future__ import annotations
@@ -89,8 +84,7 @@ class EquivalentFriction:
 
     friction: what it was simulated from. rms (A,), ascending: of the input. omega_rad_s (F,): excited lines;
     stronger (A, F): how much larger N is there than at a weak line. mean, by_level (A, M): coefficients of N
-    at such a one (`_terms`), and their derivative with respect to the level; factor (A, M, M): what the
-    simulations leave open of them.
+    there (`_terms`), and their derivative by the level; factor (A, M, M): what the simulations leave open.
     """
 
     friction: FrictionFit
@@ -126,11 +120,9 @@ def equivalent_friction(
     rng: np.random.Generator,
     amplitudes: tuple[float, float] | None = None,
 ) -> EquivalentFriction:
-    """For random-phase multisines with the records' power spectrum.
-
-    amplitudes: smallest and largest rms of the input, five are simulated from one to the other in equal steps
-    of the logarithm; none: that of the records together. Raises ValueError as `refuse_unrecorded`.
-    """
+    """For random-phase multisines with the records' power spectrum. amplitudes: smallest and largest rms of
+    the input, with five logarithmic steps; default: that of the records together. Raises ValueError as
+    `refuse_unrecorded`."""
     refuse_unrecorded(records, amplitudes)
     if amplitudes is None:
         rms = np.array([np.sqrt(np.mean(_input_rms(records) ** 2))])
@@ -148,9 +140,8 @@ def at_amplitudes(
 ) -> tuple[ResponsePosterior, Poles]:
     """Posterior of the best linear approximation, and poles of a model of it.
 
-    Over a range of amplitudes, the centre lies halfway between its ends, and the ellipses are as large as it
-    takes to hold the response with probability `level` in every half decade, averaged over the amplitudes of
-    the range: where the amplitudes matter, they may not lean on frequencies where they do not.
+    Over a range of amplitudes the centre lies halfway between its ends, and the ellipses hold the response
+    with probability `level` in every half decade, averaged over the amplitudes.
     """
     friction, arm = behind.friction, behind.friction.arm
     spaced = np.geomspace(0.5 * equivalent.omega_rad_s[0], np.pi / arm.dt_s, _N_GRID)
@@ -186,11 +177,9 @@ def at_amplitudes(
 def _share_of_scatter(
     posterior: Callable[[float], ResponsePosterior], drawn: ComplexArray, omega: RealArray, level: float
 ) -> float:
-    """How much of the scatter between amplitudes (0 to _MOST) the ellipses need, so that they hold the drawn
-    responses (A, K, F) with probability `level` in every half decade.
-
-    posterior: with a share of the scatter. omega (F,): evenly spaced in its logarithm.
-    """
+    """How much of the scatter between amplitudes (0 to _MOST) the ellipses, posterior(share), need to hold
+    the drawn responses (A, K, F) on omega (F,), evenly spaced in its logarithm, with probability `level` in
+    every half decade."""
     half_decade = int(0.5 * omega.size / np.log10(omega[-1] / omega[0]))
 
     def inside(share: float, these: ComplexArray) -> RealArray:
@@ -229,9 +218,8 @@ def _terms(omega: RealArray, last: float, corner: float) -> ComplexArray:
 
 def more_at_a_strong_line(share: RealArray) -> RealArray:
     """How much larger N is at lines with these shares (0 to 1) of the power of the speed than at a weak one,
-    relative to theirs: I1(h) / I0(h), h = share / (1 - share) / 2, for a sine among Gaussian motion through
-    the sign of their sum (two-input describing function; Gelb and Vander Velde, Multiple-Input Describing
-    Functions, 1968). A quarter of a small share; 1 for a line alone."""
+    relative to theirs: I1(h) / I0(h), h = share / (1 - share) / 2 (two-input describing function of the sign;
+    Gelb and Vander Velde, Multiple-Input Describing Functions, 1968)."""
     half = 0.5 * share / np.maximum(1 - share, 1e-9)
     return np.asarray(ive(1, half) / ive(0, half))
 
@@ -335,8 +323,7 @@ def _on_poles(
     omega: RealArray,
 ) -> tuple[ResponsePosterior, RealArray]:
     """Responses (A, K, F) as coefficients (A, K, P), and the form they stand in: on the poles of both ends of
-    the range and those of the arm as often as they stand there (what is not known of a pole lies along its
-    second); taps are those of the draws (K, .) themselves."""
+    the range and those of the arm as often as they stand there; taps are those of the draws (K, .)."""
     own = response.poles
     parts = (*ends, own)
     poles = Poles(

@@ -1,16 +1,11 @@
 """Dry friction and the linear arm behind it from records of the shaft's own position.
 
-Friction acts where the motor's torque does, so that the position is G (u - f) with f set by the motion itself
-(Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30(7), 1994). Given the arm, the motion under
-friction is simulated between the samples, and everything is one least-squares problem in the law of the
-friction and the coefficients of the arm on its poles, each taken twice: Gauss-Newton steps from derivatives
-of the simulation, in which a change of the arm also changes the friction. The poles come from the search of
-`ident.one_input` on the records with the friction taken off their input; both are repeated until the residual
-no longer falls. Friction that falls with speed (Stribeck) is tried afterwards, and stays where it lowers the
-residual by more than an order criterion asks for. Viscous friction is part of the arm and its poles.
-
-The level need not be the same in every record: how much it differs is estimated from the records, and never
-taken to be less than a thousandth.
+The position is G (u - f) with f set by the motion itself (Armstrong-Helouvry, Dupont and Canudas de Wit,
+Automatica 30(7), 1994). Given the arm, the motion under friction is simulated; law and coefficients of the
+arm on its poles, each taken twice, are one least-squares problem (Gauss-Newton). The poles come from the
+search of `ident.one_input` on the records with the friction taken off; both are repeated until the residual
+no longer falls. Friction that falls with speed (Stribeck) is tried afterwards. How much the level differs
+between records is estimated, and at least a thousandth.
 
 Neglected: a level that depends on position or load; records start at rest.
 """
@@ -65,13 +60,11 @@ def fit_friction(
 ) -> FrictionFit:
     """Law of the friction and the arm behind it.
 
-    records: one input, and the position of the shaft that the friction acts on as the one output. At rest at
-    their first sample, unless they were made in a loop (`ident.friction.in_loop`). options: of the search for
-    the arm's poles; integrators at most 1. presliding: what is expected, in output units, within a factor of
-    twenty; in a loop it is a share of the motion.
-
-    Raises ValueError where the shaft does not move, there is more than one integrator or a direct term, or
-    `identify` refuses the records.
+    records: one input, and the position of the shaft that the friction acts on as the one output; at rest at
+    their first sample, unless made in a loop (`ident.friction.in_loop`). options: of the search for the arm's
+    poles; integrators at most 1. presliding: expected, in output units, within a factor of twenty (in a loop
+    a share of the motion). Raises ValueError where the shaft does not move, there is more than one integrator
+    or a direct term, or `identify` refuses the records.
     """
     options = _swinging(options or IdentOptions())
     if recorded_in_loop(records):

@@ -49,17 +49,15 @@ class LostError(ValueError):
 class FrictionFit:
     """A linear arm with dry friction, fitted to records of its shaft's position.
 
-    law: in units of the input (times the motor's torque per unit of input: N m). model: the arm without
-    friction, each pole once. arm, coefficients (P,): the same on each pole taken twice, as they were
-    fitted. covariance_factor (P + Q, .): of the coefficients and the Q parameters of the law (level,
-    logarithm of the deflection; excess, logarithm of its speed). noise_std: of the residual, in output
-    units. between: standard deviation of the level from record to record.
+    law: in units of the input. model: the arm without friction, each pole once; arm, coefficients (P,): on
+    each pole twice. covariance_factor (P + Q, .): of the coefficients and the Q parameters of the law (level,
+    logarithm of the deflection; excess, logarithm of its speed). noise_std: output units. between: standard
+    deviation of the level from record to record.
 
     Of logs of a loop: correction (N,), the observer's (`step_through`) for a force of `ratio` at the input
-    (in its unit per unit of the noise); the constant force, bias, and the level of friction beyond the
-    first spring, which reaches the shaft through it (`spring`), both in units of the input. The covariance
-    has a row for the bias of an integrating arm and one for the level beyond the spring, too. centre: from
-    where positions of an arm that does not integrate are told; of one that does, from where a log begins.
+    (in its unit per unit of the noise); the constant force, bias, and the level beyond the first spring
+    (`spring`), both in units of the input, each with a row of the covariance. centre: from where positions of
+    an arm that does not integrate are told.
     """
 
     law: FrictionLaw
@@ -146,11 +144,8 @@ class FrictionFit:
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """The simulation of one record to first order in the coefficients and the parameters of the law.
-
-    position, friction (T,) as simulated; by_coefficients (T, P), by_law (T, Q) derivatives of the position,
-    friction_by (T, P + Q) those of the friction.
-    """
+    """The simulation of one record to first order: position, friction (T,); by_coefficients (T, P), by_law
+    (T, Q) derivatives of the position, friction_by (T, P + Q) those of the friction."""
 
     position: RealArray
     friction: RealArray
@@ -216,11 +211,9 @@ def equations(found: FrictionFit, records: Sequence[Record]) -> tuple[list[RealA
 
 
 def driven_by_law(found: FrictionFit, record: Record) -> RealArray:
-    """(T, Q) derivatives of the arm's position with respect to the parameters of the law, to the bias of an
-    integrating arm and to the level beyond a spring, where an observer tells the friction of a record.
-
-    Of an unstable arm those of its stabilised position (`ident.basis.structure.stabilised`).
-    """
+    """(T, Q) derivatives of the arm's (stabilised) position with respect to the parameters of the law, to the
+    bias of an integrating arm and to the level beyond a spring, where an observer tells the friction of a
+    record."""
     arm = replace(found.model.stable_part, input_delay_samples=0)
     friction, parameters = found.motion(record)[1], parameters_of(found.law)
     beyond = 0.0 if found.spring is None else found.force_beyond(record, found.beyond, found.law)
@@ -241,9 +234,8 @@ def driven_by_law(found: FrictionFit, record: Record) -> RealArray:
 
 
 def driven_by_shape(found: FrictionFit, record: Record, speed: float) -> RealArray:
-    """(T, S) changes of the arm's position per unit of what a friction may have that was not found: an excess
-    that falls with a tenth of this speed, a share beyond the first spring; where an observer tells the
-    friction of a record."""
+    """(T, S) changes of the arm's position per unit of what was not found: an excess that falls with a tenth
+    of this speed, a share beyond the first spring; where an observer tells the friction of a record."""
     arm = replace(found.model.stable_part, input_delay_samples=0)
     friction, columns = found.motion(record)[1], []
     if not np.isfinite(found.law.fall):
@@ -270,8 +262,8 @@ def descended(
 ) -> FrictionFit:
     """Gauss-Newton steps from found, as long as the residual falls; the level stays above least.
 
-    held: logarithms in the law stay where they are. Far from the arm, what is wrong with it would be laid to
-    them. Otherwise the pre-sliding deflection is expected near presliding, a Stribeck speed where it begins.
+    held: logarithms in the law stay, for far from the arm they would take up what is wrong with it. Otherwise
+    the pre-sliding deflection is expected near presliding, a Stribeck speed where it begins.
     """
     n = sum(found.residual(record).size for record in records)
     expected = parameters_of(found.law if held else replace(found.law, presliding=presliding))

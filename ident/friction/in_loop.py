@@ -1,14 +1,13 @@
 """Dry friction and the arm behind it from logs of a loop: any start, and arms that drift.
 
-The arm cannot run freely from its recorded input here: it started in motion, and over a long log the smallest
-error of the friction adds up to a drift. An observer follows the log instead (`ident.friction.observer`). The
-friction f of this motion is known then, and
+An observer follows the log (`ident.friction.observer`), for a free run would drift. The friction f of this
+motion is known then, and
 
     y = G (u - f - bias) + v
 
-is linear in the arm with the recorded input. v is coloured, and the observer whitens it (the direct method,
-Ljung, System Identification, 2nd ed., section 13.4: no bias in a loop as long as the noise model is right).
-Arm and friction in turns, first with the fewest poles, until neither moves.
+is linear in the arm with the recorded input. The observer whitens v (the direct method, Ljung, System
+Identification, 2nd ed., section 13.4: no bias in a loop if the noise model is right). Arm and friction in
+turns, first with the fewest poles, until neither moves.
 
 Neglected: a level that depends on position or load; what the sensor's noise does to the friction itself.
 """
@@ -150,9 +149,9 @@ def fit_friction_in_loop(
 ) -> FrictionFit:
     """Law of the friction and the arm behind it from logs of a loop.
 
-    records: one input, and the position of the shaft that the friction acts on as the one output. options: of
-    the search for the arm's poles; a delay that is not stated is sought. Raises ValueError as `identify`,
-    where the logs excite few frequencies, no observer follows them, or parts of them contradict one another.
+    records: one input, and the position of the shaft that the friction acts on. options: of the search for
+    the arm's poles; a delay that is not stated is sought. Raises ValueError as `identify`, where the logs
+    excite few frequencies, no observer follows them, or parts of them contradict one another.
     """
     report = progress or (lambda fraction, message: None)
     refuse_few_lines(records)

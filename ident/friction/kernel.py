@@ -1,22 +1,18 @@
-"""The compiled time stepper of a linear arm with dry friction at its shaft, alone and in a sampled
-control loop (compiled as a whole: an interval over draws and sizes takes a million samples).
+"""The compiled time stepper of a linear arm with dry friction at its shaft, alone and in a sampled control
+loop.
 
-The arm is a sum of states: a state j with rate s_j (1/s) obeys x' = s_j x + e, or, where chain[j] is true,
-x' = s_j x + x_before with x_before the state before it (a pole taken twice); e = drive - friction, and the
-position is the real part of sum weights_j x_j.
+A state j with rate s_j (1/s) obeys x' = s_j x + e, or, where chain[j] is true, x' = s_j x + x_before with
+x_before the state before it (a pole taken twice); e = drive - friction; the position is the real part of sum
+weights_j x_j.
 
-Friction is an elastic element whose force is limited: at standstill to level + excess, after a deflection by
-`presliding`; at speed v to level + excess exp(-|v| / fall) (Stribeck), the limit of a step being that of the
-speed before it. law is the array (level, presliding, excess, fall). The mean force over a step follows from
-the deflection in the middle of the step (implicit, so that a stiff element needs no shorter step). A sample
-has 32 steps: the friction turns round within a few hundred microseconds where the pre-sliding is ten
-microradians, and at 32 steps of 5 ms the position is right to a hundredth of a milliradian. Half a sample
-over which the shaft slips on in one direction is taken at once, where the force is constant.
+Friction is an elastic element whose force is limited: to level + excess exp(-|v| / fall) at the speed v
+before a step (Stribeck), reached after a deflection by `presliding`; law is (level, presliding, excess,
+fall). The mean force over a step follows from the deflection in the middle of it (implicit). A sample has 32
+steps: with a pre-sliding of ten microradians and samples of 5 ms the position is right to a hundredth of a
+milliradian. Half a sample of slipping in one direction is taken at once.
 
-A force that changes within a sample is more than its mean to whoever sees it through another output: the
-friction is told as the held force that moves a slow arm just as far. With M the first moment of the force
-about the middle of its sample, that is the mean plus (M of the sample before - M of the sample after) / 2, to
-first order in the part of a sample by which the force comes early or late.
+The friction is told as the held force that moves a slow arm just as far: its mean plus (M of the sample
+before - M of the sample after) / 2, M the first moment of the force about the middle of a sample.
 """
 
 from __future__ import annotations
@@ -191,8 +187,7 @@ def loop_through(
     added (T,): joins the law's command before it is limited. law (n + 1, n + 2): rows of the state and the
     output, columns A, B, M and C, D, - of x+ = A x + B e + M (limited - wanted), wanted = C x + D e + added.
     limits: of the command and of its change per sample, inf for none; steps: of measurement and command, 0
-    for none. delay, input_delay: samples between computing a command and giving it to the arm, and until it
-    acts there. The arm as in `step_through`.
+    for none. delay, input_delay: samples until a command is given to the arm, and until it acts.
     """
     order = law.shape[0] - 1
     moves = transitions(rates, chain, dt_s)

@@ -1,10 +1,9 @@
 """An observer that follows the log of an arm with friction, and what it makes of signals of the arm.
 
-At every sample the states of the simulated arm (`ident.friction.arm`) are corrected by what the measured
-position is off the predicted one: a steady Kalman filter (Anderson and Moore, Optimal Filtering, section 4.4)
-for a white force at the input beside white noise of the position. The size of the force is the one whose
-prediction errors are least. A linear arm's prediction errors are H^-1 (y - G u), H^-1 the same filter for all
-signals of its position: the whitening filter of everything that is fitted behind the friction.
+At every sample the states of the simulated arm are corrected by what the measured position is off the
+predicted one: a steady Kalman filter (Anderson and Moore, Optimal Filtering, section 4.4) for a white force
+at the input, as large as makes prediction errors least, beside white noise of the position. A linear arm's
+prediction errors are H^-1 (y - G u): the whitening filter of everything fitted behind the friction.
 """
 
 from __future__ import annotations

@@ -1,9 +1,5 @@
-"""Ellipses around the response behind the friction.
-
-What the friction takes off the input is not known exactly: its level is estimated, and it depends on the
-motion of an arm that is estimated too. Both are columns beside the basis functions in the regression of
-`ident.uncertainty.embedding`, so that the ellipses hold them.
-"""
+"""Ellipses around the response behind the friction, whose level and the motion it depends on are estimated,
+too: both are columns beside the basis functions in the regression of `ident.uncertainty.embedding`."""
 
 from __future__ import annotations
 
@@ -61,9 +57,9 @@ def without_friction(
 ) -> BehindFriction:
     """Posterior of the response from input to the shaft's position, as if there were no dry friction.
 
-    records: those of the fit, as measured. model: of the arm, fitted with the friction taken off, that the
-    posterior is to be made around; none: that of the fit. The level of the friction is estimated anew with
-    the response, so that what either does not know widens the other. Raises ValueError as `tangent`.
+    records: those of the fit, as measured. model: of the arm, fitted with the friction taken off; default
+    that of the fit. The level of the friction is estimated again with the response. Raises ValueError as
+    `tangent`.
     """
     if found.correction is not None:
         return _behind_observed(records, found, model or found.model, options)
@@ -123,12 +119,11 @@ def of_known_sign(response: ResponsePosterior, longest_s: float) -> tuple[Respon
     """The same with a gain at low frequencies that keeps its sign, and the unit normals it stands on now:
     (P'', P') times those before.
 
-    Below what the logs tell, the arm is its inertia and one damping or stiffness k. Data tell k, to a
-    deviation s, and G = 1 / k is not Gaussian where s is large: an ellipse of G would hold zero, which no
-    passive arm has. Along the one normal that moves the gain at low frequency, with x = rho a / (jw + a) the
-    relative change of G at the 95 % radius, x / (1 + x) takes its place: a further pole at a (1 + rho). The
-    centre is the mean of the gains above zero. Neglected: gains more than twice the centre's, with which a
-    loop is the tighter there.
+    Below what the logs tell, the arm is its inertia and one damping or stiffness k. Data tell k, and G = 1 /
+    k is not Gaussian where its deviation is large: an ellipse would hold zero, which no passive arm has.
+    Along the one normal that moves the gain at low frequency, with x = rho a / (jw + a) the relative change
+    of G at the 95 % radius, x / (1 + x) takes its place: a further pole at a (1 + rho). Neglected: gains more
+    than twice the centre's.
     """
     factor, n = response.covariance_factor, response.covariance_factor.shape[1]
     omega = np.geomspace(1 / (_LENGTHS * longest_s), np.pi / response.dt_s, _FREQUENCIES)
@@ -166,13 +161,9 @@ def of_known_sign(response: ResponsePosterior, longest_s: float) -> tuple[Respon
 def _by_linear_force(
     records: Sequence[Record], less: Sequence[Record], response: ResponsePosterior
 ) -> RealArray:
-    """(P, S) changes of the response's coefficients by what no amount of data tells: a part of the friction
-    that looks like a linear force.
-
-    A force k y^(i) that is taken for friction, or the other way round, changes G by k s^i G^2 (i up to 2:
-    stiffness, damping, inertia; no stiffness in an arm that integrates). Each is as large as a share of the
-    friction, rms over the records. less: the records with the friction taken off.
-    """
+    """(P, S) changes of the response's coefficients by a part of the friction that looks like a linear force,
+    which no data tell: k y^(i) changes G by k s^i G^2 (i up to 2; no stiffness in an arm that integrates),
+    each a share of the friction, rms over the records. less: the records with the friction taken off."""
     longest_s = max(record.n_samples for record in records) * response.dt_s
     omega = np.geomspace(1 / (_LENGTHS * longest_s), np.pi / response.dt_s, _FREQUENCIES)
     rows = response.frequency_rows(omega)
@@ -205,10 +196,7 @@ def other_output_without_friction(
     options: EmbeddingOptions | None = None,
 ) -> BehindFriction:
     """The same for another output of the arm, which the same friction reaches through the motor's shaft.
-
-    records: with that output; model: fitted to them with the friction taken off. The friction is that of the
-    fit to the shaft's position; what is not known about it is what that fit does not know.
-    """
+    records: with that output; model: fitted to them with the friction taken off."""
     undelayed = replace(model, input_delay_samples=0)
     less, beside, n = list[Record](), list[Beside](), found.coefficients.size
     for k, record in enumerate(records):

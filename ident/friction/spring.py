@@ -1,9 +1,9 @@
 """Friction beyond the first spring of an arm: at the load of a belt, a shaft or a harmonic drive.
 
-The load of a motor that is held still swings at the lowest zero of the motor's response. It follows the motor
-as Z = (w^2 + 2 zeta w s) / (s^2 + 2 zeta w s + w^2), less what its friction holds back, and by reciprocity a
-torque at the load moves the motor as Z times as much at the motor does. So the friction at the load is found
-from the motor's position alone, by stepping a damped load behind it, from rest. Neglected: further springs.
+The load follows the motor as Z = (w^2 + 2 zeta w s) / (s^2 + 2 zeta w s + w^2), w, zeta the lowest zero of
+the motor's response, less what its friction holds back; by reciprocity a torque at the load moves the motor
+as Z times as much at the motor does. The load is stepped behind the motor's position, from rest. Neglected:
+further springs.
 """
 
 from __future__ import annotations

@@ -1,14 +1,8 @@
 """Dead time of the input, sought together with the order.
 
-Without it a search puts poles in its place: 14 samples of delay before one real pole look like two resonances
-and two real poles. Two steps. Where may the response begin? A long ARX model (no poles, any noise) tells up
-to which lag the inputs are not missed. Is it a delay? The order is selected again behind that many samples,
-the number moved to the best one, and the delay stays where the criterion of the order, which charges for it,
-prefers the delayed model: a response that only rises slowly needs as many poles behind a
-delay as before it.
-
-Neglected: a delay of each input by itself; a loop closed around the plant (its noise comes back in the
-input).
+A long ARX model tells up to which lag the inputs are not missed. The order is selected again behind that many
+samples, the number moved to the best one; the delay stays where the criterion of the order, which charges for
+it, prefers the delayed model. Neglected: a delay of each input by itself; a loop around the plant.
 """
 
 from __future__ import annotations
@@ -117,12 +111,8 @@ class FirstAnswer(NamedTuple):
 
 def first_answer(records: Sequence[Record]) -> FirstAnswer:
     """Where the response begins, as a long ARX model says; nothing is missed where records are too short for
-    it.
-
-    The inputs stand last in one factorisation, the latest at the very end, so that the sum of the last
-    squares is what leaving out the latest inputs costs. What answers beyond
-    its lags shows in the correlation between changes of input and output.
-    """
+    it. The inputs stand last in one factorisation, the latest at its end: the sum of the last squares is what
+    leaving out the latest inputs costs. What answers beyond its lags shows in the correlation of changes."""
     shortest = min(record.n_samples for record in records)
     lags = min(_INPUT_LAGS, shortest // _ROWS_PER_LAG)
     own = min(_OUTPUT_LAGS, lags)

@@ -19,13 +19,10 @@ from ident.fit.regression import prepare
 
 @dataclass(frozen=True, eq=False)
 class ErrorSurface:
-    """Mean square residual over two coordinates of one pair.
+    """Mean square residual J/N (20) over two coordinates of one pair, coefficients fitted at every point.
 
-    first, second : (A,), (B,) arrays. Coordinate values: (beta, gamma) of (29), or (omega [rad/s], zeta).
-    names : (str, str). Their names.
-    mean_square : (A, B) array
-        J/N as in (20), coefficients fitted at every point, in squared units of the output.
-    pole : (float, float). The model's own pair in these coordinates.
+    first (A,), second (B,): values of (beta, gamma) of (29), or (omega [rad/s], zeta), called `names`;
+    mean_square (A, B) in squared units of the output; pole: the model's own pair.
     """
 
     first: RealArray
@@ -65,14 +62,9 @@ def error_surface(
     """Mean square residual with the pair number `pair` of the model moved over a grid, its other poles
     frozen.
 
-    structure : Structure. As in `Identification.structure`.
-    coordinates : "raw" for (beta, gamma), "log" for (omega, zeta)
-    first, second : arrays, optional. Grid of the two coordinates. Default: two octaves each way in omega and
-        a factor of 30 each way in zeta, logarithmic; or a window of ten damping widths in (beta, gamma),
-        gamma spaced logarithmically in 1 - gamma.
-
-    Raises ValueError if the model has no such pair, or a grid leaves |beta| < 1, 0 <= gamma < 1, 0 < omega <
-    pi/dt, 0 < zeta < 1.
+    coordinates: "raw" for (beta, gamma), "log" for (omega, zeta). first, second: grid; default two octaves
+    each way in omega and a factor of 30 in zeta, or a window of ten damping widths. Raises ValueError if the
+    model has no such pair, or a grid leaves |beta| < 1, 0 <= gamma < 1, 0 < omega < pi/dt, 0 < zeta < 1.
     """
     if not 0 <= pair < model.poles.pairs.size:
         raise ValueError(f"the model has {model.poles.pairs.size} pole pairs; there is no pair {pair}")

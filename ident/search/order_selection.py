@@ -38,11 +38,11 @@ Criterion = Callable[[float, int], float]
 
 @dataclass(frozen=True)
 class OrderStep:
-    """One structure that was tried: numbers of searched poles, residual sum of squares and criterion.
+    """One structure that was tried: numbers of searched poles, residual sum of squares, criterion.
 
-    criterion = Ne ln(J/N) + (2 n + nuisances) ln Ne, lower is better: a pole costs two numbers, itself and a
-    coefficient, and one more per record whose initial state is estimated. Ne is the number of independent
-    samples that the chosen model's residual is worth, N where it is white.
+    criterion = Ne ln(J/N) + (2 n + nuisances) ln Ne: a pole costs itself and a coefficient, and one number
+    per record whose initial state is estimated. Ne: independent samples that the chosen model's residual is
+    worth.
     """
 
     n_real: int
@@ -86,12 +86,8 @@ class OrderSelection:
         return best
 
     def exchanged(self, best: Refined) -> Refined:
-        """One pole more and the least needed one less, as long as something is gained.
-
-        A search that grows to given numbers can end with a pair where two real poles should be, and no way to
-        move them one by one. For measured responses, whose covariances tell noise from dynamics: in records
-        the pole that is least needed may be the one that matters, and the one gained follow friction.
-        """
+        """One pole more and the least needed one less, as long as something is gained: a pair may stand where
+        two real poles should. Not for records, where the pole gained may follow friction."""
         for _ in range(_EXCHANGES):
             if not self._visible(best):
                 break

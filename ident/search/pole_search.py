@@ -76,13 +76,10 @@ class PoleSearch(Generic[Problem]):
         return search_space(n_real, n_pairs, self.data.longest, self.data.dt_s, self._box)
 
     def joint(self, n_real: int, n_pairs: int) -> Refined:
-        """Best poles of a joint global search over n_real real poles and n_pairs pairs.
-
-        The search has settled if the first starts, points of the cube far from each other, all end in one
-        place that can be trusted (`is_trusted`). Agreement by itself is not enough: a broad wrong minimum
-        can catch several starts, but leaves dynamics in the residual. Else `_PATIENCE` times as many starts
-        are tried: more of them find more than more evaluations do.
-        """
+        """Best poles of a joint global search over n_real real poles and n_pairs pairs. It has settled if
+        the first starts, far from each other, all end in one place that can be trusted (`is_trusted`: a
+        broad wrong minimum catches several, but leaves dynamics); else `_PATIENCE` times as many starts
+        are tried."""
         title = f"{n_real} real, {n_pairs} pairs"
         if n_real + n_pairs == 0:
             return self.descend(self.fixed, title)
@@ -163,11 +160,8 @@ class PoleSearch(Generic[Problem]):
         return self._best_descent(starts, "pair as two")
 
     def rescan(self, best: Refined) -> Refined:
-        """Look at each block on a grid with the rest frozen, descend from what is found, until a whole round
-        gains nothing.
-
-        Not if the joint search settled on `best`.
-        """
+        """Look at each block on a grid with the rest frozen, descend from what is found, until a round gains
+        nothing; not if the joint search settled on `best`."""
         if best is self._settled:
             return best
         n_fixed_real, n_fixed_pairs = self.fixed.counts

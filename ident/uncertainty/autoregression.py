@@ -1,11 +1,9 @@
 """Autoregressive models of residuals: the whitening filter for coloured noise.
 
 Residuals of a fit are poorer in slow noise than the noise was: offset, initial states and slow poles take it
-up. A noise model from them puts too little at low frequency (AR(1) 0.87 for 0.9 with 2000 samples and 33
-columns), which makes the ellipses there too small by a quarter. For residuals e = (I - P) v of a generalised
-least squares fit that whitens noise v with A(q), E (A e)_t e_s is not zero for s < t, but minus
-(A Z)_t . Z_s with Z Z^T = K (K^T S^-1 K)^-1 K^T, S the covariance of v and K all columns of the fit: the
-part that the fit has absorbed.
+up. For residuals e = (I - P) v of a generalised least squares fit that whitens v with A(q), E (A e)_t e_s for
+s < t is minus (A Z)_t . Z_s with Z Z^T = K (K^T S^-1 K)^-1 K^T, S the covariance of v and K all columns of
+the fit.
 """
 
 from __future__ import annotations
@@ -31,11 +29,8 @@ _FREQUENCIES = np.concatenate([np.geomspace(1e-4, 1e-2, 128), np.linspace(0.0, n
 
 @dataclass(frozen=True, eq=False)
 class Absorbed:
-    """Columns Z (T,r) of each record, for innovations of unit variance.
-
-    Where a fit leaves the first rows out, Z is what the noise filter makes of its whitened rows from rest:
-    that part of the columns is correlated with the noise of the rows used.
-    """
+    """Columns Z (T,r) of each record, for innovations of unit variance. Where a fit leaves the first rows
+    out, Z is what the noise filter makes of its whitened rows from rest."""
 
     columns: tuple[RealArray, ...]
 
@@ -59,17 +54,12 @@ def fit_autoregression(
 ) -> RealArray:
     """[1, a_1, ..., a_n] of A(q) e = white, order n <= max_order by BIC, from all records together.
 
-    Conditional least squares on the rows that have max_order predecessors, so that all orders are judged on
-    the same rows; a model with a root on or outside the unit circle has its roots reflected inside. Raises
-    ValueError when no record is longer than twice max_order.
-
-    With the whitening filter `weights` that the fit behind the residuals used, and what it `absorbed`, the
-    bias of that fit is removed: the sums of (A e)_t e_(t-i) are set to what the fit would have made of them
-    for noise with that very filter, instead of to zero. That is of first order in the change of the filter,
-    and exact in expectation once it no longer changes. The sums are those over the rows used: differences of
-    lag averages are not even a covariance when the noise has many decades between its peaks and its floor. A
-    correction that moves the spectrum by more than a factor of two anywhere is no small perturbation, and is
-    shrunk until it does not; it then leaves all roots inside the unit circle (Rouche).
+    Conditional least squares on the rows that have max_order predecessors; roots on or outside the unit
+    circle are reflected inside. With the whitening filter `weights` of the fit behind the residuals, and what
+    it `absorbed`, the sums of (A e)_t e_(t-i) are set to what the fit would have made of them for noise with
+    that filter, to first order in its change. A correction that moves the spectrum by more than a factor of
+    two is shrunk, and leaves all roots inside (Rouche). Raises ValueError when no record is longer than twice
+    max_order.
     """
     long_enough = [i for i, e in enumerate(residuals) if e.size > 2 * max_order]
     usable = [np.asarray(residuals[i], dtype=np.float64) for i in long_enough]
@@ -101,13 +91,8 @@ def fit_autoregression(
 
 
 def first_rows(whitening: RealArray) -> RealArray:
-    """(n,n) lower triangle that whitens the first n samples of stationary noise with A(q) of order n.
-
-    The inverse Cholesky factor of their covariance: with it on top of A(q) no sample is lost. Dropping the
-    first rows instead leaves any transient that A(q) annuls free, such as that of a pole of the plant which
-    the noise happens to share. All the same they are dropped (zeros) where the covariance is nearly singular,
-    as that of noise inside a narrow band: see _LARGEST_CONDITION.
-    """
+    """(n,n) lower triangle that whitens the first n samples of stationary noise with A(q) of order n: the
+    inverse Cholesky factor of their covariance; zeros where that is nearly singular (_LARGEST_CONDITION)."""
     order = whitening.size - 1
     if order == 0:
         return np.zeros((0, 0))
@@ -133,10 +118,8 @@ def whitened(signals: RealArray, whitening: RealArray) -> RealArray:
 
 
 def autocovariance(whitening: RealArray, max_lag: int) -> RealArray:
-    """gamma_k, k = 0 .. max_lag, of e with A(q) e white of unit variance; A stable.
-
-    The Yule-Walker equations sum_i a_i gamma_|k - i| = (k == 0) for k = 0 .. n, then the recursion.
-    """
+    """gamma_k, k = 0 .. max_lag, of e with A(q) e white of unit variance; A stable. Yule-Walker equations
+    sum_i a_i gamma_|k - i| = (k == 0) for k = 0 .. n, then the recursion."""
     order = whitening.size - 1
     equations = toeplitz(whitening, np.zeros(order + 1))
     equations[:, 1:] += hankel(whitening)[:, 1:]

@@ -1,13 +1,9 @@
 """Several operating conditions, one uncertain plant: scatter between conditions as part of the uncertainty.
 
-A linear response identified at one amplitude, day or payload is known to its noise ellipse, but the next
-condition has another response. Random effects: G_i = G + d_i, d_i ~ N(0, T), each measured with covariance
-P_i. The plant met next is G + d, whose covariance around the mean of K estimates is T + (T + mean P) / K.
-
-P_i from the residuals of one record is right for a linear arm in stationary noise. A swept arm with friction
-is neither: noise is another one while the sweep passes, what friction does in the same way in every sweep
-stands in the residuals and does not scatter, and the response itself differs from run to run. Where an
-experiment was repeated, `repeat_posteriors` takes the scatter of a record from the other repeats.
+Random effects: G_i = G + d_i, d_i ~ N(0, T), each measured with covariance P_i. The plant met next is G + d,
+whose covariance around the mean of K estimates is T + (T + mean P) / K. P_i from the residuals of one record
+holds for a linear arm in stationary noise; where an experiment was repeated, `repeat_posteriors` takes the
+scatter from the other repeats.
 """
 
 from __future__ import annotations
@@ -54,12 +50,10 @@ def repeat_posteriors(
 ) -> list[list[ResponsePosterior]]:
     """`record_posteriors` of repeats, each with the covariance that the others of its group predict.
 
-    The estimate is linear in the output, so its error is a sum over time of the noise with known weights.
-    Noise: what the residuals of the other repeats around their common model differ by, distortion that
-    repeats taken off. Products of the summands are added up to three time constants of the slowest pole
-    apart, with weights that fall linearly (Newey and West, Econometrica 55(3), 1987), which needs no
-    stationarity; as long as the record, the window would give the sample covariance of the other estimates.
-    Groups of two keep the covariance of each record's own residuals: one other repeat differs from nothing.
+    The error of an estimate is a sum over time of the noise with known weights; noise: what the residuals of
+    the other repeats around their common model differ by. Products of the summands are added up to three time
+    constants of the slowest pole apart, with weights that fall linearly (Newey and West, Econometrica 55(3),
+    1987), which needs no stationarity. Groups of two keep the covariance of each record's own residuals.
     """
     flat = iter(record_posteriors([record for group in groups for record in group], model, options))
     theirs = [[next(flat) for _ in group] for group in groups]
@@ -128,17 +122,11 @@ def combine_posteriors(
 ) -> ResponsePosterior:
     """Posterior of the response in a condition like these, from one posterior per condition.
 
-    Mean = average of the K means; covariance = (1 + 1/K) w S + mean P / K with S the sample covariance
-    between the means. S estimates T + mean P, so noise is counted once too often in directions that differ
-    between conditions: the error is on the safe side. S has rank K - 1: with two conditions the ellipses
-    stretch along the line that joins them, and nowhere else. The conditions are taken as a sample of those to
-    be met; far outside their range nothing is promised.
-
-    w = 1 takes S as known. With small_sample_level (for instance 0.95) w makes the ellipses at that level
-    those of Hotelling's prediction region for one more condition: w = 2 (K - 1) / (K - 2) F(2, K - 2) /
-    chi2(2), 2.9 for six conditions, 10 for four; it needs K >= 4.
-
-    All must share poles, structure and fir_length (see `record_posteriors`). Raises ValueError otherwise.
+    Mean of the K means; covariance (1 + 1/K) w S + mean P / K, S the sample covariance between the means:
+    noise is counted once too often in directions that differ, which is safe. S has rank K - 1. w = 1 takes S
+    as known; with small_sample_level it gives Hotelling's prediction region for one more condition, w = 2 (K
+    - 1) / (K - 2) F(2, K - 2) / chi2(2), and needs K >= 4. All must share poles, structure and fir_length,
+    else ValueError.
     """
     if len(posteriors) < 2:
         raise ValueError(f"a scatter between conditions needs at least two; got {len(posteriors)}")

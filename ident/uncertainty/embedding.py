@@ -1,10 +1,10 @@
 """Model error and noise as one covariance: stochastic embedding, classical and tangent (design 4.5).
 
-`classical` is the recipe of Goodwin, Gevers and Ninness (IEEE TAC 37(7), 1992) that the paper's Fig. 7 uses.
-Its ellipses do not cover: poles chosen from the same data are treated as known, and the kernel keeps its
-prior variance at frequencies that the data know well. `tangent` is the default: every pole twice (which spans
-the first-order effect of moving the poles), initial state and offset as nuisance, a short kernel for what is
-left, everything conditioned on the data, averaged over one mode that the search may have missed.
+`classical` is the recipe of Goodwin, Gevers and Ninness (IEEE TAC 37(7), 1992), the paper's Fig. 7. Its
+ellipses do not cover: poles are treated as known, and the kernel keeps its prior variance. `tangent`, the
+default: every pole twice (the first-order effect of moving it), initial state and offset as nuisance, a short
+kernel for the rest, everything conditioned on the data, averaged over one mode that the search may have
+missed.
 """
 
 from __future__ import annotations
@@ -73,13 +73,11 @@ def tangent(
     """Posterior of the response around a model whose poles were chosen from these records.
 
     records: SISO, same sampling time as the model, each with its own initial state and offset; model gives
-    poles, integrators and delay (its coefficients are not used). Raises ValueError when the records are too
-    short, have another sampling time, or do not excite the poles at all.
-
-    The posterior's poles are the model's, twice; then, twice each, modes so plain that an order selection
-    would have kept them (after whitening, or in a model whose order was given); then, once each, pairs of one
-    further mode that has a probability worth counting (`ident.uncertainty.undetected_mode`). A mode that is
-    not seen in these records at all stays outside the ellipses at its peak: no data speak of it.
+    poles, integrators and delay. Its poles, twice; then, twice each, modes that an order selection would have
+    kept; then pairs of one further mode that has a probability worth counting
+    (`ident.uncertainty.undetected_mode`). Raises ValueError when the records are too short, have another
+    sampling time, or do not excite the poles at all. A mode that is not seen at all stays outside the
+    ellipses at its peak.
     """
     return tangent_beside(records, model, (), options)[0]
 
@@ -95,8 +93,8 @@ def tangent_beside(
     """The tangent posterior with q columns beside the basis functions, in every record, and their
     coefficients: mean (q,) and factor (q, P') on the same unit normals as the response's covariance_factor.
 
-    The coefficients are estimated freely, the last n_known of them as independent unknowns of zero mean and
-    unit variance. Arguments and errors otherwise as `tangent`.
+    The last n_known coefficients are independent unknowns of zero mean and unit variance, the others free.
+    Errors as `tangent`.
     """
     return _embed(
         records,
@@ -112,11 +110,9 @@ def tangent_beside(
 def classical(
     records: Sequence[Record], model: GobfModel, options: EmbeddingOptions | None = None
 ) -> ResponsePosterior:
-    """The published recipe, for comparison: F = Phi, prior C = alpha lam^k, unconditional covariance.
-
-    Same arguments and errors as `tangent`; hyperparameters are always those of largest restricted likelihood,
-    and prior_no_remainder is not used. Do not design a controller on it: see the module docstring.
-    """
+    """The published recipe, for comparison: F = Phi, prior C = alpha lam^k, unconditional covariance. Errors
+    as `tangent`; hyperparameters are those of largest restricted likelihood. Not for designs: it does not
+    cover."""
     options = options or EmbeddingOptions()
     return _embed(records, model, model.poles, options, classical_recipe=True)[0]
 
@@ -204,13 +200,11 @@ def embed_response(
     """Tangent posterior around a model whose poles were chosen from this response; `fixed` (first among its
     poles) are not doubled.
 
-    The rows are whitened frequencies instead of samples, the rest is the same. The covariances of the
-    measurement are taken as they are if the rest of the fit is no larger than they explain, and multiplied by
-    the estimated noise variance (in their units, Birge's ratio) if it is: the posterior never claims more
-    than the measurement. shared_gain_std is the relative standard deviation of a real factor common to all
-    frequencies; the fit is proportional to the measurement, so it adds exactly one direction, that of the
-    mean itself. Raises ValueError if the frequencies do not outnumber the unknowns, or shared_gain_std is
-    negative.
+    The rows are whitened frequencies. The covariances of the measurement are multiplied by the estimated
+    noise variance (in their units, Birge's ratio) where the rest of the fit is larger than they explain.
+    shared_gain_std: relative standard deviation of a real factor common to all frequencies; it adds the
+    direction of the mean. Raises ValueError if the frequencies do not outnumber the unknowns, or
+    shared_gain_std is negative.
     """
     if not 0 <= shared_gain_std < np.inf:
         raise ValueError(f"shared_gain_std must not be negative; got {shared_gain_std}")

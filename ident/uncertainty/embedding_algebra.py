@@ -1,9 +1,8 @@
 """Stochastic embedding on matrices: one QR reduction, restricted likelihood, posterior of the kernel.
 
-Model y = N nu + F theta + Psi eta + v with flat nu (nuisance) and theta, eta ~ N(0, s2 Ct), v ~ N(0, s2 I)
-(Goodwin, Gevers and Ninness, IEEE TAC 37(7), 1992; reduced formulas of design 4.5). Ct = alpha B B^T, and
-everything that depends on the data is contained in a triangle of the size of the parameters, whatever the
-record length.
+y = N nu + F theta + Psi eta + v with flat nu (nuisance) and theta, eta ~ N(0, s2 Ct), Ct = alpha B B^T, v ~
+N(0, s2 I) (Goodwin, Gevers and Ninness, IEEE TAC 37(7), 1992; reduced formulas of design 4.5). Everything
+that depends on the data is in a triangle of the size of the parameters.
 """
 
 from __future__ import annotations
@@ -37,11 +36,9 @@ _SCALES, _VISIBLE_SHARE, _LARGEST_ENERGY = 6, 0.1, 1e12
 
 @dataclass(frozen=True, eq=False)
 class Delays:
-    """Matrix (T,L) of an input (T,) one, two, ... samples ago, zero before the record; rows are made where
-    they are asked for, because all of a long record would not fit into memory.
-
-    first (n,L): in place of its first n rows. begin: rows before that one are left out.
-    """
+    """Matrix (T,L) of an input (T,) one, two, ... samples ago, zero before the record, whose rows are made
+    where they are asked for. first (n,L): in place of its first n rows. begin: rows before that one are left
+    out."""
 
     input: RealArray
     length: int
@@ -86,11 +83,9 @@ class RegressionBlock:
 class ReducedRegression:
     """[F Psi y] after projecting the nuisance out and QR: the sufficient statistics.
 
-    r11 (p,p) upper triangular in units of the original columns, r12 (p,L), r1 (p,), r22 (L,L), z (L,), rest =
-    squared norm of the part of y outside all columns, n_rows = rows minus nuisance rank. kept (p,) are the
-    columns of F that stayed, of n_columns: one that these records cannot tell from the others (a pole nearly
-    four times in the doubled set) is left out, its coefficient zero, and changes the response at no excited
-    frequency.
+    r11 (p,p) upper triangular, r12 (p,L), r1 (p,), r22 (L,L), z (L,), rest = squared norm of the part of y
+    outside all columns, n_rows = rows minus nuisance rank. kept (p,): columns of F, of n_columns, that these
+    records can tell from the others; the coefficients of those left out are zero.
     """
 
     r11: RealArray
@@ -119,12 +114,12 @@ class ReducedRegression:
 
 @dataclass(frozen=True, eq=False)
 class KernelPosterior:
-    """Gaussian of theta and eta.
+    """Gaussian of theta and eta: eta = kernel_mean + kernel_factor w', theta = R11^-1 (r1 - R12 eta +
+    sqrt(noise_variance) w); w, w' standard normal.
 
-    eta = kernel_mean + kernel_factor w', theta = R11^-1 (r1 - R12 eta + sqrt(noise_variance) w); w, w'
-    standard normal. kernel_mean (L,), kernel_factor (L,L'); conditional on the data, or (for the classical
-    recipe) mean 0 and the prior factor. alpha and lam are those of largest weight; probability_no_remainder
-    the weight on alpha = 0; log_evidence of the best pair relative to alpha = 0.
+    kernel_mean (L,), kernel_factor (L,L'): conditional on the data, or (classical recipe) 0 and the prior
+    factor. alpha, lam: those of largest weight; probability_no_remainder: weight on alpha = 0; log_evidence:
+    of the best pair relative to alpha = 0.
     """
 
     kernel_mean: RealArray
@@ -198,11 +193,8 @@ def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
 
 
 def triangle_of(columns: RealArray) -> RealArray:
-    """R (n,n) of the QR decomposition of columns (T,n); rows of zeros where T < n.
-
-    LAPACK's recursive decomposition, called directly: on a matrix this tall and narrow it is several times
-    faster than the one behind the `qr` of NumPy and SciPy.
-    """
+    """R (n,n) of the QR decomposition of columns (T,n); rows of zeros where T < n. LAPACK's recursive
+    decomposition: several times faster than `qr` of NumPy and SciPy on matrices this narrow."""
     n_rows, n = columns.shape
     width = min(_PANEL, n_rows, n)
     packed, _, info = lapack.dgeqrt(width, np.asfortranarray(columns), overwrite_a=1)
@@ -246,9 +238,8 @@ def exponential_factor(lam: float, length: int) -> RealArray:
 class KernelSpectrum:
     """Singular value decomposition of R22 B for one kernel shape: every alpha then costs O(L).
 
-    Of the L taps those n are kept that have died out neither; R22 and B are upper triangular, so R22 B has
-    nothing outside its first n rows and columns. axes (n,n) = B V, singular d (n,), projected U^T z (n,), and
-    outside = squared norm of the rest of z.
+    Of the L taps the first n are kept, which have not died out; R22 and B are upper triangular. axes (n,n) =
+    B V, singular d (n,), projected U^T z (n,), outside = squared norm of the rest of z.
     """
 
     lam: float
@@ -302,12 +293,9 @@ class KernelGrid:
 
 
 def remainder_energies(degrees_of_freedom: int) -> tuple[RealArray, RealArray]:
-    """Expected energies (A,) of what the poles leave out of the output, in noise variances, and their prior
-    (A,).
-
-    Log-uniform from invisible to what an order selection would have kept (4 ln nu, design 4.3), and one tenth
-    of the probability beyond.
-    """
+    """Expected energies (A,) of what the poles leave out of the output, in noise variances, and their
+    prior (A,): log-uniform up to what an order selection would have kept (4 ln nu, design 4.3), one tenth
+    beyond."""
     edge = 4 * np.log(degrees_of_freedom)
     n = int(np.ceil(np.log(_LARGEST_ENERGY) / np.log(edge) * _SCALES))
     energy = edge ** (np.arange(n + 1) / _SCALES)
@@ -318,11 +306,8 @@ def remainder_energies(degrees_of_freedom: int) -> tuple[RealArray, RealArray]:
 def evaluate_grid(
     reduced: ReducedRegression, spectra: Iterable[KernelSpectrum], energy: RealArray, prior: RealArray
 ) -> KernelGrid:
-    """Restricted likelihood over kernel shapes, all alike, and alpha = energy / trace(R22 B B^T R22^T).
-
-    energy (A,) is that of the remainder in the output, in noise variances, so that the grid fits any units of
-    input and output; prior (A,) of the scales.
-    """
+    """Restricted likelihood over kernel shapes, all alike, and alpha = energy / trace(R22 B B^T R22^T), for
+    energy (A,) of the remainder in the output, in noise variances, with prior (A,)."""
     spectra = tuple(spectra)
     alpha = np.stack([energy / max(float(s.singular @ s.singular), 1e-300) for s in spectra])
     values = [restricted_log_likelihood(reduced, s, a) for s, a in zip(spectra, alpha, strict=True)]
@@ -341,9 +326,9 @@ def evaluate_grid(
 def kernel_grid(
     reduced: ReducedRegression, shapes: Iterable[Callable[[float, int], RealArray]], *, order_given: bool
 ) -> KernelGrid:
-    """`evaluate_grid` over twelve decays of every shape, and scales: those of `remainder_energies` where the
-    order was given, else log-uniform from far below the noise on, for a choice from the data leaves little.
-    """
+    """`evaluate_grid` over twelve decays of every shape, and scales: those of `remainder_energies` where
+    the order was given, else log-uniform from far below the noise on, for a choice from the data leaves
+    little."""
     length = reduced.fir_length
     # Decay times from less than a sample to where the kernel has died out (e^-6 in variance) at its last tap.
     decays = np.exp(-1.0 / np.geomspace(0.7, max(length / 6.0, 1.0), 12)).tolist()

@@ -30,11 +30,11 @@ _NUISANCE_RANK = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """The rows of one record that answer to its input: nuisance (T,n), regressors F (T,p), output y (T,), all
+    """The rows of one record that answer to its input: nuisance (T,n), regressors F (T,p), output y (T,),
     whitened.
 
-    input (T,) is the input after integrators, delay and A(q); head (n,) its first samples before A(q), and
-    first (n,n) the matrix that whitens those rows: zero where they are dropped, and so are they.
+    input (T,): after integrators, delay and A(q); head (n,): its first samples before A(q); first (n,n): what
+    whitens those rows, zero where they are dropped.
     """
 
     nuisance: RealArray
@@ -61,10 +61,9 @@ class Beside:
 class EmbeddingRows:
     """How to make the matrices; made anew for each pass, so that only one record's are in memory.
 
-    poles are those of the regressors (doubled for the tangent method), fir_length that of the kernel,
-    whitening the coefficients of A(q), [1] for white noise. beside: one per record, or none, of whose columns
-    the last n_known have coefficients known to one; known_std: standard deviation of the (whitened) noise, as
-    far as known.
+    poles: of the regressors (doubled for the tangent method); fir_length: of the kernel; whitening: A(q), [1]
+    for white noise. beside: one per record, or none, whose last n_known columns have coefficients known to
+    one; known_std: of the (whitened) noise, as far as known.
     """
 
     records: tuple[Record, ...]
@@ -107,11 +106,8 @@ class EmbeddingRows:
             yield replace(rows, input=signal, head=head)
 
     def _rows(self, record: Record, beside: Beside | None) -> Rows:
-        """Matrices of one record, every column whitened.
-
-        Columns driven by the input from rest commute with A(q), so for them the input is filtered; only the
-        nuisance columns and the first rows, which A(q) does not whiten, are made from plain signals.
-        """
+        """Matrices of one record, every column whitened. Columns driven by the input from rest commute with
+        A(q): for them the input is filtered, but for the first rows."""
         structure, whitening = self.structure, self.whitening
         delay = structure.input_delay_samples
         first = first_rows(whitening)
@@ -149,10 +145,7 @@ def gls_residuals(
     rows: EmbeddingRows, reduced: ReducedRegression, kernel: KernelPosterior
 ) -> tuple[list[RealArray], Absorbed]:
     """y minus posterior mean and nuisance, unwhitened, one array per record; and what the fit has absorbed.
-
-    rows are those of the fit, with its whitening. The kernel's mean is taken off, its share of the absorption
-    (which the prior keeps small) is neglected.
-    """
+    rows: of the fit, with its whitening. Neglected: the kernel's share of the absorption."""
     mean, _ = joint_factor(reduced, kernel)
     p = reduced.n_columns
     scale = np.linalg.norm(reduced.r11, axis=0)

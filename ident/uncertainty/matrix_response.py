@@ -1,11 +1,10 @@
 """Balls that hold the matrix response of a model of several inputs and outputs, poles included.
 
-To first order the error of the response is G - G0 = K(w) n with n of unit normals, from the Gauss-Newton
-covariance of poles, shapes and free residues. With free residues at given poles its covariance would be
-(noise covariance) x (input covariance P) exactly, so that G = G0 + Lo D Li with Lo Lo^H the noise
-covariance, Li^H Li = P and D of independent complex normals. Poles, which all channels share, and shapes add
-terms that are no such product. Lo stays, P is the mean over whitened outputs, and the ball |D|_F <= radius is
-as large as holds G with the asked probability: the quantile of a sum of weighted squares.
+To first order G - G0 = K(w) n with n of unit normals, from the Gauss-Newton covariance of poles, shapes and
+free residues. With free residues at given poles it would be (noise covariance) x (input covariance P): G = G0
++ Lo D Li with Lo Lo^H the noise covariance, Li^H Li = P, D of independent complex normals. Poles and shapes
+add terms that are no such product. Lo stays, P is the mean over whitened outputs, and the ball |D|_F <=
+radius is as large as holds G: the quantile of a sum of weighted squares.
 """
 
 from __future__ import annotations
@@ -138,12 +137,9 @@ class MatrixPosterior:
 def matrix_posterior(
     records: Sequence[Record], identification: MimoIdentification, *, level: float = 0.95
 ) -> MatrixPosterior:
-    """Posterior of the matrix response.
-
-    records, identification: of `identify_mimo`. First order in the noise, which is taken as white in time,
-    and for the order and the shapes that were chosen: nothing is added for modes that the records did not
-    show. Raises ValueError if the records are not those of the identification, or poles repeat.
-    """
+    """Posterior of the matrix response of an `identify_mimo`, first order in the noise, taken as white in
+    time, for the order and the shapes that were chosen. Raises ValueError if the records are not its own, or
+    poles repeat."""
     model, structure = identification.model, identification.structure
     factor: RealArray = np.linalg.cholesky(identification.noise_covariance).astype(np.float64)
     white: RealArray = np.linalg.inv(factor).astype(np.float64)

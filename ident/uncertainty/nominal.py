@@ -19,11 +19,9 @@ _THINNEST = 1e-4
 def nominal_near(posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.ArrayLike) -> GobfModel:
     """GOBF model on given poles whose response stays closest to the posterior mean, in units of its ellipses.
 
-    Coefficients (and the direct term, where the posterior has one) minimise the sum over omega (F,)
-    of e^T P^-1 e, e the error of (Re, Im) and P the posterior covariance. Integrators and delay are the
-    posterior's. Take the posterior's own poles for the closest model, half of them for a low order; then
-    `posterior.at(omega).normalised_distance(...)` tells how far the nominal is off. Raises ValueError when
-    omega has too few frequencies for the coefficients.
+    Coefficients (and the direct term, where the posterior has one) minimise the sum over omega (F,) of e^T
+    P^-1 e, e the error of (Re, Im), P the posterior covariance. Raises ValueError when omega has too few
+    frequencies.
     """
     uncertainty = posterior.at(omega_rad_s)
     direct = posterior.has_feedthrough

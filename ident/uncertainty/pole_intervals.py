@@ -1,13 +1,8 @@
 """How sure are frequency and damping? Intervals of the poles from the posterior of the response.
 
 The tangent posterior has every pole p twice, so near p its response is q/(z - p)^2 + r/(z - p) + analytic, q
-and r linear in the coefficients. To first order that is the simple pole moved to p + q/r: r/(z - p - d) =
-r/(z - p) + r d/(z - p)^2 + ... So the covariance of the coefficients gives that of the poles, with all that
-went into it: offset and initial state, coloured noise, dynamics left over. Delay and integrators multiply
-the response by a function without pole or zero at p, which changes nothing to first order.
-
-Intervals are symmetric in the logarithms of frequency, damping and decay, whose distributions are nearer to
-Gaussian than those of the numbers themselves, and which cannot come out negative.
+and r linear in the coefficients: to first order the simple pole moved to p + q/r. Delay and integrators
+change nothing to first order. Intervals are symmetric in the logarithms of frequency, damping and decay.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """One flexible mode that the pole search may have missed, averaged over (design 4.5).
 
-A mode whose signal stays below the price of an order criterion is left out of the model, and ellipses that
-do not know of it miss the truth around it. Here every pair of a grid over frequency and damping is a
-hypothesis "the poles, and this pair": its two amplitudes get a Gaussian prior, their scale a grid, so that
-every hypothesis has a restricted likelihood comparable with those of the kernel. The pairs stand after the
-all-pass of the model's poles, orthogonal to everything those can express: the prior then says nothing
-about the model's own coefficients, and a pair next to a pole of the model is as well conditioned as any
-other.
+Every pair of a grid over frequency and damping is a hypothesis "the poles, and this pair": its two amplitudes
+get a Gaussian prior, their scale a grid, so that its restricted likelihood is comparable with those of the
+kernel. The pairs stand after the all-pass of the model's poles, orthogonal to everything those can express.
 
 Neglected: two missed modes at once, a missed mode together with a kernel, the missed mode's own initial
 state.
@@ -71,9 +67,8 @@ class CandidatePairs:
 class PairStatistics:
     """What the data say on each pair, nuisance and F projected out.
 
-    gram (J,2,2) = X^T X, projection (J,2) = X^T y, onto_regressors (J,p,2) = Q1^T X with Q1 the orthonormal
-    columns of F (F = Q1 R11); residual = |y|^2 with the same projections; size (J,) is the trace of X^T X
-    before them.
+    gram (J,2,2) = X^T X, projection (J,2) = X^T y, onto_regressors (J,p,2) = Q1^T X with F = Q1 R11; residual
+    = |y|^2; size (J,): trace of X^T X before the projections.
     """
 
     gram: RealArray
@@ -83,10 +78,8 @@ class PairStatistics:
     size: RealArray
 
     def axes(self) -> tuple[RealArray, RealArray, RealArray]:
-        """Eigenvalues (J,2), ascending, and eigenvectors of the gram matrices; projections (J,2) on them.
-
-        What is left of a column at the level of rounding says nothing: its projection is zero.
-        """
+        """Eigenvalues (J,2), ascending, and eigenvectors of the gram matrices; projections (J,2) on them,
+        zero for what is left of a column at the level of rounding."""
         values, vectors = np.linalg.eigh(self.gram)
         along = np.einsum("jki,jk->ji", vectors, self.projection)
         floor = _ROUNDING * self.size[:, None]
@@ -101,8 +94,8 @@ class PairStatistics:
 class PairEvidence:
     """log likelihood (J,A) over pairs and scales, on the scale of `embedding_algebra`.
 
-    energy (A,) are the expected energies of the scales, in noise variances, and prior (A,) their weights;
-    mean (J,A,2), covariance (J,A,2,2) of the amplitudes and noise_variance (J,A) for each.
+    energy (A,): expected, in noise variances, and prior (A,); mean (J,A,2), covariance (J,A,2,2) of the
+    amplitudes, noise_variance (J,A).
     """
 
     log_likelihood: RealArray
@@ -117,10 +110,8 @@ class PairEvidence:
 def candidate_pairs(n_samples: int) -> CandidatePairs:
     """Grid of lightly damped pairs, from six periods in the record to nine tenths of the Nyquist frequency.
 
-    Free oscillations of a candidate fall to e^-2 within the record, its damping is larger than the grid's
-    where that takes it: a sharper peak could stand between the frequencies that so short a record tells
-    apart, as high as one likes, and no data would contradict it. With fewer periods that damping is no longer
-    light, and what happens there is a matter for real poles.
+    Free oscillations of a candidate fall to e^-2 within the record: a sharper peak could stand between the
+    frequencies that the record resolves, as high as one likes, and no data would contradict it.
     """
     low, high, rate = 2 * np.pi * _FEWEST_PERIODS / n_samples, _HIGHEST, _DECAY / n_samples
     poles, prior = [], []
@@ -139,10 +130,8 @@ def candidate_pairs(n_samples: int) -> CandidatePairs:
 def pair_statistics(
     blocks: Iterable[Rows], reduced: ReducedRegression, poles: ComplexArray
 ) -> PairStatistics:
-    """One pass over the records; time O(N J (p + n)), memory that of a few hundred rows of all pairs.
-
-    blocks: `EmbeddingRows.pair_blocks`, the input sent through the all-pass of the regressors' poles.
-    """
+    """One pass over the records; time O(N J (p + n)), memory that of a few hundred rows of all pairs. blocks:
+    `EmbeddingRows.pair_blocks`."""
     q = reduced.n_regressors
     gram = np.zeros((3, poles.size))
     inner, size = np.zeros((2 * poles.size, q + 1)), np.zeros(poles.size)
@@ -180,11 +169,8 @@ def pair_statistics(
 
 @numba.njit(cache=True, fastmath=True)
 def _pair_rows(parameters: Any, signal: Any, states: Any) -> Any:
-    """The two basis functions of every pair alone, driven by the signal (T,): two arrays (T,J).
-
-    states (2,J) is where the pairs start, and afterwards where they stand. All pairs advance together, sample
-    by sample: neighbours in memory, which the processor takes four or eight at a time.
-    """
+    """The two basis functions of every pair alone, driven by the signal (T,): two arrays (T,J). states (2,J):
+    where the pairs start, and afterwards stand. All pairs advance together, neighbours in memory."""
     n_pairs = parameters.shape[0]
     numbers = np.empty((5, n_pairs))
     gb, gs, beta, sg, sb = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
@@ -222,8 +208,8 @@ def _pair_gram(x1: Any, x2: Any) -> Any:
 def pair_evidence(statistics: PairStatistics, degrees_of_freedom: int) -> PairEvidence:
     """Restricted likelihood and posterior of a ~ N(0, s2 kappa I) for every pair and scale kappa.
 
-    -2 log L = nu log s2 + log det(I + kappa G) + nu with s2 = (|y|^2 - b^T (G + I / kappa)^-1 b) / nu, which
-    is the expression for the kernel with X in the place of Psi; kappa = energy / largest eigenvalue of G.
+    -2 log L = nu log s2 + log det(I + kappa G) + nu with s2 = (|y|^2 - b^T (G + I / kappa)^-1 b) / nu; kappa
+    = energy / largest eigenvalue of G.
     """
     nu = degrees_of_freedom
     energy, prior = remainder_energies(nu)
@@ -248,10 +234,10 @@ def pair_evidence(statistics: PairStatistics, degrees_of_freedom: int) -> PairEv
 class PairMixture:
     """The pairs worth keeping, as independent hypotheses.
 
-    poles (K,), weight (K,) their posterior probabilities, probability that of all pairs together (those not
-    kept included); mean (K,2), covariance (K,2,2), noise_variance (K,) of each, averaged over the scale; onto
-    (p,2K) = Q1^T X. visible is the likeliest pair if an order selection would have kept it and the kernel
-    does not explain it better, else None.
+    poles (K,), weight (K,) their posterior probabilities, probability: of all pairs together; mean (K,2),
+    covariance (K,2,2), noise_variance (K,), averaged over the scale; onto (p,2K) = Q1^T X. visible: the
+    likeliest pair if an order selection would have kept it and the kernel does not explain it better, else
+    None.
     """
 
     poles: ComplexArray
@@ -279,14 +265,10 @@ def pair_mixture(
 ) -> PairMixture:
     """Probabilities of the pairs against everything else, and the moments of those worth keeping.
 
-    Pair j at scale a has the posterior weight prior_odds prior_j prior_a L_ja, everything else exp(log_rest);
-    mean and covariance are averaged over the scales by the law of total covariance. A pair is visible where
-    the order selection would have kept it, nu ln(J0/J1) > 4 ln nu with nu = degrees_of_freedom, and the pairs
-    together are likelier than the rest.
-
-    log_rest is the log of prior times likelihood summed over all hypotheses without a missed mode, their
-    prior probabilities adding up to 1; prior_odds those of one missed mode against none. The weight of pairs
-    not kept is shared out among all the others.
+    Pair j at scale a has the posterior weight prior_odds prior_j prior_a L_ja, everything else exp(log_rest):
+    prior times likelihood summed over all hypotheses without a missed mode; moments by the law of total
+    covariance. Visible: nu ln(J0/J1) > 4 ln nu, nu = degrees_of_freedom, and the pairs together are likelier
+    than the rest. The weight of pairs not kept is shared out among all others.
     """
     evidence = pair_evidence(statistics, degrees_of_freedom)
     logs = evidence.log_likelihood + np.log(prior_odds * candidates.prior[:, None] * evidence.prior)
@@ -319,11 +301,11 @@ def pair_mixture(
 
 
 def _worth_keeping(poles: ComplexArray, probability: RealArray) -> npt.NDArray[np.intp]:
-    """Indices of the likeliest pairs in neighbourhoods that are probable enough to matter, in grid order.
+    """Indices of the likeliest pairs in neighbourhoods that are probable enough, in grid order.
 
-    Neighbours of a pair resonate within two half bandwidths of it, whatever their damping. Moments of a
-    mixture, unlike its quantiles, feel a hypothesis however improbable it is, by the square of its distance;
-    one that all its neighbours do not make probable is outside every confidence region and left out.
+    Neighbours resonate within two half bandwidths. Moments of a mixture feel an improbable hypothesis by the
+    square of its distance; one whose neighbourhood is improbable is outside every confidence region, and left
+    out.
     """
     frequency, decay = np.angle(poles), -np.log(np.abs(poles))
     near = np.abs(frequency[:, None] - frequency) <= 2 * np.maximum(decay[:, None], decay)
@@ -333,10 +315,8 @@ def _worth_keeping(poles: ComplexArray, probability: RealArray) -> npt.NDArray[n
 
 
 def refined_pair(blocks: Callable[[], Iterable[Rows]], reduced: ReducedRegression, pair: complex) -> complex:
-    """The pair near this grid point that explains most: frequency and damping on grids that shrink around it.
-
-    Six rounds of 5 x 5 end within a hundredth of a half bandwidth; the tangent columns cover the rest.
-    """
+    """The pair near this grid point that explains most. Six rounds of 5 x 5 that shrink end within a
+    hundredth of a half bandwidth; the tangent columns cover the rest."""
     rate = np.log(pair)
     omega, zeta = float(np.abs(rate)), float(-np.real(rate) / np.abs(rate))
     step_omega, step_zeta = 0.5 * _SPACING * zeta, 0.5 * np.log(_ZETA[1] / _ZETA[0])
