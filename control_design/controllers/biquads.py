@@ -1,9 +1,9 @@
 """Structured controllers: a cascade of first- and second-order sections in the Tustin plane.
 
-With p = (2/dt)(z - 1)/(z + 1)/scale (on the circle p = j (2/dt) tan(omega dt/2)/scale) the controller is
-K = prod (n2 p^2 + n1 p + n0)/(p^2 + e^a p + e^b) times, for odd orders, (n1 p + n0)/(p + e^a), times (n1 p +
-n0)/p for an integrator, times notches (p^2 + e^c p + e^b)/(p^2 + e^a p + e^b). Every parameter vector is a
-stable controller (apart from the wanted integrator), whatever the optimiser tries.
+With p = (2/dt)(z - 1)/(z + 1)/scale (on the circle p = j (2/dt) tan(omega dt/2)/scale) the controller is K =
+prod (n2 p^2 + n1 p + n0)/(p^2 + e^a p + e^b) times, for odd orders, (n1 p + n0)/(p + e^a), times (n1 p +
+n0)/p for an integrator, times notches (p^2 + e^c p + e^b)/(p^2 + e^a p + e^b). Every parameter vector is
+stable.
 """
 
 from __future__ import annotations
@@ -100,12 +100,8 @@ class Cascade:
         return np.asarray((1.0 + h * p) / (1.0 - h * p), dtype=np.complex128)
 
     def state_space(self, x: Sequence[float] | Real) -> tuple[Real, Real, Real, Real]:
-        """Discrete (A, B, C, D) of the cascade, every section mapped exactly by p -> z.
-
-        Each section is mapped as a continuous modal block with the trapezoidal rule, in delta-friendly
-        numbers: for x' = F x + g u the rule gives A = (I - F h)^-1 (I + F h), h = dt scale/2, without forming
-        z-polynomials.
-        """
+        """Discrete (A, B, C, D) of the cascade, every section by the trapezoidal rule: x' = F x + g u becomes
+        A = (I - F h)^-1 (I + F h), h = dt scale/2."""
         h = self.dt_s * self.scale_rad_s / 2.0
         a: Real = np.zeros((0, 0))
         b: Real = np.zeros((0, 1))

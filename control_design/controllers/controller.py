@@ -27,11 +27,9 @@ class Controller(Law):
     """u = K (r - y): x+ = A x + B e + M (u_limited - u), u = C x + D e, of Y errors and U commands.
 
     A (n, n), B (n, Y), C (U, n), D (U, Y); dt_s > 0. input_limit, rate_limit: saturation (both signs) and
-    largest change per second of the command, or None; with U > 1 a tuple of these, one per actuator.
-    anti_windup_gain M (n, U): back-calculation in observer
-    form; the controller state then follows A - M C while the command is limited, so M must make that stable;
-    None = `observer_gain(A, B, C, D)`. computational_delay_samples: the command computed from the measurement
-    at t_k is applied from t_{k + delay} on. feedforward: joins u before it is limited, or None.
+    largest change per second of the command, or None; with U > 1 a tuple of these. anti_windup_gain M (n, U):
+    back-calculation in observer form, A - M C stable; default `observer_gain`. computational_delay_samples:
+    from measurement to command. feedforward: joins u before it is limited, or None.
     """
 
     kind = "controller"
@@ -195,12 +193,7 @@ class MatrixStepper:
 
 def observer_gain(A: Real, B: Real, C: Real, D: Real) -> Real:
     """Back-calculation gain M (n, U) with A - M C stable: a Kalman gain for state noise through B and output
-    noise D.
-
-    For D != 0 and a minimum-phase controller the conditioning technique would take M = B/D, which places A -
-    M C at the zeros of the controller; a designed controller may have zeros outside the circle, where that
-    winds up for ever. The Riccati gain is stable for every observable (A, C) and comes close to it otherwise.
-    """
+    noise D. (M = B/D would place A - M C at the controller's zeros, which may lie outside the circle.)"""
     from scipy.linalg import solve_discrete_are
 
     n = A.shape[0]
@@ -228,17 +221,15 @@ def observer_gain(A: Real, B: Real, C: Real, D: Real) -> Real:
 class FrictionFeedforward:
     """Friction at the reference's speed v, smoothed, as late as the loop follows.
 
-    The friction is sign(v) (level + excess exp(-|v| / fall)), Coulomb's and Stribeck's. The sign turns round
-    while the speed goes through +-width / lag_s, at which the reference moves by the pre-sliding deflection
-    `width` while the loop answers; the friction then goes through a first-order lag of lag_s, the delay of
-    the closed loop towards standstill, and joins the command: p+ = p + share (friction - p). It dies out
-    where the reference rests, so that it drives no limit cycle, and it is no feedback: poles and margins stay
-    as they are. A step is over in one sample and gets next to nothing of it.
+    sign(v) (level + excess exp(-|v| / fall)), Coulomb's and Stribeck's; the sign turns round while the speed
+    goes through +-width / lag_s, at which the reference moves by the pre-sliding deflection `width` while the
+    loop answers. Through a first-order lag of lag_s, the delay of the closed loop towards standstill, it
+    joins the command: p+ = p + share (friction - p). No feedback: poles and margins stay, and it dies out at
+    rest.
 
     level, excess >= 0 in units of the command, width > 0 of the reference, fall > 0 of the reference per
     second, lag_s > 0. Neglected: friction that depends on position or load; motion that something other than
-    the reference causes; a reference that comes in steps longer than a sample, which counts as resting
-    between them.
+    the reference causes; a reference that comes in steps longer than a sample.
     """
 
     level: float

@@ -1,11 +1,10 @@
-"""Smallest worst ratio of a convex over a concave function, many rows at once: the convex core of bound and
+"""Smallest worst ratio of a convex over a concave function, many rows at once: the core of bound and
 reference filter.
 
-Every row looks at one complex number y_k = sum_i basis_ki x_i, taken as a vector of the plane, and asks
-    |A y + a| <= gamma (e + E y - |C y + c|).
-For fixed gamma that is convex in x, so the smallest feasible gamma has no local minima. Dinkelbach's
-iteration solves it: gamma_j = worst ratio at x_j, then x_{j+1} minimises the largest (|A y + a| - gamma_j
-m(y))/m(y_j), a convex programme, by an interior point. gamma falls in every step, superlinearly near the end.
+Every row looks at one complex number y_k = sum_i basis_ki x_i, a vector of the plane, and asks |A y + a| <=
+gamma (e + E y - |C y + c|), convex in x for fixed gamma. Dinkelbach's iteration: gamma_j = worst ratio at
+x_j, then x_{j+1} minimises the largest (|A y + a| - gamma_j m(y))/m(y_j), a convex programme, by an interior
+point.
 """
 
 from __future__ import annotations
@@ -92,9 +91,8 @@ def smallest_ratio(
 ) -> MinimaxPoint:
     """Minimise the largest numerator/denominator over real x (n,), to a relative accuracy.
 
-    basis (F, n): y = basis x. start: x (n,) to begin from; None, or where a denominator is not positive: the
-    least-squares solution of the numerators, shortened until they are; where that fails, the denominators are
-    made positive first.
+    basis (F, n): y = basis x. start: x (n,) to begin from; else the least-squares solution of the numerators,
+    shortened until all denominators are positive.
     """
     step = _Scaled(basis, rows, accuracy)
     if start is not None and not np.min(rows.denominator(plane(basis @ start))) > 0:
@@ -203,10 +201,9 @@ class _Scaled:
     ) -> Real:
         """z with the smallest max h, h = (|A y + a| - gamma m(y))/scale; for feasibility h = -m(y).
 
-        Primal-dual interior point for min v, h - v + slack = 0, with predictor and corrector. The slacks are
-        variables of their own: with h < v kept throughout, one early row at its boundary stopped all others.
-        Ends when the gap is below a twentieth of what was gained (the next round begins from there anyway) or
-        at full accuracy.
+        Primal-dual interior point for min v, h - v + slack = 0, with predictor and corrector; slacks are
+        variables of their own. Ends when the gap is below a twentieth of what was gained, or at full
+        accuracy.
         """
         weight = 0.0 if feasibility else 1.0
         factor = 1.0 if feasibility else gamma

@@ -1,10 +1,9 @@
 """Second degree of freedom: u = K (F r - y), F chosen so that every member of the ellipses follows a model.
 
-The error of a member G is W (F T - T_ref), T = G K/(1 + G K), affine in F: with chosen poles the coefficients
-that make its worst case smallest are a convex minimax. T maps each ellipse (free of poles by robust
-stability) to a region whose worst point lies on the boundary, so boundary samples suffice for the design; the
-certified error is exact at every frequency of a dense grid: |a G + b| <= h |1 + k G| is a disc or the outside
-of one.
+The error of a member G is W (F T - T_ref), T = G K/(1 + G K), affine in F: with chosen poles a convex minimax
+over boundary samples of the ellipses, where the worst member lies (T is free of poles by robust stability).
+The certified error is exact at every frequency of a dense grid: |a G + b| <= h |1 + k G| is a disc or the
+outside of one.
 """
 
 from __future__ import annotations
@@ -38,12 +37,9 @@ _ACCURACY = 1e-7  # of the certified errors, which are rounded up
 
 @dataclass(frozen=True, eq=False)
 class ReferenceFilter(Law):
-    """r_filtered = F r: x+ = A x + B r, C x + D r, SISO and stable.
-
-    A (n, n), B (n, 1), C (1, n), D (1, 1); dt_s > 0. error_before, error_after: largest weighted
-    model-matching error over all plants and their ellipses with F = 1 and with F, exact at every frequency of
-    the dense grid; worst_rad_s: where the second occurs.
-    """
+    """r_filtered = F r: x+ = A x + B r, C x + D r, SISO and stable. error_before, error_after: largest
+    weighted model-matching error over all plants and ellipses with F = 1 and with F, on the dense grid;
+    worst_rad_s: where."""
 
     kind = "reference filter"
     equations = "x+ = A x + B r; filtered reference = C x + D r"
@@ -85,12 +81,9 @@ def design_reference_filter(
 ) -> ReferenceFilter:
     """Reference filter with the smallest worst-case |W (F T - T_ref)| over all plants and their ellipses.
 
-    model: T_ref(s), weight: W(s) or None for 1, both on the circle at the Tustin frequency. Poles of F as in
-    the options; searched ones start spread around the model's and follow a simplex search on their
-    logarithms.
-
-    Raises ValueError if an ellipse reaches -1 (no reference filter helps), sampling times differ, or a pole
-    is not in (0, Nyquist).
+    model: T_ref(s), weight: W(s) or None for 1, both at the Tustin frequency. Poles that are not given are
+    searched by a simplex from the model's corner. Raises ValueError if an ellipse reaches -1, sampling times
+    differ, or a pole is not in (0, Nyquist).
     """
     options = options or ReferenceFilterOptions()
     listed = (plants,) if isinstance(plants, UncertainPlant) else tuple(plants)

@@ -7,11 +7,10 @@ q = K S of the centre the worst case is at most gamma where
     |W1 S| <= gamma m,  |W3 q| <= gamma m,  m = smallest |1 + D q| over the ellipse.
 
 For a disc of radius r, m = 1 - r |q| and the problem is convex: the disc inscribed in the ellipse gives a
-value that no controller goes below, the enclosing one a value some controller reaches. For the ellipse itself
-m = max over t of Re(e^{-jt}) - |half-axes of e^{-jt} q|: convex in Q for fixed t. From the enclosing disc's
-answer, t and Q in turn lead down to a local optimum, which is a controller's value again. All three minimise
-over the same basis, so inscribed <= ellipse <= enclosing; a larger basis lowers all three a little (0.1 % on
-the example link from 57 to 91 functions): that is how far the lower bound of a finite basis can be trusted.
+value that no controller goes below, the enclosing one a value some controller reaches. For the ellipse m =
+max over t of Re(e^{-jt}) - |half-axes of e^{-jt} q|, convex in Q for fixed t: from the enclosing disc's
+answer, t and Q in turn lead down to a local optimum, a controller's value again. A larger basis lowers all
+three a little: 0.1 % on the example link from 57 to 91 functions.
 """
 
 from __future__ import annotations
@@ -92,12 +91,9 @@ def youla_bracket(
 ) -> YoulaBracket:
     """Bracket of the smallest possible worst case over the ellipses, whatever the controller's order.
 
-    Of the specification count the weighted requirements; structure, order, controller damping and the delay
-    margin do not, so the values stay lower bounds for designs that are asked for these as well. Functions
-    with the member as a factor (G S, T) enter the inscribed value by the centre alone and the other two by
-    the largest |G|: on its safe side in each.
-
-    Raises SpecificationError if specification and plants contradict each other.
+    Only weighted requirements count, so that the values are lower bounds for what is asked further. Functions
+    with the member as a factor (G S, T) enter the inscribed value by the centre alone, the others by the
+    largest |G|. Raises SpecificationError if specification and plants contradict each other.
     """
     options = options or YoulaOptions()
     listed = (plants,) if isinstance(plants, UncertainPlant) else tuple(plants)

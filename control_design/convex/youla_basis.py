@@ -21,12 +21,9 @@ def with_constant(poles: Poles, omega_rad_s: Real, dt_s: float) -> Complex:
 
 
 def chosen_poles(plant: UncertainPlant, scale_rad_s: float, real_poles: int, pairs: int) -> Poles:
-    """Poles that reach everywhere the answer may need them.
-
-    Real ones spread logarithmically from the slowest corner of the plant to the Nyquist frequency; pairs at
-    every flexible mode and at every lightly damped zero (where Q inverts the plant), damping from their own
-    to 0.7. pairs: for each; more than three of them share three times as many.
-    """
+    """Poles of the basis of Q: real ones spread logarithmically from the slowest corner of the plant to
+    Nyquist; pairs at every mode and lightly damped zero (where Q inverts the plant), damping from their own
+    to 0.7. pairs: for each; more than three of them share three times as many."""
     dt = plant.dt_s
     decay = np.abs(np.log(np.maximum(np.abs(plant.poles), 1e-6))) / dt
     slow = decay[(decay > 1e-3 * scale_rad_s)]
@@ -78,11 +75,9 @@ def stable_loop(response: Complex) -> AffineLoop:
 def coprime_factors(plant: control.StateSpace) -> Factors:
     """Factors of a discrete SISO plant by state feedback F and observer gain L, both linear-quadratic.
 
-    M = 1 + F(zI - A_F)^-1 B, N = D + (C + D F)(zI - A_F)^-1 B, X = F(zI - A_L)^-1 L,
-    Y = 1 - F(zI - A_L)^-1 (B + L D), with A_F = A + B F, A_L = A + L C. Any stabilising pair gives all
-    controllers; this one weighs output against an input that moves it equally.
-
-    Raises ValueError if an unstable or marginal mode cannot be moved by the input or seen at the output.
+    M = 1 + F(zI - A_F)^-1 B, N = D + (C + D F)(zI - A_F)^-1 B, X = F(zI - A_L)^-1 L, Y = 1 - F(zI - A_L)^-1
+    (B + L D), with A_F = A + B F, A_L = A + L C. Raises ValueError if an unstable or marginal mode cannot be
+    moved by the input or seen at the output.
     """
     a, b, c, d = (np.asarray(getattr(plant, name), dtype=np.float64) for name in "ABCD")
     n, dt = a.shape[0], plant.dt

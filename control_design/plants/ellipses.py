@@ -1,8 +1,7 @@
 """Ellipses of frequency-response uncertainty and the exact geometry control needs of them.
 
 One frequency, one filled ellipse E = {centre + u1 s1 d1 + j u1 s2 d2 : d1^2 + d2^2 <= 1} in the complex
-plane, with |u1| = 1 and s1 >= s2 >= 0. Everything here is vectorised over F frequencies and exact up to
-rounding: no sampling of the boundary, no enclosing disc.
+plane, |u1| = 1, s1 >= s2 >= 0. Exact up to rounding: no sampling of the boundary, no enclosing disc.
 """
 
 from __future__ import annotations
@@ -191,12 +190,9 @@ def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real
 
 
 def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real:
-    """Distance from `point` to the farthest point of the axis-parallel ellipse at the origin. All (F,).
-
-    Maximise |(a cos f + x, b sin f + y)| with x, y >= 0: the maximiser lies in the first quadrant, and its
-    multiplier m is the largest root of (a x/(m - a^2))^2 + (b y/(m - b^2))^2 = 1: n = m - a^2 is a
-    `secular_root`.
-    """
+    """Distance (F,) from `point` to the farthest point of the axis-parallel ellipse at the origin: with x, y
+    >= 0 the multiplier m is the largest root of (a x/(m - a^2))^2 + (b y/(m - b^2))^2 = 1, n = m - a^2 a
+    `secular_root`."""
     x, y, a, b, scale = _to_scale(point, semi_major, semi_minor)
     by, gap = b * y, a * a - b * b
     n = secular_root(a * x, by, np.zeros_like(gap), gap)
@@ -246,9 +242,8 @@ def largest_ratio(
 
     With A = |alpha|^2 - h^2 |k|^2, |alpha G + beta| <= h |1 + k G| is an Apollonius set: |G - g0| <= r for A
     > 0, >= r for A < 0, with g0 = (h^2 conj(k) - conj(alpha) beta)/A and r = h |alpha - k beta|/|A|. The
-    ellipse lies in it or not by its exact nearest/farthest distance from g0; h by bisection between the
-    centre's value and (|alpha centre + beta| + |alpha| semi_major)/min|1 + k G| (the same lossless statement
-    as the S-lemma of the design notes, without multipliers).
+    ellipse lies in it or not by its exact nearest/farthest distance from g0; h by bisection from the centre's
+    value to (|alpha centre + beta| + |alpha| semi_major)/min|1 + k G|.
     """
     e = ellipses
     distance = distance_to_minus_one(k, e)

@@ -1,9 +1,8 @@
 """First-order expansions with a proved remainder, on intervals of frequency (Taylor models of order one).
 
 On |x| <= half_width around omega_k: f(omega_k + x) = value + slope x + r with |r| <= remainder. Sums and
-products of such expansions are such expansions, so a bound that holds for z - p and 1/(z - p) on an arc of
-the circle carries over to every rational response (`RationalResponse`). Rounding of double precision is
-neglected.
+products are such expansions again, and so is every rational response (`RationalResponse`). Neglected:
+rounding.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""Single responses that must stay stable, nothing more: draws that the ellipses do not describe.
+"""Single responses that must stay stable: draws that the ellipses do not describe.
 
-Ellipses propagate parameter spreads to first order. A lightly damped mode that moves by several of its
-half-widths leaves them by far (its response turns around a circle, the ellipse goes off along the tangent),
-and a loop that is stable over ellipses of any level may be unstable for such a draw. A guard is one of these
-responses, known on its own grid: the search keeps 1 + K G winding as a stable loop's, at a modest distance.
+Ellipses propagate parameter spreads to first order; a lightly damped mode that moves by several half-widths
+leaves them, and a loop stable over ellipses of any level may be unstable for it. A guard is such a response
+on its own grid: the search keeps 1 + K G winding as a stable loop's, at a modest distance.
 """
 
 from __future__ import annotations

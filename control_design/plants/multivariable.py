@@ -39,15 +39,11 @@ class IdentifiedMatrix(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ResponseBall:
-    """G + Lo Delta Li with |Delta|_F <= radius at every frequency.
+    """G + Lo Delta Li with |Delta|_F <= radius at every frequency; `of` makes one of an identified response.
 
-    Lo : (Y, P). Li : stable discrete `control.StateSpace` with U inputs and any number of outputs, or an
-    array (F, Q, U) at omega_rad_s (F,) [rad/s]: then nothing is known, or certified, between these. radius :
-    for a Kronecker covariance Lo Lo^H (x) Li^H Li of a complex Gaussian, sqrt(chi^2 quantile / 2) with 2 U Y
-    degrees of freedom. `of` makes a ball of an identified response.
-
-    Raises ValueError for shapes that do not fit. The smallest destabilising Delta has rank one, so taking
-    the ball for a norm-bounded block loses nothing.
+    Lo (Y, P); Li: stable discrete `control.StateSpace` with U inputs, or an array (F, Q, U) at omega_rad_s
+    (F,) [rad/s], between which nothing is known. radius: for a Kronecker covariance Lo Lo^H (x) Li^H Li,
+    sqrt(chi^2 quantile / 2) with 2 U Y degrees of freedom. Raises ValueError for shapes that do not fit.
     """
 
     Lo: Real
@@ -100,16 +96,13 @@ class ResponseBall:
 
 @dataclass(frozen=True, eq=False)
 class MultivariablePlant:
-    """Nominal plant and its uncertainty: U inputs, Y outputs, u = -K y.
+    """Nominal plant (discrete `control.StateSpace`, dt in seconds) and its uncertainty: U inputs, Y outputs,
+    u = -K y.
 
-    name : shown in reports (one plant per operating point or load).
-    nominal : discrete `control.StateSpace` with dt in seconds.
-    ball : of the response matrix, or None.
-    input_error, output_error : a weight per actuator or sensor, or (): that channel's gain is (1 + w Delta),
-    |Delta| <= 1 complex, each by itself. Give one of the two. Integrators (poles at z = 1) are allowed in the
-    nominal. Neglected: products of the ball and a channel's error.
-
-    Raises ValueError for a plant that is not discrete, not finite, or whose parts do not fit.
+    ball: of the response matrix, or None. input_error, output_error: a weight per actuator or sensor, or (),
+    one of the two: that channel's gain is (1 + w Delta), |Delta| <= 1 complex, each by itself. Poles at z = 1
+    are allowed. Neglected: products of the ball and a channel's error. Raises ValueError for a plant that is
+    not discrete, not finite, or whose parts do not fit.
     """
 
     name: str

@@ -18,12 +18,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """One response with its uncertainty.
-
-    nominal: SISO discrete `control.StateSpace`. uncertainty: an object with `at(omega, level)` (any
-    frequency), a record with omega_rad_s, centre, covariance, level (its own frequencies only), or None (the
-    nominal response is exact).
-    """
+    """One response with its uncertainty. nominal: SISO discrete `control.StateSpace`. uncertainty: an object
+    with `at(omega, level)` (any frequency), a record with omega_rad_s, centre, covariance, level (its own
+    frequencies only), or None (the nominal response is exact)."""
 
     nominal: control.StateSpace
     uncertainty: EvaluableUncertainty | ResponseSet | None = None
@@ -97,12 +94,9 @@ class Channel:
         return frequency_response(self.nominal, omega_rad_s)
 
     def at(self, omega_rad_s: Real) -> Ellipses:
-        """Ellipses at omega (F,). On a record with its own grid, omega inside its range must be members of
-        that grid; outside the range the nominal response stands alone, without uncertainty (the certificate
-        says so).
-
-        Raises ValueError if a frequency is asked for at which the record has no ellipse.
-        """
+        """Ellipses at omega (F,). Of a record with its own grid omega must be on it; outside its range the
+        nominal response stands alone, without uncertainty. Raises ValueError at a frequency without
+        ellipse."""
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         if self.uncertainty is None:
             return Ellipses.of_no_size(omega, self.nominal_response(omega))
@@ -136,12 +130,8 @@ def frequency_response(system: control.StateSpace, omega_rad_s: Real) -> Complex
 
 
 def matrix_response(system: control.StateSpace, omega_rad_s: Real) -> Complex:
-    """C (zI - A)^-1 B + D on z = e^{j omega dt}, (F, Y, U), for a discrete system.
-
-    zI - A is formed as (z - 1) I - (A - I) with z - 1 = expm1(j omega dt): at 1e-4 rad/s and 1 kHz the plain
-    difference would keep only nine digits, and slow poles live there. Solved batchwise (no polynomial, no
-    eigenvector basis).
-    """
+    """C (zI - A)^-1 B + D on z = e^{j omega dt}, (F, Y, U), for a discrete system; zI - A as (z - 1) I - (A -
+    I) with z - 1 = expm1(j omega dt), for slow poles."""
     a = np.asarray(system.A, dtype=np.float64)
     b = np.asarray(system.B, dtype=np.float64)
     c = np.asarray(system.C, dtype=np.float64)
@@ -179,12 +169,9 @@ def delayed(system: control.StateSpace, samples: int) -> control.StateSpace:
 
 
 def count_integrators(poles_z: Complex) -> int:
-    """Poles at z = 1.
-
-    A multiple pole splits by a root of the rounding error (1e-8 for two, 1e-5 for three) but the mean of the
-    cluster stays accurate; a true slow pole (1e-3 rad/s at 1 kHz: 1e-6 from z = 1) is not mistaken for an
-    integrator by that test.
-    """
+    """Poles at z = 1. A multiple pole splits by a root of the rounding error (1e-8 for two, 1e-5 for three),
+    but the mean of the cluster stays accurate; a true slow pole (1e-3 rad/s at 1 kHz: 1e-6 from z = 1) is
+    none."""
     distance = np.asarray(poles_z, dtype=np.complex128) - 1.0
     distance = distance[np.argsort(np.abs(distance), kind="stable")]
     for count, radius in ((3, 1e-3), (2, 1e-5), (1, 1e-9)):
@@ -217,14 +204,10 @@ def modes_of(poles_z: Complex, dt_s: float, *, zeta_below: float = 0.4) -> tuple
 
 @dataclass(frozen=True, eq=False)
 class UncertainPlant:
-    """Input -> measured output with ellipses; optionally input -> performance output for the damping
-    requirement.
+    """Input -> measured output with ellipses (`Channel`), one plant per load or operating point.
 
-    name : shown in reports (one plant per load or operating point).
-    nominal, uncertainty, level : see `Channel`; the sampling time is the nominal's.
-    integrators : poles at z = 1, None = counted from the nominal; a number that contradicts the nominal is
-    refused. performance : the channel whose |Gp S| the damping weight bounds; None = the measured output
-    itself.
+    integrators: poles at z = 1, None = counted; a number that contradicts the nominal is refused.
+    performance: the channel whose |Gp S| the damping weight bounds; None = the measured output itself.
     """
 
     name: str

@@ -4,10 +4,10 @@ The plant is G + sum_i B_i Delta_i L_i with |Delta_i| <= 1. With v at the plant'
 
     A(t) = S^H (K^H (V_u + sum_i L_i^H L_i / t_i) K + V_y) S,   C(t) = sum_i t_i B_i B_i^H,
 
-the weighted gain is at most gamma where A <= (C + I / gamma^2)^-1, for any scalings t_i > 0: multiply
-x = S (d + sum B_i w_i) out and use |w_i| <= |L_i y|. gamma^2 = largest eigenvalue of (A^-1 - C)^-1, and its
-logarithm is convex in log t. The smallest bound over t is the worst case itself for one or two blocks (with
-the performance that makes three), an upper bound beyond (Packard and Doyle, Automatica 29, 1993).
+the weighted gain is at most gamma where A <= (C + I / gamma^2)^-1, for any t_i > 0: gamma^2 = largest
+eigenvalue of (A^-1 - C)^-1, whose logarithm is convex in log t. The smallest bound is the worst case itself
+for one or two blocks (with the performance three), an upper bound beyond (Packard and Doyle, Automatica 29,
+1993).
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Uncertainty ellipses between frequencies: centre and generators as first-order expansions with remainder.
 
-The ellipse at omega is {centre + sum_q x_q generator_q : x real, |x| <= 1}, generators scaled to the level. A
-posterior over coefficients is linear in them, so its generators are rational with known poles and everything
-between two frequencies can be bounded. A response known on its own frequencies only says nothing between
-them; the one assumption offered here is stated in `own_grid_set`.
+The ellipse at omega is {centre + sum_q x_q generator_q : x real, |x| <= 1}, generators scaled to the level:
+rational with known poles for a posterior over coefficients. Of a response known on its own frequencies only
+the assumption between them is stated in `own_grid_set`.
 """
 
 from __future__ import annotations
@@ -179,12 +178,8 @@ def _reflected_zero(p: complex, intervals: Intervals) -> FirstOrder:
 def own_grid_set(
     channel: Channel, nominal: RationalResponse, intervals: Intervals, cleared: int
 ) -> SetExpansion:
-    """Ellipses on a user's own frequencies, with an assumption between them.
-
-    Assumed: between neighbouring frequencies, at fraction x of the way, the response lies in (1 - x) E_k + x
-    E_{k+1} (Minkowski sum): on a straight line between a member of one ellipse and a member of the next.
-    Outside the range the nominal response stands alone.
-    """
+    """Ellipses on a user's own frequencies. Assumed: at fraction x of the way between neighbours the response
+    lies in (1 - x) E_k + x E_{k+1} (Minkowski sum). Outside the range the nominal response stands alone."""
     own = channel.own_grid
     assert own is not None
     low, high = intervals.centre - intervals.half_width, intervals.centre + intervals.half_width

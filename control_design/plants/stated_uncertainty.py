@@ -23,12 +23,9 @@ if TYPE_CHECKING:
 class StatedDiscs:
     """Discs |G - G_nom| <= |W| |G_nom| (multiplicative) or |G - G_nom| <= |W| (additive) at every frequency.
 
-    nominal: SISO discrete state space. weight: W(s), seen through the Tustin frequency like the weights of a
-    specification. level: the discs are handed on as ellipses of this level, so that a plant of the same level
-    has exactly the stated radius. As an uncertainty of `control_design.plants.plant_set.Channel` it can be
-    evaluated at any frequency and bounded between frequencies.
-
-    Raises ValueError for a weight with a pole on the imaginary axis: its radius is infinite there.
+    nominal: SISO discrete state space. weight: W(s) at the Tustin frequency. level: of the ellipses that are
+    these discs. Evaluated at any frequency, bounded between frequencies. Raises ValueError for a weight with
+    a pole on the imaginary axis.
     """
 
     nominal: control.StateSpace

@@ -59,12 +59,11 @@ def bandwidth_weight(
 ) -> RationalWeight:
     """W1 = (m s + wc)/(s + wc r) times (s + wc/5)/(s + p) for every slow pole p.
 
-    wc = bandwidth sqrt(2 - m^2). |W1| is at least sqrt 2 up to the bandwidth, m = modulus_margin far above it
+    wc = bandwidth sqrt(2 - m^2): |W1| is at least sqrt 2 up to the bandwidth, m = modulus_margin far above it
     and 1/r at zero frequency, r = floor (0: integral). slow_poles_rad_s: magnitudes of the plant's poles
-    below wc/5, 0 for an integrator; others are taken to be at least wc/100. A plant that integrates by itself
-    from p on meets a weight of slope one without any action of the controller's own integrator, which the
-    optimiser would then make arbitrarily slow. Each factor asks for integral action by a fifth of the corner,
-    near which the slowest pole then is.
+    below wc/5, 0 for an integrator, others at least wc/100. A plant that integrates from p on meets a weight
+    of slope one without the controller's integrator; each factor asks for its action by a fifth of the
+    corner.
     """
     corner = bandwidth_rad_s * np.sqrt(2.0 - modulus_margin**2)
     share = integral_corner(bandwidth_rad_s, modulus_margin)

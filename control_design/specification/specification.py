@@ -1,8 +1,6 @@
 """What the loop has to do, in the engineer's words, and the weights built from it.
 
-Everything is stated for the worst member of the uncertainty ellipses. Weights act on the circle through the
-Tustin frequency s = j (2/dt) tan(omega dt/2); a requirement is met where its weighted worst case is at most
-1:
+For the worst member of the uncertainty ellipses, at the Tustin frequency s = j (2/dt) tan(omega dt/2):
 
     |W1 S| <= 1   tracking and modulus margin    W1 = max(|(m s + wb)/(s + wb r)|, m)
     |W3 K S| <= 1 effort                         W3 = (s/wr + 1)/(s/(40 wr) + 1)/effort_limit

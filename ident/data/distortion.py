@@ -1,18 +1,15 @@
 """Response, noise and nonlinear distortion of periodic records, frequency by frequency and without a model.
 
 The robust method of Pintelon and Schoukens (System Identification: A Frequency Domain Approach, 2nd ed., ch.
-4) on M realisations of a random-phase signal, P whole periods of N samples each. Output Y and input U are
-spectra of single periods, their ratio G; its mean over realisations is the best linear approximation at this
-amplitude and spectrum. What differs between the periods of a realisation is noise, M (P - 1) complex degrees
-of freedom a line; between realisations it is noise / P and stochastic distortion, M - 1. At a line without
-excitation there is nothing but noise / P and distortion, M; even lines show its even part, odd ones its odd
-part, as long as only odd lines are excited.
+4) on M realisations of a random-phase signal, P whole periods each. The mean of G = Y / U over realisations
+is the best linear approximation at this amplitude and spectrum. Between the periods of a realisation there is
+noise, M (P - 1) complex degrees of freedom a line; between realisations noise / P and stochastic distortion,
+M - 1; at lines without excitation noise / P and distortion, M: its even part at even lines, as long as only
+odd lines are excited.
 
-Steady state: what lies before the last whole periods is dropped as transient, a whole period where nothing
-else lies before them. An integrating output drifts: the mean advance from a period to the next is taken off
-as a straight line. That leaves the differences between periods as they are, and adds noise that all periods
-share: a tenth of the noise power at the first line for P = 2, falling with the line's square. The input is
-taken as known.
+What lies before the last whole periods is dropped as transient. The mean advance of an integrating output
+from a period to the next is taken off as a straight line, which adds a tenth of the noise power at the first
+line for P = 2, falling with the line's square. The input is taken as known.
 """
 
 from __future__ import annotations
@@ -45,9 +42,9 @@ _ROUNDS = 6  # of weights and distortion in turns: more move it by less than 2 %
 class LineLevels:
     """Power of what is no response to the input, at lines omega_rad_s (K,), in units of |G|^2.
 
-    of_each (M, K): of the mean of each realisation's periods; its mean has `freedom` complex degrees of
-    freedom a line. noise (K,): its share of noise, known with noise_freedom, None with one period. gain (K,):
-    |G| there.
+    of_each (M, K): of the mean of each realisation's periods; their mean has `freedom` complex degrees of
+    freedom a line. noise (K,): its share, known with noise_freedom, None with one period. gain (K,): |G|
+    there.
     """
 
     omega_rad_s: RealArray
@@ -70,10 +67,9 @@ class LineLevels:
     def within(self, low_rad_s: float, high_rad_s: float, level: float = 0.95) -> BandLevel | None:
         """Distortion over gain between two frequencies, taken as one number there; None without a line.
 
-        Most likely for powers that are chi-square around (distortion + noise): where it is not one number,
-        lines of less noise count more. The interval has the degrees of freedom of their weighted sum
-        (Satterthwaite), or of the scatter of that sum between realisations where that is wider: clipping now
-        and then moves all lines together.
+        Most likely for powers that are chi-square around (distortion + noise). The interval has the degrees
+        of freedom of their weighted sum (Satterthwaite), or of its scatter between realisations where that is
+        wider.
         """
         at = (self.omega_rad_s >= low_rad_s) & (self.omega_rad_s < high_rad_s) & (self.gain > 0)
         if not at.any() or not self.freedom:
@@ -126,12 +122,11 @@ class BandLevel:
 
 @dataclass(frozen=True, eq=False)
 class Distortion:
-    """One channel at one amplitude.
+    """One channel at one amplitude rms of the input.
 
-    rms: of the input. gain (F,) at omega_rad_s (F,): best linear approximation. excited: scatter between
-    realisations, None with one of them; odd, even: lines without excitation, None where there are none.
-    noise_std (F,): of G in one period, None with one period. drift: largest mean advance of the output from a
-    period to the next, taken off.
+    gain (F,) at omega_rad_s (F,): best linear approximation. excited: scatter between realisations, None with
+    one; odd, even: lines without excitation, None where there are none. noise_std (F,): of G in one period,
+    None with one period. drift: largest mean advance of the output from a period to the next, taken off.
     """
 
     rms: float
@@ -190,10 +185,9 @@ def period_of(signal: RealArray) -> int | None:
 def distortion_of(records: Sequence[Record], *, period_samples: int | None = None) -> tuple[Distortion, ...]:
     """Levels at every amplitude, lowest first, of the periodic ones among records with one input and output.
 
-    Realisations of one amplitude share period and lines; records of the same input count as further periods
-    of one realisation. period_samples: stated, otherwise found in the input, and records without one left
-    out. Raises ValueError where a record is shorter than the stated period or does not repeat after it,
-    periods differ between records, or an output stands still.
+    Realisations of one amplitude share period and lines; records of the same input are further periods of
+    one. period_samples: stated, else found in the input. Raises ValueError where a record is shorter than the
+    stated period or does not repeat after it, periods differ between records, or an output stands still.
     """
     steady: list[_Steady] = []
     for record in records:

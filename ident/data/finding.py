@@ -104,13 +104,9 @@ def finding(kind: FindingKind, **values: Value | np.generic) -> Finding:
 
 @dataclass(frozen=True)
 class PriorTest:
-    """Verdict of the data on one prior.
-
-    statistic stands against limit: the chi-square quantile at 99 % with that many degrees of freedom, and
-    above it the prior is refused; a cancelled integrator is refused the other way round
-    (`ident.checks.prior_tests`). imposed says whether the model keeps to the prior; details are what
-    the advice needs beside these.
-    """
+    """Verdict of the data on one prior: refused where statistic exceeds limit, the chi-square quantile at 99
+    % with degrees_of_freedom (a cancelled integrator the other way round). imposed: the model keeps to the
+    prior; details: what the advice needs beside these."""
 
     kind: FindingKind
     prior: str

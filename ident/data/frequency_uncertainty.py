@@ -27,10 +27,9 @@ _CROSS = "covariance_real_imag"
 class FrequencyUncertainty:
     """G(e^{j omega dt}) ~ N(centre, covariance) over (Re, Im), frequency by frequency.
 
-    omega_rad_s (F,) strictly increasing, 0 <= omega <= pi / dt_s; centre (F,) complex; covariance (F,2,2) of
-    (real part, imaginary part), symmetric and positive semidefinite (zero = exactly known); level is the
-    confidence of each frequency's ellipse taken alone, not of all of them jointly; method says where the
-    numbers come from. Raises ValueError, naming the first frequency at fault.
+    omega_rad_s (F,) strictly increasing, 0 <= omega <= pi / dt_s; centre (F,) complex; covariance (F,2,2),
+    symmetric and positive semidefinite (zero = exactly known); level: of each frequency's ellipse taken
+    alone; method: where the numbers come from. Raises ValueError, naming the first frequency at fault.
     """
 
     omega_rad_s: RealArray

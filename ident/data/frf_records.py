@@ -22,9 +22,8 @@ _MOST_NEIGHBOURS = 50
 class FrfRepeats:
     """Measured points of a frequency response: omega_rad_s (K,), response (K,), label (K,) or none.
 
-    Points of equal frequency are repeats; the label says under which condition (date, amplitude) they were
-    taken. Runs within a condition need no label of their own. Raises ValueError for other shapes or numbers
-    that are not finite.
+    Points of equal frequency are repeats; the label is their condition (date, amplitude). Raises ValueError
+    for other shapes or numbers that are not finite.
     """
 
     omega_rad_s: RealArray
@@ -75,11 +74,8 @@ class FrfRepeats:
         return self._chosen((self.omega_rad_s >= omega_min_rad_s) & (self.omega_rad_s <= omega_max_rad_s))
 
     def open_loop(self, reference_gain: float, feedback_gain: float) -> FrfRepeats:
-        """Plant responses from those of the closed loop r -> y under u = reference_gain r - feedback_gain y.
-
-        G = T / (a - g T) point by point, so that repeats keep their own, bent distribution where 1 - g T / a
-        is small. Raises ValueError where a - g T is zero.
-        """
+        """Plant responses from those of the closed loop r -> y under u = reference_gain r - feedback_gain y:
+        G = T / (a - g T) point by point. Raises ValueError where a - g T is zero."""
         rest = reference_gain - feedback_gain * self.response
         if np.any(rest == 0):
             at = self.omega_rad_s[int(np.argmax(rest == 0))]
@@ -97,14 +93,11 @@ class FrfRepeats:
     ) -> FrequencyUncertainty:
         """Centre and covariance of the mean over all points of each frequency.
 
-        Few repeats know their own scatter badly, so the covariance is widened until the ellipse of the
-        chi-square quantile at `level` equals Hotelling's T-square ellipse at that level (variance x 1.7 with
-        10 repeats, x 9.5 with 4, x 133 with 3). pool_neighbours = m averages relative covariances over m
-        frequencies on either side first, which suits a scatter that varies slowly with frequency and few
-        repeats. outlier_threshold = t drops points farther than t robust standard deviations from the median
-        of their frequency. of = "next run" gives the region of one more run instead: scatter of a run plus
-        error of the mean, widened to Hotelling's prediction region. Raises ValueError where a frequency is
-        left with too few repeats.
+        The covariance is widened until the ellipse of the chi-square quantile at `level` equals Hotelling's
+        (variance x 1.7 with 10 repeats, x 9.5 with 4, x 133 with 3). pool_neighbours = m averages relative
+        covariances over m frequencies on either side first. outlier_threshold = t drops points farther than t
+        robust standard deviations from the median of their frequency. of = "next run": the region of one more
+        run (Hotelling's prediction region). Raises ValueError where a frequency is left with too few repeats.
         """
         if pool_neighbours < 0:
             raise ValueError(f"pool_neighbours must not be negative; got {pool_neighbours}")

@@ -25,20 +25,15 @@ def empirical_frf(
 ) -> FrequencyUncertainty:
     """Frequency response by averaged ratios of discrete Fourier transforms, with its covariance.
 
-    G = sum(Y conj(W)) / sum(U conj(W)) over the 2 half_width_lines + 1 neighbouring lines and all records,
-    where the instrument W is the reference if every record has exactly one (closed loop: G = (r -> y) / (r ->
-    u), unbiased although the noise feeds back into u), else the input itself. The covariance is circular,
-    from the residuals Y - G U of the same lines, so a response that bends within the averaging width shows up
-    as uncertainty; with n independent terms it is widened to the quantile of F(2, 2 (n - 1)) at `level`.
-    Records with the same instrument repeat nonlinear distortion exactly, so there a line of all records
-    together is one term, unless half_width_lines = 0, where the scatter between records is all there is and
-    distortion stays unseen.
+    G = sum(Y conj(W)) / sum(U conj(W)) over 2 half_width_lines + 1 neighbouring lines and all records, W the
+    reference if every record has exactly one (unbiased in a loop), else the input. The covariance is
+    circular, from the residuals Y - G U of the same lines, widened to the quantile of F(2, 2 (n - 1)) at
+    `level` for n independent terms. Records with the same instrument repeat distortion: a line of all
+    together is one term, unless half_width_lines = 0, where distortion stays unseen.
 
-    records: SISO, equal length and sampling time. half_width_lines: none given means 0 for three or more
-    records and otherwise just enough for five lines. The result has one frequency per averaging width,
-    between omega_min_rad_s (default: the first whole width) and omega_max_rad_s (default: pi/dt). periodic =
-    False takes a straight line off every signal, so that offset and drift do not leak; True takes the records
-    as whole periods in steady state. Raises ValueError when the
+    records: SISO, equal length and sampling time. half_width_lines: default 0 for three or more records, else
+    2. One frequency per averaging width, from omega_min_rad_s to omega_max_rad_s (pi/dt). periodic: whole
+    periods in steady state; else a straight line is taken off every signal. Raises ValueError when the
     records do not fit together or leave fewer than three spectral lines per estimate.
     """
     spectra = spectra_of(records, periodic)

@@ -28,20 +28,11 @@ _SAME_CLOCK = 1e-3
 class Record:
     """One uniformly sampled experiment.
 
-    name : str. Shown to the user; the file stem when read from a file.
-    input : (T, U) array
-    output : (T, Y) array
-    dt_s : float. Sampling time in seconds.
-    input_names, output_names : tuple of str. U and Y distinct names.
-    reference : (T, R) array or None. Closed-loop reference, if there is one.
-    reference_names, input_units, output_units : tuple of str
-        Units are free text for display, either empty or one per column.
-    source : str. Where the data came from (the file), named in later error messages.
-    time_column : TimeColumn or None
-        What the file's time stamps were taken for; None where dt_s was given without any.
-    repair : Repair or None. What was done to rows that jittered or were missing.
-    cut : int. Samples of the commanded input beyond what the amplifier gives (`limited`).
-    notes : tuple of Finding. What else there is to know of how the file was read.
+    input (T, U), output (T, Y), reference (T, R) or None, with distinct names each; units are free text,
+    empty or one per column. name: shown to the user; source: the file, named in error messages. time_column:
+    what time stamps were taken for, None where dt_s was given without. repair: what was done to rows that
+    jittered or were missing. cut: samples of the commanded input beyond what the amplifier gives (`limited`).
+    notes: how the file was read.
 
     Raises ValueError if a shape or a name does not fit, dt_s is not positive, or a sample is not finite or
     above 1e100 (names the first one).
@@ -213,15 +204,13 @@ class Record:
     ) -> Self:
         """Read columns of a log file, or of a table that is there; readers: `ident.data.record_files`.
 
-        The sampling time comes from the column `time`, from dt_s, or from both if they agree. The unit of
-        the time stamps is time_unit, else the one in the column's name ('t_ms', 'Zeit [ms]'), else seconds;
-        signals keep the unit in their names. What was taken stands in `time_column`, `input_units` and
-        `output_units`. scale, offset, units: by column, quantity = scale * column + offset in that unit.
-        repair: stamps that jitter, and single missing rows, are put on a uniform grid (`TimeGrid`), not
-        refused. resample_s: all rows are put on a grid of this step, not shorter than the log's own
-        (`CoarseGrid`), whatever repair says. unwrap: by column, the period at which its readings wrap (4096,
-        360), before scale and offset. decimal: the sign that separates decimals in text, 'point' or 'comma',
-        where the numbers leave a doubt. Raises ValueError in one line naming file and place.
+        The sampling time comes from the column `time`, from dt_s, or from both if they agree. Time has the
+        unit time_unit, else that in the column's name ('t_ms', 'Zeit [ms]'), else seconds. scale, offset,
+        units: by column, quantity = scale * column + offset in that unit. repair: stamps that jitter, and
+        single missing rows, are put on a uniform grid (`TimeGrid`). resample_s: all rows are put on a grid of
+        this step (`CoarseGrid`). unwrap: by column, the period at which its readings wrap (4096, 360), before
+        scale and offset. decimal: 'point' or 'comma', where the numbers leave a doubt. Raises ValueError in
+        one line naming file and place.
         """
         table = (path if isinstance(path, Table) else read_table(path)).with_decimal(decimal)
         for key, names in (("inputs", inputs), ("outputs", outputs), ("references", references)):

@@ -1,9 +1,9 @@
-"""Repeats of one experiment at one amplitude or several: what scatters, and what the amplitude changes.
+"""Repeats of one experiment at one amplitude or several: what scatters, and what the amplitude changes,
+without a model.
 
-No model. Records whose excitation (the reference of a closed loop, else the input) has the same course are
-one experiment; the size of the excitation is its amplitude. What differs between repeats of an amplitude is
-noise and change from run to run; distortion that repeats is not in it. Of a linear arm the response is the
-same at every amplitude, so what differs between amplitudes by more than the repeats scatter is not linear.
+Records whose excitation (the reference of a closed loop, else the input) has the same course are one
+experiment; its size is its amplitude. Repeats of an amplitude differ by noise and change from run to run. Of
+a linear arm the response does not depend on amplitude.
 """
 
 from __future__ import annotations
@@ -36,12 +36,11 @@ _FEWEST = 3  # frequencies in a band: of fewer there is no slope beside its mean
 class AmplitudeBand:
     """Largest against smallest amplitude in a band, as shares of the response, RMS.
 
-    difference: between the means, noise taken off; chance: what it would be by the scatter of the repeats
-    alone; scatter: of one repeat, mean over both amplitudes; gain: mean relative change in the band; shift:
-    relative change of the frequencies of resonances and zeros that fits the rest best (the response moved
-    along its slope); level_share, shift_share: of the difference's power, what one change of gain and phase
-    for the whole band explains, and what the shift; probability: of so large a difference by chance
-    (`Repeats.across_amplitudes`).
+    difference: between the means, noise taken off; chance: by the scatter of the repeats alone; scatter: of
+    one repeat, mean of both; gain: mean relative change; shift: relative change of the frequencies of
+    resonances and zeros that fits the rest best; level_share, shift_share: of the difference's power, what
+    one change of gain and phase for the band explains, and the shift; probability: of so large a difference
+    by chance.
     """
 
     from_rad_s: float
@@ -87,12 +86,10 @@ class Repeats:
     def across_amplitudes(self, low_rad_s: float, high_rad_s: float) -> AmplitudeBand | None:
         """None with one amplitude, or fewer than three frequencies in the band.
 
-        Every frequency counts by the power of its response, so that zeros, all noise, do not decide. The test
-        is the one of Dempster (Annals of Mathematical Statistics 29(4), 1958) for more dimensions than
-        repeats: power of the difference over that of the scatter, against F(2 r, 2 r n), n complex degrees of
-        freedom of the repeats (Welch's, for amplitudes that scatter differently) and r = tr(S)^2 / tr(S^2)
-        independent errors in the band, S their covariance between frequencies, its traces freed of the bias
-        that few repeats give them.
+        Frequencies count by the power of their response. Dempster's test (Annals of Mathematical Statistics
+        29(4), 1958): power of the difference over that of the scatter, against F(2 r, 2 r n), n complex
+        degrees of freedom of the repeats (Welch's) and r = tr(S)^2 / tr(S^2) independent errors in the band,
+        S their covariance between frequencies, freed of the bias of few repeats.
         """
         at = (self.omega_rad_s >= low_rad_s) & (self.omega_rad_s < high_rad_s)
         if len(self.rms) < 2 or np.count_nonzero(at) < _FEWEST:

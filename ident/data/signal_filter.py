@@ -23,14 +23,10 @@ def band_limited(
 ) -> Record:
     """Filter input, output and reference with one Butterworth filter; drop the first `skip_s` seconds.
 
-    A linear system between input and output does not change, so a fit of the filtered record is a fit
-    weighted to the band. Meant for drift and friction below `low_rad_s` and noise above `high_rad_s`; None
-    leaves that side open. The filter starts with its steady state for the first sample; what the plant did
-    before the record (and before `skip_s`) is not in it, so that a lightly damped plant not at rest then
-    needs an unknown initial state in the fit.
-
-    Raises ValueError if the band is empty or leaves (0, pi/dt), both sides are None, or nothing is left after
-    `skip_s`.
+    A fit of the result is weighted to the band; None leaves a side open. The filter starts with its steady
+    state for the first sample, so that a lightly damped plant not at rest needs an unknown initial state in
+    the fit. Raises ValueError if the band is empty or leaves (0, pi/dt), both sides are None, or nothing is
+    left after `skip_s`.
     """
     nyquist = np.pi / record.dt_s
     low, high = low_rad_s, high_rad_s

@@ -32,9 +32,9 @@ _MOST_NUMBERED = 256
 class Table:
     """Named columns of one file.
 
-    raw: by name, an array, or text cells (a tuple of str) as `layout` says they are written. A matrix (T, C)
-    is offered as C columns name[0], name[1], ... `first_line` is the file line of row 0, or None where rows
-    have no lines (npz, mat). units: by name, where the file states them apart from the names.
+    raw: by name, an array, or text cells (a tuple of str) as `layout` says. A matrix (T, C) is offered as C
+    columns name[0], name[1], ... first_line: file line of row 0, None where rows have no lines (npz, mat).
+    units: by name, where the file states them apart from the names.
     """
 
     path: Path
@@ -91,8 +91,7 @@ class Table:
 
     def columns(self, wanted: Sequence[str], rows_of: str | None = None) -> dict[str, RealArray]:
         """The wanted columns as equally long finite vectors; dates and clock times in seconds. With clocks,
-        on the rows of the first, or of `rows_of`: the others hold what came last, and rows before all have
-        come are left out.
+        on the rows of the first, or of `rows_of`: the others hold what came last, from where all have come.
 
         Raises ValueError if one is missing (lists those there are), not numeric, not finite or of another
         length.

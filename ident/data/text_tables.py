@@ -54,12 +54,11 @@ _NO_TEXT = re.compile(r"[\x00-\x08\x0e-\x1f]")
 class Layout:
     """How a text table is written.
 
-    separator: one of , ; tab | or a blank for any run of blanks. decimal: point or comma. names: of the
-    columns, numbered where there is no header line. units: by name, of a line of units. header, first: line
-    (from 1) of the names, 0 where there are none, and of the first row. skipped: lines from there on that are
-    no rows: commented out, or blank; commented: how many of them are commented out. increment: (start, step)
-    of the rows in seconds, where the lines above say so. plain: whether the decimal sign separates no groups
-    of digits for certain; stated: whether the user says which it is.
+    separator: , ; tab | or a blank for any run of blanks. decimal: point or comma. names: of the columns,
+    numbered where there is no header line. units: by name, of a line of units. header, first: line (from 1)
+    of the names, 0 for none, and of the first row. skipped: lines from there on that are no rows; commented:
+    how many of them are commented out. increment: (start, step) of the rows [s], where lines above say so.
+    plain: the decimal sign separates no groups of digits for certain; stated: by the user.
     """
 
     separator: str

@@ -168,11 +168,11 @@ def _fitted(stamps: RealArray) -> tuple[IntArray, RealArray, float]:
 
 @dataclass(frozen=True)
 class Repair:
-    """What was done to the rows of a log to have them on a uniform grid.
+    """What was done to the rows of a log to have them on a uniform grid: missing of samples rows were filled
+    in; jitter: largest distance of a stamp from its instant, in samples.
 
-    missing of samples rows were filled in; jitter: largest distance of a stamp from its instant, in samples.
-    own_s: where the grid is a coarser one, the usual step of the log itself [s], and jitter is of that; 0 on
-    the log's own grid. largest_s: the largest step that is not longer than one of the coarser grid.
+    Of a coarser grid: own_s, the usual step of the log itself [s], of which jitter is then (0 on the log's
+    own grid); largest_s: the largest step not longer than one of the grid.
     """
 
     samples: int
@@ -202,12 +202,8 @@ class Repair:
 
 @dataclass(frozen=True, eq=False)
 class TimeGrid:
-    """Rows of a log on multiples of the sampling period.
-
-    dt_s : float. Sampling period, by least squares over all stamps.
-    rows : (R,) integers, increasing from 0: the sample each row of the log is.
-    late : (R,). Stamp minus instant of that sample, in samples; 0 where all are on the grid.
-    """
+    """Rows of a log on multiples of the sampling period dt_s (least squares over all stamps). rows (R,): the
+    sample each row is, increasing from 0. late (R,): stamp minus instant of that sample, in samples."""
 
     dt_s: float
     rows: IntArray
@@ -221,11 +217,8 @@ class TimeGrid:
     @classmethod
     def of(cls, table: Table, name: str, stamps: RealArray, *, options: bool = True) -> TimeGrid:
         """The grid under the stamps (R,) [s] of the column `name`; its phase is their mean. options: as of
-        `sampling_time`.
-
-        Raises ValueError, one line with file and row: time that does not increase, more than five rows lost
-        at a place or one in twenty of all, a stamp further off the grid than a fifth of a sample.
-        """
+        `sampling_time`. Raises ValueError, one line with file and row: time that does not increase, too many
+        rows lost, a stamp too far off the grid."""
         table.increasing(stamps, name)
         interval = np.diff(stamps)
         step, counts = float(np.median(interval)), _counts(interval)
@@ -269,12 +262,8 @@ class TimeGrid:
         return tuple(int(k) for k in np.setdiff1d(np.arange(self.rows[-1] + 1), self.rows))
 
     def sampled(self, values: RealArray) -> RealArray:
-        """Outputs (R, Y) read at the stamps -> (T, Y) at the grid's instants.
-
-        A cubic spline through the readings: neglected are the fourth derivative over a sample, and that the
-        noise of the readings next to a missing row goes into it. Readings that are on the grid stay as they
-        are.
-        """
+        """Outputs (R, Y) read at the stamps -> (T, Y) at the grid's instants, by a cubic spline. Neglected:
+        the fourth derivative over a sample; noise of the readings next to a missing row."""
         from scipy.interpolate import CubicSpline  # here: a log that is refused never waits for it
 
         grid = np.arange(self.rows[-1] + 1)

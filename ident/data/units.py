@@ -161,14 +161,9 @@ def ends_with_time(name: str) -> bool:
 
 @dataclass(frozen=True)
 class TimeColumn:
-    """What the time stamps of a log were taken for.
-
-    name : str. The column.
-    unit : str. One of `KNOWN_TIME_UNITS`.
-    in_header : str. The unit in the column's name, empty if there is none.
-    stated : bool. Whether the user stated the unit (which counts more than the header).
-    doubtful : bool. The stamps are called seconds and look like integer milliseconds.
-    """
+    """What the time stamps of a log were taken for: unit, one of `KNOWN_TIME_UNITS`; in_header: that in the
+    column's name, or empty; stated: by the user, which counts more. doubtful: called seconds, and look like
+    integer milliseconds."""
 
     name: str
     unit: str

@@ -77,12 +77,8 @@ def wraps_at(values: RealArray) -> float:
 
 def unwrapped(values: RealArray, period: float) -> tuple[RealArray, float]:
     """Readings (T,) that wrap at this period, going on instead; and their longest step as a share of the
-    period where it is so near to half of it that some may go the wrong way, else 0.
-
-    Where steps come near half a period the turn is taken that changes the speed least, if that is by less
-    than a quarter of a period per sample: a machine turns on. It is a guess all the same, and the first step
-    is always the shorter one.
-    """
+    period where it is so near to half of it that some may go the wrong way, else 0. Near half a period the
+    turn is taken that changes the speed least, if by less than a quarter of a period per sample: a guess."""
     found = np.unwrap(values, period=period)
     longest = float(np.max(np.abs(np.diff(found)), initial=0.0)) / period
     if longest <= _NEARLY_HALF:
