@@ -1,4 +1,4 @@
-"""Interrupts (signals, the end of a time limit) that compiled code swallows, and processes that see none."""
+"""Interrupts (signals, the end of a time limit) that compiled code swallows."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
 from types import FrameType
 from typing import Any
 
@@ -47,20 +46,3 @@ def interrupts_kept() -> Iterator[None]:
         sys.stderr = stderr
         if seen:
             raise KeyboardInterrupt
-
-
-@contextmanager
-def interrupts_wait() -> Iterator[None]:
-    """Interrupts come through only at the end; processes begun inside do not see them."""
-    resource_tracker.ensure_running()  # its own start would let them through
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def leave_to_parent() -> None:
-    """In a worker process: the parent alone answers to the keyboard."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -14,7 +14,7 @@ from control_design.synthesis.descent import MinimaxDescent, natural_units
 from control_design.synthesis.problem import EXCHANGE_TOLERANCE
 from control_design.synthesis.starts import StartMaker, with_gain
 from control_design.synthesis.synthesis_result import StartReport
-from control_design.synthesis.work_pool import Candidate, StartTask, WorkPool, Workshop
+from control_design.synthesis.workshop import Candidate, StartTask, Workshop
 from control_design.synthesis.youla_starts import FreeControllers, fitted
 
 Told = Callable[[float, str], None]
@@ -55,13 +55,12 @@ class OrderSearch:
     def __init__(
         self,
         workshop: Workshop,
-        pool: WorkPool,
         cascade: Cascade,
         rng: np.random.Generator,
         tell: Told,
         given: Sequence[Real] = (),
     ) -> None:
-        self.workshop, self.pool, self.problem = workshop, pool, workshop.problem
+        self.workshop, self.problem = workshop, workshop.problem
         self.cascade, self.rng, self.tell, self.given = cascade, rng, tell, given
         self.options, self.spec = self.problem.options, self.problem.spec
         self.reports: list[StartReport] = []
@@ -207,7 +206,7 @@ class OrderSearch:
 
     def _done(self, tasks: Sequence[StartTask]) -> Iterator[Candidate]:
         """Where they ended, one after the other; what was run is noted."""
-        for end in self.pool.do(tasks):
+        for end in map(self.workshop.do, tasks):
             self.reports += end.reports
             yield end
 

@@ -20,7 +20,7 @@ from control_design.synthesis.problem import Problem
 from control_design.synthesis.starts import with_cancelling_section
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
-from control_design.synthesis.work_pool import Candidate, WorkPool, Workshop
+from control_design.synthesis.workshop import Candidate, Workshop
 from control_design.synthesis.youla_starts import FreeController, FreeControllers, free_controllers
 
 Progress = Callable[[float, str], None]
@@ -84,17 +84,16 @@ def synthesise(
     ladder = _ladder(specification.sections(), _LOWEST_TRACKING if problem.asks_tracking else _LOWEST_ORDER)
     reports: list[StartReport] = []
     workshop = Workshop(problem)
-    with WorkPool(workshop, options.jobs) as pool:
-        grids = list(problem.grids)
-        search = OrderSearch(workshop, pool, cascade, np.random.default_rng([root, 0]), part_of(tell, 0, 2))
-        result, settled = search.quick(free_controllers(problem.plants, specification))
-        reports += search.reports
-        if thorough and not settled:
-            problem.grids[:] = grids  # what the fits violated may be of no concern to other starts
-            rest = part_of(tell, 1, 2)
-            found = _climbed(workshop, pool, ladder, root, own_damping, result.best, rest, reports)
-            worse = result.best is None or (found.best and found.best.gamma <= result.best.gamma)
-            result = found if worse else result
+    grids = list(problem.grids)
+    search = OrderSearch(workshop, cascade, np.random.default_rng([root, 0]), part_of(tell, 0, 2))
+    result, settled = search.quick(free_controllers(problem.plants, specification))
+    reports += search.reports
+    if thorough and not settled:
+        problem.grids[:] = grids  # what the fits violated may be of no concern to other starts
+        rest = part_of(tell, 1, 2)
+        found = _climbed(workshop, ladder, root, own_damping, result.best, rest, reports)
+        worse = result.best is None or (found.best and found.best.gamma <= result.best.gamma)
+        result = found if worse else result
     return _told(problem, cascade, result, tuple(reports), tell)
 
 
@@ -116,39 +115,38 @@ def _of_lowest_order(problem: Problem, root: int, tell: Progress) -> SynthesisRe
     enough = max(_WITHIN * free.gamma if np.isfinite(free.gamma) else 0.0, limit)
     workshop, reports = Workshop(problem), list[StartReport]()
     found: dict[int, tuple[float, OrderResult]] = {}
-    with WorkPool(workshop, problem.options.jobs) as pool:
 
-        def search(order: int) -> OrderSearch:
-            sections = specification.model_copy(update={"controller_order": order}).sections()
-            cascade = Cascade(sections, problem.dt_s, problem.scale_rad_s)
-            part = part_of(tell, len(found), _HIGHEST, f"order {order}: ")
-            return OrderSearch(workshop, pool, cascade, np.random.default_rng([root, order]), part)
+    def search(order: int) -> OrderSearch:
+        sections = specification.model_copy(update={"controller_order": order}).sections()
+        cascade = Cascade(sections, problem.dt_s, problem.scale_rad_s)
+        part = part_of(tell, len(found), _HIGHEST, f"order {order}: ")
+        return OrderSearch(workshop, cascade, np.random.default_rng([root, order]), part)
 
-        def gamma(order: int) -> float:
-            own = search(order)
-            own.tell(0.0, "fits of the bound")
-            result = own.fits_only(free, enough)
-            reports.extend(own.reports)
-            found[order] = np.inf if result.best is None else result.best.gamma, result
-            return found[order][0]
-
-        order, within = _MIDDLE, enough
-        while gamma(order) > enough and order < _HIGHEST:
-            if order - 2 in found and found[order][0] > _GAINS * found[order - 2][0]:
-                break
-            order += 1
-        if found[order][0] > enough:
-            within = _WITHIN * min(value for value, _ in found.values())
-            order = min(number for number, (value, _) in found.items() if value <= within)
-        if order == _MIDDLE:
-            while order > 1 and gamma(order - 1) <= within:
-                order -= 1
+    def gamma(order: int) -> float:
         own = search(order)
-        result = found[order][1]
-        if found[order][0] > enough:
-            result, _ = own.quick(free)
-            reports += own.reports
-        cascade = own.cascade
+        own.tell(0.0, "fits of the bound")
+        result = own.fits_only(free, enough)
+        reports.extend(own.reports)
+        found[order] = np.inf if result.best is None else result.best.gamma, result
+        return found[order][0]
+
+    order, within = _MIDDLE, enough
+    while gamma(order) > enough and order < _HIGHEST:
+        if order - 2 in found and found[order][0] > _GAINS * found[order - 2][0]:
+            break
+        order += 1
+    if found[order][0] > enough:
+        within = _WITHIN * min(value for value, _ in found.values())
+        order = min(number for number, (value, _) in found.items() if value <= within)
+    if order == _MIDDLE:
+        while order > 1 and gamma(order - 1) <= within:
+            order -= 1
+    own = search(order)
+    result = found[order][1]
+    if found[order][0] > enough:
+        result, _ = own.quick(free)
+        reports += own.reports
+    cascade = own.cascade
     return _told(problem, cascade, result, tuple(reports), tell)
 
 
@@ -176,9 +174,8 @@ def synthesise_near(
     cascade, workshop = Cascade(problem.spec.sections(), problem.dt_s, problem.scale_rad_s), Workshop(problem)
     omega = problem.grids[0]
     known = FreeController(omega, controller.response(omega, with_delay=False))
-    with WorkPool(workshop, problem.options.jobs) as pool:
-        search = OrderSearch(workshop, pool, cascade, rng, tell)
-        result = search.fits_only(FreeControllers((known,), np.inf), np.inf)
+    search = OrderSearch(workshop, cascade, rng, tell)
+    result = search.fits_only(FreeControllers((known,), np.inf), np.inf)
     return _told(problem, cascade, result, result.reports, tell)
 
 
@@ -203,7 +200,6 @@ def _told(
 
 def _climbed(
     workshop: Workshop,
-    pool: WorkPool,
     ladder: Sequence[tuple[SectionKind, ...]],
     root: int,
     own_damping: float,
@@ -227,7 +223,7 @@ def _climbed(
         if number == len(ladder) - 1 and fitted is not None:
             given.append(fitted.parameters)
         part = part_of(tell, number, len(ladder), f"order {cascade.order}: ")
-        result = OrderSearch(workshop, pool, cascade, own, part, given).run()
+        result = OrderSearch(workshop, cascade, own, part, given).run()
         reports += result.reports
     return result
 

@@ -32,12 +32,6 @@ class SynthesisOptions(GridOptions):
         le=5000,
         description="IPOPT iterations per start; a descent then finishes it",
     )
-    jobs: int = Field(
-        default=1,
-        ge=1,
-        le=64,
-        description="processes that work on the starts; the result does not depend on their number",
-    )
 
 
 class MultivariableOptions(BaseModel):

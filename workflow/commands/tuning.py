@@ -165,8 +165,7 @@ class TuningSession:
 
         with self._designing:
             still()
-            options = asked.synthesis.model_copy(update={"jobs": 1})
-            rng = stage_rng(self.seed, "design")
+            options, rng = asked.synthesis, stage_rng(self.seed, "design")
             if like is None:
                 found = find_design(
                     plants, specification, options, asked.certificate, rng, still, advise=False

@@ -23,7 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
@@ -31,7 +31,6 @@ from typing import Any, Protocol, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from control_design.synthesis.interrupts import interrupts_wait
 from workflow.engine.errors import InputError, StageError, one_line
 from workflow.engine.threads import one_thread_each
 
@@ -192,12 +191,23 @@ def _begin(process: BaseProcess) -> None:
         try:
             if sys.platform.startswith("linux"):
                 # It loads for seconds and would tell of an interrupt from the keyboard with a traceback.
-                with interrupts_wait():
+                with _interrupts_wait():
                     forkserver.ensure_running()
             return process.start()
         except (EOFError, ConnectionError):
             time.sleep(0.5)  # until the dead one is known to be dead
     raise StageError("no process can be begun: the one they are forked off dies each time (out of memory?)")
+
+
+@contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """Interrupts come through only at the end; processes begun inside do not see them."""
+    resource_tracker.ensure_running()  # its own start would let them through
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _work(connection: Connection, task: Task[Any]) -> None:

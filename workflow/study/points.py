@@ -117,8 +117,7 @@ def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
             run.stage_digest(stage.name)  # says which one is missing
     else:
         config, _ = load_config(base)
-    # The points share the processors already, and a Dask worker may start no processes of its own.
-    values: dict[str, Any] = {"synthesis.jobs": 1, **study.changes}
+    values: dict[str, Any] = dict(study.changes)
     if study.study.seed is not None:
         values["run.seed"] = study.study.seed
     inputs = {} if run is None else run.manifest()["inputs"]
