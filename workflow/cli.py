@@ -15,6 +15,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import fields
 from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
@@ -45,6 +46,7 @@ from workflow.engine.threads import one_thread
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
+    from workflow.commands.logs import Reading
     from workflow.config.settings import ModelT
     from workflow.console import TerminalProgress
     from workflow.text.templates import RunSummary
@@ -137,6 +139,38 @@ CFloat = Annotated[
         "--c-float/--c-double", help="Numbers of the C code; double if left out. Fixed point is not offered."
     ),
 ]
+
+
+InputName = Annotated[
+    str | None, typer.Option("--input", help="Name of the input column [default: as names and units say]")
+]
+OutputName = Annotated[str | None, typer.Option("--output", help="Name of the output column.")]
+Time = Annotated[str | None, typer.Option(help="Name of the time column [default: what looks like it]")]
+Reference = Annotated[
+    str | None,
+    typer.Option(help="Reference column of logs made in closed loop [default: what looks like one]"),
+]
+Scale = Annotated[
+    list[str] | None,
+    typer.Option(help="COLUMN=FACTOR: quantity = factor * column + offset (repeatable).", metavar="TEXT"),
+]
+Unit = Annotated[list[str] | None, typer.Option(help="COLUMN=UNIT of the scaled quantity (repeatable).")]
+Unwrap = Annotated[
+    list[str] | None,
+    typer.Option(help="COLUMN=PERIOD of a column that wraps: encoder=4096, angle_deg=360 (repeatable)."),
+]
+Mjcf = Annotated[str | None, typer.Option(help="MuJoCo model of the machine, in place of a case.")]
+Fmu = Annotated[
+    str | None,
+    typer.Option(help="FMU (FMI 2.0, co-simulation), in place of a case; runs its native code."),
+]
+Python = Annotated[str | None, typer.Option(help="Python file with a simulation, in place of a case.")]
+MachineLog = Annotated[
+    list[str] | None,
+    typer.Option(help="Log of that machine; of several the last one judges, of one its last third."),
+]
+MachineDt = Annotated[float | None, typer.Option(help="Sampling period [s] of its logs without time.")]
+Seed = Annotated[int, typer.Option(min=0, help="Root of the random starts.")]
 
 
 class PictureFile(StrEnum):
@@ -249,9 +283,9 @@ def excite(
             help="With --closed-loop: largest motion, in the output's unit [default: the logs' largest]"
         ),
     ] = None,
-    input_name: Annotated[str | None, typer.Option("--input", help="Name of the command's column.")] = None,
-    output_name: Annotated[str | None, typer.Option("--output", help="Name of the output's column.")] = None,
-    reference: Annotated[str | None, typer.Option(help="Name of the reference's column.")] = None,
+    input_name: InputName = None,
+    output_name: OutputName = None,
+    reference: Reference = None,
     rms: Annotated[
         list[float] | None,
         typer.Option(help="Root mean square [V] (repeatable) [default: the highest allowed, and half of it]"),
@@ -276,20 +310,19 @@ def excite(
     as_json: Json = False,
 ) -> None:
     """Plan random-phase multisines that tell response, noise and nonlinear distortion apart."""
-    stated = {"realisations": realisations, "periods": periods}
-    given: dict[str, Any] = {key: value for key, value in stated.items() if value is not None}
+    named = locals()
+    given = _stated({"realisations": realisations, "periods": periods})
     if closed_loop != bool(log):
         raise InputError("--closed-loop goes with logs of the loop: flexlink excite --closed-loop LOG... ...")
     if log:
         need(*log)
         from workflow.commands.excite import write_reference
 
-        columns = {"input_name": input_name, "output_name": output_name, "reference": reference}
         given |= {"band_Hz": band, "duration_s": duration, "seed": seed, "lead_in_s": lead_in}
         summary = write_reference(
             log,
             out,
-            columns={**columns, "dt_s": dt_s},
+            _reading(named),
             largest_command=voltage,
             largest_motion=motion,
             rms=rms[0] if rms else None,
@@ -324,9 +357,7 @@ def excite(
 @app.command(cls=_OfSettings, short_help="What a log holds: columns, units, sampling, ranges.")
 def look(
     log: Annotated[Path, typer.Argument(help="CSV or other tables, npz, MAT, ... (docs/logs.md).")],
-    time: Annotated[
-        str | None, typer.Option(help="Name of the time column [default: what looks like it]")
-    ] = None,
+    time: Time = None,
     time_unit: Annotated[str | None, typer.Option(help=_LOGS)] = None,
     decimal: Annotated[str | None, typer.Option(help=_LOGS)] = None,
     out: Annotated[Path | None, typer.Option(help="Write a page here (HTML, one file).")] = None,
@@ -347,26 +378,15 @@ def init(
         typer.Argument(help="CSV or other tables, npz, MAT, ... (docs/logs.md); the last one validates."),
     ],
     out: Annotated[Path, typer.Option(help="Write the configuration here (TOML), for `flexlink run`.")],
-    input_name: Annotated[
-        str | None,
-        typer.Option("--input", help="Name of the input column [default: as names and units say]"),
-    ] = None,
-    output_name: Annotated[str | None, typer.Option("--output", help="Name of the output column.")] = None,
-    reference: Annotated[
-        str | None, typer.Option(help="Name of the reference column of logs made in closed loop.")
-    ] = None,
-    time: Annotated[str | None, typer.Option(help="Name of the time column.")] = None,
+    input_name: InputName = None,
+    output_name: OutputName = None,
+    reference: Reference = None,
+    time: Time = None,
     time_unit: Annotated[str | None, typer.Option(help=_LOGS)] = None,
     dt_s: Annotated[float | None, typer.Option(help="Sampling period [s], without a time column.")] = None,
-    scale: Annotated[
-        list[str] | None, typer.Option(help="COLUMN=FACTOR (repeatable).", metavar="TEXT")
-    ] = None,
-    unit: Annotated[
-        list[str] | None, typer.Option(help="COLUMN=UNIT of the scaled quantity (repeatable).")
-    ] = None,
-    unwrap: Annotated[
-        list[str] | None, typer.Option(help="COLUMN=PERIOD of a column that wraps [default: as it shows]")
-    ] = None,
+    scale: Scale = None,
+    unit: Unit = None,
+    unwrap: Unwrap = None,
     decimal: Annotated[str | None, typer.Option(help=_LOGS)] = None,
     input_limit: Annotated[float | None, typer.Option(help=_LOGS)] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Write over what is at --out.")] = False,
@@ -374,28 +394,11 @@ def init(
     as_json: Json = False,
 ) -> None:
     """Look at logs and write a configuration that runs: columns, roles, structure and a specification."""
+    given = locals()
     need(*log)
     from workflow.commands.init import init as write_configuration
 
-    _show(
-        write_configuration(
-            log,
-            out,
-            input_name=input_name,
-            output_name=output_name,
-            reference=reference,
-            time=time,
-            time_unit=time_unit,
-            dt_s=dt_s,
-            scale={name: _number("--scale", text) for name, text in _named("--scale", scale).items()},
-            units=_named("--unit", unit),
-            unwrap={name: _number("--unwrap", text) for name, text in _named("--unwrap", unwrap).items()},
-            decimal=decimal,
-            input_limit=input_limit,
-            replace_file=replace,
-        ),
-        as_json,
-    )
+    _show(write_configuration(log, out, _reading(given), replace_file=replace), as_json)
 
 
 @app.command(cls=_OfSettings, short_help="Identify one channel from log files; one-page report.")
@@ -406,29 +409,20 @@ def identify(
             help="CSV or other tables, npz, MAT, ... (docs/logs.md); several files are fitted together."
         ),
     ],
-    input_name: Annotated[
-        str | None,
-        typer.Option("--input", help="Name of the input column [default: as names and units say]"),
-    ] = None,
-    output_name: Annotated[str | None, typer.Option("--output", help="Name of the output column.")] = None,
-    time: Annotated[str | None, typer.Option(help="Name of the time column; this or --dt-s.")] = None,
+    input_name: InputName = None,
+    output_name: OutputName = None,
+    time: Time = None,
     time_unit: Annotated[str | None, typer.Option(help=_LOGS)] = None,
     dt_s: Annotated[
         float | None,
         typer.Option(help="Sampling period [s], if there is no --time; beside it, the exact one within 1 %."),
     ] = None,
-    scale: Annotated[
-        list[str] | None,
-        typer.Option(help="COLUMN=FACTOR: quantity = factor * column + offset (repeatable).", metavar="TEXT"),
-    ] = None,
+    scale: Scale = None,
     offset: Annotated[list[str] | None, typer.Option(help="COLUMN=VALUE, added after scaling.")] = None,
-    unit: Annotated[list[str] | None, typer.Option(help="COLUMN=UNIT of that quantity.")] = None,
+    unit: Unit = None,
     repair: Annotated[bool, typer.Option("--repair", help=_LOGS)] = False,
     resample_s: Annotated[float | None, typer.Option(help=_LOGS)] = None,
-    unwrap: Annotated[
-        list[str] | None,
-        typer.Option(help="COLUMN=PERIOD of a column that wraps: encoder=4096, angle_deg=360 (repeatable)."),
-    ] = None,
+    unwrap: Unwrap = None,
     decimal: Annotated[str | None, typer.Option(help=_LOGS)] = None,
     report_page: Annotated[
         Path | None,
@@ -440,10 +434,7 @@ def identify(
     validation: Annotated[
         list[Path] | None, typer.Option(help="Log kept for validation (repeatable).")
     ] = None,
-    reference: Annotated[
-        str | None,
-        typer.Option(help="Reference column of logs made in closed loop [default: what looks like one]."),
-    ] = None,
+    reference: Reference = None,
     loop_method: Annotated[
         str | None,
         typer.Option(help="Of logs made in closed loop: auto, direct or two_stage [default: auto]."),
@@ -479,13 +470,13 @@ def identify(
     as_json: Json = False,
 ) -> None:
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
+    given = locals() | {"relative_degree": _degree(relative_degree)}
     need(*log, *(validation or []))
     from workflow.commands.logs import are_responses, read_logs
     from workflow.config.run_config import ClosedLoopData
     from workflow.config.uncertainty_options import FitOptions, UncertaintyOptions
     from workflow.engine.storage import refuse_in_the_way
 
-    given = locals() | {"relative_degree": _degree(relative_degree)}
     options = _settings(FitOptions, given)
     with _watched(quiet) as progress:
         described = _settings(UncertaintyOptions, given)
@@ -514,24 +505,7 @@ def identify(
             )
             _identified(summary, as_json, export, out)
             return
-        logs = read_logs(
-            log,
-            input_name,
-            output_name,
-            validation=validation or [],
-            time=time,
-            dt_s=dt_s,
-            time_unit=time_unit,
-            scale={name: _number("--scale", text) for name, text in _named("--scale", scale).items()},
-            offset={name: _number("--offset", text) for name, text in _named("--offset", offset).items()},
-            units=_named("--unit", unit),
-            repair=repair,
-            resample_s=resample_s,
-            unwrap={name: _number("--unwrap", text) for name, text in _named("--unwrap", unwrap).items()},
-            decimal=decimal,
-            reference=reference,
-            input_limit=input_limit,
-        )
+        logs = read_logs(log, _reading(given), validation or [])
         # A log that is refused does not wait for what identifies: that takes seconds to load.
         from workflow.commands.identify import identify_logs
 
@@ -588,7 +562,7 @@ def design(
             "a reference filter beside it, as NAME_reference_filter."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Root of the random starts.")] = 2006,
+    seed: Seed = 2006,
     c_prefix: CPrefix = None,
     c_float: CFloat = None,
     time_limit: TimeLimit = None,
@@ -625,7 +599,7 @@ def tune(
     ] = None,
     demo: Annotated[bool, typer.Option("--demo", help="Tune the built-in arm, identified first.")] = False,
     out: Annotated[Path, typer.Option(help="Saved designs go below this directory.")] = Path("runs/tuned"),
-    seed: Annotated[int, typer.Option(min=0, help="Root of the random starts.")] = 2006,
+    seed: Seed = 2006,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0: any that is free.")] = 0,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
     time_limit: TimeLimit = None,
@@ -701,26 +675,23 @@ def check(
     case: Annotated[
         Path | None, typer.Argument(help="TOML file that names a simulator's model and its logs.")
     ] = None,
-    mjcf: Annotated[str | None, typer.Option(help="MuJoCo model, in place of a file.")] = None,
-    fmu: Annotated[str | None, typer.Option(help="FMU, in place of a file; runs its native code.")] = None,
-    python: Annotated[str | None, typer.Option(help="Python file with a simulation.")] = None,
-    log: Annotated[list[str] | None, typer.Option(help="Log of the machine (repeatable).")] = None,
-    dt_s: Annotated[float | None, typer.Option(help="Sampling period [s] of its logs without time.")] = None,
+    mjcf: Mjcf = None,
+    fmu: Fmu = None,
+    python: Python = None,
+    log: MachineLog = None,
+    dt_s: MachineDt = None,
     repair: Annotated[bool, typer.Option("--repair", help=_LOGS)] = False,
     resample_s: Annotated[float | None, typer.Option(help=_LOGS)] = None,
     time_limit: TimeLimit = None,
     as_json: Json = False,
 ) -> None:
     """Quality of logs, smallest sizes that show, candidates that act alike, what a next record needs."""
-    model = {key: name for key, name in {"mjcf": mjcf, "fmu": fmu, "python": python}.items() if name}
-    if bool(case) == bool(model) or bool(model) != bool(log):
-        raise InputError("check: expected a case file, or --mjcf, --fmu or --python with --log")
-    need(*([case] if case else [Path(name) for name in (*model.values(), *(log or []))]))
+    of_logs = {"dt_s": dt_s, "repair": repair or None, "resample_s": resample_s}
+    stated = _of_simulator("check", [case] if case else [], mjcf, fmu, python, log, of_logs)
+    need(case)
     from workflow.diagnose.check import check as look_at_case
     from workflow.diagnose.simulator_case import settings_of
 
-    of_logs = {"dt_s": dt_s, "repair": repair or None, "resample_s": resample_s}
-    stated = {**model, "log": log, **{key: value for key, value in of_logs.items() if value is not None}}
     _show(look_at_case(case or settings_of(stated, "--log")), as_json)
 
 
@@ -735,14 +706,9 @@ def diagnose(
             "well."
         ),
     ] = None,
-    mjcf: Annotated[str | None, typer.Option(help="MuJoCo model of the machine, in place of a case.")] = None,
-    fmu: Annotated[
-        str | None,
-        typer.Option(help="FMU (FMI 2.0, co-simulation), in place of a case; runs its native code."),
-    ] = None,
-    python: Annotated[
-        str | None, typer.Option(help="Python file with a simulation, in place of a case.")
-    ] = None,
+    mjcf: Mjcf = None,
+    fmu: Fmu = None,
+    python: Python = None,
     motion: Annotated[
         str | None,
         typer.Option(
@@ -750,11 +716,8 @@ def diagnose(
             "first input drives. [default: by its unit]"
         ),
     ] = None,
-    log: Annotated[
-        list[str] | None,
-        typer.Option(help="Log of that machine; of several the last one judges, of one its last third."),
-    ] = None,
-    dt_s: Annotated[float | None, typer.Option(help="Sampling period [s] of its logs without time.")] = None,
+    log: MachineLog = None,
+    dt_s: MachineDt = None,
     repair: Annotated[bool, typer.Option("--repair", help=_LOGS)] = False,
     resample_s: Annotated[float | None, typer.Option(help=_LOGS)] = None,
     rig: Annotated[
@@ -783,19 +746,12 @@ def diagnose(
     as_json: Json = False,
 ) -> None:
     """Records and rig -> is there a gap, where, which effect, how far it shrinks, what to do next."""
-    model = {key: name for key, name in {"mjcf": mjcf, "fmu": fmu, "python": python}.items() if name}
-    if bool(case) == bool(model) or bool(model) != bool(log):
-        raise InputError("diagnose: expected cases, or --mjcf, --fmu or --python with --log")
-    if motion and not (fmu or python):
-        raise InputError("diagnose: --motion is of --fmu or --python; in a case file: motion = ...")
-    of_logs = {"motion": motion, "dt_s": dt_s, "repair": repair or None, "resample_s": resample_s}
-    of_logs = {key: value for key, value in of_logs.items() if value is not None}
-    if of_logs and not model:
-        option = f"--{next(iter(of_logs)).replace('_', '-')}"
-        raise InputError(f"diagnose: {option} is of --mjcf, --fmu or --python; a case file says it itself")
-    _one_of(jobs, scheduler)
     case = case or []
-    need(*([Path(name) for name in (*model.values(), *(log or []))] if model else []))
+    of_logs = {"motion": motion, "dt_s": dt_s, "repair": repair or None, "resample_s": resample_s}
+    stated = _of_simulator("diagnose", case, mjcf, fmu, python, log, of_logs)
+    if motion and mjcf:
+        raise InputError("diagnose: --motion is of --fmu or --python; in a case file: motion = ...")
+    _one_of(jobs, scheduler)
     if case and not any(place.exists() for place in case):
         need(*case)
     from workflow.config.settings import check
@@ -809,9 +765,8 @@ def diagnose(
         from workflow.diagnose.command import diagnose_cases
         from workflow.diagnose.simulator_case import settings_of
 
-        stated = {**model, "log": log, **of_logs}
         found = diagnose_cases(
-            [settings_of(stated, "--log")] if model else case,
+            case or [settings_of(stated, "--log")],
             out,
             rig=rig,
             jobs=jobs,
@@ -832,6 +787,26 @@ def diagnose(
         raise typer.Exit(found.exit_code)
 
 
+def _of_simulator(
+    command: str,
+    cases: Sequence[Path],
+    mjcf: str | None,
+    fmu: str | None,
+    python: str | None,
+    log: Sequence[str] | None,
+    of_logs: Mapping[str, Any],
+) -> dict[str, Any]:
+    """A simulator's case as the options state it; empty beside case files. Raises InputError."""
+    model, of_logs = _stated({"mjcf": mjcf, "fmu": fmu, "python": python}), _stated(of_logs)
+    if bool(cases) == bool(model) or bool(model) != bool(log):
+        raise InputError(f"{command}: expected a case file, or --mjcf, --fmu or --python with --log")
+    if of_logs and not model:
+        option = f"--{next(iter(of_logs)).replace('_', '-')}"
+        raise InputError(f"{command}: {option} is of --mjcf, --fmu or --python; a case file says it itself")
+    need(*map(Path, (*model.values(), *(log or []))))
+    return {**model, "log": log, **of_logs} if model else {}
+
+
 def _one_of(jobs: int | None, scheduler: str | None) -> None:
     if jobs is not None and scheduler is not None:
         raise InputError("--jobs and --scheduler contradict each other: the cluster's workers set the number")
@@ -849,11 +824,27 @@ def _c_code(prefix: str | None, single: bool | None) -> dict[str, Any]:
     from workflow.engine.errors import naming
 
     number = None if single is None else "float" if single else "double"
-    stated = {"prefix": prefix, "number": number}
-    found: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
+    found = _stated({"prefix": prefix, "number": number})
     with naming("--c-prefix"):
         Dialect(**found)
     return found
+
+
+def _stated(given: Mapping[str, Any]) -> dict[str, Any]:
+    """What is there of some options."""
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def _reading(given: Mapping[str, Any]) -> Reading:
+    """How the options of a command say that logs are read."""
+    from workflow.commands.logs import Reading
+
+    lists = {"scale": "--scale", "offset": "--offset", "unwrap": "--unwrap"}
+    stated = _stated({field.name: given.get(field.name) for field in fields(Reading)})
+    for name in lists.keys() & stated.keys():
+        pairs = _named(lists[name], stated[name])
+        stated[name] = {column: _number(lists[name], text) for column, text in pairs.items()}
+    return Reading(**stated, units=_named("--unit", given.get("unit")))
 
 
 def _named(option: str, stated: Sequence[str] | None) -> dict[str, str]:

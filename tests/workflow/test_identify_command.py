@@ -14,7 +14,7 @@ from tests.ident.benchmark_plants import P2_HZ, p2
 from tests.workflow.page_shape import shape_faults
 from tests.workflow.test_report import ATTACK, Page, is_one_file
 from workflow.commands.identify import identify_logs
-from workflow.commands.logs import read_logs
+from workflow.commands.logs import Reading, read_logs
 from workflow.config.renamed_keys import RenamedKeyWarning
 from workflow.tasks.exports import read_model
 from workflow.text.formats import interval
@@ -60,7 +60,7 @@ def test_unclear_columns_offer_a_command_with_every_log(tmp_path, refused):
 
 def identify_first(logs, **written):
     fresh = [logs / "fresh.csv"]
-    read = read_logs([logs / "first.csv"], "u_V", "tip_m", time="t_s", validation=fresh)
+    read = read_logs([logs / "first.csv"], Reading("u_V", "tip_m", time="t_s"), fresh)
     return identify_logs(read, **written)
 
 
@@ -369,7 +369,7 @@ def test_hostile_names_are_escaped(undrawn, tmp_path):
     record = p2(3, 600).record
     hostile = f"{ATTACK}&$x_1$"
     log = write_log(tmp_path / "log.csv", record.input[:, 0], record.output[:, 0], ("t_s", "u_V", hostile))
-    logs = read_logs([log], "u_V", hostile, time="t_s")
+    logs = read_logs([log], Reading("u_V", hostile, time="t_s"))
     summary = identify_logs(logs, report=tmp_path / "page.html", export=tmp_path / "m.json")
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert ATTACK not in text

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from ident.data.roles import is_position
 from workflow.commands.init import read_channel
+from workflow.commands.logs import Reading
 from workflow.engine import codec, storage
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.experiment import Limits, PlannedExperiment, plan_experiment
@@ -59,24 +60,16 @@ def _document(found: PlannedExperiment) -> dict[str, object]:
 def write_reference(
     logs: Sequence[Path],
     out: Path,
-    *,
-    columns: Mapping[str, Any],
-    largest_command: float | None,
-    largest_motion: float | None,
+    stated: Reading,
     **wanted: Any,
 ) -> RunSummary:
     """Plan a reference for the loop that made these logs; one CSV (time_s and the reference) per record, and
-    the plan. columns: names as stated; wanted: as `plan_reference`. Raises InputError."""
+    the plan. wanted: as `plan_reference`. Raises InputError."""
     RunDirectory(out).refuse_unless_free()
-    read = read_channel("excite --closed-loop", logs, **columns)
+    read = read_channel("excite --closed-loop", logs, stated)
     roles = read.roles
-    found = plan_reference(
-        read.records,
-        position=is_position(roles.output, read.unit_of[roles.output]),
-        largest_command=largest_command,
-        largest_motion=largest_motion,
-        **wanted,
-    )
+    position = is_position(roles.output, read.unit_of[roles.output])
+    found = plan_reference(read.records, position=position, **wanted)
     column, time = roles.reference or "reference", np.arange(found.plan.n_samples) * found.dt_s
     texts = {
         f"{found.plan.realisations * level + k + 1:02d}_level_{level + 1}_realisation_{k + 1}.csv": (

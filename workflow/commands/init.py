@@ -17,10 +17,11 @@ from markupsafe import Markup
 from ident.data.record import Record
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response
-from ident.data.roles import Roles, is_position, roles_with_reference
+from ident.data.roles import Roles, is_position
 from ident.data.table import Table
 from ident.data.time_grid import option_for
 from ident.data.wrapping import wraps_at
+from workflow.commands.logs import Reading
 from workflow.config.run_config import RunConfig
 from workflow.config.settings import check
 from workflow.engine import codec, storage
@@ -29,7 +30,7 @@ from workflow.tasks.draft import Draft, draft_of
 from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
 from workflow.text.templates import RunSummary, environment, rows_of
 
-_SHORT = 60  # letters of a log's name
+_SHORT = 60  # letters of a log's name that leave room for a command in a line
 _NEARLY_ALL = 0.99  # rows of a held log: one may be missing
 
 
@@ -46,25 +47,28 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What the template of the configuration shows."""
+    """What the template of the configuration shows. scale, units: as stated, and the sign that is turned."""
 
     logs: tuple[Path, ...]
     file_name: str
-    roles: Roles
-    reference_stated: bool
-    time_unit: str
-    time_unit_stated: bool
-    repair: bool
-    resample_s: float | None
-    repeats: int
-    decimal: str | None
-    unwrap: Mapping[str, float]
+    stated: Reading
+    read: Channel
     scale: Mapping[str, float]
     units: Mapping[str, str]
-    input_unit: str
-    output_unit: str
-    limit_stated: bool
     draft: Draft
+
+    @property
+    def time_unit(self) -> str:
+        column = self.read.records[0].time_column
+        return "s" if column is None else column.unit
+
+    @property
+    def input_unit(self) -> str:
+        return self.read.unit_of[self.read.roles.input]
+
+    @property
+    def output_unit(self) -> str:
+        return self.read.unit_of[self.read.roles.output]
 
     @property
     def counts(self) -> bool:
@@ -73,70 +77,25 @@ class Found:
 
 
 def init(
-    logs: Sequence[Path],
-    out: Path,
-    *,
-    input_name: str | None = None,
-    output_name: str | None = None,
-    reference: str | None = None,
-    time: str | None = None,
-    time_unit: str | None = None,
-    dt_s: float | None = None,
-    scale: Mapping[str, float] | None = None,
-    units: Mapping[str, str] | None = None,
-    unwrap: Mapping[str, float] | None = None,
-    decimal: str | None = None,
-    input_limit: float | None = None,
-    replace_file: bool = False,
+    logs: Sequence[Path], out: Path, stated: Reading | None = None, *, replace_file: bool = False
 ) -> RunSummary:
     """Write the configuration of one channel of these logs. Raises InputError, one line."""
     storage.refuse_in_the_way(logs, [("--out", out)])
     if out.exists() and not replace_file:
         raise InputError(f"{out} exists: take another --out, or --replace to write over it")
-    read = read_channel(
-        "init",
-        logs,
-        input_name=input_name,
-        output_name=output_name,
-        reference=reference,
-        time=time,
-        time_unit=time_unit,
-        dt_s=dt_s,
-        scale=scale,
-        units=units,
-        unwrap=unwrap,
-        decimal=decimal,
-        input_limit=input_limit,
-    )
-    roles, how, unit_of, records = read.roles, read.how, read.unit_of, read.records
+    stated = stated or Reading()
+    read = read_channel("init", logs, stated)
+    output, unit_of = read.roles.output, read.unit_of
     with naming("init"):
         draft = draft_of(
-            records, position=is_position(roles.output, unit_of[roles.output]), limit=input_limit
+            read.records, position=is_position(output, unit_of[output]), limit=stated.input_limit
         )
-    scaled, stated = dict(scale or {}), dict(units or {})
+    scale, units = dict(stated.scale), dict(stated.units)
     if draft.look.turned:
-        scaled[roles.input] = -scaled.get(roles.input, 1.0)
-        stated |= {roles.input: unit_of[roles.input]} if unit_of[roles.input] else {}
-    column = records[0].time_column
-    found = Found(
-        tuple(logs),
-        shlex.quote(out.name),
-        roles,
-        reference is not None,
-        "s" if column is None else column.unit,
-        time_unit is not None and roles.time is not None,
-        how["repair"],
-        how["resample_s"],
-        read.repeats,
-        decimal,
-        how["unwrap"],
-        scaled,
-        stated,
-        unit_of[roles.input],
-        unit_of[roles.output],
-        input_limit is not None,
-        draft,
-    )
+        name = read.roles.input
+        scale[name] = -scale.get(name, 1.0)
+        units |= {name: unit_of[name]} if unit_of[name] else {}
+    found = Found(tuple(logs), shlex.quote(out.name), stated, read, scale, units, draft)
     text = configuration(found, _entries(logs, out, draft))
     config = check(RunConfig, tomllib.loads(text), source=str(out), context={"base": out.absolute().parent})
     storage.write_text(out, text)
@@ -150,87 +109,60 @@ def init(
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """One channel of logs as read. how: the settings of `Record.from_file`; unit_of: input and output;
-    repeats: rows of the logs that are alike, one after the other, 1 where each is its own."""
+    """One channel of logs as read. how: with what was found; unit_of: input and output; repeats: rows of the
+    logs that are alike, one after the other, 1 where each is its own."""
 
     roles: Roles
-    how: dict[str, Any]
+    how: Reading
     unit_of: dict[str, str]
     records: list[Record]
     repeats: int
 
 
-def read_channel(
-    command: str,
-    logs: Sequence[Path],
-    *,
-    input_name: str | None = None,
-    output_name: str | None = None,
-    reference: str | None = None,
-    time: str | None = None,
-    time_unit: str | None = None,
-    dt_s: float | None = None,
-    scale: Mapping[str, float] | None = None,
-    units: Mapping[str, str] | None = None,
-    unwrap: Mapping[str, float] | None = None,
-    decimal: str | None = None,
-    input_limit: float | None = None,
-) -> Channel:
+def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> Channel:
     """Columns as names and units tell them, a reference among them, repaired and unwrapped where they need
     it. command: what a complaint says to type again. Raises InputError."""
     tables = list[Table]()
     for path in logs:
         with naming(str(path)):
-            tables.append(read_table(path).with_decimal(decimal))
+            tables.append(read_table(path).with_decimal(stated.decimal))
             if has_response(tables[-1]):
                 raise ValueError("a frequency response, no log: flexlink design takes it")
     # The options are what has to be seen of a line that may be cut.
     typed = shlex.quote(str(logs[0])) if len(logs) == 1 and len(str(logs[0])) < _SHORT else "LOG..."
     with naming(str(logs[0])):
-        roles = roles_with_reference(
-            tables[0], typed, command, input=input_name, output=output_name, time=time, reference=reference
-        )
-        if dt_s is not None and time is None:
+        roles = stated.roles(tables[0], typed, command)
+        if stated.dt_s is not None and stated.time is None:
             roles = replace(roles, time=None)
-        if roles.time is None and dt_s is None:
+        if roles.time is None and stated.dt_s is None:
             raise ValueError(
                 f"no column looks like time: type flexlink {command} {typed} --dt-s SECONDS, or --time NAME"
             )
-    options = [_stamps(table, roles, time_unit) for table in tables]
+    options = [_stamps(table, roles, stated.time_unit) for table in tables]
     steps = [float(text.split()[1]) for text in options if text.startswith("--resample-s")]
-    how: dict[str, Any] = {
-        "time": roles.time,
-        "dt_s": dt_s,
-        "time_unit": time_unit if roles.time else None,
-        "references": [roles.reference] if roles.reference else [],
-        "scale": scale,
-        "units": units,
-        "repair": "--repair" in options and not steps,
-        "resample_s": max(steps, default=None),
-        "unwrap": dict(unwrap or {}) or _wrapping(tables, roles.output),
-    }
-
-    def taken() -> list[Record]:
-        found = []
-        for table in tables:
-            with naming(str(table.path)):
-                record = Record.from_file(table, [roles.input], [roles.output], **how)
-                found.append(record if input_limit is None else record.limited(input_limit))
-        return found
-
-    records = taken()
+    how = replace(
+        stated,
+        input_name=roles.input,
+        output_name=roles.output,
+        reference=roles.reference,
+        time=roles.time,
+        time_unit=stated.time_unit if roles.time else None,
+        repair="--repair" in options and not steps,
+        resample_s=max(steps, default=None),
+        unwrap=stated.unwrap or _wrapping(tables, roles.output),
+    )
+    records = [how.record(table) for table in tables]
     repeats = min(_repeats(record) for record in records)
     if repeats > 1 and not steps:
-        how["resample_s"] = float(f"{repeats * records[0].dt_s:.9g}")
-        records = taken()
+        how = replace(how, resample_s=float(f"{repeats * records[0].dt_s:.9g}"))
+        records = [how.record(table) for table in tables]
     for record in records:
         refuse_constant_input(record)
-    records = with_common_sampling_time(records)
     unit_of = {
-        name: (units or {}).get(name, "" if name in (scale or {}) else tables[0].unit(name))
+        name: stated.units.get(name, "" if name in stated.scale else tables[0].unit(name))
         for name in (roles.input, roles.output)
     }
-    return Channel(roles, how, unit_of, records, repeats if not steps else 1)
+    return Channel(roles, how, unit_of, with_common_sampling_time(records), repeats if not steps else 1)
 
 
 def _repeats(record: Record) -> int:
@@ -306,7 +238,7 @@ def _entries(logs: Sequence[Path], out: Path, draft: Draft) -> list[Entry]:
 def _numbers(found: Found) -> dict[str, Any]:
     draft, look = found.draft, found.draft.look
     return {
-        "roles": codec.plain(found.roles),
+        "roles": codec.plain(found.read.roles),
         "told_rad_s": codec.plain(look.told_rad_s),
         "first_mode": codec.plain(look.mode),
         "notch_rad_s": look.notch,

@@ -4,14 +4,71 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ident.data.record import Record
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response
-from ident.data.roles import roles_with_reference
+from ident.data.roles import Roles, roles_with_reference
+from ident.data.table import Table
 from workflow.engine.errors import naming
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Columns of one channel and how they are read, as stated; the rest as in `Record.from_file`.
+
+    reference: column of logs made in closed loop; input_limit: larger commands are taken as that.
+    """
+
+    input_name: str | None = None
+    output_name: str | None = None
+    reference: str | None = None
+    time: str | None = None
+    time_unit: str | None = None
+    dt_s: float | None = None
+    scale: Mapping[str, float] = field(default_factory=dict)
+    offset: Mapping[str, float] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    repair: bool = False
+    resample_s: float | None = None
+    unwrap: Mapping[str, float] = field(default_factory=dict)
+    decimal: str | None = None
+    input_limit: float | None = None
+
+    def roles(self, table: Table, logs: str, command: str) -> Roles:
+        """What is stated, and what names and units of the table tell. Raises ValueError."""
+        return roles_with_reference(
+            table,
+            logs,
+            command,
+            input=self.input_name,
+            output=self.output_name,
+            time=self.time,
+            reference=self.reference,
+        )
+
+    def record(self, log: Path | Table) -> Record:
+        """Of a log, where input and output are named. Raises InputError naming file, column or line."""
+        with naming(str(log.path if isinstance(log, Table) else log)):
+            record = Record.from_file(
+                log,
+                [str(self.input_name)],
+                [str(self.output_name)],
+                time=self.time,
+                dt_s=self.dt_s,
+                time_unit=self.time_unit,
+                references=[self.reference] if self.reference else [],
+                scale=self.scale,
+                offset=self.offset,
+                units=self.units,
+                repair=self.repair,
+                resample_s=self.resample_s,
+                unwrap=self.unwrap,
+                decimal=self.decimal,
+            )
+            return record if self.input_limit is None else record.limited(self.input_limit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,67 +89,22 @@ def are_responses(paths: Sequence[Path]) -> bool:
         return False
 
 
-def read_logs(
-    logs: Sequence[Path],
-    input_name: str | None = None,
-    output_name: str | None = None,
-    *,
-    validation: Sequence[Path] = (),
-    time: str | None = None,
-    dt_s: float | None = None,
-    time_unit: str | None = None,
-    scale: Mapping[str, float] | None = None,
-    offset: Mapping[str, float] | None = None,
-    units: Mapping[str, str] | None = None,
-    repair: bool = False,
-    resample_s: float | None = None,
-    unwrap: Mapping[str, float] | None = None,
-    decimal: str | None = None,
-    reference: str | None = None,
-    input_limit: float | None = None,
-) -> Logs:
-    """One channel of log files; input, output and time that are not named are found where names and units
-    leave no doubt.
-
-    scale, offset, units, repair, resample_s, unwrap, decimal: as in `Record.from_file`. time_unit: of the
-    time column, where its name does not say it. reference: column of the reference of logs made in closed
-    loop, found like the others. input_limit: what the amplifier gives at most; larger commands in the logs
-    are taken as that. Raises InputError: one line naming file, column or line.
-    """
-    if input_name is None or output_name is None or (time is None and dt_s is None):
+def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: Sequence[Path] = ()) -> Logs:
+    """One channel of log files as stated; columns that are not named are found where names and units leave no
+    doubt. Raises InputError: one line naming file, column or line."""
+    how = stated or Reading()
+    if how.input_name is None or how.output_name is None or (how.time is None and how.dt_s is None):
         with naming(str(logs[0])):
-            table, typed = read_table(logs[0]).with_decimal(decimal), shlex.join(map(str, logs))
-            roles = roles_with_reference(
-                table, typed, "identify", input=input_name, output=output_name, time=time, reference=reference
-            )
-        input_name, output_name, found = roles.input, roles.output, roles.reference
-        if found and all(found in read_table(path).names for path in (*logs[1:], *validation)):
-            reference = found
-        time = roles.time if time is None and dt_s is None else time
-
-    def read(path: Path) -> Record:
-        with naming(str(path)):
-            record = Record.from_file(
-                path,
-                [input_name],
-                [output_name],
-                time=time,
-                dt_s=dt_s,
-                time_unit=time_unit,
-                scale=scale,
-                offset=offset,
-                units=units,
-                repair=repair,
-                resample_s=resample_s,
-                unwrap=unwrap,
-                decimal=decimal,
-                references=[] if reference is None else [reference],
-            )
-            return record if input_limit is None else record.limited(input_limit)
-
-    return Logs(
-        tuple(read(path) for path in logs),
-        tuple(read(path) for path in validation),
-        (*logs, *validation),
-        input_limit,
-    )
+            table = read_table(logs[0]).with_decimal(how.decimal)
+            roles = how.roles(table, shlex.join(map(str, logs)), "identify")
+        found = roles.reference
+        everywhere = found and all(found in read_table(path).names for path in (*logs[1:], *validation))
+        how = replace(
+            how,
+            input_name=roles.input,
+            output_name=roles.output,
+            reference=found if everywhere else how.reference,
+            time=roles.time if how.time is None and how.dt_s is None else how.time,
+        )
+    measured, fresh = (tuple(how.record(path) for path in paths) for paths in (logs, validation))
+    return Logs(measured, fresh, (*logs, *validation), how.input_limit)
