@@ -20,7 +20,7 @@ DetailVerdict = Literal["none", "parametric", "effect", "ambiguous", "unknown", 
 # Nominal parameters as stated, re-estimated within their tolerances, effects added.
 Model = Literal["stated", "refit", "repaired"]
 
-NOISE_FLOOR = 1.0
+NOISE_FLOOR = 1.0  # whitened residuals of a true model have unit variance
 # A nominal parameter that has to be off by more tolerances than this is significant by itself.
 FAR_OFF = 3.0
 # Below this probability of the first answer, or with another one above that, the answer is called ambiguous.

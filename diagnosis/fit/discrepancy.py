@@ -16,10 +16,10 @@ from diagnosis.machine.machine_protocol import Real
 
 # A band holds something with this probability before its residuals are seen.
 _ACTIVE = 0.15
-_OCTAVES = 8
+_OCTAVES = 8  # down to 1/512 of the sampling rate; below it offset and drift stand together
 # What a band may hold beyond the noise: from so many standard deviations of its energy to far beyond.
 _VISIBLE, _LARGEST = 2.5, 1e4
-_GRID = 1500
+_GRID = 1500  # points over some six decades of size: 250 a decade
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ from scipy.fft import dct, idct
 from diagnosis.fit.windows import Windows
 from diagnosis.machine.machine_protocol import Real, RecordOfMachine
 
-_LOWEST = 4
-_MOST = 16.0
+_LOWEST = 4  # coefficients in the lowest band: of fewer a variance says nothing
+_MOST = 16.0  # of one band, see above: its variance is then known to a third, sqrt(2 / 16)
 # Share of the stated model error below which a gain is none: what does not interest is not fitted.
 _UNINTERESTING = 0.4
 # Noise is allowed half as much again as a data sheet says.

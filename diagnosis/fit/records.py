@@ -17,7 +17,7 @@ from diagnosis.fit.windows import Windows
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
 from diagnosis.machine.rounding import rounding_effect
 
-_ANGLE_STEP_RAD = 1e-3
+_ANGLE_STEP_RAD = 1e-3  # of difference quotients: small in a turn, large beside rounding
 # Of the spread of a state at the start.
 _STATE_STEP = 1e-3
 

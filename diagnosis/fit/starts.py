@@ -20,7 +20,7 @@ from plant.effects.search_space import Candidate
 _ZEROS_AROUND = 6
 _CYCLES = np.concatenate([np.arange(1.0, 12, 0.25), np.arange(12, 80.5, 1.0)])
 _HIGHEST_HZ, _LINES_PER_PERIOD, _LINES_AT_ONCE = 60.0, 0.4, 16
-_APART = 0.3
+_APART = 0.3  # of a logarithm (35 %), or radians (17 degrees): nearer starts count as one
 # Frequencies of long records, of which there are as many as samples: how many of them are fitted, the lowest
 # in any case.
 MOST_LINES, BEST_LINES, SLOW_LINES = 6000, 1000, 200

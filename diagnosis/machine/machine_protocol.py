@@ -21,7 +21,7 @@ Real = npt.NDArray[np.float64]
 Role = Literal["estimation", "held_out"]
 Record = TypeVar("Record", bound="RecordOfMachine")
 
-FEWEST_SAMPLES = 20
+FEWEST_SAMPLES = 20  # fewer tell no more than a handful of parameters
 # A search simulates every record some thousand times: more records than this take hours, however short.
 MOST_RECORDS = 500
 

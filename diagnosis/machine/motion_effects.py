@@ -26,7 +26,7 @@ from scipy.signal import lfilter
 
 from diagnosis.machine.machine_protocol import Real
 
-_ROUNDS = 12
+_ROUNDS = 12  # what needs more does not settle: a round that halves the rest leaves 2^-12
 # Of the change that the effects make: what rounds may still move, or may where they no longer get closer (an
 # integrator with a step of its own has noise).
 _CONVERGED, _SETTLED = 1e-5, 0.01
@@ -34,13 +34,13 @@ _CONVERGED, _SETTLED = 1e-5, 0.01
 _FORETOLD = 1e-6
 # Share of the response to a pulse that, in its own sample, shows an input that acts before its row.
 _AT_ONCE = 0.02
-_FORGOTTEN = 1e-7
+_FORGOTTEN = 1e-7  # of the largest response: the rest adds less than a sensor of 20 bits sees
 # Condition of the eigenvectors up to which a logarithm made with them is good to nine digits.
 _LOSES_LITTLE = 1e6
 # Orders of filters that a response may be of: the first that has all of it to the first share, else the best
 # to the second (what it misses, rounds add). Samples that they are fitted to.
 _ORDERS, _EXACT, _CLOSE = (2, 3, 4, 5, 6), 1e-9, 0.03
-_FITTED = 100
+_FITTED = 100  # rows, sixteen times the poles of the largest order
 # Imaginary part of a real pole; largest pole; radians of a swing in a part of a sample, and the largest
 # power of two of parts.
 _REAL, _UNSTABLE, _TURNED, _MOST_PARTS = 1e-9, 1.1, 0.1, 4

@@ -37,7 +37,7 @@ _SMOOTHED = 9  # samples, of a measured angle whose speed is asked
 # Numbers of a file have no more digits than this.
 _NO_LEVER_M = 1e-6
 _UNITS = {"hinge": ("Nm", "rad", "kg_m2"), "slide": ("N", "m", "kg")}
-_STANDARD_GRAVITY = 9.81
+_STANDARD_GRAVITY = 9.81  # m/s^2, MuJoCo's own default
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from plant.effects import Effect
 
 # Windows of the longest record, and samples between which a speed is read off.
 _WINDOWS, _SPEED_SAMPLES = 8, 5
-_FREE_RAD = 100.0
+_FREE_RAD = 100.0  # sixteen turns: the prior of a state that nobody knows, nearly flat
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ ComplexArray = npt.NDArray[np.complex128]
 _SHORTEST = 32  # samples of a period
 # Lines with less than this share of the largest one are rounding of the log, not excitation.
 _EXCITED = 1e-3
-_LEAST_LINES = 4
+_LEAST_LINES = 4  # the mean power of fewer scatters by more than half of it, 1 / sqrt(4)
 
 
 def periodic_findings(case: Case, residuals: Mapping[str, Real], level: float) -> tuple[PeriodicFinding, ...]:

@@ -20,9 +20,9 @@ from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.findings import RegimeBin, RegimeFinding, RegimePeak
 
 Integer = npt.NDArray[np.int64]
-_SHIFTS = 4999
-_LEAST_SAMPLES = 60
-_REVERSAL_S = 0.03
+_SHIFTS = 4999  # p-values down to 2e-4; seven axes of two sensors at 1 % ask each for 7e-4
+_LEAST_SAMPLES = 60  # a mean of squares of white noise is then known to a fifth, sqrt(2 / 60)
+_REVERSAL_S = 0.03  # three samples at 100 Hz, and a short part of any motion of an arm
 # A regime whose gap differs by less is beyond chance, but nothing to tell anybody.
 _LEAST_RATIO = 1.25
 

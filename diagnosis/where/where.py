@@ -24,7 +24,7 @@ from diagnosis.where.where_energy import Energy, band_gaps, experiment_gaps, par
 from diagnosis.where.where_trends import amplitude_finding, common_findings, drift_findings, linear_correction
 from plant.effects import EFFECTS
 
-LEVEL = 0.01
+LEVEL = 0.01  # one false finding an axis in a hundred pages of noise
 
 
 def where(

@@ -21,7 +21,7 @@ from diagnosis.where.findings import BandGap, ExperimentGap, PartGap, SensorGap
 _Z95 = float(norm.ppf(0.975))
 # Half a decade a band: edges 1, 3.2, 10, ... Hz, rounded for reading aloud.
 _EDGES_HZ = tuple(m * 10.0**k for k in range(-4, 6) for m in (1.0, 3.0))
-_LEAST_LINES = 3
+_LEAST_LINES = 3  # fewer make no band: offset and drift fill them
 
 
 @dataclass(frozen=True)

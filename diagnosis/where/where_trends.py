@@ -27,17 +27,17 @@ from ident.basis.functions import regressor
 from ident.basis.poles import Poles
 from plant.modal import linear_arm
 
-_DRAWS = 2000
-_BLOCK_S = 0.5
+_DRAWS = 2000  # ends of a 95 % interval are then known to 6 % of a standard deviation
+_BLOCK_S = 0.5  # a swing of a slow arm, 2 Hz: shorter blocks would be alike
 # Two inputs closer in size than this say nothing about growth.
 _LEAST_RATIO = 1.3
 # What is the same whatever the input is looked for in so many experiments with different inputs.
 _LEAST_EXPERIMENTS, _MOST_EXPERIMENTS = 4, 8
-_LARGEST_CORRELATION = 0.5
-_LEAST_SHARE = 0.5
+_LARGEST_CORRELATION = 0.5  # inputs more alike share a quarter of their energy
+_LEAST_SHARE = 0.5  # of the gap: less is not what it mostly is
 # Held-out gap energy has to stand this many standard deviations clear before a share of it means anything.
 _CLEAR = 5.0
-_Z95 = 1.96
+_Z95 = 1.96  # standard deviations of a 95 % interval
 # Besides the machine's own poles: dynamics that are missing in it, from a slow to a fast real pole.
 _FREE_POLES = (0.98, 0.9, 0.6, 0.0, 0.0)
 

@@ -26,7 +26,7 @@ from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import first_difference
 from workflow.engine.store import Store
 
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 1  # the first; a directory of another one is not resumed
 MANIFEST = "diagnose.json"
 _ENDINGS = (".json", ".html", ".rig.toml", ".effects.toml", ".next.csv", ".xml")
 

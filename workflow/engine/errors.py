@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-EXIT_OK = 0
-EXIT_INTERNAL = 1
-EXIT_BAD_INPUT = 2
-EXIT_NOT_CERTIFIED = 3
+EXIT_OK = 0  # all done
+EXIT_INTERNAL = 1  # as Python leaves after an exception
+EXIT_BAD_INPUT = 2  # as shells and click leave for wrong usage
+EXIT_NOT_CERTIFIED = 3  # the first that means nothing elsewhere
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 
-LONGEST_LINE = 300
+LONGEST_LINE = 300  # two to four lines of a terminal
 
 
 def one_line(text: object) -> str:

@@ -39,14 +39,14 @@ R = TypeVar("R")
 Report = Callable[[float, str], None]
 Watch = Callable[[int, float, str], None]
 
-MOST_ATTEMPTS = 3
-CONNECT_S = 10.0
+MOST_ATTEMPTS = 3  # the second and third have the machine for themselves
+CONNECT_S = 10.0  # a scheduler in the same network answers in milliseconds
 # Work that cannot go on says so within a minute.
 WITHOUT_WORKERS_S = 50.0
-SILENT_S = 40.0
-ANSWER_S = 10.0
-_LOOK_S = 0.05
-_ASK_S = 2.0
+SILENT_S = 40.0  # within the minute above, less the last `ANSWER_S` and `_ASK_S`
+ANSWER_S = 10.0  # as `CONNECT_S`
+_LOOK_S = 0.05  # short beside any task
+_ASK_S = 2.0  # often beside `SILENT_S`, seldom beside what a scheduler can answer
 
 # CasADi and numba's caches are used by one thread at a time, whatever a worker was started with.
 _ONE_AT_A_TIME = threading.Lock()

@@ -73,7 +73,7 @@ def _remember(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-_AGAIN_S = 0.02
+_AGAIN_S = 0.02  # after the callback has returned, before anybody notices
 
 
 def _again(event: sys.UnraisableHookArgs) -> None:

@@ -16,8 +16,8 @@ from workflow.figures import gap_style, style
 from workflow.figures.bands import Real, outline
 from workflow.text.formats import listing
 
-_MOST_BARS = 8
-_LEAST = 0.02
+_MOST_BARS = 8  # more names are too small to read at the width of a page
+_LEAST = 0.02  # of the floor: less is drawn there
 _LOOKS = {"stated": ("s", -0.22), "refit": ("D", 0.0), "repaired": ("o", 0.22)}
 
 

@@ -15,9 +15,9 @@ from plant.modal import linear_arm
 from workflow.figures import gap_style, style
 from workflow.figures.bands import Real, outline
 
-_SEGMENT = 512
+_SEGMENT = 512  # samples: 257 lines, more than a panel shows; short records still hold several
 _TRACE_BINS = 250  # a panel is some 400 pixels wide
-_MODES = 3
+_MODES = 3  # marks of higher ones stand too close
 
 
 @style.drawing("gap_measured")

@@ -11,8 +11,8 @@ from workflow.figures.bands import Real
 from workflow.text.formats import portion
 
 _LOOKS = {SENSORS[output][0]: (words, colour) for output, (words, _, colour) in gap_style.OUTPUTS.items()}
-_MOST_REGIMES = 6
-_FEW_BINS = 2
+_MOST_REGIMES = 6  # two rows of panels
+_FEW_BINS = 2  # labels of three in words overlap
 _SMALLEST = 0.05  # noise deviations; less is drawn there
 _WHISKER = {"color": "#444444", "lw": 1.0}
 _REGIMES = {

@@ -18,7 +18,7 @@ from workflow.figures.bands import Complex, Real
 from workflow.figures.subjects import RunView
 from workflow.text.formats import at_least, share
 
-_MOST_ELLIPSES = 220
+_MOST_ELLIPSES = 220  # more fill the panel, and the file
 _SEEN = 0.01  # of the panel's width: two pixels
 
 

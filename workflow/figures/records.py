@@ -15,7 +15,7 @@ from workflow.tasks.experiment import PlannedExperiment
 from workflow.tasks.log_look import LogLook
 from workflow.tasks.results import RunRecord
 
-_ZOOM_SAMPLES = 400
+_ZOOM_SAMPLES = 400  # as many as a panel has pixels across
 _WORDS = {
     "estimation": "used to estimate",
     "validation": "kept for validation",
@@ -114,7 +114,7 @@ def draw_log(found: LogLook) -> Figure | None:
     return figure
 
 
-_TIME_S = 10.0
+_TIME_S = 10.0  # a panel of more shows a band and no signal
 
 
 @style.drawing("excitation")

@@ -56,8 +56,8 @@ Drawing = Callable[..., Figure | None]
 D = TypeVar("D", bound=Drawing)
 
 WIDTH_IN = 10.0  # 100 px per inch at the width of the page
-SVG_LIMIT_BYTES = 400_000
-_PNG_DPI = 160
+SVG_LIMIT_BYTES = 400_000  # above it the PNG is the smaller file
+_PNG_DPI = 160  # 1600 pixels at `WIDTH_IN`: sharp on screens of high density
 
 _RC: Any = {
     "font.family": ["DejaVu Sans"],  # ships with matplotlib: the same picture on every machine

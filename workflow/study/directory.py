@@ -30,7 +30,7 @@ from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage
 from workflow.tasks.summary import summarise
 
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 1  # the first; a study of another one is not resumed
 _PLANT = tuple(stage.name for stage in PLANT_STAGES)
 
 

@@ -20,7 +20,7 @@ from workflow.config.settings import Section, check, expand, read_toml, repeated
 from workflow.engine.errors import InputError
 from workflow.study.columns import COLUMNS
 
-MOST_POINTS = 10_000
+MOST_POINTS = 10_000  # a day and a half at 12 s a point
 _DIGITS = 6  # of a number in a range: enough for any tuning, and short in names and tables
 
 

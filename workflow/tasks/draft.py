@@ -25,7 +25,7 @@ from workflow.tasks.loop_sensitivity import rms_of
 # Of the first mode or notch, or of the highest frequency that the logs tell: the bandwidth that is asked for,
 # and the one that is asked for at least.
 _PART, _LEAST_PART = 3, 30
-_ORDER = 5
+_ORDER = 5  # of the controller: integrator, roll-off and a notch, with one state to spare
 # An unstable pole has to be left behind by the bandwidth, by this factor.
 _BEYOND_UNSTABLE = 2.5
 # Of one log the last part validates, where that leaves so many samples and the parts are driven alike within

@@ -45,7 +45,7 @@ _LEAST_DAMPING = 1e-3
 # Chi-square by which another delay has to be worse: 3 standard deviations of one unknown.
 _WORSE, _FAR_WORSE = 9.0, 50.0
 _MOST_LINES = 300  # of the fit: more take longer and tell the same structure
-_SLOWEST = 0.1
+_SLOWEST = 0.1  # of the lowest frequency that is told: a slower pole looks like an integrator there
 _DELAYS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 
 

@@ -30,8 +30,8 @@ from workflow.tasks.stage import StageInput
 
 # A step sought by bisection is right to this share of itself; how far around the guess it may lie.
 _SHARE, _APART = 0.01, 10.0
-_DRAWS = 16
-TOLERANCE_PERCENT = 5.0
+_DRAWS = 16  # Student's factor of a 95 % interval is then within a tenth of its limit: 2.13
+TOLERANCE_PERCENT = 5.0  # of a peak of |S|: half a decibel
 # Shares of the large size; the first and SMALL are measured by `sensitivity_on_arm`.
 _SHARES = (1.0, 0.3, SMALL, 0.03, 0.01)
 # The sine's period is so many times the delay of the loop; its linear error is 2 pi over that.

@@ -30,8 +30,8 @@ from workflow.text.templates import said
 
 _SLEW_SHARE = 0.6  # of the voltage limit that the slew is predicted to use
 _OVERDRIVEN = 2.0  # times the voltage limit that the large step would need
-_PUSH_S = 0.1
-_SETTLED = 0.1
+_PUSH_S = 0.1  # half a period of 5 Hz: it excites the first modes
+_SETTLED = 0.1  # of the move: a run whose last tenth swings by less has settled
 
 
 def condition_run(

@@ -15,12 +15,12 @@ from workflow.tasks.results import MeasuredPeak, Real, SensitivityCheck
 from workflow.tasks.simulated_rig import loop_of_arm
 from workflow.tasks.stage import StageInput
 
-_DRAWS = 3
+_DRAWS = 3  # of random phases: the fewest that show a spread
 _PERIODS_SMALL = 4  # sensor noise weighs ten times as much there, too
 SMALL = 0.1  # of the large excitation: friction weighs ten times as much
 _INPUT_SHARE = 0.7  # of the input's rms in the records of the fit that the loop's command may take
 _CREST = 4.0  # peak over rms that a multisine's command stays below
-_LINES_BELOW_PEAK = 20
+_LINES_BELOW_PEAK = 20  # the peak is read to 5 % of its frequency
 _SHORTEST, _LONGEST = 500, 4000
 
 

@@ -21,7 +21,7 @@ from workflow.tasks.results import RecordsResult, RunRecord
 from workflow.tasks.simulated_rig import simulate_record
 from workflow.tasks.stage import StageInput
 
-MOST_SAMPLES = 20_000_000
+MOST_SAMPLES = 20_000_000  # of 4 kB each, 80 GB: more memory than most machines have
 
 
 def make_records(stage: StageInput) -> RecordsResult:

@@ -19,7 +19,7 @@ from workflow.engine.errors import InputError, naming
 
 DOCUMENTS = (".json", ".mat", ".npz")
 _SAMPLING_TIME = ("dt_s", "dt", "Ts")
-_SAME_CLOCK = 1e-3
+_SAME_CLOCK = 1e-3  # a share: clocks differ by some 1e-5, and files give three digits or more
 # Of an entry of a state space in any units: products of some of them are still numbers.
 _LARGEST = 1e50
 

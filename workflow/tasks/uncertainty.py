@@ -59,8 +59,8 @@ from workflow.tasks.results import (
 from workflow.tasks.stage import StageInput
 from workflow.text.templates import words
 
-_FEWEST_FREQUENCIES = 100
-_SHARE_INSIDE = 0.9
+_FEWEST_FREQUENCIES = 100  # over a band of the data, some decade: a nominal model has a tenth as many numbers
+_SHARE_INSIDE = 0.9  # of the ellipses: below it a nominal is no member of the set it stands for
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 _NOISE_ORDERS = (8, 32)
 # A model of a loop's logs outside most of its own ellipses explains nothing: machines whose certificates held
