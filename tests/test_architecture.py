@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -33,3 +34,34 @@ def test_no_file_is_read_as_pickle_and_every_package_has_tests(package):
     for path in (ROOT / package).rglob("*.py"):
         assert "allow_pickle=True" not in path.read_text(encoding="utf-8"), path
     assert list((ROOT / "tests" / package).rglob("test_*.py")), f"tests/{package} has no tests"
+
+
+_OF_NUMBERS = (ast.BinOp, ast.UnaryOp, ast.operator, ast.unaryop, ast.Attribute, ast.Name, ast.expr_context)
+
+
+def _is_number(value: ast.expr) -> bool:
+    """A number, or one made of numbers and constants such as np.pi."""
+    parts = list(ast.walk(value))
+    constants = [part.value for part in parts if isinstance(part, ast.Constant)]
+    rest = (part for part in parts if not isinstance(part, ast.Constant))
+    return (
+        bool(constants)
+        and all(isinstance(one, int | float) for one in constants)
+        and all(isinstance(part, _OF_NUMBERS) for part in rest)
+    )
+
+
+@pytest.mark.parametrize("package", PACKAGES[:-1])
+def test_every_number_of_a_module_has_its_reason(package):
+    """In a comment on its line or above it, or in a docstring below."""
+    bare = []
+    for path in sorted((ROOT / package).rglob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        lines = ["", *text.splitlines(), ""]
+        for one in ast.parse(text).body:
+            if isinstance(one, ast.Assign | ast.AnnAssign) and one.value and _is_number(one.value):
+                assert one.end_lineno is not None
+                said = "#" in "".join(lines[one.lineno : one.end_lineno + 1])
+                said |= lines[one.lineno - 1].startswith("#") or lines[one.end_lineno + 1].startswith('"""')
+                bare += [] if said else [f"{path.relative_to(ROOT)}:{one.lineno}: {lines[one.lineno]}"]
+    assert not bare, "numbers without a reason:\n" + "\n".join(bare)
