@@ -25,7 +25,6 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 from typer.core import TyperCommand
 
-from workflow.config.renamed_keys import RenamedKeyWarning, current_options
 from workflow.engine import interrupts
 from workflow.engine.errors import (
     EXIT_BAD_INPUT,
@@ -927,8 +926,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     elif argv is None:
         # An error is one line. Called from Python (tests!) warnings stay what the caller made of them.
         warnings.simplefilter("ignore")
-        warnings.filterwarnings("always", category=RenamedKeyWarning)
-        warnings.showwarning = _warn
     if argv is None:
         one_thread()  # read by the libraries when they load, which is after this line
     if not arguments:
@@ -937,7 +934,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         if argv is None:
             interrupts.watch()
         interrupts.check()
-        arguments = current_options(arguments)
         _plug_in(arguments)
         code = int(app(arguments, standalone_mode=False) or EXIT_OK)
         sys.stdout.flush()
@@ -1003,10 +999,6 @@ def _interrupted(arguments: Sequence[str], out: Path | None = None) -> int:
         if out is not None and any((out / name).is_file() for name in _MANIFESTS):
             hint = f"; {shlex.join(['flexlink', *again, '--resume'])} continues"
     return _complain(f"{interrupts.words()}{hint}", interrupts.exit_code())
-
-
-def _warn(message: Warning | str, *about: object, **more: object) -> None:
-    _complain(str(message), EXIT_OK)
 
 
 def _explain(error: Exception) -> tuple[str, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import tomllib
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 
 from tests.workflow.command import FAST_ARM, ROOT
-from workflow.config.renamed_keys import RenamedKeyWarning, current_key, with_current_keys
 from workflow.config.rig_settings import BangBang, Doublet, LogChirp, Multisine, Prbs
 from workflow.config.run_config import FileSource, RunConfig, SimulatedSource, built_in_config, load_config
 from workflow.config.settings import check
@@ -237,39 +235,6 @@ output = "y"
     (tmp_path / "own.toml").write_text(first.replace('output = "y"', 'output = "u"') % apart)
     with pytest.raises(InputError, match="input and output are the same column, 'u'"):
         load_config(tmp_path / "own.toml")
-
-
-def test_earlier_names_of_keys_are_read_and_the_new_one_is_told(tmp_path):
-    text = FAST_ARM.read_text()
-    path = tmp_path / "old.toml"
-    path.write_text(text.replace("[achievable_performance]", "[yardstick]\ncompute = false"))
-    with pytest.warns(RenamedKeyWarning, match=r"old\.toml: yardstick is now called achievable_performance"):
-        config, _ = load_config(path)
-    assert not config.achievable_performance.compute
-    path.write_text(path.read_text() + "[achievable_performance]\ncompute = true\n")
-    with pytest.raises(InputError, match="yardstick is the earlier name of achievable_performance"):
-        load_config(path)
-
-
-def test_an_earlier_name_is_read_inside_tables_in_studies_and_of_stored_runs(tmp_path):
-    text = MINIMAL.replace("[[channels]]", "[[channels]]\nuncertainty = {{ {} = 'without friction' }}", 1)
-    with pytest.warns(RenamedKeyWarning, match=r"channels\.uncertainty\.promise is now called response"):
-        config = minimal(tmp_path, text.format("promise"))
-    assert config == minimal(tmp_path, text.format("response"))
-    assert config.channels[0].uncertainty.response == "without friction"
-    with pytest.raises(InputError, match=r"channels\.uncertainty\.promise is the earlier name of response"):
-        minimal(tmp_path, text.format("response = 'as recorded', promise"))
-    stored = config.to_document()
-    first = stored["channels"][0]["uncertainty"]
-    first["promise"] = first.pop("response")
-    with pytest.warns(RenamedKeyWarning, match=r"stored: channels\.uncertainty\.promise"):
-        assert RunConfig.from_document(stored, source="stored") == config
-    assert "promise" in first, "the caller's document is changed"
-    with pytest.warns(RenamedKeyWarning, match="key: promise is now called response"):
-        assert current_key("channels[0].uncertainty.promise") == "channels[0].uncertainty.response"
-    assert current_key("notes.promise") == "notes.promise"
-    for odd in ({"channels": 3}, {"channels": [3, {"uncertainty": "promise"}]}):
-        assert with_current_keys(copy.deepcopy(odd), "odd") == odd
 
 
 def test_a_plan_is_its_records(tmp_path):

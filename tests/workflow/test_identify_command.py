@@ -15,7 +15,6 @@ from tests.workflow.page_shape import shape_faults
 from tests.workflow.test_report import ATTACK, Page, is_one_file
 from workflow.commands.identify import identify_logs
 from workflow.commands.logs import Reading, read_logs
-from workflow.config.renamed_keys import RenamedKeyWarning
 from workflow.tasks.exports import read_model
 from workflow.text.formats import interval
 
@@ -282,8 +281,7 @@ def test_friction_is_identified_from_logs_where_that_is_asked_for(flexlink, undr
     unexplained = {response: 100 - float(row["fit, validation"].split()[0]) for response, row in told.items()}
     assert unexplained["without friction"] < unexplained["as recorded"] / 2
     assert unexplained["this amplitude"] == unexplained["without friction"]  # of the same model
-    with pytest.warns(RenamedKeyWarning, match="option: --promise is now called --response"):
-        answer = flexlink(*command, "--promise", "amplitudes from 1 to 8")
+    answer = flexlink(*command, "--response", "amplitudes from 1 to 8")
     assert answer.code == 2
     assert "cannot be described: the inputs of the records have an rms from" in answer.err
 

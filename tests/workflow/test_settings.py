@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 import pytest
 from pydantic import BaseModel, ConfigDict, Field
 
-from workflow.config.settings import InputPath, check, expand, read_toml
+from workflow.config.settings import InputPath, check, expand
+from workflow.engine.documents import read_toml
 from workflow.engine.errors import InputError
 
 

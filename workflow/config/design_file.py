@@ -13,7 +13,8 @@ from control_design.specification import RationalWeight, Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from ident.basis.options import IdentOptions
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
-from workflow.config.settings import InputPath, Section, check, read_toml
+from workflow.config.settings import InputPath, Section, check
+from workflow.engine.documents import read_toml
 
 if TYPE_CHECKING:
     from workflow.config.run_config import RunConfig

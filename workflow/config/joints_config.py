@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -12,9 +11,9 @@ from pydantic import Field, model_validator
 from control_design.specification import Specification
 from control_design.specification.multivariable import MultivariableSpecification
 from control_design.synthesis.synthesis_options import MultivariableOptions
-from workflow.config.renamed_keys import with_current_keys
 from workflow.config.run_config import FileSource, Name, RunSection
-from workflow.config.settings import Section, check, read_toml, repeated
+from workflow.config.settings import Section, check, repeated
+from workflow.engine.documents import read_toml
 
 Two = tuple[float, float]
 
@@ -172,7 +171,6 @@ class JointsConfig(Section):
     @classmethod
     def from_document(cls, document: Mapping[str, Any], *, source: str) -> JointsConfig:
         """Inverse of `to_document`."""
-        document = with_current_keys(copy.deepcopy(dict(document)), source)
         return check(cls, document, source=source, context={"may_be_gone": True})
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping
 from importlib import resources
@@ -18,10 +17,10 @@ from control_design.specification import Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from plant.experiment_plan import ExperimentPlan
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
-from workflow.config.renamed_keys import with_current_keys
 from workflow.config.rig_settings import EffectTable, Excitation, Multisine, RigChoice
-from workflow.config.settings import InputPath, Section, check, read_toml, repeated
+from workflow.config.settings import InputPath, Section, check, repeated
 from workflow.config.uncertainty_options import FitOptions, UncertaintyOptions
+from workflow.engine.documents import read_toml
 
 Role = Literal["estimation", "validation", "repeat"]
 Name = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=80)]
@@ -552,7 +551,6 @@ class RunConfig(Section):
     @classmethod
     def from_document(cls, document: Mapping[str, Any], *, source: str) -> RunConfig:
         """Inverse of `to_document`; input files may have moved away since (a report needs them no more)."""
-        document = with_current_keys(copy.deepcopy(dict(document)), source)
         return check(cls, document, source=source, context={"may_be_gone": True})
 
 

@@ -12,8 +12,6 @@ from typing import Annotated, Any, TypeVar, get_args
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, ValidationInfo
 from pydantic_core import ErrorDetails, to_json
 
-from workflow.config.renamed_keys import with_current_keys
-from workflow.engine import documents
 from workflow.engine.errors import InputError, shortened
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
@@ -31,12 +29,6 @@ class Section(BaseModel):
 def repeated(values: Sequence[T]) -> T | None:
     """The first that is there more than once, if any."""
     return next((value for value in values if values.count(value) > 1), None)
-
-
-def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
-    """Text and content of a TOML file, by the names its keys have now. Raises InputError."""
-    text, document = documents.read_toml(path)
-    return text, with_current_keys(document, str(path))
 
 
 def check(

@@ -11,7 +11,8 @@ from ident.data.arrays import RealArray
 from ident.data.wrapping import unwrapped
 from plant.effects import EFFECTS
 from plant.rig import Output
-from workflow.config.settings import Section, check, meant, read_toml, repeated
+from workflow.config.settings import Section, check, meant, repeated
+from workflow.engine.documents import read_toml
 from workflow.engine.errors import InputError
 
 CASE_FILE, RIG_FILE = "case.toml", "rig.toml"

@@ -15,8 +15,8 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from workflow.config.renamed_keys import current_key
-from workflow.config.settings import Section, check, expand, read_toml, repeated
+from workflow.config.settings import Section, check, expand, repeated
+from workflow.engine.documents import read_toml
 from workflow.engine.errors import InputError
 from workflow.study.columns import COLUMNS
 
@@ -26,7 +26,7 @@ _DIGITS = 6  # of a number in a range: enough for any tuning, and short in names
 
 def _key(text: str) -> str:
     parse_key(text)
-    return current_key(text)
+    return text
 
 
 def _judged(name: str) -> str:
