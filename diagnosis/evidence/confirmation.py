@@ -1,8 +1,7 @@
 """Do the held-out records confirm the answer that the estimation records gave?
 
-They are predicted from values that were fitted without them. As long as they confirm the answer they decide
-nothing. Where they leave more over than noise, solver disagreement and uncertain values explain, or where a
-competing hypothesis predicts them far better, every answer that was still possible is confronted with them.
+They decide only where they leave more over than noise, solver disagreement and uncertain values explain, or
+where a competing hypothesis predicts them far better.
 """
 
 from __future__ import annotations
@@ -25,12 +24,8 @@ from diagnosis.machine.machine_protocol import Real
 def confronted(
     model: ResidualModel, hypotheses: Sequence[Hypothesis], leading: Hypothesis
 ) -> list[Hypothesis] | None:
-    """The hypotheses as held-out records leave them; None if these confirm the leading one and it
-    is an answer, no look-alike.
-
-    The log density with which each possible answer predicts them is added to its weights, and to those of an
-    unknown rest besides what such a rest gains by them.
-    """
+    """The hypotheses with the log density of the held-out records added to their weights, and to an unknown
+    rest what that gains; None if the records confirm the leading one and it is an answer, no look-alike."""
     case = model.case
     if not case.held_out:
         return None

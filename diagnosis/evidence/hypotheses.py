@@ -1,8 +1,7 @@
 """Hypotheses about a gap, their evidence, and probabilities over none, every effect and unknown.
 
-A hypothesis is a set of effects with fitted parameters. A true one leaves white noise and what two correct
-solvers disagree about, which is small for smooth effects and larger where contacts switch. The hypothesis
-"unknown" is the best of the others with something of any size left over.
+A true set of effects leaves white noise and what two correct solvers disagree about, more where contacts
+switch. "unknown" is the best set with something of any size left over.
 """
 
 from __future__ import annotations

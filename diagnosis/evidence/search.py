@@ -160,13 +160,7 @@ def smallest_size(candidate: Candidate, starts: Sequence[Point], ratio: float) -
     if not candidate.grows:
         x, change = -x[::-1], change[::-1]
     change = np.maximum.accumulate(change)
-    target = np.log(ratio)
-    if target <= change[0]:
-        found = x[0] + (target - change[0])
-    elif target >= change[-1]:
-        found = x[-1] + (target - change[-1])
-    else:
-        i = int(np.searchsorted(change, target))
-        share = (target - change[i - 1]) / (change[i] - change[i - 1])
-        found = x[i - 1] + share * (x[i] - x[i - 1])
+    reach = np.abs(np.log(ratio) - change).max()
+    changes, sizes_at = (np.array([part[0] - reach, *part, part[-1] + reach]) for part in (change, x))
+    found = np.interp(np.log(ratio), changes, sizes_at)
     return float(found if candidate.grows else -found)

@@ -1,9 +1,7 @@
 """How far two correct solvers of a machine with backlash may drift apart, measured where it is to be judged.
 
-Contacts amplify: two solvers, or a solver and the machine, whose impacts differ by a hair follow different
-sequences of contacts some bounces later. Neither is wrong, and a trajectory that has drifted apart says
-little. How soon that happens depends on the machine, the size of its gap and the motion, so it is measured:
-the same records with a gap that differs in its third digit.
+Contacts amplify: solvers whose impacts differ by a hair follow different sequences of contacts some bounces
+later, and neither is wrong. Measured on the same records with a gap that differs in its third digit.
 """
 
 from __future__ import annotations
@@ -74,9 +72,8 @@ NO_DRIFT = Drift()
 def without_drift(residuals: Real, spread: Real) -> tuple[Real, Drift]:
     """Residuals (N,) over a noise that includes the spread (N,), and what they gain by it.
 
-    Where trajectories have drifted apart one stays beside the other for a while: as many samples as the
-    spread is averaged over count as one there. As they are where nothing is gained, because solvers need not
-    disagree, and where much is left all the same: that is something else, and no excuse for it.
+    Where trajectories have drifted apart, as many samples as the spread is averaged over count as one. As
+    they are where nothing is gained, and where much is left all the same: that is something else.
     """
     variance = 1.0 + spread
     e = residuals / np.sqrt(variance)

@@ -44,9 +44,8 @@ def looked_at_again(
 ) -> Diagnosis:
     """The answer of a machine that does not forget its inputs, from windows where a free run says less.
 
-    A free run drifts as far as it likes, and beside that nothing else seems to matter. Windows are not looked
-    at where the records leave no gap that interests, nor where the first answer leaves none, in them either;
-    they are not taken where they only add to what was named.
+    Windows are not looked at where the records leave no gap that interests, nor where the first answer leaves
+    none, in them either; they are not taken where they only add to what was named.
     """
     # Unlisted causes act within windows too: what a free run leaves unknown stays so, and what it names of a
     # rig stands.

@@ -1,9 +1,8 @@
 """From fitted sets to an answer: which effects matter, what remains, and how sure that is.
 
-"None", "exactly these effects" and "unknown" are all false for a real machine. Two questions are asked apart:
-which effect carries a part of the gap that interests (more than the stated model error), and whether what
-then remains is no more than imperfections leave. Both are judged on shares of the motion, of estimation and
-held-out records.
+Two questions are asked apart: which effect carries a part of the gap that interests (more than the stated
+model error), and whether what then remains is no more than imperfections leave. Both are judged on shares of
+the motion, of estimation and held-out records.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Records with repeated periods: frequency response against the model, distortion, what does not repeat.
 
-What comes back in every period is the machine's answer to the input (linear at excited lines; at lines that
-were not excited it is distortion: even lines of an odd input show even distortion, odd ones odd distortion).
-What changes from period to period is noise, drift, disturbances, or a transient that has not died out; it
-measures the noise without a word from the rig file. After Pintelon and Schoukens, System Identification.
+What comes back in every period is the machine's answer to the input: linear at excited lines, distortion at
+the others (of an odd input even at even lines). What changes from period to period is noise, drift,
+disturbance or transient. After Pintelon and Schoukens, System Identification.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """What `diagnosis.where.where` answers: findings by frequency, regime, experiment, sensor, size.
 
 Every finding carries its number, an interval, a p-value against chance and whether it is `found` (beyond
-chance at the level of its axis). What is worth a sentence among them is decided here; the sentences stand in
-the templates.
+chance at the level of its axis).
 """
 
 from __future__ import annotations

@@ -1,14 +1,11 @@
 """Residuals read as one missing function: a hub torque or a sensor error that depends on one variable alone.
 
-A residual at the sensors is where a missing torque ends up, not where it acts: dry friction leaves a slow
-offset that is largest long after the reversal. So the residuals are regressed on the model's response to a
-torque on the hub that is a free function of hub speed (angle, voltage, deflection, time), piecewise linear
-with a jump allowed at zero; likewise on free functions added to a sensor. The share of the gap that one such
-function explains says where the cause acts, and the function itself is the picture of it.
+The residuals are regressed on the model's response to a torque on the hub that is a free function of hub
+speed (angle, voltage, deflection, time), piecewise linear with a jump allowed at zero; likewise on free
+functions added to a sensor. The share of the gap that one explains says where the cause acts.
 
-Linear in the nominal model: the variable is the model's, so a large gap that moves it (another speed at the
-time than the model's) leaves shares and directions but bends the curve, most at nodes few samples reach.
-Standard errors hold the sensor noise only.
+Neglected: a large gap moves the variable, which is the model's, and bends the curve. Standard errors hold the
+sensor noise only.
 """
 
 from __future__ import annotations

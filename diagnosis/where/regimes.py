@@ -1,9 +1,8 @@
 """Residual energy by regime: direction and size of hub speed, reversals, angle, deflection, command, time.
 
-Regime variables are those of the model (measured output minus residual times noise), not of the measurement:
-they do not depend on the noise whose energy is sorted by them. The test is by circular shifts in time of the
-energy against the regime, inside every experiment: exact when there is only noise, and for a coloured gap it
-keeps the colour, so that a slow residual is not significant just because its samples agree with each other.
+Regime variables are those of the model, which do not depend on the noise whose energy is sorted by them. The
+test is by circular shifts in time of the energy against the regime, inside every experiment: exact when there
+is only noise, and it keeps the colour of a gap.
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 
 With e = gap + white noise of unit variance, the sum of squares of n values (samples, or coefficients of an
 orthonormal transform) is noncentral chi-square with n degrees of freedom and the gap's energy as
-noncentrality; so p-values are exact and intervals need no resampling. Bands use the cosine transform
-(DCT-II): orthonormal like Fourier's, but a drift or an offset at the end does not leak over all frequencies.
+noncentrality. Bands use the cosine transform (DCT-II), in which a drift does not leak over all frequencies.
 """
 
 from __future__ import annotations

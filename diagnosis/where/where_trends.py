@@ -139,9 +139,8 @@ def _growth(interval: Interval) -> Growth:
 def common_findings(case: Case, residuals: Mapping[str, Real], level: float) -> tuple[CommonFinding, ...]:
     """One per sensor; empty with fewer than four experiments whose inputs differ.
 
-    Inputs that resemble each other would leave alike residuals as well, so only experiments with different
-    inputs count. For a gap that comes from the input the mean over n such experiments holds about 1/n of the
-    energy; for one that comes with the clock it holds all.
+    For a gap that comes from the input the mean over n experiments with different inputs holds about 1/n of
+    the energy; for one that comes with the clock it holds all.
 
     Found asks for more energy in the mean than noise leaves there (chi-square, exact), for half of the gap,
     and that no other choice of signs of the experiments gives as much.
@@ -206,15 +205,10 @@ def _peak(mean: Real, dt_s: float) -> tuple[float, float]:
 def linear_correction(case: Case, residuals: Mapping[str, Real]) -> LinearCorrection | None:
     """Does any linear correction of the model, from voltage to sensors, take the gap away?
 
-    Fitted to the residuals of the estimation records and judged on the held-out ones. What inertia,
-    stiffness, lag, delay or gain leave is linear in the voltage; friction, backlash, clipping, disturbances,
-    drifts are not.
-
-    Regresses the residuals on basis functions with the nominal poles taken twice, and on integrated input.
-
-    Every pole twice spans the change of a response with any of its poles to first order; one and two
-    integrators and free real poles stand for what the nominal model lacks. None if the gap of the estimation
-    or of the held-out records is too small to take shares of.
+    Fitted to the residuals of the estimation records and judged on the held-out ones, on basis functions with
+    the nominal poles taken twice (the change of a response with its poles to first order), one and two
+    integrators, and free real poles for what the nominal model lacks. None if the gap of the estimation or of
+    the held-out records is too small to take shares of.
     """
     for records in (case.estimation, case.held_out):
         whole = Energy.of(residuals[x.name] for x in records)

@@ -81,11 +81,9 @@ def design_controller(
 ) -> RunSummary:
     """Design and certify one controller for one or several plants (files: `workflow.tasks.design_source`).
 
-    Without a design file the source must be a run directory, whose own specification is taken. With `out` the
-    controller is written, by its ending as JSON, MAT file or C source, and beside it a reference filter if
-    there is one (`dialect` says how C is written); a controller that is not certified carries that in its
-    name. A specification that no controller can meet is a result (not certified, the reason in `verdict`), as
-    in a run. Raises InputError.
+    file: None takes the specification of a run directory. out: of the controller, by its ending as JSON, MAT
+    file or C source (as of dialect), and beside it of a reference filter. A specification that no controller
+    can meet is a result: not certified, the reason in `verdict`. Raises InputError.
     """
     name, file = (file.name, file) if file is not None else (str(paths[0]), DesignFile())
     written = [] if out is None else targets(out)

@@ -1,9 +1,8 @@
 """One codec for every result: frozen dataclasses to JSON and named arrays, and back by their annotations.
 
 A dataclass becomes an object of its fields, an enum its name, an array a reference into the archive beside
-the document; non-finite and complex numbers are tagged. What an annotation calls a function is no data: such
-a field is left out and comes back as its default. Nothing is guessed on reading: a field that is missing, one
-that nobody knows, and a value of another kind are refused with one line that names the place.
+the document; non-finite and complex numbers are tagged. Fields that are functions are left out and come back
+as their defaults. A field that is missing or unknown, or of another kind, is refused in one line.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Tasks somewhere else: in processes of this machine, or on the workers of a Dask cluster (extra
 `distributed`), for every command alike.
 
-Here every task has a fresh process, so that one that dies takes nothing else with it, and the digits do not
-depend on how many there are: each meets freshly loaded kernels.
+Here every task has a fresh process: one that dies takes nothing else with it, and digits do not depend on how
+many there are.
 """
 
 from __future__ import annotations

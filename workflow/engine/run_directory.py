@@ -10,8 +10,7 @@
 
 A stage is done when its file is there and the input hash recorded *inside* it equals the hash of what the
 stage would be given now (its share of the configuration, its input files, the content of the stages before
-it). File and hash appear in one rename, so there is no instant at which one is there without the other. The
-file holds a digest of its content as well: one that was changed by anybody else is no result.
+it). The file holds a digest of its content as well: one that was changed by anybody else is no result.
 """
 
 from __future__ import annotations

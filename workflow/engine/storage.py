@@ -1,9 +1,7 @@
 """Files that are either whole or absent: atomic writes of npz, JSON and text, and their readers.
 
-A file is written under a temporary name in its own directory, flushed to the disk, renamed over the final
-name, and the directory entry is flushed as well. A kill or a power cut at any instant leaves the old file or
-the new one. Pickle never appears: object arrays are refused on writing and `allow_pickle=False` holds on
-reading.
+A file is written under a temporary name in its own directory, flushed to the disk and renamed, and the
+directory entry is flushed. Pickle never appears: object arrays are refused.
 """
 
 from __future__ import annotations

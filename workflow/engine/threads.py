@@ -1,8 +1,7 @@
 """How many threads numerical libraries take: one, here and in the processes begun here.
 
-Matrices in flexlink are small: threads would only wait for one another, beside another busy process for most
-of the time. And sums that are split otherwise round otherwise: whatever OMP_NUM_THREADS says, a command ends
-with the same bytes.
+Matrices here are small, so threads would only wait for one another; and sums that are split otherwise round
+otherwise.
 """
 
 from __future__ import annotations

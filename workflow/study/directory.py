@@ -8,8 +8,8 @@
     table.csv .json      one row per point; nothing in them depends on when or where a point was computed
     study.html, pareto.svg
 
-One process writes here; workers hand over bytes. A point is finished when its manifest says so and its files
-match what they would be made from now, so a killed study goes on where it stood.
+One process writes here; workers hand over bytes. A point is finished when its files match what they would be
+made from now.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """What a worker does: bytes in, bytes out, in a directory of its own that is gone afterwards.
 
-Nothing here knows where it runs. A worker that dies leaves nothing behind, and the same task gives the same
-bytes anywhere: streams are keyed by the seed in the configuration and the stage, never by worker or order.
+The same task gives the same bytes anywhere: random streams are keyed by seed and stage.
 """
 
 from __future__ import annotations

@@ -49,11 +49,9 @@ def run_study(
 ) -> RunSummary:
     """Compute every point of a study into `out`, then table and page; the table's numbers in the summary.
 
-    `resume` takes up the study that is there, `replace` deletes it first (when all that was given is right).
-
     jobs: processes of this machine (default: one per processor). scheduler: address of a Dask scheduler whose
-    workers compute the points; what the points share is still computed here. A point that cannot be certified
-    is a result.
+    workers compute the points; what these share is computed here. resume takes up the study that is there,
+    replace deletes it first. A point that cannot be certified is a result.
 
     Raises InputError (one line) for anything wrong with what the user gave, StageError when points failed
     (table and page are written all the same, and a resumed study tries them again) or the scheduler was lost.

@@ -65,8 +65,7 @@ def find_design(
     `advise` also what would be met instead.
 
     With `calibrate`, and plants to draw from, one whose sampled responses are stable as often as the
-    certificate then asks. A specification that no controller can meet is a result, not an error: the report
-    has to say what blocks it.
+    certificate then asks. A specification that no controller can meet is a result, not an error.
     """
     # As it is stored: without what a run says beside it.
     specification = Specification.model_validate(
@@ -129,12 +128,8 @@ def certify_asked(
     *,
     between_own_points: Literal["nothing", "linear"] = "linear",
 ) -> CertifyResult:
-    """The certificate, and for how many sampled responses its worst case holds.
-
-    Without `calibrate` the certificate is that of the ellipses at their own level, whatever the draws say;
-    with it the ellipses are of the calibrated level where that is higher, and the share of stable draws is an
-    item of the certificate.
-    """
+    """The certificate, and for how many sampled responses its worst case holds. With `calibrate` the ellipses
+    are of the calibrated level where that is higher, and the share of stable draws is an item."""
     reason = undrawable(plants) if options.joint_draws else said("not_drawn")
     calibrated = reason is None and options.calibrate
     certificate = certify(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -421,13 +421,6 @@ def rigid_motion(
 
 
 def _turned(motion: RigidMotion) -> RigidMotion:
-    def turn(term: Term) -> Term:
-        return replace(term, value=-term.value)
-
-    return replace(
-        motion,
-        inertia=turn(motion.inertia),
-        viscous=turn(motion.viscous),
-        friction=turn(motion.friction),
-        stiffness=None if motion.stiffness is None else turn(motion.stiffness),
-    )
+    terms = {name: term for name, term in vars(motion).items() if isinstance(term, Term)}
+    turned: Any = {name: replace(term, value=-term.value) for name, term in terms.items()}
+    return replace(motion, **turned)

@@ -1,7 +1,5 @@
-"""The loop on the identified arm with its dry friction, which the linear prediction knows nothing of.
-
-|S| by size of the reference, sticking, error at rest, and the feed-forward of the friction.
-"""
+"""The loop on the identified arm with its dry friction: |S| by size of the reference, sticking, error at
+rest, and the feed-forward of the friction."""
 
 from __future__ import annotations
 

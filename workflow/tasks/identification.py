@@ -230,8 +230,7 @@ def _direct(found: IdentifiedChannel, explained: float | None, *, stated: bool) 
     the model.
 
     Feedback does no harm where the residuals are not found again in later inputs; else what they have in
-    common with the input, noncausal as it is, is held against the ellipses. White residuals behind a noise
-    model are no reason to rely on these: they take model and noise as independent, which a loop undoes.
+    common with the input is held against the ellipses, which take model and noise as independent.
     """
     model, residuals = found.model, found.identification.residuals
     delay = model.input_delay_samples

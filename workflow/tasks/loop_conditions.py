@@ -1,9 +1,8 @@
 """The loop on the nonlinear arm under conditions it was not designed in, each beside the same prediction.
 
-The prediction is always the identified model with the controller and its limits: payload, delay, friction and
-steps of the converters are what it does not know. Only the push at the tip needs more: a model from voltage
-to angle says nothing of forces at the tip, so the free arm's answer to the push (computed without friction)
-enters the predicted loop as a disturbance of the output.
+The prediction is the identified model with the controller and its limits; it does not know payload, delay,
+friction and converter steps. A push at the tip enters it as a disturbance of the output: the free arm's
+answer, computed without friction.
 """
 
 from __future__ import annotations

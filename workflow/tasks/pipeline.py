@@ -53,11 +53,9 @@ def run_pipeline(
 ) -> RunSummary:
     """Run every stage into `out` and return the table of numbers.
 
-    `config_text` is kept as config.toml (the file as the user wrote it; `called` in complaints); `resume`
-    takes up a run that is there, `replace` starts it afresh; `page` is the stage that comes last and writes
-    the page; `c_code` are the fields of `Dialect` that are stated, kept with the run for when it is resumed.
-    A result that is not certified is no error: the page is written all the same and `RunSummary.certified`
-    says so.
+    config_text: kept as config.toml (`called` in complaints); resume takes up a run that is there, replace
+    starts it afresh; page: the last stage, which writes the page; c_code: the fields of `Dialect` that are
+    stated, kept for when it is resumed. A result that is not certified is no error.
 
     Raises InputError (one line) for anything wrong with what the user gave; what this call created is removed
     then, unless identification had already been paid for. Raises StageError when a computation fails.

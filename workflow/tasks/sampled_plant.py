@@ -26,9 +26,8 @@ FINITE = 1e9
 def realise(posterior: ResponsePosterior, coefficients: Real) -> control.StateSpace:
     """One draw of coefficients (P,): poles and kernel in parallel.
 
-    A kernel of L taps is the basis of L poles at zero, a shift register; both parts carry their own
-    integrators and delay, which doubles those states and changes nothing in the response from rest. Unstable
-    poles are those of the draw, behind the sum: once, or what rounding leaves between two would grow.
+    A kernel of L taps is the basis of L poles at zero; both parts carry their own integrators and delay.
+    Unstable poles are those of the draw, behind the sum: once, or what rounding leaves between would grow.
     """
     n, direct = posterior.poles.order, int(posterior.has_feedthrough)
     parts = [_part(posterior, posterior.poles, coefficients[:n], float(coefficients[n]) if direct else 0.0)]
