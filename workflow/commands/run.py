@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from workflow.config.joints_config import JointsConfig, TwoJointSource, is_for_joints, load_joints
 from workflow.config.run_config import (
@@ -21,6 +23,7 @@ from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory, default_directory
 
 if TYPE_CHECKING:
+    from ident.data.record import Record
     from workflow.text.templates import RunSummary
 
 
@@ -94,30 +97,16 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
     config = load_simulation(config_path) if config_path is not None else built_in_config()[0]
     if not isinstance(config.source, SimulatedSource):
         raise InputError(f"{config_path}: source.kind is 'files'; simulating needs kind = 'simulated'")
-    out = Path(out)
     RunDirectory(out).refuse_unless_free()
     # Here: what simulates takes seconds to load, and a configuration that is refused does not need it.
-    from workflow.tasks.simulated_rig import (
-        INPUT_NAME,
-        OUTPUT_NAMES,
-        REFERENCE_NAME,
-        TRUTH_FILE,
-        simulate_record,
-        truth_of,
-    )
+    from workflow.tasks.simulated_rig import TRUTH_FILE, simulate_record, truth_of
 
-    texts = {}
+    records = []
     for index, entry in enumerate(config.source.records):
         with naming(f"{config_path or 'default arm'}: source.records[{index}] ({entry.name})"):
-            record = simulate_record(config.source, entry, config.run.seed)
-        columns = [*record.input.T, *record.output.T]
-        signals = dict(zip((INPUT_NAME, *OUTPUT_NAMES), columns, strict=True))
-        if record.reference is not None:
-            signals = {REFERENCE_NAME: record.reference[:, 0], **signals}
-        safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", entry.name)
-        texts[f"{index + 1:02d}_{safe}.csv"] = storage.csv_text({"time_s": record.time_s, **signals})
-    texts[TRUTH_FILE] = truth_of(config.source).model_dump_json(indent=1) + "\n"
-    return storage.write_new_directory(out, texts)
+            records.append(simulate_record(config.source, entry, config.run.seed))
+    truth = {TRUTH_FILE: truth_of(config.source).model_dump_json(indent=1) + "\n"}
+    return storage.write_new_directory(out, _as_csv(records) | truth)
 
 
 def _simulate_joints(config_path: Path, out: Path) -> list[Path]:
@@ -127,11 +116,17 @@ def _simulate_joints(config_path: Path, out: Path) -> list[Path]:
     RunDirectory(out).refuse_unless_free()
     from workflow.tasks.joints import simulate_point
 
+    records = [simulate_point(config, config.source, point) for point in config.source.points]
+    return storage.write_new_directory(out, _as_csv(records))
+
+
+def _as_csv(records: Sequence[Record]) -> dict[str, str]:
+    """One text by file name for each: time_s, the reference of a loop, inputs, outputs."""
     texts = {}
-    for index, point in enumerate(config.source.points):
-        record = simulate_point(config, config.source, point)
-        names = (*record.input_names, *record.output_names)
-        signals = dict(zip(names, [*record.input.T, *record.output.T], strict=True))
-        safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", point.name)
-        texts[f"{index + 1:02d}_{safe}.csv"] = storage.csv_text({"time_s": record.time_s, **signals})
-    return storage.write_new_directory(out, texts)
+    for number, record in enumerate(records, 1):
+        names = (*record.reference_names, *record.input_names, *record.output_names)
+        signals = [part for part in (record.reference, record.input, record.output) if part is not None]
+        columns = dict(zip(names, np.hstack(signals).T, strict=True))
+        safe = re.sub(r"[^A-Za-z0-9_.-]+", "_", record.name)
+        texts[f"{number:02d}_{safe}.csv"] = storage.csv_text({"time_s": record.time_s, **columns})
+    return texts
