@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Self
@@ -133,6 +134,36 @@ class FrfRepeats:
             self.response[keep],
             tuple(name for name, kept in zip(self.label, keep, strict=True) if kept),
         )
+
+
+def measured_response(
+    paths: Sequence[Path],
+    dt_s: float,
+    *,
+    level: float = 0.95,
+    pool_neighbours: int = 0,
+    outlier_threshold: float | None = None,
+) -> FrequencyUncertainty | FrfRepeats:
+    """Of a table with variances, or the mean of repeated sweeps in one file or several (`FrfRepeats.mean`);
+    the points themselves where each frequency is measured once. Raises ValueError naming the file."""
+    if len(paths) == 1 and "variance_real" in (names := read_table(paths[0]).names):
+        known = {"variance_real", "variance_imag", "covariance_real_imag"}
+        for column in names:
+            # A covariance under another name would be left out in silence, and the ellipses be wrong.
+            if column not in known and ("covar" in column.lower() or "varian" in column.lower()):
+                raise ValueError(
+                    f"{paths[0]}, line 1: unknown column {column!r}; the spread stands in "
+                    f"{', '.join(sorted(known))}"
+                )
+        return FrequencyUncertainty.from_csv(paths[0], dt_s, level=level)
+    sweeps = [FrfRepeats.from_csv(path) for path in paths]
+    omega, response = (
+        np.concatenate([getattr(one, name) for one in sweeps]) for name in ("omega_rad_s", "response")
+    )
+    found = FrfRepeats(omega, response)
+    if np.unique(omega).size == omega.size:
+        return found
+    return found.mean(dt_s, level=level, pool_neighbours=pool_neighbours, outlier_threshold=outlier_threshold)
 
 
 def _too_few(grid: RealArray, count: IntArray, freedom: IntArray) -> str:

@@ -9,9 +9,7 @@ import numpy as np
 
 from ident.basis.model_files import ModelFile
 from ident.basis.options import IdentOptions
-from ident.data.frequency_uncertainty import FrequencyUncertainty
-from ident.data.frf_records import FrfRepeats
-from ident.data.record_files import read_table
+from ident.data.frf_records import FrfRepeats, measured_response
 from ident.frequency_fit import FrfIdentification, identify_frf
 from ident.uncertainty.nominal import nominal_near
 from workflow.engine import codec, interrupts, storage
@@ -55,7 +53,13 @@ def identify_response(
     progress = progress or Progress()
     progress.plan((("identify", 1.0),))
     with progress.stage("identify"), naming(str(paths[0])):
-        response = _read(paths, dt_s, level)
+        response = measured_response(paths, dt_s, level=level)
+        if isinstance(response, FrfRepeats):
+            raise InputError(
+                f"{paths[0]}: one sweep: every frequency is measured once, so its spread is not known; give "
+                "variance_real, variance_imag or more sweeps (flexlink identify SWEEP1 SWEEP2 SWEEP3); or a "
+                "stated uncertainty, [uncertainty] multiplicative = 0.1 in the file of flexlink design --spec"
+            )
         found = identify_frf(response, options)
     written: dict[Path, bytes] = {}
     if out is not None or export is not None:
@@ -76,20 +80,6 @@ def identify_response(
         numbers=_numbers(found, out, export),
         verdict=count(len(found.warnings), "warning"),
     )
-
-
-def _read(paths: Sequence[Path], dt_s: float, level: float) -> FrequencyUncertainty:
-    if len(paths) == 1 and "variance_real" in read_table(paths[0]).names:
-        return FrequencyUncertainty.from_csv(paths[0], dt_s, level=level)
-    sweeps = [FrfRepeats.from_csv(path) for path in paths]
-    omega = np.concatenate([sweep.omega_rad_s for sweep in sweeps])
-    if np.unique(omega).size == omega.size:
-        raise InputError(
-            f"{paths[0]}: one sweep: every frequency is measured once, so its spread is not known; give "
-            "variance_real, variance_imag or more sweeps (flexlink identify SWEEP1 SWEEP2 SWEEP3); or a "
-            "stated uncertainty, [uncertainty] multiplicative = 0.1 in the file of flexlink design --spec"
-        )
-    return FrfRepeats(omega, np.concatenate([sweep.response for sweep in sweeps])).mean(dt_s, level=level)
 
 
 def _numbers(found: FrfIdentification, out: Path | None, export: Path | None) -> dict[str, object]:

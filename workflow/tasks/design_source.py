@@ -22,7 +22,7 @@ from control_design.plants.plant_set import UncertainPlant, count_integrators, f
 from control_design.plants.stated_uncertainty import StatedDiscs
 from ident.basis.model_files import FORMAT
 from ident.data.ellipses import chi2_radius
-from ident.data.frf_records import FrfRepeats
+from ident.data.frf_records import measured_response
 from ident.data.record_files import READERS, read_table
 from ident.data.response_columns import has_response
 from ident.frequency_fit import identify_frf
@@ -38,8 +38,6 @@ from workflow.tasks.results import IdentifiedPlant, RunResults
 from workflow.tasks.system_files import DOCUMENTS, read_document, read_state_space
 from workflow.tasks.uncertainty import agreement_of
 from workflow.text.templates import said, words
-
-# Endings that may hold a model; a table of any other that is read holds a measured response.
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,28 +200,25 @@ def _measured(path: Path, design: DesignFile) -> DesignSource:
 
 def _read_response(path: Path, design: DesignFile) -> tuple[FrequencyUncertainty, bool]:
     """The response, and whether its size is what the design file states."""
-    about, table = design.plant, read_table(path)
+    about = design.plant
     assert about.dt_s is not None
-    if "variance_real" in table.names:
-        _refuse_strange_spread(path, table.names)
-        return FrequencyUncertainty.from_csv(path, about.dt_s, level=about.level), False
-    repeats = FrfRepeats.from_csv(path)
-    grid, first = np.unique(repeats.omega_rad_s, return_index=True)
-    if grid.size < repeats.omega_rad_s.size:
-        response = repeats.mean(
-            about.dt_s,
-            level=about.level,
-            pool_neighbours=about.pool_neighbours,
-            outlier_threshold=about.outlier_threshold,
-        )
-        return response, False
+    found = measured_response(
+        [path],
+        about.dt_s,
+        level=about.level,
+        pool_neighbours=about.pool_neighbours,
+        outlier_threshold=about.outlier_threshold,
+    )
+    if isinstance(found, FrequencyUncertainty):
+        return found, False
     if design.uncertainty is None:
         raise InputError(
             f"{path}: one sweep: every frequency is measured once, so its spread is not known; give "
             "variance_real, variance_imag or a stated uncertainty, as [uncertainty] multiplicative = 0.1 in "
             f"{design.name}"
         )
-    centre, weight = repeats.response[first], design.uncertainty.multiplicative or design.uncertainty.additive
+    grid, first = np.unique(found.omega_rad_s, return_index=True)
+    centre, weight = found.response[first], design.uncertainty.multiplicative or design.uncertainty.additive
     assert weight is not None
     size = np.abs(centre) if design.uncertainty.multiplicative is not None else 1.0
     # As `StatedDiscs` sees the weight.
@@ -231,16 +226,6 @@ def _read_response(path: Path, design: DesignFile) -> tuple[FrequencyUncertainty
     deviation = size * np.abs(weight.at(tustin)) / chi2_radius(about.level)
     covariance = deviation[:, None, None] ** 2 * np.eye(2)
     return FrequencyUncertainty(grid, centre, covariance, about.dt_s, about.level, "stated"), True
-
-
-def _refuse_strange_spread(path: Path, names: Sequence[str]) -> None:
-    """A covariance under another name would be left out in silence, and the ellipses be wrong."""
-    known = {"variance_real", "variance_imag", "covariance_real_imag"}
-    for column in names:
-        if column not in known and ("covar" in column.lower() or "varian" in column.lower()):
-            raise InputError(
-                f"{path}, line 1: unknown column {column!r}; the spread stands in {', '.join(sorted(known))}"
-            )
 
 
 def _grid_remarks(plant: UncertainPlant) -> tuple[str, ...]:
