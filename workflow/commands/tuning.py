@@ -9,11 +9,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import tomlkit
-from pydantic.fields import FieldInfo
 
 from control_design.analysis.certificate import Certificate, certify
 from control_design.analysis.joint_coverage import at_level, drawn
@@ -47,6 +46,10 @@ _SHOWN = 1e-4  # share of the Nyquist frequency where pictures over frequency be
 _NEAR = 3.0  # distance from 0 up to which the Nyquist curve is shown
 _ELLIPSES, _CORNERS = 60, 24
 
+
+# Of a setting in the JSON schema of the specification: the page's control, and ends of its range.
+_KINDS = {"boolean": "switch", "enum": "choice", "integer": "count", "number": "number"}
+_ENDS = {"minimum": "ge", "exclusiveMinimum": "gt", "maximum": "le", "exclusiveMaximum": "lt"}
 
 Handler = Callable[[Mapping[str, Any]], dict[str, Any]]
 
@@ -82,20 +85,13 @@ class TuningSession:
 
     def settings(self) -> list[dict[str, Any]]:
         """What the page has a control for: name, kind, description, value, range."""
-        fields = Specification.model_fields
+        fields = Specification.model_json_schema()["properties"]
         found = [_control(name, field, getattr(self.specification, name)) for name, field in fields.items()]
         if self.drawable:
             level = {"ge": 0.5, "lt": 0.9999}
             words = "confidence of each ellipse: share of the probability inside"
-            found.append(
-                {
-                    "name": CONFIDENCE,
-                    "kind": "number",
-                    "words": words,
-                    "value": self._plants[0].level,
-                    **level,
-                }
-            )
+            about = {"name": CONFIDENCE, "kind": "number", "words": words, "value": self._plants[0].level}
+            found.append(about | level)
         return [one for one in found if one is not None]
 
     def _read(self, values: Mapping[str, Any]) -> tuple[Specification, list[UncertainPlant], float | None]:
@@ -345,42 +341,23 @@ def _of_synthesis(result: SynthesisResult) -> dict[str, Any]:
     return {"gamma": result.gamma, "active": words, "order": result.controller.order}
 
 
-def _control(name: str, field: FieldInfo, value: Any) -> dict[str, Any] | None:
-    """The page's control of a field; None for a pair or a weight, which stays as it is stated."""
-    words, optional = str(field.description), type(None) in _kinds(field.annotation)
-    kinds = [kind for kind in _kinds(field.annotation) if kind is not type(None)]
-    found: dict[str, Any] = {"name": name, "words": words, "value": value, "optional": optional}
-    if kinds == [int, "auto"]:
-        found["optional"], found["unasked"], kinds = True, kinds.pop(), [int]
-    if kinds == [bool]:
-        return {**found, "kind": "switch"}
-    if kinds and all(isinstance(kind, str) for kind in kinds):
-        return {**found, "kind": "choice", "choices": kinds}
-    if kinds not in ([int], [float]):
+def _control(name: str, schema: Mapping[str, Any], value: Any) -> dict[str, Any] | None:
+    """The page's control of a field by its JSON schema; None for a pair or a weight, which stays as it is."""
+    parts = schema.get("anyOf", [schema])
+    found: dict[str, Any] = {"name": name, "words": schema["description"], "value": value}
+    found["optional"] = {"type": "null"} in parts
+    if "const" in parts[-1]:
+        found |= {"optional": True, "unasked": parts[-1]["const"]}
+    kind = _KINDS.get("enum" if "enum" in parts[0] else parts[0].get("type", ""))
+    if kind is None:
         return None
-    limits = {
-        key: getattr(m, key)
-        for m in _constraints(field)
-        for key in ("ge", "gt", "le", "lt")
-        if hasattr(m, key)
+    if kind == "choice":
+        found["choices"] = parts[0]["enum"]
+    return {
+        **found,
+        "kind": kind,
+        **{short: parts[0][long] for long, short in _ENDS.items() if long in parts[0]},
     }
-    return {**found, "kind": "count" if kinds == [int] else "number", **limits}
-
-
-def _kinds(annotation: Any) -> list[Any]:
-    """Types of a union, choices of a literal; what an annotation is about."""
-    if hasattr(annotation, "__metadata__"):
-        return _kinds(annotation.__origin__)
-    inner = get_args(annotation)
-    if not inner or getattr(annotation, "__origin__", None) is tuple:
-        return [annotation]
-    return [kind for one in inner for kind in ([one] if isinstance(one, str) else _kinds(one))]
-
-
-def _constraints(field: FieldInfo) -> list[Any]:
-    """Limits of a number, those of an inner type too."""
-    inner = [one for part in get_args(field.annotation) for one in getattr(part, "__metadata__", ())]
-    return [*field.metadata, *(m for one in inner for m in getattr(one, "metadata", [one]))]
 
 
 def toml_of(file: DesignFile) -> str:
