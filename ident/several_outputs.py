@@ -20,7 +20,7 @@ from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.checks.answer import explains_nothing
-from ident.checks.input_checks import few_samples, least_independence, refuse_unusable
+from ident.checks.input_checks import alike_inputs, few_samples, refuse_unusable
 from ident.checks.plausible_modes import pole_warnings
 from ident.checks.prior_tests import NuisanceTest
 from ident.data.arrays import RealArray
@@ -42,8 +42,6 @@ _ROUNDS = 3
 _WHITE = 0.05
 # Level of the test of one shape per mode.
 _LEVEL = 1e-3
-# Where a combination of the inputs has less of the power the channels are told apart badly.
-_ALIKE_INPUT = 1e-2
 # A residual worth less than this share of its samples is not white.
 _COLOURED = 0.8
 
@@ -220,7 +218,7 @@ def _described(
         n_fixed=search.fixed.counts,
         verdicts=found.verdicts,
         search=SearchTrace(tuple(search.stages), tuple(search.minima), (), search.evaluations),
-        advise=partial(_advice, search, model, residual),
+        advise=partial(_advice, records, search, model, residual),
     )
 
 
@@ -253,14 +251,14 @@ def _model(
     )
 
 
-def _advice(search: PoleSearch[OutputRegressions], model: MimoModel, residual: RealArray) -> list[Finding]:
+def _advice(
+    records: Sequence[Record], search: PoleSearch[OutputRegressions], model: MimoModel, residual: RealArray
+) -> list[Finding]:
     data, found = search.data, pole_warnings(model.outputs[0], search.fixed, search.bounds)
     if model.order:
         for one, rest in zip(data.each, residual, strict=True):
             found += explains_nothing(one, model.poles, search.fixed, rest)
-    found += few_samples(data.each[0], model.order)
-    if least_independence(data.each[0]) < _ALIKE_INPUT:
-        found.append(finding(FindingKind.ALIKE_INPUTS, inputs=str(list(model.input_names))))
+    found += few_samples(data.each[0], model.order) + alike_inputs(records)
     worth = data.colour(residual.ravel()).effective_samples
     if worth < _COLOURED * data.n_samples:
         found.append(finding(FindingKind.COLOURED_RESIDUAL, n_samples=data.n_samples, worth=worth))

@@ -557,7 +557,7 @@ def design(
         Path | None,
         typer.Option(
             help="Write the controller here, by the ending: .json or .mat (discrete state space), .c (C99, "
-            "with its header); or into a directory, as controller.json, .c and .h; "
+            "with its header); or into a directory, as controller.json, .mat, .c and .h; "
             "a reference filter beside it, as NAME_reference_filter."
         ),
     ] = None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -15,6 +14,7 @@ from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import matrix_response
 from ident.data.arrays import lock
 from ident.data.json_text import json_value
+from ident.data.mat_files import mat_bytes
 
 if TYPE_CHECKING:
     import control
@@ -124,18 +124,15 @@ class Law:
     def to_mat(self) -> bytes:
         """MATLAB 5 file of all fields; a limit that is None is infinite (one per actuator: a row), a
         feed-forward that is None is left out."""
-        import scipy.io  # here: few use such files, and every command would wait for it
-
         values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
         given = values.pop("feedforward", None)
         if given is not None:
             values["feedforward"] = vars(given)
-        stream: Any = io.BytesIO()  # scipy takes streams, its stubs know paths only
         for name, value in values.items():
             if isinstance(value, tuple):
                 values[name] = np.array([np.inf if one is None else one for one in value])
-        scipy.io.savemat(stream, {k: np.inf if value is None else value for k, value in values.items()})
-        return bytes(stream.getvalue())
+        values = {name: np.inf if value is None else value for name, value in values.items()}
+        return mat_bytes(values, f"flexlink {self.kind}")
 
     @classmethod
     def from_json(cls, text: str) -> Self:

@@ -7,28 +7,24 @@ wanted, ellipses. State matrices and poles that contradict each other are refuse
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.io
 
 from ident.basis.model import GobfModel
 from ident.basis.poles import NO_POLES, Poles
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.json_text import json_value
-from ident.data.mat_files import mat_variables
+from ident.data.mat_files import mat_bytes, mat_variables
 
 FORMAT = "flexlink GOBF model"
 FORMAT_VERSION = 1  # the first; files of another one are refused
 
 # The state matrices are computed anew on reading; another machine may round differently.
 _STATE_TOLERANCE = 1e-9
-# The text that opens a .mat file carries the date; without it equal models give equal files.
-_MAT_HEADER = b"MATLAB 5.0 MAT-file, flexlink GOBF model".ljust(116)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +76,7 @@ class ModelFile:
         """Content of a .mat file; every number is a double, vectors are columns, pairs and centre complex."""
         variables = self._document()
         variables |= {name: float(value) for name, value in variables.items() if isinstance(value, int)}
-        buffer: Any = io.BytesIO()  # scipy takes streams, its stubs know paths only
-        scipy.io.savemat(buffer, variables, oned_as="column")
-        return bytes(_MAT_HEADER + buffer.getvalue()[len(_MAT_HEADER) :])
+        return mat_bytes(variables, FORMAT, oned_as="column")
 
     @classmethod
     def from_mat(cls, content: bytes, source: str = "model file") -> ModelFile:

@@ -11,7 +11,7 @@ from scipy.special import chdtri
 
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
-from ident.data.arrays import RealArray
+from ident.data.arrays import ComplexArray, RealArray
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.fit.least_squares import Regression
@@ -37,6 +37,12 @@ _DRIFT_LEVEL = 1e-5  # one false alarm in 100 000 records
 _AS_WELL = 1.05
 # Inputs are one signal if a combination of them, each scaled to unit length, has less of the power.
 _SAME_INPUT = 1e-12
+# Inputs are alike in a band where a combination of them, each of unit power there, has less of it ...
+_ALIKE_INPUT = 1e-2
+# ... by lines whose power is worth so many an input (a Hann window makes 1.5 of one; independent inputs then
+# have ten times as much), within an octave. Poles bridge a band of less than a third of an octave. An input
+# rests at lines with less than _LEAKAGE of its mean density.
+_LINES_AN_INPUT, _CELLS, _LEAST_CELLS = 6.0, 12, 4
 # Of a sine in a Hann window there are 2, of an integrator that hunts against stiction up to 3.3; of 45
 # closed-loop machines' logs, moves among them, 10 or more; of measured ones 8 or more.
 _FEWEST_LINES = 6.0
@@ -114,6 +120,60 @@ def least_independence(data: Regression) -> float:
         return 1.0
     rows = data.u / np.linalg.norm(data.u, axis=1, keepdims=True)
     return float(np.linalg.eigvalsh(rows @ rows.T)[0])
+
+
+def alike_inputs(records: Sequence[Record]) -> list[Finding]:
+    """Where several inputs move in fewer directions than there are inputs: which inputs, the rank of their
+    spectra, summed over all records, and the widest band of each such group."""
+    names, dt_s = records[0].input_names, records[0].dt_s
+    each = [detrend(one.input, axis=0) * np.hanning(len(one.input))[:, None] for one in records]
+    if len(names) == 1:
+        return []
+    lines = np.concatenate([np.fft.rfft(moved, axis=0)[1:] / np.sqrt(len(moved)) for moved in each])
+    omega = np.concatenate([2 * np.pi * np.fft.rfftfreq(len(moved), dt_s)[1:] for moved in each])
+    lines /= np.sqrt(np.mean(np.abs(lines) ** 2, axis=0))
+    cell = np.floor(_CELLS * np.log2(omega / omega.min()) + 1e-9).astype(int)  # of a twelfth of an octave
+    power, n_cells = np.sum(np.abs(lines) ** 2, axis=1), int(cell.max()) + 1
+    sums = np.zeros((n_cells, len(names), len(names)), dtype=np.complex128)
+    np.add.at(sums, cell, lines[:, :, None] * lines[:, None, :].conj())
+    count, first, second = (np.bincount(cell, power**k, n_cells) for k in range(3))
+    groups: dict[tuple[tuple[str, ...], int], tuple[int, int]] = {}
+    start, band, group = 0, (0, 0), None
+    for stop in range(1, n_cells + 1):
+        start = max(start, stop - _CELLS)
+        here = slice(start, stop)
+        if first[here].sum() ** 2 < _LINES_AN_INPUT * len(names) * second[here].sum():
+            continue
+        found = _dependent(sums[here].sum(axis=0) / count[here].sum())
+        band = (band[0] if found == group and band[1] == start else start, stop)
+        group, start = found, stop
+        if group is not None:
+            key = tuple(names[i] for i in group[0]), group[1]
+            groups[key] = max(groups.get(key, (0, 0)), band, key=lambda ends: ends[1] - ends[0])
+    return [
+        finding(
+            FindingKind.ALIKE_INPUTS, inputs=str(list(inputs)), rank=rank, count=len(names),
+            low_rad_s=omega[cell == low].min(), high_rad_s=omega[cell < high].max(),
+        )
+        for (inputs, rank), (low, high) in groups.items()
+        if high - low >= _LEAST_CELLS
+    ]  # fmt: skip
+
+
+def _dependent(spectrum: ComplexArray) -> tuple[tuple[int, ...], int] | None:
+    """Inputs that rest or depend on one another by their spectral matrix (U, U), and its rank; None for full
+    rank, or where every input rests."""
+    size = np.diag(spectrum).real
+    moved = np.flatnonzero(size > _LEAKAGE)
+    unit = spectrum[np.ix_(moved, moved)] / np.sqrt(np.outer(size[moved], size[moved]))
+    values, vectors = np.linalg.eigh(unit)
+    rank = int(np.sum(values > _ALIKE_INPUT))
+    if rank in (0, size.size):
+        return None
+    share = np.zeros(size.size)
+    share[moved] = np.sum(np.abs(vectors[:, : moved.size - rank]) ** 2, axis=1)
+    involved = (size <= _LEAKAGE) | (share > 0.05 * max(share.max(), 1e-300))
+    return tuple(int(i) for i in np.flatnonzero(involved)), rank
 
 
 def advice(

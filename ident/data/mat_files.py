@@ -1,17 +1,18 @@
-"""MATLAB files of level 5 (versions 5 to 7.2) as plain values.
+"""MATLAB files of level 5 (versions 5 to 7.2) from and as plain values.
 
-Read here and not by scipy, whose compiled reader trusts what the file says of itself: a name with a NUL in it
-or a variable that is there twice has ended the process. Every length is checked against the bytes that are
-there. Source: MathWorks, MAT-File Format, chapter 1. Version 7.3 is HDF5 (`record_files`); level 4, sparse
-matrices and MATLAB's own objects (timeseries, table, string, datetime) are not read.
+Written by scipy; read here and not by scipy, whose compiled reader trusts what the file says of itself: a
+name with a NUL in it or a variable that is there twice has ended the process. Every length is checked against
+the bytes that are there. Source: MathWorks, MAT-File Format, chapter 1. Version 7.3 is HDF5 (`record_files`);
+level 4, sparse matrices and MATLAB's own objects (timeseries, table, string, datetime) are not read.
 """
 
 from __future__ import annotations
 
+import io
 import re
 import struct
 import zlib
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -26,6 +27,17 @@ _COMPLEX_FLAG = 0x08  # MAT-File Format, figure 1-3: bit 3 of the flags
 _HEADER_BYTES = 128  # MAT-File Format, figure 1-1
 _DEEPEST = 16  # of structs in structs: far from Python's own limit
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}")
+
+
+def mat_bytes(variables: dict[str, Any], what: str, *, oned_as: Literal["row", "column"] = "row") -> bytes:
+    """Content of a file of the variables; equal variables give equal files. what: said in its first line."""
+    import scipy.io  # here: few write such files, and every command would wait for it
+
+    stream: Any = io.BytesIO()  # scipy takes streams, its stubs know paths only
+    scipy.io.savemat(stream, variables, oned_as=oned_as)
+    head = b"MATLAB 5.0 MAT-file, " + what.encode("ascii")
+    # The text that opens the file has 116 bytes; scipy writes the date there.
+    return head.ljust(116) + bytes(stream.getvalue()[116:])
 
 
 def mat_variables(content: bytes, source: object) -> dict[str, Any]:

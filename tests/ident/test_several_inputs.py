@@ -10,6 +10,7 @@ from ident.basis.functions import free_response
 from ident.basis.model import MisoModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
+from ident.checks.input_checks import alike_inputs
 from ident.data.finding import FindingKind
 from ident.data.record import Record
 from ident.fit.least_squares import fit
@@ -328,6 +329,51 @@ def test_advice_on_alike_inputs_and_coloured_residuals():
     options = IdentOptions(n_real=1, n_pairs=2)
     result = identify_mimo([Record("alike", nearly, y + noise, DT_S, ("a", "b"), ("tip",))], options)
     assert {FindingKind.ALIKE_INPUTS, FindingKind.COLOURED_RESIDUAL} <= kinds(result.warnings)
+
+
+def _bands(*inputs):
+    """Of every finding: inputs, rank, lowest and highest frequency [rad/s]; 10 ms, an output beside it."""
+    records = [
+        Record("r", u, u[:, :1], 0.01, tuple(f"u{i}" for i in range(u.shape[1])), ("y",)) for u in inputs
+    ]
+    found = [item.values for item in alike_inputs(records)]
+    return [(v["inputs"], v["rank"], v["low_rad_s"], v["high_rad_s"]) for v in found]
+
+
+def _in_band(signal_, low_rad_s, high_rad_s):
+    lines = np.fft.rfft(signal_, axis=0)
+    omega = 2 * np.pi * np.fft.rfftfreq(len(signal_), 0.01)
+    lines[(omega < low_rad_s) | (omega > high_rad_s)] = 0
+    return np.fft.irfft(lines, len(signal_), axis=0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_dependent_inputs_are_named_with_their_band_and_rank(seed):
+    a = np.random.default_rng(seed).normal(size=(4000, 3))
+    alike = a[:, :2] - _in_band(a[:, :2], 20, 80) + _in_band(a[:, 2:], 20, 80) * [1.0, -3.0]
+    ((names, rank, low, high),) = _bands(np.column_stack([alike, a[:, 2]])[:, :2])
+    assert (names, rank) == ("['u0', 'u1']", 1)
+    np.testing.assert_allclose([low, high], [20, 80], rtol=0.26)  # a third of an octave: lines are few there
+    resting = np.column_stack([a[:, 0], _in_band(a[:, 1], 0, 40)])
+    ((names, rank, low, high),) = _bands(resting)
+    assert (names, rank) == ("['u1']", 1)
+    np.testing.assert_allclose([low, high], [40, np.pi / 0.01], rtol=0.26)
+    ((names, rank, *_),) = _bands(np.column_stack([a, a[:, 0] + a[:, 2]]))
+    assert (names, rank) == ("['u0', 'u2', 'u3']", 3)
+    late = np.column_stack([a[:, 0], np.roll(a[:, 0], 7)])  # independent as whole records are
+    assert _bands(late)[0][:2] == ("['u0', 'u1']", 1)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_independent_inputs_are_not_called_alike(seed):
+    rng = np.random.default_rng(seed)
+    for n, count in ((60, 2), (400, 7), (3000, 3)):
+        white = rng.normal(size=(n, count))
+        assert not _bands(white)
+        assert not _bands(np.cumsum(white, axis=0))
+        assert not _bands(np.tile(white, (6, 1)))  # a period: every line of it has rank one
+    one = rng.normal(size=(500, 1))
+    assert not _bands(one * [1.0, 0.0], one * [0.0, 1.0])
 
 
 def test_two_link_example(tmp_path):

@@ -36,6 +36,8 @@ VALUES = {
     "unknowns": 90,
     "worth": 123.4,
     "inputs": "['a', 'b']",
+    "rank": 1,
+    "count": 2,
     "record": "r<1>",
     "signal": "output",
     "name": "y",

@@ -9,6 +9,7 @@ import control
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.io
 
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import matrix_response
@@ -78,6 +79,9 @@ def test_a_run_ends_with_a_certified_controller_and_a_page(run_of_the_arm):
     assert law.D.shape == (2, 2)
     assert law.input_limit == (24.0, 24.0)
     assert "controller_step" in (run_of_the_arm / "controller.c").read_text()
+    mat = scipy.io.loadmat(run_of_the_arm / "controller.mat")
+    np.testing.assert_array_equal(mat["A"], law.A)
+    np.testing.assert_array_equal(mat["input_limit"], [[24.0, 24.0]])
     page = (run_of_the_arm / "report.html").read_text()
     assert "Certified: every requirement is met, and the loop settles at 1 of 1 operating point" in page
     for picture in ("joint-steps", "joint-requirements", "matrix-response", "mode-shapes"):
@@ -134,6 +138,25 @@ def test_logs_give_the_same_model_as_the_arm(logs, run_of_the_arm, tmp_path, cap
     assert found["points"][0]["radius"] == pytest.approx(own["points"][0]["radius"], rel=1e-3)
     assert found["design"]["gamma"] == pytest.approx(own["design"]["gamma"], rel=1e-2)
     assert found["closed_loop"]["machine"] == "identified"
+
+
+def test_inputs_that_are_one_signal_in_a_band_are_named_with_the_band(logs, tmp_path, capfd):
+    table = pd.read_csv(logs)
+    lines = np.fft.rfft(table[["shoulder_V", "elbow_V"]].to_numpy(), axis=0)
+    omega = 2 * np.pi * np.fft.rfftfreq(len(table), table["time_s"][1])
+    alike = (omega > 30) & (omega < 90)
+    lines[alike, 1] = 2 * lines[alike, 0]
+    table["elbow_V"] = np.fft.irfft(lines, len(table), axis=0)[:, 1]
+    table.to_csv(tmp_path / "log.csv", index=False)
+    config = _from_log(tmp_path, tmp_path / "log.csv")
+    text = config.read_text().replace("controller_order = 4", "controller_order = 0")
+    config.write_text(text, encoding="utf-8")  # the loop is not what is tested
+    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) != 2
+    said = " ".join(capfd.readouterr().out.replace("│", " ").split())
+    assert "the inputs ['shoulder_V', 'elbow_V'] are not independent from" in said
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "not independent" in page
+    assert "(rank 1 of 2)" in page
 
 
 def _twice(table):

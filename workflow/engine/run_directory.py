@@ -6,7 +6,7 @@
     stages/<name>.npz | .json
     figures/
     report.html
-    controller.json .c .h     and those of the reference filter, where there is one
+    controller.json .mat .c .h     and those of the reference filter, where there is one
 
 A stage is done when its file is there and the input hash recorded *inside* it equals the hash of what the
 stage would be given now (its share of the configuration, its input files, the content of the stages before
@@ -39,7 +39,7 @@ _RESULT = "result"
 _PACKAGES = ("flexlink", "numpy", "scipy", "control", "casadi", "nlopt", "numba", "pydantic", "matplotlib")
 
 
-CONTROLLER_SUFFIXES = (".json", ".c", ".h")
+CONTROLLER_SUFFIXES = (".json", ".mat", ".c", ".h")
 CONTROLLER_FILES = tuple(
     f"controller{of}{suffix}" for of in ("", "_reference_filter") for suffix in CONTROLLER_SUFFIXES
 )

@@ -142,6 +142,33 @@ def draw_matrix_response(run: JointsView) -> Figure:
     return figure
 
 
+@style.drawing("singular-values")
+def draw_singular_values(run: JointsView) -> Figure:
+    """Largest and smallest gain of the plant over all directions of its inputs, with the ball, per point."""
+    figure, grid = style.panels(2.9, 1, 1, squeeze=False)
+    axes = grid[0, 0]
+    for number, point in enumerate(run.results.identify.points):
+        shown = point.shown
+        omega = shown.omega_rad_s
+        sizes = np.linalg.svd(shown.centre, compute_uv=False)
+        # Weyl: no singular value moves by more than the largest one of the deviation.
+        off = shown.radius * np.linalg.norm(shown.output_factor, 2)
+        off = off * np.linalg.norm(shown.input_factor, 2, axis=(1, 2))
+        for each, line, label in (
+            (sizes[:, 0], style.MODEL_LINE, "largest"), (sizes[:, -1], style.PREDICTED_LINE, "smallest")
+        ):  # fmt: skip
+            axes.fill_between(
+                omega, np.maximum(each - off, 1e-2 * each), each + off, **style.BAND,
+                label=None if number or label == "largest" else "over the ball",
+            )  # fmt: skip
+            axes.plot(omega, each, **line, label=None if number else label)
+    axes.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]), xlabel="frequency [rad/s]")
+    first = run.config.joints[0]
+    unit = style.ratio_unit(run.unit(first.output), run.unit(first.input))
+    axes.set_ylabel(f"singular value [{style.plain(unit, 16)}]")
+    return figure
+
+
 @style.drawing("joint-requirements")
 def draw_joint_requirements(run: JointsView) -> Figure | None:
     """Largest singular value of every weighted function, the worst over balls and operating points."""

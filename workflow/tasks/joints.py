@@ -21,6 +21,7 @@ from control_design.synthesis.multivariable import MultivariableResult, synthesi
 from ident.basis.mimo_model import MimoModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
+from ident.data.finding import Finding
 from ident.data.record import Record
 from ident.identification import MimoIdentification
 from ident.several_outputs import identify_mimo
@@ -57,6 +58,7 @@ class PointModel:
     Li_d: Real
     radius: float
     shown: MatrixUncertainty
+    warnings: tuple[Finding, ...] = ()
 
     @property
     def shaped(self) -> bool:
@@ -275,7 +277,7 @@ def _described(
     shown = posterior.at(np.geomspace(lowest_rad_s, 0.999 * top, _SHOWN))
     return PointModel(
         name, found.model, np.sqrt(np.diag(found.noise_covariance)), found.output_fit_percent, found.rank_one,
-        posterior.output_factor, *Li, posterior.largest_radius(lowest_rad_s), shown,
+        posterior.output_factor, *Li, posterior.largest_radius(lowest_rad_s), shown, found.warnings,
     )  # fmt: skip
 
 

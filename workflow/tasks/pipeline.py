@@ -209,7 +209,7 @@ def _dialect(run: RunDirectory, stated: Mapping[str, Any]) -> Dialect:
 
 
 def _keep_controller(results: RunResults, config: RunConfig, dialect: Dialect) -> list[Path]:
-    """controller.json, .c and .h in the run directory, and those of its reference filter."""
+    """controller.json, .mat, .c and .h in the run directory, and those of its reference filter."""
     if (controller := results.design.controller) is None:
         return []
     second, certified = results.reference_filter, results.certify.certified
