@@ -209,17 +209,6 @@ def test_inverse_dynamics_give_a_start_of_the_level(kind: str) -> None:
     assert level_of(records, ways, stiff=kind == "pendulum") == pytest.approx(levels_of(one), rel=1 / 3)
 
 
-@pytest.mark.slow
-def test_unstable_pole_behind_friction() -> None:
-    one = machine("pendulum", 0)
-    records = [logged(one, log) for log in (0, 1)]
-    found = fit_friction(records, IdentOptions())
-    growth = max(one.plant.linear(one.draft.q_operating)[3].real)
-    (unstable,) = found.model.unstable_poles
-    assert np.log(unstable.real) / one.plant.dt_s == pytest.approx(growth, rel=0.05)
-    assert found.level == pytest.approx(levels_of(one), rel=0.1)
-
-
 def test_an_arm_that_drifts_is_judged_in_windows() -> None:
     """A random walk of force beside the command: windows of 2.5 s tell what a free run over 40 s does not."""
     rng, poles = np.random.default_rng(2), Poles.from_continuous(decay_per_s=[5.0], dt_s=0.01)

@@ -257,6 +257,7 @@ def test_a_second_output_behind_the_friction_is_refused(flexlink, refused, tmp_p
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_what_is_taken_is_certified_and_holds_on_the_true_machine(flexlink, tmp_path):
     machine = plant(limit=0.5)
     made = [

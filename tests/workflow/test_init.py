@@ -267,6 +267,7 @@ def test_the_reported_log(flexlink, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_the_reported_log_becomes_a_controller_without_an_edit(flexlink, tmp_path):
     if not REPORTED.is_dir():
         pytest.skip("the reported logs are not there: shared/reported/closed_loop_friction")
@@ -285,6 +286,7 @@ def test_the_reported_log_becomes_a_controller_without_an_edit(flexlink, tmp_pat
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_the_axis_of_emps_becomes_a_controller(refused, flexlink, tmp_path, flexlink_data):
     """Against its published model: 95.1089 kg, 203.5034 N s/m, 20.3935 N, 35.15065188 N/V."""
     out = tmp_path / "my.toml"
@@ -318,6 +320,7 @@ def test_the_notch_of_the_ruler_robot(flexlink, tmp_path, flexlink_data):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_one_move_of_two_coupled_links_asks_for_another_experiment(
     refused, flexlink, tmp_path, flexlink_data
 ):

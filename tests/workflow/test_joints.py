@@ -129,6 +129,7 @@ def _from_log(folder: Path, log: Path, source: str = 'time = "time_s"') -> Path:
     return _written(folder, head + _JOINTS + _REST)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_logs_give_the_same_model_as_the_arm(logs, run_of_the_arm, tmp_path, capsys):
     config = _from_log(tmp_path, logs)
     assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet", "--json"]) == 0

@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 from tests.golden import margins
+from tests.workflow.command import draw_nothing
 from workflow.config.run_config import load_config
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.results import RunResults
@@ -28,7 +29,9 @@ def measured(tmp_path_factory, request) -> Iterator[Example]:
         if example not in done:
             os.environ["FLEXLINK_DATA"] = str(request.getfixturevalue("flexlink_data"))
             out = tmp_path_factory.mktemp("margins") / example
-            done[example] = margins.measure(example, out), out
+            with pytest.MonkeyPatch.context() as patch:
+                draw_nothing(patch)
+                done[example] = margins.measure(example, out), out
         return done[example]
 
     before = os.environ.get("FLEXLINK_DATA")

@@ -85,6 +85,7 @@ def call(examples_alone, flexlink):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 def test_commands_of_the_readme_give_the_right_answer(call):
     assert len(call("simulate")["files"]) == 10
     found = modes_of(call("identify"))
@@ -98,20 +99,31 @@ def test_commands_of_the_readme_give_the_right_answer(call):
     planned = [np.loadtxt(path, delimiter=",", skiprows=1) for path in sorted(glob.glob("voltages/*.csv"))]
     assert len(planned) == 8
     assert max(np.max(np.abs(table[:, 1])) for table in planned) <= 24
-    done = call("run")
-    assert done["certified"]
-    assert f"    {done['verdict']}\n    report: runs/mine/report.html\n" in README
-    assert Path("runs/mine/controller.c").is_file()
     (snippet,) = re.findall(r"^    from pathlib import Path\n(?:    .*\n)+", COMMANDS_PAGE, re.MULTILINE)
     names: dict = {}
     exec(textwrap.dedent(snippet), names)
     assert names["summary"].certified
+    assert f"    {names['summary'].verdict}\n    report: runs/mine/report.html\n" in README
+    assert Path("runs/mine_again/controller.c").is_file()
 
 
-@pytest.mark.slow
-def test_the_diagnosis_of_the_readme_finds_what_was_hidden(call):
-    (answer,) = call("diagnose")["cases"]
-    machine = tomllib.loads(Path("examples/gap_case/machine.toml").read_text(encoding="utf-8"))
+def test_tutorials_run_what_the_readme_runs():
+    """`tests/test_docs.py` runs the tutorials and reads what they leave."""
+    engineer, student = (
+        (ROOT / "docs" / "tutorials" / f"{name}.md").read_text(encoding="utf-8")
+        for name in ("engineer", "student")
+    )
+    for words in COMMANDS:
+        if words[0] == "run":
+            assert f"flexlink {shlex.join(words)}\n" in engineer
+        if words[0] == "diagnose":
+            assert f"flexlink {shlex.join(words[: words.index('--out')])} --out answer\n" in student
+
+
+def assert_hidden_cause_is_found(path: Path) -> None:
+    """The answer to `flexlink diagnose examples/gap_case` is right, and the one of README."""
+    answer = json.loads(path.read_text(encoding="utf-8"))
+    machine = tomllib.loads((ROOT / "examples" / "gap_case" / "machine.toml").read_text(encoding="utf-8"))
     (truth,) = machine["source"]["effects"]
     assert answer["combination"] == [truth["name"]]
     low, high = answer["effects"][0]["intervals"]["torque_Nm"]

@@ -98,6 +98,7 @@ def write_pendulum_log(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("integrator", "load_kg", "friction_Nm"),
     [
