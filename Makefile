@@ -11,6 +11,8 @@ OUT ?= runs/default
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export NO_MKDOCS_2_WARNING := 1
+# A process a core, each with .8 GB.
+PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal -q
 
 .PHONY: help install run test test-all lint types wheel dist check docs clean
 
@@ -43,10 +45,10 @@ run: $(STAMP)
 	$(BIN)/flexlink run --out $(OUT) --replace
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -q -m "not slow"
+	$(PYTEST) -m "not slow"
 
 test-all: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -q
+	$(PYTEST)
 
 lint: $(PACKAGES)
 	$(BIN)/ruff check .

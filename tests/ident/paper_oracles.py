@@ -65,20 +65,6 @@ def combination(pole: complex, x1: RealArray, x2: RealArray) -> ComplexArray:
     return np.asarray(np.array([x1, x2]) @ np.linalg.inv(numerators), dtype=np.complex128)
 
 
-def pair_response(pole: complex, x1: RealArray, x2: RealArray, z: ComplexArray) -> ComplexArray:
-    """Values (F, 2) of the two functions with numerators x1 = (m1, m2) and x2 = (m3, m4) at the points z
-    (F,).
-
-    Raises ValueError if x1 and x2 do not satisfy (14) and (15) to 1e-9.
-    """
-    metric, target = pair_metric(pole), abs(1 - pole**2) ** 2
-    gram = np.array([[x1 @ metric @ x1, x1 @ metric @ x2], [x2 @ metric @ x1, x2 @ metric @ x2]])
-    if not np.all(np.abs(gram - target * np.eye(2)) <= 1e-9 * target):
-        raise ValueError(f"the numerators {x1} and {x2} do not satisfy (14) and (15) for the pole {pole:.6g}")
-    factor = np.sqrt((1 - abs(pole)) * (1 + abs(pole))) / ((z - pole) * (z - np.conj(pole)))
-    return np.column_stack([(x1[0] * z + x1[1]) * factor, (x2[0] * z + x2[1]) * factor])
-
-
 def complex_realisation(poles: Poles) -> tuple[ComplexArray, ComplexArray]:
     """(A_bar, B_bar) = (E^-1 A, E^-1 B) of (24), states x_i = L_i(q) u with L_i of (5); (n, n) and (n, 1).
 

@@ -13,7 +13,6 @@ import typing
 import nlopt
 import numpy as np
 import pytest
-import scipy.linalg
 import scipy.optimize
 import scipy.signal
 
@@ -36,16 +35,21 @@ from ident.one_input import identify
 from ident.search.direct import minimise
 from ident.search.error_surface import error_surface
 from ident.search.pole_search import PoleSearch
-from tests.ident import test_basis, test_error_surface, test_least_squares, test_model, test_pole_search
+from tests.ident import (
+    test_basis,
+    test_candidate_cost,
+    test_error_surface,
+    test_least_squares,
+    test_model,
+    test_pole_search,
+)
 from tests.ident.benchmark_plants import as_record
 from tests.ident.paper_oracles import (
     combination,
     complex_realisation,
     kautz_numerators,
     pair_metric,
-    pair_response,
     paper_numerators,
-    printed_functions,
     real_realisation,
     rotated_numerators,
 )
@@ -94,11 +98,15 @@ EQUATIONS = (
         [basis_response, regressor],
         [test_basis.test_laguerre_by_transfer_functions],
     ),
-    ((7,), "real pair as combinations of the complex functions", [combination], []),
-    ((8, 9, 10), "the combination is unitary", [combination], []),
+    (
+        (7, 8, 9, 10),
+        "real pair as unitary combinations of the complex functions",
+        [combination],
+        [test_basis.test_paper_state_space_gives_the_same_basis],
+    ),
     ((11, 12), "each function from the one before", [basis_response, complex_realisation], []),
-    ((13,), "m1 q + m2 behind the all-pass of the poles before", [pair_response, combination], []),
-    ((14, 15, 16), "x_k' M x_k = |1 - xi^2|^2, x_1' M x_2 = 0, and M", [pair_metric, pair_response], []),
+    ((13,), "m1 q + m2 behind the all-pass of the poles before", [regressor, combination], []),
+    ((14, 15, 16), "x_k' M x_k = |1 - xi^2|^2, x_1' M x_2 = 0, and M", [pair_metric], []),
     ((17,), "x_2 from x_1 by a quarter turn in the space of M", [rotated_numerators], []),
     ((18, 19), "the solution with m2 = 0", [paper_numerators], []),
     (
@@ -139,7 +147,10 @@ EQUATIONS = (
         (30,),
         "cost over eta with the coefficients fitted every time",
         [CandidateCost.rss, PoleSearch.joint, identify],
-        [test_pole_search.test_paper_coordinates_can_be_chosen],
+        [
+            test_candidate_cost.test_the_cost_of_candidates_is_the_residual_of_the_fit,
+            test_pole_search.test_paper_coordinates_can_be_chosen,
+        ],
     ),
     (
         (31,),
@@ -187,18 +198,6 @@ SOLUTIONS = {
     "rotated by 2.9": lambda pole: rotated_numerators(pole, 2.9),
     "Kautz": kautz_numerators,
 }
-PAIRS = [0.9 * np.exp(0.3j), 0.99 * np.exp(2.5j), 0.3 * np.exp(1.0j), 0.999 * np.exp(0.05j)]
-
-
-@pytest.mark.parametrize("solution", SOLUTIONS)
-@pytest.mark.parametrize("pole", PAIRS)
-def test_7_to_13_combinations_of_the_complex_functions_are_unitary_and_the_real_ones(pole, solution):
-    x1, x2 = SOLUTIONS[solution](pole)
-    c = combination(pole, x1, x2)
-    complex_pair = printed_functions(np.array([pole, np.conj(pole)]), Z)
-    # Near the circle the 2 x 2 system has the condition 2 / |1 - |xi|^2|, a thousand here.
-    np.testing.assert_allclose(complex_pair @ c.T, pair_response(pole, x1, x2, Z), rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(c @ c.conj().T, np.eye(2), atol=1e-10)
 
 
 def test_11_12_functions_follow_from_the_one_before():
@@ -244,44 +243,6 @@ def test_13_to_19_every_solution_gives_the_same_fit_behind_other_poles(first, se
     np.testing.assert_allclose(theirs @ np.linalg.lstsq(theirs, y)[0], expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("solution", SOLUTIONS)
-def test_14_to_16_constraints_make_the_pair_orthonormal(solution):
-    pole = 0.9 * np.exp(0.3j)
-    circle = np.exp(2j * np.pi * np.arange(4096) / 4096)
-    values = pair_response(pole, *SOLUTIONS[solution](pole), circle)
-    np.testing.assert_allclose(values.conj().T @ values / 4096, np.eye(2), atol=1e-12)
-
-
-def test_14_to_16_wrong_numerators_are_refused():
-    with pytest.raises(ValueError, match="do not satisfy"):
-        pair_response(0.5j, np.array([1.0, 0.0]), np.array([1.0, 0.0]), np.array([1.0 + 0j]))
-
-
-@pytest.mark.parametrize("pole", PAIRS)
-def test_17_second_numerator_is_the_quarter_turn(pole):
-    root = np.real(scipy.linalg.sqrtm(pair_metric(pole)))
-    turn = np.array([[0.0, 1.0], [-1.0, 0.0]])
-    for angle in (0.0, 0.7, 2.9):
-        x1, x2 = rotated_numerators(pole, angle)
-        printed = np.linalg.inv(root) @ turn @ root @ x1
-        # Either sign of x2 solves (14) and (15).
-        assert min(np.linalg.norm(printed - x2), np.linalg.norm(printed + x2)) < 1e-8 * np.linalg.norm(x2)
-
-
-@pytest.mark.parametrize("pole", PAIRS)
-def test_18_19_solution_with_m2_zero(pole):
-    x1, x2 = paper_numerators(pole)
-    assert x1[1] == 0
-    size = np.sqrt(1 + abs(pole) ** 2)
-    np.testing.assert_allclose(x1[0], abs(1 - pole**2) / size, rtol=1e-14)
-    np.testing.assert_allclose(x2, [-(pole + np.conj(pole)).real / size, size], rtol=1e-14)
-    # It is one of the solutions of (17): the angle is that of M^1/2 x1, and x2 comes with either sign.
-    unit = np.real(scipy.linalg.sqrtm(pair_metric(pole))) @ x1
-    first, second = rotated_numerators(pole, float(np.arctan2(unit[1], unit[0])))
-    np.testing.assert_allclose(first, x1, atol=1e-8 * np.linalg.norm(x1))
-    assert min(np.linalg.norm(second - x2), np.linalg.norm(second + x2)) < 1e-8 * np.linalg.norm(x2)
-
-
 def test_21_output_is_linear_in_the_coefficients():
     u = noise(7)
     one, two = noise(8, 7), noise(9, 7)
@@ -316,70 +277,17 @@ def test_28_29_filter_parameters_and_poles_correspond():
     assert beta == pytest.approx(1.8 * np.cos(0.3) / 1.81)
 
 
-def test_30_cost_of_eta_is_that_of_the_fitted_coefficients():
-    u, y = noise(14), noise(15)
-    data = prepare([as_record(u, y)], Structure())
-    space = search_space(1, 1, 400, DT_S, IdentOptions(coordinates="raw"))
-    none = Poles()
-    cost = data.candidate_cost(space, none, none)
-    units = np.random.default_rng(16).random((40, 3))
-    values = cost.rss(units)
-    checked = 0
-    for unit, value in zip(units, values, strict=True):
-        x, beta, gamma = space.coordinates(unit[None, :])[0]
-        # Columns from the parameters of (28) alone: denominators q - x and q^2 - beta (1 + gamma) q + gamma.
-        pair = np.array([1, -beta * (1 + gamma), gamma])
-        if np.abs(np.roots(pair)).max() > 0.99 or np.ptp(np.abs(np.roots(pair))) > 0.5:
-            continue
-        passed = scipy.signal.lfilter([-x, 1], [1, -x], u)
-        columns = np.column_stack(
-            [
-                scipy.signal.lfilter([0, 1], [1, -x], u),
-                scipy.signal.lfilter([0, 1, 0], pair, passed),
-                scipy.signal.lfilter([0, 0, 1], pair, passed),
-            ]
-        )
-        residual = y - columns @ np.linalg.lstsq(columns, y)[0]
-        assert value == pytest.approx(residual @ residual, rel=1e-8)
-        checked += 1
-    assert checked >= 10
-
-
 def test_31_all_variants_of_nlopt_are_there():
     offered = {name for name in dir(nlopt) if name.startswith("GN_") and "DIRECT" in name}
     assert offered <= set(DIRECT)
 
 
-def damped_pair(noise_share):
-    """A well-damped pair, the box of the paper's (beta, gamma) and the cost over it."""
-    pole, u = 0.8 * np.exp(0.9j), noise(17)
-    clean = scipy.signal.lfilter([0, 1.0, 0.5], [1, -2 * pole.real, abs(pole) ** 2], u)
-    space = search_space(0, 1, 400, DT_S, IdentOptions(coordinates="raw"))
-    data = prepare([as_record(u, clean + noise_share * np.std(clean) * noise(18))], Structure())
-    return pole, space, data.candidate_cost(space, Poles(), Poles())
-
-
-@pytest.mark.parametrize("algorithm", DIRECT)
-def test_31_every_variant_stays_in_the_box_and_finds_the_same_optimum(algorithm):
-    """(30) by (31): a well-damped pair at 20 dB, in the paper's (beta, gamma); smooth near its optimum."""
-    pole, space, cost = damped_pair(noise_share=0.1)
-    points, values = minimise(cost.log, 2, algorithm, 1500)
-    assert np.all((points >= 0) & (points <= 1))
-    # The optimum by another method, from the true pair; gamma may not leave the box for the simplex either.
-    beta, gamma = 2 * pole.real / (1 + abs(pole) ** 2), abs(pole) ** 2
-    low, high = space.coordinates(np.array([[0.0, 0.0], [1.0, 1.0]]))
-    start = (np.array([beta, gamma]) - low) / (high - low)
-    best = scipy.optimize.minimize(
-        cost.log, start, method="Nelder-Mead", options={"xatol": 1e-8, "fatol": 1e-12}
-    )
-    # 1500 evaluations leave boxes of 3^-8 or less around the optimum.
-    np.testing.assert_allclose(points[np.argmin(values)], best.x, atol=3.0**-8)
-    assert values.min() == pytest.approx(best.fun, abs=1e-5)
-
-
 def test_31_a_search_that_nlopt_breaks_off_keeps_what_it_found():
     """Noise-free, every box near the pole is worth dividing: the original DIRECT fills its tables."""
-    pole, space, cost = damped_pair(noise_share=0.0)
+    pole, u = 0.8 * np.exp(0.9j), noise(17)
+    y = scipy.signal.lfilter([0, 1.0, 0.5], [1, -2 * pole.real, abs(pole) ** 2], u)
+    space = search_space(0, 1, 400, DT_S, IdentOptions(coordinates="raw"))
+    cost = prepare([as_record(u, y)], Structure()).candidate_cost(space, Poles(), Poles())
     points, values = minimise(cost.log, 2, "GN_ORIG_DIRECT", 1500)
     beta, gamma = space.coordinates(points[np.argmin(values)][None, :])[0]
     assert beta == pytest.approx(2 * pole.real / (1 + abs(pole) ** 2), abs=0.02)

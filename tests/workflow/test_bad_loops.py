@@ -225,7 +225,7 @@ def test_a_log_without_motion_is_named(line, tmp_path):
     ("change", "said"),
     [
         (lambda one, k: {"y": lfilter([0.1], [1, -0.9], one["y"])}, "no model of 'enc_rad' explains"),
-        (lambda one, k: {"u": log(10 + k)["u"]}, "'enc_rad'"),
+        pytest.param(lambda one, k: {"u": log(10 + k)["u"]}, "'enc_rad'", marks=pytest.mark.slow),
         pytest.param(
             lambda one, k: {"u": np.concatenate([np.full(5, one["u"][0]), one["u"][:-5]])},
             "logged late",

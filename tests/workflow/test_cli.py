@@ -487,14 +487,6 @@ def test_design_of_an_impossible_specification_is_three_like_a_run(flexlink, tmp
     assert not (tmp_path / "controller.json").exists()
 
 
-def test_reader_that_leaves_early_is_no_error(tmp_path):
-    write_case(tmp_path, good_table())
-    with start_flexlink("look", tmp_path / "log.csv") as process:
-        process.stdout.close()
-        assert process.stderr.read() == b""
-    assert process.returncode == 0
-
-
 def test_terminal_codes_in_names_are_shown_as_text(refused, tmp_path):
     log = tmp_path / "log.csv"
     log.write_text("t,u,y\n0,1,2\n1,2,3\n")
