@@ -16,6 +16,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -148,12 +149,12 @@ def test_every_key_of_a_configuration_has_a_meaning():
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_tutorial_runs_and_shows_what_it_finds(name, tmp_path, monkeypatch):
     pytest.importorskip("mkdocs")
-    from mkdocs.config import load_config
     from mkdocs.structure.files import Files
 
     hook, files = pages(), Files([])
     monkeypatch.setattr(hook, "TemporaryDirectory", lambda: contextlib.nullcontext(tmp_path))
-    config = load_config(str(ROOT / "mkdocs.yml"), extra={"execute": True})
+    here = SimpleNamespace(_current_plugin=None)
+    config = SimpleNamespace(extra={"execute": True}, site_dir="", use_directory_urls=False, plugins=here)
     text = (DOCS / "tutorials" / f"{name}.md").read_text(encoding="utf-8")
     page = html.unescape(hook.notebook(text, Path("tutorials", f"{name}.md"), config, files))
     assert re.search(NOTEBOOKS[name].replace("|", ".*?"), page, re.DOTALL | re.MULTILINE)

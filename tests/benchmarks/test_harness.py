@@ -57,19 +57,6 @@ def test_nothing_is_written_by_half_a_run(results):
     assert not list(results.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"seed": 4}, "4"),
-        ({"seeds": (1, 2)}, "1 2"),
-        ({"seeds": 5, "first_seed": 10}, "10 to 14"),
-        ({}, "none"),
-    ],
-)
-def test_seeds_in_words(options, words):
-    assert harness._seeds(options) == words
-
-
 def test_missing_data_ends_the_program_in_one_line(monkeypatch, tmp_path):
     monkeypatch.setenv("FLEXLINK_DATA", str(tmp_path))
     with pytest.raises(SystemExit, match="set FLEXLINK_DATA to the folder that holds emps"):

@@ -115,7 +115,7 @@ def test_worker_killed_midway_changes_no_number(cluster, near, tmp_path):
 
 
 @pytest.mark.slow
-def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, tmp_path):
+def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, near, tmp_path):
     cluster.add_worker()
     study, call = far_study(tmp_path, cluster.address)
     process = start_flexlink(*call)
@@ -130,6 +130,7 @@ def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, tmp
     assert 1 <= done < 6
     run_study(load_study(study), tmp_path / "out", resume=True, jobs=2)
     assert finished_points(tmp_path / "out") == 6
+    assert_same_study(near, tmp_path / "out")
 
 
 @dataclass(frozen=True)
@@ -146,11 +147,13 @@ class Sleep:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("who", "words"),
-    [("scheduler", "has not answered for 8 s"), ("worker", "no worker that answers for 8 s")],
+    [("scheduler", "has not answered for 4 s"), ("worker", "no worker that answers for 4 s")],
 )
 def test_a_network_that_stalls(cluster, monkeypatch, who, words):
-    """A process that is stopped keeps its connections and says nothing, as behind a dead switch."""
-    for name, seconds in {"SILENT_S": 8, "WITHOUT_WORKERS_S": 8, "ANSWER_S": 2, "_ASK_S": 0.2}.items():
+    """A process that is stopped keeps its connections and says nothing, as behind a dead switch. It is told
+    within a minute: the time of silence, and what it takes to notice; here with a shorter one."""
+    assert SILENT_S + 20 <= 60
+    for name, seconds in {"SILENT_S": 4, "WITHOUT_WORKERS_S": 4, "ANSWER_S": 1, "_ASK_S": 0.2}.items():
         monkeypatch.setattr(f"workflow.engine.executor.{name}", seconds)
     cluster.add_worker()
     with closing(DaskCluster(cluster.address)) as far:
@@ -161,28 +164,7 @@ def test_a_network_that_stalls(cluster, monkeypatch, who, words):
         began_s = time.monotonic()
         with pytest.raises(StageError, match=f"{words}; --resume continues it"):
             next(found)
-    assert time.monotonic() - began_s < 30
-
-
-@pytest.mark.slow
-def test_a_stalled_study_goes_on_elsewhere(cluster, near, tmp_path):
-    """Within a minute it says what is missing: the time of silence, and what it takes to notice. Here with a
-    shorter one."""
-    assert SILENT_S + 20 <= 60
-    cluster.add_worker()
-    study, call = far_study(tmp_path, cluster.address)
-    patience = "from workflow.engine import executor; executor.SILENT_S, executor.ANSWER_S = 8.0, 2.0"
-    process = start_flexlink(*call, first=patience)
-    wait_until(lambda: finished_points(tmp_path / "out") >= 1, process)
-    cluster.scheduler.send_signal(signal.SIGSTOP)
-    began_s = time.monotonic()
-    said = finish(process, 1, seconds=120)
-    assert time.monotonic() - began_s < 8 + 20
-    assert said == (
-        f"flexlink: the Dask scheduler at {cluster.address} has not answered for 8 s; --resume continues it\n"
-    )
-    run_study(load_study(study), tmp_path / "out", resume=True, jobs=2)
-    assert_same_study(near, tmp_path / "out")
+    assert time.monotonic() - began_s < 4 + 20
 
 
 @pytest.mark.slow
