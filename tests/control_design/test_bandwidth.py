@@ -29,6 +29,7 @@ def _asked(**change) -> Specification:
     return Specification(**(stated | {"integrator": True} | change))
 
 
+@pytest.mark.slow
 def test_the_highest_bandwidth_that_is_met_is_taken():
     rng = np.random.default_rng(1)
     found = {}

@@ -85,7 +85,9 @@ def by_run(
     return results.identify.channels[0], results.uncertainty.channels[0]
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(name, marks=[pytest.mark.slow] * (name == "friction")) for name in CASES]
+)
 def test_the_same_numbers_by_identify_and_by_run(case, tmp_path):
     signals, reference, settings, way = CASES[case]
     names = NAMES if reference else (NAMES[0], "", *NAMES[2:])
