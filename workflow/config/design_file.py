@@ -93,10 +93,8 @@ class DesignFile(Section):
     synthesis: SynthesisOptions = Field(default_factory=SynthesisOptions)
     plant: PlantSection = Field(default_factory=PlantSection)
     uncertainty: StatedUncertainty | None = None
-    certificate: CertificateOptions = Field(default_factory=lambda: CertificateOptions.model_validate({}))
-    achievable_performance: AchievableOptions = Field(
-        default_factory=lambda: AchievableOptions.model_validate({})
-    )
+    certificate: CertificateOptions = Field(default_factory=CertificateOptions)
+    achievable_performance: AchievableOptions = Field(default_factory=AchievableOptions)
     reference_filter: ReferenceFilterSettings | None = None
     _name: str = PrivateAttr("a design file (--spec FILE)")
 

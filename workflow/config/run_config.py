@@ -232,7 +232,7 @@ class Channel(Section):
     bounds_band_rad_s: Band | None = Field(
         None, description="band of the data for the ellipses, if wider than that of the poles"
     )
-    identification: FitOptions = Field(default_factory=lambda: FitOptions.model_validate({}))
+    identification: FitOptions = Field(default_factory=FitOptions)
     uncertainty: UncertaintyOptions = Field(default_factory=UncertaintyOptions)
 
     @property
@@ -414,10 +414,8 @@ class RunConfig(Section):
     closed_loop_data: ClosedLoopData = Field(default_factory=ClosedLoopData)
     specification: RunSpecification
     synthesis: SynthesisOptions = Field(default_factory=SynthesisOptions)
-    certificate: CertificateOptions = Field(default_factory=lambda: CertificateOptions.model_validate({}))
-    achievable_performance: AchievableOptions = Field(
-        default_factory=lambda: AchievableOptions.model_validate({})
-    )
+    certificate: CertificateOptions = Field(default_factory=CertificateOptions)
+    achievable_performance: AchievableOptions = Field(default_factory=AchievableOptions)
     reference_filter: ReferenceFilterSettings | None = Field(
         None, description="second degree of freedom; default: the reference is not filtered"
     )

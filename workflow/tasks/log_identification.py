@@ -66,7 +66,7 @@ def identify_records(
     Raises InputError.
     """
     progress, described = progress or Progress(), described or UncertaintyOptions()
-    loop = loop or ClosedLoopData.model_validate({})
+    loop = loop or ClosedLoopData()
     stated = {} if options is None else options.model_dump(exclude_unset=True)
     fit, friction = FitOptions.model_validate(stated), None
     with naming("identify"), progress.stage("identify") as update:
@@ -92,7 +92,7 @@ def identify_records(
             with_plot=with_plot,
         )
     with naming("identify"), progress.stage("uncertainty"):
-        rng = stage_rng(RunSection.model_validate({}).seed, "uncertainty", channel.label)
+        rng = stage_rng(RunSection().seed, "uncertainty", channel.label)
         spread, equivalent = uncertainty_of(channel, about, measured, rng, friction=friction)
     return LogIdentification(
         measured=tuple(measured),
