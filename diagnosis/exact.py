@@ -197,11 +197,8 @@ def _intervals(
 
 
 def _solver_variance(end: Descent, samples_per_record: float) -> float:
-    """Variance of fitted values in units of what white noise gives, where contacts switch.
-
-    Two correct solvers of backlash drift apart once a contact falls differently, and stay apart to the end of
-    a record: an error of their usual disagreement that is correlated over the record.
-    """
+    """Variance of fitted values in units of what white noise gives, where contacts switch: the usual
+    disagreement of correct solvers, correlated over a record."""
     if not end.non_smooth:
         return 1.0
     # median of the half-normal prior of the disagreement's size

@@ -36,11 +36,8 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class StartColumns:
-    """Derivatives of the coefficients by a `Start`: zeros (N, Z), states of every record (T Y, S) each.
-
-    A zero takes the measured start along: per_zero (S, Z) as `Start.with_zeros`. Apart, both would move what
-    is measured by so much more than their difference moves anything that a damped step goes nowhere.
-    """
+    """Derivatives of the coefficients by a `Start`: zeros (N, Z), states of every record (T Y, S) each. A
+    zero takes the measured start along, per_zero (S, Z) as `Start.with_zeros`: apart, steps go nowhere."""
 
     zeros: Real
     states: tuple[Real, ...]

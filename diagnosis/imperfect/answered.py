@@ -229,11 +229,8 @@ def _fitted(
 def _intervals(
     search: Search, explanation: Explanation, k: int, rng: np.random.Generator
 ) -> dict[str, tuple[float, float]]:
-    """95 % intervals of the parameters of the k-th effect, from Gaussian draws of its coordinates.
-
-    Beside what the likelihood leaves open, some of the imperfections may act as the effect does, and its size
-    then is that of both: a share of the motion that the effect carries the more of, the less it matters.
-    """
+    """95 % intervals of the parameters of the k-th effect, from Gaussian draws of its coordinates: what the
+    likelihood leaves open, and imperfections that may act as the effect does."""
     end = explanation.end
     candidate, coordinates = end.candidates[k], end.coordinates_of(k)
     first = end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])

@@ -224,11 +224,8 @@ def _tailored(
     limits: Limits,
     rng: np.random.Generator,
 ) -> list[Excitation]:
-    """Multisine and binary signal at the lines where the hypotheses differ most for the voltage spent there.
-
-    Read from the first multisine among the prospects, the wide one; exact for linear machines with nothing to
-    absorb, a good guess otherwise, and judged by simulation like every other choice.
-    """
+    """Multisine and binary signal at the lines where the hypotheses differ most for the voltage spent there,
+    by the first multisine among the prospects; exact for linear machines with nothing to absorb."""
     wide = [p for p in prospects if p.excitation.kind == "multisine"]
     if not wide:
         return []

@@ -1,7 +1,7 @@
 """Which record of one's own machine to repeat, and how changed, so that the answers that are left come apart.
 
-Nobody has said what the machine can be asked for beyond what it did, so every choice is a record again: as it
-was, at a third of its size, with the sign of every input changed, or, of one input, half as fast.
+Every choice is a record again: as it was, at a third of its size, with the sign of every input changed, or,
+of one input, half as fast.
 """
 
 from __future__ import annotations

@@ -95,8 +95,7 @@ def cannot(do: str, path: Path) -> Iterator[None]:
 def naming(where: str) -> Iterator[None]:
     """Turn a library's complaint about user input into an `InputError` that says where it arose.
 
-    The rooms raise `ValueError` for what the user gave. `LinAlgError` is a `ValueError` too, but it is the
-    computation that failed there and not the input, so it becomes a `StageError`.
+    `LinAlgError` is a `ValueError` too, but of the computation: it becomes a `StageError`.
     """
     # Not at the top: the command line settles how many threads numpy takes before numpy is loaded.
     from numpy.linalg import LinAlgError

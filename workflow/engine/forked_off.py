@@ -1,7 +1,6 @@
 """Loaded by the process that workers are forked off, and by no other.
 
-An interrupt while a worker is begun leaves half of its task in the pipe: nobody waits for that worker any
-more, and its traceback is not for the user.
+An interrupt while a worker is begun leaves half of its task in the pipe, and a traceback for nobody.
 """
 
 from __future__ import annotations

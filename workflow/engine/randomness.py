@@ -10,8 +10,7 @@ import numpy as np
 def stage_rng(seed: int, *names: str) -> np.random.Generator:
     """Generator keyed by the run's seed and the names (stage, channel, record ...).
 
-    The names enter as the eight 32-bit words of their SHA-256, so distinct names give independent streams
-    and the order in which streams are asked for does not matter.
+    The names enter as the eight 32-bit words of their SHA-256: the order of asking does not matter.
     """
     digest = hashlib.sha256("\0".join(names).encode("utf-8")).digest()
     words = np.frombuffer(digest, dtype="<u4")

@@ -1,7 +1,6 @@
 """A reference for the loop that is there, planned from its own logs: lines, amplitudes, what to expect.
 
-The loop is known where the logs tell it, from the reference to command and motion, without any model. Its
-steady state under a periodic reference follows line by line.
+The loop is known where the logs tell it, without any model; its steady state follows line by line.
 """
 
 from __future__ import annotations

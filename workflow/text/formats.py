@@ -1,7 +1,6 @@
 """Numbers as words: the filters and functions that templates have, and the one place that formats a number.
 
-Each takes plain values (None and non-finite ones too) and returns text. What the text means in a sentence,
-and every sentence, stands in the templates.
+Each takes plain values (None and non-finite ones too) and returns text; sentences stand in the templates.
 """
 
 from __future__ import annotations

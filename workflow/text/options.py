@@ -1,7 +1,6 @@
 """What a setting is called by the command that speaks: a hint has to work where it is read.
 
-Configurations and Python call a setting by its key. `flexlink identify` has options of its own for some;
-what it has none for is named with the command that has it.
+Configurations and Python call a setting by its key; `flexlink identify` has options of its own for some.
 """
 
 from __future__ import annotations
