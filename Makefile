@@ -11,8 +11,9 @@ OUT ?= runs/default
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export NO_MKDOCS_2_WARNING := 1
-# A process a core, each with .8 GB.
-PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal -q
+# A process a core, from two to four: each takes .8 GB.
+WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$((n < 2 ? 2 : n > 4 ? 4 : n)))
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -q
 
 .PHONY: help install run test test-all lint types wheel dist check docs clean
 

@@ -67,9 +67,7 @@ def reference(whole):
     ("appears", "pause_s"),
     [
         pytest.param("manifest.json", 0.0, marks=pytest.mark.slow),
-        pytest.param("stages/records.npz", 0.02, marks=pytest.mark.slow),
         ("stages/uncertainty.npz", 0.2),
-        pytest.param("stages/certify.json", 0.0, marks=pytest.mark.slow),
     ],
 )
 def test_killed_run_resumes_with_identical_numbers(reference, tmp_path, appears, pause_s):
