@@ -12,9 +12,10 @@ from ident.basis.functions import free_response, regressor
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure, filter_input
+from ident.data.record import Record
 from ident.fit.least_squares import fit, linearisation, project
 from ident.fit.refinement import Bounds, free_optimality, pole_system, refine
-from ident.fit.regression import prepare, thinned
+from ident.fit.regression import prepare, prepare_inputs, thinned
 from tests.ident.benchmark_plants import as_record, p2
 
 STRUCTURES = {
@@ -32,10 +33,19 @@ STRUCTURES = {
 POLES = Poles([0.7, 0.95], [0.9 * np.exp(0.5j)])
 
 
-def records():
+def every_kind(test):
+    """Of one input and of two that share the poles."""
+    structures = pytest.mark.parametrize("structure", STRUCTURES.values(), ids=STRUCTURES)
+    return pytest.mark.parametrize("n_inputs", [1, 2])(structures(test))
+
+
+def records(n_inputs=1):
     """Two records of unequal length whose output has nothing to do with any model."""
-    rng = np.random.default_rng(0)
-    return [as_record(rng.normal(size=n), 1 + rng.normal(size=n)) for n in (150, 90)]
+    rng, names = np.random.default_rng(0), tuple("ab"[:n_inputs])
+    return [
+        Record("test", rng.normal(size=(n, n_inputs)), 1 + rng.normal(size=(n, 1)), 0.005, names, ("y",))
+        for n in (150, 90)
+    ]
 
 
 def dense(data, poles):
@@ -50,7 +60,7 @@ def dense(data, poles):
             whole = np.zeros(data.n_samples)
             whole[here] = column
             blocks.append(whole)
-    shared = [np.concatenate([regressor(poles, data.u[0, here]) for here in data.segments])]
+    shared = [np.concatenate([regressor(poles, u[here]) for here in data.segments]) for u in data.u]
     if structure.feedthrough:
         shared.append(data.u.T)
     return np.column_stack([*blocks, *shared])
@@ -62,25 +72,22 @@ def dense_residual(data, poles):
     return data.y - columns @ lstsq(columns, data.y, rcond=1e-13)[0]
 
 
-@pytest.mark.parametrize("structure", STRUCTURES.values(), ids=STRUCTURES)
-def test_fit_is_the_dense_least_squares_fit(structure):
-    data = prepare(records(), structure)
+@every_kind
+def test_fit_is_the_dense_least_squares_fit(structure, n_inputs):
+    data = prepare_inputs(records(n_inputs), structure)
     expected = dense_residual(data, POLES)
     linear = fit(data, POLES)
     # Integrating twice makes columns of very different directions nearly parallel: 1e-9 instead of 1e-12.
     np.testing.assert_allclose(linear.residual, expected, atol=1e-9)
     columns = dense(data, POLES)
     theta = lstsq(columns, data.y, rcond=None)[0]
-    n_shared = POLES.order + structure.feedthrough
-    found = (
-        [*linear.coefficients[0], *linear.feedthrough] if structure.feedthrough else linear.coefficients[0]
-    )
-    np.testing.assert_allclose(found, theta[-n_shared:], rtol=1e-6)
+    found = [*linear.coefficients.ravel(), *(linear.feedthrough if structure.feedthrough else ())]
+    np.testing.assert_allclose(found, theta[-len(found) :], rtol=1e-6)
 
 
-@pytest.mark.parametrize("structure", STRUCTURES.values(), ids=STRUCTURES)
-def test_compiled_linearisation_is_that_of_the_orthogonal_factorisation(structure):
-    data = prepare(records(), structure)
+@every_kind
+def test_compiled_linearisation_is_that_of_the_orthogonal_factorisation(structure, n_inputs):
+    data = prepare_inputs(records(n_inputs), structure)
     residual = dense_residual(data, POLES)
     expected = linearisation(data, POLES)
     rss, normal, gradient = data.linearise(*POLES.writable())
@@ -102,10 +109,10 @@ def test_nearly_dependent_columns_are_factorised():
     np.testing.assert_array_equal(found.normal, expected.normal)
 
 
-@pytest.mark.parametrize("structure", STRUCTURES.values(), ids=STRUCTURES)
-def test_gradient_is_the_difference_quotient(structure):
+@every_kind
+def test_gradient_is_the_difference_quotient(structure, n_inputs):
     """dJ/dp = -2 r^T s_p for 1 - a of the real poles and (s, f) of the pair."""
-    data = prepare(records(), structure)
+    data = prepare_inputs(records(n_inputs), structure)
     _, slope = pole_system(data.linearise(*POLES.writable()), POLES)
 
     def cost(x):

@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.basis.functions import free_response
 from ident.basis.model import MisoModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.checks.input_checks import alike_inputs
 from ident.data.finding import FindingKind
 from ident.data.record import Record
-from ident.fit.least_squares import fit
 from ident.fit.regression import prepare_inputs
 from ident.one_input import identify
 from ident.several_outputs import identify_mimo
@@ -118,49 +116,6 @@ def test_order_criterion_counts_one_plus_u_numbers_per_pole():
     data = prepare_inputs([record(0, n=300)], IdentOptions(feedthrough=True).structure())
     # 6 poles, 6 coefficients and a direct term for each of two inputs, and the offset.
     assert data.n_parameters(6) == 6 + 2 * 6 + 2 + 1
-
-
-def test_fit_is_plain_least_squares():
-    records = [record(1, n=200), record(2, n=150)]
-    structure = IdentOptions(estimate_initial_state=True, feedthrough=True).structure()
-    data = prepare_inputs(records, structure)
-    poles = Poles(np.array([0.95]), np.array([0.9 + 0.2j]))
-    found = fit(data, poles)
-    # The same basis by dlsim of its transfer functions, channel by channel.
-    columns, local = [], []
-    for i, item in enumerate(records):
-        rows = []
-        for u in item.input.T:
-            for j in range(poles.order):
-                one = MisoModel(poles, np.eye(3)[[j]], np.zeros(1), DT_S, ("u",))
-                rows.append(signal.dlsim((*one.state_space(), DT_S), u)[1][:, 0])
-        columns.append(np.column_stack([*rows, item.input]))
-        nuisance = np.zeros((item.n_samples, 2 * (1 + poles.order)))
-        nuisance[:, i * 4] = 1.0
-        nuisance[:, i * 4 + 1 : i * 4 + 4] = free_response(poles, item.n_samples)
-        local.append(nuisance)
-    theta, rss = np.linalg.lstsq(np.hstack([np.vstack(columns), np.vstack(local)]), data.y, rcond=None)[:2]
-    np.testing.assert_allclose(found.coefficients.ravel(), theta[:6], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found.feedthrough, theta[6:8], rtol=1e-9, atol=1e-12)
-    assert found.rss == pytest.approx(rss[0], rel=1e-10)
-
-
-@pytest.mark.parametrize("initial_state", [False, True])
-def test_gradient_is_that_of_the_joint_cost(initial_state):
-    data = prepare_inputs(
-        [record(1, n=400), record(2, n=300)],
-        IdentOptions(estimate_initial_state=initial_state, feedthrough=True).structure(),
-    )
-    poles = Poles(np.array([0.95]), np.array([0.95 + 0.25j]))
-    here = data.linearise(*poles.writable())
-
-    def cost(a):
-        return fit(data, Poles(np.array([a]), poles.pairs)).rss
-
-    step = 1e-5
-    numerical = (cost(0.95 + step) - cost(0.95 - step)) / (2 * step)
-    # State of the first block is b/(z - a) y_hat, and dJ/da = -2 r^T y_hat/(z - a).
-    assert -2 * here.gradient[0] / np.sqrt(1 - 0.95**2) == pytest.approx(numerical, rel=1e-6)
 
 
 @pytest.mark.parametrize(("integrators", "zeros"), [(0, 0), (1, 1), (2, 2), (3, 3), (2, 0)])
