@@ -14,6 +14,7 @@ from ident.data.signal_filter import band_limited
 from ident.one_input import identify
 from ident.uncertainty.autoregression import fit_autoregression
 from ident.uncertainty.embedding import classical, tangent
+from tests.ident.test_embedding_algebra import dense_posterior
 
 from .benchmark_plants import DT_S as DT
 from .three_mode_arm import BANDS, OMEGA, per_band, random_arm
@@ -148,18 +149,9 @@ def dense(records, poles, structure, alpha, lam, s2, length):
     flat, kernel, y = np.vstack(flat), np.vstack(kernel), np.concatenate(output)
     index = np.arange(1, length + 1)
     prior = s2 * alpha * lam ** np.maximum.outer(index, index)
-    weight = np.linalg.inv(kernel @ prior @ kernel.T + s2 * np.eye(y.size))
-    pseudo = np.linalg.pinv(np.linalg.cholesky(weight).T @ flat)
-    cov_flat = pseudo @ pseudo.T
-    estimate = pseudo @ np.linalg.cholesky(weight).T @ y
-    gain = prior @ kernel.T @ weight
-    eta = gain @ (y - flat @ estimate)
-    wanted = np.arange(flat.shape[1] - len(poles) - direct, flat.shape[1])
-    cov_eta = prior - gain @ kernel @ prior + gain @ flat @ cov_flat @ flat.T @ gain.T
-    cross = -gain @ flat @ cov_flat[:, wanted]
-    return np.concatenate([estimate[wanted], eta]), np.block(
-        [[cov_flat[np.ix_(wanted, wanted)], cross.T], [cross, cov_eta]]
-    )
+    mean, covariance, _ = dense_posterior(flat, kernel, y, prior, s2)
+    wanted = slice(flat.shape[1] - len(poles) - direct, None)
+    return mean[wanted], covariance[wanted, wanted]
 
 
 @pytest.mark.parametrize("structure", [(0, 0, False), (0, 2, True), (1, 1, True)])

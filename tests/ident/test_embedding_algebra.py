@@ -54,8 +54,9 @@ def dense_posterior(flat, kernel, y, covariance, s2):
     """Textbook Gaussian formulas: flat coefficients by generalised least squares, eta by conditioning."""
     sigma = kernel @ covariance @ kernel.T + s2 * np.eye(y.size)
     weight = np.linalg.inv(sigma)
-    cov_flat = np.linalg.inv(flat.T @ weight @ flat)
-    estimate = cov_flat @ flat.T @ weight @ y
+    root = np.linalg.cholesky(weight).T
+    pseudo = np.linalg.pinv(root @ flat)
+    cov_flat, estimate = pseudo @ pseudo.T, pseudo @ root @ y
     gain = covariance @ kernel.T @ weight
     eta = gain @ (y - flat @ estimate)
     cov_eta = covariance - gain @ kernel @ covariance + gain @ flat @ cov_flat @ flat.T @ gain.T
