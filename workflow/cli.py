@@ -777,7 +777,8 @@ def diagnose(
             progress=progress,
         )
     if as_json:
-        print_json(found.to_document())
+        for part in found.json_parts(ascii_only=_ascii_only()):
+            sys.stdout.write(part)
     else:
         _show(found.summary, as_json)
     for line in found.complaints():
@@ -891,8 +892,11 @@ def print_json(document: Mapping[str, Any]) -> None:
     """A document, and nothing else, on standard output; in ASCII where that is not UTF-8."""
     from workflow.engine.codec import plain_text
 
-    ascii_only = "utf" not in (getattr(sys.stdout, "encoding", None) or "utf-8").lower()
-    sys.stdout.write(plain_text(document, ascii_only=ascii_only))
+    sys.stdout.write(plain_text(document, ascii_only=_ascii_only()))
+
+
+def _ascii_only() -> bool:
+    return "utf" not in (getattr(sys.stdout, "encoding", None) or "utf-8").lower()
 
 
 def _show_files(files: Sequence[Path], as_json: bool) -> None:

@@ -6,6 +6,7 @@ import csv
 import io
 import os
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,10 @@ import pytest
 from benchmarks.fleet import write_fleet
 from tests.workflow.command import finish, start_flexlink, wait_until
 from tests.workflow.test_study_cluster import cluster  # noqa: F401
-from workflow.diagnose import fleet
+from workflow.diagnose import command, fleet
+from workflow.engine import codec
+from workflow.engine.executor import Failure
+from workflow.text.templates import RunSummary
 
 
 def machine(name: str, level: float | None = None, value: float = 1.0, **more) -> fleet.Machine:
@@ -86,6 +90,63 @@ def test_groups_and_table_have_every_machine():
     assert [row["elbow.frictionloss.level_Nm"] for row in rows] == ["0.1", "", "0.3", "0.5", ""]
     assert rows[2]["elbow.damping (repaired)"] == "1.0"
     assert rows[4]["answer"] == 'no log "a", really'
+
+
+def test_machines_of_one_cause_come_apart_where_their_sizes_have_a_gap():
+    rng = np.random.default_rng(5)
+    light, heavy, bent = (
+        [machine(f"{what}-{k}", level * rng.lognormal(0.0, 0.05)) for k in range(count)]
+        for what, level, count in (("light", 0.1, 7), ("heavy", 0.4, 5), ("bent", 3.0, 4))
+    )
+    every = [*bent, *light, machine("right-1"), *heavy]
+    rng.shuffle(every)
+    found = fleet.groups(every)
+    parts = [{one.name.split("-")[0] for one in group.machines} for group in found]
+    assert parts == [{"light"}, {"heavy"}, {"bent"}, {"right"}]
+    assert [len(group.machines) for group in found] == [7, 5, 4, 1]
+    size = ("elbow.frictionloss", "level_Nm")
+    assert [group.apart for group in found] == [size, size, size, None]
+    page = command._overview(every, {})
+    assert all(f"level {group.sizes[size][1]:.3g} N m to" in page for group in found[:3])
+    # Of negative sizes the same, and a size that only some have sets nothing apart.
+    tilted = [machine(f"{k}", -level) for k, level in enumerate([1, 1.1, 1.05, 9, 9.5, 9.2])]
+    assert [len(group.machines) for group in fleet.groups(tilted)] == [3, 3]
+    tilted[0] = replace(tilted[0], sizes={("elbow.frictionloss", "other"): (1.0, 0.0, 0.0)})
+    assert [len(group.machines) for group in fleet.groups(tilted)] == [6]
+
+
+@pytest.mark.parametrize("count", [6, 12, 40, 300])
+def test_machines_that_scatter_about_one_size_stay_together(count):
+    rng, apart = np.random.default_rng(6), 0
+    for k in range(300):
+        draw = (rng.lognormal, rng.uniform, rng.standard_normal)[k % 3]
+        apart += len(fleet.groups([machine(f"{j}", float(draw())) for j in range(count)])) > 1
+    assert apart <= 9  # of 300 overviews at 1 %: more than 9 with probability 0.1 %
+
+
+def test_answers_are_written_one_after_another():
+    class Answers(list):
+        """Counts what was read."""
+
+        read = 0
+
+        def __iter__(self):
+            for one in super().__iter__():
+                self.read += 1
+                yield one
+
+    for count in (0, 1, 3):
+        answers = Answers({"case": f"ä{k}", "list": [1, {"x": None}], "empty": []} for k in range(count))
+        failures = (("bad", Failure("no log", bad_input=True)),)
+        run = command.DiagnosisRun(answers, failures, RunSummary("t", (), report_path="index.html"))
+        failed = [{"case": "bad", "reason": "no log"}]
+        whole = {"cases": list(answers), "failed": failed, "report": "index.html"}
+        assert "".join(run.json_parts()) == codec.plain_text(whole)
+        assert "".join(run.json_parts(ascii_only=True)) == codec.plain_text(whole, ascii_only=True)
+        answers.read, parts = 0, run.json_parts()
+        for k in range(count):
+            assert next(parts).count('case"') == 1
+            assert answers.read == k + 1
 
 
 @pytest.mark.slow

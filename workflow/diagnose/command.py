@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace as changed
 from functools import partial
 from pathlib import Path
@@ -75,12 +75,16 @@ class DiagnosisRun:
             if document["detail_verdict"] == "not_converged"
         ]
 
-    def to_document(self) -> dict[str, Any]:
-        return {
-            "cases": list(self.documents),
-            "failed": [{"case": case, "reason": failure.reason} for case, failure in self.failures],
-            "report": self.summary.report_path,
-        }
+    def json_parts(self, *, ascii_only: bool = False) -> Iterator[str]:
+        """All of it as JSON text, one answer after another."""
+        failed = [{"case": case, "reason": failure.reason} for case, failure in self.failures]
+        rest = {"cases": [], "failed": failed, "report": self.summary.report_path}
+        before, after = codec.plain_text(rest, ascii_only=ascii_only).split("[", 1)
+        for document in self.documents:
+            text = codec.plain_text(document, ascii_only=ascii_only).rstrip().replace("\n", "\n  ")
+            yield f"{before}[\n  {text}" if before else f",\n  {text}"
+            before = ""
+        yield f"{before}[{after}" if before else f"\n {after}"
 
 
 def diagnose_cases(

@@ -1,4 +1,4 @@
-"""Many machines at once: those of one cause together, sizes that change with a number in their names, CSV."""
+"""Many machines at once: those of one cause and size together, sizes that change with their numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plant.effects import in_words
 from workflow.diagnose.words import closure_words, short_answer
 from workflow.text.formats import listing
 
-# Chance of one false trend in an overview, all sizes together (Bonferroni).
+# Chance of one false trend in an overview, or one false gap among sizes, all of them together (Bonferroni).
 _FALSE_TREND = 0.01
 # With fewer machines no order of them is as unlikely as that.
 _LEAST_MACHINES = 6
@@ -72,10 +72,12 @@ class Machine:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Machines of one cause. sizes: (effect, parameter) -> median, smallest, largest."""
+    """Machines of one cause. sizes: (effect, parameter) -> median, smallest, largest. apart: the size that
+    sets them apart from others of this cause."""
 
     cause: str
     machines: tuple[Machine, ...]
+    apart: tuple[str, str] | None = None
 
     @property
     def sizes(self) -> dict[tuple[str, str], tuple[float, float, float]]:
@@ -102,12 +104,40 @@ class Trend:
 
 
 def groups(machines: Iterable[Machine]) -> list[Group]:
-    """By cause, the most frequent first."""
+    """By cause, the most frequent first, and by size where there is a gap."""
     found: dict[str, list[Machine]] = {}
     for one in machines:
         found.setdefault(one.cause, []).append(one)
     ordered = sorted(found.items(), key=lambda item: (-len(item[1]), item[0]))
-    return [Group(cause, tuple(members)) for cause, members in ordered]
+    return [
+        Group(cause, tuple(part), apart) for cause, members in ordered for part, apart in _by_size(members)
+    ]
+
+
+def _by_size(
+    members: list[Machine], apart: tuple[str, str] | None = None
+) -> list[tuple[list[Machine], tuple[str, str] | None]]:
+    """Parts that are farther from each other than any two of one part, by the size with the surest gap.
+
+    Beyond that, sizes spread evenly over the whole range (on a log scale) would seldom leave such a gap: the
+    largest of n - 1 spacings exceeds a share g of it with probability (n - 1) (1 - g)^(n - 2) at most.
+    """
+    n = len(members)
+    best: tuple[float, float, tuple[str, str]] = (_FALSE_TREND, 0.0, ("", ""))
+    keys = [key for key in members[0].sizes if all(key in one.sizes for one in members)]
+    for key in keys if n >= _LEAST_MACHINES else ():
+        sizes = np.sort([one.sizes[key][0] for one in members])
+        x = np.sign(sizes) * np.log(np.abs(sizes)) if np.min(sizes) * np.max(sizes) > 0 else sizes
+        k = int(np.argmax(np.diff(x))) + 1
+        gap = x[k] - x[k - 1]
+        if 1 < k < n - 1 and gap > max(x[k - 1] - x[0], x[-1] - x[k]):
+            chance = len(keys) * (n - 1) * (1 - gap / (x[-1] - x[0])) ** (n - 2)
+            best = min(best, (float(chance), float(sizes[k]), key))
+    chance, first, key = best
+    if not chance < _FALSE_TREND:
+        return [(members, apart)]
+    parts = [[one for one in members if (one.sizes[key][0] >= first) == large] for large in (False, True)]
+    return [found for part in parts for found in _by_size(part, key)]
 
 
 def serial_numbers(names: Sequence[str]) -> dict[str, int]:
