@@ -41,7 +41,7 @@ def fitted(case: Any) -> tuple[dict[str, float], dict[str, float]]:
     listed = {effect.name: effect.parameters[0] for effect in case.plant.effects if not effect.signed}
     for name, one in quantities.items():
         stated = case.plant.tolerances.get(name)
-        if name.endswith(("delay", "lag", "backlash", "sensor_gain", "payload", "inertia")) or (
+        if name.endswith(("delay", "lag", "backlash", "sensor_gain", "payload", "inertia", "forcerange")) or (
             stated is None and name not in listed
         ):
             continue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,11 +12,13 @@ import numpy as np
 from diagnosis.machine.plant_effect import EffectParameter, PlantEffect
 from plant.effects.search_space import Dependence, geometric
 
-Put = Callable[[Any, float], None]
+Put = Callable[..., None]
 
 # Its defaults are MuJoCo's own: what an edit adds takes nothing from the default class of a model.
 PLAIN = mujoco.MjSpec()
 LAGS = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
+# Last parts of names: of numbers that MuJoCo does not act on, and of the joint behind a spring.
+STRIBECK, DEAD_ZONE, ELASTIC = "stribeck", "dead_zone", "elastic"
 # Which numbers of an actuator's gain and bias are force, by type: fixed or none, affine, muscle.
 FORCES = {0: (0,), 1: (0, 1, 2), 2: (2, 3)}
 
@@ -25,7 +27,8 @@ FORCES = {0: (0,), 1: (0, 1, 2), 2: (2, 3)}
 class Quantity:
     """A number of the model. put: writes it into an MjSpec. Where the model has none of it, an effect:
 
-    parameter : with its unit; unit : its magnitude, of which low to high is its range.
+    parameter : with its unit; unit : its magnitude, of which low to high is its range. more : what follows
+    the size; grows, contains : as of `PlantEffect`. by_name : tried only where it is chosen.
     """
 
     name: str
@@ -38,6 +41,10 @@ class Quantity:
     signed: bool = False
     dependence: Dependence = "smooth"
     group: str = ""
+    more: tuple[EffectParameter, ...] = ()
+    grows: bool = True
+    contains: str | None = None
+    by_name: bool = False
 
     @property
     def effect(self) -> PlantEffect:
@@ -46,10 +53,12 @@ class Quantity:
         size = EffectParameter(self.parameter, low, high, tuple(geometric(first, last, 6)))
         return PlantEffect(
             self.name,
-            (size,),
+            (size, *self.more),
             self.signed,
-            dependence=self.dependence,
-            group=self.group,
+            self.grows,
+            self.dependence,
+            self.group,
+            self.contains,
         )
 
 
@@ -105,12 +114,30 @@ def put_gain(name: str, spec: Any, factor: float) -> None:
     """Force of an actuator, its feedback included."""
     one = spec.actuator(name)
     for key, kind in (("gainprm", one.gaintype), ("biasprm", one.biastype)):
-        for k in FORCES[int(kind)]:
-            put_component(one, key, k, factor * getattr(one, key)[k])
+        put_scaled(name, key, FORCES[int(kind)], 1.0, spec, factor)
+
+
+def put_scaled(name: str, key: str, places: Sequence[int], stated: float, spec: Any, value: float) -> None:
+    """Numbers of an actuator in proportion to a value that is stated."""
+    one = spec.actuator(name)
+    for k in places:
+        put_component(one, key, k, value / stated * getattr(one, key)[k])
+
+
+def put_kp(name: str, stated: float, spec: Any, value: float) -> None:
+    """Stiffness of a servo, without its damping."""
+    put_scaled(name, "gainprm", (0,), stated, spec, value)
+    put_scaled(name, "biasprm", (0, 1), stated, spec, value)
 
 
 def put_forcerange(name: str, limits: tuple[float, float], spec: Any, factor: float) -> None:
     spec.actuator(name).forcerange = factor * np.array(limits)
+
+
+def put_limit(name: str, limits: tuple[float, float], spec: Any, limit: float) -> None:
+    """The same force both ways, within stated limits."""
+    one = spec.actuator(name)
+    one.forcelimited, one.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, np.clip(limits, -limit, limit)
 
 
 def put_lag(name: str, spec: Any, value: float) -> None:
@@ -138,29 +165,78 @@ def put_inertia(name: str, spec: Any, factor: float) -> None:
     body.inertia = np.array(body.inertia) * factor
 
 
+def put_centre(name: str, k: int, spec: Any, shift: float) -> None:
+    """Of mass, along an axis of the body; the inertia about it stays."""
+    body = spec.body(name)
+    put_component(body, "ipos", k, body.ipos[k] + shift)
+
+
+def put_shape(name: str, i: int, j: int, spec: Any, value: float) -> None:
+    """Stretches a mass (i = j) or shears it along the shorter of two axes by the longer, in axes of the body.
+
+    That multiplies the Cholesky factor L of its second moments S = L L^T by a triangular matrix: factors and
+    shears are log-Cholesky coordinates, and any of them leave an inertia that a body can have.
+    """
+    body = spec.body(name)
+    turn = _matrix(body.iquat)
+    inertia = turn @ np.diag(body.inertia) @ turn.T
+    moments = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    shorter, longer = (i, j) if moments[i, i] < moments[j, j] else (j, i)
+    change = np.eye(3)
+    change[shorter, longer] = value
+    moments = change @ moments @ change.T
+    principal, axes = np.linalg.eigh(np.trace(moments) * np.eye(3) - moments)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    body.inertia, quaternion = principal, np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, axes.ravel())
+    body.iquat = quaternion
+
+
+def _matrix(quaternion: Any) -> Any:
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, np.array(quaternion))
+    return matrix.reshape(3, 3)
+
+
 def put_payload(name: str, at: tuple[float, ...], spec: Any, mass: float) -> None:
     load = spec.body(name).add_body(name=f"{name} payload", pos=at)
     load.explicitinertial, load.mass, load.ipos = True, mass, np.zeros(3)
     load.inertia = np.full(3, 1e-9 * mass)
 
 
-def put_backlash(name: str, spec: Any, gap: float) -> None:
-    """A second joint on the same axis that is free within the gap; armature stays at the first, the motor."""
+def _behind(name: str, what: str, spec: Any) -> Any:
+    """A second joint on the axis of the first; armature stays at that, the motor."""
     joint = spec.joint(name)
-    in_degrees = spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
-    gap = np.rad2deg(gap) if in_degrees else gap
-    joint.parent.add_joint(
-        PLAIN.default,
-        name=f"{name} backlash",
-        type=joint.type,
-        axis=joint.axis,
-        pos=joint.pos,
-        limited=mujoco.mjtLimited.mjLIMITED_TRUE,
-        range=np.array([-0.5, 0.5]) * gap,
-        solref_limit=np.array([2 * spec.option.timestep, 1.0]),
+    return joint.parent.add_joint(
+        PLAIN.default, name=f"{name} {what}", type=joint.type, axis=joint.axis, pos=joint.pos
     )
 
 
-def put_number(name: str, spec: Any, value: float) -> None:
-    one = spec.numeric(name) or spec.add_numeric(name=name, size=1)
-    one.data = np.array([value])
+def put_backlash(name: str, spec: Any, gap: float) -> None:
+    """Free within the gap."""
+    joint = _behind(name, "backlash", spec)
+    in_degrees = spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
+    gap = np.rad2deg(gap) if in_degrees else gap
+    joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, np.array([-0.5, 0.5]) * gap
+    joint.solref_limit = np.array([2 * spec.option.timestep, 1.0])
+
+
+def put_spring(name: str, load: float, spec: Any, stiffness: float, damping_ratio: float) -> None:
+    """load : inertia behind it; the damping is that of the load against the motor."""
+    joint, motor = _behind(name, ELASTIC, spec), spec.joint(name).armature
+    put_component(joint, "stiffness", 0, stiffness)
+    damping = 2 * damping_ratio * np.sqrt(stiffness * load * motor / (load + motor))
+    put_component(joint, "damping", 0, damping)
+
+
+def put_stribeck(name: str, spec: Any, level: float, share: float, velocity: float) -> None:
+    """Dry friction of level at rest, a share of it at speed; MJCF has no word for the difference."""
+    joint = spec.joint(name)
+    joint.frictionloss += share * level
+    put_number(f"{name}.{STRIBECK}", spec, (1 - share) * level, velocity)
+
+
+def put_number(name: str, spec: Any, *value: float) -> None:
+    if (one := spec.numeric(name)) is not None:
+        spec.delete(one)
+    spec.add_numeric(name=name, size=len(value)).data = np.array(value)

@@ -34,10 +34,14 @@ _JOINT_UNITS = {
 
 
 def names(path: str) -> dict[str, list[str]]:
-    """Kind -> names of what an MJCF file has of it: "actuator", "sensor", "joint"."""
+    """Kind -> names of what an MJCF file has of it: "actuator", "sensor", "joint" (but those that a sensor of
+    their name reads, as in a repaired file)."""
     spec = read(path)
     every = {"actuator": spec.actuators, "sensor": spec.sensors, "joint": spec.joints}
-    return {kind: [one.name for one in every[kind] if one.name] for kind in every}
+    found = {kind: [one.name for one in every[kind] if one.name] for kind in every}
+    angles = [one for one in spec.sensors if one.type == _SENSORS.mjSENS_JOINTPOS]
+    read_by = {one.name for one in angles if one.name == one.objname}
+    return {**found, "joint": [name for name in found["joint"] if name not in read_by]}
 
 
 _FILES = re.compile(rb"""\b(file|(?:mesh|texture|asset)dir)\s*=\s*["']([^"'<]+)""")

@@ -6,10 +6,9 @@
     found = diagnose(PlantCase("arm", plant, experiments))
     text = arm.repaired(plant, found.rig, found.repair)  # MJCF
 
-Every effect is an edit of the model, so that the repaired file holds it: friction loss, damping, armature
-and stiffness of joints, gain, lag and delay of actuators, backlash, mass and inertia of links, a payload,
-gravity, delay of sensors; gain and offset of a sensor, which MJCF does not know, stand in it as
-<numeric name="SENSOR.gain"> and "SENSOR.offset" and are read from there. So is the tolerance of a value,
+Every effect is an edit of the model, so that the repaired file holds it (docs/simulators.md has the list).
+What MJCF does not know stands in it as <numeric name="SENSOR.gain">, "SENSOR.offset",
+"ACTUATOR.dead_zone" and "JOINT.stribeck" and is read from there. So is the tolerance of a value,
 "tolerance.shoulder.damping"; others have a usual one (`TOLERANCES`).
 """
 
@@ -17,19 +16,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.machine.mujoco_edits import Quantity
+from diagnosis.machine.mujoco_edits import DEAD_ZONE, STRIBECK, Quantity
 from diagnosis.machine.mujoco_model import MujocoModel
 from diagnosis.machine.mujoco_quantities import Quantities
 from diagnosis.machine.mujoco_simulation import Simulation
 from diagnosis.machine.own_plant import Plant, PlantExperiment
 from diagnosis.machine.plant_effect import Change
 
+# Last parts of numbers in a file that MuJoCo does not act on.
+_BEYOND = (".gain", ".offset", f".{DEAD_ZONE}", f".{STRIBECK}")
 # Relative standard deviations where the file has no <numeric name="tolerance.NAME">, by a name's last part.
 TOLERANCES = {
     "mass": 0.03,
@@ -38,10 +41,15 @@ TOLERANCES = {
     "damping": 0.2,
     "armature": 0.1,
     "stiffness": 0.05,
+    "drag": 0.2,
     "gain": 0.02,
+    "kp": 0.02,
+    "kv": 0.1,
+    "dead_zone": 0.2,
     "forcerange": 0.1,
     "lag": 0.2,
     "delay": 0.2,
+    **dict.fromkeys(("stretch_x", "stretch_y", "stretch_z"), 0.025),  # inertia goes with the square
 }
 _ELSE = 0.01  # gravity, sensors
 # Noise deviations that the largest start of an effect has to move a record by to be looked for, and the
@@ -65,7 +73,7 @@ class MujocoArm(MujocoModel):
         """Half the largest speed over the travel [rad/s], and enough to hold every joint against gravity."""
         model, data = self.nominal, mujoco.MjData(self.nominal)
         mujoco.mj_forward(model, data)
-        fastest, sizes = 0.0, Quantities(self, experiments).sizes()
+        fastest, sizes = 0.0, Quantities(self, experiments).sizes
         for _, name, inertia in self.tracked:
             joint = model.joint(name)
             _, travel, speed = sizes[name]
@@ -78,11 +86,10 @@ class MujocoArm(MujocoModel):
 
     def repaired(self, plant: Plant, repaired: Plant, effects: Sequence[Change]) -> str:
         """MJCF of the model with the values of a repaired plant (`Diagnosis.rig`) and effects (`repair`)."""
-        values = dict(repaired.parameters)
+        values: dict[str, Any] = dict(repaired.parameters)
         for change in effects:
-            size = next(iter(change.values.values()))
-            name = change.id.removeprefix("wrong_")
-            values[name] = values[name] * size if name in values else size
+            size, name = tuple(change.values.values()), change.id.removeprefix("wrong_")
+            values[name] = values[name] * size[0] if name in values else size
         assert isinstance(plant.simulation, Simulation)
         changed = {k: v for k, v in values.items() if v != plant.parameters.get(k)}
         spec = plant.simulation.edited(changed, self.spec)
@@ -102,18 +109,32 @@ class MujocoArm(MujocoModel):
             spec.meshdir, spec.texturedir = (
                 str(Path(spec.modelfiledir, one).resolve()) for one in (spec.meshdir, spec.texturedir)
             )
+        names = [one.name for one in spec.numerics if not one.name.startswith("tolerance.")]
+        if beyond := [name for name in names if name.endswith(_BEYOND)]:
+            note = spec.text("flexlink") or spec.add_text(name="flexlink")
+            note.data = f"MuJoCo does not act on {', '.join(beyond)}"
         spec.compile()
         return str(spec.to_xml())
 
     def plant(
-        self, experiments: Sequence[PlantExperiment], noise: Real, *, model_error: float = 0.0
+        self,
+        experiments: Sequence[PlantExperiment],
+        noise: Real,
+        *,
+        model_error: float = 0.0,
+        named: Sequence[str] = (),
     ) -> Plant:
         """The arm with everything that its model has as nominal parameters and all else as effects.
 
         experiments : input (T, U + Y) commands, then outputs as measured; output (T, Y).
         model_error : share of the motion that commands make; beside the tracking that is less than all of it.
+        named : patterns that choose quantities which are tried by name only.
         """
-        every = self.quantities(experiments)
+        every = {
+            name: one
+            for name, one in self.quantities(experiments).items()
+            if not one.by_name or any(fnmatchcase(name, pattern) for pattern in named)
+        }
         stated = {name: one.value for name, one in every.items() if one.value != 0.0}
         tolerances = {name: self.number(f"tolerance.{name}", _usual_tolerance(name)) for name in stated}
         simulation = Simulation(self, every, noise)
@@ -131,9 +152,10 @@ class MujocoArm(MujocoModel):
             return False
 
         missing = [one.effect for one in every.values() if one.value == 0.0]
-        sizes = {effect.name: effect.parameters[0] for effect in missing}
         shown = {name for name, value in stated.items() if seen({name: _WRONG * value}, {})}
-        shown |= {name for name, size in sizes.items() if seen({}, {name: {size.name: size.starts[-1]}})}
+        for one in missing:
+            largest = {p.name: p.starts[-1 if one.grows else 0] for p in one.parameters}
+            shown |= {one.name} if seen({}, {one.name: largest}) else set()
         silent = [f"wrong_{name}" for name in stated if name not in shown and tolerances[name] > 0]
         return Plant(
             simulation,

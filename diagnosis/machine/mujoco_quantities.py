@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import mujoco
@@ -13,31 +13,47 @@ from scipy.signal import savgol_filter
 
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.mujoco_edits import (
+    DEAD_ZONE,
+    ELASTIC,
     FORCES,
     LAGS,
+    STRIBECK,
     Quantity,
     put_backlash,
+    put_centre,
+    put_component,
     put_delay,
     put_first,
     put_forcerange,
     put_gain,
     put_gravity,
     put_inertia,
+    put_kp,
     put_lag,
+    put_limit,
     put_mass,
     put_number,
     put_payload,
+    put_scaled,
+    put_shape,
+    put_spring,
+    put_stribeck,
 )
 from diagnosis.machine.mujoco_model import MujocoModel
 from diagnosis.machine.mujoco_simulation import start_filters
 from diagnosis.machine.own_plant import PlantExperiment
-from plant.effects.search_space import Dependence
+from diagnosis.machine.plant_effect import EffectParameter
+from plant.effects.search_space import Dependence, geometric
 
 _SMOOTHED = 9  # samples, of a measured angle whose speed is asked
 # Numbers of a file have no more digits than this.
 _NO_LEVER_M = 1e-6
 _UNITS = {"hinge": ("Nm", "rad", "kg_m2"), "slide": ("N", "m", "kg")}
 _STANDARD_GRAVITY = 9.81  # m/s^2, MuJoCo's own default
+# From this share of a limit on the stated model reaches it.
+_REACHED = 0.999
+_SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.5,), "linear")
+_DAMPING_RATIO = EffectParameter("damping_ratio", 1e-3, 1.0, (0.03, 0.3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +65,7 @@ class Quantities:
 
     def by_name(self) -> dict[str, Quantity]:
         """Everything that may be off or missing, by name."""
-        model, experiments, sizes = self.model, self.experiments, self.sizes()
+        model, experiments, sizes = self.model, self.experiments, self.sizes
         spec = model.spec
         longest = 0.2 * max(len(e.input) for e in experiments)
         swings = [max(float(np.ptp(e.output[:, k])) for e in experiments) for k in range(len(model.outputs))]
@@ -67,7 +83,8 @@ class Quantities:
         if joint.type not in kinds:
             return
         F, x, m = _UNITS[kinds[joint.type]]
-        inertia = float(self.model.nominal.dof_M0[self.model.nominal.joint(joint.name).dofadr[0]])
+        name, h = joint.name, self.model.nominal.opt.timestep
+        inertia = float(self.model.nominal.dof_M0[self.model.nominal.joint(name).dofadr[0]])
         parts: tuple[tuple[str, str, float, float, Dependence], ...] = (
             ("frictionloss", f"level_{F}", force, 1.0, "continuous"),
             ("damping", f"coefficient_{F}s_{x}", force / speed, 10.0, "smooth"),
@@ -79,23 +96,66 @@ class Quantities:
             yield Quantity(
                 f"{joint.name}.{key}",
                 value,
-                partial(put_first, joint.name, key),
+                partial(put_first, name, key),
                 parameter,
                 unit,
                 (1e-4, most),
                 dependence=dependence,
                 group="joint",
             )
-        if joint.armature > 0:
+        drag = float(joint.damping[1])
+        yield Quantity(
+            f"{name}.drag",
+            drag,
+            lambda spec, value: put_component(spec.joint(name), "damping", 1, value),
+            f"coefficient_{F}s2_{x}2",
+            force / speed**2,
+            (1e-4, 10.0),
+            group="joint",
+            by_name=drag == 0,
+        )
+        if self.model.spec.numeric(f"{name}.{STRIBECK}") is None:
             yield Quantity(
-                f"{joint.name}.backlash",
+                f"{name}.{STRIBECK}",
                 0.0,
-                partial(put_backlash, joint.name),
-                f"gap_{x}",
-                travel,
-                (1e-3, 0.5),
-                dependence="non-smooth",
+                partial(put_stribeck, name),
+                f"level_{F}",
+                force,
+                dependence="continuous",
                 group="joint",
+                more=(_SHARE, _scaled(f"velocity_{x}_s", speed, 0.01, 1.0, 0.02, 0.2, 2)),
+                contains=None if joint.frictionloss else f"{name}.frictionloss",
+                by_name=True,
+            )
+        motor, load = joint.armature, inertia - joint.armature
+        if not motor > 0:
+            return
+        yield Quantity(
+            f"{name}.backlash",
+            0.0,
+            partial(put_backlash, name),
+            f"gap_{x}",
+            travel,
+            (1e-3, 0.5),
+            dependence="non-smooth",
+            group="joint",
+        )
+        # From a spring that gives way by the travel to one that steps of the model can follow.
+        softest = force / travel
+        stiffest = motor * load / inertia / h**2
+        if stiffest > softest:
+            yield Quantity(
+                f"{name}.{ELASTIC}",
+                0.0,
+                partial(put_spring, name, load),
+                f"stiffness_{F}_{x}",
+                softest,
+                (1.0, stiffest / softest),
+                (1.0, 0.5 * stiffest / softest),
+                group="joint",
+                more=(_DAMPING_RATIO,),
+                grows=False,
+                by_name=True,
             )
 
     def _of_actuator(self, one: Any, longest: float) -> Iterator[Quantity]:
@@ -110,10 +170,44 @@ class Quantities:
         )
         if {int(one.gaintype), int(one.biastype)} <= set(FORCES):
             yield Quantity(f"{one.name}.gain", 1.0, partial(put_gain, one.name))
-        limits = self.model.nominal.actuator(one.name)
-        if limits.forcelimited[0]:
+        kinds, (_, stiffness, damping) = (int(one.gaintype), int(one.biastype)), one.biasprm[:3]
+        if kinds == (0, 1) and stiffness == -one.gainprm[0] != 0:
+            put = partial(put_kp, one.name, one.gainprm[0])
+            yield Quantity(f"{one.name}.kp", float(one.gainprm[0]), put, by_name=True)
+            if damping:
+                put = partial(put_scaled, one.name, "biasprm", (2,), -damping)
+                yield Quantity(f"{one.name}.kv", -float(damping), put, by_name=True)
+        if kinds == (0, 0):
+            dead = self.model.number(f"{one.name}.{DEAD_ZONE}", 0.0)
+            u = [actuator.name for actuator in self.model.spec.actuators].index(one.name)
             yield Quantity(
-                f"{one.name}.forcerange", 1.0, partial(put_forcerange, one.name, tuple(limits.forcerange))
+                f"{one.name}.{DEAD_ZONE}",
+                dead,
+                partial(put_number, f"{one.name}.{DEAD_ZONE}"),
+                "width",
+                max(float(np.max(np.abs(e.input[:, u]))) for e in self.experiments) or 1.0,
+                (1e-3, 1.0),
+                dependence="continuous",
+                group="actuator",
+                by_name=dead == 0,
+            )
+        stated = self.model.nominal.actuator(one.name)
+        limits = tuple(stated.forcerange) if stated.forcelimited[0] else (-np.inf, np.inf)
+        least, largest = self.forces[one.name]
+        if least <= _REACHED * limits[0] or largest >= _REACHED * limits[1]:
+            yield Quantity(f"{one.name}.forcerange", 1.0, partial(put_forcerange, one.name, limits))
+        elif (force := max(-least, largest)) > 0:
+            yield Quantity(
+                f"{one.name}.forcerange",
+                0.0,
+                partial(put_limit, one.name, limits),
+                "limit",
+                force,
+                (0.05, 1.0),
+                (0.1, 0.98),
+                dependence="continuous",
+                group="actuator",
+                grows=False,
             )
         if one.dyntype in LAGS:
             yield late(f"{one.name}.lag", lag, partial(put_lag, one.name), "time_constant_s")
@@ -136,6 +230,15 @@ class Quantities:
         # Of a link on one hinge in the world, inertia is what armature is.
         if model.body_weldid[model.body_parentid[model.body_weldid[k]]]:
             yield Quantity(f"{body.name}.inertia", 1.0, partial(put_inertia, body.name))
+        part = partial(Quantity, group="link", by_name=True)
+        radius = float(np.sqrt(np.max(body.inertia) / body.mass))
+        for i, axis in enumerate("xyz"):
+            put = partial(put_centre, body.name, i)
+            yield part(f"{body.name}.com_{axis}", 0.0, put, "shift_m", radius, (1e-3, 1.0), signed=True)
+            yield part(f"{body.name}.stretch_{axis}", 1.0, partial(put_shape, body.name, i, i))
+            for j in range(i):
+                put = partial(put_shape, body.name, j, i)
+                yield part(f"{body.name}.shear_{'xyz'[j]}{axis}", 0.0, put, "slope", 1.0, signed=True)
 
     def _load_place(self, k: int) -> tuple[str, tuple[float, ...]] | None:
         """Body and place in it of a payload of link k with all that is fixed to it: the first site.
@@ -201,17 +304,14 @@ class Quantities:
             group="sensor",
         )
 
+    @cached_property
     def sizes(self) -> dict[str, tuple[float, float, float]]:
         """Largest force of its actuators, travel and speed of every joint; of one not measured, of all."""
-        columns = [k for k, _, _ in self.model.tracked]
         joints = [self.model.nominal.joint(joint) for _, joint, _ in self.model.tracked]
         dofs = [int(joint.dofadr[0]) for joint in joints]
-        biggest = np.zeros((len(columns), 3))
-        for e in self.experiments:
-            q = e.output[:, columns]
-            v = savgol_filter(q, _SMOOTHED, 2, deriv=1, delta=self.model.dt_s, axis=0)
-            forces = self._forces(e.input[:, : len(self.model.inputs)], q, v)[:, dofs]
-            here = [np.max(np.abs(forces), axis=0), np.ptp(q, axis=0), np.max(np.abs(v), axis=0)]
+        biggest = np.zeros((len(joints), 3))
+        for q, v, at_joints, _ in self._felt:
+            here = [np.max(np.abs(at_joints[:, dofs]), axis=0), np.ptp(q, axis=0), np.max(np.abs(v), axis=0)]
             biggest = np.maximum(biggest, np.transpose(here))
         seen = {joint.name: tuple(map(float, row)) for joint, row in zip(joints, biggest, strict=True)}
         usual = tuple(max((one[k] for one in seen.values()), default=0.0) or 1.0 for k in range(3))
@@ -220,8 +320,17 @@ class Quantities:
             for joint in self.model.spec.joints
         }
 
-    def _forces(self, commands: Real, q: Real, v: Real) -> Real:
-        """(T, DOF) what the actuators do to every joint at measured positions and speeds, without delay."""
+    @cached_property
+    def forces(self) -> dict[str, tuple[float, float]]:
+        """Least and largest force of every actuator."""
+        whole = np.concatenate([forces for *_, forces in self._felt])
+        names = (one.name for one in self.model.spec.actuators)
+        return dict(zip(names, zip(whole.min(axis=0), whole.max(axis=0), strict=True), strict=True))
+
+    @cached_property
+    def _felt(self) -> list[tuple[Real, Real, Real, Real]]:
+        """Of every record (T, J) measured positions and speeds, (T, DOF) what the stated actuators do there
+        to every joint, (T, U) their forces; without delay."""
         spec = self.model.spec.copy()
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
         for one in spec.actuators:
@@ -229,12 +338,24 @@ class Quantities:
         model = spec.compile()
         data, joints = mujoco.MjData(model), [model.joint(joint) for _, joint, _ in self.model.tracked]
         at, dofs = [j.qposadr[0] for j in joints], [j.dofadr[0] for j in joints]
-        forces = np.zeros((len(q), model.nv))
-        for k, command in enumerate(commands):
-            data.qpos[at], data.qvel[dofs], data.ctrl[:] = q[k], v[k], command
-            start_filters(model, data, command)
-            mujoco.mj_fwdPosition(model, data)
-            mujoco.mj_fwdVelocity(model, data)
-            mujoco.mj_fwdActuation(model, data)
-            forces[k] = data.qfrc_actuator
-        return forces
+        found = []
+        for e in self.experiments:
+            q = e.output[:, [k for k, _, _ in self.model.tracked]]
+            v = savgol_filter(q, _SMOOTHED, 2, deriv=1, delta=self.model.dt_s, axis=0)
+            at_joints, forces = np.zeros((len(q), model.nv)), np.zeros((len(q), model.nu))
+            for k, command in enumerate(e.input[:, : model.nu]):
+                data.qpos[at], data.qvel[dofs], data.ctrl[:] = q[k], v[k], command
+                start_filters(model, data, command)
+                mujoco.mj_fwdPosition(model, data)
+                mujoco.mj_fwdVelocity(model, data)
+                mujoco.mj_fwdActuation(model, data)
+                at_joints[k], forces[k] = data.qfrc_actuator, data.actuator_force
+            found.append((q, v, at_joints, forces))
+        return found
+
+
+def _scaled(
+    name: str, unit: float, low: float, high: float, first: float, last: float, count: int
+) -> EffectParameter:
+    starts = tuple(geometric(first * unit, last * unit, count))
+    return EffectParameter(name, low * unit, high * unit, starts)

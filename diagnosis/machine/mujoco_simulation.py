@@ -17,7 +17,15 @@ from mujoco import rollout
 from scipy.interpolate import CubicSpline
 
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.machine.mujoco_edits import PLAIN, Quantity, put_component, put_gain
+from diagnosis.machine.mujoco_edits import (
+    DEAD_ZONE,
+    ELASTIC,
+    PLAIN,
+    STRIBECK,
+    Quantity,
+    put_component,
+    put_gain,
+)
 from diagnosis.machine.mujoco_model import MujocoModel
 from diagnosis.machine.own_plant import PlantExperiment
 
@@ -52,20 +60,21 @@ class Simulation:
     _paths: dict[Any, tuple[Real, Real]] = field(default_factory=dict, repr=False)
     _starts: dict[Any, _Start] = field(default_factory=dict, repr=False)
 
-    def edited(self, values: Mapping[str, float], of: Any = None) -> Any:
+    def edited(self, values: Mapping[str, Any], of: Any = None) -> Any:
         """The model (MjSpec) with these values; of: as a whole, else what moves of it."""
         spec = (of or self.arm.moving).copy()
         for name, value in values.items():
-            self.quantities[name].put(spec, value)
+            self.quantities[name].put(spec, *np.ravel(value).tolist())
         return spec
 
     def __call__(
         self, parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]], inputs: Real
     ) -> Real:
-        values = {**parameters, **{name: next(iter(size.values())) for name, size in effects.items()}}
+        values: dict[str, Any] = {**parameters}
+        values |= {name: tuple(size.values()) for name, size in effects.items()}
         changed = {k: v for k, v in values.items() if v != self.quantities[k].value}
         model, start = self._model(changed), self._start(inputs)
-        found = self._run(model, values, inputs, start.state)
+        found = self._run(model, inputs, start.state)
         measured = inputs[:, len(self.arm.inputs) :]
         if not (self.settles and np.all(np.isfinite(found))):
             return found
@@ -76,7 +85,7 @@ class Simulation:
             moved_by = [
                 before + size * (np.arange(before.size) == u) for u, size in zip(late, spread, strict=True)
             ]
-            runs = [self._run(model, values, inputs, start.state, one) for one in moved_by]
+            runs = [self._run(model, inputs, start.state, one) for one in moved_by]
             slopes = np.array([(run - found) / size for run, size in zip(runs, spread, strict=True)])
             own = start.beside(spread, slopes).shift(measured - found)[start.state.size :]
             before[late] += own
@@ -90,7 +99,7 @@ class Simulation:
             weight = float(np.clip(np.max(missed) - 1, 0.0, 1.0))
             if weight == 0:
                 break
-            again = self._run(model, values, inputs, start.state + shift, before) - start.adds(shift)
+            again = self._run(model, inputs, start.state + shift, before) - start.adds(shift)
             found, moved = found + weight * (again - found), moved + weight * (shift - moved)
         return found
 
@@ -118,7 +127,7 @@ class Simulation:
             found.append(lines)
         return np.array(found)
 
-    def _model(self, changed: Mapping[str, float]) -> tuple[Any, Any]:
+    def _model(self, changed: Mapping[str, Any]) -> tuple[Any, Any]:
         return _remembered(
             self._models, tuple(changed.items()), lambda: self._compiled(self.edited(changed)), _KEPT
         )
@@ -147,7 +156,6 @@ class Simulation:
     def _run(
         self,
         compiled: tuple[Any, Any],
-        values: Mapping[str, float],
         inputs: Real,
         start: Real,
         before: Real | None = None,
@@ -158,14 +166,16 @@ class Simulation:
         U, T = len(arm.inputs), len(inputs)
         h = model.opt.timestep
         steps = round(arm.dt_s / h)
+        dead = np.array([_number(model, f"{name}.{DEAD_ZONE}", 0.0)[0] for name in arm.inputs])
+        commands, before = (u - np.clip(u, -dead, dead) for u in (inputs[:, :U], before))
         control = np.zeros((T * steps, model.nu))
-        control[:, :U] = np.repeat(inputs[:, :U], steps, axis=0)
+        control[:, :U] = np.repeat(commands, steps, axis=0)
         mujoco.mj_resetData(model, data)
-        gain = np.array([values.get(f"{name}.sensor_gain", 1.0) for name in arm.outputs])
-        offset = np.array([values.get(f"{name}.sensor_offset", 0.0) for name in arm.outputs])
+        gain = np.array([_number(model, f"{name}.gain", 1.0)[0] for name in arm.outputs])
+        offset = np.array([_number(model, f"{name}.offset", 0.0)[0] for name in arm.outputs])
         omega = arm.tracking_rad_s
         for j, (k, joint, inertia) in enumerate(arm.tracked):
-            late = values.get(f"{arm.outputs[k]}.sensor_delay", 0.0)
+            late = float(model.sensor_delay[model.sensor(arm.outputs[k]).id])
             path, speed = self._path(inputs[:, U + k], h, late, model.opt.integrator)
             data.joint(joint).qpos[0] = (start[j] - offset[k]) / gain[k]
             data.joint(joint).qvel[0] = start[len(arm.tracked) + j] / gain[k]
@@ -185,11 +195,9 @@ class Simulation:
                 if n:
                     first = data.sensordata[model.sensor_adr[s]]
                     mujoco.mj_initSensorHistory(model, data, s, None, np.full((n, 1), first), 0.0)
-        state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
-        mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        _, sensed = rollout.rollout(model, data, state[None], control[None])
+        _wind(model, data, control[0])
         columns = [model.sensor(name).adr[0] for name in arm.outputs]
-        return np.asarray(sensed[0, ::steps][:, columns] * gain + offset)
+        return np.asarray(_sensed(model, data, control)[::steps, columns] * gain + offset)
 
     def _path(self, y: Real, step_s: float, late_s: float, integrator: int) -> tuple[Real, Real]:
         """What was measured, and its slope, as the tracking meets them in every step (`_MET`), read `late_s`
@@ -215,11 +223,10 @@ class Simulation:
             guess, spread = np.array(begun).reshape(-1, 2, 2).transpose(2, 1, 0).reshape(2, -1)
             for u in arm.filtered:
                 guess, spread = np.append(guess, inputs[0, u]), np.append(spread, np.std(inputs[:, u]) or 1.0)
-            stated = {name: one.value for name, one in self.quantities.items() if one.value != 0.0}
             model = self._model({})
-            first = self._run(model, stated, inputs, guess)
+            first = self._run(model, inputs, guess)
             moved = guess + np.diag(spread)
-            runs = [self._run(model, stated, inputs, state) for state in moved]
+            runs = [self._run(model, inputs, state) for state in moved]
             slopes = [(run - first) / size for run, size in zip(runs, spread, strict=True)]
             start = _Start(guess, guess, spread, np.array(slopes).reshape(-1, *first.shape), self.noise)
             return replace(start, state=guess + start.shift(inputs[:, U:] - first))
@@ -257,8 +264,8 @@ class Simulation:
             more = e.input.copy()
             more[:, free] += _FORCED * (more[:, free] - np.mean(more[:, free], axis=0))
             start = self._start(e.input).state
-            by_forces = self._run(forced, stated, more, start)
-            by_forces -= self._run(self._model({}), stated, e.input, start)
+            by_forces = self._run(forced, more, start)
+            by_forces -= self._run(self._model({}), e.input, start)
             made += float(np.sum(np.var(by_forces / _FORCED, axis=0) / np.var(e.output, axis=0)))
             moved += len(self.arm.outputs)
         return float(min(np.sqrt(made / moved), 1.0))
@@ -301,6 +308,51 @@ class _Start:
         return np.asarray(
             np.linalg.solve(H, A @ (left / level).ravel() + (self.guess - self.state) / self.spread**2)
         )
+
+
+def _number(model: Any, name: str, *without: float) -> Real:
+    """A <numeric> of a compiled model."""
+    k = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
+    return np.array(without) if k < 0 else np.asarray(model.numeric(k).data)
+
+
+def _wind(model: Any, data: Any, command: Real) -> None:
+    """Springs of drives so far that motor and link speed up together."""
+    springs = [one for k in range(model.njnt) if (one := model.joint(k)).name.endswith(f" {ELASTIC}")]
+    if not springs:
+        return
+    dofs, at = (np.array([getattr(one, key)[0] for one in springs]) for key in ("dofadr", "qposadr"))
+    data.ctrl[:] = command
+    mujoco.mj_forward(model, data)
+    by_force = np.zeros((dofs.size, model.nv))
+    mujoco.mj_solveM(model, data, by_force, np.eye(model.nv)[dofs])
+    force = np.linalg.solve(by_force[:, dofs], data.qacc[dofs])
+    data.qpos[at] = force / model.jnt_stiffness[[one.id for one in springs]]
+
+
+def _sensed(model: Any, data: Any, control: Real) -> Real:
+    """(N, U) commands of steps -> (N, S) what sensors read at their beginning.
+
+    Friction that falls with speed is held over a step.
+    """
+    state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    falling = [
+        (model.joint(k).dofadr[0], *_number(model, f"{model.joint(k).name}.{STRIBECK}", 0.0, 1.0))
+        for k in range(model.njnt)
+    ]
+    dofs, excess, velocity = np.array([one for one in falling if one[1] != 0]).reshape(-1, 3).T
+    if not dofs.size:
+        return np.asarray(rollout.rollout(model, data, state[None], control[None])[1][0])
+    dofs, level = dofs.astype(int), np.array(model.dof_frictionloss)
+    found = np.zeros((len(control), model.nsensordata))
+    for k, command in enumerate(control):
+        model.dof_frictionloss[dofs] = level[dofs] + excess * np.exp(-np.abs(data.qvel[dofs]) / velocity)
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data)
+        found[k] = data.sensordata
+    model.dof_frictionloss[:] = level
+    return found
 
 
 def _rms(signals: Real) -> Real:

@@ -549,7 +549,7 @@ def test_the_force_on_a_joint_is_what_its_actuators_do_whatever_lies_between(dri
     arm, _ = link(PLAIN, motor=f"{motor}</actuator>{tendon}<actuator>")
     torque = steps()
     measured = PlantExperiment("one", "estimation", np.column_stack([torque, torque]), torque[:, None])
-    assert Quantities(arm, (measured,)).sizes()["hinge"][0] == pytest.approx(
+    assert Quantities(arm, (measured,)).sizes["hinge"][0] == pytest.approx(
         4 * np.max(np.abs(torque)), rel=1e-9
     )
 

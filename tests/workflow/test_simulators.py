@@ -203,6 +203,7 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, text, complaint):
             'say which is which, columns = {"sensor hinge" = ..., "joint hinge" = ...}',
         ),
         ("u", "hinge", "hinge", {"joint hinge": "hinge"}, ""),
+        ("u", "hinge", "hinge as it is", {}, ""),
         ("s", "hinge", "s", {"actuator s": "u", "sensor s": "speed"}, ""),
         ("a", "a", "a", {"actuator a": "u", "sensor a": "speed", "joint a": "hinge"}, ""),
         (
@@ -222,7 +223,8 @@ def test_a_name_that_two_things_have_is_asked_for(tmp_path, motor, hinge, sensor
     text = HINGE.replace('name="hinge"', f'name="{hinge}"').replace('joint="hinge"', f'joint="{hinge}"')
     text = text.replace('"motor"', f'"{motor}"')
     if sensor:
-        velocity = f'<sensor><jointvel name="{sensor}" joint="{hinge}"/></sensor></mujoco>'
+        kind, sensor = ("jointpos", hinge) if sensor == "hinge as it is" else ("jointvel", sensor)
+        velocity = f'<sensor><{kind} name="{sensor}" joint="{hinge}"/></sensor></mujoco>'
         text = text.replace("</mujoco>", velocity)
     (tmp_path / "arm.xml").write_text(text)
     write_log(tmp_path / "one.csv", 0, 0.0)

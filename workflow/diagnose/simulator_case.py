@@ -277,8 +277,10 @@ def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_
         tracking = settings.tracking_rad_s
         if tracking is None:
             tracking = arm.tracking(experiments)
+        # A pattern for all of a place ("elbow.*") is no name.
+        named = [one for one in settings.candidates if one.rpartition(".")[2] != "*" and "." in one]
         plant = replace(arm, tracking_rad_s=tracking).plant(
-            experiments, noise, model_error=settings.model_error
+            experiments, noise, model_error=settings.model_error, named=named
         )
         return plant, lambda found: arm.repaired(plant, found.rig, found.repair)
 
