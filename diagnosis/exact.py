@@ -52,7 +52,7 @@ def without_error(
     hypotheses = [h for h in every if h.is_answer]
     alike = [h for h in every if not h.is_answer]
     likeliest = max(every, key=lambda h: h.unknown_weight)
-    last = accepted.fit if late else _refined(model, accepted.fit)
+    last = accepted.end if late else _refined(model, accepted.end)
     refit = model.by_experiment(base.deviations, ())
     after = model.by_experiment(last.deviations, last.effects)
     rounding, together = rounding_effect(case), accepted.names
@@ -96,7 +96,7 @@ def without_error(
         simulations=model.simulations,
         held_out_decided=seen is not None,
         doubts=(f"the time limit left out {', '.join(left_out)}",) if left_out else (),
-        unlisted=likeliest.fit.effects if found.verdict == "unknown" and not likeliest.is_answer else (),
+        unlisted=likeliest.end.effects if found.verdict == "unknown" and not likeliest.is_answer else (),
         competing=_to_part(case, hypotheses, weighed, alike) if isinstance(case, Case) else (),
     )
 
@@ -104,8 +104,8 @@ def without_error(
 def _as_good(hypotheses: Sequence[Hypothesis], accepted: Hypothesis) -> tuple[str, ...]:
     """Effects of sets of the same number that fit as well as the accepted one."""
     rivals = [h for h in hypotheses if accepted.names and len(h.names) == len(accepted.names)]
-    near = [h for h in rivals if h.fit.loss <= accepted.fit.loss + SUBSTANTIAL]
-    return tuple(name for h in sorted(near, key=lambda h: h.fit.loss) for name in h.names)
+    near = [h for h in rivals if h.end.loss <= accepted.end.loss + SUBSTANTIAL]
+    return tuple(name for h in sorted(near, key=lambda h: h.end.loss) for name in h.names)
 
 
 def _to_part(
@@ -119,7 +119,7 @@ def _to_part(
     imitated = [LOOK_ALIKES[n].look_alike_of for n in likeliest.names if n in LOOK_ALIKES]
     if min([weighed.cause["unknown"], *(weighed.presence[str(name)] for name in imitated)]) < POSSIBLE:
         return competing
-    double = competing_hypothesis(case, likeliest.fit, weighed.cause["unknown"])
+    double = competing_hypothesis(case, likeliest.end, weighed.cause["unknown"])
     return tuple(sorted((*competing, double), key=lambda hypothesis: -hypothesis.probability))[
         :MOST_COMPETING
     ]
@@ -156,10 +156,10 @@ def _fitted(
         holding = [h for h in hypotheses if name in h.names]
         if not holding:
             return None
-        end = last if name in last.names else max(holding, key=lambda h: h.log_weight).fit
+        end = last if name in last.names else max(holding, key=lambda h: h.log_weight).end
         k, after = end.names.index(name), gap_of(end)
         rest = {n for n in end.names if n != name}
-        without = [gap_of(h.fit) for h in hypotheses if rest == set(h.names)] if rest else [gap_refit]
+        without = [gap_of(h.end) for h in hypotheses if rest == set(h.names)] if rest else [gap_refit]
         share = _explained(min(without, default=float("nan")), after, gap_refit, floor)
         return Fitted(
             end.candidates[k],

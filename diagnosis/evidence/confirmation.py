@@ -29,13 +29,13 @@ def confronted(
     case = model.case
     if not case.held_out:
         return None
-    first = _prediction(model, leading.fit)
+    first = _prediction(model, leading.end)
     confirmed = leading.is_answer and first.unknown_gain < SUBSTANTIAL
     if confirmed and not _contradicted(model, hypotheses, leading, first):
         return None
     best = max(h.evidence for h in hypotheses)
     seen = {
-        k: first if h is leading else _prediction(model, h.fit)
+        k: first if h is leading else _prediction(model, h.end)
         for k, h in enumerate(hypotheses)
         if h.evidence > best - DECISIVE
     }
@@ -54,7 +54,7 @@ def _contradicted(
         if len(h.names) <= len(leading.names) or not leading.names:
             close.setdefault((frozenset(h.names), h.is_answer), h)
     return any(
-        h.weight + _prediction(model, h.fit).gain > ahead
+        h.weight + _prediction(model, h.end).gain > ahead
         for h in close.values()
         if h is not leading and h.weight > leading.log_weight - DECISIVE
     )

@@ -16,6 +16,7 @@ from diagnosis.fit.descent import Descent
 from diagnosis.fit.discrepancy import Discrepancy
 from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL
 from diagnosis.fit.solver_spread import NO_DRIFT, Drift
+from diagnosis.search.explanation import Weighed
 from plant.effects import EFFECTS
 
 # Solver disagreement in noise deviations (half-normal scale); 0.2 between two solvers of backlash.
@@ -31,7 +32,7 @@ _UNKNOWN_BESIDE = float(np.log(PRIOR_UNKNOWN / _PRIOR_COUNT[0]))
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
+class Hypothesis(Weighed):
     """A fit, what it leaves over, and logs of (prior probability times evidence), comparable within a case.
 
     log_weight : exactly these effects, with the disagreement their solvers are allowed; -inf for a cause
@@ -40,22 +41,9 @@ class Hypothesis:
     listed : effects that are looked for.
     """
 
-    fit: Descent
     log_weight: float
     unknown_weight: float
     listed: tuple[str, ...] = tuple(EFFECTS)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.fit.names
-
-    @property
-    def end(self) -> Descent:
-        return self.fit
-
-    @property
-    def key(self) -> tuple[str, ...]:
-        return tuple(sorted(self.names))
 
     @property
     def is_answer(self) -> bool:
@@ -184,7 +172,7 @@ class Probabilities:
 
 def best_of_sets(hypotheses: Sequence[Hypothesis]) -> dict[tuple[str, ...], Hypothesis]:
     """Sorted effect names -> the hypothesis of this set with the largest weight."""
-    return {tuple(sorted(h.names)): h for h in sorted(hypotheses, key=lambda h: h.log_weight)}
+    return {h.key: h for h in sorted(hypotheses, key=lambda h: h.log_weight)}
 
 
 def probabilities(hypotheses: Sequence[Hypothesis]) -> Probabilities:

@@ -110,7 +110,7 @@ class WhiteSearch(SearchLoop[Hypothesis]):
     def polished(self, end: Descent, rank: int, around: Descent) -> Descent:
         """Finished where it may matter: among faint effects alone a few units of loss decide, and stated
         values that a gap has pulled far off need more than rough steps to come back."""
-        best = min(h.fit.loss for h in self.found)
+        best = min(h.end.loss for h in self.found)
         smooth = all(c.dependence == "smooth" for c in end.candidates)
         faint = smooth and not around.candidates
         close = end.loss < best + DECISIVE and (faint or end.loss < around.loss - WORTH_IT)
@@ -123,7 +123,7 @@ class WhiteSearch(SearchLoop[Hypothesis]):
 
     def _near(self, end: Descent) -> bool:
         """Whether backlash or the like may be the answer; beside much of a gap jumps do not matter."""
-        return _beyond_noise(end) < max(_NEAR * _beyond_noise(self.found[0].fit), _NEAR)
+        return _beyond_noise(end) < max(_NEAR * _beyond_noise(self.found[0].end), _NEAR)
 
     def explained(self, end: Descent) -> Hypothesis:
         """With its log weights; a cause beyond the list is no answer but part of what is unknown."""

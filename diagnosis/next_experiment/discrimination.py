@@ -109,7 +109,7 @@ def competing_hypotheses(
         # No effect at all competes with everything, though it is contained in every set.
         if not any(key and other and (set(key) <= set(other) or set(other) <= set(key)) for other in kept):
             kept.append(key)
-    return tuple(competing_hypothesis(case, best[key].fit, sets.get(key, 0.0)) for key in kept)
+    return tuple(competing_hypothesis(case, best[key].end, sets.get(key, 0.0)) for key in kept)
 
 
 def competing_hypothesis(case: Case, fit: Descent, probability: float) -> CompetingHypothesis:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,7 +14,27 @@ from diagnosis.machine.machine_protocol import Real
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
+class Weighed(ABC):
+    """The end of a fit with its evidence."""
+
+    end: Descent
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.end.names
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        return tuple(sorted(self.names))
+
+    @property
+    @abstractmethod
+    def evidence(self) -> float:
+        """Log of the probability of these effects, up to a constant of the case."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation(Weighed):
     """A fitted set of effects and what it leaves.
 
     log_likelihoods : (R,) of every record, estimation and held-out.
@@ -23,7 +44,6 @@ class Explanation:
     mean_squares : (2, Y) energies left over those of the motion, noise included: of differences.
     """
 
-    end: Descent
     log_likelihoods: Real
     log_prior: float
     log_volume: float
@@ -31,14 +51,6 @@ class Explanation:
     left_held_out: tuple[Real, ...]
     shares: Real
     mean_squares: Real
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.end.names
-
-    @property
-    def key(self) -> tuple[str, ...]:
-        return tuple(sorted(self.names))
 
     def pooled_held_out(self, noise: Real) -> float:
         """Energy left of the held-out records, in noise deviations (Y,)."""
@@ -51,22 +63,6 @@ class Explanation:
     @property
     def evidence(self) -> float:
         return self.log_likelihood + self.log_prior + self.log_volume
-
-
-class Weighed(Protocol):
-    """What a search asks of an end that was weighed."""
-
-    @property
-    def end(self) -> Descent: ...
-
-    @property
-    def names(self) -> tuple[str, ...]: ...
-
-    @property
-    def key(self) -> tuple[str, ...]: ...
-
-    @property
-    def evidence(self) -> float: ...
 
 
 E = TypeVar("E", bound=Weighed)
