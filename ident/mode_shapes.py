@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.fft import next_fast_len
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
@@ -214,28 +215,44 @@ class ModalFit:
             q = np.linalg.qr(free.T)[0]
             rows -= (rows @ q) @ q.T
 
-    def covariance_factor(self) -> RealArray:
+    def covariance_factor(self, noise: Sequence[RealArray] = ()) -> RealArray:
         """S (P, P'), S S^T the covariance of all free numbers to first order, noise of one: the modes', then
-        of every output the coefficients of the linear columns."""
-        factor = _inverse_factor(self._jacobian)
-        n_outputs, n_free = self.y.shape[0], len(self.free)
-        if not n_free:
+        of every output the coefficients of the linear columns.
+
+        noise: A(q) of every output, A(q) e white and e of power 1; without, white. The fit takes it as white:
+        (J^T J)^-1 J^T R J (J^T J)^-1, R that of the noise, at no frequency below white noise of its power:
+        an A(q) does not see how little there is at low ones.
+        """
+        factor, slopes, linear = _inverse_factor(self._jacobian), self._jacobian, self._linear_columns()
+        if len(self.free):
+            slopes = self._linearised(self.x, linear=False)[1]
+            # The modes' columns off the linear ones: what is left of these is independent of them.
+            mixed = np.linalg.lstsq(linear, slopes, rcond=None)[0]
+            own = _inverse_factor(linear)
+            factor = np.block([[factor, np.zeros((len(factor), own.shape[1]))], [mixed @ factor, own]])
+        if all(weights.size == 1 for weights in noise):
             return factor
-        poles = [pole for pole, _ in self.found()]
+        columns = np.concatenate([-slopes, linear], axis=1).reshape(*self.y.shape, -1)
+        through: RealArray = np.zeros((0, columns.shape[2]))
+        for rows, weights in zip(columns, noise, strict=True):
+            for here in self.segments:
+                size = next_fast_len(2 * (here.stop - here.start), real=True)
+                power = np.maximum(1 / np.abs(np.fft.rfft(weights, size)) ** 2, 1.0) * 2 / size
+                lines = np.fft.rfft(rows[here], size, axis=0) * np.sqrt(power)[:, None]
+                parts = [through, lines.real, lines.imag]
+                through = np.asarray(np.linalg.qr(np.concatenate(parts), mode="r"))
+        return np.asarray(factor @ factor.T @ through.T)
+
+    def _linear_columns(self) -> RealArray:
+        """Of all outputs, off the nuisances, (Y N, Y Q)."""
+        n_outputs, n_free = self.y.shape[0], len(self.free)
         columns = np.zeros((n_outputs * n_free, *self.y.shape))
         for k in range(n_outputs):
             columns[k * n_free : (k + 1) * n_free, k] = self.free
         rows = columns.reshape(-1, self.y.shape[1])
-        self.data.each[0].take_out_local(self._local_q(poles), rows)
-        linear = rows.reshape(n_outputs * n_free, -1).T
-        # The modes' columns off the linear ones: what is left of these is independent of them.
-        mixed = np.linalg.lstsq(linear, self._slopes(), rcond=None)[0]
-        own = _inverse_factor(linear)
-        return np.block([[factor, np.zeros((len(factor), own.shape[1]))], [mixed @ factor, own]])
-
-    def _slopes(self) -> RealArray:
-        """The Jacobian of the residual off the nuisances only, (Y N, P): minus what the model moves by."""
-        return self._linearised(self.x, linear=False)[1]
+        if n_free:
+            self.data.each[0].take_out_local(self._local_q([pole for pole, _ in self.found()]), rows)
+        return rows.reshape(n_outputs * n_free, self.y.size).T
 
     def response_columns(self, omega_rad_s: RealArray) -> ComplexArray:
         """Change of the response with each number of `covariance_factor`, (F, Y, U, P)."""

@@ -23,8 +23,10 @@ from ident.data.record import Record
 from ident.fit.several_outputs import prepare_outputs, whitened
 from ident.identification import MimoIdentification
 from ident.mode_shapes import ModalFit, modes_of
+from ident.uncertainty.autoregression import autocovariance, fit_autoregression
 
 _RADII, _AROUND = 400, 41  # frequencies, and those around a mode, whose largest radius stands for all
+_AR_ORDER = 16  # at most, of the noise
 _DRAWS = 20_000  # of the sum of squares: its 95 % quantile then is right to about 1 %
 
 
@@ -137,9 +139,9 @@ class MatrixPosterior:
 def matrix_posterior(
     records: Sequence[Record], identification: MimoIdentification, *, level: float = 0.95
 ) -> MatrixPosterior:
-    """Posterior of the matrix response of an `identify_mimo`, first order in the noise, taken as white in
-    time, for the order and the shapes that were chosen. Raises ValueError if the records are not its own, or
-    poles repeat."""
+    """Posterior of the matrix response of an `identify_mimo`, first order in the noise, whose colour is that
+    of the residuals (an autoregression of each output), for the order and the shapes that were chosen. Raises
+    ValueError if the records are not its own, or poles repeat."""
     model, structure = identification.model, identification.structure
     factor: RealArray = np.linalg.cholesky(identification.noise_covariance).astype(np.float64)
     white: RealArray = np.linalg.inv(factor).astype(np.float64)
@@ -153,4 +155,8 @@ def matrix_posterior(
     own = np.einsum("xy,yub->xub", white, model.coefficients)
     modes = modes_of(model.poles, own, identification.n_fixed, identification.rank_one or None)
     fit = ModalFit(data, modes)
-    return MatrixPosterior(model, factor, fit, fit.covariance_factor(), level)
+    each = [(residual @ white.T).T for residual in identification.residuals]
+    order = min(_AR_ORDER, max(1, max(one.shape[1] for one in each) // 20))
+    filters = [fit_autoregression([one[k] for one in each], order) for k in range(len(white))]
+    noise = [weights * np.sqrt(autocovariance(weights, 0)[0]) for weights in filters]
+    return MatrixPosterior(model, factor, fit, fit.covariance_factor(noise), level)

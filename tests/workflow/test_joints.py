@@ -11,13 +11,14 @@ import pandas as pd
 import pytest
 import scipy.io
 
+from control_design.analysis.closed_loop import simulate_joints
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import matrix_response
-from plant import two_link_arm
+from plant import multisine, multisine_lines, two_link_arm
 from workflow.cli import main
 from workflow.config.joints_config import JointsConfig, load_joints
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.joints import JointsResults, _judged
+from workflow.tasks.joints import JointsResults, _judged, machine_at
 
 _JOINTS = """
 [[joints]]
@@ -90,14 +91,38 @@ def test_a_run_ends_with_a_certified_controller_and_a_page(run_of_the_arm):
     assert status == "complete"
 
 
-def test_the_ball_holds_the_response_of_small_motions(run_of_the_arm):
-    """Linearised by automatic differentiation, not identified."""
-    run = RunDirectory.open(run_of_the_arm)
-    (point,) = JointsResults(run).identify.points
+def _check_the_ball(run: Path):
+    """It holds the response of small motions, linearised by automatic differentiation, not identified."""
+    (point,) = JointsResults(RunDirectory.open(run)).identify.points
     a, b = two_link_arm(0.05).linear(1.6)
     true = control.c2d(control.ss(a, b, np.eye(2, len(a)), np.zeros((2, 2))), point.model.dt_s)
     inside = point.shown.distance(matrix_response(true, point.shown.omega_rad_s)) <= 1
     assert np.mean(inside) > 0.9
+    return point, a
+
+
+def test_logs_of_a_closed_loop_give_a_certified_controller(run_of_the_arm, tmp_path, capsys):
+    law = Controller.from_json((run_of_the_arm / "controller.json").read_text())
+    config = load_joints(run_of_the_arm / "config.toml")[0]
+    rng = np.random.default_rng(5)
+    machine = machine_at(config.source, config.source.points[0], rng, coulomb_Nm=(0.0, 0.0))
+    lines = multisine_lines(3000, law.dt_s, (0.2, 60.0))
+    r = np.column_stack([multisine(lines, 3000, 0.01, rng) for _ in range(2)])
+    y, u = simulate_joints(law, machine, r)
+    names = ["shoulder_V", "elbow_V", "shoulder_rad", "elbow_rad", "shoulder_set", "elbow_set"]
+    table = pd.DataFrame(np.column_stack([u, y, r]), columns=names)
+    table.insert(0, "time_s", np.arange(3000) * law.dt_s)
+    table.to_csv(tmp_path / "loop.csv", index=False)
+    asked = _from_log(
+        tmp_path, tmp_path / "loop.csv", 'time = "time_s"\nreferences = ["shoulder_set", "elbow_set"]'
+    )
+    assert main(["run", "--config", str(asked), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    assert "two-stage identification" in (tmp_path / "run" / "report.html").read_text()
+    _check_the_ball(tmp_path / "run")
+
+
+def test_the_ball_holds_the_response_of_small_motions(run_of_the_arm):
+    point, a = _check_the_ball(run_of_the_arm)
     modes = sorted(omega for omega, zeta, _ in point.modes if zeta < 0.3)
     poles = np.linalg.eigvals(a)
     light = np.sort(np.abs(poles[(poles.imag > 0) & (-poles.real < 0.3 * np.abs(poles))]))
@@ -200,7 +225,7 @@ def test_logs_that_tell_too_little_are_refused_in_one_line(spoilt, words, logs, 
 @pytest.mark.parametrize(
     ("source", "words"),
     [
-        ('time = "time_s"\nreferences = ["shoulder_rad"]', "closed loop"),
+        ('time = "time_s"\nreferences = ["shoulder_rad"]', "1 references move"),
         ('dt_s = 0.002\ntime = "time_s"', "not both"),
     ],
 )

@@ -135,11 +135,6 @@ class JointsConfig(Section):
                         f"source.records[{number}] has role {record.role!r}: with several joints each record "
                         "is fitted; leave role out"
                     )
-                if self.source.references or record.references:
-                    raise ValueError(
-                        "references: logs of a closed loop are not identified for several joints yet; give "
-                        "logs of the open loop, or one joint at a time in a run of one loop"
-                    )
         if self.closed_loop.step is not None and len(self.closed_loop.step) != len(self.joints):
             raise ValueError(f"closed_loop.step needs one value for each of {len(self.joints)} joints")
         if self.closed_loop.step is not None and not any(self.closed_loop.step):

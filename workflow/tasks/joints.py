@@ -21,7 +21,8 @@ from control_design.synthesis.multivariable import MultivariableResult, synthesi
 from ident.basis.mimo_model import MimoModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.data.finding import Finding
+from ident.closed_loop import two_stage_several
+from ident.data.finding import Finding, FindingKind
 from ident.data.record import Record
 from ident.identification import MimoIdentification
 from ident.several_outputs import identify_mimo
@@ -253,19 +254,18 @@ def identify_points(stage: StageInput) -> PointModels:
 
         records = [item.record for item in items if (item.condition or "arm") == name]
         if options.increments:
-            records = [_increments(record) for record in records]
+            records = [record.each(partial(np.diff, axis=0)) for record in records]
+        remarks: tuple[Finding, ...] = ()
         with naming(f"operating point {name!r}"):
+            if any(record.reference is not None for record in records):
+                stages = two_stage_several(records, asked, start=start, progress=report)
+                records, start = list(stages.records), stages.plant.poles
+                remarks = stages.finding, *stages.warnings
             one = identify_mimo(records, asked, start=start, progress=report)
-            found.append(_described(name, records, one, options.level, options.lowest_rad_s))
+            point = _described(name, records, one, options.level, options.lowest_rad_s)
+        found.append(replace(point, warnings=(*remarks, *point.warnings)))
         start = one.model.poles
     return PointModels(tuple(found))
-
-
-def _increments(record: Record) -> Record:
-    return replace(
-        record, input=np.diff(record.input, axis=0), output=np.diff(record.output, axis=0), reference=None,
-        reference_names=(),
-    )  # fmt: skip
 
 
 def _described(
@@ -277,8 +277,9 @@ def _described(
     shown = posterior.at(np.geomspace(lowest_rad_s, 0.999 * top, _SHOWN))
     return PointModel(
         name, found.model, np.sqrt(np.diag(found.noise_covariance)), found.output_fit_percent, found.rank_one,
-        posterior.output_factor, *Li, posterior.largest_radius(lowest_rad_s), shown, found.warnings,
-    )  # fmt: skip
+        posterior.output_factor, *Li, posterior.largest_radius(lowest_rad_s), shown,
+        tuple(item for item in found.warnings if item.kind is not FindingKind.COLOURED_RESIDUAL),
+    )  # fmt: skip  # the ball takes the noise in its colour
 
 
 def design_joints(stage: StageInput) -> JointsDesignResult:
