@@ -48,9 +48,8 @@ except KeyboardInterrupt:
     ("solves", "delay_s"),
     [
         (1, 0.0),
-        pytest.param(1, 0.03, marks=pytest.mark.slow),
         pytest.param(1, 0.1, marks=pytest.mark.slow),
-        (2, 0.06),
+        pytest.param(2, 0.06, marks=pytest.mark.slow),
     ],
 )
 def test_an_interrupt_in_the_interior_point_ends_the_synthesis(tmp_path, solves, delay_s):

@@ -161,6 +161,7 @@ def test_joints_that_integrate_and_an_integrator_in_the_controller():
     assert verdict.stability_radius == np.inf
 
 
+@pytest.mark.slow
 def test_joints_alike_are_controlled_nearly_as_well_as_one():
     """All singular values of the loop meet then, as many as there are joints. Measured: 1.08 times the
     worst case of one joint; bounding two of three eigenvalues ends at 3.6 times."""
