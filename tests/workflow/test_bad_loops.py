@@ -224,18 +224,18 @@ def test_a_log_without_motion_is_named(line, tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda one, k: {"y": lfilter([0.1], [1, -0.9], one["y"])}, "no model of 'enc_rad' explains"),
+        pytest.param(
+            lambda one, k: {"y": lfilter([0.1], [1, -0.9], one["y"])},
+            "no model of 'enc_rad' explains",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(lambda one, k: {"u": log(10 + k)["u"]}, "'enc_rad'", marks=pytest.mark.slow),
         pytest.param(
             lambda one, k: {"u": np.concatenate([np.full(5, one["u"][0]), one["u"][:-5]])},
             "logged late",
             marks=pytest.mark.slow,
         ),
-        pytest.param(
-            lambda one, k: log(k, machine=plant(load=3 * LOAD)) if k == 1 else {},
-            "parts of them differ",
-            marks=pytest.mark.slow,
-        ),
+        (lambda one, k: log(k, machine=plant(load=3 * LOAD)) if k == 1 else {}, "parts of them differ"),
     ],
     ids=["filtered position", "command of another axis", "late command", "another load"],
 )
