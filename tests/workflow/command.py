@@ -65,8 +65,8 @@ def finish(process: subprocess.Popen[bytes], code: int = 0, *, seconds: float = 
 
 
 def without_progress(error: str) -> str:
-    """Standard error without the lines that come every ten seconds."""
-    return re.sub(r"^flexlink: \d+ s: .*\n", "", error, flags=re.MULTILINE)
+    """Standard error without the lines that come every ten seconds, and where something is compiled."""
+    return re.sub(r"^flexlink: (?:\d+ s: |compiling, once).*\n", "", error, flags=re.MULTILINE)
 
 
 def wait_until(condition: Callable[[], object], process: subprocess.Popen[bytes]) -> None:

@@ -26,7 +26,7 @@ import workflow.tasks.simulated_rig
 from control_design.controllers.controller import Controller
 from tests.ident.mutations import DAMAGE, Tally, tally
 from tests.ident.test_forty_logs import LOGS, Log
-from tests.workflow.command import FAST_ARM, ROOT, build_nothing, draw_nothing
+from tests.workflow.command import FAST_ARM, ROOT, build_nothing, draw_nothing, without_progress
 from tests.workflow.diagnosis_examples import FRICTION, write_case
 from tests.workflow.mutations import spoilt, tamper
 from tests.workflow.study_examples import SMALL_STUDY, TWO_POINTS, write_study
@@ -183,8 +183,7 @@ def refusal(arguments: list[str], folder: Path) -> str | None:
             code = main(arguments)
         except ComputesError:
             return None
-    told = re.sub(r"(?m)^flexlink: \d+ s: .*\n", "", error.getvalue())  # signs of life of long work
-    line = told.removesuffix("\n").removeprefix("flexlink: ")
+    line = without_progress(error.getvalue()).removesuffix("\n").removeprefix("flexlink: ")
     assert code in (0, 2, 3), f"exit {code}: {line}"
     assert code != 2 or str(folder) in line, f"no file named: {line}"
     return line if code == 2 else None
