@@ -17,6 +17,8 @@ Put = Callable[..., None]
 # Its defaults are MuJoCo's own: what an edit adds takes nothing from the default class of a model.
 PLAIN = mujoco.MjSpec()
 LAGS = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
+# Second moment of a rod across, as a share of all: MuJoCo refuses what rounding makes thinner than a line.
+_THINNEST = 1e-9
 # Last parts of names: of numbers that MuJoCo does not act on, and of the joint behind a spring.
 STRIBECK, DEAD_ZONE, ELASTIC = "stribeck", "dead_zone", "elastic"
 # Which numbers of an actuator's gain and bias are force, by type: fixed or none, affine, muscle.
@@ -86,11 +88,11 @@ def put_compiled(spec: Any, model: Any) -> None:
 # Each writes a value into an MjSpec once the arguments before it are bound.
 
 
-def put_first(joint: str, key: str, spec: Any, value: float) -> None:
-    """A number of a joint, or the first of several (of a polynomial of the speed)."""
+def put_at_joint(joint: str, key: str, k: int, spec: Any, value: float) -> None:
+    """A number of a joint, or the k-th of several (of a polynomial of the speed)."""
     one = spec.joint(joint)
     if np.ndim(getattr(one, key)):
-        put_component(one, key, 0, value)
+        put_component(one, key, k, value)
     else:
         setattr(one, key, value)
 
@@ -185,9 +187,10 @@ def put_shape(name: str, i: int, j: int, spec: Any, value: float) -> None:
     change = np.eye(3)
     change[shorter, longer] = value
     moments = change @ moments @ change.T
-    principal, axes = np.linalg.eigh(np.trace(moments) * np.eye(3) - moments)
+    principal, axes = np.linalg.eigh(moments)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
-    body.inertia, quaternion = principal, np.zeros(4)
+    principal = np.maximum(principal, _THINNEST * np.sum(principal))
+    body.inertia, quaternion = np.sum(principal) - principal, np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, axes.ravel())
     body.iquat = quaternion
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -18,12 +18,12 @@ from diagnosis.machine.mujoco_edits import (
     FORCES,
     LAGS,
     STRIBECK,
+    Put,
     Quantity,
+    put_at_joint,
     put_backlash,
     put_centre,
-    put_component,
     put_delay,
-    put_first,
     put_forcerange,
     put_gain,
     put_gravity,
@@ -43,7 +43,7 @@ from diagnosis.machine.mujoco_model import MujocoModel
 from diagnosis.machine.mujoco_simulation import start_filters
 from diagnosis.machine.own_plant import PlantExperiment
 from diagnosis.machine.plant_effect import EffectParameter
-from plant.effects.search_space import Dependence, geometric
+from plant.effects.search_space import Dependence
 
 _SMOOTHED = 9  # samples, of a measured angle whose speed is asked
 # Numbers of a file have no more digits than this.
@@ -85,78 +85,36 @@ class Quantities:
         F, x, m = _UNITS[kinds[joint.type]]
         name, h = joint.name, self.model.nominal.opt.timestep
         inertia = float(self.model.nominal.dof_M0[self.model.nominal.joint(name).dofadr[0]])
-        parts: tuple[tuple[str, str, float, float, Dependence], ...] = (
-            ("frictionloss", f"level_{F}", force, 1.0, "continuous"),
-            ("damping", f"coefficient_{F}s_{x}", force / speed, 10.0, "smooth"),
-            ("armature", f"inertia_{m}", inertia, 10.0, "smooth"),
-            ("stiffness", f"stiffness_{F}_{x}", force / travel, 10.0, "smooth"),
+        # Name, where it stands, parameter, unit, largest size in it, dependence.
+        parts: tuple[tuple[str, str, int, str, float, float, Dependence], ...] = (
+            ("frictionloss", "frictionloss", 0, f"level_{F}", force, 1.0, "continuous"),
+            ("damping", "damping", 0, f"coefficient_{F}s_{x}", force / speed, 10.0, "smooth"),
+            ("drag", "damping", 1, f"coefficient_{F}s2_{x}2", force / speed**2, 10.0, "smooth"),
+            ("armature", "armature", 0, f"inertia_{m}", inertia, 10.0, "smooth"),
+            ("stiffness", "stiffness", 0, f"stiffness_{F}_{x}", force / travel, 10.0, "smooth"),
         )
-        for key, parameter, unit, most, dependence in parts:
-            value = float(np.ravel(getattr(joint, key))[0])
-            yield Quantity(
-                f"{joint.name}.{key}",
-                value,
-                partial(put_first, name, key),
-                parameter,
-                unit,
-                (1e-4, most),
-                dependence=dependence,
-                group="joint",
-            )
-        drag = float(joint.damping[1])
-        yield Quantity(
-            f"{name}.drag",
-            drag,
-            lambda spec, value: put_component(spec.joint(name), "damping", 1, value),
-            f"coefficient_{F}s2_{x}2",
-            force / speed**2,
-            (1e-4, 10.0),
-            group="joint",
-            by_name=drag == 0,
-        )
+        of = partial(Quantity, group="joint")
+        for what, key, k, parameter, unit, most, kind in parts:
+            value = float(np.ravel(getattr(joint, key))[k])
+            put: Put = partial(put_at_joint, name, key, k)
+            usual = of(f"{name}.{what}", value, put, parameter, unit, (1e-4, most), dependence=kind)
+            yield replace(usual, by_name=what == "drag" and value == 0)
         if self.model.spec.numeric(f"{name}.{STRIBECK}") is None:
-            yield Quantity(
-                f"{name}.{STRIBECK}",
-                0.0,
-                partial(put_stribeck, name),
-                f"level_{F}",
-                force,
-                dependence="continuous",
-                group="joint",
-                more=(_SHARE, _scaled(f"velocity_{x}_s", speed, 0.01, 1.0, 0.02, 0.2, 2)),
-                contains=None if joint.frictionloss else f"{name}.frictionloss",
-                by_name=True,
-            )
+            velocity = EffectParameter(f"velocity_{x}_s", 0.01 * speed, speed, (0.02 * speed, 0.2 * speed))
+            inner = None if joint.frictionloss else f"{name}.frictionloss"
+            dry = of(f"{name}.{STRIBECK}", 0.0, partial(put_stribeck, name), f"level_{F}", force)
+            yield replace(dry, dependence="continuous", more=(_SHARE, velocity), contains=inner, by_name=True)
         motor, load = joint.armature, inertia - joint.armature
         if not motor > 0:
             return
-        yield Quantity(
-            f"{name}.backlash",
-            0.0,
-            partial(put_backlash, name),
-            f"gap_{x}",
-            travel,
-            (1e-3, 0.5),
-            dependence="non-smooth",
-            group="joint",
-        )
+        put, gap = partial(put_backlash, name), f"gap_{x}"
+        yield of(f"{name}.backlash", 0.0, put, gap, travel, (1e-3, 0.5), dependence="non-smooth")
         # From a spring that gives way by the travel to one that steps of the model can follow.
-        softest = force / travel
-        stiffest = motor * load / inertia / h**2
-        if stiffest > softest:
-            yield Quantity(
-                f"{name}.{ELASTIC}",
-                0.0,
-                partial(put_spring, name, load),
-                f"stiffness_{F}_{x}",
-                softest,
-                (1.0, stiffest / softest),
-                (1.0, 0.5 * stiffest / softest),
-                group="joint",
-                more=(_DAMPING_RATIO,),
-                grows=False,
-                by_name=True,
-            )
+        softest, stiffest = force / travel, motor * load / inertia / h**2
+        if (most := stiffest / softest) > 1:
+            put, parameter = partial(put_spring, name, load), f"stiffness_{F}_{x}"
+            spring = of(f"{name}.{ELASTIC}", 0.0, put, parameter, softest, (1.0, most), (1.0, 0.5 * most))
+            yield replace(spring, more=(_DAMPING_RATIO,), grows=False, by_name=True)
 
     def _of_actuator(self, one: Any, longest: float) -> Iterator[Quantity]:
         """longest : of a lag or delay, in samples."""
@@ -168,6 +126,7 @@ class Quantities:
             starts=(0.2, min(20.0, longest)),
             group="actuator",
         )
+        of = partial(Quantity, dependence="continuous", group="actuator")
         if {int(one.gaintype), int(one.biastype)} <= set(FORCES):
             yield Quantity(f"{one.name}.gain", 1.0, partial(put_gain, one.name))
         kinds, (_, stiffness, damping) = (int(one.gaintype), int(one.biastype)), one.biasprm[:3]
@@ -180,35 +139,19 @@ class Quantities:
         if kinds == (0, 0):
             dead = self.model.number(f"{one.name}.{DEAD_ZONE}", 0.0)
             u = [actuator.name for actuator in self.model.spec.actuators].index(one.name)
-            yield Quantity(
-                f"{one.name}.{DEAD_ZONE}",
-                dead,
-                partial(put_number, f"{one.name}.{DEAD_ZONE}"),
-                "width",
-                max(float(np.max(np.abs(e.input[:, u]))) for e in self.experiments) or 1.0,
-                (1e-3, 1.0),
-                dependence="continuous",
-                group="actuator",
-                by_name=dead == 0,
-            )
+            put = partial(put_number, f"{one.name}.{DEAD_ZONE}")
+            unit = max(float(np.max(np.abs(e.input[:, u]))) for e in self.experiments)
+            zone = of(f"{one.name}.{DEAD_ZONE}", dead, put, "width", unit or 1.0, (1e-3, 1.0))
+            yield replace(zone, by_name=dead == 0)
         stated = self.model.nominal.actuator(one.name)
         limits = tuple(stated.forcerange) if stated.forcelimited[0] else (-np.inf, np.inf)
         least, largest = self.forces[one.name]
         if least <= _REACHED * limits[0] or largest >= _REACHED * limits[1]:
             yield Quantity(f"{one.name}.forcerange", 1.0, partial(put_forcerange, one.name, limits))
         elif (force := max(-least, largest)) > 0:
-            yield Quantity(
-                f"{one.name}.forcerange",
-                0.0,
-                partial(put_limit, one.name, limits),
-                "limit",
-                force,
-                (0.05, 1.0),
-                (0.1, 0.98),
-                dependence="continuous",
-                group="actuator",
-                grows=False,
-            )
+            put = partial(put_limit, one.name, limits)
+            limit = of(f"{one.name}.forcerange", 0.0, put, "limit", force, (0.05, 1.0), (0.1, 0.98))
+            yield replace(limit, grows=False)
         if one.dyntype in LAGS:
             yield late(f"{one.name}.lag", lag, partial(put_lag, one.name), "time_constant_s")
         put = partial(put_delay, "actuator", one.name, self.model.spec.option.timestep)
@@ -231,10 +174,12 @@ class Quantities:
         if model.body_weldid[model.body_parentid[model.body_weldid[k]]]:
             yield Quantity(f"{body.name}.inertia", 1.0, partial(put_inertia, body.name))
         part = partial(Quantity, group="link", by_name=True)
-        radius = float(np.sqrt(np.max(body.inertia) / body.mass))
+        radius = max(float(np.sqrt(np.max(body.inertia) / body.mass)), float(np.linalg.norm(body.ipos)))
         for i, axis in enumerate("xyz"):
             put = partial(put_centre, body.name, i)
-            yield part(f"{body.name}.com_{axis}", 0.0, put, "shift_m", radius, (1e-3, 1.0), signed=True)
+            yield part(
+                f"{body.name}.com_{axis}", 0.0, put, "shift_m", radius or 1.0, (1e-3, 1.0), signed=True
+            )
             yield part(f"{body.name}.stretch_{axis}", 1.0, partial(put_shape, body.name, i, i))
             for j in range(i):
                 put = partial(put_shape, body.name, j, i)
@@ -352,10 +297,3 @@ class Quantities:
                 at_joints[k], forces[k] = data.qfrc_actuator, data.actuator_force
             found.append((q, v, at_joints, forces))
         return found
-
-
-def _scaled(
-    name: str, unit: float, low: float, high: float, first: float, last: float, count: int
-) -> EffectParameter:
-    starts = tuple(geometric(first * unit, last * unit, count))
-    return EffectParameter(name, low * unit, high * unit, starts)

@@ -166,7 +166,9 @@ def _chosen(plant: Plant, settings: SimulatorSettings) -> Plant:
     for key in ("candidates", "exclude"):
         for pattern in getattr(settings, key):
             if not fnmatch.filter(there, pattern):
-                raise ValueError(f"{key}: {pattern!r} matches nothing; there are {listing(there)}")
+                raise ValueError(
+                    f"{key}: {pattern!r} matches nothing that shows in the logs; there are {listing(there)}"
+                )
 
     def taken(name: str) -> bool:
         def within(patterns: Sequence[str]) -> bool:
