@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from control_design.analysis.certificate import certify
-from control_design.analysis.closed_loop import ClosedLoopTrajectory as LoopTrajectory
+from control_design.analysis.closed_loop import ClosedLoopTrajectory as LoopTrajectory, StepMetrics
 from control_design.analysis.joint_coverage import JointCoverage
 from control_design.controllers.controller import Controller
 from control_design.convex.youla import PlantBracket, YoulaBracket
@@ -421,6 +421,10 @@ def friction_check(sensitivity: SensitivityCheck) -> FrictionCheck:
         sticking_interval=(0.0012, 0.0014),
         error_at_rest=0.006,
         error_interval=(0.0058, 0.0062),
+        step=StepMetrics(0.2, 0.1, 10.0, 0.0, 1.5, 0.001, 3.0, 0.0),
+        watched_s=20.0,
+        left=0.002,
+        output=0.2 - 0.2 * np.exp(-np.linspace(0, 6, 100)),
         tracking=SlowSine(0.05, 0.1, 0.001, error, 0.2 * error),
     )
 

@@ -6,6 +6,7 @@
     stages/<name>.npz | .json
     figures/
     report.html
+    model.json                     the identified response of one loop, with its ellipses
     controller.json .mat .c .h     and those of the reference filter, where there is one
 
 A stage is done when its file is there and the input hash recorded *inside* it equals the hash of what the
@@ -32,7 +33,7 @@ from workflow.engine import codec, documents, storage
 from workflow.engine.errors import InputError, naming, shortened
 from workflow.engine.store import Store
 
-LAYOUT_VERSION = 6  # 6: results without fields that nobody read
+LAYOUT_VERSION = 7  # 7: the reference step with friction
 T = TypeVar("T")
 _INPUT_HASH, _DIGEST = "_input_hash", "_sha256"
 _RESULT = "result"
@@ -40,8 +41,9 @@ _PACKAGES = ("flexlink", "numpy", "scipy", "control", "casadi", "nlopt", "numba"
 
 
 CONTROLLER_SUFFIXES = (".json", ".mat", ".c", ".h")
-CONTROLLER_FILES = tuple(
-    f"controller{of}{suffix}" for of in ("", "_reference_filter") for suffix in CONTROLLER_SUFFIXES
+KEPT_FILES = (
+    "model.json",
+    *(f"controller{of}{suffix}" for of in ("", "_reference_filter") for suffix in CONTROLLER_SUFFIXES),
 )
 
 
@@ -70,7 +72,7 @@ class RunDirectory(Store):
     what = "run"
     manifest_name = "manifest.json"
     folders = ("stages", "figures")
-    own_files = ("report.html", *CONTROLLER_FILES, "config.toml", "config.json")
+    own_files = ("report.html", *KEPT_FILES, "config.toml", "config.json")
 
     # -- opening ---------------------------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from workflow.figures import style
 from workflow.figures.bands import Real, envelope, outline
 from workflow.figures.sensitivity import curves_of
-from workflow.figures.subjects import MACHINE, RunView
+from workflow.figures.subjects import FRICTION, MACHINE, RunView
 from workflow.tasks.results import LoopRuns
 from workflow.text.formats import share, si
 
@@ -38,6 +38,7 @@ def draw_run(run: RunView) -> Figure:
         disturbance=loop.disturbance,
         command_limit=loop.input_limit,
         model=loop.model_answer,
+        sticking=loop.with_friction,
     )
 
 
@@ -53,14 +54,15 @@ def draw_closed_loop(
     disturbance: Real | None = None,
     command_limit: float | None = None,
     model: Real | None = None,
+    sticking: Real | None = None,
 ) -> Figure:
     """Rows: what `labels` names of output, performance and command. Left: the reference step. Right: the
     disturbance.
 
     time_s, reference, disturbance and model (the answer of the model that a reference filter makes the loop
     follow) are (T,). labels: (name, unit) of each row. others: runs on `machine`, in words; without one, of
-    plants drawn from the uncertainty. The first run is drawn as a line, all of them as the band between their
-    extremes.
+    plants drawn from the uncertainty. sticking: the output with friction, as far as it goes. The first run is
+    drawn as a line, all of them as the band between their extremes.
     """
     both = (predicted,) if others is None else (predicted, others)
     onset, windows = _windows(time_s, disturbance, labels, both)
@@ -79,6 +81,9 @@ def draw_closed_loop(
             axes.plot(*outline(time, line[part], 180), **_PREDICTED, **hold)
             if kind == "output":
                 axes.plot(time, reference[part], **_REFERENCE)
+                if sticking is not None and start == time_s[0]:
+                    held = sticking[part]
+                    axes.plot(*outline(time[: held.size], held, 180), **style.MODEL_LINE, label=FRICTION)
                 if model is not None:
                     axes.plot(time, model[part], **style.MODEL_LINE, ls=":", label="model to follow")
             axes.set_xlim(start, stop)
@@ -293,7 +298,7 @@ def draw_friction(run: RunView) -> Figure | None:
         (sine.given, style.MODEL_LINE, "with friction feed-forward"),
     ):
         errors.plot(*outline(time_s, error, 400), **look, label=words)
-    for sign in (-1, 1):
+    for sign in (-1, 1) if found.error_at_rest > 0 else ():
         errors.axhline(
             sign * found.error_at_rest, **style.LIMIT_LINE, label="largest error that friction can hold"
         )

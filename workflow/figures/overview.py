@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from workflow.figures import style
 from workflow.figures.bands import enlargement, envelope, outline, response_band
 from workflow.figures.nyquist import draw_around_minus_one, loop_of
-from workflow.figures.subjects import MACHINE, RunView
+from workflow.figures.subjects import FRICTION, MACHINE, RunView
 from workflow.text.formats import share
 
 
@@ -43,6 +43,8 @@ def draw_overview(run: RunView) -> Figure:
     label = f"{machine}: all {achieved.shape[0]} runs"
     step.fill_between(*envelope(time_s, achieved), **style.ACHIEVED_BAND, label=label)
     step.plot(*outline(time_s, achieved[0], 180), **style.ACHIEVED_LINE, label=f"{machine}: first run")
+    if loop.with_friction is not None:
+        step.plot(*outline(time_s, loop.with_friction, 180), **style.MODEL_LINE, label=FRICTION)
     predicted = loop.predicted_runs.output[0, half]
     step.plot(time_s, predicted, **style.PREDICTED_LINE, label="predicted, nominal model")
     step.plot(time_s, loop.reference[half], **style.REFERENCE_STEPS, label="reference")

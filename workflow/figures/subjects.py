@@ -36,6 +36,7 @@ from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.results import IdentifiedChannel, LoopCheck, ModelMode, RunResults, UncertainChannel
 
 MACHINE = {"simulated": "simulated arm", "identified": "plants drawn from the identified uncertainty"}
+FRICTION = "identified arm with friction"
 LIGHT = 0.3  # damping ratio below which a pole pair is called lightly damped
 
 

@@ -95,7 +95,10 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
             achieved = run_on_draws(controller, (posterior, own), shown, trial, **converter_steps(options))
         if options.sensitivity and results.identify.friction is not None:
             stage.progress.update("closed_loop", 0.95, "friction")
-            friction = check_friction(stage, controller, trial.step, trial.half, sensitivity)
+            first = slice(0, trial.half)
+            friction = check_friction(
+                stage, controller, trial.reference[first], trial.given[first], sensitivity
+            )
     model = None
     if reference_filter is not None and config.reference_filter is not None:
         model = model_answer(config.reference_filter.reference_model, trial.reference, controller.dt_s)

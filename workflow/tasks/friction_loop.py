@@ -17,6 +17,7 @@ from control_design.analysis.closed_loop import (
     MeasuredSensitivity,
     sensitivity_of,
     simulate,
+    step_metrics,
 )
 from control_design.controllers.controller import Controller, FrictionFeedforward
 from ident.friction import FrictionFit, FrictionLaw
@@ -35,6 +36,8 @@ _SHARES = (1.0, 0.3, SMALL, 0.03, 0.01)
 # The sine's period is so many times the delay of the loop; its linear error is 2 pi over that.
 _SLOW, _LONGEST = 300.0, 20_000
 _SINE_SHARE = 0.2  # of the reference step
+# Friction lets integral action wait: the step is watched so many times as long as the linear loop needs.
+_WATCHED, _MOST_WATCHED = 20, 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,18 +177,19 @@ def interval_of(values: Sequence[float], level: float = 0.95) -> Interval:
 def check_friction(
     stage: StageInput,
     controller: Controller,
-    step: float,
-    transient_samples: int,
+    reference: Real,
+    given: Real,
     sensitivity: SensitivityCheck | None,
 ) -> FrictionCheck:
     """What friction does to the loop of this controller (without feed-forward), predicted and, where
-    `sensitivity` was measured on the simulated arm, measured."""
+    `sensitivity` was measured on the simulated arm, measured. reference (T,): a step and the time in which
+    the linear loop settles; given (T,): what a reference filter makes of it."""
     found, certificate = stage.results.identify.friction, stage.results.certify.certificate
     assert found is not None
     assert certificate is not None
     steps = converter_steps(stage.config.closed_loop)
     loops = drawn(controller, found, stage.rng("closed_loop", "friction"), _DRAWS, **steps)
-    plan = sensitivity_plan(stage, controller, transient_samples)
+    plan = sensitivity_plan(stage, controller, reference.size)
     names = ["0", "further 1", "1", "further 2", "further 3"]
     low, high, measured = np.empty(len(_SHARES)), np.empty(len(_SHARES)), np.empty(len(_SHARES))
     for k, (name, share) in enumerate(zip(names, _SHARES, strict=True)):
@@ -202,8 +206,15 @@ def check_friction(
     fitted = FrictionLoop.of(controller, found, **steps)
     radius = float(np.max(np.abs(controller.poles), initial=0.0))
     rest = settling_samples(radius, 200, 6000)
-    # With integral action the command grows until the arm moves, however small the step.
-    sticking = [0.0 if radius > 1 - 1e-9 else loop.sticking_step(rest) for loop in (fitted, *loops)]
+    # With integral action the command grows until the arm moves, however small the step or the error.
+    integral = radius > 1 - 1e-9
+    sticking = [0.0 if integral else loop.sticking_step(rest) for loop in (fitted, *loops)]
+    error_at_rest = 0.0 if integral else fitted.error_at_rest
+    held = min(_WATCHED * reference.size, max(_MOST_WATCHED, reference.size)) - reference.size
+    run = fitted.run(np.pad(given, (0, held), mode="edge"))
+    run = replace(run, reference=np.pad(reference, (0, held), mode="edge"))
+    moving = int(np.flatnonzero(run.reference)[0])
+    error = np.abs(run.reference - run.measured)[moving:]
     tolerance = TOLERANCE_PERCENT / 100
     return FrictionCheck(
         level=found.law.breakaway,
@@ -220,9 +231,15 @@ def check_friction(
         linear_from=holds_from(sizes, np.abs(np.sqrt(low * high) / plan.nominal_peak - 1) - tolerance),
         sticking_step=sticking[0],
         sticking_interval=interval_of(sticking[1:]) if min(sticking) > 0 else (0.0, max(sticking)),
-        error_at_rest=fitted.error_at_rest,
-        error_interval=_around(fitted.error_at_rest, found),
-        tracking=slow_sine(stage, controller, _SINE_SHARE * step, on_arm=sensitivity is not None),
+        error_at_rest=error_at_rest,
+        error_interval=_around(error_at_rest, found),
+        step=step_metrics(run),
+        watched_s=error.size * controller.dt_s,
+        left=float(np.max(error[error.size // 2 :])),
+        output=run.measured[: reference.size],
+        tracking=slow_sine(
+            stage, controller, _SINE_SHARE * float(reference[-1]), on_arm=sensitivity is not None
+        ),
     )
 
 

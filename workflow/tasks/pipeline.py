@@ -12,14 +12,15 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from control_design.controllers.c_code import Dialect
+from ident.basis.model_files import ModelFile
 from workflow.config.joints_config import JointsConfig
 from workflow.config.run_config import RunConfig
 from workflow.engine import interrupts, storage
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import CommandInterruptedError, InputError, naming, one_line
 from workflow.engine.progress import Progress
-from workflow.engine.run_directory import CONTROLLER_FILES, LAYOUT_VERSION, RunDirectory, hash_of
-from workflow.tasks.exports import write_controller
+from workflow.engine.run_directory import KEPT_FILES, LAYOUT_VERSION, RunDirectory, hash_of
+from workflow.tasks.exports import model_bytes, write_controller
 from workflow.tasks.joints import JOINT_STAGES, JointsResults
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage, StageInput
@@ -35,7 +36,7 @@ class Kind:
 
     stages: tuple[Stage, ...]
     results: Callable[[RunDirectory], Any]
-    keep_controller: Callable[[Any, Any, Dialect], list[Path]]
+    keep: Callable[[Any, Any, Dialect], list[Path]]
     summarise: Callable[[Any, Any], RunSummary]
 
 
@@ -89,8 +90,8 @@ def run_pipeline(
         try:
             for stage in stages:
                 _perform(stage, given, inputs, ready if stage is stages[0] else None)
-            written = kind.keep_controller(given.results, config, dialect)
-            for name in CONTROLLER_FILES:  # none of an earlier design stay
+            written = kind.keep(given.results, config, dialect)
+            for name in KEPT_FILES:  # none of an earlier design stay
                 if run.path / name not in written:
                     (run.path / name).unlink(missing_ok=True)
             summary = kind.summarise(given.results, config)
@@ -208,18 +209,24 @@ def _dialect(run: RunDirectory, stated: Mapping[str, Any]) -> Dialect:
     return replace(before, **stated)
 
 
-def _keep_controller(results: RunResults, config: RunConfig, dialect: Dialect) -> list[Path]:
-    """controller.json, .mat, .c and .h in the run directory, and those of its reference filter."""
+def _keep_files(results: RunResults, config: RunConfig, dialect: Dialect) -> list[Path]:
+    """model.json, and controller.json, .mat, .c and .h with those of its reference filter."""
+    found = results.uncertainty.channels[config.control_index]
+    model = results.run.path / "model.json"
+    storage.write_together({model: model_bytes(model, ModelFile(found.nominal, found.frequency))})
     if (controller := results.design.controller) is None:
-        return []
+        return [model]
     second, certified = results.reference_filter, results.certify.certified
     law, about = second.law(controller), certified_for(results, config)
-    return write_controller(
-        results.run.path, law, second.filter, certified=certified, about=about, dialect=dialect
-    )
+    return [
+        model,
+        *write_controller(
+            results.run.path, law, second.filter, certified=certified, about=about, dialect=dialect
+        ),
+    ]
 
 
-def _keep_joints_controller(results: JointsResults, config: JointsConfig, dialect: Dialect) -> list[Path]:
+def _keep_joints_files(results: JointsResults, config: JointsConfig, dialect: Dialect) -> list[Path]:
     if (law := results.design.controller) is None:
         return []
     about = f"{len(results.identify.points)} operating points"
@@ -230,8 +237,8 @@ def _keep_joints_controller(results: JointsResults, config: JointsConfig, dialec
 def kind_of(config: RunConfig | JointsConfig) -> Kind:
     """Of one loop, or of several joints."""
     if isinstance(config, JointsConfig):
-        return Kind(JOINT_STAGES, JointsResults, _keep_joints_controller, summarise_joints)
-    return Kind(STAGES, RunResults, _keep_controller, summarise)
+        return Kind(JOINT_STAGES, JointsResults, _keep_joints_files, summarise_joints)
+    return Kind(STAGES, RunResults, _keep_files, summarise)
 
 
 def _fail(run: RunDirectory, error: BaseException, *, created: bool) -> None:

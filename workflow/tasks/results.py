@@ -486,7 +486,9 @@ class FrictionCheck:
     certified_from: size from which on, up to the largest, `high` exceeds the certified peak by at most
     tolerance_percent; linear_from: from which on the middle of the interval is that near to the peak of the
     linear prediction; None where not even at the largest. sticking_step: largest step after which the arm
-    does not leave its pre-sliding; error_at_rest: largest error with which it may rest.
+    does not leave its pre-sliding; error_at_rest: largest error with which it may rest, 0 with integral
+    action. step: of the reference step on the arm as it was fitted, without noise, watched for `watched_s` after the
+    step; left: the largest error in the last half of that time; output (T,): as long as the trial's step.
     """
 
     level: float
@@ -505,6 +507,10 @@ class FrictionCheck:
     sticking_interval: Interval
     error_at_rest: float
     error_interval: Interval
+    step: StepMetrics
+    watched_s: float
+    left: float
+    output: Real
     tracking: SlowSine
 
     @property
@@ -563,6 +569,11 @@ class LoopCheck:
     sensitivity: SensitivityCheck | None = None
     conditions: tuple[ConditionRun, ...] = ()
     friction: FrictionCheck | None = None
+
+    @property
+    def with_friction(self) -> Real | None:
+        """Output of the reference step with the identified friction, where the runs are of linear plants."""
+        return None if self.friction is None or self.machine == "simulated" else self.friction.output
 
     @property
     def draws(self) -> int:
