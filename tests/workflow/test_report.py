@@ -86,6 +86,7 @@ def test_page_and_pictures_are_written(drawn):
         "joint-",
         "matrix-",
         "mode-",
+        "singular-values",
     )
     assert families == {name for name in drawings() if not name.startswith(elsewhere)}
     text = drawn.report_path.read_text(encoding="utf-8")

@@ -487,8 +487,9 @@ class FrictionCheck:
     tolerance_percent; linear_from: from which on the middle of the interval is that near to the peak of the
     linear prediction; None where not even at the largest. sticking_step: largest step after which the arm
     does not leave its pre-sliding; error_at_rest: largest error with which it may rest, 0 with integral
-    action. step: of the reference step on the arm as it was fitted, without noise, watched for `watched_s` after the
-    step; left: the largest error in the last half of that time; output (T,): as long as the trial's step.
+    action. step: of the reference step on the arm as it was fitted, without noise, watched for `watched_s`
+    after the step; left: the largest error in the last half of that time; output (T,): as long as the trial's
+    step.
     """
 
     level: float
