@@ -177,8 +177,7 @@ def _searched_with_initial_state(records: Sequence[Record], outcome: Outcome, re
     search = PoleSearch(free, options)
     start, polished = None, None
     if without.poles.order - search.fixed.order < 3 and None in (options.n_real, options.n_pairs):
-        # Nothing found from rest: a free decay looks just so. Judge by what a search with free responses
-        # finds.
+        # Nothing found from rest: a free decay looks just so. Judge by a search with free responses.
         most_pairs = options.max_pairs if options.n_pairs is None else options.n_pairs
         n_real = min(2, options.max_real) if options.n_real is None else options.n_real
         end = search.joint(n_real, min(1, most_pairs))

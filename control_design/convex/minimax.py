@@ -19,8 +19,7 @@ import scipy.linalg
 from control_design.plants.ellipses import Complex, Integer, Real, quotient
 from control_design.plants.frequency_grid import with_violations
 
-# Radii of the rounding of |.| at its kink. An active numerator is as large as gamma m, of which the rounding
-# is a thousandth: it changes the row by 5e-7. Sharper kinks of inactive rows only slow Newton down.
+# Radii of the rounding of |.| at its kink, a thousandth of an active numerator: it changes the row by 5e-7.
 _ROUND_NUMERATOR = 1e-3
 _ROUND_REACH = 1e-4  # denominators are about one: off by at most 1e-4, at the kink alone
 _ROUND_FEASIBILITY = 1e-2  # while denominators are being made positive: their maximum may sit on the kink
@@ -247,8 +246,8 @@ class _Scaled:
             if not np.all(np.isfinite(step)):
                 break  # the system has become singular to working precision: the best point stands
             length = min(1.0, 0.99 * min(primal_length, dual_length))
-            # Rows are convex: what they lie above their linearisation after the step is its error. Far from
-            # the kinks the model is nearly flat and steps would run away.
+            # What convex rows lie above their linearisation is its error: far from the kinks steps would run
+            # away.
             allowed, rise = float(np.max(slack)), by_row @ step[:n]
             h_new = self._values(z + length * step[:n], weight, factor, scale)
             while np.max(h_new - h - length * rise) > allowed and length > 1e-8:

@@ -141,8 +141,7 @@ class BracketProblem:
     def answers(self) -> list[tuple[float, Real]]:
         """Of ellipses, enclosing and inscribed discs: see `exchanged`."""
         enclosing = self.exchanged("enclosing", None)
-        # Where the enclosing discs cannot be stabilised together, the ellipses may be: started from the
-        # inscribed.
+        # Where the enclosing discs cannot be stabilised, the ellipses may be: started from the inscribed.
         inscribed = self.exchanged("inscribed", None)
         start = enclosing if np.isfinite(enclosing[0]) else inscribed
         return [self.exchanged("ellipse", start[1]), enclosing, inscribed]

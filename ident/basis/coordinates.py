@@ -22,8 +22,7 @@ from ident.data.arrays import RealArray, kernel_array, lock
 
 # A pair this close to critical damping is two real poles in disguise; its two columns become dependent.
 ZETA_LIMIT = 0.98
-# Without a bound of the user no pair is less damped: links have more, and an undamped pair with a free
-# initial state fits any slow disturbance.
+# Links have more; an undamped pair with a free initial state fits any slow disturbance.
 ZETA_LEAST = 1e-3
 
 

@@ -47,8 +47,7 @@ def _blocks(real: Any, pairs: Any) -> Any:
     for i in range(pairs.size):
         re, im = pairs[i].real, pairs[i].imag
         gamma = re**2 + im**2
-        # |p| < 1 can still round to 1 - gamma = 0 at the last bit; a block without input would be no basis
-        # function.
+        # |p| < 1 can round to 1 - gamma = 0; a block without input would be no basis function.
         one_minus_gamma = max((1 - abs(re)) * (1 + abs(re)) - im**2, 5e-17)
         blocks[real.size + i, 0] = gamma
         blocks[real.size + i, 1] = 2 * re / (1 + gamma)
@@ -255,8 +254,7 @@ def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, 
 def run_cascade_free(blocks: Any, n_real: int, rows: Any, row: int, length: int) -> None:
     """Free responses A^k B of the whole cascade into rows[row:, :length]: the states after an impulse at k =
     -1. Zero once a block and its input are below 1e-30, which keeps (slow) denormal numbers away."""
-    # The all-pass response to the impulse: its value at k = -1 (the direct terms), the signal w from k = 0
-    # on.
+    # The all-pass response to the impulse: its value at k = -1, the signal w from k = 0 on.
     impulse = 1.0
     w = np.zeros(length)
     alive = 0  # w is zero from here on

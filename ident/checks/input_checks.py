@@ -18,12 +18,10 @@ from ident.fit.least_squares import Regression
 from ident.fit.problem import residual_colour
 from ident.fit.refinement import pole_system
 
-# An input is there at a frequency if it has this share of the density that it would have if its power were
-# spread evenly up to Nyquist ...
+# An input is there at a frequency with this share of the density of an input spread evenly up to Nyquist ...
 _WEAK_INPUT = 1e-2
-# ... or if the response over a third of that frequency can be told to 30 %: the power that the model makes of
-# it, over what the model leaves, times the number of spectral lines there is at least 10; never below this
-# share of its largest density, where windows leak.
+# ... or if the response over a third of that frequency can be told to 30 %: power of the model over the rest,
+# times the spectral lines there; never below a share of its largest density, where windows leak.
 _TOLD = 10.0
 _LEAKAGE = 1e-6  # -60 dB: side lobes of a Hann window from its seventh line on
 # A rate of decay within this factor either way (95 %) is known; beyond, the record does not tell it.
@@ -43,8 +41,7 @@ _ALIKE_INPUT = 1e-2
 # have ten times as much), within an octave. Poles bridge a band of less than a third of an octave. An input
 # rests at lines with less than _LEAKAGE of its mean density.
 _LINES_AN_INPUT, _CELLS, _LEAST_CELLS = 6.0, 12, 4
-# Of a sine in a Hann window there are 2, of an integrator that hunts against stiction up to 3.3; of 45
-# closed-loop machines' logs, moves among them, 10 or more; of measured ones 8 or more.
+# A sine in a Hann window has 2, an integrator hunting in stiction 3.3, logs of 45 machines and measured 8 up.
 _FEWEST_LINES = 6.0
 # Deviations from an operating point this many times larger are lost beside it.
 _LARGE_OFFSET = 10.0
@@ -261,8 +258,7 @@ def clipped(records: Sequence[Record]) -> list[Finding]:
             ("output", record.output, record.output_names),
         ):
             share = clipped_share(signal[:, 0])
-            # An input that stands at the amplifier's limit because that is known is no doubt, nor are means
-            # of a binary one.
+            # An input at the amplifier's known limit is no doubt, nor are means of a binary one.
             known = record.cut or (record.repair is not None and record.repair.own_s)
             if share > 0 and not (kind == "input" and known):
                 found.append(
@@ -278,8 +274,7 @@ def _drifting(
     residuals: Sequence[RealArray],
     fixed: Poles,
 ) -> list[Finding]:
-    # A machine that integrates also integrates friction and offsets of its drive: its output walks away
-    # without any fault of the record.
+    # A machine that integrates also integrates friction and offsets: its output walks away without any fault.
     if model.integrators:
         return []
     slow = np.flatnonzero(1 - model.poles.real < 1 / (_SLOW * data.longest))

@@ -1,11 +1,11 @@
-"""Run as a script, alone: the columns of an HDF5, parquet, xlsx or MCAP file or of a ROS bag, from
+"""Run as a script, alone: the columns of an HDF5, parquet, xlsx, MATLAB or MCAP file or of a ROS bag, from
 standard input to output.
 
 The libraries that read these formats are compiled, and a file can be made to end their process or to fill
 the memory. Here that process is not ours, and has limits of memory and time. Out come an npz archive (arrays
-0, 1, ..., and `about`: names and units as JSON) or, of a spreadsheet, JSON: the text of each table, with
-tabs, by the name of its sheet. Exit code 2: one line on standard error says what is wrong; 3: the library it
-names is not there.
+0, 1, ..., and `about`: names and units, or the tree of variables, as JSON) or, of a spreadsheet, JSON: the
+text of each table, with tabs, by the name of its sheet. Exit code 2: one line on standard error says what is
+wrong; 3: the library it names is not there.
 """
 
 import io
@@ -13,6 +13,7 @@ import json
 import resource
 import sys
 import tempfile
+import warnings
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -280,18 +281,53 @@ def _cell(value: Any) -> str:
     return " ".join(text.split())
 
 
-def _archive(columns: Columns) -> bytes:
+def mat_variables(content: bytes) -> bytes:
+    """Archive of the arrays of a MATLAB file (to version 7.2), `about` the tree of its variables: each is
+    {"array": number}, {"text": .}, {"list": [.]}, {"struct": {name: .}} or {"unread": why}."""
+    import numpy as np
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatlabFunction, MatlabOpaque, mat_struct
+
+    warnings.simplefilter("error")  # a variable that is there twice
+    arrays: list[Any] = []
+
+    def tree(value: Any) -> dict[str, Any]:
+        if isinstance(value, mat_struct):
+            return {"struct": {name: tree(getattr(value, name)) for name in value._fieldnames}}
+        if isinstance(value, MatlabFunction | MatlabOpaque) or not isinstance(value, np.ndarray):
+            what = "a sparse matrix" if hasattr(value, "tocsc") else "a MATLAB object or function"
+            return {
+                "unread": f"{what}; expected numbers: save plain vectors, e.g. t = x.Time; y = full(x.Data)"
+            }
+        if value.dtype.kind == "U":
+            rows = [str(row).rstrip() for row in value.ravel()]
+            return {"text": "".join(map(str, value.ravel()))} if len(rows) < 2 else {"text": rows}
+        if value.dtype.kind == "O":
+            items = [tree(item) for item in value.ravel(order="F")]
+            one = len(items) == 1 and isinstance(value.item(), mat_struct)
+            return items[0] if one else {"list": items}
+        # Whole numbers are stored in fewer bytes than their class has.
+        arrays.append(value.astype(np.complex128 if value.dtype.kind == "c" else np.float64))
+        return {"array": len(arrays) - 1}
+
+    found = loadmat(io.BytesIO(content), struct_as_record=False)
+    variables = {name: tree(value) for name, value in found.items() if not name.startswith("__")}
+    if not all(map(str.isidentifier, variables)):
+        raise RefusedError("damaged: a variable has no possible name")
+    return _archive({"struct": variables}, arrays)
+
+
+def _archive(about: Any, arrays: list[Any]) -> bytes:
     import numpy as np
 
-    about = json.dumps([[name, unit] for name, _, unit in columns]).encode()
-    stream = io.BytesIO()
-    arrays = {str(k): values for k, (_, values, _) in enumerate(columns)}
-    np.savez(stream, about=np.frombuffer(about, dtype=np.uint8), **arrays)
+    stream, text = io.BytesIO(), json.dumps(about).encode()
+    named = {str(k): values for k, values in enumerate(arrays)}
+    np.savez(stream, about=np.frombuffer(text, dtype=np.uint8), **named)
     return stream.getvalue()
 
 
 def main(kind: str) -> int:
-    """kind: hdf5, parquet, xlsx, mcap, bag (ROS 1) or db3 (ROS 2)."""
+    """kind: hdf5, parquet, xlsx, mat, mcap, bag (ROS 1) or db3 (ROS 2)."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
@@ -299,10 +335,13 @@ def main(kind: str) -> int:
     try:
         if kind == "xlsx":
             found = json.dumps(sheet_texts(content)).encode("utf-8", "replace")
-        elif kind in ("hdf5", "parquet"):
-            found = _archive(hdf5_columns(content) if kind == "hdf5" else parquet_columns(content))
+        elif kind == "mat":
+            found = mat_variables(content)
         else:
-            found = _archive(bag_columns(content, kind))
+            read = {"hdf5": hdf5_columns, "parquet": parquet_columns}.get(kind)
+            columns = read(content) if read else bag_columns(content, kind)
+            about = [[name, unit] for name, _, unit in columns]
+            found = _archive(about, [values for _, values, _ in columns])
     except ImportError as error:
         sys.stderr.write(error.name or str(error))
         return 3

@@ -30,8 +30,7 @@ from ident.data.record import Record, in_groups
 _REPEATS = 1e-4
 # Power of a line over the strongest: excited above the first, without excitation below the second.
 _EXCITED, _SILENT = 1e-2, 1e-4
-# Records whose input differs by less in rms are of one amplitude; inputs nearer than that are one
-# realisation.
+# Records whose input differs by less in rms are of one amplitude, in itself of one realisation.
 _SAME = 0.02
 # Noise is averaged over this many harmonics to each side, fewer next to zero.
 _SMOOTHING = 10

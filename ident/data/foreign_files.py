@@ -78,13 +78,13 @@ def as_numbers(values: Any) -> np.ndarray[Any, np.dtype[Any]]:
 
 
 def read_in_child(kind: str, library: str, content: bytes, extra: str = "logs") -> bytes:
-    """What `child_reader` makes of the bytes of a file of this kind (HDF5, parquet, xlsx, MCAP, bag, db3).
+    """What `child_reader` makes of the bytes of a file: HDF5, parquet, xlsx, MATLAB .mat, MCAP, bag, db3.
 
     Raises ValueError, beginning with ':': damaged, too large, too slow, or the library is not installed.
     """
     # No plug-ins that the surroundings name: a filter of HDF5 is a library that gets loaded.
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("HDF5", "PYTHON"))}
-    command = [sys.executable, "-I", str(_SCRIPT), kind.lower()]
+    command = [sys.executable, "-I", str(_SCRIPT), kind.lower().rpartition(".")[2]]
     try:
         done = subprocess.run(
             command,

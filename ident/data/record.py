@@ -19,8 +19,7 @@ from ident.data.wrapping import unwrapped, wraps_at
 
 T = TypeVar("T")
 
-# Clocks of one machine that differ by less are one: a thousandth of every frequency, below what most records
-# tell.
+# Clocks of one machine differ by less: a thousandth of every frequency, below what most records tell.
 _SAME_CLOCK = 1e-3
 
 

@@ -118,8 +118,7 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
     first = layout.first - 1
     commented = [k for k in range(first, len(lines)) if _is_comment(lines[k])]
     blank = [k for k in range(first, len(lines)) if not lines[k].strip()]
-    # Behind every row they are a line end too many (written twice by some programs); one alone may be a
-    # sample that is missing.
+    # Behind every row they are a line end too many; one alone may be a sample that is missing.
     double = 2 * len(blank) >= len(lines) - first - len(commented) - 2
     skipped = {*commented, *(blank if double else ())}
     body = [line for k, line in enumerate(lines[first:], first) if k not in skipped]

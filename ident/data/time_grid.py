@@ -16,8 +16,8 @@ from ident.data.arrays import IntArray, RealArray
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.table import Table
 
-# Each sampling interval may differ from the mean one by this fraction: at the Nyquist frequency the phase
-# of a sample is then wrong by at most 0.03 rad. A clock's jitter is far below it, a lost sample far above.
+# Of an interval from the mean one: at the Nyquist frequency a phase wrong by 0.03 rad; above a clock's
+# jitter.
 TIME_TOLERANCE = 0.01
 # Stamps this far off a multiple (in samples) are no jitter that an interpolation makes good.
 LARGEST_JITTER = 0.2
@@ -58,8 +58,7 @@ def sampling_time(
         return float(dt_s)
     table.increasing(stamps, name)
     interval = np.diff(stamps)
-    # The median says what the step is even where samples are lost; the mean over all is the better
-    # estimate after.
+    # The median holds where samples are lost; the mean is the better estimate after.
     median = float(np.median(interval))
     uneven = np.flatnonzero(~(np.abs(interval - median) <= TIME_TOLERANCE * median))
     if uneven.size and not only_rounded(stamps):

@@ -15,8 +15,7 @@ from ident.data.arrays import RealArray
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.foreign_files import shown
 
-# Units per second, or seconds per unit. Both are integers, so that 2 [ms] becomes the very double that 0.002
-# is: division by an exact number is rounded once.
+# Integers, so that 2 [ms] becomes the very double that 0.002 is: an exact division is rounded once.
 _PER_SECOND = {"s": 1, "ms": 1000, "us": 10**6, "ns": 10**9}
 _SECONDS_PER = {"min": 60, "h": 3600, "d": 86400}
 _SPELLED = {

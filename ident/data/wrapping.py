@@ -6,8 +6,7 @@ import numpy as np
 
 from ident.data.arrays import RealArray
 
-# Where readings usually start again: powers of two, turns in degrees, tenths, arc minutes and radians, round
-# numbers of lines of an encoder.
+# Where readings start again: powers of two, turns in several units, round numbers of an encoder's lines.
 _PERIODS = tuple(
     sorted(
         {
@@ -21,8 +20,7 @@ _PERIODS = tuple(
         }
     )
 )
-# Steps of a wrapping signal are short, or nearly as long as the range: of those from .4 to .6 of it there are
-# no more than this share of the longer ones. (A sine near the Nyquist frequency has .25, random levels 1.2.)
+# Steps from .4 to .6 of the range over longer ones: few where it wraps; a sine near Nyquist has .25.
 _VALLEY = 0.15
 # A signal that switches between two levels, or a spike, is seldom in between.
 _BETWEEN = 0.1
@@ -61,8 +59,8 @@ def wraps_at(values: RealArray) -> float:
     period = usual[0] if usual else float(f"{span + 1 if whole else span:.6g}")
     going_on = np.unwrap(values, period=period)
     if between < _BETWEEN:
-        # It switches between two levels, drops out, or swings about the place where it wraps: then that is a
-        # usual one, it moves on both sides, and noise is not all that is left.
+        # It switches, drops out, or swings about a usual place of wrapping, moves on both sides, and is no
+        # noise.
         sides = (values[values < low + 0.5 * span], values[values > low + 0.5 * span])
         moves = min(np.unique(side).size for side in sides) >= _LEVELS
         usual_place = min(abs(low), abs(low + period / 2)) <= 2 * max(step * span, 1e-3 * period)

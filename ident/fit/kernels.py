@@ -16,11 +16,9 @@ from ident.basis.coordinates import blocks_of_point
 from ident.basis.functions import run_cascade, run_cascade_free
 from ident.data.arrays import INSIDE
 
-# A column whose part outside the columns before it is below this fraction of its length carries no
-# information.
+# A column whose part outside the columns before it is below this share of its length says nothing.
 _RANK_TOLERANCE = 1e-11
-# Least square of a column's part outside the columns before it, relative to its own, for a linearisation by
-# products: the error of the inverse is about 1e-16 over this, before refinement.
+# Least square of a column's part outside the ones before: the inverse is wrong by 1e-16 over this.
 _LEAST_PIVOT = 1e-8
 # numpy's scalars: of Python's own numba compiles a version of the called function for each value.
 _START: Any = np.int64(0)
@@ -31,8 +29,8 @@ _called = numba.njit(**INSIDE)
 
 @numba.njit(**INSIDE, forceinline=True, fastmath={"reassoc", "contract"})
 def _dot(a: Any, b: Any, lo: int, hi: int) -> float:
-    # Slices counted from 0: with a[k], lo <= k < hi, the compiler has to allow for negative k and does not
-    # vectorise (ten times slower).
+    # Slices counted from 0: a[k], lo <= k < hi, allows for negative k and is not vectorised (ten times
+    # slower).
     x, y = a[lo:hi], b[lo:hi]
     total = 0.0
     for k in range(x.size):
@@ -344,8 +342,7 @@ def linearise(
         fitted[0, k] = output[k] - residual[k]
     _take_out_local(residual, local_q, starts)
     if free:
-        # Free responses are part of the output that the poles make; a polynomial part then does no harm
-        # (filtered, it stays in the span of the columns).
+        # Free responses are part of the output that the poles make; a polynomial part stays in their span.
         for k in range(n_total):
             fitted[0, k] = y[k] - residual[k]
     on_residual = np.empty(rows.shape[0])

@@ -21,8 +21,7 @@ from ident.data.arrays import ComplexArray, IntArray, RealArray
 from ident.fit.kernels import cost_of_point, driven_rows, linearise
 from ident.fit.problem import CandidateCost, Linearisation, PoleProblem, ResidualColour, residual_colour
 
-# Directions of the columns weaker than this fraction of the strongest are left at zero: the data do not
-# show them.
+# Directions weaker than this share of the strongest are left at zero: the data do not show them.
 _RANK_TOLERANCE = 1e-12
 # Residual this small relative to the output (in power) is rounding: no further pole can be seen.
 EXPLAINED = 1e-18
@@ -261,8 +260,7 @@ def block_states(data: Regression, poles: Poles, signal: RealArray) -> RealArray
 
 def fitted_output(data: Regression, projection: Projection) -> RealArray:
     """The part of the output that the poles make, (N,)."""
-    # With free responses among the columns a polynomial part does no harm (filtered, it stays in their span);
-    # without them it has to be left out.
+    # A polynomial part stays in the span of free responses; without them it has to be left out.
     if data.structure.estimate_initial_state:
         return np.asarray(data.y - projection.residual)
     return np.asarray(projection.coefficients(data.y) @ projection.shared)

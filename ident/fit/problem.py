@@ -17,8 +17,7 @@ from ident.basis.coordinates import SearchSpace
 from ident.basis.poles import Poles
 from ident.data.arrays import ComplexArray, IntArray, RealArray, kernel_array
 
-# Below this fraction of |y|^2 the products of the candidates' columns know nothing; a refinement sees the
-# true residual.
+# Below this share of |y|^2 products of columns know nothing; a refinement sees the true residual.
 _FLOOR = 1e-13
 _LAGS_OF_WHITENESS = 25  # as `ident.checks.residual_tests.whiteness_test`
 _LEVEL = 0.99  # of that test

@@ -20,8 +20,7 @@ from ident.data.arrays import RealArray
 from ident.fit.pole_unknowns import chain_rule, damped_step, scaled_system, start
 from ident.fit.problem import Linearisation, Linearised
 
-# Damping of the first step in units of the scaled normal matrix. From afar a full step mostly leads too far:
-# half the evaluations of a refinement that starts boldly are steps taken back.
+# Damping of the first step, in units of the scaled normal matrix: from afar a full step leads too far.
 NEAR, FAR = 1e-3, 1.0
 # Steps that do not gain multiply the damping by this, by its square next, and so on.
 _GROWTH = 4.0

@@ -332,8 +332,7 @@ def _on_poles(
     size = poles.order + response.fir_length
     form = replace(response, poles=poles, mean=np.zeros(size), covariance_factor=np.zeros((size, 1)))
     rows, taps = form.frequency_rows(omega), coefficients[:, own.order :]
-    # N is larger at strong lines in size, not in phase, and no stable poles follow that: what they leave has
-    # to be small beside what is not known of the response at an amplitude.
+    # No stable poles follow N at strong lines: what they leave has to be small beside what is not known.
     scale = 1 / np.std(responses, axis=1).mean(axis=0)
     targets = ((responses - taps @ rows[:, poles.order :].T) * scale).reshape(-1, omega.size).T
     columns = scale[:, None] * rows[:, : poles.order]

@@ -87,8 +87,7 @@ class SteppedArm:
         rates = np.concatenate([np.zeros(structure.integrators, np.complex128), both])
         second = np.column_stack([np.zeros(single.size, np.bool_), ~images]).ravel()
         chain = np.concatenate([np.zeros(structure.integrators, np.bool_), second])
-        # Coefficients of both forms agree where their responses do: least squares over frequency, exact
-        # because they span the same space.
+        # Coefficients of both forms agree where responses do: they span the same space.
         omega = np.concatenate([np.geomspace(1e-4, 0.05, 60), np.linspace(0.05, 3.1, 300)]) / dt_s
         z = np.exp(1j * omega * dt_s)
         states = _state_responses(z, rates, chain, dt_s)

@@ -33,19 +33,16 @@ from ident.one_input import untested_model
 
 # Speeds over which friction may fall, in units of the rms speed, and the first guess of what it falls by.
 _FALLS, _EXCESS = (0.03, 0.1, 0.3), 0.1
-# The start takes the sign of the measured speed, smoothed below this share of the Nyquist frequency; speeds
-# below a fiftieth of the usual one count as part of the turn.
+# The start takes the sign of the speed, smoothed below this share of Nyquist; a fiftieth of it is the turn.
 _SMOOTHING, _SLOW = 0.15, 0.02
 _START_ROUNDS, _MOST_SEARCHES = 4, 8
 
 Report = Callable[[float, str], None]
-# Of different values that the position takes: with 21 the level of the default arm's friction came out within
-# its standard deviation (7 %), with 11 a third too low.
+# Different positions: with 21 the level was within its standard deviation (7 %), with 11 a third too low.
 _FEWEST_VALUES = 15
 # A position that is noise to this share has not moved.
 _MOSTLY_NOISE = 0.9
-# The speed of a driven shaft is within 90 degrees of its force, and the drive's own lag comes on top; that of
-# a point beyond the first mode is opposite.
+# A driven shaft's speed is within 90 degrees of its force, with a lag on top; beyond a mode it is opposite.
 _MOST_DEG = 135.0
 _LIGHT = 0.3  # with more damping a mode's peak is less than 1.75 of its gain at rest: 1 / (2 zeta)
 _UNSEEN, _ANYWAY = "the friction of the shaft cannot be told: ", "; response = 'as recorded' needs none"

@@ -58,18 +58,15 @@ Report = Callable[[float, str], None]
 _ROUNDS, _FEW_ROUNDS, _LONGEST_DELAY = 12, 3, 20
 # A level that moves by less than the first share stays; by more than the second, the order is chosen anew.
 _STAYS, _MOVES = 5e-3, 0.05
-# Lags by which a command follows a position; a residual this small is rounding; one log in a million is
-# taken for a loop by chance.
+# Lags by which a command follows; a residual that is rounding; one log in a million is taken for a loop.
 _CAUSES, _NOTHING, _BY_CHANCE = 8, 1e-5, 1e-6
 # Largest step of the level, as a share of it; parts of a step that are tried.
 _LARGEST_STEP, _LENGTHS = 0.3, (1.0, 0.5, 0.25, 0.1)
-# Samples that a command is moved to see whether it was logged late, and the errors that are less by much: two
-# samples late make 1.4 times the errors of a belt; a rigid axis with a filtered sensor has .97 of them.
+# Samples that a command may be late, and errors that are less by much: 1.4 of a belt, .97 of a rigid axis.
 _EARLIER, _MUCH_BETTER = 2, 0.8
 # Change of a constant force, as a share of the rms input, that a derivative is taken from.
 _CHANGE_OF_BIAS = 0.01
-# Deflection before slipping, as a share of the rms motion, expected within a factor of twenty; the start,
-# which sees a smoothed motion, takes more.
+# Deflection before slipping, as a share of the rms motion, within a factor of twenty; the start takes more.
 _PRESLIDING, _COARSE = 1e-5, 10.0
 # Lowest further pair, as a share of the first mode: friction that is left over looks like slow poles.
 _LOWEST_PAIR, _ABOVE_NOISE = 0.4, 1.2
@@ -78,8 +75,7 @@ _FALLS, _EXCESS, _STRIBECK_STEPS = (0.03, 0.1, 0.3), 0.1, 6
 # Directions of a start (columns of unit length) below this are left out; as few of the parameters.
 _NUISANCE_RANK, _RANK = 1e-10, 1e-9
 _NOISE_ORDER = 32  # as `EmbeddingOptions.max_ar_order` where 8 leave residuals that are not white
-# Variance between parts of the logs over that of their noise: fits of machines of ten kinds that were right
-# had 1 to 9, one that was wrong 35 000.
+# Variance between parts of logs over their noise's: 1 to 9 for ten kinds of machines, 35 000 for a wrong fit.
 _CONTRADICTORY = 100.0
 
 

@@ -16,8 +16,7 @@ _LINES, _BEYOND = 25, 1.5
 # A position is well above its noise where its power is so many times the noise's.
 _WELL = 10.0
 _LEAST_NOISE = 1e-6  # of the motion: a sensor of 20 bits
-# Bands of the inverse dynamics, the lowest with so many periods in the shortest record; steepness of
-# their edge.
+# Bands, the lowest with so many periods in the shortest record; steepness of their edge.
 _BANDS, _PERIODS, _STEEP = 8, 8, 8
 _DERIVATIVES = 3  # stiffness, damping, inertia, and the lag of a drive behind them
 

@@ -22,8 +22,7 @@ from ident.friction.arm import SteppedArm
 from ident.friction.gauss_newton import FrictionFit, LostError
 from ident.friction.inverse_dynamics import noise_of
 
-# Force that an observer expects in a sample, in units of the input's rms over the noise of the position: from
-# an observer slower than the arm to one that takes the last two samples for its state.
+# Force over the position's noise: from an observer slower than the arm to one of the last two samples.
 _RATIOS = np.geomspace(1e-4, 10, 11)
 _NEARBY = np.array([0.5, 1.0, 2.0])
 # Share of the force that each state takes by itself, so that equal poles have a filter, too.

@@ -25,11 +25,9 @@ from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
 
 _NOISE_ORDER = 32  # as in `ident.friction.in_loop`
-# No law is exact. One that was not found in a log may still be there to this share of the level, and as much
-# of the friction, rms, may look like a linear force, which shows in no residual (standard deviation).
+# Share of the level that another law, or a linear force that shows in no residual, may have (deviation).
 _SHAPE = 0.05
-# What is put onto the basis functions: on so many frequencies, from so many records' lengths on. An ellipse
-# whose 95 % radius is beyond this share of the gain is made anew, with the sign of a passive arm.
+# Grid of what is put onto the basis; an ellipse beyond this share of the gain gets a passive arm's sign.
 _FREQUENCIES, _LENGTHS, _LARGEST, _LEVEL = 400, 100, 0.85, 0.95
 
 
@@ -98,8 +96,7 @@ def _behind_observed(
         beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([plain, shape, logs, own])))
         less.append(found.taken_off(record))
     known = shape.shape[1] + found.law.n_logs + len(records)
-    # What drives an arm away from its simulation is never white, and needs a long noise model. As missed
-    # modes, five slow ones were added where friction of another law was left over.
+    # What drives an arm away from its simulation is never white; as missed modes five slow ones were added.
     order = max(options.max_ar_order, _NOISE_ORDER)
     coloured = {"coloured_noise": True, "max_ar_order": order, "prior_missed_mode": 0.0}
     options = options.model_copy(update=coloured)

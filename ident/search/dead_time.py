@@ -28,15 +28,13 @@ _OUTPUT_LAGS, _INPUT_LAGS = 30, 100
 _ROWS_PER_LAG = 20  # the lags then take up a twentieth of the noise
 # Lags that are missed less probably than this are missed: what is found here is judged again.
 _MISSED = 1e-3
-# Numbers of samples that are tried from the best one so far: next to it, and over a gap where a band-limited
-# input leaves several alike.
+# Samples from the best one so far: next to it, and over a gap of a band-limited input.
 _STEPS = (-1, 1, -3, 3, -8, 8)
 # Numbers of samples beside the best one where the order is selected again, and whether from the start.
 _NEIGHBOURS = ((-1, False), (1, False), *((step, True) for step in (-3, -2, -1, 0, 1, 2, 3)))
 # Selections of the order behind one number of samples after the other, at most.
 _ROUNDS = 6
-# The criterion of the order is -2 log of a Bayes factor: from 6 on evidence is called strong (Kass and
-# Raftery, JASA 90(430), 1995). Below, a fast pole explains as much, and a machine has those more often.
+# -2 log of a Bayes factor: strong from 6 on (Kass and Raftery, JASA 90(430), 1995); a fast pole is likelier.
 _STRONG = 6.0
 # Numbers of samples that the data do not refuse beside the best one.
 _LEVEL = 0.95

@@ -37,8 +37,7 @@ def minimise(
     try:
         problem.optimize(np.full(dimension, 0.5))
     except nlopt.runtime_error:
-        # The original DIRECT may fill its tables in mid-iteration (noise-free data) and report a bare
-        # failure; the points it looked at are a search all the same.
+        # The original DIRECT may fill its tables (noise-free data): the points it looked at are a search.
         if not points:
             raise
     return np.array(points), np.array(costs)

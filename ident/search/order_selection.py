@@ -19,8 +19,7 @@ Progress = Callable[[float, str], None]
 
 # Exchanges of a pole for another at most.
 _EXCHANGES = 4
-# Two optima with equal numbers of poles whose -2 log likelihoods differ by less fit equally well: what
-# friction leaves in the records decides between them.
+# Optima of equal order whose -2 log likelihoods differ by less fit equally well: friction decides.
 _LIKELIER = 2.0
 # Damping ratio above which a pair does what real poles do, and how far apart two of them begin.
 _NO_OVERSHOOT, _APART = 0.9, 1.5
@@ -71,8 +70,7 @@ class OrderSelection:
         n_real = min(2, options.max_real) if options.n_real is None else options.n_real
         most_pairs = options.max_pairs if options.n_pairs is None else options.n_pairs
         self.progress(0.05, "global search for the first poles")
-        # One mode is searched together with the real poles, further ones pair by pair: a joint search over
-        # several pairs has never found the best poles.
+        # One mode with the real poles, then pair by pair: a joint search of several has never found the best.
         first = self.search.joint(n_real, min(1, most_pairs)) if start is None else start
         best = self._noted(self.search.rescan(first))
         for _ in range(3):

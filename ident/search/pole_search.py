@@ -29,8 +29,7 @@ Problem = TypeVar("Problem", bound=PoleProblem, covariant=True)
 GAIN = 1e-6
 # Rescans of every block at most.
 _ROUNDS = 6
-# Descents that only compare starts stop when this fraction of J is left to gain; the winner goes on to the
-# end.
+# Descents that only compare starts stop when this share of J is left to gain.
 ROUGH = 1e-3
 # So many starts that end in one place make further ones and a rescan superfluous.
 _STARTS_TO_AGREE = 3
@@ -40,12 +39,10 @@ _PATIENCE = 5
 _PAIR_EVALUATIONS = 240
 _REAL_GRID = 9  # levels of a real pole: two a decade over the box of a record of 10 000 samples
 _PAIR_GRID = (40, 2)
-# Ends of rough descents are one optimum if they differ in J by no more than what such descents leave, in a
-# pole by no more than this fraction; of rates below the box's slowest nothing is told anyway.
+# Ends of rough descents are one optimum if J and poles differ by no more than this.
 _SAME_COST = 3 * ROUGH
 _SAME_POLE = 0.1  # see `_SAME_COST`
-# Share of the output's power up to which a residual counts as little: with more noise than that many minima
-# lie close together, and a whiteness test does not tell them apart.
+# Up to this share of the output's power a residual is little: with more noise many minima lie together.
 _LITTLE_NOISE = 0.02
 
 

@@ -17,12 +17,9 @@ from scipy.signal import lfilter
 
 from ident.data.arrays import RealArray
 
-# Largest change of A(q) by a correction, relative to A(q), at any frequency: |1 + x|^2 >= 1/2 for all x of
-# this size, so that the spectrum of the noise is nowhere more than doubled.
+# Largest relative change of A(q) by a correction: |1 + x|^2 >= 1/2, the spectrum is nowhere doubled.
 _LARGEST_MOVE = 1.0 - 1.0 / np.sqrt(2.0)
-# First rows are whitened exactly up to this condition number of their covariance. The start of a record is
-# never quite stationary (a record cut out of a sweep, a filter that starts settled): a deviation by a
-# hundredth of the noise then counts like the whole noise in the direction of the largest weight.
+# First rows are whitened up to this condition of their covariance: no start of a record is quite stationary.
 _LARGEST_CONDITION = 1e4
 _FREQUENCIES = np.concatenate([np.geomspace(1e-4, 1e-2, 128), np.linspace(0.0, np.pi, 2048)])
 

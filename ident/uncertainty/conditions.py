@@ -22,8 +22,7 @@ from ident.data.record import Record
 from ident.uncertainty.embedding import common_fir_length, tangent, tangent_rows
 from ident.uncertainty.embedding_algebra import nuisance_basis, triangle_of
 
-# Errors count together for as long as a response lasts: time constants of the slowest pole, and the longest
-# share of a record, so that enough windows are left.
+# Errors count together for so many time constants of the slowest pole, at most a share of a record.
 _TIME_CONSTANTS, _LONGEST_WINDOW = 3.0, 0.1
 
 

@@ -54,16 +54,13 @@ from ident.uncertainty.undetected_mode import (
 _DEFAULT_FIR_LENGTH = 150
 # The same for a measured frequency response, as far as the frequencies can carry it.
 _FRF_FIR_LENGTH = 60
-# Slow, alike over frequency, near the Nyquist frequency: what is left out stands anywhere (kernels of the
-# diagonal/correlated family, Chen, Ohlsson and Ljung, Automatica 48(8), 2012).
+# Slow, alike, near Nyquist: the rest stands anywhere (Chen, Ohlsson and Ljung, Automatica 48(8), 2012).
 _SHAPES = (tc_factor, exponential_factor, alternating_factor)
-# Modes that the order selection missed and the embedding adds: coloured noise hides them from a search that
-# takes it for white, and whitening brings them out.
+# Modes that the embedding adds: coloured noise hides them from a search that takes it for white.
 _MOST_ADDED = 5
 # Share of the output that is nothing beside its noise.
 _FREE = 1e-9
-# Rounds of residuals -> noise model -> whitening: the first sees residuals of an unwhitened fit, the others
-# remove what is left of its bias.
+# Rounds of residuals, noise model, whitening: the first is unwhitened, the others remove its bias.
 _NOISE_ROUNDS = 3
 
 

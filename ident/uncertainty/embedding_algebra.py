@@ -25,8 +25,7 @@ _PIECE = 65536
 _PANEL = 32
 # Nuisance columns whose part orthogonal to the earlier ones is below this are the same column twice.
 _NUISANCE_RANK = 1e-10
-# A diagonal entry of R11 (columns of unit length) below this says that these records cannot tell the column
-# from the earlier ones.
+# Below this entry of R11 (columns of unit length) records cannot tell a column from the earlier ones.
 _EXCITATION = 1e-10
 # Share of the largest prior variance below which a tap is none: rounding, even ten orders above the noise.
 _DIED_OUT = 1e-17
@@ -156,8 +155,7 @@ def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
     for block in blocks:
         p, length = block.regressors.shape[1], block.kernel.shape[1]
         basis = nuisance_basis(block.nuisance)
-        # The nuisance as the first columns: below its rows, the triangle is that of everything orthogonal
-        # to it, for the price of a few columns more.
+        # The nuisance as first columns: below its rows the triangle is orthogonal to it.
         rank = basis.shape[1]
         upper = np.zeros((0, rank + p + length + 1))
         for rows in pieces(block.output.size):

@@ -17,8 +17,7 @@ from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import ComplexArray, RealArray, lock
 
-# Points of the circle on which the two coefficients are read off; 16 determine a Laurent series to rounding
-# when the next pole is three radii away (1/3^15 = 7e-8 of it is left, far below any interval).
+# 16 points determine a Laurent series to 1/3^15 = 7e-8 when the next pole is three radii away.
 _POINTS = 16
 _SHARE_OF_DISTANCE = 1 / 3  # see `_POINTS`
 

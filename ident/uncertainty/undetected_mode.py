@@ -32,8 +32,7 @@ from ident.uncertainty.embedding_algebra import (
 )
 from ident.uncertainty.embedding_rows import Rows
 
-# Damping ratios of lightly damped structures; a true one half way (in ratio) between two of them or at 0.005
-# loses less than a tenth of its energy.
+# Lightly damped: half way (in ratio) between two, or at 0.005, a mode loses a tenth of its energy.
 _ZETA = (0.01, 0.03)
 # A candidate's own decay over the record, in time constants, is at least this.
 _DECAY = 2.0
@@ -42,8 +41,7 @@ _FEWEST_PERIODS = 6.0  # the damping that `_DECAY` asks for is then light: 2 / (
 _HIGHEST = 0.9 * np.pi
 # Neighbours in frequency are this many half bandwidths apart: a mode half way loses a tenth of its energy.
 _SPACING = 1.5
-# A missed mode around a frequency is averaged over from this probability on (the level of the confidence
-# regions that it could belong to); of the pairs that stand for it at most so many are kept.
+# Least probability of a missed mode around a frequency, and of each pair; most pairs that stand for it.
 _LEAST_PROBABILITY = 0.05
 # Of some hundred pairs that are left out for it: together less than `_LEAST_PROBABILITY`.
 _NEGLIGIBLE = 1e-4

@@ -67,10 +67,12 @@ def damaged(name, folder, count) -> Tally:
     return tally(attempt, count, 15)
 
 
-@pytest.mark.parametrize("count", [150, pytest.param(3000, marks=pytest.mark.slow)])
+# A process of its own reads a .mat.
+@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", WHOLE)
-def test_damaged_bytes(name, count, tmp_path):
-    assert damaged(name, tmp_path, count).wrong == []
+def test_damaged_bytes(name, many, tmp_path):
+    few, often = (2, 50) if name == "hub.mat" else (150, 3000)
+    assert damaged(name, tmp_path, often if many else few).wrong == []
 
 
 STRANGE_VALUES = (
