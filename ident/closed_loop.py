@@ -41,11 +41,8 @@ _FIRST_STAGE = EmbeddingOptions(coloured_noise=True, prior_missed_mode=0.0, fir_
 
 @dataclass(frozen=True, eq=False)
 class TwoStage:
-    """Open-loop records made from closed-loop ones, and how good the first stage is.
-
-    records: input u_hat, output y - G0 (u - u_hat), no reference (it has done its work). fit_percent (per
-    record) of u by u_hat. plant: G0.
-    """
+    """Open-loop records: input u_hat, output y - G0 (u - u_hat); fit_percent (per record) of u by u_hat;
+    plant G0."""
 
     records: tuple[Record, ...]
     fit_percent: tuple[float, ...]
@@ -70,13 +67,10 @@ def two_stage(
 ) -> TwoStage:
     """Turn r -> u -> y into an open-loop problem for `identify` and `tangent` with the same options.
 
-    r -> u is fitted with a direct term and as many poles as the data ask for, whatever `options` say about
-    the plant; on common poles, by each record for itself, so that controllers may differ. plant: G0; default:
-    that of a second stage on the direct fit. Raises ValueError when a record has not exactly one reference
-    and input, or where the records excite few frequencies.
-
-    Noise at the plant's input reaches the output through G, far from white where G integrates: the ellipses
-    then need a noise model of high order (`EmbeddingOptions.max_ar_order`).
+    r -> u: a direct term and as many poles as the data ask for, common to the records, zeros of each. plant:
+    G0; default: of a second stage on the direct fit. Raises ValueError when a record has not exactly one
+    reference and input, or where the records excite few frequencies. Noise at the plant's input needs a noise
+    model of high order (`EmbeddingOptions.max_ar_order`).
     """
     options = options or IdentOptions()
     closed, fixed = [_reference_to_input(record) for record in records], options.fixed()
@@ -173,13 +167,10 @@ def _unexplained(record: Record) -> RealArray:
 
 
 def with_controller(record: Record, numerator: Sequence[float], denominator: Sequence[float]) -> Record:
-    """The record with what its known controller K = numerator / denominator, in z, highest power first, tells
-    of a reference r that was not recorded: u = K (r - y) says denominator u + numerator y = numerator r, free
-    of the noise in y. That signal, delayed by the order, is the reference of the result, which is shorter by
-    the order.
-
-    Raises ValueError for a controller that is not proper, or more than one input or output.
-    """
+    """The record with a reference made of its known controller K = numerator / denominator, in z, highest
+    power first: u = K (r - y) says denominator u + numerator y = numerator r, free of the noise in y;
+    delayed, and the record shorter, by the order. Raises ValueError for a controller that is not proper, or
+    several channels."""
     order = len(denominator) - 1
     late = order + 1 - len(numerator)
     if late < 0 or not denominator[0] or not any(numerator):

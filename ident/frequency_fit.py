@@ -83,8 +83,8 @@ def identify_frf(
     """Fit a GOBF model to a measured frequency response, each frequency weighted by its covariance.
 
     response: with a covariance at every frequency, whose errors are independent. options: as for records;
-    offset and initial state must be "auto" or False. embedding: fir_length, hyperparameters and
-    prior_no_remainder count. shared_gain_std: relative standard deviation of a real factor common to all
+    offset and initial state must be "auto" or False. embedding: fir_length and
+    hyperparameters count. shared_gain_std: relative standard deviation of a real factor common to all
     frequencies, which the residual does not show; widens the posterior.
 
     Raises ValueError for a frequency without covariance, too few frequencies for the given order, or an

@@ -1,10 +1,8 @@
-"""One shape for every mode: a residue of rank one in place of a free one, where the records let it.
+"""One shape for every mode: a residue c b of rank one in place of a free one, where the records let it.
 
-A mode of a structure moves all sensors in one proportion and takes from all motors in one: its residue is
-c b. With free residues n poles make a model of up to n min(Y, U) states, and what they have too many of is
-noise. The likelihood ratio of both fits is chi-squared, with (Y - 1)(U - 1) degrees for a real pole and twice
-as many for a pair. Mode after mode is tried, those nearest to one shape first; what the records refuse
-keeps a free residue: two modes that lie together, or an input that acts past the structure.
+The likelihood ratio of both fits is chi-squared, with (Y - 1)(U - 1) degrees for a real pole and twice as
+many for a pair. Mode after mode is tried, those nearest to one shape first. Two modes that lie together, or
+an input that acts past the structure, keep a free residue.
 """
 
 from __future__ import annotations
@@ -49,8 +47,8 @@ class Shaped:
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """A pole (the upper one of a pair) and its residue (Y, U); whether the pole moves, whether the residue
-    has rank one."""
+    """A pole (the upper one of a pair) and its residue (Y, U); whether it moves, and has a residue of rank
+    one."""
 
     pole: complex
     residue: ComplexArray
@@ -125,8 +123,8 @@ def modes_of(
 
 
 class ModalFit:
-    """Output error over poles, shapes and free residues; nuisances, integrators and direct terms, which are
-    linear, are projected out. Begins at the modes as they are given."""
+    """Output error over poles, shapes and free residues from modes as given; what is linear is projected
+    out."""
 
     def __init__(self, data: OutputRegressions, modes: Sequence[Mode]) -> None:
         self.data, self.modes = data, modes
@@ -379,8 +377,8 @@ def _count(mode: Mode) -> int:
 
 
 def _start(mode: Mode, sizes: RealArray) -> RealArray:
-    """Free numbers of a mode: log decay (and a logistic number of the angle), then c, and b without its
-    largest, which is one."""
+    """Free numbers of a mode: log decay (and logistic angle), then c, and b without its largest, which is
+    one."""
     pole, residue = mode.pole, mode.residue
     head = [np.log(-np.log(abs(pole)))] if mode.moves else []
     head += [logit(np.angle(pole) / np.pi)] if mode.moves and mode.is_pair else []

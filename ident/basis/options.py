@@ -203,13 +203,6 @@ class EmbeddingOptions(BaseModel):
         default="average",
         description="average the kernel over a grid weighted by restricted likelihood, or take the largest",
     )
-    prior_no_remainder: float | None = Field(
-        default=None,
-        ge=0.0,
-        lt=1.0,
-        description="prior probability that the poles explain everything (alpha = 0); default: 1/2, "
-        "or 0 where the order was given",
-    )
     estimate_offset: bool = Field(default=True, description="a constant on each record's output")
     estimate_initial_state: bool = Field(
         default=True, description="free response of all poles in each record"
@@ -240,8 +233,6 @@ class EmbeddingOptions(BaseModel):
     @property
     def no_remainder(self) -> float:
         """Prior probability that the poles explain everything."""
-        if self.prior_no_remainder is not None:
-            return self.prior_no_remainder
         return 0.0 if self.order_given else 0.5
 
     feedthrough: bool | None = Field(default=None, description="direct term; default: as in the model")

@@ -17,11 +17,8 @@ INSIDE: Any = {"cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": Tr
 
 
 def kernel_array(array: RealArray) -> RealArray:
-    """The array as compiled code takes it: C-contiguous and writable, copied only where it is not.
-
-    A locked array is another type to the compiler, for which it compiles the function once more, and two
-    compilations of one function may round differently. One type always: the same numbers always.
-    """
+    """The array as compiled code takes it: C-contiguous and writable. One type is one compilation: two may
+    round differently."""
     flags = array.flags
     return array if flags.c_contiguous and flags.writeable else array.copy(order="C")
 

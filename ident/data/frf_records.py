@@ -183,10 +183,8 @@ def _too_few(grid: RealArray, count: IntArray, freedom: IntArray) -> str:
 
 
 def inliers(points: ComplexArray, threshold: float) -> ComplexArray:
-    """Points within `threshold` robust standard deviations of the median.
-
-    In one pass: repeated on ten points or so, the spread shrinks by chance until good points fall.
-    """
+    """Points within `threshold` robust standard deviations of the median, in one pass: repeated, it shrinks
+    by chance."""
     distance = np.abs(points - (np.median(points.real) + 1j * np.median(points.imag)))
     # The median distance of a circular Gaussian cloud (Rayleigh) is 1.1774 standard deviations.
     spread = float(np.median(distance)) / 1.1774

@@ -15,11 +15,8 @@ _KINDS = {bool: "true or false", int: "numbers", float: "numbers", str: "text", 
 
 
 def json_columns(text: str, *, in_lines: bool) -> dict[str, Any]:
-    """Arrays, text or `Unread` by name; what is nested is called log.signals[0].values, what a row lacks is
-    NaN.
-
-    Raises ValueError, beginning with ':' or ', line 3:': no JSON, or a name twice in one object.
-    """
+    """Arrays, text or `Unread` by name, nested as log.signals[0].values; what a row lacks is NaN. Raises
+    ValueError, beginning with ':' or ', line 3:': no JSON, or a name twice in one object."""
     if in_lines:
         lines = enumerate(text.split("\n"), 1)
         document: Any = [_parsed(line, k) for k, line in lines if line.strip()]

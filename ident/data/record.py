@@ -167,10 +167,8 @@ class Record:
         return self.each(lambda signal: signal[start:stop])
 
     def limited(self, limit: float) -> Record:
-        """The record with an input cut off at a limit, both signs: what an amplifier makes of commands.
-
-        Raises ValueError unless the limit is positive.
-        """
+        """The record with an input cut off at a limit, both signs, as of an amplifier. Raises ValueError
+        unless > 0."""
         if not limit > 0:
             raise ValueError(f"the limit of the input must be positive; got {limit:g}")
         cut = int(np.sum(np.abs(self.input) > limit))

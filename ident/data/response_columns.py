@@ -1,9 +1,5 @@
-"""Which columns of a table are a frequency response, under the names that analysers and programs give them.
-
-A quantity is found by a word of its name and read by the unit that the name (or a line of units) states. What
-does not say its unit is asked for: a gain may be a factor or in dB, a phase in rad or degrees, a frequency in
-Hz or rad/s, and nothing in the numbers tells.
-"""
+"""Which columns of a table are a frequency response, under the names that analysers and programs give them:
+by a word of the name, and the unit stated. A unit that is not stated is asked for."""
 
 from __future__ import annotations
 

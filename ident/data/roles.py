@@ -53,11 +53,8 @@ class Roles:
 
 def roles_of(table: Table, log: str, command: str = "identify", **stated: str | None) -> Roles:
     """The columns of one channel. stated: input, output, time and reference as far as the user named them.
-    log, command: of the command line that a complaint offers.
-
-    Raises ValueError where a role has no column or several, or where a reference beside them may mean a
-    closed loop: it lists all columns, and says what to type.
-    """
+    log, command: what a complaint offers to type. Raises ValueError where a role has no column or several, or
+    a reference beside them may mean a closed loop."""
     moving = [name for name in table.names if _is_signal(table, name)]
     time = stated.get("time") or time_of(table)
     rest = [name for name in moving if name not in (time, *stated.values())]

@@ -56,11 +56,8 @@ def band_limited(
 
 
 def settling_time_s(dt_s: float, low_rad_s: float, high_rad_s: float, *, filter_order: int = 2) -> float:
-    """Time after which the start of `band_limited` has died down to e^-5 of itself.
-
-    Before it, records of a machine that was not in a steady state carry a free response of the filter, which
-    a fit takes for a mode at the edge of the band.
-    """
+    """Time after which the start of `band_limited` has died down to e^-5: before, it looks like a mode at the
+    edge."""
     _, poles, _ = scipy.signal.butter(
         filter_order, [low_rad_s, high_rad_s], "bandpass", output="zpk", fs=2 * np.pi / dt_s
     )
@@ -68,11 +65,8 @@ def settling_time_s(dt_s: float, low_rad_s: float, high_rad_s: float, *, filter_
 
 
 def increments(record: Record) -> Record:
-    """Input, output and reference filtered by 1 - q^-1, one sample shorter: the same response, slow noise
-    whitened.
-
-    Raises ValueError if a single sample is all there is.
-    """
+    """The record through 1 - q^-1, one sample shorter: the same response, slow noise whitened. ValueError for
+    one sample."""
     if record.n_samples < 2:
         raise ValueError(f"{record.label}: differences need at least two samples")
     return record.each(lambda signal: np.diff(signal, axis=0))

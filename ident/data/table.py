@@ -1,7 +1,5 @@
-"""Named columns of one log file, checked where they are asked for.
-
-Every complaint is one line that names file, place and expectation.
-"""
+"""Named columns of one log file, checked where they are asked for; complaints name file, place,
+expectation."""
 
 from __future__ import annotations
 
@@ -211,8 +209,7 @@ class Table:
         )
 
     def seconds(self, name: str, stamps: RealArray, unit: str | None) -> tuple[RealArray, TimeColumn]:
-        """Time stamps in seconds, from the unit stated or written in the header, and what was taken for
-        which. Raises ValueError for an unknown unit."""
+        """Time stamps in seconds, and what was taken for which. Raises ValueError for an unknown unit."""
         if self.is_clock(name):
             return self._clock_seconds(name, stamps, unit)
         try:
@@ -236,8 +233,7 @@ class Table:
         return (stamps / 60 if unit == "min" else stamps), TimeColumn(name, "s", "s")
 
     def _since_first(self, name: str, stamps: RealArray) -> RealArray:
-        """Stamps; of integers and text with more digits than doubles keep, such as nanoseconds since 1970,
-        what passed since the first; small ones as they are."""
+        """Stamps; of integers and text with more digits than doubles keep what passed since the first."""
         values = self.raw[name]
         if not stamps.size or abs(stamps[0]) < _LONG_STAMP:
             return stamps
@@ -272,8 +268,8 @@ class Table:
 
 
 def _split(name: str, values: Any) -> dict[str, Any]:
-    """A matrix (T, C), or (C, T) as Simulink writes it, as its C columns (samples are more than signals);
-    MATLAB's vectors, (T, 1) and (1, T), as vectors; an array of records as its fields."""
+    """A matrix (T, C), or (C, T) as of Simulink, as C columns; (T, 1), (1, T) as vectors; records by
+    field."""
     if isinstance(values, np.ndarray) and values.dtype.names and values.ndim == 1:
         return {f"{name}.{field}": values[field] for field in values.dtype.names}
     if not isinstance(values, np.ndarray) or values.ndim != 2:

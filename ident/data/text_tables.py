@@ -1,8 +1,6 @@
-"""Tables in text files: which line holds the names, what separates the cells, how a number is written.
-
-Nothing is asked of the user: the layout that fits the lines best is taken, and stands in `Layout` for
-whoever shows it. What cannot be told, such as decimal commas between commas, is refused.
-"""
+"""Tables in text files: which line holds the names, what separates the cells, how a number is written. The
+layout that fits best is taken, and shown; what cannot be told, such as decimal commas between commas, is
+refused."""
 
 from __future__ import annotations
 

@@ -1,9 +1,5 @@
-"""The uniform grid under a log's time stamps: its step, or why there is none; outputs put on it on request.
-
-Identification asks for uniform rows (`sampling_time`). Where the sampling period is known and the input
-switches on its multiples, stamps that stray a little, and single rows that a log lost, can be made good
-(`TimeGrid`). Stamps that keep to no grid are resampled to a coarser one (`CoarseGrid`).
-"""
+"""The uniform grid under a log's time stamps: its step, or why there is none (`sampling_time`); stamps that
+stray a little and single lost rows made good (`TimeGrid`), or a coarser grid (`CoarseGrid`) on request."""
 
 from __future__ import annotations
 
@@ -41,12 +37,9 @@ _READINGS = 3
 def sampling_time(
     table: Table, stamps: RealArray | None, name: str | None, dt_s: float | None, *, options: bool = True
 ) -> float:
-    """dt in seconds from time stamps [s] (mean interval), or the given one; both must agree where both are
-    there. options: whether who reads the complaint can give --repair and --resample-s.
-
-    Raises ValueError if neither is given, dt_s is not positive, or the stamps are not increasing and uniform
-    to `TIME_TOLERANCE`, rounding to their last digit aside.
-    """
+    """dt in seconds from time stamps [s] (mean interval), or the given one; both must agree. options: whether
+    who reads the complaint can give --repair and --resample-s. Raises ValueError if neither is given, dt_s is
+    not positive, or the stamps are not increasing and uniform to `TIME_TOLERANCE`, rounding aside."""
     if dt_s is not None and not (np.isfinite(dt_s) and dt_s > 0):
         raise ValueError(f"{table.path}: dt_s must be a positive number of seconds; got {dt_s}")
     if stamps is None:
@@ -88,8 +81,7 @@ def sampling_time(
 
 
 def only_rounded(stamps: RealArray) -> bool:
-    """Whether increasing stamps (T,) [s] are a uniform clock's, rounded to their last decimal digit: 0.008,
-    0.016, 0.023 for steps of 1/128 s."""
+    """Whether stamps (T,) [s] are a uniform clock's, rounded: 0.008, 0.016, 0.023 for steps of 1/128 s."""
     since = stamps - stamps[0]
     digit = next((10.0**-k for k in range(10) if np.allclose(since, np.round(since, k), 0, 1e-10)), 0.0)
     uniform = np.polyval(np.polyfit(np.arange(since.size), since, 1), np.arange(since.size))
@@ -100,8 +92,7 @@ def only_rounded(stamps: RealArray) -> bool:
 
 
 def clock_doubts(stamps: RealArray, record: str) -> tuple[Finding, ...]:
-    """What is said of uniform stamps (T,) [s] whose small deviations add up to more than a repair would take:
-    the clock drifts, and a frequency is known no better than its rate."""
+    """The finding on uniform stamps (T,) [s] whose small deviations add up: no frequency is better known."""
     interval = np.diff(stamps)
     if interval.size < 2 * _PARTS or only_rounded(stamps):
         return ()
@@ -122,8 +113,8 @@ def jitter_of(stamps: RealArray) -> float:
 
 
 def option_for(stamps: RealArray) -> str:
-    """The option that takes increasing stamps (T,) [s]: none where they are uniform, '--repair',
-    '--resample-s SECONDS' with a step that fits, or 'split' where too many rows are missing at a place."""
+    """The option that takes increasing stamps (T,) [s]: '', '--repair', '--resample-s SECONDS', or
+    'split'."""
     interval = np.diff(stamps)
     median = float(np.median(interval))
     if np.max(np.abs(interval - median)) <= TIME_TOLERANCE * median or only_rounded(stamps):
@@ -274,25 +265,23 @@ class TimeGrid:
         return filled
 
     def held(self, values: RealArray) -> RealArray:
-        """Inputs (R,), each held from its grid instant on -> (T,); half-way between their neighbours where
-        a row is missing, which is wrong by no more than half of what the input changes there."""
+        """Inputs (R,), each held from its grid instant on -> (T,); half-way between neighbours of a missing
+        row."""
         return np.interp(np.arange(self.rows[-1] + 1), self.rows, values)
 
 
 @dataclass(frozen=True, eq=False)
 class CoarseGrid:
-    """Rows of a log whose stamps keep to no grid, on a coarser one that begins with the first row.
-
-    stamps : (R,) [s], increasing. dt_s : float. Step of the grid.
-    """
+    """Rows of a log with stamps (R,) [s], increasing, on a coarser grid of step dt_s from the first row
+    on."""
 
     stamps: RealArray
     dt_s: float
 
     @classmethod
     def of(cls, table: Table, name: str, stamps: RealArray, dt_s: float) -> Self:
-        """Raises ValueError, one line: time that does not increase, a step that is shorter than the log's
-        own or longer than the log, or more than five steps without a reading."""
+        """Raises ValueError: time that does not increase, a step that does not fit, five steps without a
+        reading."""
         table.increasing(stamps, name)
         interval = np.diff(stamps)
         own, span, row = float(np.median(interval)), float(stamps[-1] - stamps[0]), int(np.argmax(interval))
@@ -329,13 +318,11 @@ class CoarseGrid:
         return Repair(instants.size, empty, jitter_of(self.stamps), own, float(np.max(near)))
 
     def sampled(self, values: RealArray) -> RealArray:
-        """Outputs (R,) read at the stamps -> (T,) on straight lines between the readings: unlike a spline
-        these never make noise larger, however near to each other two stamps are."""
+        """Outputs (R,) -> (T,) on straight lines between the readings, which never make noise larger."""
         return np.interp(self._instants, self.stamps, values)
 
     def held(self, values: RealArray) -> RealArray:
-        """Inputs (R,), each held from its stamp to the next -> (T,) means over the steps of the grid, which
-        give the output the same push."""
+        """Inputs (R,), each held from its stamp to the next -> (T,) means over the steps: the same push."""
         edges = np.append(self._instants, self._instants[-1] + self.dt_s)
         stamps = np.append(self.stamps, max(self.stamps[-1], edges[-1]) + self.dt_s)
         pushed = np.concatenate([[0.0], np.cumsum(values * np.diff(stamps))])

@@ -83,11 +83,8 @@ _NO_CLOCK_S = 1e11
 
 @dataclass(frozen=True)
 class UnitEvidence:
-    """What a file says of the unit of a time column, in its name and beside it.
-
-    unit: the one known unit, or empty. unclear: why it has to be asked for, or empty: units that contradict
-    each other, or a word that may be a unit and is none that is known. Neither: the file says nothing.
-    """
+    """What a file says of the unit of a time column. unit: the one known unit, or empty; unclear: why it has
+    to be asked for (units that contradict each other, an unknown word), or empty."""
 
     unit: str = ""
     unclear: str = ""
@@ -229,11 +226,8 @@ class TimeColumn:
 
 
 def written_unit(name: str) -> str:
-    """The unit in a column's name, as written there; empty if there is none.
-
-    Brackets at the end hold a unit whatever they say (a number is an index); after 'in', '/' and an
-    underscore only known units count, for other words stand there as well.
-    """
+    """The unit in a column's name, as written, or empty. Brackets at the end hold a unit whatever they say
+    but a number; after 'in', '/' and an underscore only known units count."""
     name = unicodedata.normalize("NFKC", name)
     found = _BRACKETED.search(name)
     if found:

@@ -37,12 +37,8 @@ _SAME_SPEED = 0.25
 
 
 def wraps_at(values: RealArray) -> float:
-    """The period at which readings (T,) seem to wrap, 0 where they do not: they jump by nearly their whole
-    range from one to the next, and go on smoothly once they are unwrapped.
-
-    A sawtooth that is meant to be one looks the same. Readings that never came near both ends of their range
-    are not seen.
-    """
+    """The period at which readings (T,) seem to wrap, else 0: they jump by nearly their whole range, and go
+    on smoothly once unwrapped. So does a sawtooth; readings that never came near both ends are not seen."""
     span = float(np.ptp(values)) if values.size >= 20 else 0.0
     if not span > 0:
         return 0.0

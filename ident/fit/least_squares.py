@@ -102,8 +102,7 @@ class Regression:
         return tuple(slice(low, high) for low, high in pairwise(self.starts.tolist()))
 
     def n_parameters(self, order: int) -> int:
-        """Number of free real numbers of a fit with `order` poles: coefficients of each input, poles,
-        nuisances."""
+        """Free real numbers of a fit with `order` poles: coefficients of each input, poles, nuisances."""
         local = self.polynomials.shape[0] + (order if self.structure.estimate_initial_state else 0)
         return int(order + self.n_inputs * (order + self.structure.feedthrough) + self.n_records * local)
 
@@ -186,8 +185,7 @@ class Projection:
 
 @dataclass(frozen=True, eq=False)
 class LinearFit:
-    """Least-squares fit for given poles: coefficients (U, B), direct terms (U,), residual (N,), residual sum
-    of squares."""
+    """Coefficients (U, B), direct terms (U,), residual (N,) and its sum of squares at given poles."""
 
     coefficients: RealArray
     feedthrough: RealArray
@@ -196,8 +194,8 @@ class LinearFit:
 
 
 def _driven(data: Regression, poles: Poles, signals: RealArray) -> tuple[RealArray, RealArray]:
-    """Basis functions driven by each of the signals (U, N), record by record from rest, (U B, N), and the
-    signals sent through the all-pass of the poles (U, N)."""
+    """Basis functions driven by signals (U, N) from rest, (U B, N), and the signals behind the all-pass (U,
+    N)."""
     rows, through = np.empty((signals.shape[0] * poles.order, signals.shape[1])), signals.copy()
     driven_rows(block_parameters(poles), poles.real.size, through, data.starts, rows)
     return rows, through
@@ -234,10 +232,8 @@ def project(data: Regression, shared: Poles, local: Poles | None = None) -> Proj
 
 
 def fit(data: Regression, poles: Poles) -> LinearFit:
-    """theta = R^-1 Q^T y by thin QR, never by Phi^T Phi (27).
-
-    Raises ValueError if there are not more samples than free numbers.
-    """
+    """theta = R^-1 Q^T y by thin QR (27). Raises ValueError if there are not more samples than free
+    numbers."""
     needed = data.n_parameters(poles.order)
     if not data.n_samples > needed:
         raise ValueError(f"too few samples: {data.n_samples} for {needed} unknowns with {poles.order} poles")
@@ -275,8 +271,7 @@ def pole_sensitivities(data: Regression, poles: Poles, projection: Projection) -
 
 
 def linearisation(data: Regression, poles: Poles) -> Linearisation:
-    """Cost and Kaufman linearisation at the given poles by orthogonal factorisation; `Regression.linearise`
-    has them faster."""
+    """`Regression.linearise` by orthogonal factorisation."""
     projection = project(data, poles)
     states, residual = pole_sensitivities(data, poles, projection), projection.residual
     return Linearisation(float(residual @ residual), states @ states.T, states @ residual)

@@ -23,12 +23,9 @@ PRESLIDING = 1e-5
 
 @dataclass(frozen=True)
 class FrictionLaw:
-    """Dry friction at a shaft: level + excess exp(-|speed| / fall) while it slips.
-
-    level: Coulomb friction in units of the arm's input. presliding: deflection before slipping, in units of
-    the position. excess: how much more it takes to break away (Stribeck), which is gone at speeds, in units
-    of the position per second, well above fall. Raises ValueError for what no friction has.
-    """
+    """Dry friction at a shaft: level + excess exp(-|speed| / fall) while it slips, in units of the arm's
+    input. presliding: deflection before slipping; fall: in units of the position per second. Raises
+    ValueError."""
 
     level: float
     presliding: float = PRESLIDING

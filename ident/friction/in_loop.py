@@ -90,8 +90,8 @@ def recorded_in_loop(records: Sequence[Record]) -> bool:
 
 
 def _told_by_position(u: RealArray, y: RealArray) -> float:
-    """Chi-square, of `_CAUSES` numbers, by which the position's past tells more of a command than as much
-    again of the command's own past, which in a sum of sines tells the rest as well."""
+    """Chi-square, of `_CAUSES` numbers, by which the position's past tells more of a command than its own
+    past."""
     n = _CAUSES
     if u.size < 8 * n:
         return 0.0
@@ -109,8 +109,8 @@ def _told_by_position(u: RealArray, y: RealArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Logs:
-    """What is fitted: records without their references; presliding: expected deflection before slipping, in
-    units of the position; least: smallest level, rms: of the input; centre: of the positions."""
+    """Records without their references; presliding: expected deflection, in units of the position; least:
+    smallest level, rms: of the input; centre: of the positions."""
 
     records: tuple[Record, ...]
     presliding: float
@@ -210,8 +210,8 @@ def _of_structure(logs: _Logs, options: IdentOptions) -> tuple[IdentOptions, Fri
 def _simple(
     logs: _Logs, options: IdentOptions, *, thrown_over: bool = False
 ) -> tuple[IdentOptions, FrictionFit] | None:
-    """The options with the unstable poles that show, and level and arm in turns; thrown_over: None where none
-    shows."""
+    """The options with the unstable poles that show, and level and arm in turns; thrown_over: None without
+    any."""
     ways = [direction_of(smoothed(r.output[:, 0]), _COARSE * logs.presliding) for r in logs.records]
     level = max(level_of(logs.records, ways, stiff=not options.integrators), logs.least)
     used = [
@@ -248,8 +248,7 @@ def _moving(options: IdentOptions) -> IdentOptions:
 
 
 def _above_noise(records: Sequence[Record], options: IdentOptions) -> IdentOptions:
-    """Pairs no higher than where the position rises above its noise, real poles no slower than a record tells
-    from the integrator; noise is whitened here."""
+    """Pairs no higher than the position rises above its noise, real poles no slower than a record tells."""
     longest_s = max(record.n_samples * record.dt_s for record in records)
     highest_rad_s = 2 * np.pi * _ABOVE_NOISE * highest_Hz(records)
     told = {"omega_max_rad_s": highest_rad_s, "decay_min_per_s": 1 / longest_s}
@@ -258,9 +257,8 @@ def _above_noise(records: Sequence[Record], options: IdentOptions) -> IdentOptio
 
 
 def _beyond(found: FrictionFit, options: IdentOptions) -> IdentOptions:
-    """No pair far below the first mode, and one real pole: what is left of friction looks like slow ones.
-    Poles and zeros of a driven shaft take turns: with friction at the load, whose zero is known, no pair
-    below the middle between it and the mode."""
+    """No pair far below the first mode, and one real pole: friction that is left looks like slow ones. With
+    friction at the load, whose zero is known, no pair below the middle between it and the mode."""
     poles = found.model.poles
     update: dict[str, float | int] = {"max_real": min(options.max_real, 1)}
     modes = poles.omega_rad_s(found.model.dt_s)[poles.zeta() < LARGEST_DAMPING]
@@ -311,8 +309,8 @@ def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: in
 
 
 def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
-    """One Gauss-Newton step in arm, law and bias, or in the last two alone, as much of it as lowers the
-    prediction errors."""
+    """One Gauss-Newton step in arm, law and bias, or the last two, as far as it lowers the prediction
+    errors."""
     errors = logs.errors(found)
     blocks, targets = _equations(found, logs.records, ObserverFilter.of(found))
     p, theta = found.coefficients.size, parameters_of(found.law)
@@ -347,8 +345,8 @@ def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
 
 
 def _held(logs: _Logs, found: FrictionFit) -> FrictionFit:
-    """The same with the constant force (a weight) that leaves the predictions of an arm that does not
-    integrate no mean error, where that lowers the others."""
+    """The same with the constant force that leaves predictions no mean error, where that lowers the
+    others."""
 
     def off(one: FrictionFit) -> float:
         left = [record.output[:, 0] - one.centre - one.motion(record)[0] for record in logs.records]
@@ -420,12 +418,9 @@ def identify_behind(
     options: IdentOptions | None = None,
     progress: Report | None = None,
 ) -> Identification:
-    """The arm behind the friction of logs of a loop, with everything needed to judge it: poles of the number
-    that the fit of the friction has, on records whitened by its observer.
-
-    records: those of the fit, with the friction taken off (`FrictionFit.taken_off`). Residuals and fit are
-    those of simulations over windows (`fit_in_windows`).
-    """
+    """The arm behind the friction of logs of a loop: poles of the number that the fit of the friction has, on
+    records with the friction taken off, whitened by its observer. Residuals and fit are over windows
+    (`fit_in_windows`)."""
     options, structure = _above_noise(records, options or IdentOptions()), found.arm.structure
     options = options.model_copy(update={"integrators": structure.integrators})
     if structure.unstable.order:

@@ -47,10 +47,7 @@ _LITTLE_NOISE = 0.02
 
 
 class PoleSearch(Generic[Problem]):
-    """The search on one problem; collects the trace on the way.
-
-    The fixed poles come first among the poles of each type and are never moved.
-    """
+    """The search on one problem, with its trace. Fixed poles come first of each type and are never moved."""
 
     def __init__(self, data: Problem, options: IdentOptions) -> None:
         self.data = data
@@ -103,10 +100,8 @@ class PoleSearch(Generic[Problem]):
         return best
 
     def is_trusted(self, best: Refined) -> bool:
-        """Whether `best` leaves little of the output, the rest white, and is no saddle of equal real poles.
-
-        Two real poles that meet stay together in a descent, although apart they may fit better.
-        """
+        """Whether `best` leaves little of the output, the rest white, and is no saddle of equal real
+        poles."""
         distances = sorted(1 - a for a in best.poles.real[self.fixed.real.size :].tolist())
         meeting = any(
             fast > self._slowest / 4 and fast - slow <= _SAME_POLE * fast
@@ -145,10 +140,7 @@ class PoleSearch(Generic[Problem]):
         )
 
     def split_pair(self, poles: Poles) -> Refined:
-        """Best descent from the given poles with one searched pair as two, a half-width apart.
-
-        `add_pair` cannot see a mode that close to another: the tangent space has what it would add first.
-        """
+        """Best descent with one searched pair as two, a half-width apart, where `add_pair` sees no mode."""
         starts = []
         for i in range(self.fixed.pairs.size, poles.pairs.size):
             log = cmath.log(poles.pairs[i])
@@ -179,8 +171,8 @@ class PoleSearch(Generic[Problem]):
         return best
 
     def _rescan(self, best: Refined, part: Literal["real", "pairs"], here: slice) -> Refined:
-        """Descents from the best points of a grid over one block, the rest frozen; none from next to where it
-        already is: such a one would come back."""
+        """Descents from the best points of a grid over one block, the rest frozen, not from next to where it
+        is."""
         poles = best.poles
         if part == "real":
             kept, block = poles.without_real(here), Poles(poles.real[here])
@@ -316,8 +308,7 @@ class SearchStage:
 
 @dataclass(frozen=True, eq=False)
 class PolishedMinimum:
-    """End of one descent: where it was started from, the poles it reached and their residual sum of
-    squares."""
+    """End of one descent: where it started, the poles it reached and their residual sum of squares."""
 
     stage: str
     poles: Poles
@@ -326,13 +317,8 @@ class PolishedMinimum:
 
 @dataclass(frozen=True, eq=False)
 class SearchTrace:
-    """All global searches and descents of one identification.
-
-    stages : tuple of SearchStage
-    minima : tuple of PolishedMinimum. In the order they were found.
-    warnings : tuple of Finding
-    evaluations : int. Cost evaluations in all, rescans and descents included.
-    """
+    """Global searches (stages) and descents (minima, in order) of one identification, warnings, and
+    evaluations of the cost, rescans and descents included."""
 
     stages: tuple[SearchStage, ...]
     minima: tuple[PolishedMinimum, ...]

@@ -1,5 +1,4 @@
-"""Records as rows of the embedding's regression: nuisance, regressors, kernel, output, all whitened; and what
-a fit of them leaves."""
+"""Records as whitened rows of the embedding's regression, and what a fit of them leaves."""
 
 from __future__ import annotations
 
@@ -47,11 +46,8 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """What the output of one record depends on besides the basis functions driven by its input.
-
-    first (T,p1): in place of the first p1 regressors, where a change of the response does more than they say;
-    columns (T,q): with coefficients that all records share.
-    """
+    """What the output of one record depends on besides the basis functions: first (T,p1), in place of the
+    first p1 regressors; columns (T,q), with coefficients that all records share."""
 
     first: RealArray
     columns: RealArray
