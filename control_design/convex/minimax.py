@@ -71,10 +71,8 @@ def plane(value: Complex) -> Real:
 
 
 class MinimaxPoint(NamedTuple):
-    """x (n,) of the original basis, gamma = largest ratio there.
-
-    gamma is infinite if no x was found for which every denominator is positive.
-    """
+    """x (n,) of the original basis, gamma = largest ratio there; infinite if no x makes every denominator
+    positive."""
 
     x: Real
     gamma: float
@@ -164,10 +162,7 @@ def exchanged(
 
 
 class _Scaled:
-    """The rows in coordinates z of the basis that are orthonormal as seen by the rows.
-
-    x = map z, z = back x, y = planar z.
-    """
+    """The rows in coordinates z that are orthonormal as seen by them: x = map z, z = back x, y = planar z."""
 
     def __init__(self, basis: Complex, rows: PlaneRows, accuracy: float) -> None:
         self.rows, self.accuracy = rows, accuracy
@@ -320,8 +315,7 @@ def _to_boundary(value: Real, step: Real) -> float:
 def _norm_derivatives(
     forms: Real, vector: Real, size: Real, rounding: Real, weight: Real
 ) -> tuple[Real, Real]:
-    """Gradient (R, m) of the rounded norms of vector = forms z, and sum of weight times their Hessians (m,
-    m)."""
+    """Gradient (R, m) of the rounded norms of vector = forms z, sum of weight times their Hessians (m, m)."""
     length = np.hypot(vector[:, 0], vector[:, 1])
     u = np.where(length[:, None] > 0, vector, [1.0, 0.0]) / np.where(length > 0, length, 1.0)[:, None]
     along = u[:, 0, None] * forms[:, 0] + u[:, 1, None] * forms[:, 1]

@@ -57,8 +57,7 @@ class ReferenceFilter(Law):
                 raise ValueError(f"reference filter {name} must not be negative; got {getattr(self, name)}")
 
     def filtered(self, reference: Real) -> Real:
-        """The reference (T,) behind the reference filter, from rest: what `closed_loop.simulate` takes as
-        reference."""
+        """The reference (T,) behind the filter, from rest: what `closed_loop.simulate` takes."""
         reference = np.asarray(reference, dtype=np.float64)
         if reference.ndim != 1:
             raise ValueError(f"reference must be (T,); got {reference.shape}")

@@ -56,11 +56,8 @@ class PlantBracket:
 
 @dataclass(frozen=True)
 class YoulaBracket:
-    """What any controller could reach, the worst over the plants.
-
-    With several plants no single controller needs to reach these values: each plant may have its own Q. They
-    are then lower bounds of what one controller for all can do.
-    """
+    """What any controller could reach, the worst over the plants; each may need a Q of its own, so that with
+    several these are lower bounds of what one controller can do."""
 
     plants: tuple[PlantBracket, ...]
 
@@ -253,8 +250,7 @@ class BracketProblem:
 
 
 def _best_angles(loop: AffineLoop, data: PlantData, y: Complex) -> Real:
-    """Angle t of the supporting normal that gives the exact distance, (F,): largest m(t) by refined
-    search."""
+    """Angle t of the supporting normal that gives the exact distance, (F,): largest m(t)."""
     e = data.ellipses
     q = loop.effort + loop.effort_slope * y
     c = 1.0 + (e.centre * data.delay - loop.base) * q

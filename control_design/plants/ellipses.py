@@ -32,10 +32,7 @@ def quotient(above: Any, below: Real, otherwise: float = 0.0) -> Any:
 
 
 class ResponseSet(Protocol):
-    """Uncertain response on given frequencies; `ident.uncertainty.FrequencyUncertainty` is one.
-
-    omega_rad_s (F,), centre (F,) complex, covariance (F, 2, 2) of (real, imaginary), level in (0, 1).
-    """
+    """omega_rad_s (F,), centre (F,) complex, covariance (F, 2, 2) of (real, imaginary), level in (0, 1)."""
 
     @property
     def omega_rad_s(self) -> Real: ...
@@ -56,11 +53,8 @@ class EvaluableUncertainty(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Ellipses:
-    """Filled uncertainty ellipses at F frequencies.
-
-    omega_rad_s (F,) ascending, centre (F,), semi_major >= semi_minor >= 0 (F,), direction (F,) unit complex:
-    the major axis. The minor axis is 1j * direction.
-    """
+    """Filled uncertainty ellipses: omega_rad_s (F,) ascending, centre (F,), semi_major >= semi_minor >= 0
+    (F,), direction (F,) of the major axis, of modulus one; the minor axis is 1j * direction."""
 
     omega_rad_s: Real
     centre: Complex
@@ -85,11 +79,8 @@ class Ellipses:
 
     @classmethod
     def from_covariance(cls, omega_rad_s: Real, centre: Complex, covariance: Real, level: float) -> Ellipses:
-        """Ellipse e^T P^-1 e <= chi2_2(level) of covariance P (F, 2, 2); the quantile is -2 ln(1 - level).
-
-        Raises ValueError if level is outside (0, 1) or a covariance is not symmetric positive semi-definite
-        (names the frequency).
-        """
+        """Ellipse e^T P^-1 e <= -2 ln(1 - level) of covariance P (F, 2, 2). Raises ValueError if level is
+        outside (0, 1) or a covariance is not symmetric positive semi-definite (names the frequency)."""
         if not 0 < level < 1:
             raise ValueError(f"uncertainty: level must lie in (0, 1); got {level}")
         covariance = np.asarray(covariance, dtype=np.float64)
@@ -146,9 +137,7 @@ class Ellipses:
 
 def secular_root(p: Real, q: Real, c: Real, d: Real) -> Real:
     """Root t >= 0 of (p/(c + t))^2 + (q/(d + t))^2 = 1 for p, q, c, d >= 0; 0 where the sum is below 1 there.
-
-    The left side is convex and decreasing, so Newton from the left never overshoots.
-    """
+    Convex and decreasing: Newton from the left never overshoots."""
     # Lower bounds of the root: each term alone <= 1. Both make the sum >= 1, where Newton is monotone.
     t = np.maximum(np.maximum(p - c, q - d), 0.0)
     tiny = 1e-300
@@ -173,11 +162,8 @@ def _to_scale(point: Complex, a: Real, b: Real) -> tuple[Real, Real, Real, Real,
 
 
 def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real:
-    """Distance from `point` to the filled axis-parallel ellipse at the origin; 0 inside. All (F,).
-
-    The nearest point is (a^2 x/(a^2 + t), b^2 y/(b^2 + t)), t the `secular_root` (first-order condition; t is
-    the multiplier). Degenerate axes (segments, points) are the limit b -> 0.
-    """
+    """Distance (F,) from `point` to the filled axis-parallel ellipse at the origin; 0 inside. The nearest
+    point is (a^2 x/(a^2 + t), b^2 y/(b^2 + t)), t the `secular_root`."""
     x, y, a, b, scale = _to_scale(point, semi_major, semi_minor)
     t = secular_root(a * x, b * y, a * a, b * b)
     da, db = a * a + t, b * b + t
@@ -206,10 +192,8 @@ def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Rea
 
 
 def distance_to_minus_one(k: Complex, ellipses: Ellipses) -> Real:
-    """min |1 + G k| over G in E at every frequency, (F,); 0 where some member puts the loop on -1. Exact.
-
-    k (F,): what multiplies the member, the controller with its delay; not the loop gain.
-    """
+    """min |1 + G k| over G in E, (F,), exact; 0 where some member puts the loop on -1. k (F,): the controller
+    with its delay."""
     size = np.abs(k)
     # 1 + G k = k u1 (conj(u1) (centre + 1/k) + s1 d1 + j s2 d2); work with k (centre + 1/k) = 1 + k centre.
     turned = quotient((1.0 + k * ellipses.centre) * np.conj(k * ellipses.direction), size, 1.0)

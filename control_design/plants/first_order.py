@@ -23,10 +23,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """Frequency intervals centre_k +- half_width_k [rad/s], (F,) each, for a sampling time dt_s.
-
-    An interval may reach below 0 or above pi/dt: responses are analytic on the whole circle.
-    """
+    """Frequency intervals centre_k +- half_width_k [rad/s], (F,) each, at dt_s; also below 0 or above
+    pi/dt."""
 
     centre: Real
     half_width: Real
@@ -62,8 +60,7 @@ class Intervals:
         return FirstOrder(shift - root_minus_1, 1j * dt * (1.0 + shift), 0.5 * (h * dt) ** 2, h)
 
     def pole(self, root_minus_1: complex) -> FirstOrder:
-        """1/(z - p), p = 1 + root_minus_1: |d2/d omega2| = dt^2 |z + p|/|z - p|^3, bounded by the distance of
-        the arc."""
+        """1/(z - p), p = 1 + root_minus_1: |d2/d omega2| = dt^2 |z + p|/|z - p|^3, bounded on the arc."""
         shift, dt, h = self.z_minus_1, self.dt_s, self.half_width
         value = 1.0 / (shift - root_minus_1)
         nearest = np.maximum(self.distance_to(root_minus_1), 1e-100)
@@ -86,10 +83,8 @@ class Intervals:
 
 @dataclass(frozen=True, eq=False)
 class FirstOrder:
-    """value, slope: (F,) or, for Q functions at once, (F, Q); remainder, half_width: (F,).
-
-    With Q functions the remainder bounds the Euclidean norm of their Q remainders.
-    """
+    """value, slope: (F,) or, for Q functions at once, (F, Q); remainder (F,), of their Euclidean norm;
+    half_width (F,)."""
 
     value: Complex
     slope: Complex
@@ -148,10 +143,8 @@ def _norm(value: Complex) -> Real:
 
 @dataclass(frozen=True, eq=False)
 class RationalResponse:
-    """gain z^-delay_samples prod (z - q)/prod (z - p)/(z - 1)^integrators.
-
-    zeros_minus_1, poles_minus_1 hold q - 1 and p - 1: slow poles keep their digits that way.
-    """
+    """gain z^-delay_samples prod (z - q)/prod (z - p)/(z - 1)^integrators; zeros_minus_1 and poles_minus_1
+    hold q - 1 and p - 1, so that slow poles keep their digits."""
 
     gain: float
     zeros_minus_1: Complex

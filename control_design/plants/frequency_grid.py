@@ -46,7 +46,7 @@ def lowest_rad_s(dt_s: float, roots_z: Complex) -> float:
 
 def near_the_circle(roots_z: Complex, dt_s: float, per_decade: int = 25) -> Real:
     """Frequencies [rad/s] around poles and zeros close to the unit circle, geometric from a tenth of their
-    distance to it outwards: what they do to a response, however narrow, is seen there."""
+    distance."""
     parts = [np.zeros(0)]
     for root in np.unique(np.asarray(roots_z, dtype=np.complex128)):
         angle, distance = abs(float(np.angle(root))), abs(abs(complex(root)) - 1.0)
@@ -60,8 +60,7 @@ def near_the_circle(roots_z: Complex, dt_s: float, per_decade: int = 25) -> Real
 
 
 def mode_points(mode: Mode, count: int, half_widths: float = 20.0) -> Real:
-    """Frequencies spaced like sinh within +-half_widths half-bandwidths (zeta omega) of a mode, densest at
-    its peak."""
+    """Frequencies spaced like sinh within +-half_widths half-bandwidths (zeta omega) of a mode."""
     width = max(mode.zeta, 1e-6) * mode.omega_rad_s
     reach = np.arcsinh(half_widths)
     points = mode.omega_rad_s + width * np.sinh(np.linspace(-reach, reach, count))
@@ -77,8 +76,8 @@ def frequency_grid(
     n_mode: int,
     extra: npt.ArrayLike = (),
 ) -> Real:
-    """Ascending grid from omega_min to Nyquist inclusive; `n_mode` points are shared out over the modes (at
-    least 20 each)."""
+    """Ascending grid from omega_min to Nyquist; `n_mode` points are shared out over the modes (at least 20
+    each)."""
     parts = [np.geomspace(omega_min_rad_s, nyquist_rad_s, n_log), np.asarray(extra, dtype=np.float64)]
     if modes:
         each = max(20, n_mode // len(modes))
@@ -100,8 +99,7 @@ def checked_grid(
     roots: npt.ArrayLike = (),
     extra: npt.ArrayLike = (),
 ) -> Real:
-    """Grid that a design is checked on, whatever it was made on: from `lowest_rad_s` of the plant and the
-    further `roots`."""
+    """Grid that a design is checked on: from `lowest_rad_s` of the plant and the further `roots`."""
     low = lowest_rad_s(plant.dt_s, np.concatenate([plant.poles, np.asarray(roots, dtype=np.complex128)]))
     n_mode, top = per_mode * len(modes), plant.nyquist_rad_s
     return frequency_grid(top, modes, omega_min_rad_s=low, n_log=n_log, n_mode=n_mode, extra=extra)
@@ -132,8 +130,7 @@ def _outside(own: Real, wanted: Real) -> Real:
 
 
 def with_own_grid(plant: UncertainPlant, wanted: Real) -> Real:
-    """`wanted` where the uncertainty is known everywhere; else all of its own frequencies, and `wanted`
-    outside their range."""
+    """`wanted`; of an uncertainty with its own frequencies all of these, and `wanted` outside their range."""
     own = plant.own_grid
     if own is None:
         return wanted
@@ -141,8 +138,8 @@ def with_own_grid(plant: UncertainPlant, wanted: Real) -> Real:
 
 
 def plant_grid(plant: UncertainPlant, wanted: Real) -> Real:
-    """`wanted` where the uncertainty is known everywhere; else the nearest of its own frequencies, and
-    `wanted` outside their range, where `Channel.at` has the nominal response only."""
+    """`wanted`; of an uncertainty with its own frequencies the nearest of these, and `wanted` outside their
+    range."""
     own = plant.own_grid
     if own is None:
         return wanted

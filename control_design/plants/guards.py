@@ -20,10 +20,8 @@ GUARD_MODULUS = 0.1  # distance from -1 asked of a guard: stability with somethi
 
 @dataclass(frozen=True, eq=False)
 class Guard:
-    """One response of one plant: number of the plant, omega (F,) ending at Nyquist, response (F,).
-
-    The response is taken to have the integrators and unstable poles of the nominal.
-    """
+    """One response of one plant: its number, omega (F,) ending at Nyquist, response (F,) with the nominal's
+    integrators and unstable poles."""
 
     plant: int
     omega_rad_s: Real

@@ -74,8 +74,8 @@ class ResponseBall:
 
     @classmethod
     def of(cls, posterior: IdentifiedMatrix, lowest_rad_s: float) -> ResponseBall:
-        """Of an identified matrix response, from lowest_rad_s on: Li is exact, the radius the largest of a
-        grid of frequencies."""
+        """Of an identified matrix response, from lowest_rad_s on: Li exact, the radius the largest of a
+        grid."""
         import control  # here, because it brings a plotting library with it
 
         li = control.ss(*posterior.input_factor(lowest_rad_s), posterior.dt_s, remove_useless_states=False)

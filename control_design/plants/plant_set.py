@@ -1,5 +1,4 @@
-"""The uncertain plant: a nominal state space for the poles, ellipses for everything that must hold on the
-machine."""
+"""The uncertain plant: a nominal state space for the poles, ellipses for what must hold on the machine."""
 
 from __future__ import annotations
 
@@ -193,8 +192,7 @@ class Mode:
 
 
 def modes_of(poles_z: Complex, dt_s: float, *, zeta_below: float = 0.4) -> tuple[Mode, ...]:
-    """Oscillatory pole pairs of z-plane poles as s = ln(z)/dt, ascending in frequency; zeta < 0 is
-    unstable."""
+    """Oscillatory pole pairs of z-plane poles as s = ln(z)/dt, ascending in frequency; zeta < 0: unstable."""
     poles = np.asarray(poles_z, dtype=np.complex128)
     upper = poles[(np.imag(poles) > 1e-9) & (np.abs(poles) > 1e-6)]
     s = np.log(upper) / dt_s

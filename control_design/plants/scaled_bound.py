@@ -81,8 +81,7 @@ def stability_bound(rows: Rows, K: Array) -> Array:
 
 
 def structured_norm(M: Array) -> Array:
-    """min over diagonal D of the largest singular value of D M D^-1, (F,) for M (F, n, n): mu of n complex
-    scalar blocks up to n = 3."""
+    """min over diagonal D of the largest singular value of D M D^-1, (F,) for M (F, n, n): mu up to n = 3."""
     count, n = M.shape[0], M.shape[1]
     each = np.broadcast_to(np.eye(n)[:, :, None] * np.eye(n)[:, None, :], (count, n, n, n)).astype(
         np.complex128

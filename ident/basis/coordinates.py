@@ -94,8 +94,8 @@ class SearchSpace:
         return Poles(blocks[: self.n_real, 0], pairs)
 
     def levels(self, poles: Poles) -> RealArray:
-        """Where poles lie in the box, 0 to 1: (R + P,) by their first coordinate; beyond a side counts as on
-        it."""
+        """Where poles lie in the box, 0 to 1: (R + P,) by their first coordinate, those beyond on its
+        side."""
         if self.raw:
             first = np.concatenate([poles.real, 2 * poles.pairs.real / (1 + np.abs(poles.pairs) ** 2)])
         else:
@@ -157,8 +157,7 @@ def _coordinates_of_point(unit: Any, n_real: int, low: Any, high: Any) -> Any:
 
 @numba.njit(cache=True)
 def blocks_of_point(unit: Any, n_real: int, low: Any, high: Any, raw: bool) -> Any:
-    """Cascade blocks of a point of the unit cube (see `ident.basis.functions.block_parameters`), without
-    cancellation."""
+    """Cascade blocks (`ident.basis.functions.block_parameters`) of a point of the unit cube."""
     point = _coordinates_of_point(unit, n_real, low, high)
     blocks = np.zeros((n_real + (unit.size - n_real) // 2, 4))
     for i in range(n_real):

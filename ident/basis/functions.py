@@ -130,8 +130,7 @@ def _response_and_all_pass(poles: Poles, z: ComplexArray) -> tuple[ComplexArray,
 
 
 def log_all_pass_slopes(poles: Poles, z: ComplexArray) -> ComplexArray:
-    """d log B / d pole at the points z (F,), (F, B): by each real pole, then by real and imaginary part of
-    each pair."""
+    """d log B / d pole at z (F,), (F, B): by each real pole, then by real and imaginary part of each pair."""
 
     def slope(p: ComplexArray) -> ComplexArray:
         return np.asarray(1 / (z[:, None] - p) - z[:, None] / (1 - p * z[:, None]))
@@ -185,16 +184,14 @@ def _through(poles: Poles, u: RealArray) -> tuple[RealArray, RealArray]:
 
 
 def free_response(poles: Poles, n_samples: int) -> RealArray:
-    """Free responses of the cascade (T, B): column i is h_i(k + 1), k = 0..T-1. Columns of an unknown initial
-    state."""
+    """Free responses of the cascade (T, B), h_i(k + 1), k = 0..T-1: columns of an unknown initial state."""
     rows = np.empty((poles.order, n_samples))
     run_cascade_free(block_parameters(poles), poles.real.size, rows, 0, n_samples)
     return rows.T
 
 
 def nuisance_columns(poles: Poles, n_samples: int, n_polynomials: int, free: bool) -> RealArray:
-    """Powers 0 .. n_polynomials - 1 of a ramp from -1 to 1 and, if `free`, the free responses of the poles,
-    (T, n)."""
+    """Powers 0 .. n_polynomials - 1 of a ramp from -1 to 1 and, if `free`, the free responses, (T, n)."""
     powers = np.vander(np.linspace(-1.0, 1.0, n_samples), n_polynomials, increasing=True)
     return np.hstack([powers, free_response(poles, n_samples)]) if free else powers
 

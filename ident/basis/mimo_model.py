@@ -104,8 +104,7 @@ class MimoModel:
         return np.stack([one.simulate(u) for one in self.outputs], axis=1)
 
     def residues(self) -> Residues:
-        """Partial fractions. Raises ValueError with more than one integrator, or where poles repeat: a pole
-        of higher order has no single residue."""
+        """Partial fractions. Raises ValueError with more than one integrator, or where poles repeat."""
         if self.integrators > 1:
             raise ValueError(f"{self.integrators} integrators in a row have no residue each; expected 0 or 1")
         values, columns = residue_columns(self.poles)
@@ -161,8 +160,8 @@ class MimoModel:
 
 
 def residue_columns(poles: Poles) -> tuple[ComplexArray, ComplexArray]:
-    """Poles (B,) and the residues (B, B) of every basis function at each: [b, m]. Raises ValueError where
-    poles repeat."""
+    """Poles (B,) and residues (B, B) of every basis function at each: [b, m]. ValueError where poles
+    repeat."""
     basis = basis_state_space(poles)
     values, vectors = np.linalg.eig(basis.A)
     apart = np.abs(values[:, None] - values[None, :]) + np.eye(values.size)

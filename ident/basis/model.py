@@ -1,5 +1,4 @@
-"""A GOBF model: poles, coefficients and the fixed structure around them; with one input, or several on the
-same poles."""
+"""A GOBF model: poles, coefficients and the fixed structure around them; with one input or several."""
 
 from __future__ import annotations
 
@@ -146,8 +145,7 @@ class GobfModel:
         return _as_control(self, [self.input_name])
 
     def simulate(self, u: RealArray) -> RealArray:
-        """Output (T,) for the input u (T,), from rest. Raises ValueError for an unstable model, whose output
-        has no bound."""
+        """Output (T,) for the input u (T,), from rest. Raises ValueError for an unstable model."""
         refuse_unstable(self.unstable)
         filtered = filter_input(u, self.integrators, self.input_delay_samples)
         return np.asarray(regressor(self.poles, filtered) @ self.coefficients + self.feedthrough * filtered)
@@ -266,10 +264,8 @@ def refuse_unstable(unstable: Poles) -> None:
 def _unmirrored(
     A: RealArray, B: RealArray, C: RealArray, D: RealArray, unstable: Poles
 ) -> tuple[RealArray, RealArray, RealArray, RealArray]:
-    """The state space behind 1/B of the all-pass, without the states of the mirrored poles.
-
-    These are eigenvectors that the output of 1/B does not see: the states are taken orthogonally to them.
-    """
+    """The state space behind 1/B of the all-pass, its states orthogonal to the eigenvectors of the mirrored
+    poles."""
     for block in unstable.blocks():
         a, b, c, d = inverse_all_pass(block)
         A = np.block([[A, np.zeros((len(A), block.order))], [b @ C, a]])

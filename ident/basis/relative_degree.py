@@ -31,8 +31,7 @@ _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
 
 def refuse_without_counterpart(poles: Poles, integrators: int) -> None:
-    """Raise ValueError if a pole (those at 0 that belong to integrators apart) has no continuous-time
-    counterpart."""
+    """Raise ValueError if a pole (but those at 0 of integrators) has no continuous-time counterpart."""
     for a in poles.real[integrators:]:
         if not a > 0:
             raise ValueError(

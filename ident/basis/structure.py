@@ -1,5 +1,4 @@
-"""What is known or assumed around the basis: integrators, delay, direct term, and the nuisance columns of a
-fit."""
+"""What is known or assumed around the basis: integrators, delay, direct term, and nuisance columns."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""What the levels of noise and distortion say: linear, and how far, or distorted, where and of which kind;
-and what repeats at several amplitudes say of records without a period."""
+"""What noise, distortion and repeats at several amplitudes say: linear, and how far, or distorted, and
+how."""
 
 from __future__ import annotations
 

@@ -180,10 +180,8 @@ def advice(
     residuals: Sequence[RealArray],
     fixed: Poles,
 ) -> list[Finding]:
-    """One finding per doubt about the records behind a fitted model; residuals (T,) one per record.
-
-    `fixed` are the poles that were given (they come first among the model's).
-    """
+    """One finding per doubt about the records behind a fitted model; residuals (T,); `fixed` poles come
+    first."""
     limit = excitation_limit_rad_s(records, model, residuals)
     return [
         *few_samples(data, model.order),
@@ -204,10 +202,7 @@ def few_samples(data: Regression, order: int) -> list[Finding]:
 
 
 def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[Finding]:
-    """Poles whose decay the records do not tell, by the Gauss-Newton covariance.
-
-    Where the residual is coloured, what counts for a pole is the noise around its own frequency.
-    """
+    """Poles whose decay the records do not tell, by the Gauss-Newton covariance and the noise around them."""
     poles, dt_s = model.poles, model.dt_s
     n_real, n_pairs = fixed.counts
     here = data.linearise(*poles.writable())

@@ -269,8 +269,7 @@ def _fewer_integrators_value(records: Sequence[Record], free: Fitted, fewer: int
 
 
 def _spare_integrators(records: Sequence[Record], given: Fitted) -> tuple[int, float, float] | None:
-    """How few integrators are enough beside the same other poles, with statistic and price; None: all are
-    needed."""
+    """How few integrators are enough beside the same other poles, with statistic and price; None: all."""
     k = given.data.structure.integrators
     one = 2 * float(np.log(given.worth()))
     others = Poles(given.poles.real[k:], given.poles.pairs)

@@ -63,8 +63,7 @@ class FrfRegression:
 
     @cached_property
     def omega_max_rad_s(self) -> float | None:
-        """The last measured frequency: beyond nothing shows where a pair is; a refinement may still go
-        there."""
+        """The last measured frequency: beyond nothing shows where a pair is."""
         return min(float(np.angle(self.z).max()), 0.9 * np.pi) / self.dt_s
 
     def n_parameters(self, order: int, n_fixed: int = 0) -> int:
@@ -156,8 +155,8 @@ def _cascade_responses(blocks: RealArray, n_real: int, z: ComplexArray, drive: C
 def prepare_response(
     response: FrequencyUncertainty, *, integrators: int, delay_samples: int, feedthrough: bool
 ) -> FrfRegression:
-    """Whiten a measured response. Raises ValueError at a frequency without any uncertainty, or at omega = 0
-    with integrators."""
+    """Whiten a measured response. Raises ValueError without any uncertainty, or at omega = 0 with
+    integrators."""
     omega = response.omega_rad_s
     s1, s2, direction = standard_axes(response.covariance)
     turn = np.conj(direction)

@@ -93,8 +93,8 @@ def fit_friction(
 
 
 def _swinging(options: IdentOptions) -> IdentOptions:
-    """Pairs that can be modes: one that does not swing follows what a wrong level leaves, in the place of a
-    mode and for good, because the level then fits the pair."""
+    """Pairs that can be modes: one that does not swing follows what a wrong level leaves, which then fits
+    it."""
     if (options.zeta_min or 0.0) >= LARGEST_DAMPING:
         return options
     largest = min(options.zeta_max or LARGEST_DAMPING, LARGEST_DAMPING)
@@ -206,8 +206,8 @@ def refuse_unseen_shaft(found: FrictionFit, records: Sequence[Record]) -> None:
 
 
 def _off_the_force(model: GobfModel) -> tuple[float, float]:
-    """Where, rad/s, and how far, degrees, the speed of a model of the position is off the input: as a whole
-    around the slowest lightly damped mode, or below it, whichever is more."""
+    """Where, rad/s, and how far, degrees, the speed is off the input at most, around the first mode or
+    below."""
     dt_s = model.dt_s
     omega = model.poles.omega_rad_s(dt_s)[model.poles.zeta() < _LIGHT]
     first = float(omega.min()) if omega.size else 0.3 * np.pi / dt_s

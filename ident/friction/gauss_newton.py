@@ -127,14 +127,13 @@ class FrictionFit:
         return level * self.spring.force(record.output[:, 0], level, law)
 
     def residual(self, record: Record) -> RealArray:
-        """(T - delay,) what the simulation leaves of the position, less its mean, in the rows that answer to
-        the record's input."""
+        """(T - delay,) what the simulation leaves of the position, less its mean, in rows that answer to the
+        input."""
         left = answered(record.output[:, 0] - self.motion(record)[0], self.arm.structure.input_delay_samples)
         return np.asarray(left - left.mean())
 
     def taken_off(self, record: Record) -> Record:
-        """The record (one input; any outputs) as if its input had been smaller by the friction. Raises
-        LostError where that is not finite."""
+        """The record with its input smaller by the friction. Raises LostError where that is not finite."""
         delay = self.arm.structure.input_delay_samples
         friction = self.motion(record)[1]
         if not np.all(np.isfinite(friction)):
@@ -155,8 +154,8 @@ class Linearised:
 
 
 def parameters_of(law: FrictionLaw) -> RealArray:
-    """(Q,) level and logarithm of the pre-sliding deflection; with Stribeck friction its excess and the
-    logarithm of the speed that it falls over."""
+    """(Q,) level, logarithm of the pre-sliding deflection; of Stribeck friction excess, logarithm of its
+    speed."""
     plain = [law.level, np.log(law.presliding)]
     return np.array([*plain, law.excess, np.log(law.fall)] if np.isfinite(law.fall) else plain)
 
@@ -197,8 +196,7 @@ def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: Re
 
 
 def equations(found: FrictionFit, records: Sequence[Record]) -> tuple[list[RealArray], list[RealArray]]:
-    """Of every record the derivatives (T - delay, P + Q) of the simulated position, and what it leaves, in
-    the rows that answer to the record's input."""
+    """Of every record the derivatives (T - delay, P + Q) of the simulated position, and what it leaves."""
     delay = found.arm.structure.input_delay_samples
     local = [linearised(found.arm, found.coefficients, found.law, record.input[:, 0]) for record in records]
     return (

@@ -22,7 +22,7 @@ _DERIVATIVES = 3  # stiffness, damping, inertia, and the lag of a drive behind t
 
 
 class _Spectrum(NamedTuple):
-    """Line (T,) through the ends of a position, spectrum of the rest and its mirror image, its power over the
+    """Line (T,) through the ends of a position, spectrum of rest and mirror image, its power over the
     noise."""
 
     line: RealArray
@@ -50,8 +50,7 @@ def smoothed(y: RealArray) -> RealArray:
 
 
 def noise_of(y: RealArray) -> float:
-    """Standard deviation of the noise of a position (T,), taken from the upper half of its band; not below a
-    millionth of the motion."""
+    """Standard deviation of the noise of a position (T,), from the upper half of its band, floored."""
     power = np.abs(_spectrum(y).values) ** 2
     white = np.sqrt(np.median(power[power.size // 2 :]) / np.log(2) / (2 * y.size))
     return float(max(white, _LEAST_NOISE * np.std(y)))
@@ -75,8 +74,8 @@ def highest_Hz(records: Sequence[Record]) -> float:
 
 
 def direction_of(position: RealArray, presliding: float) -> RealArray:
-    """(T,) friction of unit level that a motion (T,) makes, held over each sample: an elastic element that
-    slips after a deflection."""
+    """(T,) friction of unit level for a motion (T,), held over each sample: elastic, slipping after a
+    deflection."""
     found = np.diff(position, prepend=position[0]) / presliding
     _slip(found)
     return np.asarray(0.5 * (found + np.append(found[1:], found[-1])))

@@ -32,8 +32,8 @@ _TINY = np.finfo(np.float64).tiny
 
 @numba.njit(**INSIDE)
 def transitions(rates: Any, chain: Any, dt_s: float) -> Any:
-    """(2, 3, N): what a step, and a stride, does to a state: its decay, a unit of effort onto it, the state
-    before it onto it."""
+    """(2, 3, N): of a step, and a stride, a state's decay, a unit of effort onto it, the state before it onto
+    it."""
     moves = np.zeros((2, 3, rates.size), dtype=np.complex128)
     for k in range(2):
         length = dt_s / _STRIDES if k else dt_s / (_STRIDES * _STEPS)
@@ -62,10 +62,8 @@ def advance(
     dt_s: float,
     law: Any,
 ) -> Any:
-    """One sample: mean and first moment (in samples) of the friction.
-
-    state (N,) and shaft (3,), its position, deflection and speed, are changed in place.
-    """
+    """One sample: mean and first moment (in samples) of the friction. Changes state (N,) and shaft (3,), its
+    position, deflection and speed, in place."""
     n = rates.size
     tried = np.empty(n, dtype=np.complex128)
     decay, onto, carried = moves[0, 0], moves[0, 1], moves[0, 2]

@@ -97,8 +97,8 @@ class ObserverFilter:
 
 
 def prediction_errors(found: FrictionFit, records: Sequence[Record]) -> float:
-    """Sum of squares of the observer's prediction errors, without the start of each record; infinite where it
-    loses the log."""
+    """Sum of squares of the prediction errors, without the start of each record; infinite where it is
+    lost."""
     with np.errstate(over="ignore", invalid="ignore"):
         parts = [found.residual(record) for record in records]
         total = sum(float(np.sum(part[part.size // _START :] ** 2)) for part in parts)
@@ -106,10 +106,8 @@ def prediction_errors(found: FrictionFit, records: Sequence[Record]) -> float:
 
 
 def observed(found: FrictionFit, records: Sequence[Record]) -> FrictionFit:
-    """The fit with the observer whose predictions of the records are best; near the one it has, if any.
-
-    Raises LostError where no observer follows them.
-    """
+    """The fit with the observer that predicts best, near the one it has. Raises LostError where none
+    follows."""
     noise = np.sqrt(np.mean([noise_of(record.output[:, 0]) ** 2 for record in records]))
     rms = np.sqrt(np.mean([np.mean(record.input**2) for record in records]))
     tried = list[tuple[float, FrictionFit]]()
