@@ -20,8 +20,9 @@ from ident import GobfModel, IdentOptions, identify
 from ident.basis.functions import regressor
 from ident.basis.options import EmbeddingOptions
 from ident.basis.posterior import ResponsePosterior
-from ident.uncertainty.embedding import classical, tangent
+from ident.uncertainty.embedding import tangent
 from tests.ident.benchmark_plants import DT_S, Truth
+from validation.paper.classical import classical
 
 OMEGA = np.geomspace(0.3, 300.0, 150)
 BANDS = ((0.3, 1), (1, 5), (5, 13), (13, 19), (19, 55), (55, 85), (66, 72), (85, 150), (150, 190), (190, 301))

@@ -1,10 +1,7 @@
-"""Model error and noise as one covariance: stochastic embedding, classical and tangent (design 4.5).
+"""Model error and noise as one covariance: tangent stochastic embedding (design 4.5).
 
-`classical` is the recipe of Goodwin, Gevers and Ninness (IEEE TAC 37(7), 1992), the paper's Fig. 7. Its
-ellipses do not cover: poles are treated as known, and the kernel keeps its prior variance. `tangent`, the
-default: every pole twice (the first-order effect of moving it), initial state and offset as nuisance, a short
-kernel for the rest, everything conditioned on the data, averaged over one mode that the search may have
-missed.
+Every pole twice (the first-order effect of moving it), initial state and offset as nuisance, a short kernel
+for the rest, everything conditioned on the data, averaged over one mode that the search may have missed.
 """
 
 from __future__ import annotations
@@ -34,7 +31,6 @@ from ident.uncertainty.embedding_algebra import (
     exponential_factor,
     joint_factor,
     kernel_grid,
-    prior_posterior,
     reduce_regression,
     tc_factor,
     total_log_evidence,
@@ -61,7 +57,7 @@ _MOST_ADDED = 5
 # Share of the output that is nothing beside its noise.
 _FREE = 1e-9
 # Rounds of residuals, noise model, whitening: the first is unwhitened, the others remove its bias.
-_NOISE_ROUNDS = 3
+NOISE_ROUNDS = 3
 
 
 def tangent(
@@ -96,22 +92,10 @@ def tangent_beside(
     return _embed(
         records,
         model,
-        model.poles.doubled(),
         options or EmbeddingOptions(),
-        classical_recipe=False,
         beside=beside,
         n_known=n_known,
     )
-
-
-def classical(
-    records: Sequence[Record], model: GobfModel, options: EmbeddingOptions | None = None
-) -> ResponsePosterior:
-    """The published recipe, for comparison: F = Phi, prior C = alpha lam^k, unconditional covariance. Errors
-    as `tangent`; hyperparameters are those of largest restricted likelihood. Not for designs: it does not
-    cover."""
-    options = options or EmbeddingOptions()
-    return _embed(records, model, model.poles, options, classical_recipe=True)[0]
 
 
 def common_fir_length(records: Sequence[Record], poles: Poles, options: EmbeddingOptions) -> int:
@@ -132,29 +116,24 @@ def tangent_rows(
 def _embed(
     records: Sequence[Record],
     model: GobfModel,
-    poles: Poles,
     options: EmbeddingOptions,
     *,
-    classical_recipe: bool,
     beside: Sequence[Beside] = (),
     n_known: int = 0,
 ) -> tuple[ResponsePosterior, RealArray, RealArray]:
-    rows, n_off = (
-        replace(_rows(records, model, poles, options, beside), n_known=n_known),
-        model.unstable.order,
-    )
+    rows, n_off = _rows(records, model, model.poles.doubled(), options, beside), model.unstable.order
+    rows = replace(rows, n_known=n_known)
     if n_known:
         rows = replace(rows, known_std=_noise_std(rows))
-    solve = _solve_classical if classical_recipe else _solve
     # Coloured noise taken for white passes for modes: none are added before it has been whitened.
     first = options.model_copy(update={"prior_missed_mode": 0.0}) if options.coloured_noise else options
-    solved = solve(rows, first)
+    solved = _solve(rows, first)
     if options.coloured_noise:
-        for _ in range(_NOISE_ROUNDS):
+        for _ in range(NOISE_ROUNDS):
             residuals, absorbed = gls_residuals(solved.rows, solved.reduced, solved.kernel)
             whitening = fit_autoregression(residuals, options.max_ar_order, solved.rows.whitening, absorbed)
             behind = replace(solved.rows, whitening=whitening)
-            solved = solve(replace(behind, known_std=_noise_std(behind)) if n_known else behind, options)
+            solved = _solve(replace(behind, known_std=_noise_std(behind)) if n_known else behind, options)
     poles = solved.rows.poles
     reduced, kernel, missed = solved.reduced, solved.kernel, solved.missed
     if missed is not None and missed.poles.size:
@@ -174,7 +153,7 @@ def _embed(
     off = slice(after, after + n_off)
     mean, factor = np.concatenate([mean, joint[0][off]]), np.concatenate([factor, joint[1][off]])
     report = embedding_report(
-        "classical embedding" if classical_recipe else "tangent embedding",
+        "tangent embedding",
         reduced,
         kernel,
         ar_coefficients=tuple(float(a) for a in solved.rows.whitening[1:]),
@@ -319,13 +298,6 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
         pair = refined_pair(rows.pair_blocks, reduced, missed.visible)
         rows = replace(rows, poles=rows.poles.appended(Poles(pairs=np.array([pair, pair]))))
         n_added += 1
-
-
-def _solve_classical(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
-    reduced = reduce_regression(rows.blocks())
-    return _Solved(
-        rows, reduced, prior_posterior(kernel_grid(reduced, [exponential_factor], order_given=False))
-    )
 
 
 def _pairs_after_poles(coefficients: RealArray, order: int, pairs: ComplexArray) -> RealArray:

@@ -116,9 +116,8 @@ class KernelPosterior:
     """Gaussian of theta and eta: eta = kernel_mean + kernel_factor w', theta = R11^-1 (r1 - R12 eta +
     sqrt(noise_variance) w); w, w' standard normal.
 
-    kernel_mean (L,), kernel_factor (L,L'): conditional on the data, or (classical recipe) 0 and the prior
-    factor. alpha, lam: those of largest weight; probability_no_remainder: weight on alpha = 0; log_evidence:
-    of the best pair relative to alpha = 0.
+    kernel_mean (L,), kernel_factor (L,L'): conditional on the data. alpha, lam: those of largest
+    weight; probability_no_remainder: weight on alpha = 0; log_evidence: of the best pair relative to it.
     """
 
     kernel_mean: RealArray
@@ -404,24 +403,6 @@ def conditional_posterior(grid: KernelGrid, weights: RealArray, weight_none: flo
         alpha=float(grid.alpha[best]) if np.any(weights) else 0.0,
         lam=grid.spectra[best[0]].lam,
         probability_no_remainder=weight_none,
-        log_evidence=float(grid.log_likelihood[best] - grid.log_likelihood_none),
-    )
-
-
-def prior_posterior(grid: KernelGrid) -> KernelPosterior:
-    """The classical recipe: alpha, lam of largest restricted likelihood, eta left at its prior."""
-    best = np.unravel_index(int(np.argmax(grid.log_likelihood)), grid.log_likelihood.shape)
-    spectrum = grid.spectra[best[0]]
-    s2, alpha = float(grid.noise_variance[best]), float(grid.alpha[best])
-    factor = np.zeros((spectrum.length, spectrum.singular.size))
-    factor[: spectrum.singular.size] = np.sqrt(s2 * alpha) * spectrum.axes  # B V (B V)^T = B B^T
-    return KernelPosterior(
-        kernel_mean=np.zeros(spectrum.length),
-        kernel_factor=factor,
-        noise_variance=s2,
-        alpha=alpha,
-        lam=spectrum.lam,
-        probability_no_remainder=0.0,
         log_evidence=float(grid.log_likelihood[best] - grid.log_likelihood_none),
     )
 

@@ -13,8 +13,9 @@ from ident.data.record import Record
 from ident.data.signal_filter import band_limited
 from ident.one_input import identify
 from ident.uncertainty.autoregression import fit_autoregression
-from ident.uncertainty.embedding import classical, tangent
+from ident.uncertainty.embedding import tangent
 from tests.ident.test_embedding_algebra import dense_posterior
+from validation.paper.classical import classical
 
 from .benchmark_plants import DT_S as DT
 from .three_mode_arm import BANDS, OMEGA, per_band, random_arm

@@ -18,10 +18,10 @@ from ident.uncertainty.embedding_algebra import (
     joint_factor,
     kernel_spectrum,
     nuisance_basis,
-    prior_posterior,
     reduce_regression,
     tc_factor,
 )
+from validation.paper.classical import prior_posterior
 
 N, P, L = 90, 4, 12
 

@@ -8,10 +8,11 @@ import pytest
 from ident import GobfModel, IdentOptions, Poles, identify
 from ident.basis.functions import basis_response
 from ident.basis.posterior import ResponsePosterior
-from ident.uncertainty.embedding import classical, tangent
+from ident.uncertainty.embedding import tangent
 from ident.uncertainty.pole_intervals import pole_intervals
 from tests.ident.benchmark_plants import P2_HZ, P2_ZETA, as_record, p2
 from tests.ident.three_mode_arm import random_arm
+from validation.paper.classical import classical
 
 DT_S = 0.005
 CIRCLE = np.exp(1j * np.linspace(0.001, np.pi, 4000))

@@ -19,7 +19,8 @@ from ident.data.record import Record
 from ident.identification import Identification
 from ident.one_input import identify
 from ident.uncertainty import FrequencyUncertainty
-from ident.uncertainty.embedding import classical, tangent
+from ident.uncertainty.embedding import tangent
+from validation.paper.classical import classical
 from validation.paper.machines import LinkExperiment, PaperMachine, SimulationExample
 from validation.paper.methods import JUDGED_BAND_RAD_S, gobf_options
 from validation.paper.settings import PaperSettings

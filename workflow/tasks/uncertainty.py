@@ -36,7 +36,7 @@ from ident.friction import (
 )
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.conditions import combine_posteriors, group_posteriors, repeat_posteriors
-from ident.uncertainty.embedding import classical, tangent
+from ident.uncertainty.embedding import tangent
 from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import growth_intervals, pole_intervals
 from workflow.config.run_config import Channel
@@ -319,8 +319,6 @@ def posterior_of(
     model: GobfModel, bounded: Sequence[Record], options: UncertaintyOptions, records: Sequence[RunRecord]
 ) -> ResponsePosterior:
     """One library call, by method."""
-    if options.method == "classical":
-        return classical(bounded, model, options)
     if options.method == "tangent":
         return tangent(bounded, model, options)
     condition = {item.record.name: item.condition for item in records}
