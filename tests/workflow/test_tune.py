@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import re
+import shutil
 import signal
 import threading
 import time
@@ -26,9 +27,10 @@ from tests.workflow.test_design_sources import DT_S, QUICK, WISH, arm, document,
 from workflow.commands import tuning
 from workflow.commands.tune import TuneServer
 from workflow.commands.tuning import SupersededError, TuningSession, toml_of
-from workflow.config.design_file import read_design_file
+from workflow.config.design_file import DesignFile, read_design_file
 from workflow.engine import codec
-from workflow.tasks.results import IdentifiedPlant
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.results import IdentifiedPlant, RunResults
 
 UNCERTAIN = "\n[uncertainty]\nmultiplicative = 0.05\n"
 
@@ -150,7 +152,6 @@ def test_near_designs_are_soon_there_and_hardly_worse(session):
     assert near["gamma"] == pytest.approx(started["gamma"], rel=0.02)
     assert near["items"][0]["requirement"] == started["items"][0]["requirement"]
     assert session.near({"bandwidth_rad_s": 60.0, "effort_limit": None}) == {}
-    assert session.near({"lowest_bandwidth_rad_s": 0.3}) == {}
     session.design({})
 
 
@@ -430,3 +431,20 @@ def test_a_plant_of_its_own_grid_has_curves_on_it(session):
     plant = UncertainPlant("known", control.ss(nominal), Known())
     gains = tuning._gains(session._last, plant, session.specification)
     assert len(gains[0]["x"]) == 40
+
+
+def test_a_run_is_tuned_from_its_own_design_at_the_bandwidth_it_found(fast_run, tmp_path):
+    run = shutil.copytree(fast_run, tmp_path / "run")
+    session = TuningSession([run], DesignFile(), tmp_path / "saved", 2006)
+    found = session.near({})
+    assert found["gamma"] == pytest.approx(RunResults(RunDirectory(run)).design.gamma, rel=0.02)
+    stated = session.specification.bandwidth_rad_s
+    open_ended = session.specification.model_dump() | {
+        "bandwidth_rad_s": 3 * stated,
+        "lowest_bandwidth_rad_s": 0.1 * stated,
+    }
+    file = DesignFile.model_validate({"specification": open_ended})
+    session = TuningSession([run], file, tmp_path / "saved", 2006)
+    assert session.specification.lowest_bandwidth_rad_s is None
+    assert "lowest_bandwidth_rad_s" not in [one["name"] for one in session.settings()]
+    assert session.specification.bandwidth_rad_s == stated

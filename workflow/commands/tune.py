@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import count
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -71,6 +72,7 @@ class TuneServer(ThreadingHTTPServer):
                     if isinstance(value, dict | tuple)
                 ],
                 out=session.out,
+                name=next(name for k in count(1) if not (session.out / (name := f"tuned-{k}")).exists()),
             )
         )
 

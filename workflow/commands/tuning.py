@@ -31,10 +31,11 @@ from workflow.config.settings import check
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.randomness import stage_rng
+from workflow.engine.run_directory import RunDirectory
 from workflow.figures.sensitivity import sensitivity_curves
 from workflow.tasks.design import bracket_numbers, find_bracket, find_design
 from workflow.tasks.design_source import level_can_change, load_sources
-from workflow.tasks.results import DesignResult
+from workflow.tasks.results import DesignResult, RunResults
 from workflow.text.templates import said
 
 CONFIDENCE = "confidence"  # a setting beside those of the specification: level of the ellipses
@@ -73,19 +74,20 @@ class TuningSession:
             asked = asked.model_copy(update={"specification": file.specification})
         if asked.specification is None:
             raise InputError(f"{', '.join(map(str, paths))}: no specification: give --spec FILE")
-        known = asked.specification.model_dump(include=set(Specification.model_fields))
-        self.specification = Specification.model_validate(known)
+        found = _of_run(self.paths)
+        self.specification = _at_one_bandwidth(asked.specification, found)
         self.file = asked
         self._plants = [source.plant for source in sources]
         self.drawable = all(level_can_change(plant) for plant in self._plants)
-        self._last: Controller | None = None
+        self._last = None if found is None else found.controller
         self._newest, self._designing = 0, threading.Lock()
 
     # -- settings --------------------------------------------------------------------------------------------
 
     def settings(self) -> list[dict[str, Any]]:
         """What the page has a control for: name, kind, description, value, range."""
-        fields = Specification.model_json_schema()["properties"]
+        fields = {**Specification.model_json_schema()["properties"]}
+        del fields["lowest_bandwidth_rad_s"]
         found = [_control(name, field, getattr(self.specification, name)) for name, field in fields.items()]
         if self.drawable:
             level = {"ge": 0.5, "lt": 0.9999}
@@ -138,9 +140,8 @@ class TuningSession:
 
     def near(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """As `design`, from the last controller alone: soon, and seldom worse. Empty where that leads
-        nowhere, or the bandwidth is to be found."""
-        specification, _, _ = self._read(values)
-        if self._last is None or specification.lowest_bandwidth_rad_s or self.file.certificate.calibrate:
+        nowhere."""
+        if self._last is None or self.file.certificate.calibrate:
             return {}
         found = self._designed(values, self._last)
         return found if found["plants"] else {}
@@ -339,6 +340,23 @@ def _of_synthesis(result: SynthesisResult) -> dict[str, Any]:
     active = result.blocking[0] if result.blocking else None
     words = "" if active is None else f"{active.weight} of {active.plant} at {active.omega_rad_s:.4g} rad/s"
     return {"gamma": result.gamma, "active": words, "order": result.controller.order}
+
+
+def _of_run(paths: Sequence[Path]) -> DesignResult | None:
+    """What the run has designed whose directory is the only plant."""
+    if len(paths) > 1 or not paths[0].is_dir():
+        return None
+    run = RunDirectory.open(paths[0])
+    return RunResults(run).design if run.stage_file("design") else None
+
+
+def _at_one_bandwidth(specification: Specification, found: DesignResult | None) -> Specification:
+    """Of one that leaves the bandwidth open: that which its run has found, or the one to try first. A search
+    for it takes a dozen designs, and the page has a slider for it."""
+    known = specification.model_dump(include=set(Specification.model_fields))
+    if known.pop("lowest_bandwidth_rad_s") is not None and found is not None:
+        known["bandwidth_rad_s"] = (found.specification or specification).bandwidth_rad_s
+    return Specification.model_validate(known)
 
 
 def _control(name: str, schema: Mapping[str, Any], value: Any) -> dict[str, Any] | None:

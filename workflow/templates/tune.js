@@ -94,6 +94,7 @@ const scale = async () => {
   if (waiting) { waiting = false; scale(); }
 };
 const design = () => {
+  if (shown) show({...shown, stale: true});
   clearTimeout(timer);
   timer = setTimeout(run, 120);  // arrows come in a row
 };
@@ -109,7 +110,7 @@ const run = async () => {
       show({...whole, whole});
       return ((performance.now() - started) / 1000).toFixed(1);
     };
-    const near = before ? await post("/near", {settings: values}) : {};
+    const near = await post("/near", {settings: values});
     if (mine !== number) return;
     if (near.plants) {
       document.body.dataset.near = take(near);
