@@ -434,7 +434,7 @@ def test_a_plant_of_its_own_grid_has_curves_on_it(session):
 
 
 def test_a_run_is_tuned_from_its_own_design_at_the_bandwidth_it_found(fast_run, tmp_path):
-    run = shutil.copytree(fast_run, tmp_path / "run")
+    run = shutil.copytree(fast_run[0], tmp_path / "run")
     session = TuningSession([run], DesignFile(), tmp_path / "saved", 2006)
     found = session.near({})
     assert found["gamma"] == pytest.approx(RunResults(RunDirectory(run)).design.gamma, rel=0.02)
