@@ -76,7 +76,7 @@ def as_numbers(values: Any) -> np.ndarray[Any, np.dtype[Any]]:
     return array
 
 
-def read_in_child(kind: str, library: str, content: bytes, extra: str = "logs") -> bytes:
+def read_in_child(kind: str, library: str, content: bytes) -> bytes:
     """What `child_reader` makes of the bytes of a file: HDF5, parquet, xlsx, MATLAB .mat, MCAP, bag, db3.
 
     Raises ValueError, beginning with ':': damaged, too large, too slow, or the library is not installed.
@@ -99,9 +99,7 @@ def read_in_child(kind: str, library: str, content: bytes, extra: str = "logs") 
         return done.stdout
     said = shown(done.stderr.decode("utf-8", "replace"))
     if done.returncode == _NO_LIBRARY:
-        raise ValueError(
-            f": {kind} files need {library}: pip install 'flexlink[{extra}]' (or pip install {library})"
-        )
+        raise ValueError(f": {kind} files need {library}: {sys.executable} -m pip install {library}")
     raise ValueError(
         f": {said if done.returncode == _REFUSED and said else f'not a {kind} file, or a damaged one'}"
     )

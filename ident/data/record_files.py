@@ -182,7 +182,7 @@ def _read_json(file: Path, content: bytes) -> Table:
 def _read_bag(file: Path, content: bytes) -> Table:
     """MCAP, ROS 1 and ROS 2 bags: topic.field; signals of several topics hold their last message."""
     kind = file.name.lower().removesuffix(".gz").rpartition(".")[2]
-    table = _read_columns(file, content, kind, "mcap and rosbags", "robotics")
+    table = _read_columns(file, content, kind, "mcap rosbags")
     recorded = {name[:-1]: table.raw[name] for name in table.names if name.endswith("\t")}
     raw = {name: values for name, values in table.raw.items() if not name.endswith("\t")}
     # A topic's name may be the beginning of another's: the longest that fits comes last.
@@ -191,8 +191,8 @@ def _read_bag(file: Path, content: bytes) -> Table:
     return replace(table, raw=raw, clocks=clocks)
 
 
-def _read_columns(file: Path, content: bytes, kind: str, library: str, extra: str = "logs") -> Table:
-    arrays = npz_arrays(read_in_child(kind, library, content, extra))
+def _read_columns(file: Path, content: bytes, kind: str, library: str) -> Table:
+    arrays = npz_arrays(read_in_child(kind, library, content))
     about = json.loads(arrays.pop("about").tobytes())
     names = distinct([name for name, _ in about])
     columns = {name: arrays[str(k)] for k, name in enumerate(names)}

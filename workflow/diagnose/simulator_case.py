@@ -5,6 +5,7 @@ from __future__ import annotations
 import fnmatch
 import re
 import runpy
+import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -207,13 +208,13 @@ _Simulator = Callable[
 ]
 
 
-def _needs(package: str, extra: str) -> None:
+def _needs(package: str) -> None:
     if find_spec(package) is None:
-        raise ValueError(f"needs the package {package}: pip install 'flexlink[{extra}]'")
+        raise ValueError(f"needs the package {package}: {sys.executable} -m pip install {package}")
 
 
 def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s: float) -> Any:
-    _needs("mujoco", "mujoco")
+    _needs("mujoco")
     from diagnosis.machine.mujoco_model import names
     from diagnosis.machine.mujoco_plant import MujocoArm
 
@@ -290,7 +291,7 @@ def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_
 
 
 def _fmu(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s: float) -> Any:
-    _needs("fmpy", "fmu")
+    _needs("fmpy")
     from diagnosis.machine.fmu_plant import Fmu
 
     fmu = Fmu(model, dt_s)

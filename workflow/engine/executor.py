@@ -259,9 +259,8 @@ class DaskCluster:
             dask: Any = import_module("dask")
             distributed: Any = import_module("distributed")
         except ImportError as error:
-            raise InputError(
-                "--scheduler needs the extra 'distributed': pip install 'flexlink[distributed]'"
-            ) from error
+            need = f"--scheduler needs the package distributed: {sys.executable} -m pip install distributed"
+            raise InputError(need) from error
         self._distributed = distributed
         self.address = address
         self._last_seen: dict[str, Any] = {}
