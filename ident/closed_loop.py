@@ -34,7 +34,7 @@ from ident.unstable import quick_poles
 
 # A first stage that explains less of the input than this has gone wrong.
 _EXPLAINED_PERCENT = 50.0
-# The same for balls: with 91 % they held a response at .90 of the frequencies, not .95, with 74 % at .40.
+# The same for balls: with 89 % they held a response at .90 of the frequencies, not .95, with 70 % at .40.
 _ENOUGH_FOR_BALLS = 90.0
 _FIRST_STAGE = EmbeddingOptions(coloured_noise=True, prior_missed_mode=0.0, fir_length=1)
 
