@@ -43,7 +43,7 @@ def draw_error_surface(channel: ChannelView) -> Figure | None:
     surface = _surface(channel, channel.shown_pair)
     omega, zeta = surface.first, surface.second
     ratio = np.sqrt(surface.mean_square.T / surface.mean_square.min())
-    figure, (left, right) = style.panels(4.9, 1, 2, width_ratios=[1.75, 1.0])
+    figure, (left, bar, right) = style.panels(4.9, 1, 3, width_ratios=[1.75, 0.06, 1.0])
     top = max(float(np.percentile(ratio, 99)), 1.0001)
     levels = np.geomspace(1.0, top, 22)
     shades = np.clip(ratio, 1.0, top)
@@ -62,7 +62,7 @@ def draw_error_surface(channel: ChannelView) -> Figure | None:
     left.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]), ylim=(zeta[0], zeta[-1]))
     left.set(xlabel=_PAIR_AXIS, ylabel="damping ratio of the pair [1]")
     left.set_title(f"Error surface: {style.plain(channel.name, 34)}")
-    _round_ticks(figure.colorbar(filled, ax=left, pad=0.01, aspect=30), levels)
+    _round_ticks(figure.colorbar(filled, cax=bar), levels)
     right.plot(omega, ratio.min(axis=0), **style.MODEL_LINE)
     right.axvline(surface.pole[0], color=style.HIGHLIGHT, lw=1.4)
     right.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]))

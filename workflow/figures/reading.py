@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 from matplotlib import rcParams
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -14,9 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.markers import TICKDOWN, TICKLEFT, TICKUP
 from matplotlib.text import Annotation
-from matplotlib.ticker import Locator, NullLocator
 
-POINT = 72  # units of an SVG per inch
+from workflow.figures.layout import POINT, every_axis, within
 
 
 def marked(figure: Figure, reaches: list[tuple[float, float]]) -> dict[str, Any]:
@@ -79,28 +79,17 @@ def marked(figure: Figure, reaches: list[tuple[float, float]]) -> dict[str, Any]
     }
 
 
-def take_minor_ticks(figure: Figure) -> list[tuple[Axis, Locator]]:
-    """Take the minor ticks off every axis, most numerous and without words; to be put back as one artist."""
-    every = [axis for axes in _all_axes(figure) for axis in (axes.xaxis, axes.yaxis)]
-    taken = [(axis, axis.get_minor_locator()) for axis in every]
-    for axis in every:
-        axis.set_minor_locator(NullLocator())
-    return taken
-
-
-def draw_minor_ticks(taken: list[tuple[Axis, Locator]]) -> None:
+def draw_minor_ticks(figure: Figure) -> None:
     """Those of an axis as markers of one line: as ticks they would take a quarter of the drawing's time."""
-    for axis, locator in taken:
-        axis.set_minor_locator(locator)
-        low, high = sorted(axis.get_view_interval())
-        places = [place for place in axis.get_minorticklocs() if low <= place <= high]
-        axis.set_minor_locator(NullLocator())
-        if not places or not axis.get_visible():
+    for axis in every_axis(axes for axes in figure.axes if axes.get_visible()):
+        places = np.asarray(axis.get_minorticklocs(), dtype=np.float64)
+        if not places.size or not axis.get_visible():
             continue
+        places = places[within(axis, places)]
         axes: Any = axis.axes
         x = axis is axes.xaxis
-        edge = [0.0 if axes in axes.figure.axes else 1.0] * len(places)  # a second axis stands on top
-        marker: Any = TICKLEFT if not x else TICKUP if edge[0] else TICKDOWN
+        edge = np.full(places.size, 0.0 if axes in axes.figure.axes else 1.0)  # a second axis stands on top
+        marker: Any = TICKLEFT if not x else TICKDOWN if axes in axes.figure.axes else TICKUP
         line = Line2D(
             *((places, edge) if x else (edge, places)),
             transform=axes.get_xaxis_transform("grid") if x else axes.get_yaxis_transform("grid"),

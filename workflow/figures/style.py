@@ -28,8 +28,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocat
 from matplotlib.transforms import ScaledTranslation
 
 from workflow.engine import interrupts
-from workflow.figures.layout import lay_out, titles
-from workflow.figures.reading import POINT, draw_minor_ticks, marked, take_minor_ticks
+from workflow.figures.layout import POINT, lay_out, titles
+from workflow.figures.reading import draw_minor_ticks, marked
 
 MEASURED = "#6b6b6b"  # what sensors said
 MODEL = "#0072B2"  # identified model, open loop
@@ -157,9 +157,8 @@ def render(figure: Figure, also: Iterable[str] = ()) -> Picture:
     also: further kinds of file, pdf or png.
     """
     with house_style():
-        minor = take_minor_ticks(figure)
         reaches = lay_out(figure)
-        draw_minor_ticks(minor)
+        draw_minor_ticks(figure)
         plot = marked(figure, reaches)
         text = io.StringIO()
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
