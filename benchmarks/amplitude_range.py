@@ -28,8 +28,9 @@ from ident.data.arrays import ComplexArray, RealArray
 from ident.friction import at_amplitudes, equivalent_friction
 from plant import parse_effects, simulate
 from plant.excitation import multisine, multisine_lines
+from plant.simulation import quantised
 from workflow.config.run_config import SimulatedSource, built_in_config
-from workflow.tasks.simulated_rig import OUTPUT_NAMES, quantised, rig_of
+from workflow.tasks.simulated_rig import OUTPUT_NAMES, rig_of
 
 PERIOD, DT_S, PHASE_DRAWS = 1000, 0.005, 20
 RECORDED_V = (2.0, 2.0, 6.0, 6.0)

@@ -35,7 +35,7 @@ from workflow.config.run_config import RunConfig, SimulatedSource, built_in_conf
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.results import RunResults
-from workflow.tasks.simulated_rig import OUTPUT_NAMES, EncodedArm
+from workflow.tasks.simulated_rig import OUTPUT_NAMES, encoded_arm
 from workflow.tasks.stage import StageInput
 from workflow.tasks.stages import STAGES
 from workflow.text.templates import said
@@ -93,7 +93,7 @@ def measured(
     """S on the arm of the configuration with further effects."""
     assert isinstance(config.source, SimulatedSource)
     extra = [{"name": name, **values} for name, values in effects.items()]
-    arm = EncodedArm(config.source, extra, np.random.default_rng([seed, 1]))
+    arm = encoded_arm(config.source, extra, np.random.default_rng([seed, 1]))
     return measure_sensitivity(
         controller,
         arm,

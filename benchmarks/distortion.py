@@ -25,9 +25,9 @@ from ident.data.arrays import RealArray
 from ident.data.distortion import BandLevel, Distortion, LineLevels, distortion_of
 from ident.data.record import Record
 from plant import ExperimentPlan, parse_effects
-from plant.simulation import Simulator
+from plant.simulation import Simulator, quantised
 from workflow.config.run_config import SimulatedSource, built_in_config
-from workflow.tasks.simulated_rig import INPUT_NAME, OUTPUT_NAMES, quantised, rig_of
+from workflow.tasks.simulated_rig import INPUT_NAME, OUTPUT_NAMES, rig_of
 
 BANDS = tuple(itertools.pairwise(EDGES_RAD_S.tolist()))
 _WITHIN = 10 ** (2 / 20)

@@ -41,7 +41,7 @@ from workflow.tasks.friction_loop import (
     predicted_peak,
 )
 from workflow.tasks.loop_sensitivity import SensitivityPlan, plan_sensitivity, rms_of, settling_samples
-from workflow.tasks.simulated_rig import EncodedArm, rig_of
+from workflow.tasks.simulated_rig import encoded_arm, rig_of
 
 FRICTIONS_NM = (0.005, 0.02, 0.1)
 SIZES_RAD = (0.003, 0.01, 0.03, 0.1, 0.2)
@@ -66,7 +66,7 @@ def sine_errors(law: Controller, source: SimulatedSource, seed: int) -> tuple[fl
     quarter = round(0.5 * np.pi / SINE_RAD_S / law.dt_s)
     reference = SINE_RAD * np.sin(0.5 * np.pi * np.arange(5 * quarter) / quarter)
     quiet = SampledArm(rig_of(source), parse_effects(source.effects), None)
-    noisy = EncodedArm(source, (), np.random.default_rng([seed, 4]))
+    noisy = encoded_arm(source, (), np.random.default_rng([seed, 4]))
     hub, measured = (simulate(law, arm, reference).measured for arm in (quiet, noisy))
     return tuple(float(np.sqrt(np.mean((reference - y)[quarter:] ** 2))) for y in (hub, measured))
 
@@ -88,7 +88,7 @@ def one_arm(
     for k, size in enumerate(SIZES_RAD):
         excitation = plan.excitation(size / plan.rms)
         phases = partial(np.random.default_rng, [*key, 2, k])
-        arm = EncodedArm(source, (), np.random.default_rng([*key, 3, k]))
+        arm = encoded_arm(source, (), np.random.default_rng([*key, 3, k]))
         peaks[k, 0] = measure_sensitivity(controller, arm, phases(), **excitation).peak[0]
         peaks[k, 1:] = predicted_peak(loops, phases, np.random.default_rng([*key, 5, k]), **excitation)
     samples = settling_samples(float(np.max(np.abs(controller.poles))), 200, 6000)
@@ -97,7 +97,7 @@ def one_arm(
     stuck = sticking_on_arm(controller, source, samples)
     left = []
     for size in STEPS_RAD:
-        arm = EncodedArm(source, (), np.random.default_rng([seed, 6]))
+        arm = encoded_arm(source, (), np.random.default_rng([seed, 6]))
         left.append(abs(size - float(np.mean(simulate(controller, arm, np.full(600, size)).measured[-60:]))))
     law = replace(controller, feedforward=friction_feedforward(controller, found))
     loose = source.model_copy(update={"effects": ()})

@@ -385,3 +385,73 @@ def run(
                     while remaining > 0 and (remaining >> level) & 1 == 0:
                         level += 1
             part = next_part
+
+
+@njit(cache=True, error_model="numpy")
+def run_in_loop(
+    signals: Real,
+    law: Real,
+    limits: Real,
+    steps: Real,
+    path: Real,
+    sensor: Real,
+    counts: Integer,
+    rows: Real,
+    output: Real,
+    command: Real,
+    limited: Any,
+    x: Real,
+    reference: Real,
+    mode: Integer,
+    arguments: Any,
+) -> None:
+    """Fill output (T, 2), command (T,) and limited (T,) of a loop around hub angle or tip, from rest.
+
+    signals (T, 8): set point, what joins the law's command before its limits, what joins the measurement and
+        the command that acts, hub torque, tip force, noise of hub angle and tip.
+    law (n + 1, n + 2): rows of the state and the output, columns A, B, M and C, D, - of x+ = A x + B e + M
+        (limited - wanted), wanted = C x + D e. limits (2,): of the command and of its change in a sample.
+        steps (2,): of measurement and command, 0 for none.
+    path (4,): limit that the machine clips its input at, then gain, dead zone and saturation of its voltage.
+    sensor (4,): step of the hub's encoder; gain, drift per sample and step of the tip sensor.
+    counts (4,): samples from computing a command to handing it over, column that is measured, samples of the
+        voltage's delay, parts of a sample.
+    rows (2, N): hub angle and tip of the state. x, reference, mode, arguments: as of `run`.
+    """
+    n = law.shape[0] - 1
+    own, later = np.zeros(n), np.zeros(n)
+    delay, column, wait, last = counts[0], counts[1], counts[2], 0.0
+    queue, acting = np.zeros(delay + 1), np.zeros(wait + 2)
+    inputs, states = np.zeros((1, 4)), np.empty((1, x.size))
+    for k in range(signals.shape[0]):
+        hub = _along(rows, 0, x) + signals[k, 6]
+        output[k, 0] = hub if sensor[0] == 0 else sensor[0] * np.rint(hub / sensor[0])
+        tip = sensor[1] * _along(rows, 1, x) + sensor[2] * k + signals[k, 7]
+        output[k, 1] = tip if sensor[3] == 0 else sensor[3] * np.rint(tip / sensor[3])
+        y = output[k, column] + signals[k, 2]
+        if steps[0] > 0:
+            y = steps[0] * np.rint(y / steps[0])
+        output[k, column] = y
+        error = signals[k, 0] - y
+        wanted = law[n, n] * error + signals[k, 1]
+        for i in range(n):
+            wanted += law[n, i] * own[i]
+        u = min(max(wanted, last - limits[1]), last + limits[1])
+        u = min(max(u, -limits[0]), limits[0])
+        for i in range(n):
+            later[i] = law[i, n] * error + law[i, n + 1] * (u - wanted)
+            for j in range(n):
+                later[i] += law[i, j] * own[j]
+        for i in range(n):
+            own[i] = later[i]
+        last, limited[k] = u, u != wanted
+        if steps[1] > 0:
+            u = steps[1] * np.rint(u / steps[1])
+        queue[k % (delay + 1)] = u
+        command[k] = queue[(k + 1) % (delay + 1)]
+        voltage = path[1] * min(max(command[k] + signals[k, 3], -path[0]), path[0])
+        acting[k % (wait + 2)] = np.copysign(min(max(abs(voltage) - path[2], 0.0), path[3]), voltage)
+        inputs[0, 1] = acting[(k - wait) % (wait + 2)]
+        inputs[0, 0] = acting[(k + 1) % (wait + 2)] if counts[3] == 2 else inputs[0, 1]
+        inputs[0, 2], inputs[0, 3] = signals[k, 4], signals[k, 5]
+        run(inputs, states, x, reference, mode, *arguments)

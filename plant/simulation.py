@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from plant.effects import Effect, make_machine
+from plant.kernel import run_in_loop
 from plant.machine import Machine, Real, SensorPath
 from plant.modal import OUTPUT_NAMES
 from plant.plan import SUBSTEP_S, make_plan
@@ -223,6 +224,9 @@ class SampledArm(Simulator):
     """The machine as a controller sees it: measure at t_k, then hold a voltage until t_(k+1).
 
     Same compiled stepper and same numbers as `simulate`. The only object of this package with a state.
+
+    encoder_step_rad: of the measured hub angle, 0 for none. tip_force_N (T,): acts at the tip from rest on,
+    one value for each sample, beside what `advance` is given.
     """
 
     output_names = OUTPUT_NAMES
@@ -236,9 +240,12 @@ class SampledArm(Simulator):
         dt_s: float | None = None,
         n_modes: int | None = None,
         substep_s: float = SUBSTEP_S,
+        encoder_step_rad: float = 0.0,
+        tip_force_N: Real | None = None,
     ) -> None:
         super().__init__(rig, effects, dt_s=dt_s, n_modes=n_modes, substep_s=substep_s)
         self._rng = rng
+        self.encoder_step_rad, self.tip_force_N = encoder_step_rad, tip_force_N
         self._inputs = np.zeros((1, 4))
         self._rows = self.plan.output_rows
         self.reset()
@@ -263,7 +270,8 @@ class SampledArm(Simulator):
             sensors = self.machine.rig.sensors
             time = self._sample * self.dt_s
             reading = _tip_reading(self.machine.sensor, tip, time, sensors.tip_noise_m * tip_noise)
-            self._measurement = np.array([hub + sensors.hub_angle_noise_rad * hub_noise, reading])
+            angle = hub + sensors.hub_angle_noise_rad * hub_noise
+            self._measurement = quantised(np.array([angle, reading]), self.encoder_step_rad)
         return self._measurement.copy()
 
     def advance(self, voltage_V: float, hub_torque_Nm: float = 0.0, tip_force_N: float = 0.0) -> None:
@@ -278,10 +286,62 @@ class SampledArm(Simulator):
         late = self._pending.popleft()
         row = self._inputs[0]
         row[0], row[1] = late if self.plan.parts == 2 else self._pending[0], self._pending[0]
+        if self.tip_force_N is not None and self._sample < self.tip_force_N.size:
+            tip_force_N += float(self.tip_force_N[self._sample])
         row[2], row[3] = hub_torque_Nm, tip_force_N
         self.plan.advance(self._inputs, self._state)
         self._sample += 1
         self._measurement = None
+
+    def in_loop(
+        self,
+        signals: Real,
+        law: Real,
+        limits: Real,
+        steps: Real,
+        delay_samples: int,
+        measured: int,
+        clip: float = np.inf,
+    ) -> tuple[Real, Real, npt.NDArray[np.bool_]]:
+        """Outputs (T, 2), commands (T,) and whether they were limited (T,) of a loop, from rest: what
+        `control_design.analysis.closed_loop.simulate` does, compiled.
+
+        signals (T, 5) and the law's arrays as of `plant.kernel.run_in_loop`; clip: of the machine's input.
+        A subclass that measures or advances otherwise sets `in_loop` to None.
+        """
+        n, voltage, sensor = len(signals), self.machine.voltage, self.machine.sensor
+        force, noise = np.zeros(n), np.zeros((n, 2))
+        if self.tip_force_N is not None:
+            force[: self.tip_force_N.size] = self.tip_force_N[:n]
+        if self._rng is not None:
+            levels = self.machine.rig.sensors
+            noise = self._rng.standard_normal((n, 2)) * (levels.hub_angle_noise_rad, levels.tip_noise_m)
+        output, command, limited = np.empty((n, 2)), np.empty(n), np.empty(n, dtype=np.bool_)
+        run_in_loop(
+            np.column_stack([signals, force, noise]),
+            law,
+            limits,
+            steps,
+            np.array([clip, voltage.gain, voltage.dead_zone_V, voltage.limit_V]),
+            np.array([self.encoder_step_rad, sensor.gain, sensor.drift_m_s * self.dt_s, sensor.step_m]),
+            np.array([delay_samples, measured, self.plan.delay_samples, self.plan.parts]),
+            np.ascontiguousarray(self._rows[[0, 2]]),
+            output,
+            command,
+            limited,
+            *self.plan.at(),
+            self.plan.arguments,
+        )
+        return output, command, limited
+
+
+def quantised(output: Real, encoder_step_rad: float) -> Real:
+    """(..., 2) measured outputs with the hub angle rounded to encoder steps (0 = no encoder)."""
+    if encoder_step_rad == 0:
+        return output
+    result = output.copy()
+    result[..., 0] = encoder_step_rad * np.rint(output[..., 0] / encoder_step_rad)
+    return result
 
 
 def _noise(machine: Machine, rng: np.random.Generator | None, n_samples: int, *, accelerometer: bool) -> Real:

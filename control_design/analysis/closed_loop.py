@@ -18,7 +18,7 @@ from ident.data.arrays import lock
 
 class SampledMachine(Protocol):
     """A machine sampled every dt_s: measure at t_k, then hold the input until t_{k+1}. `plant.SampledArm` is
-    one."""
+    one; it has the whole loop compiled too, as `in_loop`, which `simulate` then calls."""
 
     @property
     def dt_s(self) -> float: ...
@@ -140,6 +140,17 @@ def simulate(
         )
     if not (measurement_step >= 0 and command_step >= 0):
         raise ValueError("measurement_step and command_step must not be negative")
+    time_s = np.asarray(np.arange(n) * controller.dt_s, dtype=np.float64)
+    if (in_loop := getattr(machine, "in_loop", None)) is not None:
+        joins = np.zeros(n)
+        if controller.feedforward is not None:
+            joins = controller.feedforward.signal(wanted, controller.dt_s)
+        delay, steps = controller.computational_delay_samples, np.array([measurement_step, command_step])
+        signals = np.column_stack([wanted, joins, shift, added, torque])
+        y, u, at_limit = in_loop(signals, *law_arrays(controller), steps, delay, measured_index)
+        if not np.all(np.isfinite(u)):
+            raise ValueError("the loop ran away: its command is not finite")
+        return ClosedLoopTrajectory(time_s, wanted, y, u, at_limit, controller.dt_s, measured_index)
     machine.reset()
     stepper = controller.stepper()
     queue = [0.0] * controller.computational_delay_samples
@@ -164,14 +175,19 @@ def simulate(
         else:
             machine.advance(applied + added[k])
     return ClosedLoopTrajectory(
-        np.asarray(np.arange(n) * controller.dt_s, dtype=np.float64),
-        wanted,
-        np.array(output),
-        command,
-        limited,
-        controller.dt_s,
-        measured_index,
+        time_s, wanted, np.array(output), command, limited, controller.dt_s, measured_index
     )
+
+
+def law_arrays(controller: Controller) -> tuple[Real, Real]:
+    """For compiled loops: (n + 1, n + 2), columns A, B, M and C, D, -; limits (2,) of the command and of its
+    change in a sample."""
+    assert controller.anti_windup_gain is not None
+    law = np.zeros((controller.order + 1, controller.order + 2))
+    law[:-1] = np.hstack([controller.A, controller.B, controller.anti_windup_gain])
+    law[-1:, :-1] = np.hstack([controller.C, controller.D])
+    change = controller.limits("rate_limit") * controller.dt_s
+    return law, np.concatenate([controller.limits("input_limit"), change])
 
 
 class JointsMachine(Protocol):

@@ -28,7 +28,7 @@ from workflow.tasks.identification import as_bounded, as_fitted
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.records import make_records, read_record, with_common_sampling_time
 from workflow.tasks.results import IdentifiedPlant, RunRecord, RunResults, UncertaintyResult
-from workflow.tasks.simulated_rig import EncodedArm, rig_of
+from workflow.tasks.simulated_rig import encoded_arm, rig_of
 from workflow.tasks.stage import StageInput
 from workflow.tasks.stages import STAGES, design_filter, find_amplitude_cost
 from workflow.tasks.uncertainty import posterior_of
@@ -241,7 +241,7 @@ def test_encoder_rounds_the_hub_angle_only():
     config, _ = load_config(FAST_ARM)
     step = 0.01
     source = config.source.model_copy(update={"encoder_step_rad": step})
-    arm = EncodedArm(source, [], np.random.default_rng(1))
+    arm = encoded_arm(source, [], np.random.default_rng(1))
     for _ in range(20):
         arm.advance(6.0)
     hub, tip = arm.measure()
@@ -252,8 +252,8 @@ def test_encoder_rounds_the_hub_angle_only():
 
 def test_extra_effect_replaces_one_of_the_same_kind():
     config, _ = load_config(FAST_ARM)
-    free = EncodedArm(config.source, [], np.random.default_rng(1))
-    braked = EncodedArm(
+    free = encoded_arm(config.source, [], np.random.default_rng(1))
+    braked = encoded_arm(
         config.source, [{"name": "viscous_friction", "coefficient_Nms": 5.0}], np.random.default_rng(1)
     )
     for arm in (free, braked):

@@ -231,6 +231,8 @@ class Trial:
 class _WatchedArm(SampledArm):
     """The arm, with the true tip position as a third output."""
 
+    in_loop = None  # type: ignore[assignment]  # it measures two outputs
+
     def measure(self) -> Real:
         return np.append(super().measure(), self.true_output[1])
 

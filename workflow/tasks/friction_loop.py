@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import control
@@ -15,6 +15,7 @@ from scipy.stats import t as student
 from control_design.analysis.closed_loop import (
     ClosedLoopTrajectory,
     MeasuredSensitivity,
+    law_arrays,
     sensitivity_of,
     simulate,
     step_metrics,
@@ -69,8 +70,7 @@ class FrictionLoop:
             np.ascontiguousarray(reference, dtype=np.float64),
             np.zeros(n) if noise is None else self.found.noise_std * noise.standard_normal(n),
             np.zeros(n) if law.feedforward is None else law.feedforward.signal(reference, law.dt_s),
-            self._law,
-            np.array([law.input_limit or np.inf, (law.rate_limit or np.inf) * law.dt_s]),
+            *law_arrays(law),
             np.array([self.measurement_step, self.command_step]),
             law.computational_delay_samples,
             arm.structure.input_delay_samples,
@@ -85,13 +85,6 @@ class FrictionLoop:
         )
         time_s = np.asarray(np.arange(n) * law.dt_s, dtype=np.float64)
         return ClosedLoopTrajectory(time_s, reference, measured[:, None], command, limited, law.dt_s)
-
-    @cached_property
-    def _law(self) -> Real:
-        law = self.controller
-        assert law.anti_windup_gain is not None
-        matrix = np.block([[law.A, law.B, law.anti_windup_gain], [law.C, law.D, np.zeros((1, 1))]])
-        return np.ascontiguousarray(matrix, dtype=np.float64)
 
     def sensitivity(
         self, phases: np.random.Generator, noise: np.random.Generator, **excitation: Any

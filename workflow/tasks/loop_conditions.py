@@ -24,7 +24,7 @@ from plant.simulation import simulate as simulate_arm
 from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
 from workflow.tasks.results import ConditionRun, Real
 from workflow.tasks.sampled_plant import FINITE, ClippedMachine, simulate_draw
-from workflow.tasks.simulated_rig import OUTPUT_NAMES, UNITS, EncodedArm
+from workflow.tasks.simulated_rig import OUTPUT_NAMES, UNITS, encoded_arm
 from workflow.text.templates import said
 
 _SLEW_SHARE = 0.6  # of the voltage limit that the slew is predicted to use
@@ -245,7 +245,7 @@ class ConditionBench:
         predicted = self.predict(reference, law=law, output_disturbance=output_disturbance, clip=clip)
         extra = list((self.effects | {k: dict(v) for k, v in (effects or {}).items()}).values())
         rng = self.rng.spawn(1)[0]
-        arm = EncodedArm(self.source, extra, rng, rig=rig or self.rig, tip_force_N=tip_force_N)
+        arm = encoded_arm(self.source, extra, rng, rig=rig or self.rig, tip_force_N=tip_force_N)
         measurement, command = steps or (self.options.measurement_step, self.options.quantisation)
         achieved = simulate(
             law or self.controller,

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from operator import add
+from typing import Any
 
 import control
 import numpy as np
@@ -110,6 +112,12 @@ class ClippedMachine:
     @property
     def dt_s(self) -> float:
         return self._machine.dt_s
+
+    @property
+    def in_loop(self) -> Callable[..., Any] | None:
+        """The machine's, where it has one (`plant.simulation.SampledArm.in_loop`)."""
+        whole = getattr(self._machine, "in_loop", None)
+        return None if whole is None else partial(whole, clip=self._limit)
 
     def reset(self) -> None:
         self._machine.reset()

@@ -19,7 +19,7 @@ from ident.data.record import Record
 from plant.effects import make_machine, parse_effects
 from plant.modal import default_n_modes, equations_of_motion
 from plant.rig import Rig
-from plant.simulation import SampledArm, simulate
+from plant.simulation import SampledArm, quantised, simulate
 from workflow.config.rig_settings import rig_called
 from workflow.config.run_config import ClosedLoopOptions, RunConfig, SimulatedRecord, SimulatedSource
 from workflow.config.settings import Section, check
@@ -65,7 +65,7 @@ def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) 
             input_limit=source.input_limit,
         )
         reference = source.loop.reference_rad_per_V * voltage
-        ran = simulate_loop(law, EncodedArm(source, (), rng), reference)
+        ran = simulate_loop(law, encoded_arm(source, (), rng), reference)
         voltage, output = ran.command, ran.output
     return Record(
         name=entry.name,
@@ -81,46 +81,26 @@ def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) 
     )
 
 
-def quantised(output: npt.NDArray[np.float64], encoder_step_rad: float) -> npt.NDArray[np.float64]:
-    """(..., 2) measured outputs with the hub angle rounded to encoder steps (0 = no encoder)."""
-    if encoder_step_rad == 0:
-        return output
-    result = output.copy()
-    result[..., 0] = encoder_step_rad * np.rint(output[..., 0] / encoder_step_rad)
-    return result
-
-
-class EncodedArm(SampledArm):
-    """The simulated arm behind its encoder: the measured hub angle comes in encoder steps.
-
-    extra_effects: take the place of those of the source that have their names. tip_force_N (T,): acts at the
-    tip, one value per sample from rest on.
-    """
-
-    def __init__(
-        self,
-        source: SimulatedSource,
-        extra_effects: Sequence[Mapping[str, Any]],
-        rng: np.random.Generator,
-        *,
-        rig: Rig | None = None,
-        tip_force_N: npt.NDArray[np.float64] | None = None,
-    ) -> None:
-        self._step, self._force = source.encoder_step_rad, tip_force_N
-        replaced = {effect["name"] for effect in extra_effects}
-        kept = [effect for effect in source.effects if effect["name"] not in replaced]
-        effects = parse_effects((*kept, *extra_effects))
-        super().__init__(rig or rig_of(source), effects, rng, n_modes=source.modes)
-
-    def reset(self) -> None:
-        super().reset()
-        self._forces = iter(() if self._force is None else self._force.tolist())
-
-    def measure(self) -> npt.NDArray[np.float64]:
-        return quantised(super().measure(), self._step)
-
-    def advance(self, voltage_V: float, hub_torque_Nm: float = 0.0, tip_force_N: float = 0.0) -> None:
-        super().advance(voltage_V, hub_torque_Nm, tip_force_N + next(self._forces, 0.0))
+def encoded_arm(
+    source: SimulatedSource,
+    extra_effects: Sequence[Mapping[str, Any]],
+    rng: np.random.Generator,
+    *,
+    rig: Rig | None = None,
+    tip_force_N: npt.NDArray[np.float64] | None = None,
+) -> SampledArm:
+    """The simulated arm behind its encoder; extra_effects take the place of those of the source that have
+    their names."""
+    replaced = {effect["name"] for effect in extra_effects}
+    kept = [effect for effect in source.effects if effect["name"] not in replaced]
+    return SampledArm(
+        rig or rig_of(source),
+        parse_effects((*kept, *extra_effects)),
+        rng,
+        n_modes=source.modes,
+        encoder_step_rad=source.encoder_step_rad,
+        tip_force_N=tip_force_N,
+    )
 
 
 def converter_steps(options: ClosedLoopOptions) -> dict[str, float]:
@@ -138,7 +118,7 @@ def loop_of_arm(
     further effects, which output is measured, and the steps of the converters."""
     assert isinstance(config.source, SimulatedSource)  # or the configuration had been refused
     return {
-        "machine": ClippedMachine(EncodedArm(config.source, effects, rng, rig=rig), FINITE),
+        "machine": ClippedMachine(encoded_arm(config.source, effects, rng, rig=rig), FINITE),
         "measured_index": OUTPUT_NAMES.index(config.control_channel.output),
         **converter_steps(config.closed_loop),
     }
