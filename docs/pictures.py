@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import tempfile
+import threading
+import time
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 import flexlink
 from diagnosis.diagnosis import diagnose
+from tests.browser import Browser
 from workflow.commands.run import run_from_files
+from workflow.commands.tune import tuning
 from workflow.diagnose.case_files import load_case
 from workflow.figures.gap_records import draw_measured_beside_simulated
 from workflow.figures.style import render
@@ -38,6 +44,22 @@ def response() -> bytes:
     return render(flexlink.bode(flexlink.uncertainty(found))).content
 
 
+def tune() -> bytes:
+    """The page of `flexlink tune --demo` with its first design and the bound, in 64 colours."""
+    with tempfile.TemporaryDirectory() as name, tuning([], None, out=Path(name), seed=2006) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        browser, picture, small = Browser(), Path(name) / "page.png", BytesIO()
+        browser.go(server.url, 1280, 860)
+        while browser.ask("document.querySelectorAll('#numbers dd')[1]?.textContent ?? '–'") == "–":
+            time.sleep(0.5)
+        browser.ask("document.getElementById('state').textContent = ''")  # how long it took here
+        browser.picture(picture, whole=False)
+        browser.close()
+        server.shutdown()
+        Image.open(picture).convert("RGB").quantize(64).save(small, "png", optimize=True)
+    return small.getvalue()
+
+
 if __name__ == "__main__":
-    for draw in (overview, diagnosis, response):
-        (DOCS / f"{draw.__name__}.svg").write_bytes(draw())
+    for draw in (overview, diagnosis, response, tune):
+        (DOCS / f"{draw.__name__}.{'png' if draw is tune else 'svg'}").write_bytes(draw())

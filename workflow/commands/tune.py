@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import secrets
-import tempfile
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -169,19 +168,17 @@ def tuning(
     port: int = 0,
     progress: Progress | None = None,
 ) -> Iterator[TuneServer]:
-    """A server for these plants (none: the built-in arm, identified afresh), not serving yet."""
-    progress = progress or Progress()
-    with tempfile.TemporaryDirectory(prefix="flexlink-") as scratch:
-        if not paths:
-            paths = [Path(scratch) / "default_arm"]
-            config, text = built_in_config()
-            identify_only(config, paths[0], config_text=text, progress=progress)
-        server = TuneServer(TuningSession(paths, file or DesignFile(), out, seed), port)
-        try:
-            yield server
-        finally:
-            server.session.cancel()
-            server.server_close()
+    """A server for these plants (none: the built-in arm, identified into `out`), not serving yet."""
+    if not paths:
+        paths = [out / "default_arm"]
+        config, text = built_in_config()
+        identify_only(config, paths[0], config_text=text, progress=progress)
+    server = TuneServer(TuningSession(paths, file or DesignFile(), out, seed), port)
+    try:
+        yield server
+    finally:
+        server.session.cancel()
+        server.server_close()
 
 
 def serve(server: TuneServer, tell: Callable[[str], None], *, browser: bool) -> None:

@@ -33,6 +33,7 @@ from workflow.engine.errors import InputError
 from workflow.engine.randomness import stage_rng
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.sensitivity import sensitivity_curves
+from workflow.figures.subjects import unit_of
 from workflow.tasks.design import bracket_numbers, find_bracket, find_design
 from workflow.tasks.design_source import level_can_change, load_sources
 from workflow.tasks.results import DesignResult, RunResults
@@ -77,7 +78,7 @@ class TuningSession:
         found = _of_run(self.paths)
         self.specification = _at_one_bandwidth(asked.specification, found)
         self.file = asked
-        self._plants = [source.plant for source in sources]
+        self._plants, self._units = [source.plant for source in sources], sources[0].units
         self.drawable = all(level_can_change(plant) for plant in self._plants)
         self._last = None if found is None else found.controller
         self._newest, self._designing = 0, threading.Lock()
@@ -85,7 +86,7 @@ class TuningSession:
     # -- settings --------------------------------------------------------------------------------------------
 
     def settings(self) -> list[dict[str, Any]]:
-        """What the page has a control for: name, kind, description, value, range."""
+        """What the page has a control for: name, kind, description, unit, value, range."""
         fields = {**Specification.model_json_schema()["properties"]}
         del fields["lowest_bandwidth_rad_s"]
         found = [_control(name, field, getattr(self.specification, name)) for name, field in fields.items()]
@@ -94,7 +95,7 @@ class TuningSession:
             words = "confidence of each ellipse: share of the probability inside"
             about = {"name": CONFIDENCE, "kind": "number", "words": words, "value": self._plants[0].level}
             found.append(about | level)
-        return [one for one in found if one is not None]
+        return [one | {"unit": unit_of(one["name"], *self._units)} for one in found if one is not None]
 
     def _read(self, values: Mapping[str, Any]) -> tuple[Specification, list[UncertainPlant], float | None]:
         stated = dict(values)

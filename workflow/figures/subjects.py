@@ -263,11 +263,6 @@ class RunView:
     def requirements(self) -> list[tuple[str, Any, str, str]]:
         """Name, value, unit and meaning of what the specification asks for."""
         asked = self.specification
-        units = {
-            "effort_limit": ratio_unit(self.input_unit, self.output_unit),
-            "input_limit": self.input_unit,
-            "rate_limit": ratio_unit(self.input_unit, "s"),
-        }
         rows = []
         for name, field in type(asked).model_fields.items():
             value = getattr(asked, name)
@@ -275,7 +270,7 @@ class RunView:
                 continue
             if name == "low_frequency_rejection" and (asked.bandwidth_rad_s is None or asked.integrator):
                 continue
-            unit = units.get(name, next((unit for end, unit in _ENDINGS if name.endswith(end)), ""))
+            unit = unit_of(name, self.input_unit, self.output_unit)
             rows.append((name, value, unit, field.description or ""))
         return rows
 
@@ -341,6 +336,16 @@ class RunView:
 
 _NOT_A_REQUIREMENT = {"structure", "controller_order", "computational_delay_samples"}
 _ENDINGS = (("_rad_s", "rad/s"), ("_s", "s"))
+
+
+def unit_of(key: str, input_unit: str, output_unit: str) -> str:
+    """Of a key of the specification, for a plant whose signals have these units."""
+    units = {
+        "effort_limit": ratio_unit(input_unit, output_unit),
+        "input_limit": input_unit,
+        "rate_limit": ratio_unit(input_unit, "s"),
+    }
+    return units.get(key, next((unit for end, unit in _ENDINGS if key.endswith(end)), ""))
 
 
 def _as_fitted(record: Record, channel: Channel, friction: FrictionFit | None) -> Record:

@@ -43,13 +43,15 @@ from workflow.text.templates import said, words
 @dataclass(frozen=True, eq=False)
 class DesignSource:
     """A plant as read; remarks say what is worth knowing about it; a run brings its own specification and
-    options (`config`), and knows what a certificate is about (`certified_for`)."""
+    options (`config`), and knows what a certificate is about (`certified_for`) and the units of input and
+    output."""
 
     plant: UncertainPlant
     origin: str
     remarks: tuple[str, ...] = ()
     config: RunConfig | None = None
     certified_for: str = ""
+    units: tuple[str, str] = ("", "")
 
 
 def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource]:
@@ -98,7 +100,9 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
         results = RunResults(run)
         about = certified_for(results, config)
         plant = results.uncertainty.plant(config)
-        return DesignSource(plant, "run directory", (f"about {about}",), config, about)
+        channel = config.control_channel
+        units = results.records.unit(channel.input), results.records.unit(channel.output)
+        return DesignSource(plant, "run directory", (f"about {about}",), config, about, units)
     if _ending(path) in READERS and _ending(path) not in DOCUMENTS:
         return _measured(path, design)
     document = read_document(path)

@@ -109,13 +109,19 @@ def run_pipeline(
 def identify_only(
     config: RunConfig, out: Path, *, config_text: str = "", progress: Progress | None = None
 ) -> None:
-    """The stages up to the uncertain plant into `out`, which `flexlink design` reads. Raises as a run."""
+    """The stages up to the uncertain plant into `out`, which `flexlink design` reads; an earlier run there is
+    replaced. Raises as a run."""
     given = StageInput(config, RunResults(RunDirectory(out)), progress or Progress())
     inputs = {str(path): storage.sha256_of_file(path) for path in config.input_files}
     stages = [stage for stage in STAGES if stage.name in ("records", "identify", "uncertainty")]
-    with given.results.run.writing(resume=False, replace=False), threadpool_limits(1):
+    with given.results.run.writing(replace=True), threadpool_limits(1):
         RunDirectory.begin(
-            out, config_text=config_text, config=config.to_document(), seed=config.run.seed, inputs=inputs
+            out,
+            config_text=config_text,
+            config=config.to_document(),
+            seed=config.run.seed,
+            inputs=inputs,
+            replace=True,
         )
         given.progress.plan([(stage.name, stage.expected_s) for stage in stages])
         for stage in stages:

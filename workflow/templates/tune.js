@@ -31,7 +31,7 @@ const STEPS = 200;
 for (const one of SETTINGS) {
   const stated = one.value != null && (one.kind !== "switch" || one.value) && one.kind !== "choice";
   const row = make("div", $(stated || one.name === "controller_order" ? "stated" : "further"), "", {class: "control"});
-  make("label", row, one.name.replace(/_rad_s$/, " [rad/s]").replace(/_s$/, " [s]").replaceAll("_", " ") + (one.unasked ? `, or ${one.unasked}` : ""), {for: "c-" + one.name, title: one.words});
+  make("label", row, one.name.replace(/(_rad)?_s$/, "").replaceAll("_", " ") + (one.unit ? ` [${one.unit}]` : "") + (one.unasked ? `, or ${one.unasked}` : ""), {for: "c-" + one.name, title: one.words});
   const line = make("div", row), id = "c-" + one.name;
   if (one.kind === "switch" || one.kind === "choice") {
     const box = one.kind === "switch" ? make("input", line, "", {type: "checkbox", id}) : make("select", line, "", {id});
