@@ -24,6 +24,8 @@ class Clock(Progress):
         self.begun = clock()
     def finish(self, stage, seconds, *, taken_up):
         spent[stage] = clock() - self.begun
+from workflow.__main__ import collect_seldom
+collect_seldom()
 from workflow.commands.run import run_from_files
 import workflow.report.pages, workflow.tasks.pipeline
 spent["imports"] = clock()

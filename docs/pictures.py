@@ -45,7 +45,7 @@ def response() -> bytes:
 
 
 def tune() -> bytes:
-    """The page of `flexlink tune --demo` with its first design and the bound, in 64 colours."""
+    """The page of `flexlink tune --demo` with its first design and the bound, in 256 colours."""
     with tempfile.TemporaryDirectory() as name, tuning([], None, out=Path(name), seed=2006) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         browser, picture, small = Browser(), Path(name) / "page.png", BytesIO()
@@ -56,7 +56,7 @@ def tune() -> bytes:
         browser.picture(picture, whole=False)
         browser.close()
         server.shutdown()
-        Image.open(picture).convert("RGB").quantize(64).save(small, "png", optimize=True)
+        Image.open(picture).convert("RGB").quantize(256).save(small, "png", optimize=True)
     return small.getvalue()
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import control
 import numpy as np
@@ -29,7 +30,7 @@ from control_design.plants.weights import RationalWeight
 from control_design.specification.requirement import constant_weight
 from ident.basis.functions import basis_state_space
 from ident.basis.poles import Poles
-from ident.data.arrays import factor_matrices
+from ident.data.arrays import factor_matrices, readonly
 
 _BOUNDARY_SAMPLES = 24  # of every ellipse
 _ACCURACY = 1e-7  # of the certified errors, which are rounded up
@@ -61,7 +62,14 @@ class ReferenceFilter(Law):
         reference = np.asarray(reference, dtype=np.float64)
         if reference.ndim != 1:
             raise ValueError(f"reference must be (T,); got {reference.shape}")
-        return np.asarray(control.forced_response(self.to_control(), inputs=reference).outputs)
+        return _filtered(self, reference.tobytes())
+
+
+@lru_cache(maxsize=8)
+def _filtered(law: ReferenceFilter, reference: bytes) -> Real:
+    # Trials of one loop have one reference; stepping through it in Python takes longer than the loop.
+    outputs = control.forced_response(law.to_control(), inputs=np.frombuffer(reference)).outputs
+    return readonly(outputs)
 
 
 def worst_matching_error(k: Complex, follow: Complex, model: Complex, ellipses: Ellipses) -> Real:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -33,6 +34,8 @@ _STEPS, _LENGTHS = 8, (1.0, 0.5, 0.25, 0.1)
 WORTH = 0.5
 # Sizes of the changes that derivatives are taken from, relative to the motion and to the level.
 _CHANGE, _CHANGE_OF_LEVEL, _CHANGE_OF_LOG, _CHANGE_BEYOND = 1e-3, 2e-3, 0.02, 0.05
+# Samples of a record up to which its derivatives are kept for the next who asks: 32 of them take 130 MB.
+_LONGEST_KEPT = 20_000
 
 
 class LostError(ValueError):
@@ -168,6 +171,18 @@ def law_of(parameters: RealArray) -> FrictionLaw:
 
 def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray) -> Linearised:
     """Central differences of the simulation with input u (T,): the friction follows every change."""
+    if u.size > _LONGEST_KEPT:
+        return _linearised(arm, coefficients, law, u)
+    return _kept(arm, coefficients.tobytes(), law, u.tobytes())
+
+
+@lru_cache(maxsize=32)
+def _kept(arm: SteppedArm, coefficients: bytes, law: FrictionLaw, u: bytes) -> Linearised:
+    # Where one descent ends the next begins, and so does what is said of the friction-free arm.
+    return _linearised(arm, np.frombuffer(coefficients), law, np.frombuffer(u))
+
+
+def _linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray) -> Linearised:
     position, friction = arm.run(coefficients, u, law)
     structure = arm.structure
     effort = filter_input(u, 0, structure.input_delay_samples) - friction
