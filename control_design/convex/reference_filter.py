@@ -69,7 +69,7 @@ class ReferenceFilter(Law):
 def _filtered(law: ReferenceFilter, reference: bytes) -> Real:
     # Trials of one loop have one reference; stepping through it in Python takes longer than the loop.
     outputs = control.forced_response(law.to_control(), inputs=np.frombuffer(reference)).outputs
-    return readonly(outputs)
+    return np.asarray(readonly(outputs))
 
 
 def worst_matching_error(k: Complex, follow: Complex, model: Complex, ellipses: Ellipses) -> Real:
