@@ -6,6 +6,7 @@ BIN := $(VENV)/bin
 PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
 OUT ?= runs/default
+VERSION := $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
 
 # One thread per process: the linear algebra here is small, and two processes with two threads each fight over two cores.
 export OMP_NUM_THREADS := 1
@@ -67,7 +68,7 @@ wheel:
 dist: $(PACKAGES)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check build
 	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(BIN)/python -m build --wheel --outdir build/dist .
-	git archive --format=tar.gz --prefix=flexlink/ --output=build/dist/flexlink-source.tar.gz HEAD
+	git archive --format=tar.gz --prefix=flexlink-$(VERSION)/ --output=build/dist/flexlink-$(VERSION).tar.gz HEAD
 
 check: test-all lint types wheel
 
