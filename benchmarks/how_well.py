@@ -136,7 +136,8 @@ SECTIONS = {
     ),
     "Diagnosis": (
         Row(
-            "1000 machines on two workers of a cluster, one killed: files that differ from a local run; memory",
+            "1000 machines on two workers of a cluster, one killed: files that differ from a local run; "
+            "memory",
             "fleet",
             r"^far: exit 0, 1000 cases, \d+ s, parent (\d+) MB\n(\d+) files, (\d+) differ",
             "{2} of {1}; {0} MB in the command that waits",
