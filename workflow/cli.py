@@ -164,6 +164,13 @@ Fmu = Annotated[
     typer.Option(help="FMU (FMI 2.0, co-simulation), in place of a case; runs its native code."),
 ]
 Python = Annotated[str | None, typer.Option(help="Python file with a simulation, in place of a case.")]
+Motion = Annotated[
+    str | None,
+    typer.Option(
+        help="Of an FMU or Python file: the first output is the position or speed of the body that the "
+        "first input drives. [default: by its unit]"
+    ),
+]
 MachineLog = Annotated[
     list[str] | None,
     typer.Option(help="Log of that machine; of several the last one judges, of one its last third."),
@@ -669,7 +676,7 @@ def study(
     _leave(summary)
 
 
-@app.command(short_help="What logs can tell of a simulator's model, in seconds.")
+@app.command(cls=_OfSettings, short_help="What logs can tell of a simulator's model, in seconds.")
 def check(
     case: Annotated[
         Path | None, typer.Argument(help="TOML file that names a simulator's model and its logs.")
@@ -677,6 +684,7 @@ def check(
     mjcf: Mjcf = None,
     fmu: Fmu = None,
     python: Python = None,
+    motion: Motion = None,
     log: MachineLog = None,
     dt_s: MachineDt = None,
     repair: Annotated[bool, typer.Option("--repair", help=_LOGS)] = False,
@@ -685,7 +693,7 @@ def check(
     as_json: Json = False,
 ) -> None:
     """Quality of logs, smallest sizes that show, candidates that act alike, what a next record needs."""
-    of_logs = {"dt_s": dt_s, "repair": repair or None, "resample_s": resample_s}
+    of_logs = {"motion": motion, "dt_s": dt_s, "repair": repair or None, "resample_s": resample_s}
     stated = _of_simulator("check", [case] if case else [], mjcf, fmu, python, log, of_logs)
     need(case)
     from workflow.diagnose.check import check as look_at_case
@@ -694,7 +702,7 @@ def check(
     _show(look_at_case(case or settings_of(stated, "--log")), as_json)
 
 
-@app.command(short_help="Why machine and model differ: cause, size, closure.")
+@app.command(cls=_OfSettings, short_help="Why machine and model differ: cause, size, closure.")
 def diagnose(
     out: Annotated[Path, typer.Option(help="Directory for answers, pages and repaired rigs; new or empty.")],
     case: Annotated[
@@ -708,13 +716,7 @@ def diagnose(
     mjcf: Mjcf = None,
     fmu: Fmu = None,
     python: Python = None,
-    motion: Annotated[
-        str | None,
-        typer.Option(
-            help="Of an FMU or Python file: the first output is the position or speed of the body that the "
-            "first input drives. [default: by its unit]"
-        ),
-    ] = None,
+    motion: Motion = None,
     log: MachineLog = None,
     dt_s: MachineDt = None,
     repair: Annotated[bool, typer.Option("--repair", help=_LOGS)] = False,
@@ -748,8 +750,6 @@ def diagnose(
     case = case or []
     of_logs = {"motion": motion, "dt_s": dt_s, "repair": repair or None, "resample_s": resample_s}
     stated = _of_simulator("diagnose", case, mjcf, fmu, python, log, of_logs)
-    if motion and mjcf:
-        raise InputError("diagnose: --motion is of --fmu or --python; in a case file: motion = ...")
     _one_of(jobs, scheduler)
     if case and not any(place.exists() for place in case):
         need(*case)
@@ -803,6 +803,8 @@ def _of_simulator(
     if of_logs and not model:
         option = f"--{next(iter(of_logs)).replace('_', '-')}"
         raise InputError(f"{command}: {option} is of --mjcf, --fmu or --python; a case file says it itself")
+    if mjcf and "motion" in of_logs:
+        raise InputError(f"{command}: --motion is of --fmu or --python")
     need(*map(Path, (*model.values(), *(log or []))))
     return {**model, "log": log, **of_logs} if model else {}
 

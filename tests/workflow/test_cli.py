@@ -11,15 +11,17 @@ import sys
 import time
 from inspect import signature
 
+import click
 import numpy as np
 import pytest
 import scipy.io
+from typer.main import get_command
 
 from ident.basis.options import IdentOptions
 from plant.experiment_plan import ExperimentPlan
 from tests.workflow.command import FAST_ARM, ROOT, start_flexlink
 from workflow import cli
-from workflow.cli import main
+from workflow.cli import app, main
 from workflow.config.run_config import FileSource
 from workflow.config.uncertainty_options import FitOptions, UncertaintyOptions
 from workflow.engine import interrupts
@@ -404,6 +406,8 @@ def test_help_keeps_what_stands_in_brackets(flexlink, command, words):
         ("identify", IdentOptions, "--feedthrough", "feedthrough", "."),
         ("look", FileSource, "--decimal", "decimal", "[point, comma]"),
         ("excite", ExperimentPlan, "--periods", "periods", "[at least 1; at most 1000; default: 2]"),
+        ("check", FileSource, "--resample-s", "resample_s", "[above 0]"),
+        ("diagnose", FileSource, "--resample-s", "resample_s", "[above 0]"),
     ],
 )
 def test_an_option_says_what_the_field_it_sets_says(flexlink, command, settings, option, key, more):
@@ -411,6 +415,12 @@ def test_an_option_says_what_the_field_it_sets_says(flexlink, command, settings,
     said = settings.model_fields[key].description
     said = re.escape(said[:1].upper() + said[1:])
     assert re.search(rf"{option} (<\w+> )?{said} ?{re.escape(more)} --", shown), shown
+
+
+@pytest.mark.parametrize("command", sorted(get_command(app).commands))
+def test_no_option_has_a_path_of_python_as_its_help(command):
+    command = get_command(app).commands[command]
+    assert not re.search(r"[a-z_]+:[A-Z]", command.get_help(click.Context(command)))
 
 
 @pytest.mark.parametrize("command", [[], ["run"], ["identify"], ["diagnose"], ["report"], ["blind"]])
@@ -438,7 +448,7 @@ def test_a_shell_completes_commands_and_options(shell, typed, offered):
         "COMP_CWORD": str(typed.count(" ")),
         "_TYPER_COMPLETE_FISH_ACTION": "get-args",
     }
-    code = "import sys; sys.argv[0] = 'flexlink'; from workflow.cli import main; sys.exit(main())"
+    code = "import sys; sys.argv[0] = 'flexlink'; from workflow.cli import app, main; sys.exit(main())"
     done = subprocess.run(
         [sys.executable, "-c", code],
         env=os.environ | env,
@@ -451,7 +461,7 @@ def test_a_shell_completes_commands_and_options(shell, typed, offered):
 
 
 def test_completion_is_installed_for_the_shell_that_runs(tmp_path):
-    code = "import sys; sys.argv[0] = 'flexlink'; from workflow.cli import main; sys.exit(main())"
+    code = "import sys; sys.argv[0] = 'flexlink'; from workflow.cli import app, main; sys.exit(main())"
     home = {"HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
     done = subprocess.run(
         [sys.executable, "-c", code, "--install-completion", "bash"],
@@ -537,7 +547,7 @@ def test_what_is_refused_is_refused_before_anything_slow_is_loaded(tmp_path, com
     slow = {"control", "matplotlib", "casadi", "nlopt"} | (
         {"numba", "scipy.signal"} if without_arm else set()
     )
-    code = "import sys\nfrom workflow.cli import main\n"
+    code = "import sys\nfrom workflow.cli import app, main\n"
     code += f"print(main({command.split()!r}), *({slow!r} & sys.modules.keys()))"
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
