@@ -14,6 +14,7 @@ What MJCF does not know stands in it as <numeric name="SENSOR.gain">, "SENSOR.of
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -84,8 +85,19 @@ class MujocoArm(MujocoModel):
             fastest = max(fastest, 0.5 * speed / travel, _HELD * float(falls))
         return fastest
 
-    def repaired(self, plant: Plant, repaired: Plant, effects: Sequence[Change]) -> str:
-        """MJCF of the model with the values of a repaired plant (`Diagnosis.rig`) and effects (`repair`)."""
+    def repaired(
+        self,
+        plant: Plant,
+        repaired: Plant,
+        effects: Sequence[Change],
+        records: Sequence[PlantExperiment] = (),
+        folder: Path | None = None,
+    ) -> str:
+        """MJCF of the model with the values of a repaired plant (`Diagnosis.rig`) and effects (`repair`).
+
+        records : to replay, each with a keyframe "start of NAME". folder : where it will be written, from
+        which it finds its meshes and textures; None: by their absolute paths.
+        """
         values: dict[str, Any] = dict(repaired.parameters)
         for change in effects:
             size, name = tuple(change.values.values()), change.id.removeprefix("wrong_")
@@ -104,17 +116,31 @@ class MujocoArm(MujocoModel):
                     at = model.joint(joint.name).qposadr[0]
                     whole[at : at + size] = pose[first : first + size]
                 key.qpos = whole
-        # Wherever it is written, it finds its meshes where they are.
-        if spec.modelfiledir:
-            spec.meshdir, spec.texturedir = (
-                str(Path(spec.modelfiledir, one).resolve()) for one in (spec.meshdir, spec.texturedir)
-            )
         names = [one.name for one in spec.numerics if not one.name.startswith("tolerance.")]
         if beyond := [name for name in names if name.endswith(_BEYOND)]:
             note = spec.text("flexlink") or spec.add_text(name="flexlink")
             note.data = f"MuJoCo does not act on {', '.join(beyond)}"
+        for e in records:
+            data = plant.simulation.began(model, e.input)
+            spec.add_key(name=f"start of {e.name}", qpos=data.qpos, qvel=data.qvel, act=data.act)
         spec.compile()
-        return str(spec.to_xml())
+        meshes, textures = ([*spec.meshes, *spec.hfields, *spec.skins], spec.textures)
+        for key, assets in (("meshdir", meshes), ("texturedir", textures)):
+            there = Path(spec.modelfiledir, getattr(spec, key)).resolve()
+            try:
+                at = os.path.relpath(there, folder.resolve()) if folder else str(there)
+            except ValueError:  # on another drive
+                at = str(there)
+            read = any(one.file or any(getattr(one, "cubefiles", ())) for one in assets)
+            if spec.modelfiledir or not read:
+                setattr(spec, key, Path(at).as_posix() if read else "")
+        # "--" ends a comment of XML.
+        said = []
+        for name, size in changed.items():
+            now = ", ".join(f"{value:.6g}" for value in np.ravel(size))
+            said.append(f"  {name}: {plant.parameters.get(name, 0.0):.6g} to {now}")
+        listed = "\n".join(said or ["  nothing"]).replace("--", "- -")
+        return f"<!-- Changed by flexlink diagnose:\n{listed}\n-->\n{spec.to_xml()}"
 
     def plant(
         self,

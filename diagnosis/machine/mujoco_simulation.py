@@ -50,7 +50,8 @@ _MET = {
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """parameters, effects, inputs (T, U + Y) -> outputs (T, Y). settles : they are meant for `settled`."""
+    """parameters, effects, inputs (T, U + Y) -> outputs (T, Y). settles : they are meant for `settled`;
+    else every record starts as its first samples say."""
 
     arm: MujocoModel
     quantities: Mapping[str, Quantity]
@@ -74,7 +75,7 @@ class Simulation:
         values |= {name: tuple(size.values()) for name, size in effects.items()}
         changed = {k: v for k, v in values.items() if v != self.quantities[k].value}
         model, start = self._model(changed), self._start(inputs)
-        found = self._run(model, inputs, start.state)
+        found = self._run(model, inputs, start.state if self.settles else start.guess)
         measured = inputs[:, len(self.arm.inputs) :]
         if not (self.settles and np.all(np.isfinite(found))):
             return found
@@ -170,20 +171,14 @@ class Simulation:
         commands, before = (u - np.clip(u, -dead, dead) for u in (inputs[:, :U], before))
         control = np.zeros((T * steps, model.nu))
         control[:, :U] = np.repeat(commands, steps, axis=0)
-        mujoco.mj_resetData(model, data)
-        gain = np.array([_number(model, f"{name}.gain", 1.0)[0] for name in arm.outputs])
-        offset = np.array([_number(model, f"{name}.offset", 0.0)[0] for name in arm.outputs])
+        self._put(model, data, start, before)
+        gain, offset = self._readings(model)
         omega = arm.tracking_rad_s
-        for j, (k, joint, inertia) in enumerate(arm.tracked):
+        for j, (k, _, inertia) in enumerate(arm.tracked if omega else ()):
             late = float(model.sensor_delay[model.sensor(arm.outputs[k]).id])
             path, speed = self._path(inputs[:, U + k], h, late, model.opt.integrator)
-            data.joint(joint).qpos[0] = (start[j] - offset[k]) / gain[k]
-            data.joint(joint).qvel[0] = start[len(arm.tracked) + j] / gain[k]
-            if omega:
-                target = omega**2 * (path - offset[k]) + 2 * omega * speed
-                control[:, U + j] = inertia / gain[k] * target
-        start_filters(model, data, before)
-        data.act[model.actuator_actadr[list(arm.filtered)]] = start[2 * len(arm.tracked) :]
+            target = omega**2 * (path - offset[k]) + 2 * omega * speed
+            control[:, U + j] = inertia / gain[k] * target
         for u in range(U):
             n = model.actuator_history[u, 0]
             if n:
@@ -198,6 +193,30 @@ class Simulation:
         _wind(model, data, control[0])
         columns = [model.sensor(name).adr[0] for name in arm.outputs]
         return np.asarray(_sensed(model, data, control)[::steps, columns] * gain + offset)
+
+    def _put(self, model: Any, data: Any, start: Real, before: Real) -> None:
+        """A start (S,), see `_Start`, and the commands (U,) before it."""
+        mujoco.mj_resetData(model, data)
+        (gain, offset), arm = self._readings(model), self.arm
+        for j, (k, joint, _) in enumerate(arm.tracked):
+            data.joint(joint).qpos[0] = (start[j] - offset[k]) / gain[k]
+            data.joint(joint).qvel[0] = start[len(arm.tracked) + j] / gain[k]
+        start_filters(model, data, before)
+        data.act[model.actuator_actadr[list(arm.filtered)]] = start[2 * len(arm.tracked) :]
+
+    def began(self, model: Any, inputs: Real) -> Any:
+        """MjData of a compiled model as a record begins: joints as its first samples say."""
+        data = mujoco.MjData(model)
+        self._put(model, data, self._start(inputs).guess, inputs[0, : len(self.arm.inputs)])
+        return data
+
+    def _readings(self, model: Any) -> tuple[Real, Real]:
+        """Gain and offset of every sensor (Y,)."""
+        of = {
+            key: np.array([_number(model, f"{name}.{key}", usual)[0] for name in self.arm.outputs])
+            for key, usual in (("gain", 1.0), ("offset", 0.0))
+        }
+        return of["gain"], of["offset"]
 
     def _path(self, y: Real, step_s: float, late_s: float, integrator: int) -> tuple[Real, Real]:
         """What was measured, and its slope, as the tracking meets them in every step (`_MET`), read `late_s`

@@ -320,19 +320,20 @@ def test_the_repaired_file_does_in_mujoco_what_the_diagnosis_simulated():
         Change("hinge.sensor_offset", {"offset": 0.1}),
     )
     repaired = plant.scaled({"hinge.damping": 1.5})
-    text = arm.repaired(plant, repaired, changes)
-    known = [c for c in changes if c.id != "hinge.sensor_offset"]
-    expected = as_begun(repaired).simulated(known)(inputs)[:, 0]
+    record = PlantExperiment("one", "held_out", inputs, turned(torque)[:, None])
+    text = arm.repaired(plant, repaired, changes, (record,))
+    assert "  hinge.damping: 0.2 to 0.3\n" in text
+    expected = as_begun(repaired).simulated(changes)(inputs)[:, 0]
     # MuJoCo alone, from the text alone; commands were as in the first row before it.
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
-    data.act[:] = torque[0]
-    data.joint("hinge").qpos[0], data.joint("hinge").qvel[0] = plant.simulation._start(inputs).state
+    mujoco.mj_resetDataKeyframe(model, data, model.key("start of one").id)
+    assert data.act[0] == torque[0]
     n = model.actuator_history[0, 0]
     mujoco.mj_initCtrlHistory(model, data, 0, None, np.full((n, 1), torque[0]))
     found = []
     for u in torque:
-        found.append(data.joint("hinge").qpos[0])
+        found.append(data.joint("hinge").qpos[0] + 0.1)
         data.ctrl[0] = u
         mujoco.mj_step(model, data, 10)
     assert np.std(expected) > 0.03
@@ -661,7 +662,11 @@ def test_the_repaired_file_loads_where_it_is_written(tmp_path, compiler, include
     arm = MujocoArm.from_file(str(model), outputs=("hinge",), dt_s=DT_S)
     plant, _ = plant_of(arm, steps(), turned(steps()) + 0.5)
     repaired = plant.scaled({"rod.mass": 1.2})
-    text = arm.repaired(plant, repaired, (Change("hinge.backlash", {"gap_rad": 0.02}),))
+    text = arm.repaired(
+        plant, repaired, (Change("hinge.backlash", {"gap_rad": 0.02}),), folder=tmp_path / "out"
+    )
+    assert str(tmp_path) not in text
+    assert ("texturedir" in text) == ("texturedir" in compiler)
     (tmp_path / "out" / "arm.xml").write_text(text)
     given = mujoco.MjModel.from_xml_path(str(model))
     again = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "arm.xml"))

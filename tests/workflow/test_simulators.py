@@ -44,21 +44,30 @@ def write_log(path: Path, seed: int, friction: float) -> None:
     np.savetxt(path, rows, delimiter=",", header="time_s,motor,hinge", comments="")
 
 
-def test_a_mujoco_model_is_diagnosed_and_comes_back_repaired(tmp_path, flexlink):
+def test_a_mujoco_model_is_diagnosed_and_comes_back_repaired(tmp_path, flexlink, monkeypatch):
     mujoco = pytest.importorskip("mujoco")
     (tmp_path / "arm.xml").write_text(HINGE)
-    write_log(tmp_path / "one.csv", 0, 0.12)
-    write_log(tmp_path / "two.csv", 1, 0.12)
-    (tmp_path / "arm.toml").write_text('mjcf = "arm.xml"\nlog = ["one.csv", "two.csv"]\n')
-    out = tmp_path / "out"
+    write_log(tmp_path / "first.csv", 0, 0.12)
+    write_log(tmp_path / "second.csv", 1, 0.12)
+    (tmp_path / "arm.toml").write_text('mjcf = "arm.xml"\nlog = ["first.csv", "second.csv"]\n')
+    out = tmp_path / "found"
     answer = flexlink("diagnose", str(tmp_path / "arm.toml"), "--out", str(out), "--json", "--jobs", "1")
     (case,) = answer.document()["cases"]
     assert case["combination"] == ["hinge.frictionloss"]
     repaired = mujoco.MjModel.from_xml_path(str(out / "arm.xml"))
     assert repaired.joint("hinge").frictionloss[0] == pytest.approx(0.12, rel=0.1)
+    assert "  hinge.frictionloss: 0 to 0.1" in (out / "arm.xml").read_text()
     page = (out / "arm.html").read_text()
     assert "hinge.frictionloss" in page
+    assert 'href="arm.xml"' in page
     assert page.count("<animate ") == 3  # measured, stated, repaired
+    # The guide's replay, by MuJoCo alone, gives the number of the answer.
+    (replay,) = [text for text in snippets("python") if "genfromtxt" in text]
+    monkeypatch.chdir(tmp_path)
+    printed: list[float] = []
+    exec(replay, {"print": printed.append})
+    # MJCF has six digits.
+    assert printed == pytest.approx([case["replayed"]["hinge"]["repaired"]], rel=1e-3)
 
 
 PENDULUM = """<mujoco><option timestep="0.002" integrator="{integrator}"/><worldbody><body name="arm">
@@ -379,7 +388,7 @@ def test_a_folder_of_a_stranger_runs_nothing(tmp_path, refused):
 
 
 def test_a_python_file_becomes_a_case(tmp_path):
-    (source,) = snippets("python")
+    source = snippets("python")[-1]
     (tmp_path / "motor.py").write_text(source)
     voltage = np.random.default_rng(0).uniform(-1, 1, 20).repeat(15)
     speed, rows = 0.0, []

@@ -115,7 +115,9 @@ def diagnose_cases(
     code = code_digest("diagnosis", drawing=True)
     limits: dict[str, Any] = {} if time_limit_s is None else {"time_limit_s": time_limit_s}
     options, engine = {"controller": controller, **limits}, partial(engine or diagnose, **limits)
-    work, unreadable = _load(places, lambda place: PlacedCase(place, rig, Path.cwd(), options, code, engine))
+    work, unreadable = _load(
+        places, lambda place: PlacedCase(place, rig, Path.cwd(), options, code, engine, out.resolve())
+    )
     width = max(1, min(jobs or os.cpu_count() or 1, len(work)))
     preload = ["diagnosis.diagnosis", "workflow.diagnose.command"]
     with (
@@ -178,6 +180,7 @@ class PlacedCase:
     options: Mapping[str, Any]
     code_sha256: str
     diagnose: Callable[..., Diagnosis]
+    out: Path
     name: str = ""
     input_sha256: str = ""
 
@@ -205,7 +208,7 @@ class PlacedCase:
         loaded = _loaded(place, self.rig, self.folder)
         if loaded.input_sha256 != self.input_sha256:
             raise StageError(f"case {self.name}: its files changed meanwhile; run the command again")
-        return Work(loaded, self.made_from, self.diagnose).run(report)
+        return Work(loaded, self.made_from, self.diagnose, self.out).run(report)
 
 
 def _load(
@@ -304,6 +307,7 @@ def _summary(
             groups=groups(machines) if several else (),
             trends=trends(machines) if several else (),
             failures=failures,
+            folder=page.parent,
         ),
         verdict=short_answer(documents[0])
         if count == 1 and not failures

@@ -74,6 +74,7 @@ def document_of(
         "unlisted": [effect.to_dict() for effect in found.unlisted],
         "replayed": found.replayed,
         "units": found.case.units,
+        "validation": [e.name for e in found.case.held_out],
         "gap_closed": found.gap_closed,
         "gap_closed_interval": found.gap_closed_interval,
         "gap_by_experiment": found.gap_by_experiment,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import tomlkit
@@ -35,11 +36,13 @@ _DIAGNOSED, _WHERE, _NEXT, _CONTROLLER = 0.75, 0.8, 0.85, 0.9
 @dataclass(frozen=True, eq=False)
 class Work:
     """One case to do. made_from: what the answer depends on (equal entries, equal answer); of its `options`
-    `controller` says whether the controllers are compared. diagnose: `diagnosis.diagnose` with the others."""
+    `controller` says whether the controllers are compared. diagnose: `diagnosis.diagnose` with the others.
+    out: folder of the files."""
 
     loaded: LoadedCase | SimulatorCase
     made_from: Mapping[str, Any]
     diagnose: Callable[..., Diagnosis]
+    out: Path = Path()
 
     def run(self, report: Report) -> tuple[dict[str, bytes], float]:
         """File name -> content, and the CPU time of the process so far [s].
@@ -90,9 +93,10 @@ class Work:
             found = self.diagnose(loaded.case, progress=lambda f, m: report(_CONTROLLER * f, m))
             coming = following(found)
             told = of_case(loaded.case, telling(loaded.case, time.monotonic() + _TOLD_S))
-            files = {f"{name}.html": plant_page(found, coming, told).encode()}
+            files = {}
             if loaded.repaired is not None:
-                files[f"{name}.xml"] = loaded.repaired(found).encode()
+                files[f"{name}.xml"] = loaded.repaired(found, self.out).encode()
+            files[f"{name}.html"] = plant_page(found, coming, told, *files).encode()
         beside = {
             "completeness": completeness_of(found, remains_of(found)),
             "next_experiment": {"advice": coming.advice, **codec.plain(coming.repeat or {})},

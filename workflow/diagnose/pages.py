@@ -55,9 +55,11 @@ def case_page(page: CasePage, progress: Callable[[float, str], None] | None = No
     return _rendered("diagnosis/case.html.j2", page.found, progress, page=page, versions=versions)
 
 
-def plant_page(found: Diagnosis, coming: Following, told: RunSummary | None = None) -> str:
+def plant_page(
+    found: Diagnosis, coming: Following, told: RunSummary | None = None, repaired: str = ""
+) -> str:
     """One self-contained HTML page about a `PlantCase`; equal content gives equal bytes. told: what its
-    records can tell (`workflow.diagnose.check`).
+    records can tell (`workflow.diagnose.check`). repaired: file of the repaired model beside the page.
 
     Raises ValueError if the plant does not state its sampling period.
     """
@@ -74,6 +76,7 @@ def plant_page(found: Diagnosis, coming: Following, told: RunSummary | None = No
         "remains": remains_of(found),
         "next_experiment": coming,
         "told": told,
+        "repaired": repaired,
         "moving": moving_figures(found),
         "numbers": json.dumps(numbers, indent=1),
     }

@@ -102,13 +102,13 @@ class SimulatorSettings(Section):
 
 @dataclass(frozen=True, eq=False)
 class SimulatorCase:
-    """See `workflow.diagnose.case_files.LoadedCase`. repaired: diagnosis -> MJCF, None of other
-    simulators."""
+    """See `workflow.diagnose.case_files.LoadedCase`. repaired: diagnosis, folder -> MJCF to write there, None
+    of other simulators."""
 
     case: PlantCase
     rig_file: str
     input_sha256: str
-    repaired: Callable[[Diagnosis], str] | None
+    repaired: Callable[[Diagnosis, Path], str] | None
     descriptions: Mapping[str, str] = field(default_factory=dict)
     suspected: tuple[str, ...] = ()
 
@@ -202,7 +202,7 @@ def _chosen(plant: Plant, settings: SimulatorSettings) -> Plant:
 
 # A simulator is opened in two steps: it names the inputs and outputs that the logs are read for, and makes
 # its plant (and what writes a repaired model) of what was read.
-_Finish = Callable[[Sequence[PlantExperiment], Real], tuple[Plant, Callable[[Diagnosis], str] | None]]
+_Finish = Callable[[Sequence[PlantExperiment], Real], tuple[Plant, Callable[[Diagnosis, Path], str] | None]]
 _Simulator = Callable[
     [Path, Sequence[Table], SimulatorSettings, float], tuple[tuple[str, ...], tuple[str, ...], _Finish]
 ]
@@ -285,7 +285,11 @@ def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_
         plant = replace(arm, tracking_rad_s=tracking).plant(
             experiments, noise, model_error=settings.model_error, named=named
         )
-        return plant, lambda found: arm.repaired(plant, found.rig, found.repair)
+
+        def repaired(found: Diagnosis, folder: Path) -> str:
+            return arm.repaired(plant, found.rig, found.repair, found.case.held_out, folder)
+
+        return plant, repaired
 
     return commands, labels, finish
 
