@@ -3,5 +3,9 @@ from .diagnosis import diagnose as diagnose
 from .fit.residual import ResidualModel as ResidualModel, pooled_rms as pooled_rms
 from .machine.case import Case as Case, Experiment as Experiment
 from .machine.own_plant import Plant as Plant, PlantCase as PlantCase, PlantExperiment as PlantExperiment
-from .machine.plant_effect import EffectParameter as EffectParameter, PlantEffect as PlantEffect
+from .machine.plant_effect import (
+    Change as Change,
+    EffectParameter as EffectParameter,
+    PlantEffect as PlantEffect,
+)
 from .machine.with_effects import with_effects as with_effects

@@ -226,6 +226,21 @@ class Diagnosis:
         return {e.name: e.untried for e in self.effects if e.untried}
 
     @property
+    def nothing_tried(self) -> bool:
+        """Whether a time limit left no candidate tried."""
+        return self.verdict == "unknown" and 0 < len(self.untried) == len(self.effects) - 2
+
+    @property
+    def beside(self) -> tuple[str, ...]:
+        """Effects of the repaired model with the answer that carry less than the threshold."""
+        return self.shares.small if self.shares and self.combination else ()
+
+    @property
+    def instead(self) -> tuple[str, ...]:
+        """Answers that the records cannot rule out in place of the first."""
+        return tuple(name for name in self.ambiguous_with if name not in self.beside)
+
+    @property
     def runner_up(self) -> str:
         """The likeliest answer beside the accepted ones."""
         others = [name for name in self.probabilities if name not in self.combination]

@@ -169,7 +169,7 @@ class Quantities:
             yield Quantity(f"{body.name}.payload", 0.0, put, "mass_kg", mass, (1e-3, 10.0), group="link")
         if not body.mass > 0:
             return
-        yield Quantity(f"{body.name}.mass", float(body.mass), partial(put_mass, body.name))
+        yield Quantity(f"{body.name}.mass", float(body.mass), partial(put_mass, body.name), "mass_kg")
         # Of a link on one hinge in the world, inertia is what armature is.
         if model.body_weldid[model.body_parentid[model.body_weldid[k]]]:
             yield Quantity(f"{body.name}.inertia", 1.0, partial(put_inertia, body.name))

@@ -12,6 +12,7 @@ import pytest
 
 from diagnosis import PlantExperiment
 from tests.workflow.command import ROOT
+from workflow.diagnose import check
 from workflow.diagnose.simulator_case import load_simulator_case, settings_of
 from workflow.engine.errors import InputError
 
@@ -430,6 +431,56 @@ def test_the_logs_of_the_example_are_what_its_script_records(tmp_path):
         np.testing.assert_allclose(again, kept, rtol=0, atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("command", "cut"),
+    [
+        (np.random.default_rng(0).uniform(-1, 1, 60).repeat(25), False),
+        (np.random.default_rng(0).uniform(-1, 1, 60).repeat(25).clip(-0.8, 0.8), True),
+        (np.sin(np.arange(1500) / 40), False),
+        (np.sin(np.arange(1500) / 40).clip(-0.9, 0.7), True),
+        (np.where(np.random.default_rng(0).random(1500) > 0.5, 1.0, -1.0), False),
+    ],
+    ids=["levels", "levels cut off", "sine", "sine cut off", "two levels"],
+)
+def test_a_command_is_cut_off_where_it_stays_at_its_ends(command, cut):
+    assert bool(check._at_ends(command)) == cut
+
+
+@pytest.mark.parametrize(
+    ("names", "motion", "units"),
+    [
+        (
+            ("force_N", "place_m"),
+            "position",
+            {"coulomb_friction": "force_N", "viscous_friction": "coefficient_Ns_m", "backlash": "gap_m"}
+            | {"hardening_spring": "cubic_N_m3", "input_drift": "rate_N_s", "input_delay": ""},
+        ),
+        (
+            ("drive_V", "speed_rad_s"),
+            "speed",
+            {"spring": "stiffness_V_rad", "output_drift": "rate_rad_s2", "output_offset": "offset_rad_s"},
+        ),
+        (("u", "y"), "speed", {"coulomb_friction": "", "output_offset": ""}),
+    ],
+    ids=["position", "speed", "no units"],
+)
+def test_sizes_have_the_units_of_inputs_and_outputs(tmp_path, names, motion, units):
+    integrated = "np.cumsum(speed) * 0.01" if motion == "position" else "speed"
+    (tmp_path / "m.py").write_text(
+        "import numpy as np\nfrom scipy.signal import lfilter\n"
+        f"INPUTS, OUTPUTS, PARAMETERS = {names[0]!r}, {names[1]!r}, {{'gain': 2.0}}\n"
+        "def simulate(p, effects, u):\n    speed = lfilter([0, 0.05 * p['gain']], [1, -0.95], u[:, 0])\n"
+        f"    return ({integrated})[:, None]\n"
+    )
+    u = np.random.default_rng(0).uniform(-1, 1, 20).repeat(20)
+    rows = np.column_stack([0.01 * np.arange(400), u, np.cumsum(u) * 0.01])
+    np.savetxt(tmp_path / "m.csv", rows, delimiter=",", header=f"time_s,{','.join(names)}", comments="")
+    settings = settings_of({"python": "m.py", "log": "m.csv", "motion": motion}, "here")
+    loaded = load_simulator_case(settings, tmp_path, "here")
+    for effect, parameter in units.items():
+        assert next(iter(loaded.units[effect].values()), "") == parameter
+
+
 def test_check_says_what_logs_can_tell(tmp_path, flexlink, refused):
     """Of a bad log: a command that is cut off, one column of noise, values that act alike."""
     pytest.importorskip("mujoco")
@@ -444,8 +495,8 @@ def test_check_says_what_logs_can_tell(tmp_path, flexlink, refused):
         arguments += ["--log", str(tmp_path / name)]
     document = flexlink("check", *arguments, "--json").document()
     rows_of = {(row["section"], row["label"]): row["value"] for row in document["table"]}
-    assert "is it cut off?" in rows_of["two", "command 1"]
-    assert ("one", "command 1") not in rows_of
+    assert "is it cut off?" in rows_of["two", "motor"]
+    assert ("one", "motor") not in rows_of
     assert rows_of["smallest size that shows", "motor.gain"].endswith("% of 1")
     groups = [{*one["names"]} for one in document["numbers"]["alike"]]
     assert {"hinge.damping", "rod.mass", "motor.gain"} in groups

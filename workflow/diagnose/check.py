@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from diagnosis.machine.own_plant import PlantCase
+from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.telling import Telling, telling
 from workflow.diagnose.case_settings import case_document
 from workflow.diagnose.simulator_case import (
+    SimulatorCase,
     SimulatorSettings,
     is_simulator,
     load_simulator_case,
@@ -27,8 +28,9 @@ from workflow.text.templates import RunSummary, rows_of
 
 # Groups that are shown, those that are most alike; candidates of every list; what a next record needs.
 _MOST_SHOWN, _MOST_LISTED, _MOST_ADVICE = 8, 20, 6
-# A command with more values than these that is at an end of its range for this share of the time may be cut.
-_VALUES, _LIMITED = 20, 0.02
+# A command with more values than these may be cut that is at the ends of its range for this share of the
+# time, and at one of them so many times longer than at a usual value.
+_VALUES, _LIMITED, _LONGER = 20, 0.02, 3.0
 _INERTIAL = ("mass", "inertia", "armature", "damping", "payload", "frictionloss")
 
 
@@ -36,18 +38,20 @@ def check(place: Path | SimulatorSettings, time_limit_s: float = np.inf) -> RunS
     """Logs, smallest sizes that show, what acts alike, what a record would have to do. Raises InputError."""
     deadline_s = time.monotonic() + time_limit_s
     if isinstance(place, SimulatorSettings):
-        case = load_simulator_case(place, Path(), "--log").case
+        loaded = load_simulator_case(place, Path(), "--log")
     else:
         file, document = case_document(place)
         if not is_simulator(document):
             raise InputError(f"{file}: names no simulator's model; of a log alone: flexlink look LOG")
-        case = load_simulator_case(settings_of(document, str(file)), file.parent, str(file)).case
-    return of_case(case, telling(case, deadline_s))
+        loaded = load_simulator_case(settings_of(document, str(file)), file.parent, str(file))
+    return of_case(loaded, telling(loaded.case, deadline_s))
 
 
-def of_case(case: PlantCase, found: Telling) -> RunSummary:
+def of_case(loaded: SimulatorCase, found: Telling) -> RunSummary:
     """The same of a case that is loaded."""
-    logs = [_log(case, k) for k in range(len(case.experiments))]
+    case = loaded.case
+    of = getattr(case.plant.simulation, "quantities", {})  # of MuJoCo, whose names have no units
+    logs = [_log(loaded, k) for k in range(len(case.experiments))]
     alike = tuple(sorted(found.alike, key=lambda one: (len(one.names), one.left)))
     shown = dict(sorted(found.least.items(), key=lambda item: item[1]))
     first = replace(found, least=shown, alike=alike[:_MOST_SHOWN])
@@ -58,8 +62,15 @@ def of_case(case: PlantCase, found: Telling) -> RunSummary:
         "shows": [name for name in shown if name not in found.hidden],
         "most": _MOST_LISTED,
         "more": len(alike) - len(first.alike),
-        "sizes": {effect.name: effect.parameters[0].name for effect in case.plant.effects},
+        "sizes": {
+            effect.name: loaded.units.get(effect.name, {}).get(size, size)
+            for effect in case.plant.effects
+            for size in [effect.parameters[0].name]
+        },
+        "limits": [effect.name for effect in case.plant.effects if not effect.grows],
+        "units": case.units,
         "values": dict(case.plant.parameters),
+        "value_names": {key: of[key].parameter if key in of else key for key in case.plant.parameters},
         "untried": dict(case.plant.inactive),
         "advice": list(dict.fromkeys(_advice(first)))[:_MOST_ADVICE],
     }
@@ -67,31 +78,36 @@ def of_case(case: PlantCase, found: Telling) -> RunSummary:
         title=case.name,
         sections=rows_of("summary/check.j2", FILTERS.items(), **told),
         numbers={"logs": codec.plain(logs), **codec.plain(found), "advice": told["advice"]},
-        verdict=f"{len(shown) - len(found.hidden)} of {len(shown)} candidates show, {len(alike)} groups of "
-        "them act alike",
+        verdict=f"{len(shown) - len(found.hidden)} of {len(shown)} candidates show; {len(alike)} groups "
+        "of them look alike in these records",
     )
 
 
-def _log(case: PlantCase, k: int) -> dict[str, Any]:
+def _log(loaded: SimulatorCase, k: int) -> dict[str, Any]:
+    case = loaded.case
     e, limited = case.experiments[k], {}
-    for u, command in enumerate(e.input.T[: e.input.shape[1] - _measured(case)]):
-        at_ends = float(np.mean((command == command.max()) | (command == command.min())))
-        if at_ends == 1.0 or (at_ends > _LIMITED and np.unique(command).size > _VALUES):
-            limited[f"command {u + 1}"] = at_ends if np.ptp(command) == 0 else min(at_ends, 0.99)
+    for name, command in zip(loaded.inputs, e.input.T, strict=False):  # behind them what was measured
+        if share := _at_ends(command):
+            limited[name] = share
     motion = np.std(e.output, axis=0)
     outputs = list(zip(case.outputs, map(float, motion), map(float, case.noise), strict=True))
     return {"name": e.name, "role": e.role, "samples": len(e.output), "outputs": outputs, "limited": limited}
 
 
-def _measured(case: PlantCase) -> int:
-    """Columns of the inputs behind the commands that hold what was measured."""
-    e = case.experiments[0]
-    Y = e.output.shape[1]
-    return Y if e.input.shape[1] > Y and np.array_equal(e.input[:, -Y:], e.output) else 0
+def _at_ends(command: Real) -> float:
+    """Share of the time that a command is at the ends of its range, 1 if it never moves; 0 unless it may be
+    cut off there: one of held levels is at every level for as long."""
+    values, counts = np.unique(command, return_counts=True)
+    if values.size == 1:
+        return 1.0
+    share = float(counts[[0, -1]].sum() / command.size)
+    longer = max(counts[[0, -1]]) > _LONGER * np.median(counts)
+    return min(share, 0.99) if share > _LIMITED and values.size > _VALUES and longer else 0.0
 
 
 def _advice(found: Telling) -> Iterator[str]:
     """What would tell apart what acts alike, and show what is hidden; for every group the first that fits."""
+    rest: list[str] = []
     for one in found.alike:
         last = {name: name.rpartition(".")[2] for name in one.names}
         of = {
@@ -113,6 +129,11 @@ def _advice(found: Telling) -> Iterator[str]:
         elif set(of) <= {"mass", "payload", "inertia"}:
             yield f"for {listing(one.names)}: weigh one of them"
         else:
-            yield f"for {listing(one.names)}: state one of them, or record at another speed and amplitude"
+            rest.append(listing(one.names))
+    if rest:
+        yield (
+            f"for {'; '.join(rest)}: record at another speed and amplitude, or exclude what you know is "
+            "as stated (exclude = [...] in the case file)"
+        )
     if found.hidden:
         yield f"for {listing(found.hidden)}: move what they act on farther or faster"

@@ -74,6 +74,7 @@ def document_of(
         "unlisted": [effect.to_dict() for effect in found.unlisted],
         "replayed": found.replayed,
         "units": found.case.units,
+        "model_error": getattr(loaded, "model_error", 0.0),
         "validation": [e.name for e in found.case.held_out],
         "gap_closed": found.gap_closed,
         "gap_closed_interval": found.gap_closed_interval,

@@ -21,7 +21,7 @@ from workflow.diagnose.directory import answer_text
 from workflow.diagnose.document import completeness_of, document_of
 from workflow.diagnose.following import following
 from workflow.diagnose.pages import CasePage, case_page, moved, plant_page, remains_of
-from workflow.diagnose.simulator_case import SimulatorCase
+from workflow.diagnose.simulator_case import SimulatorCase, with_units
 from workflow.engine import codec, storage
 from workflow.engine.errors import naming
 from workflow.engine.executor import Report
@@ -91,12 +91,13 @@ class Work:
         name = loaded.case.name
         with naming(f"case {name}"):
             found = self.diagnose(loaded.case, progress=lambda f, m: report(_CONTROLLER * f, m))
+            found = with_units(found, loaded.units)
             coming = following(found)
-            told = of_case(loaded.case, telling(loaded.case, time.monotonic() + _TOLD_S))
+            told = of_case(loaded, telling(loaded.case, time.monotonic() + _TOLD_S))
             files = {}
             if loaded.repaired is not None:
                 files[f"{name}.xml"] = loaded.repaired(found, self.out).encode()
-            files[f"{name}.html"] = plant_page(found, coming, told, *files).encode()
+            files[f"{name}.html"] = plant_page(found, coming, told, loaded.model_error, *files).encode()
         beside = {
             "completeness": completeness_of(found, remains_of(found)),
             "next_experiment": {"advice": coming.advice, **codec.plain(coming.repeat or {})},

@@ -56,10 +56,15 @@ def case_page(page: CasePage, progress: Callable[[float, str], None] | None = No
 
 
 def plant_page(
-    found: Diagnosis, coming: Following, told: RunSummary | None = None, repaired: str = ""
+    found: Diagnosis,
+    coming: Following,
+    told: RunSummary | None = None,
+    model_error: float = 0.0,
+    repaired: str = "",
 ) -> str:
     """One self-contained HTML page about a `PlantCase`; equal content gives equal bytes. told: what its
-    records can tell (`workflow.diagnose.check`). repaired: file of the repaired model beside the page.
+    records can tell (`workflow.diagnose.check`). model_error: as stated. repaired: file of the repaired model
+    beside the page.
 
     Raises ValueError if the plant does not state its sampling period.
     """
@@ -76,6 +81,7 @@ def plant_page(
         "remains": remains_of(found),
         "next_experiment": coming,
         "told": told,
+        "model_error": model_error,
         "repaired": repaired,
         "moving": moving_figures(found),
         "numbers": json.dumps(numbers, indent=1),

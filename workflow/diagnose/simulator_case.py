@@ -17,10 +17,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
-from diagnosis.answer import Diagnosis
+from diagnosis.answer import Diagnosis, NamedEffect
+from diagnosis.machine.around import Body
 from diagnosis.machine.listed_effects import WHERE
 from diagnosis.machine.machine_protocol import Real, check_count
 from diagnosis.machine.own_plant import Plant, PlantCase, PlantExperiment
+from diagnosis.machine.plant_effect import PlantEffect
 from diagnosis.machine.with_effects import with_effects
 from ident.data.record import Record
 from ident.data.record_files import read_table
@@ -103,13 +105,17 @@ class SimulatorSettings(Section):
 @dataclass(frozen=True, eq=False)
 class SimulatorCase:
     """See `workflow.diagnose.case_files.LoadedCase`. repaired: diagnosis, folder -> MJCF to write there, None
-    of other simulators."""
+    of other simulators. inputs: names of the commands. model_error: as stated.
+    units: effect -> its parameters with units."""
 
     case: PlantCase
     rig_file: str
     input_sha256: str
     repaired: Callable[[Diagnosis, Path], str] | None
     descriptions: Mapping[str, str] = field(default_factory=dict)
+    inputs: tuple[str, ...] = ()
+    model_error: float = 0.0
+    units: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     suspected: tuple[str, ...] = ()
 
 
@@ -158,7 +164,70 @@ def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) 
         model.name,
         hash_of({"settings": settings.model_dump(mode="json"), "files": hashes}),
         repaired,
+        inputs=tuple(inputs),
+        model_error=settings.model_error,
+        units={effect.name: _with_units(effect, plant, inputs) for effect in plant.effects},
     )
+
+
+# Units of listed effects' parameters: of a force F and a motion x, or of the signal S that they change.
+_SIZES = {
+    **dict.fromkeys(("force", "static_force", "torque"), "{F}"),
+    "velocity": "{x}_s",
+    "coefficient": "{F}s_{x}",
+    "stiffness": "{F}_{x}",
+    "cubic": "{F}_{x}3",
+    **dict.fromkeys(("offset", "width", "limit", "gap"), "{S}"),
+    "rate_per_s": "{S}_s",
+}
+
+
+def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dict[str, str]:
+    """Parameter -> the same with its unit."""
+    acts, names = effect.acts, plant.output_names
+    units: dict[str, str] = {}
+
+    def unit(name: str) -> str:
+        found = unit_of(name) or plant.units.get(name, "")
+        return found.replace(" ", "").replace("²", "2").replace("/", "_")
+
+    if effect.name.endswith(".sensor_offset"):  # of MuJoCo, whose other sizes have units
+        units["S"] = unit(effect.name.removesuffix(".sensor_offset"))
+    elif acts is not None and isinstance(acts.on, Body):
+        units["F"], units["S"] = unit(inputs[acts.on.force]), unit((*names, "")[acts.on.motion])
+        units["x"] = units["S"] = units["S"].removesuffix("_s") if acts.on.of_speed else units["S"]
+    elif acts is not None and isinstance(acts.on, int):
+        units["S"] = unit(inputs[acts.on] if acts.where == "input" else names[acts.on])
+    found = {}
+    for parameter in (one.name for one in effect.parameters):
+        size = _SIZES.get(parameter, "")
+        if effect.name.endswith("quadratic_drag"):
+            size = "{F}s2_{x}2"
+        if size and all(units.get(key) for key in re.findall(r"{(\w)}", size)):
+            # A rate of a speed is per second squared.
+            found[parameter] = f"{parameter.removesuffix('_per_s')}_{size.format(**units)}".replace(
+                "_s_s", "_s2"
+            )
+    return found
+
+
+def with_units(found: Diagnosis, units: Mapping[str, Mapping[str, str]]) -> Diagnosis:
+    """Sizes of the effects under names with units; the repair keeps the names that the simulation takes."""
+
+    def named(effect: NamedEffect) -> NamedEffect:
+        of = units.get(effect.name, {})
+
+        def said(values: Mapping[str, Any]) -> dict[str, Any]:
+            return {of.get(key, key): value for key, value in values.items()}
+
+        return replace(
+            effect,
+            parameters=said(effect.parameters),
+            intervals=said(effect.intervals),
+            remarks=said(effect.remarks),
+        )
+
+    return replace(found, effects=tuple(map(named, found.effects)))
 
 
 def _chosen(plant: Plant, settings: SimulatorSettings) -> Plant:

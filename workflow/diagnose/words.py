@@ -57,6 +57,12 @@ def sureness(p: float) -> str:
     return next(word for limit, word in _SURE.items() if p >= limit)
 
 
+def nothing_tried(document: Mapping[str, Any]) -> bool:
+    """Whether a time limit left no candidate tried."""
+    needs = [effect["needs"] for effect in document["presence"].values()]
+    return document["verdict"] == "unknown" and bool(needs) and all(needs)
+
+
 def short_answer(document: Mapping[str, Any]) -> str:
     """Both answers of a JSON document in a few words: which effects are present, and whether that is all."""
     if document["detail_verdict"] == "not_converged":
@@ -64,6 +70,8 @@ def short_answer(document: Mapping[str, Any]) -> str:
     chosen = document["combination"]
     present = [n for n, e in document["presence"].items() if n in chosen or e["probability"] >= 0.5]
     if not present:
+        if nothing_tried(document):
+            return "no answer: nothing was tried"
         none = "no significant model error" if "shares" in document else "no model error"
         return none if document["verdict"] == "none" else "none of the candidate effects"
     more = "" if document["completeness"]["probability"] >= 0.5 else ", and something else"
@@ -95,7 +103,7 @@ def trend_words(found: Any) -> str:
     )
 
 
-FILTERS: Mapping[str, Callable[..., str]] = {
+FILTERS: Mapping[str, Callable[..., Any]] = {
     "effect": in_words,
     "parameter_unit": unit_of,
     "parameter": parameter_words,
@@ -106,6 +114,7 @@ FILTERS: Mapping[str, Callable[..., str]] = {
     "times_noise": times_noise,
     "sureness": sureness,
     "short_answer": short_answer,
+    "nothing_tried": nothing_tried,
     "closure": closure_words,
     "trend": trend_words,
 }

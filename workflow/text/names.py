@@ -15,6 +15,8 @@ def unit_of(parameter: str) -> str:
     found = _UNIT.search(parameter)
     if found is None:
         return ""
+    if parameter[: found.start()].endswith("_per"):
+        return f"1/{found[1].translate(_POWERS)}"
     over, under = (" ".join(re.findall(_FACTORS, part or "")).translate(_POWERS) for part in found.groups())
     # An inertia is the one product that is written with a "_" between.
     return f"{over} {under}" if (over, under) == ("kg", "m²") else f"{over}/{under}" if under else over
@@ -22,4 +24,4 @@ def unit_of(parameter: str) -> str:
 
 def name_words(parameter: str) -> str:
     """Name without its unit: "torque_Nm" as "torque"."""
-    return _UNIT.sub("", parameter).replace("_", " ").replace("youngs", "Young's")
+    return _UNIT.sub("", parameter).removesuffix("_per").replace("_", " ").replace("youngs", "Young's")
