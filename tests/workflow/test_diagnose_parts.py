@@ -10,7 +10,14 @@ from plant import EFFECTS, parse_effects, simulate
 from plant.effects import in_words
 from tests.workflow.diagnosis_examples import small_rig
 from workflow.diagnose.controller_check import check_controller, sampled_linear_machine
-from workflow.diagnose.words import FILTERS, key_words, parameter_words, probability_words, unit_of
+from workflow.diagnose.words import (
+    FILTERS,
+    key_words,
+    parameter_words,
+    probability_words,
+    short_answer,
+    unit_of,
+)
 from workflow.text import formats
 
 LINEAR = {
@@ -105,3 +112,30 @@ def test_no_probability_is_called_certain():
 def test_filters_of_diagnoses_hide_none_of_the_shared_ones():
     """The shared macros of a diagnosis' page go through the shared ones."""
     assert not set(FILTERS) & (set(formats.FILTERS) | {"words"})
+
+
+@pytest.mark.parametrize(
+    ("verdict", "needs", "said"),
+    [
+        ("unknown", ("more time", "more time"), "no answer: nothing was tried"),
+        ("unknown", ("more time", ""), "none of the candidate effects"),
+        ("none", ("more time", "more time"), "no model error"),
+    ],
+)
+def test_an_answer_of_which_nothing_was_tried_names_none_of_the_candidates(verdict, needs, said):
+    presence = {f"effect_{k}": {"probability": 0.1, "needs": need} for k, need in enumerate(needs)}
+    document = {"detail_verdict": verdict, "verdict": verdict, "combination": [], "presence": presence}
+    assert short_answer(document) == said
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "unit"),
+    [
+        ("rate_per_s", "rate", "1/s"),
+        ("rate_V_s", "rate", "V/s"),
+        ("cubic_N_m3", "cubic", "N/m³"),
+        ("gap", "gap", ""),
+    ],
+)
+def test_a_name_is_words_and_a_unit(name, words, unit):
+    assert (FILTERS["parameter_name"](name), unit_of(name)) == (words, unit)
