@@ -172,12 +172,22 @@ class SynthesisResult(Shown, synthesis_result.SynthesisResult):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Certificate(Shown, certificate.Certificate):
-    """Result of `certify`, with controller, plants and specification."""
+    """Result of `certify`, with controller, plants and specification.
+
+    certified, gamma, items: the verdict, the largest weighted gain, every requirement with what was achieved.
+    plants: per plant its `worst_margins` and `nominal_margins` (`gain_up`, `gain_down`, `phase_rad`,
+    `delay_s`, `modulus`), `bandwidth_rad_s`, `stable`, `pole_radius`; nan where the loop is not stable.
+    """
 
     table_in_notebook = True
     controller: Controller | None = None
     uncertain_plants: tuple[plant_set.UncertainPlant, ...] = ()
     specification: Specification = field(default_factory=Specification)
+
+    @property
+    def nominal_only(self) -> bool:
+        """No plant had an uncertainty: the worst case is the nominal plant."""
+        return not any(plant.stated for plant in self.plants)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

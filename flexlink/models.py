@@ -9,7 +9,6 @@ from typing import Any, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ValidationError
 from threadpoolctl import threadpool_limits
 
 from flexlink.shown import Shown, dressed
@@ -22,6 +21,7 @@ from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record as PlainRecord
+from ident.data.settings import Settings
 from ident.data.signal_filter import band_limited
 from ident.data.table import Table
 from ident.frequency_fit import identify_frf
@@ -33,7 +33,6 @@ from ident.uncertainty.embedding import tangent
 from ident.uncertainty.matrix_response import matrix_posterior
 from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals
-from plant.rig import one_line
 
 __all__ = [
     "EmbeddingOptions",
@@ -58,7 +57,7 @@ __all__ = [
     "uncertainty",
 ]
 
-Options = TypeVar("Options", bound=BaseModel)
+Options = TypeVar("Options", bound=Settings)
 # Frequencies over which a low-order nominal model is fitted to a posterior.
 _NOMINAL_POINTS = 400
 
@@ -398,10 +397,7 @@ def error_surface(
 
 
 def _options(kind: type[Options], options: Options | None, settings: dict[str, Any]) -> Options | None:
-    """The options, or those that the settings make; every refusal in one line."""
+    """The options, or those that the settings make."""
     if options is not None and settings:
         raise ValueError(f"give options or single settings, not both; got options and {', '.join(settings)}")
-    try:
-        return kind(**settings) if settings else options
-    except ValidationError as error:
-        raise ValueError(f"{kind.__name__}: {one_line(error)}") from None
+    return kind(**settings) if settings else options

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Literal
 
@@ -39,7 +39,8 @@ class PlantVerdict:
     value over the ellipses (<= 1 met, 0 = not asked). bandwidth_rad_s: up to here
     every member has |S| below -3 dB. own_grid_rad_s: range of a user's own frequency grid, None if the
     uncertainty is known everywhere; assumed_linear: between its points the response was assumed on a straight
-    line between members. stated: an uncertainty was given at all. own_performance: the damping requirement
+    line between members. Margins and bandwidth are nan where the loop is not stable. stated: an uncertainty
+    was given at all. own_performance: the damping requirement
     looks at a channel of its own, any pair of members allowed. all_frequencies: what was proved between the
     grid points.
     """
@@ -232,6 +233,9 @@ def _check_plant(
     stable = bool(radius < 1.0)
     below = np.flatnonzero(distance < np.sqrt(2.0))
     bandwidth = float(worst.omega_rad_s[below[0] - 1]) if below.size and below[0] > 0 else 0.0
+    if not stable:  # |1 + K G| says nothing of a loop that is not stable
+        nominal = margins = Margins(*[np.nan] * len(fields(Margins)))
+        peaks, bandwidth = dict.fromkeys(peaks, (np.nan, None)), np.nan
     if stable and count.matches and margins.modulus > 0:
         proof = bound_all_frequencies(
             controller,
@@ -268,13 +272,16 @@ def _check_plant(
     found = Findings(
         plant.name,
         peaks,
-        proof.bounds if proof.possible else None,
-        (margins.modulus, float(worst.omega_rad_s[at])),
+        proof.bounds if proof.possible and stable else None,
+        (margins.modulus, float(worst.omega_rad_s[at]) if stable else None),
         margins.delay_s,
         loop_modes,
         controller,
     )
-    return verdict, [requirement.check(found) for requirement in specification.requirements(plant)]
+    items = [requirement.check(found) for requirement in specification.requirements(plant)]
+    if plant.uncertainty is None and plant.damped.uncertainty is None:
+        items = [replace(item, about="nominal loop") for item in items]
+    return verdict, items
 
 
 def _zeros(controller: Controller) -> Complex:

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from control_design.plants.ellipses import Complex, Integer, Real
 from control_design.plants.plant_set import Mode, UncertainPlant
+from ident.data.settings import Settings
 
 _LOWEST_ANGLE = 5e-7
 """Lowest frequency of the grids, rad per sample (1e-4 rad/s at 200 Hz), above slower poles."""
@@ -21,10 +22,8 @@ _WIDE = 0.1
 """Roots farther from the circle than this, rad per sample, leave nothing narrow between grid points."""
 
 
-class GridOptions(BaseModel):
+class GridOptions(Settings):
     """How fine the frequency grids of a programme and of its dense check are."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     grid_points: int = Field(default=110, ge=20, le=2000, description="logarithmic points of the programme")
     mode_points: int = Field(default=60, ge=0, le=1000, description="points spread around the flexible modes")

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from control_design.plants.ellipses import Complex
+from ident.data.settings import Settings
 
 # Of the corner. SIMC, at its fastest: a quarter of the crossover (Skogestad, J. Process Control 13, 2003).
 _INTEGRAL_SHARE = 0.2
@@ -19,11 +20,10 @@ _SLOWEST = 0.01
 _ROLLOFF_END = 40.0  # the effort weight flattens this far above its corner, so that it stays proper
 
 
-class RationalWeight(BaseModel):
+class RationalWeight(Settings):
     """W(s) = numerator(s)/denominator(s), coefficients of s with the highest power first; stable and
     proper."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     numerator: tuple[float, ...] = Field(min_length=1, description="coefficients, highest power of s first")
     denominator: tuple[float, ...] = Field(min_length=1, description="coefficients, highest power of s first")
 

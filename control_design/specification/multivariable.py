@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from control_design.plants.ellipses import Boolean, Complex, Real
 from control_design.plants.weights import RationalWeight
 from control_design.specification.specification import Specification, SpecificationError
+from ident.data.settings import Settings
 
 _READ = {
     "bandwidth_rad_s", "integrator", "low_frequency_rejection", "modulus_margin", "effort_limit",
@@ -18,7 +19,7 @@ _READ = {
 }  # fmt: skip
 
 
-class MultivariableSpecification(BaseModel):
+class MultivariableSpecification(Settings):
     """joints[i] says what is asked of output i (bandwidth, modulus margin, integrator) and of actuator i
     (effort, limits); with more outputs than actuators, or fewer, the longer of the two counts.
 
@@ -27,7 +28,6 @@ class MultivariableSpecification(BaseModel):
     Keys of a joint that no matrix design reads are refused.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     joints: tuple[Specification, ...] = Field(min_length=1, description="one specification per joint")
     structure: Literal["full", "decentralised"] | tuple[tuple[bool, ...], ...] = Field(
         default="full", description="which entries of K (actuators x sensors) may differ from zero"

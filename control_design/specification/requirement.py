@@ -83,15 +83,16 @@ class SpecificationItem:
 class Findings:
     """What was found out about one loop, for requirements to decide on.
 
-    peaks: by name of the weighted requirement, its largest value over ellipses and grid, and where. bounds:
+    peaks: by name of the weighted requirement, its largest value over ellipses and grid, and where; nan and
+    None where the loop is not stable, as `modulus`. bounds:
     the same proved for all frequencies, None where that is not possible. modulus: smallest distance from -1,
     and where. delay_s: worst delay margin. modes: of the nominal closed loop.
     """
 
     plant: str
-    peaks: Mapping[str, tuple[float, float]]
+    peaks: Mapping[str, tuple[float, float | None]]
     bounds: Mapping[str, float] | None
-    modulus: tuple[float, float]
+    modulus: tuple[float, float | None]
     delay_s: float
     modes: Sequence[Mode]
     controller: Controller

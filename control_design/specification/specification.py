@@ -18,7 +18,7 @@ from functools import lru_cache
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from control_design.controllers.biquads import SOLVER_SLACK, SectionKind
 from control_design.plants.ellipses import Real
@@ -38,6 +38,7 @@ from control_design.specification.requirement import (
     WeightedRequirement,
     constant_weight,
 )
+from ident.data.settings import Settings
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -46,10 +47,8 @@ class SpecificationError(ValueError):
     """The specification contradicts itself or the plant; no controller of any order can meet it."""
 
 
-class Specification(BaseModel):
+class Specification(Settings):
     """Requirements on the closed loop, for every plant in the uncertainty set."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     bandwidth_rad_s: _Positive | None = Field(
         default=None,

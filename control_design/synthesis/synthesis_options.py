@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from control_design.plants.frequency_grid import GridOptions
+from ident.data.settings import Settings
 
 
 class SynthesisOptions(GridOptions):
@@ -34,10 +35,9 @@ class SynthesisOptions(GridOptions):
     )
 
 
-class MultivariableOptions(BaseModel):
+class MultivariableOptions(Settings):
     """The same for several joints."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     starts: int = Field(default=1, ge=1, le=50, description="static gains to grow from; the best counts")
     candidates: int = Field(default=3, ge=1, le=20, description="blocks tried wherever the order grows")
     growth_steps: int = Field(default=12, ge=1, le=200, description="steps of each candidate")

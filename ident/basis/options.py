@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
+from ident.data.settings import Settings
 
 Algorithm = Literal[
     "GN_DIRECT_L",
@@ -21,15 +22,13 @@ Algorithm = Literal[
 ]
 
 
-class IdentOptions(BaseModel):
-    """Settings of the fit and of the pole search (design 4.3).
+class IdentOptions(Settings):
+    """Settings of the fit and of the pole search.
 
     What you know is kept and tested against the data (`ident.checks.prior_tests`). The data choose numbers of
     poles that are None, record length and sampling time the box of the search; bounds of yours also bind the
     refinement.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     n_real: int | None = Field(None, ge=0, le=8, description="number of real poles; default: from the data")
     n_pairs: int | None = Field(None, ge=0, le=12, description="number of pole pairs; default: from the data")
@@ -189,10 +188,8 @@ class IdentOptions(BaseModel):
         )
 
 
-class EmbeddingOptions(BaseModel):
+class EmbeddingOptions(Settings):
     """Settings of the uncertainty estimate."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     fir_length: int | None = Field(
         default=None,

@@ -102,7 +102,7 @@ class Poles:
         return Poles(self.real, np.delete(self.pairs, index))
 
     def doubled(self, n_fixed: tuple[int, int] = (0, 0)) -> Poles:
-        """Every pole twice, neighbours equal: those of Phi2 (design 4.2); the first of each type, fixed,
+        """Every pole twice, neighbours equal: those of Phi2; the first of each type, fixed,
         once."""
         kept = zip((self.real, self.pairs), n_fixed, strict=True)
         return Poles(*(np.concatenate([part[:n], np.repeat(part[n:], 2)]) for part, n in kept))

@@ -8,10 +8,11 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from ident.data.arrays import RealArray
+from ident.data.settings import meant
 from ident.data.wrapping import unwrapped
 from plant.effects import EFFECTS
 from plant.rig import Output
-from workflow.config.settings import Section, check, meant, repeated
+from workflow.config.settings import Section, check, repeated
 from workflow.engine.documents import read_toml
 from workflow.engine.errors import InputError
 
