@@ -14,6 +14,9 @@ Basis       `regressor`, `basis_response`
 Controllers `UncertainPlant`, `Specification`, `RationalWeight`, `synthesise`, `SynthesisOptions`, `certify`,
             `Certificate`, `Controller`, `simulate_loop`, `step_metrics`, `c_source`,
             `synthesise_jointly`, `youla_bracket`, `YoulaOptions`
+Joints      `MultivariablePlant`, `ResponseBall`, `MultivariableSpecification`, `MultivariableOptions`,
+            `synthesise_multivariable`, `MultivariableResult`, `certify_multivariable`,
+            `MultivariableCertificate`: several sensors and actuators, after `identify_mimo`
 Machines    `Rig`, `paper_link`, `effect`, `simulate`, `SampledArm`, `prbs`, `multisine`
 Causes      `Case`, `Experiment`, `diagnose`, `Diagnosis`
 Pictures    `plot`, `bode`, `compare`

@@ -11,26 +11,35 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from control_design.analysis import certificate, closed_loop
+from control_design.analysis import certificate, closed_loop, multivariable_certificate
 from control_design.analysis.closed_loop import LinearMachine, SampledMachine, step_metrics
-from control_design.controllers.c_code import c_source
+from control_design.controllers import c_code
 from control_design.controllers.controller import Controller
 from control_design.convex import youla
 from control_design.convex.convex_options import YoulaOptions
 from control_design.plants import plant_set
+from control_design.plants.multivariable import MultivariablePlant, ResponseBall
 from control_design.plants.weights import RationalWeight
 from control_design.specification import Specification
-from control_design.synthesis import joint_synthesis, synthesis, synthesis_result
-from control_design.synthesis.synthesis_options import SynthesisOptions
+from control_design.specification.multivariable import MultivariableSpecification
+from control_design.synthesis import joint_synthesis, multivariable, synthesis, synthesis_result
+from control_design.synthesis.synthesis_options import MultivariableOptions, SynthesisOptions
 from flexlink.models import Uncertainty
 from flexlink.shown import Shown, dressed
 from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.uncertainty.matrix_response import MatrixPosterior
 
 __all__ = [
     "Certificate",
     "Controller",
     "LoopRun",
+    "MultivariableCertificate",
+    "MultivariableOptions",
+    "MultivariablePlant",
+    "MultivariableResult",
+    "MultivariableSpecification",
     "RationalWeight",
+    "ResponseBall",
     "Specification",
     "SynthesisOptions",
     "SynthesisResult",
@@ -38,10 +47,12 @@ __all__ = [
     "YoulaOptions",
     "c_source",
     "certify",
+    "certify_multivariable",
     "simulate_loop",
     "step_metrics",
     "synthesise",
     "synthesise_jointly",
+    "synthesise_multivariable",
     "youla_bracket",
 ]
 
@@ -68,6 +79,11 @@ def state_space(system: Any, what: str = "the system") -> control.StateSpace:
     if type(system).__module__.startswith("scipy.signal") and hasattr(system, "to_ss"):
         own = system.to_ss()
         system = control.ss(own.A, own.B, own.C, own.D, own.dt or 0, remove_useless_states=False)
+    if isinstance(system, (MatrixPosterior, MultivariablePlant)):
+        raise WrongSystemError(
+            f"{what} is a {type(system).__name__}, of several inputs and outputs: use "
+            "flexlink.synthesise_multivariable and flexlink.certify_multivariable"
+        )
     if not isinstance(system, (control.StateSpace, control.TransferFunction)):
         raise WrongSystemError(
             f"{what} is a {type(system).__name__}; expected a discrete system of python-control: "
@@ -98,7 +114,8 @@ def _checked(system: Any, what: str) -> None:
     if (system.ninputs, system.noutputs) != (1, 1):
         raise WrongSystemError(
             f"{what} has {system.ninputs} inputs and {system.noutputs} outputs; take one channel: "
-            "system[output, input], as system[0, 0]"
+            "system[output, input], as system[0, 0]; or design for all with "
+            "flexlink.synthesise_multivariable(flexlink.MultivariablePlant(name, system), ...)"
         )
     measured = isinstance(system, control.FrequencyResponseData)
     if system.dt == 0 and not isinstance(system.dt, bool):
@@ -191,6 +208,28 @@ class Certificate(Shown, certificate.Certificate):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+class YoulaBracket(Shown, youla.YoulaBracket):
+    """Result of `youla_bracket`, from worst cases over three regions at every frequency.
+
+    inscribed: with the disc inside each ellipse, which no controller of any order falls below (`floor`).
+    ellipse: what some controller reaches over the ellipses (a local optimum). enclosing: the same over the
+    disc around each. `plants` has the three of each plant; inf where none was found to be robustly stable.
+    """
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MultivariableResult(Shown, multivariable.MultivariableResult):
+    """Result of `synthesise_multivariable`: `controller`, `gamma`, `worst` by requirement."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MultivariableCertificate(Shown, multivariable_certificate.MultivariableCertificate):
+    """Result of `certify_multivariable`: `met`, `gamma`, and `verdicts` by plant."""
+
+    table_in_notebook = True
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class LoopRun(Shown, closed_loop.ClosedLoopTrajectory):
     """Closed-loop simulation, the result of `simulate_loop`."""
 
@@ -264,7 +303,7 @@ def synthesise_jointly(
 
 def youla_bracket(
     plants: Any, specification: Specification, options: YoulaOptions | None = None
-) -> youla.YoulaBracket:
+) -> YoulaBracket:
     """What no controller of any order can fall below (`floor`); `control_design.youla_bracket`.
 
     Examples
@@ -275,7 +314,7 @@ def youla_bracket(
     True
     """
     with threadpool_limits(1):
-        return youla.youla_bracket(_several(plants), specification, options)
+        return YoulaBracket(youla.youla_bracket(_several(plants), specification, options).plants)
 
 
 def certify(
@@ -312,6 +351,44 @@ def certify(
     )
 
 
+def synthesise_multivariable(
+    plants: MultivariablePlant | Sequence[MultivariablePlant],
+    specification: MultivariableSpecification,
+    options: MultivariableOptions | None = None,
+) -> MultivariableResult:
+    """Design one controller of all sensors and actuators; `control_design.synthesise_multivariable`."""
+    with threadpool_limits(1):
+        found = multivariable.synthesise_multivariable(plants, specification, options)
+    return dressed(MultivariableResult, found)
+
+
+def certify_multivariable(
+    controller: Controller | MultivariableResult,
+    plants: MultivariablePlant | Sequence[MultivariablePlant],
+    specification: MultivariableSpecification,
+    *,
+    dense_points: int = 1500,
+) -> MultivariableCertificate:
+    """Certify a controller of all sensors and actuators; `control_design.certify_multivariable`."""
+    with threadpool_limits(1):
+        found = multivariable_certificate.certify_multivariable(
+            getattr(controller, "controller", controller), plants, specification, dense_points=dense_points
+        )
+    return MultivariableCertificate(found.verdicts)
+
+
+def c_source(controller: Any, prefix: str = "controller", number: c_code.Number = "double") -> str:
+    """C99 source of a controller; `control_design.c_source`.
+
+    controller: a `Controller`, a result that has one (`synthesise`, `certify`), or a discrete system of
+    python-control (ss, tf). prefix: start of every name. number: type of states and coefficients.
+    """
+    given = getattr(controller, "controller", controller)
+    return c_code.c_source(
+        given if isinstance(given, Controller) else _as_controller(given, 1), prefix, number
+    )
+
+
 def simulate_loop(controller: Any, machine: Any, reference: npt.ArrayLike, **more: Any) -> LoopRun:
     """Simulate the closed loop with limits and delay; arguments as in `control_design.simulate`.
 
@@ -330,6 +407,11 @@ def simulate_loop(controller: Any, machine: Any, reference: npt.ArrayLike, **mor
         machine = machine.nominal
     if isinstance(machine, control.lti.LTI):
         machine = LinearMachine(state_space(machine, "the machine"))
+    if not all(hasattr(machine, part) for part in ("measure", "advance", "reset", "dt_s")):
+        raise WrongSystemError(
+            f"the machine is a {type(machine).__name__}; expected flexlink.SampledArm(rig, effects, rng), a "
+            "linear system or an UncertainPlant"
+        )
     chosen: SampledMachine = machine
     if not isinstance(controller, Controller):
         controller = _as_controller(controller, 1)

@@ -12,8 +12,10 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from flexlink.shown import Shown, dressed
-from ident.basis import model, posterior
+from ident import several_outputs
+from ident.basis import posterior
 from ident.basis.functions import basis_response, regressor
+from ident.basis.model import GobfModel as PlainModel
 from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.poles import Poles
 from ident.data.foreign_files import distinct
@@ -25,12 +27,11 @@ from ident.data.settings import Settings
 from ident.data.signal_filter import band_limited
 from ident.data.table import Table
 from ident.frequency_fit import identify_frf
-from ident.identification import Identification as Identified
+from ident.identification import Identification as Identified, MimoIdentification as MimoIdentified
 from ident.one_input import identify as identify_records
-from ident.search.error_surface import ErrorSurface, error_surface as surface_of
-from ident.several_outputs import identify_mimo
+from ident.search.error_surface import ErrorSurface as PlainSurface, error_surface as surface_of
+from ident.uncertainty import matrix_response
 from ident.uncertainty.embedding import tangent
-from ident.uncertainty.matrix_response import matrix_posterior
 from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals
 
@@ -60,6 +61,8 @@ __all__ = [
 Options = TypeVar("Options", bound=Settings)
 # Frequencies over which a low-order nominal model is fitted to a posterior.
 _NOMINAL_POINTS = 400
+# Factor on the odds: Bayes factor of "positive" evidence (Kass and Raftery, 1995).
+_POSITIVE = 3.0
 
 
 class Record(Shown, PlainRecord):
@@ -172,7 +175,7 @@ class Record(Shown, PlainRecord):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class GobfModel(Shown, model.GobfModel):
+class GobfModel(Shown, PlainModel):
     """Poles and coefficients of a model on generalised orthonormal basis functions.
 
     Fields as in `ident.basis.model.GobfModel`.
@@ -281,10 +284,28 @@ class Identification(Shown, Identified):
 
     table_in_notebook = True
     records: tuple[PlainRecord, ...] = ()
+    order_given: bool = False
 
     def to_control(self) -> Any:
         """The model as `control.StateSpace`."""
         return self.model.to_control()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MimoIdentification(Shown, MimoIdentified):
+    """Result of `identify_mimo`: the fields of `ident.MimoIdentification`, and the records."""
+
+    table_in_notebook = True
+    records: tuple[PlainRecord, ...] = ()
+
+    def to_control(self) -> Any:
+        """The model as `control.StateSpace`."""
+        return self.model.to_control()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MatrixPosterior(Shown, matrix_response.MatrixPosterior):
+    """Result of `matrix_posterior`: balls around a matrix response at any frequency (`at`)."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -299,6 +320,13 @@ class Uncertainty(Shown, posterior.ResponsePosterior):
     """
 
     nominal_poles: Poles = Poles()  # noqa: RUF009 (frozen)
+    prior_missed_mode: float = 0.0
+
+    @property
+    def missed_mode_suspected(self) -> bool:
+        """The data themselves raise the odds that a mode is missing."""
+        now, before = self.report.probability_missed_mode, self.prior_missed_mode
+        return now * (1 - before) >= _POSITIVE * (1 - now) * before > 0
 
     def nominal(self) -> GobfModel:
         """Model on the identified poles, nearest to the centre in units of the ellipses."""
@@ -320,6 +348,11 @@ class Uncertainty(Shown, posterior.ResponsePosterior):
         return self.nominal().to_control()
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class ErrorSurface(Shown, PlainSurface):
+    """Result of `error_surface`: `mean_square` (A, B) over `first` (A,) and `second` (B,), called `names`."""
+
+
 def identify(
     records: PlainRecord | Sequence[PlainRecord], options: IdentOptions | None = None, **settings: Any
 ) -> Identification:
@@ -334,23 +367,54 @@ def identify(
     GobfModel of order 2, u -> y, dt = 0.01 s: fits 99.0 % of record
       mode at 20 rad/s (3.18 Hz), damping ratio 0.0499
     """
-    chosen = _options(IdentOptions, options, settings)
-    used = (records,) if isinstance(records, PlainRecord) else tuple(records)
+    chosen, used = _options(IdentOptions, options, settings), _records(records)
     with threadpool_limits(1):
         found = identify_records(used, chosen)
-    return dressed(Identification, found, model=dressed(GobfModel, found.model), records=used)
+    given = chosen is not None and chosen.n_pairs is not None
+    model = dressed(GobfModel, found.model)
+    return dressed(Identification, found, model=model, records=used, order_given=given)
+
+
+def identify_mimo(
+    records: PlainRecord | Sequence[PlainRecord],
+    options: IdentOptions | None = None,
+    *,
+    free_shapes: bool = False,
+    start: Poles | None = None,
+    **settings: Any,
+) -> MimoIdentification:
+    """Identify one model with shared poles of several inputs, outputs or both.
+
+    settings: fields of `IdentOptions`, instead of `options`; with several outputs at most one integrator and
+    no relative degree. free_shapes: leave every residue free, in place of one shape for every mode. start:
+    poles where the search begins. Raises ValueError as `identify`.
+    """
+    chosen, used = _options(IdentOptions, options, settings), _records(records)
+    with threadpool_limits(1):
+        found = several_outputs.identify_mimo(used, chosen, free_shapes=free_shapes, start=start)
+    return dressed(MimoIdentification, found, records=used)
+
+
+def matrix_posterior(
+    records: PlainRecord | Sequence[PlainRecord], identification: MimoIdentified, *, level: float = 0.95
+) -> MatrixPosterior:
+    """Uncertainty of a matrix response: balls that hold it with probability `level` at every frequency."""
+    with threadpool_limits(1):
+        found = matrix_response.matrix_posterior(_records(records), identification, level=level)
+    return dressed(MatrixPosterior, found)
 
 
 def uncertainty(
     identification: Identified,
-    records: Sequence[PlainRecord] | None = None,
+    records: PlainRecord | Sequence[PlainRecord] | EmbeddingOptions | None = None,
     options: EmbeddingOptions | None = None,
     **settings: Any,
 ) -> Uncertainty:
     """Posterior of the response around an identified model: noise, pole error and unmodelled dynamics.
 
     records: those of the identification; not needed if it came from `flexlink.identify`. settings: fields of
-    `EmbeddingOptions`, instead of `options`.
+    `EmbeddingOptions`, instead of `options`. `order_given` is taken from `flexlink.identify`. Ellipses of
+    another level than 95 %: `spread.at(omega_rad_s).ellipse(level)`.
 
     Examples
     --------
@@ -362,13 +426,23 @@ def uncertainty(
     >>> bool(spread.at([20.0]).contains(found.model.frequency_response([20.0]))[0])
     True
     """
-    chosen = _options(EmbeddingOptions, options, settings)
-    used = records if records is not None else getattr(identification, "records", ())
-    if not used:
-        raise ValueError("give the records of the identification")
+    if isinstance(records, EmbeddingOptions):
+        records, options = None, records
+    for name, mend in _ELSEWHERE.items():
+        if name in settings:
+            raise ValueError(f"{name} is no setting of uncertainty: {mend}")
+    chosen = _options(EmbeddingOptions, options, settings) or EmbeddingOptions()
+    if chosen.order_given is None:
+        chosen = chosen.model_copy(update={"order_given": getattr(identification, "order_given", False)})
+    used = _records_of(identification, records)
     with threadpool_limits(1):
         found = tangent(used, identification.model, chosen)
-    return dressed(Uncertainty, found, nominal_poles=identification.model.poles)
+    return dressed(
+        Uncertainty,
+        found,
+        nominal_poles=identification.model.poles,
+        prior_missed_mode=chosen.prior_missed_mode,
+    )
 
 
 def error_surface(
@@ -388,12 +462,42 @@ def error_surface(
     >>> surface.names, bool(abs(surface.first[i] - 20) < 2)
     (('omega_rad_s', 'zeta'), True)
     """
-    used = records if records is not None else getattr(identification, "records", ())
-    used = (used,) if isinstance(used, PlainRecord) else tuple(used)
+    used = _records_of(identification, records)
+    for name in {"first", "second"} & set(settings):
+        settings[name] = np.asarray(settings[name], dtype=np.float64)
+    with threadpool_limits(1):
+        found = surface_of(used, identification.model, identification.structure, **settings)
+    return dressed(ErrorSurface, found)
+
+
+_ELSEWHERE = {
+    "level": "spread.at(omega_rad_s).ellipse(level) has ellipses of any level",
+    "method": "the paper's recipe is validation.paper.classical.classical(records, model)",
+}
+
+
+def _records(records: Any) -> tuple[PlainRecord, ...]:
+    """One record or several."""
+    used = (records,) if isinstance(records, PlainRecord) else records
+    if isinstance(used, (str, np.ndarray)) or not all(isinstance(each, PlainRecord) for each in used):
+        raise ValueError(
+            f"expected a flexlink.Record or several, got {type(records).__name__}: "
+            "flexlink.Record(u=u, y=y, dt_s=dt_s)"
+        )
+    return tuple(used)
+
+
+def _records_of(identification: Identified, records: Any) -> tuple[PlainRecord, ...]:
+    """These records or those of the identification, of one input and one output."""
+    model = getattr(identification, "model", None)
+    if isinstance(identification, MimoIdentified):
+        raise ValueError("several inputs or outputs: use flexlink.matrix_posterior(records, identification)")
+    if not isinstance(model, PlainModel):
+        raise ValueError(f"expected the result of flexlink.identify, got {type(identification).__name__}")
+    used = _records(getattr(identification, "records", ()) if records is None else records)
     if not used:
         raise ValueError("give the records of the identification")
-    with threadpool_limits(1):
-        return surface_of(used, identification.model, identification.structure, **settings)
+    return used
 
 
 def _options(kind: type[Options], options: Options | None, settings: dict[str, Any]) -> Options | None:

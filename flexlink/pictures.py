@@ -19,7 +19,8 @@ from flexlink.machines import Simulation
 from ident.basis.model import GobfModel
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
-from ident.identification import Identification
+from ident.identification import Identification, MimoIdentification
+from ident.search.error_surface import ErrorSurface
 from ident.uncertainty import ResponsePosterior
 
 if TYPE_CHECKING:
@@ -41,7 +42,13 @@ def plot(result: object) -> Figure:
     >>> [axes.get_xlabel() for axes in figure.axes[2:]]
     ['time, all records [s]', 'time in this record [s]']
     """
-    raise TypeError(f"there is no picture of a {type(result).__name__}")
+    raise TypeError(unknown("picture", result, plot))
+
+
+def unknown(what: str, result: object, of: Any) -> str:
+    """What there is a picture or a table of."""
+    known = sorted({kind.__name__ for kind in of.registry} - {"object"})
+    return f"no {what} of {type(result).__name__}; there is one of {', '.join(known)}"
 
 
 def bode(result: Any) -> Figure:
@@ -126,7 +133,8 @@ def _simulation(simulation: Simulation) -> Figure:
 
 
 @plot.register(Identification)
-def _poles(found: Identification) -> Figure:
+@plot.register(MimoIdentification)
+def _poles(found: Identification | MimoIdentification) -> Figure:
     from workflow.figures.poles import draw_poles
 
     return draw_poles(found.model)
@@ -168,6 +176,13 @@ def _run(run: LoopRun) -> Figure:
     runs = LoopRuns(run.measured[None], run.command[None], None, run.limited[None])
     labels = {"output": ("output", ""), "command": ("command", "")}
     return draw_closed_loop(run.time_s, run.reference, runs, labels)
+
+
+@plot.register(ErrorSurface)
+def _surface(surface: ErrorSurface) -> Figure:
+    from workflow.figures.pole_search import draw_surface
+
+    return draw_surface(surface)
 
 
 @plot.register(Diagnosis)

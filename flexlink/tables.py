@@ -7,14 +7,20 @@ from functools import singledispatch
 import numpy as np
 import pandas as pd
 
+from control_design.analysis.multivariable_certificate import MultivariableCertificate
+from control_design.convex.youla import YoulaBracket
 from diagnosis.answer import Diagnosis
 from flexlink.design import Certificate, LoopRun, SynthesisResult
 from flexlink.machines import Simulation
-from flexlink.pictures import as_response
+from flexlink.models import MimoIdentification
+from flexlink.pictures import as_response, unknown
 from ident.basis.model import GobfModel
+from ident.basis.poles import Poles
+from ident.data.arrays import ComplexArray
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 from ident.identification import Identification
+from ident.search.error_surface import ErrorSurface
 from ident.uncertainty import ResponsePosterior
 from workflow.figures.bands import response_band
 
@@ -28,7 +34,8 @@ def table(result: object) -> pd.DataFrame:
     Record, simulation, closed loop: a row per sample. Model, identification: a row per mode or real pole.
     Uncertainty, measured response: a row per frequency, with the range of gain and phase over the ellipse.
     Certificate: a row per requirement. Synthesis: a row per active constraint. Diagnosis: a row per effect
-    and parameter, with its 95 % interval. Raises TypeError for anything else.
+    and parameter, with its 95 % interval. Error surface: a row per grid point. Youla bracket: a row per
+    plant. Raises TypeError for anything else.
 
     Examples
     --------
@@ -39,7 +46,7 @@ def table(result: object) -> pd.DataFrame:
     >>> found.records[0].table().columns.to_list()
     ['time_s', 'u', 'y']
     """
-    raise TypeError(f"there is no table of a {type(result).__name__}")
+    raise TypeError(unknown("table", result, table))
 
 
 @table.register(Record)
@@ -70,15 +77,18 @@ def _run(run: LoopRun) -> pd.DataFrame:
 def _model(model: GobfModel) -> pd.DataFrame:
     """zeta and omega of a pair are those of the continuous pole that samples to it; a real pole has the rate
     at which it decays."""
-    poles, dt_s = model.stable_poles, model.dt_s
+    return _modes(model.stable_poles, model.dt_s, model.unstable_poles)
+
+
+def _modes(poles: Poles, dt_s: float, unstable: ComplexArray | tuple[()] = ()) -> pd.DataFrame:
     omega = poles.omega_rad_s(dt_s)
     modes = pd.DataFrame({"kind": "mode", "omega_rad_s": omega, "zeta": poles.zeta()})
     decays = pd.DataFrame({"kind": "real pole", "decay_per_s": poles.decay_per_s(dt_s)})
-    outside = np.log(model.unstable_poles) / dt_s
-    unstable = pd.DataFrame(
+    outside = np.log(np.asarray(unstable, complex)) / dt_s
+    growing = pd.DataFrame(
         {"kind": "unstable pole", "omega_rad_s": np.abs(outside.imag), "decay_per_s": -outside.real}
     )
-    parts = [part for part in (modes, decays, unstable) if len(part)]
+    parts = [part for part in (modes, decays, growing) if len(part)]
     rows = pd.concat(parts or [modes], ignore_index=True)
     rows = rows.reindex(columns=["kind", "omega_rad_s", "frequency_Hz", "zeta", "decay_per_s"])
     return rows.assign(frequency_Hz=rows["omega_rad_s"] / (2 * np.pi))
@@ -87,6 +97,32 @@ def _model(model: GobfModel) -> pd.DataFrame:
 @table.register(Identification)
 def _identification(found: Identification) -> pd.DataFrame:
     return _model(found.model)
+
+
+@table.register(MimoIdentification)
+def _mimo(found: MimoIdentification) -> pd.DataFrame:
+    return _modes(found.model.poles, found.model.dt_s)
+
+
+@table.register(ErrorSurface)
+def _surface(surface: ErrorSurface) -> pd.DataFrame:
+    first, second = np.meshgrid(surface.first, surface.second, indexing="ij")
+    columns = {surface.names[0]: first.ravel(), surface.names[1]: second.ravel()}
+    return pd.DataFrame({**columns, "mean_square": surface.mean_square.ravel()})
+
+
+@table.register(YoulaBracket)
+def _bracket(bracket: YoulaBracket) -> pd.DataFrame:
+    return pd.DataFrame([vars(plant) for plant in bracket.plants])
+
+
+@table.register(MultivariableCertificate)
+def _joints(certificate: MultivariableCertificate) -> pd.DataFrame:
+    return pd.DataFrame(
+        {"plant": v.plant, "requirement": name, "achieved": v.worst[name], "bound": bound,
+         "met": v.stable and bound <= 1, "omega_rad_s": v.worst_at[name]}
+        for v in certificate.verdicts for name, bound in v.bounds.items()
+    )  # fmt: skip
 
 
 @table.register(ResponsePosterior)

@@ -21,6 +21,7 @@ import flexlink
 ROOT = Path(__file__).resolve().parents[1]
 GUIDE = ROOT / "docs" / "from_python.md"
 RESULTS = {"Identification", "Uncertainty", "SynthesisResult", "Certificate", "LoopRun", "Simulation"}
+RESULTS |= {"MultivariableResult", "MultivariableCertificate"}
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 

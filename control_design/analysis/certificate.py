@@ -228,7 +228,7 @@ def _check_plant(
         at_zero=not integrators,
     ).worse(nominal)
     at = int(np.argmin(distance))
-    peaks = {name: worst.peak(name) for name in worst.names}
+    peaks: dict[str, tuple[float, float | None]] = {name: worst.peak(name) for name in worst.names}
     weighted = max(peak for peak, _ in peaks.values())
     stable = bool(radius < 1.0)
     below = np.flatnonzero(distance < np.sqrt(2.0))

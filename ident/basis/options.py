@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from numbers import Number
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+import numpy as np
+from pydantic import Field, field_validator, model_validator
 
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
@@ -40,7 +42,8 @@ class IdentOptions(Settings):
     )
     fixed_poles: tuple[tuple[float, float], ...] = Field(
         (),
-        description="known poles in the z plane, each as real part, imaginary part >= 0; not changed",
+        description="known poles in the z plane: flexlink.Poles, complex numbers, or (real part, imaginary "
+        "part >= 0) each; not changed",
     )
 
     unstable_poles: tuple[tuple[float, float], ...] = Field(
@@ -104,6 +107,16 @@ class IdentOptions(Settings):
     zeta_max: float | None = Field(None, gt=0, le=0.98, description="largest damping ratio of a pair")
     decay_min_per_s: float | None = Field(None, gt=0, description="slowest decay of a real pole, 1/s")
     decay_max_per_s: float | None = Field(None, gt=0, description="fastest decay of a real pole, 1/s")
+
+    @field_validator("fixed_poles", "unstable_poles", mode="before")
+    @classmethod
+    def _numbers(cls, given: Any) -> Any:
+        """`Poles` and complex numbers as parts; of a conjugate pair, the upper one."""
+        poles = list(given.values) if isinstance(given, Poles) else given
+        if not (isinstance(poles, (list, tuple, np.ndarray)) and any(isinstance(p, Number) for p in poles)):
+            return poles
+        upper = [complex(p) for p in poles if np.imag(p) >= 0 or np.conj(p) not in poles]
+        return tuple((p.real, p.imag) for p in upper)
 
     @model_validator(mode="after")
     def _consistent(self) -> IdentOptions:

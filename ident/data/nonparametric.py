@@ -15,7 +15,7 @@ from ident.data.record import Record
 
 
 def empirical_frf(
-    records: Sequence[Record],
+    records: Record | Sequence[Record],
     *,
     omega_min_rad_s: float | None = None,
     omega_max_rad_s: float | None = None,
@@ -36,6 +36,7 @@ def empirical_frf(
     periods in steady state; else a straight line is taken off every signal. Raises ValueError when the
     records do not fit together or leave fewer than three spectral lines per estimate.
     """
+    records = (records,) if isinstance(records, Record) else records
     spectra = spectra_of(records, periodic)
     width = 2 * _half_width(half_width_lines, len(records)) + 1
     groups = _groups(spectra, width, omega_min_rad_s, omega_max_rad_s)

@@ -34,39 +34,52 @@ _HOLLOW: dict[str, Any] = {
 
 @style.drawing("error-surface")
 def draw_error_surface(channel: ChannelView) -> Figure | None:
-    """The surface of the slowest lightly damped pair, on a grid around it; nothing without a pair.
-
-    Residual RMS over that of the smallest grid point: contours on log axes, and the floor along frequency.
-    """
+    """The surface of the slowest lightly damped pair, on a grid around it; nothing without a pair."""
     if channel.shown_pair is None:
         return None
     surface = _surface(channel, channel.shown_pair)
-    omega, zeta = surface.first, surface.second
+    searched = searched_pairs(channel.found.identification.search.stages, surface.pole[0])
+    return draw_surface(surface, searched, style.plain(channel.name, 34))
+
+
+@style.finished
+def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str = "") -> Figure:
+    """Residual RMS over that of the smallest grid point: contours, and the floor along the first coordinate.
+
+    searched: points (E, 2) that a search tried.
+    """
+    first, second = surface.first, surface.second
     ratio = np.sqrt(surface.mean_square.T / surface.mean_square.min())
     figure, (left, bar, right) = style.panels(4.9, 1, 3, width_ratios=[1.75, 0.06, 1.0])
     top = max(float(np.percentile(ratio, 99)), 1.0001)
     levels = np.geomspace(1.0, top, 22)
     shades = np.clip(ratio, 1.0, top)
-    filled = left.contourf(omega, zeta, shades, levels=levels, cmap="cividis_r", norm="log")
-    searched = searched_pairs(channel.found.identification.search.stages, surface.pole[0])
-    low, high = [omega[0], zeta[0]], [omega[-1], zeta[-1]]
-    seen = searched[np.all((searched >= low) & (searched <= high), axis=1)]
-    if seen.size:
-        left.plot(seen[:, 0], seen[:, 1], **_DOTS, label=f"{seen.shape[0]} points the search tried")
+    filled = left.contourf(first, second, shades, levels=levels, cmap="cividis_r", norm="log")
+    low, high = [first[0], second[0]], [first[-1], second[-1]]
+    if searched is not None:
+        seen = searched[np.all((searched >= low) & (searched <= high), axis=1)]
+        if seen.size:
+            left.plot(seen[:, 0], seen[:, 1], **_DOTS, label=f"{seen.shape[0]} points the search tried")
     others = [(i, j) for i, j in surface.local_minima() if _is_another(surface, i, j)]
     if others:
         i, j = np.array(others[:8]).T
-        left.plot(omega[i], zeta[j], **_HOLLOW, label="other local minima")
-    label = f"found: {surface.pole[0]:.4g} rad/s, damping {surface.pole[1]:.3g}"
-    left.plot(surface.pole[:1], surface.pole[1:], **style.STAR | {"ms": 15, "mew": 0.8}, label=label)
-    left.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]), ylim=(zeta[0], zeta[-1]))
-    left.set(xlabel=_PAIR_AXIS, ylabel="damping ratio of the pair [1]")
-    left.set_title(f"Error surface: {style.plain(channel.name, 34)}")
+        left.plot(first[i], second[j], **_HOLLOW, label="other local minima")
+    polar = surface.names == ("omega_rad_s", "zeta")
+    words = ("{:.4g} rad/s, damping {:.3g}" if polar else "beta {:.6g}, gamma {:.6g}").format(*surface.pole)
+    star = style.STAR | {"ms": 15, "mew": 0.8}
+    left.plot(surface.pole[:1], surface.pole[1:], **star, label=f"found: {words}")
+    scale, labels = (
+        ("log", (_PAIR_AXIS, "damping ratio of the pair [1]")) if polar else ("linear", surface.names)
+    )
+    left.set(xscale=scale, yscale=scale, xlim=(first[0], first[-1]), ylim=(second[0], second[-1]))
+    left.set(xlabel=labels[0], ylabel=labels[1])
+    left.set_title(f"Error surface: {name}" if name else "Error surface")
     _round_ticks(figure.colorbar(filled, cax=bar), levels)
-    right.plot(omega, ratio.min(axis=0), **style.MODEL_LINE)
+    right.plot(first, ratio.min(axis=0), **style.MODEL_LINE)
     right.axvline(surface.pole[0], color=style.HIGHLIGHT, lw=1.4)
-    right.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]))
-    right.set(xlabel=_PAIR_AXIS, ylabel="residual RMS / smallest [1]", title="Along frequency, best damping")
+    right.set(xscale=scale, yscale="log", xlim=(first[0], first[-1]))
+    title = "Along frequency, best damping" if polar else "Along beta, best gamma"
+    right.set(xlabel=labels[0], ylabel="residual RMS / smallest [1]", title=title)
     return figure
 
 
