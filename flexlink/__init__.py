@@ -17,7 +17,7 @@ Controllers `UncertainPlant`, `Specification`, `RationalWeight`, `synthesise`, `
 Joints      `MultivariablePlant`, `ResponseBall`, `MultivariableSpecification`, `MultivariableOptions`,
             `synthesise_multivariable`, `MultivariableResult`, `certify_multivariable`,
             `MultivariableCertificate`: several sensors and actuators, after `identify_mimo`
-Machines    `Rig`, `paper_link`, `effect`, `simulate`, `SampledArm`, `prbs`, `multisine`
+Machines    `Rig`, `paper_link`, `effect`, `simulate`, `linear_arm`, `SampledArm`, `prbs`, `multisine`
 Causes      `Case`, `Experiment`, `diagnose`, `Diagnosis`
 Pictures    `plot`, `bode`, `compare`
 Tables      `table`

@@ -30,6 +30,7 @@ from .machines import (
     SampledArm as SampledArm,
     Simulation as Simulation,
     effect as effect,
+    linear_arm as linear_arm,
     multisine as multisine,
     paper_link as paper_link,
     prbs as prbs,

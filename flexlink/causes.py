@@ -22,7 +22,10 @@ class Diagnosis(Shown, answer.Diagnosis):
 
 
 def diagnose(case: Any, **more: Any) -> Diagnosis:
-    """Find the effect that explains the model error of a rig; arguments as in `diagnosis.diagnose`.
+    """Find the effect that explains the model error of a rig or of your own simulation.
+
+    case: a `Case`, or a `diagnosis.PlantCase` (docs/own_plant.md). more: `time_limit_s` and the other
+    arguments of `diagnosis.diagnose`.
 
     Takes about ten seconds for records of a few thousand samples.
 

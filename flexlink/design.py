@@ -251,10 +251,11 @@ def synthesise(
     rng: np.random.Generator | int = 0,
     **more: Any,
 ) -> SynthesisResult:
-    """Design one controller for one or several uncertain plants; arguments as in `control_design.synthesise`.
+    """Design one controller for one or several uncertain plants.
 
     plants: an `UncertainPlant` or what makes one (ss, tf, a model), or several. rng: a generator, or the seed
-    of one.
+    of one. more: as in `control_design.synthesise`. Raises SpecificationError where no controller can meet
+    the specification.
 
     Examples
     --------
@@ -329,6 +330,11 @@ def certify(
     error to command, to which the computational delay of the specification is added. plants: as in
     `synthesise`. plants and specification default to those of a result of `synthesise`.
 
+    more: `n_dense` (points of the grid, 6000); `between_own_points` ("linear" or "nothing": the response
+    between measured frequencies); `joint_coverage` (probability that the worst case holds for a complete
+    posterior sample), with `rng` (a generator or the seed of one), `joint_draws`, `joint_stable_share`.
+    Raises ValueError where sampling times or delays do not match, or the loop is algebraic.
+
     Examples
     --------
     >>> given = flexlink.Controller([[1.0]], [[0.05]], [[1.0]], [[0.0]], dt_s=0.01)
@@ -344,6 +350,8 @@ def certify(
     chosen = _several(plants)
     if controller is not None and not isinstance(controller, Controller):
         controller = _as_controller(controller, specification.computational_delay_samples)
+    if "joint_coverage" in more:
+        more["rng"] = np.random.default_rng(more.get("rng", 0))
     with threadpool_limits(1):
         found = certificate.certify(controller, chosen, specification, **more)
     return dressed(
@@ -394,7 +402,9 @@ def simulate_loop(controller: Any, machine: Any, reference: npt.ArrayLike, **mor
 
     controller: a `Controller`, or a discrete system of python-control (ss, tf) as in `certify`, with a delay
     of one sample. machine: a `SampledArm` or anything with `measure`, `advance` and `reset`; a linear system
-    or an `UncertainPlant` (its nominal) as well.
+    or an `UncertainPlant` (its nominal) as well. more: `hub_torque_Nm`, `input_disturbance`,
+    `output_disturbance` (T,), and the quantisation steps `measurement_step`, `command_step`. Raises
+    ValueError where sampling times or lengths do not match.
 
     Examples
     --------

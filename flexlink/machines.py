@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,22 @@ from flexlink.shown import Shown, dressed
 from plant import simulation
 from plant.effects import Effect, parse_effect
 from plant.excitation import multisine, prbs
+from plant.modal import linear_arm
 from plant.presets import paper_link
 from plant.rig import Rig
 from plant.simulation import SampledArm
 
-__all__ = ["Rig", "SampledArm", "Simulation", "effect", "multisine", "paper_link", "prbs", "simulate"]
+__all__ = [
+    "Rig",
+    "SampledArm",
+    "Simulation",
+    "effect",
+    "linear_arm",
+    "multisine",
+    "paper_link",
+    "prbs",
+    "simulate",
+]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -30,9 +41,10 @@ class Simulation(Shown, simulation.Trajectory):
         return float(self.time_s[1])
 
     def record(self, output: str = "hub_angle_rad", name: str = "simulated") -> Record:
-        """Voltage and one measured output, `hub_angle_rad` or `tip_m`, as a `Record`."""
-        if output not in SampledArm.output_names:
-            raise ValueError(f"no output {output!r}; there are {', '.join(SampledArm.output_names)}")
+        """Voltage and one signal of the machine, as `hub_angle_rad` or `tip_m`, as a `Record`."""
+        signals = [each.name for each in fields(self) if each.name not in ("time_s", "voltage_V")]
+        if output not in signals:
+            raise ValueError(f"no output {output!r}; there are {', '.join(signals)}")
         return Record(
             self.voltage_V, getattr(self, output), self.dt_s,
             name=name, input_names=("voltage_V",), output_names=(output,),
@@ -55,12 +67,17 @@ def effect(name: str, **parameters: Any) -> Effect:
 def simulate(
     rig: Rig,
     voltage_V: npt.ArrayLike,
-    effects: Sequence[Effect] = (),
+    effects: Effect | Sequence[Effect] = (),
     *,
-    rng: np.random.Generator | None = None,
+    rng: np.random.Generator | int | None = None,
     **settings: Any,
 ) -> Simulation:
-    """Drive a machine from rest with a held voltage (T,); arguments as in `plant.simulate`.
+    """Drive a machine from rest with a held voltage (T,).
+
+    effects: one or several of `effect`. rng: a generator or the seed of one, for the sensor noise; without it
+    there is none. settings: `dt_s` (default: the rig's), `hub_torque_Nm` and `tip_force_N` (T,) from outside,
+    `n_modes`, `substep_s` (longest step where the machine is not linear), as in `plant.simulate`. Raises
+    ValueError for a signal that is not (T,) or not finite, or an effect given twice.
 
     Examples
     --------
@@ -70,5 +87,7 @@ def simulate(
     >>> arm.record("tip_m").output.shape
     (500, 1)
     """
-    result = simulation.simulate(rig, voltage_V, effects, rng=rng, **settings)
+    given = (effects,) if isinstance(effects, Effect) else effects
+    noise = None if rng is None else np.random.default_rng(rng)
+    result = simulation.simulate(rig, voltage_V, given, rng=noise, **settings)
     return dressed(Simulation, result)

@@ -16,6 +16,7 @@ from ident import several_outputs
 from ident.basis import posterior
 from ident.basis.functions import basis_response, regressor
 from ident.basis.model import GobfModel as PlainModel
+from ident.basis.model_files import ModelFile
 from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.poles import Poles
 from ident.data.foreign_files import distinct
@@ -190,6 +191,14 @@ class GobfModel(Shown, PlainModel):
 
     table_in_notebook = True
 
+    def save(self, path: str | Path) -> None:
+        """Write poles, coefficients and state space to a .json or .mat file, as `identify --export` does."""
+        from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
+
+        if Path(path).suffix.lower() not in MODEL_SUFFIXES:
+            raise ValueError(f"{path}: expected a file name that ends in {' or '.join(MODEL_SUFFIXES)}")
+        Path(path).write_bytes(model_bytes(Path(path), ModelFile(self)))
+
 
 def _listed(names: str | Sequence[str]) -> tuple[str, ...]:
     """One name or several."""
@@ -289,6 +298,10 @@ class Identification(Shown, Identified):
     def to_control(self) -> Any:
         """The model as `control.StateSpace`."""
         return self.model.to_control()
+
+    def save(self, path: str | Path) -> None:
+        """Write the model as `GobfModel.save`."""
+        GobfModel.save(self.model, path)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -450,9 +463,10 @@ def error_surface(
 ) -> ErrorSurface:
     """Mean square residual with one pole pair of an identified model moved over a grid, its others frozen.
 
-    records: those of the identification, taken from it if it came from `flexlink.identify`. The other
-    arguments as `ident.error_surface`: pair, coordinates ("log": omega and zeta, "raw": beta and gamma),
-    first and second (grids), n_points.
+    records: those of the identification, taken from it if it came from `flexlink.identify`. settings: `pair`
+    (number of the pole pair, 0), `coordinates` ("log": omega and zeta, "raw": beta and gamma), `first` and
+    `second` (grids), `n_points` of each grid (61). Raises ValueError if there is no such pair or a grid
+    leaves the stable pairs.
 
     Examples
     --------

@@ -20,15 +20,15 @@ def prbs(
     hold_samples: int,
     amplitude_V: float,
     n_samples: int,
-    start: np.random.Generator | npt.ArrayLike | None = None,
+    start: np.random.Generator | int | npt.ArrayLike | None = None,
 ) -> Real:
     """Pseudo-random binary sequence +-amplitude of maximum length, every value held for hold_samples.
 
     The period is (2^register_length - 1) * hold_samples; the sequence s of one period (unheld, unit
     amplitude) has the circular autocorrelation sum_k s_k s_(k+l) = -1 for every l but 0.
 
-    start : Register at the start: bits (register_length,) that are not all zero, or a generator that draws
-        them (the first bit is then set to 1); None starts with all ones.
+    start : Register at the start: bits (register_length,) that are not all zero, or a generator (or the seed
+        of one) that draws them (the first bit is then set to 1); None starts with all ones.
 
     Raises ValueError for a register length outside 2..20, a hold or length below 1, a bad amplitude or
     register.
@@ -40,8 +40,8 @@ def prbs(
     _check_positive(amplitude_V=amplitude_V)
     if start is None:
         register = np.ones(register_length, dtype=np.int8)
-    elif isinstance(start, np.random.Generator):
-        register = start.integers(0, 2, register_length).astype(np.int8)
+    elif isinstance(start, (int, np.random.Generator)):
+        register = np.random.default_rng(start).integers(0, 2, register_length).astype(np.int8)
         register[0] = 1
     else:
         register = np.array(start, dtype=np.int8)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
@@ -220,8 +220,11 @@ def _toml(value: float | str) -> str:
     return f'"{value}"' if isinstance(value, str) else repr(float(value))
 
 
-def one_line(error: ValidationError) -> str:
-    """The gravest complaint of pydantic in one line: dotted key, what was expected, what came."""
+def one_line(error: ValidationError, known: Collection[str] = ()) -> str:
+    """The gravest complaint of pydantic in one line: dotted key, what was expected, what came.
+
+    known: the keys, where they are not those of a rig.
+    """
     # An unknown key first: a misspelt key is also a missing one, and its spelling is what has to be seen.
     first = min(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden")
     key = ".".join(str(part) for part in first["loc"])
@@ -229,8 +232,10 @@ def one_line(error: ValidationError) -> str:
     if kind == "missing":
         text = f"{key}: missing, expected a value"
     elif kind == "extra_forbidden":
-        close = get_close_matches(key, (*parameter_keys(), *Rig.model_fields), n=1, cutoff=0.7)
-        text = f"{key}: unknown key" + (f" (did you mean {close[0]}?)" if close else "")
+        names = known or (*parameter_keys(), *Rig.model_fields)
+        close = get_close_matches(key, names, n=1, cutoff=0.7)
+        hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}" if known else ""
+        text = f"{key}: unknown key" + (f" ({hint})" if hint else "")
     elif kind == "value_error":
         text = f"{key}: {message}" if key else message
     else:

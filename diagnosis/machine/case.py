@@ -20,8 +20,8 @@ class Experiment:
     """One record.
 
     name : str
-    role : "estimation" or "held_out"
-        Held-out records are for validation; no parameter is fitted to them.
+    role : "estimation" or "validation" (kept as "held_out")
+        No parameter is fitted to validation records.
     voltage_V : (T,). Commanded voltage, held from its row to the next.
     output : (T, Y). The outputs as measured, at the instants at which the voltage changes.
     kind : str. Kind of input, free text for the page.

@@ -18,7 +18,7 @@ from plant.effects import EFFECTS
 from plant.effects.search_space import Candidate
 
 Real = npt.NDArray[np.float64]
-Role = Literal["estimation", "held_out"]
+Role = Literal["estimation", "held_out", "validation"]  # the last two are one
 Record = TypeVar("Record", bound="RecordOfMachine")
 
 FEWEST_SAMPLES = 20  # fewer tell no more than a handful of parameters
@@ -204,8 +204,10 @@ def check_record(record: RecordOfMachine, output_names: Sequence[str] = ()) -> N
     if u.ndim != 2 or y.ndim != 2 or len(u) != len(y) or (output_names and y.shape[1] != len(output_names)):
         outputs = len(output_names) or "Y"
         raise ValueError(f"{what}: needs input (T, U) and output (T, {outputs}); got {u.shape} and {y.shape}")
+    if record.role == "validation":
+        object.__setattr__(record, "role", "held_out")
     if record.role not in ("estimation", "held_out"):
-        raise ValueError(f"{what}: role must be estimation or held_out; got {record.role!r}")
+        raise ValueError(f"{what}: role must be estimation or validation; got {record.role!r}")
     if not (np.all(np.isfinite(u)) and np.all(np.isfinite(y))):
         raise ValueError(f"{what}: a value is not finite")
     if len(u) < FEWEST_SAMPLES:

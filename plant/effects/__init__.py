@@ -45,7 +45,7 @@ def parse_effect(entry: Mapping[str, Any]) -> Effect:
     try:
         return kinds[name].model_validate({key: value for key, value in entry.items() if key != "name"})
     except ValidationError as error:
-        raise ValueError(f"effect {name}: {one_line(error)}") from error
+        raise ValueError(f"effect {name}: {one_line(error, kinds[name].model_fields)}") from error
 
 
 def parse_effects(entries: Iterable[Mapping[str, Any]]) -> tuple[Effect, ...]:

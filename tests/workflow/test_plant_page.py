@@ -8,9 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.signal import lfilter
 
-import diagnosis
 from workflow.diagnose.pages import write_plant_page
 
 GUIDE = Path(__file__).resolve().parents[2] / "docs" / "own_plant.md"
@@ -37,9 +35,7 @@ def _motor():
 
 
 def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path, faults_seen):
-    given = {name: getattr(diagnosis, name) for name in diagnosis.__all__}
-    given |= {"np": np, "lfilter": lfilter, "replace": replace, "DT_S": DT_S, "folder": tmp_path}
-    given |= {"write_plant_page": write_plant_page, **_motor()}
+    given = {"DT_S": DT_S, "folder": tmp_path, **_motor()}
     test = doctest.DocTestParser().get_doctest(GUIDE.read_text(), given, GUIDE.name, str(GUIDE), 0)
     result = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(test, clear_globs=False)
     assert (result.failed, result.attempted > 8) == (0, True)
