@@ -378,9 +378,10 @@ def certify_multivariable(
     dense_points: int = 1500,
 ) -> MultivariableCertificate:
     """Certify a controller of all sensors and actuators; `control_design.certify_multivariable`."""
+    law = controller if isinstance(controller, Controller) else controller.controller
     with threadpool_limits(1):
         found = multivariable_certificate.certify_multivariable(
-            getattr(controller, "controller", controller), plants, specification, dense_points=dense_points
+            law, plants, specification, dense_points=dense_points
         )
     return MultivariableCertificate(found.verdicts)
 

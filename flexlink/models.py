@@ -338,7 +338,7 @@ class Uncertainty(Shown, posterior.ResponsePosterior):
     @property
     def missed_mode_suspected(self) -> bool:
         """The data themselves raise the odds that a mode is missing."""
-        now, before = self.report.probability_missed_mode, self.prior_missed_mode
+        now, before = getattr(self.report, "probability_missed_mode", 0.0), self.prior_missed_mode
         return now * (1 - before) >= _POSITIVE * (1 - now) * before > 0
 
     def nominal(self) -> GobfModel:
@@ -501,7 +501,7 @@ def _records(records: Any) -> tuple[PlainRecord, ...]:
     return tuple(used)
 
 
-def _records_of(identification: Identified, records: Any) -> tuple[PlainRecord, ...]:
+def _records_of(identification: Any, records: Any) -> tuple[PlainRecord, ...]:
     """These records or those of the identification, of one input and one output."""
     model = getattr(identification, "model", None)
     if isinstance(identification, MimoIdentified):

@@ -19,7 +19,7 @@ from flexlink.machines import Simulation
 from ident.basis.model import GobfModel
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
-from ident.identification import Identification, MimoIdentification
+from ident.identification import Identification
 from ident.search.error_surface import ErrorSurface
 from ident.uncertainty import ResponsePosterior
 
@@ -133,8 +133,7 @@ def _simulation(simulation: Simulation) -> Figure:
 
 
 @plot.register(Identification)
-@plot.register(MimoIdentification)
-def _poles(found: Identification | MimoIdentification) -> Figure:
+def _poles(found: Identification) -> Figure:
     from workflow.figures.poles import draw_poles
 
     return draw_poles(found.model)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import os
+import re
 import subprocess
 import sys
 from importlib import import_module
@@ -307,12 +308,91 @@ def test_another_sampling_time_is_refused_with_what_to_do():
         (lambda: flexlink.identify(example_record(), pairs=1), "pairs"),
         (lambda: flexlink.identify(example_record(), flexlink.IdentOptions(), n_pairs=1), "not both"),
         (lambda: flexlink.effect("magic"), "unknown effect 'magic'"),
+        (lambda: flexlink.effect("viscous_friction", c=1.0), "known: coefficient_Nms"),
+        (lambda: flexlink.Specification(bandwith_rad_s=1.0), "did you mean bandwidth_rad_s"),
+        (lambda: flexlink.YoulaOptions(zzz=3), "known keys: dense_points"),
+        (lambda: flexlink.RationalWeight(numerator=[1.0]), "missing key denominator"),
+        (lambda: flexlink.MultivariableOptions(starts=0), "starts: .*got 0"),
+        (lambda: flexlink.identify([1.0]), r"flexlink\.Record\(u=u"),
+        (lambda: flexlink.identify(np.ones(9), np.ones(9)), r"flexlink\.Record\(u=u"),
+        (lambda: flexlink.uncertainty(example_record()), "result of flexlink.identify"),
+        (lambda: flexlink.uncertainty(None, level=0.9), r"spread\.at"),
+        (lambda: flexlink.simulate_loop(TF, flexlink.paper_link(), [1.0]), "SampledArm"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(call, message):
     with pytest.raises(ValueError, match=message) as caught:
         call()
     assert "\n" not in str(caught.value)
+
+
+def test_an_unstable_loop_is_called_so_and_has_no_margins():
+    """A sign turned round, in one channel and in two."""
+    wrong = control.tf([-0.5, 0.45], [1.0, -1.0], 0.01)
+    found = flexlink.certify(wrong, example_plant(), flexlink.Specification(bandwidth_rad_s=1.0))
+    assert repr(found).splitlines()[0].startswith("Not certified: the nominal loop of 'motor' is UNSTABLE")
+    assert np.isnan(list(vars(found.plants[0].worst_margins).values())).all()
+    assert np.isnan(found.plants[0].bandwidth_rad_s)
+    assert found.table()["achieved"].isna().all()
+    both = control.append(control.ss(TF), control.ss(TF))
+    joint = flexlink.Specification(modulus_margin=0.3)
+    wanted = flexlink.MultivariableSpecification(joints=(joint, joint), controller_order=2)
+    given = flexlink.Controller(np.zeros((1, 1)), np.zeros((1, 2)), np.zeros((2, 1)), -3 * np.eye(2), 0.01)
+    matrix = flexlink.certify_multivariable(given, flexlink.MultivariablePlant("two", both), wanted)
+    assert "UNSTABLE" in repr(matrix)
+
+
+def test_without_uncertainty_the_certificate_is_of_the_nominal_plant_and_says_so():
+    found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
+    asked = flexlink.Specification(modulus_margin=0.3)
+    given = flexlink.Controller.proportional(0.05, 0.01)
+    spread = flexlink.uncertainty(found, flexlink.EmbeddingOptions(prior_missed_mode=0.0))
+    for plant, nominal in ((found, True), (found.to_control(), True), (spread, False)):
+        certificate = flexlink.certify(given, plant, asked)
+        assert certificate.nominal_only is nominal
+        assert ("nominal plant only" in repr(certificate)) is nominal
+        assert (certificate.table()["about"] == "nominal loop").all() == nominal
+
+
+def test_the_order_given_reaches_the_uncertainty():
+    record = example_record()
+    given = flexlink.uncertainty(flexlink.identify(record, n_pairs=1, n_real=0))
+    assert given.report.probability_no_remainder == 0
+    chosen = flexlink.uncertainty(flexlink.identify(record, max_pairs=1, max_real=0))
+    assert chosen.report.probability_no_remainder > 0
+    assert not given.missed_mode_suspected  # the record has one mode: nothing speaks for another
+    assert "may be missing" not in repr(given)
+
+
+def test_fixed_poles_are_taken_in_every_form():
+    poles = flexlink.Poles(real=[0.8], pairs=[0.9 + 0.3j])
+    for form in (poles, poles.values, [0.8, 0.9 + 0.3j], [(0.8, 0.0), (0.9, 0.3)]):
+        fixed = flexlink.IdentOptions(fixed_poles=form, n_real=0, n_pairs=0).fixed()
+        np.testing.assert_array_equal(fixed.values, poles.values)
+    outside = flexlink.IdentOptions(unstable_poles=[1.1]).unstable()
+    np.testing.assert_array_equal(outside.values, [1 / 1.1])
+
+
+@pytest.mark.parametrize("kind", ["IdentOptions", "EmbeddingOptions", "Specification", "SynthesisOptions",
+    "YoulaOptions", "RationalWeight", "MultivariableOptions", "MultivariableSpecification"])  # fmt: skip
+def test_help_of_options_lists_every_field(kind):
+    options = getattr(flexlink, kind)
+    for name, field in options.model_fields.items():
+        assert re.search(rf"^    {name}( = .+)?: {re.escape(field.description)}$", options.__doc__, re.M)
+
+
+def test_error_surface_and_bracket_have_table_print_and_picture():
+    found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
+    for coordinates in ("log", "raw"):
+        surface = flexlink.error_surface(found, n_points=9, coordinates=coordinates)
+        assert isinstance(surface.plot(), Figure)
+        assert len(surface.table()) == 81
+        assert repr(surface).startswith("Error surface")
+    coarse = flexlink.YoulaOptions(grid_points=60, dense_points=1000)
+    bracket = flexlink.youla_bracket(example_plant(), example_specification(), coarse)
+    assert bracket.table()["inscribed"][0] == bracket.floor
+    with pytest.raises(TypeError, match="there is one of Certificate, "):
+        flexlink.plot(bracket)
 
 
 def test_a_plant_module_of_the_users_own_is_not_taken_for_ours(tmp_path):

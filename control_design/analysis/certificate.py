@@ -233,6 +233,7 @@ def _check_plant(
     stable = bool(radius < 1.0)
     below = np.flatnonzero(distance < np.sqrt(2.0))
     bandwidth = float(worst.omega_rad_s[below[0] - 1]) if below.size and below[0] > 0 else 0.0
+    peak_sensitivity = 1.0 / margins.modulus if margins.modulus > 0 else float("inf")
     if not stable:  # |1 + K G| says nothing of a loop that is not stable
         nominal = margins = Margins(*[np.nan] * len(fields(Margins)))
         peaks, bandwidth = dict.fromkeys(peaks, (np.nan, None)), np.nan
@@ -258,7 +259,7 @@ def _check_plant(
         worst_margins=margins,
         worst_margin_omega_rad_s=float(worst.omega_rad_s[at]),
         worst_weighted=weighted if margins.modulus > 0 else float("inf"),
-        worst_peak_sensitivity=1.0 / margins.modulus if margins.modulus > 0 else float("inf"),
+        worst_peak_sensitivity=peak_sensitivity,
         bandwidth_rad_s=bandwidth,
         frequencies=int(worst.omega_rad_s.size),
         own_grid_rad_s=None
