@@ -113,8 +113,10 @@ class IdentOptions(Settings):
     def _numbers(cls, given: Any) -> Any:
         """`Poles` and complex numbers as parts; of a conjugate pair, the upper one."""
         poles = list(given.values) if isinstance(given, Poles) else given
-        if not (isinstance(poles, (list, tuple, np.ndarray)) and any(isinstance(p, Number) for p in poles)):
+        if not isinstance(poles, (list, tuple, np.ndarray)):
             return poles
+        if not any(isinstance(p, Number) for p in poles):
+            return tuple(tuple(p) if isinstance(p, list) else p for p in poles)
         upper = [complex(p) for p in poles if np.imag(p) >= 0 or np.conj(p) not in poles]
         return tuple((p.real, p.imag) for p in upper)
 
