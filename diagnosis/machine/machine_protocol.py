@@ -18,7 +18,7 @@ from plant.effects import EFFECTS
 from plant.effects.search_space import Candidate
 
 Real = npt.NDArray[np.float64]
-Role = Literal["estimation", "held_out", "validation"]  # the last two are one
+Role = Literal["estimation", "held_out"]
 Record = TypeVar("Record", bound="RecordOfMachine")
 
 FEWEST_SAMPLES = 20  # fewer tell no more than a handful of parameters
