@@ -204,7 +204,7 @@ def check_record(record: RecordOfMachine, output_names: Sequence[str] = ()) -> N
     if u.ndim != 2 or y.ndim != 2 or len(u) != len(y) or (output_names and y.shape[1] != len(output_names)):
         outputs = len(output_names) or "Y"
         raise ValueError(f"{what}: needs input (T, U) and output (T, {outputs}); got {u.shape} and {y.shape}")
-    if record.role == "validation":
+    if str(record.role) == "validation":
         object.__setattr__(record, "role", "held_out")
     if record.role not in ("estimation", "held_out"):
         raise ValueError(f"{what}: role must be estimation or validation; got {record.role!r}")
