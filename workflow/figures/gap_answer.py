@@ -56,7 +56,8 @@ def draw_waterfall(found: Diagnosis) -> Figure:
         width=0.6,
         tick_label=[gap_style.WORDS[model].replace(" ", "\n") for model in gaps],
     )
-    left.bar_label(bars, [f"{v:.3f}" if v < 10 else f"{v:.1f}" for v in gaps.values()], padding=3)
+    digits = [".3g" if rough > 0 else ".3f" if v < 10 else ".1f" for v in gaps.values()]
+    left.bar_label(bars, [format(v, d) for v, d in zip(gaps.values(), digits, strict=True)], padding=3)
     left.axhline(floor, **line, zorder=1)
     left.set(xlim=(-0.6, max(len(gaps), 3) - 0.4), ylim=(0, 1.15 * max(*gaps.values(), floor)))
     left.set(ylabel=words, title="Validation records together")
