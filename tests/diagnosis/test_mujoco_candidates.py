@@ -160,7 +160,7 @@ def test_it_is_named_with_its_size_and_the_repaired_model_moves_as_the_machine(t
     assert low < size < high
     assert value == pytest.approx(size, rel=0.1)
     # MuJoCo alone, from the text alone, on commands that no log has.
-    text = loaded.repaired(found)
+    text = loaded.repaired(found, Path(tmp_path))
     model = mujoco.MjModel.from_xml_string(text)
     beyond = {"motor.dead_zone", "hinge.stribeck"} & {effect}
     notes = [line for line in text.splitlines() if '<text name="flexlink"' in line]

@@ -219,7 +219,7 @@ def test_a_parametric_effect_is_the_rig_with_that_parameter():
         ({"name": "coulomb_friction"}, r"^effect coulomb_friction: torque_Nm: missing, expected a value$"),
         (
             {"name": "coulomb_friction", "torque_Nm": 1.0, "level": 2.0},
-            r"^effect coulomb_friction: level: unknown key$",
+            r"^effect coulomb_friction: level: unknown key \(known: torque_Nm\)$",
         ),
         (
             {

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.colorbar import Colorbar
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, MaxNLocator, MultipleLocator
@@ -26,18 +27,18 @@ _CUT_LINES: tuple[dict[str, Any], ...] = (
 def draw_surface(study: SurfaceStudy) -> Figure:
     """Above: surface and cuts. Below: minima against the grid, and shares of DIRECT's searches at order 4."""
     figure = style.new_figure(8.6)
-    grid = figure.add_gridspec(4, 2, height_ratios=[0.5, 0.7, 0.6, 0.6], width_ratios=[1.15, 1.0])
-    left = figure.add_subplot(grid[:2, 0])
-    close, whole = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
-    counts, shares = figure.add_subplot(grid[2:, 0]), figure.add_subplot(grid[2:, 1])
-    _surface(figure, left, study)
+    grid = figure.add_gridspec(4, 3, height_ratios=[0.5, 0.7, 0.6, 0.6], width_ratios=[1.1, 0.05, 1.0])
+    left, bar = figure.add_subplot(grid[:2, 0]), figure.add_subplot(grid[:2, 1])
+    close, whole = figure.add_subplot(grid[0, 2]), figure.add_subplot(grid[1, 2])
+    counts, shares = figure.add_subplot(grid[2:, :2]), figure.add_subplot(grid[2:, 2])
+    _surface(left, bar, study)
     _cuts(close, whole, study)
     _counts(counts, study.counts)
     _shares(shares, study.shares)
     return figure
 
 
-def _surface(figure: Figure, axes: Axes, study: SurfaceStudy) -> None:
+def _surface(axes: Axes, beside: Axes, study: SurfaceStudy) -> None:
     surface = study.surface
     # Levels of equal area: on an even scale the side valleys, a few per cent deep, would not show.
     levels = np.unique(np.quantile(surface.mean_square, np.linspace(0, 1, 25)))
@@ -72,7 +73,8 @@ def _surface(figure: Figure, axes: Axes, study: SurfaceStudy) -> None:
     axes.xaxis.set_major_formatter(FormatStrFormatter("%.3f"))
     axes.yaxis.set_major_formatter(FormatStrFormatter("%.4f"))
     axes.grid(visible=False)
-    bar = figure.colorbar(mesh, ax=axes, pad=0.02, aspect=30, ticks=levels[:: max(levels.size // 6, 1)])
+    ticks = levels[:: max(levels.size // 6, 1)]
+    bar = Colorbar(beside, mesh, ticks=ticks)
     bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%.5f"))
     bar.set_label("J [output²]")
 

@@ -84,14 +84,14 @@ def _place(figure: Figure, around: dict[Axes, Real], legend_px: float) -> None:
     room = np.zeros((2, 2, max(grid.nrows, grid.ncols)))  # column or row, before or after, which
     room += pads[:, None, None]
     for axes, (left, bottom, right, top) in around.items():
-        for which, cell, words in zip((0, 1), _cell(axes), ((left, right), (top, bottom)), strict=True):
-            room[which, :, cell] = np.maximum(room[which, :, cell], np.array(words) + pads[which])
+        for which, ends, words in zip((0, 1), _cells(axes), ((left, right), (top, bottom)), strict=True):
+            room[which, (0, 1), ends] = np.maximum(room[which, (0, 1), ends], np.array(words) + pads[which])
     above = size[1] - max(legend_px + 2 * pads[1], 0.0)
     x_px = _edges(room[0, :, : grid.ncols], grid.get_width_ratios(), size[0])
     y_px = size[1] - _edges(room[1, :, : grid.nrows], grid.get_height_ratios(), above)
     for axes in figure.axes:
-        column, row = _cell(axes)
-        box = np.array([[x_px[0, column], y_px[1, row]], [x_px[1, column], y_px[0, row]]]) / size
+        (left, right), (top, bottom) = _cells(axes)
+        box = np.array([[x_px[0, left], y_px[1, bottom]], [x_px[1, right], y_px[0, top]]]) / size
         axes.set_position(Bbox(np.round(box, 5)))
         axes.apply_aspect()
         for child in axes.child_axes:
@@ -99,10 +99,11 @@ def _place(figure: Figure, around: dict[Axes, Real], legend_px: float) -> None:
             child.apply_aspect(locate(child, None))
 
 
-def _cell(axes: Axes) -> tuple[int, int]:
-    """Column and row."""
+def _cells(axes: Axes) -> tuple[tuple[int, int], tuple[int, int]]:
+    """First and last column, first and last row."""
     place: Any = axes.get_subplotspec()
-    return place.colspan.start, place.rowspan.start
+    columns, rows = place.colspan, place.rowspan
+    return (columns.start, columns.stop - 1), (rows.start, rows.stop - 1)
 
 
 def _edges(room: Any, ratios: Sequence[float], total: float) -> Any:
@@ -241,4 +242,4 @@ def _along(axis: Axis) -> int:
 def _column(axis: Axis) -> Any:
     """Of a y axis on the left its column; of others the axis itself."""
     side: Any = axis.get_label_position()
-    return _cell(axis.axes)[0] if side == "left" else axis
+    return _cells(axis.axes)[0][0] if side == "left" else axis
