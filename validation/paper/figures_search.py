@@ -73,7 +73,7 @@ def _surface(axes: Axes, beside: Axes, study: SurfaceStudy) -> None:
     axes.xaxis.set_major_formatter(FormatStrFormatter("%.3f"))
     axes.yaxis.set_major_formatter(FormatStrFormatter("%.4f"))
     axes.grid(visible=False)
-    ticks = levels[:: max(levels.size // 6, 1)]
+    ticks = levels[:: max(levels.size // 6, 1)].tolist()
     bar = Colorbar(beside, mesh, ticks=ticks)
     bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%.5f"))
     bar.set_label("J [output²]")
