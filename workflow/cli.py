@@ -660,7 +660,8 @@ def study(
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Controller tuning study: specification, ellipses, synthesis or payload varied over one plant."""
+    """Controller tuning study: specification, ellipses, synthesis or payload varied over one plant, of one
+    loop or of several joints."""
     need(config)
     _one_of(jobs, scheduler)
     with _watched(quiet) as progress:

@@ -297,3 +297,43 @@ def test_what_cannot_be_met_is_a_result_with_exit_code_one(tmp_path, capfd):
     assert "not certified" in capfd.readouterr().err
     assert "Not certified" in (tmp_path / "run" / "report.html").read_text()
     assert np.isfinite(Controller.from_json((tmp_path / "run" / "controller.json").read_text()).D).all()
+
+
+def test_a_study_varies_what_a_joint_is_asked(run_of_the_arm, tmp_path):
+    """From the run's models: its own point is designed as in the run, and a faster one has a larger worst
+    case; the table says what the certificate and the loops of each point say."""
+    study = f"""
+    [study]
+    base = "{run_of_the_arm}"
+    [[axes]]
+    key = "joints[1].bandwidth_rad_s"
+    label = "elbow"
+    values = [5.0, 200.0]
+    [[axes]]
+    key = "design.structure"
+    values = ["full", "diagonal"]
+    """
+    assert main(["study", "--config", str(_written(tmp_path, study)), "--out", str(tmp_path / "bad")]) == 2
+    study = study.replace(', "diagonal"', "")
+    out = tmp_path / "study"
+    where = _written(tmp_path, study)
+    assert main(["study", "--config", str(where), "--out", str(out), "--quiet", "--jobs", "1"]) == 0
+    table = pd.read_csv(out / "table.csv")
+    assert list(table["state"]) == ["certified", "not certified"]
+    assert table["worst_gamma"][0] < 1 < table["worst_gamma"][1]
+    certificate = JointsResults(RunDirectory(run_of_the_arm)).certify.certificate
+    disks = [disk.alpha for one in certificate.verdicts for disk in (one.input_disk, one.output_disk)]
+    assert table["disk_margin"][0] == pytest.approx(min(disks), rel=1e-9)
+    own = out / "points" / "1"
+    for name in ("design.npz", "certify.json"):
+        assert (own / "stages" / name).read_bytes() == (run_of_the_arm / "stages" / name).read_bytes()
+    assert main(["report", str(own)]) == 0
+    assert "worst case" in (out / "study.html").read_text()
+
+
+@pytest.mark.parametrize("command", ["design", "tune"])
+def test_commands_for_one_loop_say_what_to_use(command, run_of_the_arm, capfd):
+    assert main([command, str(run_of_the_arm)]) == 2
+    told = capfd.readouterr().err.splitlines()[-1]
+    assert "a run for several joints" in told
+    assert "flexlink study" in told

@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from workflow.config.joints_config import JointsConfig, TwoJointSource, is_for_joints, load_joints
+from workflow.config.joints_config import AnyConfig, TwoJointSource, is_for_joints, load_any, load_joints
 from workflow.config.run_config import (
-    RunConfig,
     SimulatedSource,
     built_in_config,
-    load_config,
     load_simulation,
 )
 from workflow.engine import storage
@@ -45,9 +43,9 @@ def run_from_files(
         raise InputError(
             f"{'--resume' if resume else '--replace'} needs --out DIR, the directory of the earlier run"
         )
-    config: RunConfig | JointsConfig
+    config: AnyConfig
     if config_path is not None:
-        config, text = (load_joints if is_for_joints(config_path) else load_config)(config_path)
+        config, text = load_any(config_path)
     elif resume and out is not None and (out / "manifest.json").is_file():
         from workflow.tasks.pipeline import any_config_of
 

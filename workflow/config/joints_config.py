@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import tomlkit
 from pydantic import Field, model_validator
 
 from control_design.specification import Specification
 from control_design.specification.multivariable import MultivariableSpecification
 from control_design.synthesis.synthesis_options import MultivariableOptions
-from workflow.config.run_config import FileSource, Name, RunSection
+from workflow.config.run_config import FileSource, Name, RunConfig, RunSection, load_config
 from workflow.config.settings import Section, check, repeated
 from workflow.engine.documents import read_toml
 
@@ -163,10 +164,23 @@ class JointsConfig(Section):
         document["joints"] = [joint.model_dump(mode="json", exclude_unset=True) for joint in self.joints]
         return document
 
+    def to_toml(self) -> str:
+        """As a user would write it; what has no value is left out."""
+        joints = [joint.model_dump(mode="json", exclude_unset=True) for joint in self.joints]
+        return tomlkit.dumps(self.model_dump(mode="json", exclude_none=True) | {"joints": joints})
+
     @classmethod
     def from_document(cls, document: Mapping[str, Any], *, source: str) -> JointsConfig:
         """Inverse of `to_document`."""
         return check(cls, document, source=source, context={"may_be_gone": True})
+
+
+AnyConfig = RunConfig | JointsConfig
+
+
+def load_any(path: Path) -> tuple[AnyConfig, str]:
+    """A run of one loop or of several joints, and its text. Raises InputError as `load_config`."""
+    return load_joints(path) if is_for_joints(path) else load_config(path)
 
 
 def is_for_joints(path: Path) -> bool:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from control_design.analysis.margins import Margins
+    from workflow.tasks.joints import JointsResults
     from workflow.tasks.results import RunResults
 
 Number = float | int | None
@@ -35,6 +36,7 @@ _ALL = (
     Column("gain_margin_dB", "gain margin", "dB", "larger"),
     Column("phase_margin_deg", "phase margin", "deg", "larger"),
     Column("delay_margin_ms", "delay margin", "ms", "larger"),
+    Column("disk_margin", "disk margin, all joints at once", "", "larger"),
     Column("bandwidth_rad_s", "bandwidth", "rad/s", "larger"),
     Column("mode_damping", "mode damping", "", "larger"),
     Column("mode_omega_rad_s", "of the mode at", "rad/s"),
@@ -108,6 +110,29 @@ def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None)
         if check.sensitivity is not None:
             found["predicted_peak_sensitivity"] = check.sensitivity.nominal_peak
             found["measured_peak_sensitivity"] = check.sensitivity.measured[0].peak
+    return found
+
+
+def numbers_of_joints(results: JointsResults) -> dict[str, Number]:
+    """The same of several joints: worst over the operating points, over sensors and actuators, and, in closed
+    loop, over runs and joints. disk_margin is that of the nominal loop."""
+    from workflow.engine.codec import plain
+
+    found: dict[str, Number] = dict.fromkeys(COLUMNS)
+    design, certificate, runs = results.design.found, results.certify.certificate, results.closed_loop.runs
+    if design is not None:
+        found["design_gamma"] = plain(design.gamma)
+    if certificate is not None:
+        verdicts = certificate.verdicts
+        bounds = max(bound for verdict in verdicts for bound in verdict.bounds.values())
+        found["worst_gamma"] = plain(bounds if math.isfinite(bounds) else certificate.gamma)
+        if all(verdict.stable for verdict in verdicts):
+            disks = [disk.alpha for one in verdicts for disk in (one.input_disk, one.output_disk)]
+            found["disk_margin"] = min(disks)
+    if runs:
+        found["settled_draws"], found["draws"] = sum(run.settled for run in runs), len(runs)
+        if all(run.settled for run in runs):
+            found["overshoot_percent"] = 100.0 * max(0.0, *(float(run.overshoot.max()) for run in runs))
     return found
 
 

@@ -23,15 +23,12 @@ from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory, first_difference
 from workflow.engine.store import Store
-from workflow.study.points import PLANT_STAGES, POINT_STAGES, Base, Combination, Point
+from workflow.study.points import Base, Combination, Point
 from workflow.study.task import Done
 from workflow.tasks.pipeline import stage_input_hash
-from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage
-from workflow.tasks.summary import summarise
 
 LAYOUT_VERSION = 1  # the first; a study of another one is not resumed
-_PLANT = tuple(stage.name for stage in PLANT_STAGES)
 
 
 @dataclass(frozen=True)
@@ -111,12 +108,14 @@ class StudyDirectory(Store):
 
     def has_plant(self, point: Point) -> bool:
         """Whether the plant of a point is there, made from what it would be made from now."""
-        return _matches(self.plant(point), point, PLANT_STAGES, skip=point.given)
+        return _matches(self.plant(point), point, point.kind.plant, skip=point.given)
 
     def has_point(self, point: Point) -> bool:
         """Whether a point is finished, with the plant that stands in the study."""
         run = self.point(point)
-        return _matches(run, point, POINT_STAGES) and run.stage_files(_PLANT) == self.plant_files(point)
+        return _matches(run, point, point.kind.after) and run.stage_files(_plant(point)) == self.plant_files(
+            point
+        )
 
     def save_plant(self, point: Point, given: Mapping[str, bytes], done: Done) -> None:
         """Keep records, model and ellipses."""
@@ -128,7 +127,7 @@ class StudyDirectory(Store):
         """Keep a finished point, with the plant's stages beside its own: a run like any other."""
         run = self.point(point)
         _write(run, point, self.plant_files(point), done)
-        certified = summarise(RunResults(run), point.config).certified
+        certified = point.kind.summarise(point.kind.results(run), point.config).certified
         run.record_status("complete" if certified else "complete, not certified")
 
     def link_numbers(self, points: Iterable[Combination]) -> None:
@@ -143,7 +142,11 @@ class StudyDirectory(Store):
 
     def plant_files(self, point: Point) -> dict[str, bytes]:
         """The stage files of the plant that a point shares, by file name."""
-        return self.plant(point).stage_files(_PLANT)
+        return self.plant(point).stage_files(_plant(point))
+
+
+def _plant(point: Point) -> tuple[str, ...]:
+    return tuple(stage.name for stage in point.kind.plant)
 
 
 def _write(run: RunDirectory, point: Point, given: Mapping[str, bytes], done: Done) -> None:

@@ -14,14 +14,16 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from workflow.config.joints_config import JointsConfig
 from workflow.engine import codec
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures import style
-from workflow.study.columns import COLUMNS, Column, Number, numbers_of
+from workflow.study.columns import COLUMNS, Column, Number, numbers_of, numbers_of_joints
 from workflow.study.points import Combination, Point, short
 from workflow.study.settings import Axis, ParetoPlot, StudyConfig
+from workflow.tasks.joints import JointsResults
 from workflow.tasks.results import RunResults
-from workflow.tasks.summary import verdict_of
+from workflow.tasks.summary import summarise_joints, verdict_of
 from workflow.text.templates import RunSummary, render_text, rows_of, said
 
 State = Literal["certified", "does not settle", "keeps moving", "not certified", "impossible", "failed"]
@@ -43,6 +45,8 @@ class PointRow(Combination):
 
 def row_of(point: Point, run: RunDirectory) -> PointRow:
     """The row of a finished point."""
+    if isinstance(point.config, JointsConfig):
+        return _row_of_joints(point, JointsResults(run), point.config)
     results, specification = RunResults(run), point.config.specification
     design, certify, loop = results.design, results.certify, results.closed_loop
     state: State
@@ -68,6 +72,18 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
     if state == "does not settle":
         why = said("never_settles", loop.check)
     return PointRow(point.number, point.name, point.values, state, why, numbers)
+
+
+def _row_of_joints(point: Point, results: JointsResults, config: JointsConfig) -> PointRow:
+    state: State = "certified"
+    if results.design.found is None:
+        state = "impossible"
+    elif not results.certify.certified:
+        state = "not certified"
+    elif not all(run.settled for run in results.closed_loop.runs):
+        state = "does not settle"
+    why = summarise_joints(results, config).verdict
+    return PointRow(point.number, point.name, point.values, state, why, numbers_of_joints(results))
 
 
 def row_without_run(point: Combination, state: State, why: str) -> PointRow:
@@ -114,7 +130,7 @@ def pareto_front(rows: Sequence[PointRow], plot: ParetoPlot) -> list[int]:
     return [placed[i].number for i in np.flatnonzero(~np.any(beats, axis=0))]
 
 
-_BEST_BY = ("worst_gamma", "bandwidth_rad_s", "modulus_margin", "rise_time_s")
+_BEST_BY = ("worst_gamma", "bandwidth_rad_s", "modulus_margin", "disk_margin", "rise_time_s")
 
 
 @dataclass(frozen=True, eq=False)

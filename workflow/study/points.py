@@ -12,38 +12,37 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from workflow.config.run_config import RunConfig, built_in_config, load_config
+from workflow.config.joints_config import AnyConfig, load_any
+from workflow.config.run_config import built_in_config
 from workflow.config.settings import check
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory, hash_of
 from workflow.study.settings import Axis, StudyConfig, last_name, with_values
-from workflow.tasks.pipeline import config_of
-from workflow.tasks.stage import Stage
-from workflow.tasks.stages import STAGES
-
-PLANT_STAGES: tuple[Stage, ...] = tuple(s for s in STAGES if s.name in ("records", "identify", "uncertainty"))
-POINT_STAGES: tuple[Stage, ...] = tuple(
-    s for s in STAGES if s.name not in ("records", "identify", "uncertainty")
-)
+from workflow.tasks.pipeline import Kind, any_config_of, kind_of
 
 
 @dataclass(frozen=True, eq=False)
 class Base:
     """What every point starts from: a configuration, and the run whose plant is used where one was given."""
 
-    config: RunConfig
+    config: AnyConfig
     inputs: Mapping[str, str]
     run: RunDirectory | None
     folder: Path
 
-    def changed(self, values: Mapping[str, Any], source: str) -> RunConfig:
+    @property
+    def kind(self) -> Kind:
+        """Of one loop, or of several joints: every point is of the same."""
+        return kind_of(self.config)
+
+    def changed(self, values: Mapping[str, Any], source: str) -> AnyConfig:
         """The configuration with dotted keys set. Raises InputError naming `source` where they do not fit."""
         try:
             document = with_values(self.document, values)
         except ValueError as error:
             raise InputError(f"{source}: {error}") from error
-        return check(RunConfig, document, source=source, context=self.context)
+        return check(type(self.config), document, source=source, context=self.context)
 
     @cached_property
     def document(self) -> dict[str, Any]:
@@ -54,7 +53,7 @@ class Base:
         """What paths in changed values are relative to; logs behind a run that is there may be gone."""
         return {"base": self.folder, "may_be_gone": self.run is not None}
 
-    def inputs_of(self, config: RunConfig) -> Mapping[str, str]:
+    def inputs_of(self, config: AnyConfig) -> Mapping[str, str]:
         """SHA-256 of the input files, those of the run where one was given."""
         if self.run is not None:
             return self.inputs
@@ -65,7 +64,7 @@ class Base:
         """SHA-256 of the stage files taken from a given run."""
         if self.run is None:
             return {}
-        return {stage.name: self.run.stage_digest(stage.name) for stage in PLANT_STAGES}
+        return {stage.name: self.run.stage_digest(stage.name) for stage in self.kind.plant}
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +91,16 @@ class Point(Combination):
     well. given: stages taken over from the base where that is a run.
     """
 
-    config: RunConfig
+    config: AnyConfig
     inputs: Mapping[str, str]
     plant_key: str
     design_key: str
     given: tuple[str, ...]
+
+    @property
+    def kind(self) -> Kind:
+        """Of one loop, or of several joints."""
+        return kind_of(self.config)
 
 
 def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
@@ -108,15 +112,16 @@ def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
     one of those stages.
     """
     run: RunDirectory | None = None
+    config: AnyConfig
     if base is None:
         config, _ = built_in_config()
     elif base.is_dir():
         run = RunDirectory.open(base)
-        config = config_of(run)
-        for stage in PLANT_STAGES:
+        config = any_config_of(run)
+        for stage in kind_of(config).plant:
             run.stage_digest(stage.name)  # says which one is missing
     else:
-        config, _ = load_config(base)
+        config, _ = load_any(base)
     values: dict[str, Any] = dict(study.changes)
     if study.study.seed is not None:
         values["run.seed"] = study.study.seed
@@ -131,7 +136,7 @@ class PointMaker:
 
     def __init__(self, study: StudyConfig, study_path: Path, base: Base) -> None:
         self._axes, self._path, self._base = study.axes, study_path, base
-        self._original = None if base.run is None else config_of(base.run)
+        self._original = None if base.run is None else any_config_of(base.run)
         self._digests = base.digests
         self._made = 0
         for index, axis in enumerate(self._axes):
@@ -150,14 +155,13 @@ class PointMaker:
         plant_key = hash_of(
             {
                 "given": {name: self._digests[name] for name in given},
-                "seed": None if len(given) == len(PLANT_STAGES) else config.run.seed,
+                "seed": None if len(given) == len(self._base.kind.plant) else config.run.seed,
                 "files": dict(inputs),
-                "settings": {stage.name: stage.settings(config) for stage in PLANT_STAGES},
+                "settings": {stage.name: stage.settings(config) for stage in self._base.kind.plant},
             }
         )
-        design_key = hash_of(
-            {"plant": plant_key, "seed": config.run.seed, "settings": POINT_STAGES[0].settings(config)}
-        )
+        design = self._base.kind.after[0].settings(config)
+        design_key = hash_of({"plant": plant_key, "seed": config.run.seed, "settings": design})
         name = self._name(values, hash_of({"plant": plant_key, "config": config.to_document()}))
         return Point(self._made, name, dict(values), config, inputs, plant_key, design_key, given)
 
@@ -188,7 +192,7 @@ class PointMaker:
         for where, value in ends.items():
             try:
                 document = with_values(self._base.document, {axis.key: value})
-                RunConfig.model_validate(document, context=self._base.context)
+                type(self._base.config).model_validate(document, context=self._base.context)
             except ValidationError as error:
                 if all(_only_a_contradiction(detail, axis.key) for detail in error.errors()):
                     continue
@@ -197,10 +201,10 @@ class PointMaker:
             self._base.changed({axis.key: value}, f"{self._path}: axes[{index}].{where}")
 
 
-def shared_stages(one: RunConfig, other: RunConfig) -> tuple[str, ...]:
+def shared_stages(one: AnyConfig, other: AnyConfig) -> tuple[str, ...]:
     """Stages of the plant before the first whose settings differ."""
     same = itertools.takewhile(
-        lambda stage: hash_of(stage.settings(one)) == hash_of(stage.settings(other)), PLANT_STAGES
+        lambda stage: hash_of(stage.settings(one)) == hash_of(stage.settings(other)), kind_of(one).plant
     )
     return tuple(stage.name for stage in same)
 

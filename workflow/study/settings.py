@@ -120,6 +120,11 @@ _DEFAULT_PLOTS = (
     ParetoPlot(x="bandwidth_rad_s", y="modulus_margin"),
     ParetoPlot(x="peak_command", y="rise_time_s"),
 )
+# Of several joints: commands and bandwidths are one per joint.
+JOINTS_PLOTS = (
+    ParetoPlot(x="worst_gamma", y="disk_margin"),
+    ParetoPlot(x="disk_margin", y="overshoot_percent"),
+)
 
 
 class StudySection(Section):

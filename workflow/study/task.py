@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from workflow.engine import storage
 from workflow.engine.code_version import code_digest
@@ -21,9 +22,7 @@ from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.study.points import Point
 from workflow.tasks.pipeline import stage_input_hash
-from workflow.tasks.results import RunResults
 from workflow.tasks.stage import StageInput
-from workflow.tasks.stages import STAGES
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,15 +64,16 @@ class Task:
             )
 
     def _fill(self, run: RunDirectory, point: Point, earlier: Sequence[RunDirectory]) -> Done:
+        config: Any = point.config
         run.stages_path.mkdir(parents=True)
         for name, content in self.given.items():
             storage.write_bytes(run.stages_path / name, content)
-        seconds, hashes, results = {}, {}, RunResults(run)
-        for stage in (stage for stage in STAGES if stage.name in self.stages):
+        seconds, hashes, results = {}, {}, point.kind.results(run)
+        for stage in (stage for stage in point.kind.stages if stage.name in self.stages):
             started = time.monotonic()
             wanted = stage_input_hash(stage, point.config, run, point.inputs)
             if not _take_over(run, stage.name, wanted, earlier):
-                run.save_stage(stage.name, stage.run(StageInput(point.config, results, Progress())), wanted)
+                run.save_stage(stage.name, stage.run(StageInput(config, results, Progress())), wanted)
             seconds[stage.name], hashes[stage.name] = time.monotonic() - started, wanted
         return Done(run.stage_files(self.stages), seconds, hashes)
 

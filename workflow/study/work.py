@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from workflow.config.joints_config import AnyConfig, JointsConfig
 from workflow.engine import codec, storage
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import InputError, StageError
@@ -18,8 +19,6 @@ from workflow.report.rendering import render_page
 from workflow.study.directory import StudyDirectory
 from workflow.study.page import PointRow, StudyView, csv_text, row_of, row_without_run, study_summary
 from workflow.study.points import (
-    PLANT_STAGES,
-    POINT_STAGES,
     Base,
     Contradiction,
     Point,
@@ -27,9 +26,8 @@ from workflow.study.points import (
     load_base,
     shared_stages,
 )
-from workflow.study.settings import StudyFile
+from workflow.study.settings import JOINTS_PLOTS, StudyFile
 from workflow.study.task import Done, Task
-from workflow.tasks.pipeline import config_of
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage
 from workflow.text.templates import RunSummary
@@ -134,7 +132,10 @@ class _Work:
             else:
                 groups.setdefault(point.design_key, []).append(point)
         self._report(rows.values())
-        work = [_task(group, self.directory.plant_files(group[0]), POINT_STAGES) for group in groups.values()]
+        work = [
+            _task(group, self.directory.plant_files(group[0]), self.base.kind.after)
+            for group in groups.values()
+        ]
         for found in _done(self.executor, list(groups.values()), work):
             for point, done in found:
                 if isinstance(done, Failure):
@@ -153,7 +154,8 @@ class _Work:
         work = []
         for point, given in wanted:
             there = {name.partition(".")[0] for name in given}
-            work.append(_task([point], given, [stage for stage in PLANT_STAGES if stage.name not in there]))
+            lacking = [stage for stage in self.base.kind.plant if stage.name not in there]
+            work.append(_task([point], given, lacking))
         given_of = {point.name: given for point, given in wanted}
         for ((point, done),) in _done(self.here, [[point] for point, _ in wanted], work):
             if isinstance(done, Failure):
@@ -197,9 +199,11 @@ def _done(
 def _write_up(directory: StudyDirectory, file: StudyFile, base: Base, rows: Sequence[PointRow]) -> RunSummary:
     """Table, picture and page: all of them or none."""
     study = file.config
+    if "pareto" not in study.model_fields_set and isinstance(base.config, JointsConfig):
+        study = study.model_copy(update={"pareto": JOINTS_PLOTS})
     title = study.study.title or base.config.run.title or base.config.run.name
     where = str(base.run.path) if base.run is not None else study.study.base or "the built-in arm"
-    view = StudyView(title, study, file.text, where, rows, _units(directory, rows))
+    view = StudyView(title, study, file.text, where, rows, _units(directory, base.config, rows))
     directory.link_numbers(rows)
     page = render_page("study.html.j2", title=title, study=view)
     files = {f"{name}.{picture.kind}": picture.content for name, picture in page.pictures.items()}
@@ -210,12 +214,14 @@ def _write_up(directory: StudyDirectory, file: StudyFile, base: Base, rows: Sequ
     return study_summary(view, str(directory.page_path))
 
 
-def _units(directory: StudyDirectory, rows: Sequence[PointRow]) -> dict[str, str]:
-    """Units that the rig decides, from the records of any finished point."""
+def _units(directory: StudyDirectory, config: AnyConfig, rows: Sequence[PointRow]) -> dict[str, str]:
+    """Units that the rig decides, from the records of any finished point; those of joints differ by joint."""
+    if isinstance(config, JointsConfig):
+        return {}
+    control = config.control_channel
     for row in rows:
         run = RunDirectory(directory.points_path / row.name)
         if run.stage_file("records") is not None:
-            control = config_of(run).control_channel
             units = RunResults(run).records.records[0].units
             return {
                 "peak_command": units.get(control.input, ""),

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from control_design.controllers.c_code import Dialect
 from ident.basis.model_files import ModelFile
-from workflow.config.joints_config import JointsConfig
+from workflow.config.joints_config import AnyConfig, JointsConfig
 from workflow.config.run_config import RunConfig
 from workflow.engine import interrupts, storage
 from workflow.engine.code_version import code_digest
@@ -31,17 +31,22 @@ from workflow.text.templates import RunSummary, said
 
 @dataclass(frozen=True)
 class Kind:
-    """What differs between runs of one loop and of several joints: stages before the page, what reads their
-    results, the controller's files, the table."""
+    """What differs between runs of one loop and of several joints: stages up to the uncertain plant, stages
+    from there to the page, what reads their results, the controller's files, the table."""
 
-    stages: tuple[Stage, ...]
+    plant: tuple[Stage, ...]
+    after: tuple[Stage, ...]
     results: Callable[[RunDirectory], Any]
     keep: Callable[[Any, Any, Dialect], list[Path]]
     summarise: Callable[[Any, Any], RunSummary]
 
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        return (*self.plant, *self.after)
+
 
 def run_pipeline(
-    config: RunConfig | JointsConfig,
+    config: AnyConfig,
     out: Path,
     *,
     config_text: str = "",
@@ -113,7 +118,7 @@ def identify_only(
     replaced. Raises as a run."""
     given = StageInput(config, RunResults(RunDirectory(out)), progress or Progress())
     inputs = {str(path): storage.sha256_of_file(path) for path in config.input_files}
-    stages = [stage for stage in STAGES if stage.name in ("records", "identify", "uncertainty")]
+    stages = kind_of(config).plant
     with given.results.run.writing(replace=True), threadpool_limits(1):
         RunDirectory.begin(
             out,
@@ -139,7 +144,7 @@ def rebuild_page(run: RunDirectory, page: Stage, progress: Progress | None = Non
 
 
 def _given(
-    config: RunConfig | JointsConfig, run: RunDirectory, progress: Progress, called: str = "the configuration"
+    config: AnyConfig, run: RunDirectory, progress: Progress, called: str = "the configuration"
 ) -> StageInput:
     given: Any = config
     return StageInput(given, kind_of(config).results(run), progress, called)
@@ -153,16 +158,21 @@ def certified_for(results: RunResults, config: RunConfig) -> str:
 
 
 def config_of(run: RunDirectory) -> RunConfig:
-    """The configuration a run was begun with."""
-    return RunConfig.from_document(run.config_document(), source=str(run.path / "config.json"))
+    """The configuration a run of one loop was begun with. Raises InputError for one of several joints."""
+    config = any_config_of(run)
+    if isinstance(config, JointsConfig):
+        raise InputError(
+            f"{run.path}: a run for several joints, and this command takes one loop; other settings: edit "
+            f"{run.path / 'config.toml'} and flexlink run, or vary them with flexlink study"
+        )
+    return config
 
 
-def any_config_of(run: RunDirectory) -> RunConfig | JointsConfig:
+def any_config_of(run: RunDirectory) -> AnyConfig:
     """The same, of a run for several joints too."""
-    document = run.config_document()
-    if "joints" in document:
-        return JointsConfig.from_document(document, source=str(run.path / "config.json"))
-    return config_of(run)
+    document, source = run.config_document(), str(run.path / "config.json")
+    kind = JointsConfig if "joints" in document else RunConfig
+    return kind.from_document(document, source=source)
 
 
 def _perform(
@@ -192,7 +202,7 @@ def _perform(
     progress.finish(stage.name, seconds, taken_up=False)
 
 
-def stage_input_hash(stage: Stage, config: RunConfig, run: RunDirectory, inputs: Mapping[str, str]) -> str:
+def stage_input_hash(stage: Stage, config: AnyConfig, run: RunDirectory, inputs: Mapping[str, str]) -> str:
     """SHA-256 over all that a stage's result depends on, our own code included."""
     return hash_of(
         {
@@ -240,11 +250,11 @@ def _keep_joints_files(results: JointsResults, config: JointsConfig, dialect: Di
     return write_controller(results.run.path, law, None, certified=certified, about=about, dialect=dialect)
 
 
-def kind_of(config: RunConfig | JointsConfig) -> Kind:
+def kind_of(config: AnyConfig) -> Kind:
     """Of one loop, or of several joints."""
     if isinstance(config, JointsConfig):
-        return Kind(JOINT_STAGES, JointsResults, _keep_joints_files, summarise_joints)
-    return Kind(STAGES, RunResults, _keep_files, summarise)
+        return Kind(JOINT_STAGES[:2], JOINT_STAGES[2:], JointsResults, _keep_joints_files, summarise_joints)
+    return Kind(STAGES[:3], STAGES[3:], RunResults, _keep_files, summarise)
 
 
 def _fail(run: RunDirectory, error: BaseException, *, created: bool) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
+from workflow.config.joints_config import AnyConfig
 from workflow.config.run_config import RunConfig
 from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
@@ -60,6 +61,6 @@ class Stage:
     except_for: Mapping[str, Any] | None = None
     also_writes: Callable[[RunDirectory], tuple[Path, ...]] = lambda run: ()
 
-    def settings(self, config: RunConfig) -> dict[str, Any]:
+    def settings(self, config: AnyConfig) -> dict[str, Any]:
         """Its share of the configuration, JSON-able."""
         return config.model_dump(mode="json", include=self.uses, exclude=self.except_for)
