@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import tomlkit
-from pydantic import Field, model_validator
+from pydantic import Field, NonNegativeInt, model_validator
 
 from control_design.specification import Specification
 from control_design.specification.multivariable import MultivariableSpecification
@@ -60,7 +60,9 @@ class JointsIdentification(Section):
     """Model of each operating point, on shared poles."""
 
     integrators: int = Field(1, ge=0, le=1, description="1: joints that turn freely")
-    input_delay_samples: int = Field(0, ge=0, description="dead time of every channel")
+    input_delay_samples: NonNegativeInt | tuple[NonNegativeInt, ...] = Field(
+        0, description="dead time, of all inputs or one for each"
+    )
     n_real: int | None = Field(None, ge=0, description="real poles; default: the data decide")
     n_pairs: int | None = Field(None, ge=0, description="pole pairs; default: the data decide")
     increments: bool = Field(
@@ -136,6 +138,11 @@ class JointsConfig(Section):
                         f"source.records[{number}] has role {record.role!r}: with several joints each record "
                         "is fitted; leave role out"
                     )
+        if len(self.dead_times) != len(self.joints):
+            raise ValueError(
+                "identification.input_delay_samples needs one value, or one for each of "
+                f"{len(self.joints)} joints"
+            )
         if self.closed_loop.step is not None and len(self.closed_loop.step) != len(self.joints):
             raise ValueError(f"closed_loop.step needs one value for each of {len(self.joints)} joints")
         if self.closed_loop.step is not None and not any(self.closed_loop.step):
@@ -151,6 +158,12 @@ class JointsConfig(Section):
             controller_order=self.design.controller_order,
             controller_damping=self.design.controller_damping,
         )
+
+    @property
+    def dead_times(self) -> tuple[int, ...]:
+        """Of each input, in samples."""
+        stated = self.identification.input_delay_samples
+        return (stated,) * len(self.joints) if isinstance(stated, int) else stated
 
     @property
     def input_files(self) -> list[Path]:

@@ -45,6 +45,7 @@ _SHOWN = 400  # frequencies of the pictures
 class PointModel:
     """What the records of one operating point say: model, ball (the factor Li as a state space of Li_a to
     Li_d, radius), fits in per cent (records, outputs), whether each mode has one shape, balls for pictures.
+    later: samples by which each input acts later than in model and ball; their sizes are the same.
     """
 
     name: str
@@ -60,6 +61,7 @@ class PointModel:
     radius: float
     shown: MatrixUncertainty
     warnings: tuple[Finding, ...] = ()
+    later: tuple[int, ...] = ()
 
     @property
     def shaped(self) -> bool:
@@ -82,9 +84,10 @@ class PointModel:
         if gain_error:
             weight = RationalWeight(numerator=(gain_error,), denominator=(1.0,))
             off = (weight,) * len(self.model.input_names)
-        return MultivariablePlant(
-            self.name, self.model.to_control(), ResponseBall(self.Lo, Li, self.radius), input_error=off
-        )
+        nominal = self.model.to_control()
+        if any(self.later):
+            nominal, Li = (_behind(system, self.later) for system in (nominal, Li))
+        return MultivariablePlant(self.name, nominal, ResponseBall(self.Lo, Li, self.radius), input_error=off)
 
     @property
     def modes(self) -> tuple[tuple[float, float, Real | None], ...]:
@@ -237,9 +240,11 @@ def identify_points(stage: StageInput) -> PointModels:
     """A model and its ball for every operating point; each search begins at the poles of the point before."""
     config, results = _of(stage)
     options = config.identification
+    least = min(config.dead_times)
+    later = tuple(delay - least for delay in config.dead_times)
     asked = IdentOptions(
         integrators=options.integrators,
-        input_delay_samples=options.input_delay_samples,
+        input_delay_samples=least,
         n_real=options.n_real,
         n_pairs=options.n_pairs,
     )
@@ -252,7 +257,9 @@ def identify_points(stage: StageInput) -> PointModels:
         def report(fraction: float, message: str, number: int = number, name: str = name) -> None:
             stage.progress.update("identify", (number + fraction) / len(names), f"{name}: {message}")
 
-        records = [item.record for item in items if (item.condition or "arm") == name]
+        records = [
+            _with_later_inputs(item.record, later) for item in items if (item.condition or "arm") == name
+        ]
         if options.increments:
             records = [record.each(partial(np.diff, axis=0)) for record in records]
         remarks: tuple[Finding, ...] = ()
@@ -263,9 +270,29 @@ def identify_points(stage: StageInput) -> PointModels:
                 remarks = stages.finding, *stages.warnings
             one = identify_mimo(records, asked, start=start, progress=report)
             point = _described(name, records, one, options.level, options.lowest_rad_s)
-        found.append(replace(point, warnings=(*remarks, *point.warnings)))
+        found.append(replace(point, warnings=(*remarks, *point.warnings), later=later))
         start = one.model.poles
     return PointModels(tuple(found))
+
+
+def _with_later_inputs(record: Record, later: tuple[int, ...]) -> Record:
+    """Each input as it stands when it begins to act; the samples before the first of them are left out."""
+    most = max(later)
+    held = [record.input[most - delay : record.n_samples - delay, k] for k, delay in enumerate(later)]
+    return replace(record.slice(most, record.n_samples), input=np.column_stack(held))
+
+
+def _behind(system: Any, later: tuple[int, ...]) -> Any:
+    """The system with each input so many samples later."""
+    import control
+
+    chains = [
+        control.ss(np.eye(n, k=-1), np.eye(n, 1), np.eye(1, n, n - 1), 0, system.dt)
+        if n
+        else control.ss([], [], [], 1, system.dt)
+        for n in later
+    ]
+    return system * control.append(*chains)
 
 
 def _described(
@@ -361,7 +388,7 @@ def _machines(
     source, options = config.source, config.closed_loop
     if not isinstance(source, TwoJointSource):
         return [
-            (point.name, "identified model", partial(_ModelMachine, point.model))
+            (point.name, "identified model", partial(_ModelMachine, point.plant(0.0).nominal))
             for point in results.identify.points
         ]
     found: list[tuple[str, str, Callable[[], Any]]] = []
@@ -380,11 +407,10 @@ def _machines(
 class _ModelMachine:
     """An identified model as a machine."""
 
-    def __init__(self, model: MimoModel) -> None:
-        self._a, self._b, self._c, d = model.state_space()
-        if np.any(d):
+    def __init__(self, system: Any) -> None:
+        if np.any(system.D):
             raise InputError("a model with a direct term cannot run in a loop of sampled commands")
-        self.dt_s = model.dt_s
+        self._a, self._b, self._c, self.dt_s = system.A, system.B, system.C, system.dt
         self.reset()
 
     def reset(self) -> None:
