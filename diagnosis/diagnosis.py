@@ -56,7 +56,20 @@ def diagnose(
     for doubt in doubts:
         warnings.warn(f"plant: {doubt}", stacklevel=2)
     answer = _at_noise_seen(case, progress, rng, deadline_s)
-    return replace(answer, doubts=(*doubts, *answer.doubts))
+    return replace(answer, doubts=(*doubts, *_asked_of(case, answer), *answer.doubts))
+
+
+def _asked_of(case: CaseOfMachine, answer: Diagnosis) -> tuple[str, ...]:
+    """What decides an "unknown" that is small where nobody has said how much the simulation may miss."""
+    if not isinstance(case, PlantCase) or case.machine.weighing.stated or answer.verdict != "unknown":
+        return ()
+    left, usual = answer.completeness.most, case.machine.weighing.model_error
+    if not left < usual:
+        return ()
+    return (
+        f"model_error is unspecified, and {100 * left:.2g} % of the motion remains, more than noise. If a"
+        f" good simulation may miss that much, specify it, as model_error={usual:g}",
+    )
 
 
 def _at_noise_seen(

@@ -83,6 +83,10 @@ def test_a_plant_as_stated_is_no_alarm():
 def test_what_no_listed_effect_describes_is_unknown():
     found = diagnose(_case(lambda t, x, v, f: (f - 80.0 * x - 3.0 * v + 2 * np.sin(25 * t)) / 2.0))
     assert found.verdict == "unknown"
+    # It is small beside the motion: the answer asks whether that matters.
+    left = found.completeness.most
+    assert left < 0.05
+    assert any(f"{100 * left:.2g} % of the motion" in d and "model_error=0.05" in d for d in found.doubts)
 
 
 def test_a_stated_model_error_is_no_unknown_cause():
@@ -93,6 +97,7 @@ def test_a_stated_model_error_is_no_unknown_cause():
     )
     found = diagnose(case)
     assert (found.verdict, found.combination) == ("none", ())
+    assert found.doubts == ()
 
 
 @pytest.mark.parametrize(
