@@ -18,7 +18,7 @@ Joints      `MultivariablePlant`, `ResponseBall`, `MultivariableSpecification`, 
             `synthesise_multivariable`, `MultivariableResult`, `certify_multivariable`,
             `MultivariableCertificate`: several sensors and actuators, after `identify_mimo`
 Machines    `Rig`, `paper_link`, `effect`, `simulate`, `linear_arm`, `SampledArm`, `prbs`, `multisine`
-Causes      `Case`, `Experiment`, `diagnose`, `Diagnosis`
+Causes      `Case`, `Experiment`, `load_case`, `diagnose`, `Diagnosis`
 Pictures    `plot`, `bode`, `compare`
 Tables      `table`
 

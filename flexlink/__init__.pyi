@@ -1,4 +1,10 @@
-from .causes import Case as Case, Diagnosis as Diagnosis, Experiment as Experiment, diagnose as diagnose
+from .causes import (
+    Case as Case,
+    Diagnosis as Diagnosis,
+    Experiment as Experiment,
+    diagnose as diagnose,
+    load_case as load_case,
+)
 from .design import (
     Certificate as Certificate,
     Controller as Controller,

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from diagnosis import answer, diagnosis as chain
 from diagnosis.machine.case import Case, Experiment
+from diagnosis.machine.own_plant import PlantCase
 from flexlink.shown import Shown, dressed
 
-__all__ = ["Case", "Diagnosis", "Experiment", "diagnose"]
+__all__ = ["Case", "Diagnosis", "Experiment", "diagnose", "load_case"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -24,8 +27,8 @@ class Diagnosis(Shown, answer.Diagnosis):
 def diagnose(case: Any, **more: Any) -> Diagnosis:
     """Find the effect that explains the model error of a rig or of your own simulation.
 
-    case: a `Case`, or a `diagnosis.PlantCase` (docs/own_plant.md). more: `time_limit_s` and the other
-    arguments of `diagnosis.diagnose`.
+    case: a `Case`, or a `diagnosis.PlantCase` (docs/own_plant.md); `load_case` reads either. more:
+    `time_limit_s` and the other arguments of `diagnosis.diagnose`.
 
     Takes about ten seconds for records of a few thousand samples.
 
@@ -43,3 +46,21 @@ def diagnose(case: Any, **more: Any) -> Diagnosis:
     """
     with threadpool_limits(1):
         return dressed(Diagnosis, chain.diagnose(case, **more))
+
+
+def load_case(place: str | os.PathLike[str], rig: str | None = None) -> Case | PlantCase:
+    """Read a case as `flexlink diagnose` does (docs/case_files.md, docs/simulators.md).
+
+    place: a folder with `case.toml`, or such a TOML file; one that names a simulator's model must be named
+    itself. rig: another rig file than the one that the case file names. Raises ValueError, one line, which
+    names the file and what is wrong in it.
+
+    Examples
+    --------
+    >>> case = flexlink.load_case("examples/gap_case")
+    >>> case.name, [experiment.role for experiment in case.experiments].count("held_out")
+    ('gap_case', 1)
+    """
+    from workflow.diagnose.command import load_any_case
+
+    return load_any_case(Path(place), rig).case

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -19,6 +20,7 @@ from ident.basis.model import GobfModel as PlainModel
 from ident.basis.model_files import ModelFile
 from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.poles import Poles
+from ident.data.finding import Finding
 from ident.data.foreign_files import distinct
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
@@ -280,8 +282,29 @@ def _refuse_other_rows(*signals: Any) -> None:
         )
 
 
+@dataclass(frozen=True)
+class _Sentence(Finding):
+    """A warning that prints as its sentence."""
+
+    def __str__(self) -> str:
+        from workflow.text.templates import words
+
+        return words(self)
+
+    __repr__ = __str__
+
+
+class _Warned:
+    """Put before the class of a fit: its warnings as `_Sentence`."""
+
+    @cached_property
+    def warnings(self) -> tuple[Finding, ...]:
+        """What to look at before trusting the model."""
+        return tuple(_Sentence(each.kind, each.values) for each in super().warnings)  # type: ignore[misc]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Identification(Shown, Identified):
+class Identification(_Warned, Shown, Identified):
     """Result of `identify`: the fields of `ident.Identification`, and the records.
 
     Examples
@@ -305,7 +328,7 @@ class Identification(Shown, Identified):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MimoIdentification(Shown, MimoIdentified):
+class MimoIdentification(_Warned, Shown, MimoIdentified):
     """Result of `identify_mimo`: the fields of `ident.MimoIdentification`, and the records."""
 
     table_in_notebook = True

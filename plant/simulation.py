@@ -377,6 +377,8 @@ def _signal(name: str, values: npt.ArrayLike, n_samples: int | None) -> Real:
         signal = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be an array of numbers: {error}") from error
+    if signal.ndim == 2 and signal.shape[1] == 1:  # the one column of a record
+        signal = signal[:, 0]
     if signal.ndim != 1 or signal.size == 0 or (n_samples is not None and signal.size != n_samples):
         raise ValueError(f"{name} must have shape ({n_samples or 'T'},), T >= 1; got {signal.shape}")
     if not np.all(np.isfinite(signal)):

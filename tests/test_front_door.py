@@ -67,7 +67,8 @@ GIVEN = {
         pytest.param("causes", marks=pytest.mark.slow),
     ],
 )
-def test_examples_run(module):
+def test_examples_run(module, monkeypatch):
+    monkeypatch.chdir(ROOT)
     found = import_module("flexlink" if module == "__init__" else f"flexlink.{module}")
     result = doctest.testmod(found, extraglobs=GIVEN, optionflags=FLAGS)
     assert result.failed == 0
@@ -79,6 +80,21 @@ def test_documents_run(path, tmp_path, monkeypatch):
     result = doctest.testfile(str(path), module_relative=False, optionflags=FLAGS)
     assert result.attempted > 0
     assert result.failed == 0
+
+
+def test_a_case_of_a_simulator_is_read_as_the_command_reads_it(tmp_path):
+    (tmp_path / "motor.py").write_text(
+        'INPUTS, OUTPUTS = ("voltage_V",), ("level",)\nPARAMETERS = {"gain": 2.0}\n'
+        'def simulate(parameters, effects, inputs):\n    return parameters["gain"] * inputs\n'
+    )
+    rows = [f"{0.01 * k:.2f},{k % 7},{2.2 * (k % 7) + 0.01 * (k % 3):.2f}" for k in range(300)]
+    (tmp_path / "run.csv").write_text("\n".join(["time_s,voltage_V,level", *rows]))
+    (tmp_path / "motor.toml").write_text('python = "motor.py"\nlog = "run.csv"\nmodel_error = 0.02\n')
+    case = flexlink.load_case(tmp_path / "motor.toml")
+    assert (case.name, case.model_error, case.outputs) == ("motor", 0.02, ("level",))
+    assert sum(len(e.output) for e in case.experiments) == 300
+    with pytest.raises(ValueError, match="no case is there"):
+        flexlink.load_case(tmp_path / "other")
 
 
 def test_every_name_is_there_and_shown_in_an_example():
@@ -129,6 +145,39 @@ def test_long_calls_run_on_one_thread(inner, call, monkeypatch):
         with pytest.raises(RuntimeError, match=r"^1$"):
             call()
         assert max(library["num_threads"] for library in threadpool_info()) == 2
+
+
+@pytest.mark.parametrize("integrators", [0, 1])
+def test_the_one_column_of_a_record_is_a_signal(integrators):
+    record, given = example_record(), flexlink.Controller([[1.0]], [[0.05]], [[1.0]], [[0.0]], dt_s=0.01)
+    poles = flexlink.Poles.from_continuous(omega_rad_s=[20.0], zeta=[0.05], dt_s=0.01)
+    model = flexlink.GobfModel(poles, [0.3, 0.1], feedthrough=0.5, dt_s=0.01, integrators=integrators)
+    spread = flexlink.uncertainty(flexlink.identify(record, n_pairs=1, n_real=0))
+    for run in (
+        lambda u: flexlink.regressor(poles, u),
+        model.simulate,
+        spread.simulate,
+        lambda u: flexlink.simulate(flexlink.paper_link(), u).output,
+        lambda u: flexlink.simulate_loop(given, example_plant(), u).measured,
+    ):
+        np.testing.assert_array_equal(run(record.input), run(record.input[:, 0]))
+    with pytest.raises(ValueError, match=r"u must be \(T,\), one input; got shape \(9, 2\)"):
+        flexlink.regressor(poles, np.ones((9, 2)))
+
+
+def test_warnings_print_as_sentences():
+    rng = np.random.default_rng(3)
+    record, u = example_record(), rng.standard_normal((1000, 2))
+    y = lfilter([0.0, 1.0], [1.0, -0.5], u[:, 0]) + lfilter([1.0], [1.0, -0.95], rng.standard_normal(1000))
+    for found in (
+        flexlink.identify(record, n_pairs=0, n_real=1),
+        flexlink.identify_mimo(flexlink.Record(u, y, 0.01), n_pairs=0, n_real=1),
+    ):
+        assert found.warnings
+        for warning in found.warnings:
+            assert str(warning) == repr(warning)
+            assert f"! {warning}" in repr(found)
+            assert "Finding" not in str(warning)
 
 
 def test_results_show_draw_and_convert():

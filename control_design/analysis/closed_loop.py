@@ -231,6 +231,8 @@ def _signal(name: str, value: npt.ArrayLike | None, n: int | None) -> Real:
     if value is None:
         return np.zeros(n or 0)
     array = np.asarray(value, dtype=np.float64)
+    if array.ndim == 2 and array.shape[1] == 1:  # the one column of a record
+        array = array[:, 0]
     if array.ndim != 1 or array.size == 0 or (n is not None and array.size != n):
         raise ValueError(f"{name} must be (T,) with T = {n or 'at least 1'}; got {array.shape}")
     if not np.all(np.isfinite(array)):

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ident.basis.poles import Poles
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import ComplexArray, RealArray, one_signal
 
 
 class LosslessCascade(NamedTuple):
@@ -165,7 +165,10 @@ def all_pass_slopes(poles: Poles, y: RealArray) -> RealArray:
 
 
 def regressor(poles: Poles, u: RealArray) -> RealArray:
-    """Basis functions driven by u from rest: Phi (T, B) with Phi[k, i] = [L_i(q) u](k); Phi[0] = 0."""
+    """Basis functions driven by u (T,) or (T, 1) from rest.
+
+    Phi (T, B) with Phi[k, i] = [L_i(q) u](k); Phi[0] = 0.
+    """
     return _through(poles, u)[0].T
 
 
@@ -175,9 +178,9 @@ def all_pass_signal(poles: Poles, u: RealArray) -> RealArray:
 
 
 def _through(poles: Poles, u: RealArray) -> tuple[RealArray, RealArray]:
-    signal = np.array(u, dtype=np.float64)
+    signal = np.array(one_signal(u))
     if signal.ndim != 1:
-        raise ValueError(f"u must be (T,); got shape {signal.shape}")
+        raise ValueError(f"u must be (T,), one input; got shape {signal.shape}")
     rows = np.empty((poles.order, signal.size))
     run_cascade(block_parameters(poles), poles.real.size, signal, rows, 0, 0, signal.size)
     return rows, signal

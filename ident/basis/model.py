@@ -145,7 +145,7 @@ class GobfModel:
         return _as_control(self, [self.input_name])
 
     def simulate(self, u: RealArray) -> RealArray:
-        """Output (T,) for the input u (T,), from rest. Raises ValueError for an unstable model."""
+        """Output (T,) for the input u (T,) or (T, 1), from rest. Raises ValueError for an unstable model."""
         refuse_unstable(self.unstable)
         filtered = filter_input(u, self.integrators, self.input_delay_samples)
         return np.asarray(regressor(self.poles, filtered) @ self.coefficients + self.feedthrough * filtered)

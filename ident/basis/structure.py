@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.basis.poles import NO_POLES, Poles
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import ComplexArray, RealArray, one_signal
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class Structure:
 
 
 def filter_input(u: RealArray, integrators: int, delay_samples: int) -> RealArray:
-    """(1 - q^-1)^-integrators q^-delay u (T,), from rest: delayed by whole samples, then summed, exact."""
-    u = np.asarray(u, dtype=np.float64)
+    """(1 - q^-1)^-integrators q^-delay u (T,) or (T, 1), from rest: delayed by samples, summed, exact."""
+    u = one_signal(u)
     delayed = np.zeros_like(u)
     delayed[delay_samples:] = u[: max(u.size - delay_samples, 0)]
     for _ in range(integrators):

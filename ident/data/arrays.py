@@ -23,6 +23,12 @@ def kernel_array(array: RealArray) -> RealArray:
     return array if flags.c_contiguous and flags.writeable else array.copy(order="C")
 
 
+def one_signal(values: npt.ArrayLike) -> RealArray:
+    """One signal as (T,), which may be the only column (T, 1) of a record; other shapes as they are."""
+    signal = np.asarray(values, dtype=np.float64)
+    return signal[:, 0] if signal.ndim == 2 and signal.shape[1] == 1 else signal
+
+
 def real_rows(values: ComplexArray) -> RealArray:
     """Real parts (F, .) above imaginary ones: complex equations in real unknowns, as twice as many real
     ones."""

@@ -186,7 +186,7 @@ class PlacedCase:
 
     def read(self) -> PlacedCase:
         """With name and hash of what stands there. Raises InputError."""
-        loaded = _loaded(self.place, self.rig)
+        loaded = load_any_case(self.place, self.rig)
         return changed(self, name=loaded.case.name, input_sha256=loaded.input_sha256)
 
     @property
@@ -205,7 +205,7 @@ class PlacedCase:
                 "the code of the worker is not that of the diagnosis: another version, or edited"
             )
         place = self.folder / self.place if isinstance(self.place, Path) else self.place
-        loaded = _loaded(place, self.rig, self.folder)
+        loaded = load_any_case(place, self.rig, self.folder)
         if loaded.input_sha256 != self.input_sha256:
             raise StageError(f"case {self.name}: its files changed meanwhile; run the command again")
         return Work(loaded, self.made_from, self.diagnose, self.out).run(report)
@@ -232,7 +232,10 @@ def _load(
     return loaded, failures
 
 
-def _loaded(place: Path | SimulatorSettings, rig: str | None, folder: Path = Path()) -> _Loaded:
+def load_any_case(
+    place: Path | SimulatorSettings, rig: str | None = None, folder: Path = Path()
+) -> LoadedCase | SimulatorCase:
+    """A case of a rig or of a simulator: as `load_case` and `load_simulator_case`."""
     if isinstance(place, SimulatorSettings):
         return load_simulator_case(place, folder, "--log")
     file, document = case_document(place)
