@@ -137,7 +137,7 @@ class Diagnosis:
     gap_before, gap_refit, gap_after : float. Pooled RMS of (measured - model)/noise over the held-out
         experiments: nominal rig, nominal parameters moved within their tolerances, accepted effects added.
     gap_closed, gap_closed_interval : float, (low, high)
-        1 - (R_after - F)/(R_refit - F) with R, F the held-out mean squares and the noise floor's (design 6.2)
+        1 - (R_after - F)/(R_refit - F) with R, F the held-out mean squares and the noise floor's
         and its 95 % bootstrap interval over blocks of samples; nan without a gap to close.
     deviations : key -> tolerances
         How far the nominal parameters are off, with the accepted effects in the model.

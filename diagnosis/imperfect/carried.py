@@ -30,7 +30,7 @@ def shares_of(
     nominal: Explanation,
     rng: np.random.Generator,
 ) -> Shares:
-    """Shares of the energy of the held-out residuals beyond white noise of the stated size (design 6.2).
+    """Shares of the energy of the held-out residuals beyond white noise of the stated size.
 
     matter : those of the effects of the repaired model that are not small. nominal : what they are added to.
 

@@ -1,4 +1,4 @@
-"""Generalised orthonormal basis functions as a lossless cascade (design 4.1, paper (5)).
+"""Generalised orthonormal basis functions as a lossless cascade (Ziaei and Wang, 2006, (5)).
 
 L_m(z) = sqrt(1 - |x_m|^2)/(z - x_m) * prod_{i<m} (1 - conj(x_i) z)/(z - x_i), strictly proper; real poles
 first. A conjugate pair gets the real two-column Kautz form after the all-pass of the poles before it: sg (z -

@@ -1,4 +1,4 @@
-"""Relative degree of the continuous-time plant as linear conditions on the coefficients (design 4.3).
+"""Relative degree of the continuous-time plant as linear conditions on the coefficients.
 
 A plant of relative degree r behind a zero-order hold has C B_c = C A_c B_c = ... = C A_c^(r-2) B_c = 0, where
 [[A_c, B_c], [0, 0]] dt is the logarithm of [[A, B], [0, 1]] and (A, B) are the discrete states. For given

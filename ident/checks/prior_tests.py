@@ -1,4 +1,4 @@
-"""Tests of what the user says is known: integrators, fixed poles, input delay, relative degree (design 4.3);
+"""Tests of what the user says is known: integrators, fixed poles, input delay, relative degree;
 and whether the data ask for a nuisance: an unknown initial state, an offset.
 
 Generalised likelihood ratios Ne ln(J with the prior / J without) against a chi-square quantile, Ne the

@@ -112,7 +112,7 @@ class FrfRegression:
 
     def criterion(self, rss: float, order: int, worth: float) -> Callable[[float, int], float]:
         """J / scale + (free numbers) ln Ne, Ne = worth: a pole, of two numbers, is kept if J falls by more
-        than 2 ln Ne (a pair: 4 ln Ne, design 4.3). J is a chi-square because the covariances are known; where
+        than 2 ln Ne (a pair: 4 ln Ne). J is a chi-square because the covariances are known; where
         it is larger than they explain, they are multiplied by its excess, the scale."""
         scale = max(1.0, rss / max(self.n_rows - self.n_parameters(order), 1))
         share, price = worth / self.n_rows, float(np.log(worth))

@@ -1,4 +1,4 @@
-"""Linear least squares of records for given poles by thin QR, with per-record nuisance columns (design 4.2).
+"""Linear least squares of records for given poles by thin QR, with per-record nuisance columns.
 
 One output; with several inputs the columns are [Phi(u_1) Phi(u_2) ...]. Modulo these columns moving a pole
 changes the output by -(dD_b/dp)/D_b y_hat, y_hat being the fitted output of all channels together.
@@ -206,7 +206,7 @@ def project(data: Regression, shared: Poles, local: Poles | None = None) -> Proj
     same).
 
     With `shared` doubled and `local` not, all first-order changes of the poles are taken out of the residual,
-    which is what candidates for a further pole see (design 4.3).
+    which is what candidates for a further pole see.
     """
     local = shared if local is None else local
     rows = _driven(data, shared, data.u)[0]

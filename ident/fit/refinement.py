@@ -1,4 +1,4 @@
-"""Local refinement of the poles: Levenberg-Marquardt on Kaufman's Jacobian (design 4.2).
+"""Local refinement of the poles: Levenberg-Marquardt on Kaufman's Jacobian (BIT 15, 1975).
 
 Modulo the columns of the regression, moving a pole changes the fitted output y_hat by -(dD_b/dp)/D_b y_hat,
 D_b(z) the denominator of its block: sensitivities are combinations of the block's states driven by y_hat, and
@@ -139,7 +139,7 @@ def pole_system(here: Linearisation, poles: Poles, fixed: Poles = NO_POLES) -> t
 
 def free_optimality(here: Linearisation, poles: Poles, bounds: Bounds, fixed: Poles = NO_POLES) -> float:
     """|P r|/|r| over the tangent directions of the poles that are neither fixed nor held by a bound: 0 at an
-    optimum. With records from rest and nothing held it is |Phi2^T r|/|r|, Phi2 the orthonormal doubled basis
-    (design 4.2)."""
+    optimum. With records from rest and nothing held it is |Phi2^T r|/|r|, Phi2 the orthonormal doubled
+    basis."""
     promised = scaled_system(*poles.writable(), *fixed.counts, bounds.array, here.normal, here.gradient)[-1]
     return float(np.sqrt(max(promised, 0.0) / here.rss)) if here.rss > 0 else 0.0

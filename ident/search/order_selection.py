@@ -1,4 +1,4 @@
-"""How many poles: stepwise from the data, or the numbers asked for (design 4.3)."""
+"""How many poles: stepwise from the data, or the numbers asked for."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ class OrderSelection:
         return self.search.data.criterion(end.rss, end.poles.order, self.search.colour(end).effective_samples)
 
     def _better(self, trial: Refined, best: Refined) -> bool:
-        """Is the larger trial's criterion lower? For one more pair: Ne ln(J0/J1) > 4 ln Ne (design 4.3)."""
+        """Is the larger trial's criterion lower? For one more pair: Ne ln(J0/J1) > 4 ln Ne."""
         criterion = self._criterion(trial)
         return criterion(trial.rss, trial.poles.order) < criterion(best.rss, best.poles.order)
 

@@ -1,4 +1,4 @@
-"""Global search for the poles: DIRECT on log J, descents from the best points, block rescans (design 4.3)."""
+"""Global search for the poles: DIRECT on log J, descents from the best points, block rescans."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Model error and noise as one covariance: tangent stochastic embedding (design 4.5).
+"""Model error and noise as one covariance: tangent stochastic embedding.
 
 Every pole twice (the first-order effect of moving it), initial state and offset as nuisance, a short kernel
 for the rest, everything conditioned on the data, averaged over one mode that the search may have missed.
@@ -46,7 +46,7 @@ from ident.uncertainty.undetected_mode import (
     with_pairs,
 )
 
-# Kernel of 150 taps (design 4.5), as far as the records can carry it.
+# Kernel of 150 taps, as far as the records can carry it.
 _DEFAULT_FIR_LENGTH = 150
 # The same for a measured frequency response, as far as the frequencies can carry it.
 _FRF_FIR_LENGTH = 60

@@ -1,7 +1,7 @@
 """Stochastic embedding on matrices: one QR reduction, restricted likelihood, posterior of the kernel.
 
 y = N nu + F theta + Psi eta + v with flat nu (nuisance) and theta, eta ~ N(0, s2 Ct), Ct = alpha B B^T, v ~
-N(0, s2 I) (Goodwin, Gevers and Ninness, IEEE TAC 37(7), 1992; reduced formulas of design 4.5). Everything
+N(0, s2 I) (Goodwin, Gevers and Ninness, IEEE TAC 37(7), 1992). Everything
 that depends on the data is in a triangle of the size of the parameters.
 """
 
@@ -291,7 +291,7 @@ class KernelGrid:
 
 def remainder_energies(degrees_of_freedom: int) -> tuple[RealArray, RealArray]:
     """Expected energies (A,) of what the poles leave out of the output, in noise variances, and their
-    prior (A,): log-uniform up to what an order selection would have kept (4 ln nu, design 4.3), one tenth
+    prior (A,): log-uniform up to what an order selection would have kept (4 ln nu), one tenth
     beyond."""
     edge = 4 * np.log(degrees_of_freedom)
     n = int(np.ceil(np.log(_LARGEST_ENERGY) / np.log(edge) * _SCALES))

@@ -1,4 +1,4 @@
-"""One flexible mode that the pole search may have missed, averaged over (design 4.5).
+"""One flexible mode that the pole search may have missed, averaged over.
 
 Every pair of a grid over frequency and damping is a hypothesis "the poles, and this pair": its two amplitudes
 get a Gaussian prior, their scale a grid, so that its restricted likelihood is comparable with those of the

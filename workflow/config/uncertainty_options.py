@@ -23,7 +23,7 @@ class FitOptions(IdentOptions):
 
 
 class UncertaintyOptions(EmbeddingOptions):
-    """Ellipses around an identified response: method and model class (design 4.5)."""
+    """Ellipses around an identified response: method and model class."""
 
     coloured_noise: bool | Literal["auto"] = Field(
         "auto",
