@@ -740,8 +740,8 @@ def diagnose(
         float | None,
         typer.Option(
             min=1.0,
-            help="Seconds after which a case with a model error tries nothing more; its page says what was "
-            "left out. [default: none]",
+            help="Seconds of search after which a case tries nothing more; its page says what was left out. "
+            "Not counted: starting, reading the logs, drawing the page. [default: none]",
         ),
     ] = None,
     quiet: Quiet = False,
@@ -1008,9 +1008,15 @@ def _interrupted(arguments: Sequence[str], out: Path | None = None) -> int:
     return _complain(f"{interrupts.words()}{hint}", interrupts.exit_code())
 
 
+# Options of development versions that reports of users still type.
+_REPLACED = {"--promise": "--response"}
+
+
 def _explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, (InputError, StageError)):
         return str(error), error.exit_code
+    if replaced := _REPLACED.get(getattr(error, "option_name", "")):
+        return f"No such option: {error.option_name}; it is now {replaced} (flexlink --help)", EXIT_BAD_INPUT  # type: ignore[attr-defined]
     if hasattr(error, "format_message"):  # typer's own: unknown option, missing argument ...
         return f"{error.format_message() or 'no command given'} (flexlink --help)", EXIT_BAD_INPUT
     if isinstance(error, OSError):  # a file that none of ours asks about, a pipe or a terminal

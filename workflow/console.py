@@ -50,6 +50,7 @@ class TerminalProgress(progress.Progress):
         self._doing, self._task = "starting", self._bar.add_task("starting", total=1.0, left="")
         self._expected: dict[str, float] = {}
         self._done_s = 0.0
+        self._reported_s = self._began_s  # when work was last reported
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -77,16 +78,19 @@ class TerminalProgress(progress.Progress):
             self._bar.console.print(f"  {line}", highlight=False)
 
     def _ahead(self) -> str:
-        """Share done and time left. What compiled is no sign of slowness, but more of it is to come."""
+        """Share done and time left, as of the last report of work: it falls till the next and is unknown
+        where that takes longer. What compiled is no sign of slowness, but more of it is to come."""
         total_s = sum(self._expected.values())
         if not total_s or self._worked_s < 0.02 * total_s:  # less says nothing about the whole
             return ""
-        spent_s = time.monotonic() - self._began_s - self._compiled_s
+        spent_s = self._reported_s - self._began_s - self._compiled_s
         slowness = (spent_s + _PRIOR_S) / (self._worked_s + _PRIOR_S)
         left_s = (total_s - self._worked_s) * slowness
         if self._compiled_s:
             left_s += max(COMPILING_S - self._compiled_s, 0.0)
-        return f" ({100 * self._worked_s / total_s:.0f} %, about {left_s:.0f} s left)"
+        left_s -= time.monotonic() - self._reported_s
+        share = f"{100 * self._worked_s / total_s:.0f} %"
+        return f" ({share}, about {left_s:.0f} s left)" if left_s >= 0.0 else f" ({share})"
 
     def _watch_compiler(self) -> None:
         """Compiling is told when it begins, and its time kept apart."""
@@ -114,12 +118,16 @@ class TerminalProgress(progress.Progress):
         self._bar.update(self._task, total=sum(self._expected.values()) or 1.0)
         self._watch_compiler()
 
+    def _worked(self, worked_s: float) -> None:
+        if worked_s != self._worked_s:
+            self._worked_s, self._reported_s = worked_s, time.monotonic()
+
     def start(self, stage: str) -> None:
         self.update(stage, 0.0)
 
     def update(self, stage: str, fraction: float, message: str = "") -> None:
         interrupts.check()  # some libraries swallow one while they are loaded
-        self._worked_s = self._done_s + min(max(fraction, 0.0), 1.0) * self._expected.get(stage, 0.0)
+        self._worked(self._done_s + min(max(fraction, 0.0), 1.0) * self._expected.get(stage, 0.0))
         self._doing = f"{stage}: {message}" if message else stage
         ahead = self._ahead().partition(", ")[2].rstrip(")")
         self._bar.update(
@@ -131,7 +139,7 @@ class TerminalProgress(progress.Progress):
             self._expected[stage] = 0.0  # it says nothing about the speed of this run
             self._bar.update(self._task, total=sum(self._expected.values()) or 1.0)
         self._done_s += self._expected.get(stage, 0.0)
-        self._worked_s = self._done_s
+        self._worked(self._done_s)
         if not self._bar.disable:
             words = "kept from the earlier run" if taken_up else f"{seconds:.1f} s"
             self._bar.console.print(f"  {escape(stage):<12} {words}", highlight=False)

@@ -204,6 +204,10 @@ def test_unwritable_output_is_refused_before_the_work(refused, tmp_path):
     assert "cannot write" in refused("simulate", "--config", FAST_ARM, "--out", tmp_path / "file" / "x")
 
 
+def test_an_option_of_another_name_is_said_to_be_replaced(refused):
+    assert "it is now --response" in refused("identify", "log.csv", "--promise", "without friction")
+
+
 def test_existing_directory_is_refused(refused, fast_run):
     assert "not empty" in refused("run", "--config", FAST_ARM, "--out", fast_run[0])
 

@@ -45,6 +45,10 @@ def test_time_left_follows_the_speed_of_the_machine(clock):
         clock[0] = 3 * 20.0 * share  # three times slower than expected
         told.update("first", share)
     assert told._ahead() == f" (20 %, about {80 * (60 + 10) / (20 + 10):.0f} s left)"
+    clock[0] += 50.0  # nothing is reported: that much less is left, until nobody knows
+    assert told._ahead() == f" (20 %, about {80 * (60 + 10) / (20 + 10) - 50:.0f} s left)"
+    clock[0] += 150.0
+    assert told._ahead() == " (20 %)"
     told.finish("first", 60.0, taken_up=False)
     clock[0] = 260.0
     told.update("second", 0.9)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -51,6 +53,9 @@ def test_table_and_page(log, flexlink, tmp_path, faults_seen):
     for words in ("3 rows missing", "milliseconds", "steps of 0.002 rad", "stands still", "clipped?", "▁"):
         assert words in answer.out
     assert f"flexlink identify {log} --input u_V --output hub_rad --time t_ms" in answer.out
+    taken = answer.out.partition("taken as")[2].partition("signals")[0]
+    for role, name in (("command", "u_V"), ("output", "hub_rad"), ("time", "t_ms")):
+        assert re.search(rf"{role} +│ {name} ", taken)
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert page.count("<figure>") == 1
     assert "steps of 0.002 rad" in page

@@ -79,7 +79,7 @@ def of_case(loaded: SimulatorCase, found: Telling) -> RunSummary:
         sections=rows_of("summary/check.j2", FILTERS.items(), **told),
         numbers={"logs": codec.plain(logs), **codec.plain(found), "advice": told["advice"]},
         verdict=f"{len(shown) - len(found.hidden)} of {len(shown)} candidates show; {len(alike)} groups "
-        "of them look alike in these records",
+        "of them look alike in these records, if one of them is present",
     )
 
 
