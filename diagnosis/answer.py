@@ -48,6 +48,8 @@ class NamedEffect:
         it explains in that set; of one that is not in the repaired model without an interval (nan).
     remarks : parameter -> what its interval does not say: at an end of its range, or as wide as that.
     untried : what it would need to be tried; "" where it was.
+    widened_by : key of the nominal value that the first interval is widest by, where tolerances make up most
+        of it; else "". Were all of them exact, it would be half as wide or less.
     """
 
     name: str
@@ -59,6 +61,7 @@ class NamedEffect:
     explains: tuple[float, float, float] = (float("nan"),) * 3
     remarks: Mapping[str, str] = field(default_factory=dict)
     untried: str = ""
+    widened_by: str = ""
 
 
 @dataclass(frozen=True)

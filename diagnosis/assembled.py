@@ -33,13 +33,14 @@ from plant.effects.search_space import Candidate
 @dataclass(frozen=True, eq=False)
 class Fitted:
     """An effect where it is fitted best: coordinates (A,), 95 % intervals; gap_after, explains as in
-    `NamedEffect`, of the set that it is in."""
+    `NamedEffect`, of the set that it is in; widened_by: the nominal value it is widest by."""
 
     candidate: Candidate
     coordinates: Real
     intervals: dict[str, tuple[float, float]]
     gap_after: float
     explains: tuple[float, float, float]
+    widened_by: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +118,7 @@ def assembled(
     of_sensor = rounding_effect(case)
     floor = NOISE_FLOOR if of_sensor is None else of_sensor.floor
     closed, interval = share_closed(case, refit, after, rng, floor)
-    named = {name: _entry(name, found, fitted(name), case) for name in weighed.presence}
+    named = {name: _entry(name, found, fitted(name), case, keys) for name in weighed.presence}
     for name in ("none", "unknown"):
         named[name] = NamedEffect(name, weighed.cause[name], weighed.cause[name], {}, {}, float("nan"))
 
@@ -151,7 +152,9 @@ def assembled(
     )
 
 
-def _entry(name: str, found: Judgement, fitted: Fitted | None, case: CaseOfMachine) -> NamedEffect:
+def _entry(
+    name: str, found: Judgement, fitted: Fitted | None, case: CaseOfMachine, keys: tuple[str, ...]
+) -> NamedEffect:
     weighed, rounding = found.probabilities, found.rounding
     entry = NamedEffect(name, weighed.cause[name], weighed.presence[name], {}, {}, float("nan"))
     if fitted is not None:
@@ -162,6 +165,7 @@ def _entry(name: str, found: Judgement, fitted: Fitted | None, case: CaseOfMachi
             gap_after=fitted.gap_after,
             explains=fitted.explains,
             remarks=remarks(fitted.candidate, fitted.coordinates, fitted.intervals),
+            widened_by="" if fitted.widened_by is None else keys[fitted.widened_by],
         )
     elif rounding is not None and name == rounding.name:
         gap = held_out_gap(case, found.repaired.residuals)

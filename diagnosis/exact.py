@@ -11,7 +11,7 @@ from diagnosis.assembled import Fitted, Judgement, Model, assembled
 from diagnosis.evidence.confirmation import confronted
 from diagnosis.evidence.hypotheses import DISAGREEMENT, Hypothesis, Probabilities, probabilities
 from diagnosis.evidence.search import WhiteSearch
-from diagnosis.fit.coordinates import parameter_intervals
+from diagnosis.fit.coordinates import parameter_intervals, widened_by
 from diagnosis.fit.descent import FINE, Descent
 from diagnosis.fit.likelihood import SUBSTANTIAL
 from diagnosis.fit.residual import ResidualModel
@@ -26,7 +26,6 @@ from diagnosis.next_experiment.discrimination import (
 )
 from diagnosis.search.loop import Progress
 from plant.effects import LOOK_ALIKES
-from plant.effects.search_space import Candidate
 
 
 def without_error(
@@ -161,12 +160,17 @@ def _fitted(
         rest = {n for n in end.names if n != name}
         without = [gap_of(h.end) for h in hypotheses if rest == set(h.names)] if rest else [gap_refit]
         share = _explained(min(without, default=float("nan")), after, gap_refit, floor)
+        # What is left beyond the noise widens intervals in proportion, as does what solvers disagree about.
+        wider = max(1.0, end.rms**2) * _solver_variance(end, samples)
+        inverse = wider * np.asarray(np.linalg.pinv(end.hessian, hermitian=True), dtype=np.float64)
+        rows = end.rows_of(k)
         return Fitted(
             end.candidates[k],
             end.coordinates_of(k),
-            _intervals(end, k, samples, rng),
+            parameter_intervals(end.candidates[k], end.coordinates_of(k), inverse[rows, rows], rng),
             after,
             (share, float("nan"), float("nan")),
+            widened_by(inverse, end.deviations.size, rows.start, float(inverse[rows, rows][0, 0])),
         )
 
     return fitted
@@ -176,24 +180,6 @@ def _explained(without: float, after: float, refit: float, floor: float) -> floa
     """Share of the energy of the validation error beyond noise that an effect explains; nan without one."""
     error = refit**2 - floor**2
     return float(np.clip((without**2 - after**2) / error, 0.0, 1.0)) if error > 0 else float("nan")
-
-
-def _intervals(
-    end: Descent, k: int, samples_per_record: float, rng: np.random.Generator
-) -> dict[str, tuple[float, float]]:
-    """95 % intervals of the parameters of the k-th candidate, from Gaussian draws of its coordinates.
-
-    What is left beyond the noise widens them in proportion, and so does what solvers may disagree about.
-    """
-    candidate: Candidate = end.candidates[k]
-    at = end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])
-    rows = slice(at, at + len(candidate.axes))
-    covariance = (
-        np.asarray(np.linalg.pinv(end.hessian, hermitian=True), dtype=np.float64)[rows, rows]
-        * max(1.0, end.rms**2)
-        * _solver_variance(end, samples_per_record)
-    )
-    return parameter_intervals(candidate, end.coordinates_of(k), covariance, rng)
 
 
 def _solver_variance(end: Descent, samples_per_record: float) -> float:

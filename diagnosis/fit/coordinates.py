@@ -55,6 +55,21 @@ def solved(matrix: Real, right: Real) -> Real:
         return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
 
 
+# Of the variance: without this share the interval would be half as wide.
+_MOST = 0.75
+
+
+def widened_by(inverse: Real, nominal: int, size: int, variance: float) -> int | None:
+    """Where the tolerances of the first `nominal` unknowns make up most of the variance of unknown `size`:
+    the one that makes up most of it; else None. inverse (M, M): covariance of the unknowns as far as the
+    likelihood tells; variance: of that unknown, from all sources."""
+    with_them = inverse[size, :nominal]
+    together = with_them @ solved(inverse[:nominal, :nominal], with_them)
+    if not nominal or not together > _MOST * variance:
+        return None
+    return int(np.argmax(with_them**2 / np.diag(inverse)[:nominal]))
+
+
 def parameter_intervals(
     candidate: Candidate, coordinates: Real, covariance: Real, rng: np.random.Generator
 ) -> dict[str, tuple[float, float]]:

@@ -67,6 +67,11 @@ class Descent:
     def effects(self) -> tuple[Any, ...]:
         return effects_at(self.candidates, self.coordinates)
 
+    def rows_of(self, k: int) -> slice:
+        """Where the coordinates of the k-th candidate stand among the unknowns."""
+        first = self.deviations.size + sum(len(c.axes) for c in self.candidates[:k])
+        return slice(first, first + len(self.candidates[k].axes))
+
     @property
     def non_smooth(self) -> bool:
         """Whether contacts switch."""

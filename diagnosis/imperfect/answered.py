@@ -8,7 +8,7 @@ import numpy as np
 
 from diagnosis.answer import Diagnosis, held_out_gap
 from diagnosis.assembled import Fitted, Judgement, Model, assembled
-from diagnosis.fit.coordinates import parameter_intervals
+from diagnosis.fit.coordinates import parameter_intervals, widened_by
 from diagnosis.fit.descent import Descent
 from diagnosis.imperfect import verdict as judging
 from diagnosis.imperfect.carried import closed_by, shares_of
@@ -213,35 +213,33 @@ def _fitted(
         best = next((e for e in likeliest if name in e.names), None)
         if best is None:
             return None
+        end = best.end
+        likely = np.linalg.pinv(end.normal(search.records).hessian, hermitian=True)
+        inverse = judging.TEMPER * np.asarray(likely, dtype=np.float64)
         k, rest = best.names.index(name), judging.best_without(sets, best, name)
+        rows = end.rows_of(k)
+        covariance = inverse[rows, rows] + _taken_for(search, best, k)
         explains = closed_by(search, best, found.nominal) - closed_by(search, rest, found.nominal)
         return Fitted(
-            best.end.candidates[k],
-            best.end.coordinates_of(k),
-            _intervals(search, best, k, rng),
+            end.candidates[k],
+            end.coordinates_of(k),
+            parameter_intervals(end.candidates[k], end.coordinates_of(k), covariance, rng),
             held_out_gap(search.case, _whitened(search.case, best)),
             carried.get(name) or (max(explains, 0.0), float("nan"), float("nan")),
+            widened_by(inverse, end.deviations.size, rows.start, covariance[0, 0]),
         )
 
     return fitted
 
 
-def _intervals(
-    search: Search, explanation: Explanation, k: int, rng: np.random.Generator
-) -> dict[str, tuple[float, float]]:
-    """95 % intervals of the parameters of the k-th effect, from Gaussian draws of its coordinates: what the
-    likelihood leaves open, and imperfections that may act as the effect does."""
-    end = explanation.end
-    candidate, coordinates = end.candidates[k], end.coordinates_of(k)
-    first = end.deviations.size + sum(len(c.axes) for c in end.candidates[:k])
-    rows = slice(first, first + len(candidate.axes))
-    inverse = np.asarray(np.linalg.pinv(end.normal(search.records).hessian, hermitian=True), dtype=np.float64)
+def _taken_for(search: Search, explanation: Explanation, k: int) -> Real:
+    """Covariance of the k-th effect's coordinates from imperfections of the model that may act as it does."""
+    candidate, coordinates = explanation.end.candidates[k], explanation.end.coordinates_of(k)
     rest = judging.best_without(best_of_sets(search.found), explanation, explanation.names[k])
     alike = judging.LITTLE * search.case.machine.weighing.model_error
     share = max(judging.share_beside(rest, explanation), alike)
     sizes = alike / share * np.array([_size(candidate, i, x) for i, x in enumerate(coordinates)])
-    covariance = judging.TEMPER * inverse[rows, rows] + np.outer(sizes, sizes)
-    return parameter_intervals(candidate, coordinates, covariance, rng)
+    return np.outer(sizes, sizes)
 
 
 def _size(candidate: Candidate, i: int, x: float) -> float:

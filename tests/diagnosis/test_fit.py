@@ -8,6 +8,7 @@ import pytest
 from diagnosis import Experiment
 from diagnosis.evidence.search import fitted_to
 from diagnosis.fit import starts as starts_module
+from diagnosis.fit.coordinates import widened_by
 from diagnosis.fit.levels import Levels
 from diagnosis.fit.likelihood import White
 from diagnosis.fit.residual import ResidualModel
@@ -130,3 +131,16 @@ def test_a_descent_may_stand_before_either_likelihood(likelihood):
     change = rng.standard_normal((60, 2))
     moved = likelihood.seen(residuals[0] + change) - likelihood.seen(residuals[0])
     np.testing.assert_allclose(likelihood.changed(change).ravel(), moved, atol=1e-12)
+
+
+@pytest.mark.parametrize(("known", "blamed"), [(0.1, None), (10.0, 0)])
+def test_an_interval_that_tolerances_make_wide_says_by_which(known, blamed):
+    """Two nominal values a, b (tolerance 1) and a size s. One record tells s + a to 0.1, another s + b / 90 to
+    `known`: only where that is much does s hang on a."""
+    rows = np.array([[10.0, 0.0, 10.0], [0.0, 1 / known / 90, 1 / known]])
+    inverse = np.linalg.inv(rows.T @ rows + np.diag([1.0, 1.0, 0.0]))
+    exact = 1 / (rows.T @ rows)[2, 2]
+    assert (exact < 0.25 * inverse[2, 2]) == (blamed is not None)
+    assert widened_by(inverse, 2, 2, inverse[2, 2]) == blamed
+    assert widened_by(inverse, 2, 2, 100 * inverse[2, 2]) is None  # other doubts are larger
+    assert widened_by(inverse[2:, 2:], 0, 0, inverse[2, 2]) is None
