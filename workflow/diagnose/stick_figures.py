@@ -35,7 +35,7 @@ def moving_figures(found: Diagnosis) -> Markup | None:
     figures = {model: figure(run[at]) for model, run in outputs.items()}
     if figures["measured"] is None:
         return None
-    flat, seconds = _flat(figures), min(T * case.dt_s, _LONGEST_S)
+    (flat, scale, seen), seconds = _flat(figures), min(T * case.dt_s, _LONGEST_S)
     colours: dict[str, str] = {
         "measured": gap_style.PALE,
         **{m: str(gap_style.MODELS[m]["color"]) for m in runs},
@@ -45,12 +45,12 @@ def moving_figures(found: Diagnosis) -> Markup | None:
     )
     return Markup(
         f'<svg viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" role="img" aria-label="Stick figures, measured and '
-        f'simulated, {seconds:.3g} s of motion">{paths}</svg>'
+        f'simulated, {seconds:.3g} s of motion">{paths}{_frame(scale, seen, T * case.dt_s, seconds)}</svg>'
     )
 
 
-def _flat(figures: Mapping[str, Real]) -> dict[str, Real]:
-    """(F, L, 2, 3) [m] -> (F, L, 2, 2) in the picture, one scale for all."""
+def _flat(figures: Mapping[str, Real]) -> tuple[dict[str, Real], float, str]:
+    """(F, L, 2, 3) [m] -> (F, L, 2, 2) in the picture, one scale [1/m] for all; axes across and up."""
     measured = figures["measured"]
     reach = np.ptp(measured.reshape(-1, 3), axis=0)
     moves = np.ptp(measured.reshape(len(measured), -1, 3), axis=0).max(axis=0)
@@ -67,7 +67,27 @@ def _flat(figures: Mapping[str, Real]) -> dict[str, Real]:
     scale = float(np.min((np.array([_WIDTH, _HEIGHT]) - 2 * _EDGE) / np.maximum(wide, 1e-3 * size)))
     middle = np.array([_WIDTH, _HEIGHT]) / 2
     up = np.array([1.0, -1.0])
-    return {model: middle + up * scale * (one - first - wide / 2) for model, one in near.items()}
+    flat = {model: middle + up * scale * (one - first - wide / 2) for model, one in near.items()}
+    return flat, scale, "".join("xyz"[k] for k in kept)
+
+
+def _frame(scale: float, seen: str, lasts_s: float, seconds: float) -> str:
+    """A length to measure by, the axes of the world that are seen, and a bar that fills as time goes by."""
+    length = 10.0 ** np.floor(np.log10(0.25 * _WIDTH / scale))
+    length *= max(step for step in (1, 2, 5) if step * length <= 0.25 * _WIDTH / scale)
+    x, y, end = _EDGE, _HEIGHT - _EDGE, _EDGE + length * scale
+    faster = f", shown {lasts_s / seconds:.2g} times faster" if lasts_s > 1.01 * seconds else ""
+    right = _WIDTH - _EDGE
+    ink, words = 'stroke="#555" stroke-width="1.5" fill="none"', 'fill="#555" font-size="12"'
+    return (
+        f'<path d="M{x} {y - 4}v4H{end:.1f}v-4" {ink}/><text x="{x}" y="{y - 8}" {words}>{length:g} m</text>'
+        f'<path d="M{x} {y - 70}v40h40" {ink}/><text x="{x + 44}" y="{y - 26}" {words}>{seen[0]}</text>'
+        f'<text x="{x - 4}" y="{y - 76}" {words}>{seen[1]}</text>'
+        f'<text x="{right}" y="{y - 8}" {words} text-anchor="end">0 to {lasts_s:.3g} s{faster}</text>'
+        f'<path d="M{right - 160} {y}h160" stroke="#ddd" stroke-width="4"/>'
+        f'<rect x="{right - 160}" y="{y - 2}" width="0" height="4" fill="#555"><animate '
+        f'attributeName="width" from="0" to="160" dur="{seconds:.4g}s" repeatCount="indefinite"/></rect>'
+    )
 
 
 def _path(lines: Real, colour: str, width: float, seconds: float) -> str:
