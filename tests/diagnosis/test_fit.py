@@ -135,7 +135,7 @@ def test_a_descent_may_stand_before_either_likelihood(likelihood):
 
 @pytest.mark.parametrize(("known", "blamed"), [(0.1, None), (10.0, 0)])
 def test_an_interval_that_tolerances_make_wide_says_by_which(known, blamed):
-    """Two nominal values a, b (tolerance 1) and a size s. One record tells s + a to 0.1, another s + b / 90 to
+    """Two nominal values a, b (tolerance 1) and a size s. One record tells s + a to 0.1, another s + b/90 to
     `known`: only where that is much does s hang on a."""
     rows = np.array([[10.0, 0.0, 10.0], [0.0, 1 / known / 90, 1 / known]])
     inverse = np.linalg.inv(rows.T @ rows + np.diag([1.0, 1.0, 0.0]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +84,14 @@ class LogLook:
     unclear: str
     response: ResponseLook | None = None
     doubts: tuple[Finding, ...] = ()
+
+    @property
+    def taken_as(self) -> dict[str, str]:
+        """Role -> column, as far as names and units tell."""
+        if self.roles is None:
+            return {}
+        of = {"command": self.roles.input, **asdict(self.roles)}
+        return {role: of[role] for role in ("command", "output", "reference", "time") if of[role]}
 
 
 def look_at(
