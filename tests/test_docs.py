@@ -164,6 +164,8 @@ def test_tutorial_runs_and_shows_what_it_finds(name, tmp_path, monkeypatch):
     assert all(len(made[f"tutorials/{picture}"]) > 10_000 for picture in pictures)
     cells = json.loads(made[f"tutorials/{name}.ipynb"])["cells"]
     assert all(cell["execution_count"] for cell in cells if cell["cell_type"] == "code")
+    if name == "engineer":
+        assert test_readme.verdict_of_the_run() in page
     if name == "student":
         test_readme.assert_hidden_cause_is_found(tmp_path / "answer" / "gap_case.json")
 

@@ -56,7 +56,8 @@ def test_a_stick_figure_stands_where_its_joint_says():
     np.testing.assert_allclose(lines[:, -1, 0], 0 * tips, atol=1e-12)
 
 
-@pytest.mark.parametrize(("limit", "stated"), [(0.4, 0.8), pytest.param(0.7, 0.35, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("limit", "stated"), [(0.4, 0.8), (0.7, 0.35)])
 def test_a_force_limit_that_is_stated_wrong_is_named(limit, stated):
     text = ROD.replace(
         'joint="hinge"/></actuator>', f'joint="hinge" forcerange="-{stated} {stated}"/></actuator>'
@@ -696,6 +697,7 @@ def test_a_joint_on_a_base_that_flies_is_refused_in_one_line(base, refused):
         MujocoArm(spec, ("hip",), DT_S)
 
 
+@pytest.mark.slow
 def test_a_load_that_a_gain_imitates_stays_open_beside_it():
     """A load, a mass and a gain leave alike; what is small beside one of them does not decide."""
     truth, case = cases.case_of(63, 51)

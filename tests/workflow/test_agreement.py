@@ -14,14 +14,15 @@ from scipy.signal import lfilter
 from control_design.controllers.controller import Controller
 from ident.basis.options import IdentOptions
 from ident.data.finding import FindingKind
+from ident.data.record import Record
 from tests.workflow.test_init import DT_S, recorded, write
 from workflow.commands.logs import read_logs
-from workflow.config.run_config import RunConfig
+from workflow.config.run_config import ClosedLoopData, RunConfig
 from workflow.config.settings import check
 from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
-from workflow.tasks.identification import identify_channels
+from workflow.tasks.identification import identify_channels, with_stated_controller
 from workflow.tasks.log_identification import identify_records
 from workflow.tasks.records import make_records
 from workflow.tasks.results import IdentifiedChannel, UncertainChannel
@@ -151,22 +152,26 @@ def test_noise_in_a_loop_without_reference_is_refused(flexlink, noisy_logs):
     assert "as asked for: what the loop feeds back moves the response" in told["reason"]
 
 
-@pytest.mark.parametrize("form", ["coefficients", "controller.json", "matrices.json"])
-def test_a_stated_controller_opens_the_loop(noisy_logs, tmp_path, form):
+def test_a_stated_controller_opens_the_loop(noisy_logs, tmp_path):
     law = Controller.proportional(GAIN, 0.01, computational_delay_samples=0)
-    stated: Any = {"controller_file": str(tmp_path / form)}
-    if form == "coefficients":
-        stated = {"controller": {"numerator": [GAIN], "denominator": [1.0]}}
-    elif form == "controller.json":
-        (tmp_path / form).write_text(json.dumps(law.to_dict()))
-    else:
-        matrices = {"A": [[0.5]], "B": [[0.0]], "C": [[1.0]], "D": [[GAIN]], "dt_s": 0.01}
-        (tmp_path / form).write_text(json.dumps(matrices))
-    about, spread = by_run(noisy_logs, None, loop=stated)
+    matrices = {"A": [[0.5]], "B": [[0.0]], "C": [[1.0]], "D": [[GAIN]], "dt_s": 0.01}
+    files = {"controller.json": law.to_dict(), "matrices.json": matrices}
+    for name, content in files.items():
+        (tmp_path / name).write_text(json.dumps(content))
+    stated = [{"controller_file": str(tmp_path / name)} for name in files]
+    about, spread = by_run(noisy_logs, None, loop=stated[0])
     assert about.closed_loop.kind is FindingKind.INDIRECT
     assert about.closed_loop.values["least_percent"] > 50
     assert about.modes[0].omega_rad_s == pytest.approx(30.0, rel=0.05)
     assert share_held(spread) > 0.9
+    # Whatever form it has, it tells the reference behind its numerator: 8, or 8 (1 - 0.5/z).
+    _, reference, u, y = noisy_loop(1)
+    record = Record("a", u[:, None], y[:, None], 0.01, ("u_A",), ("y_rad",))
+    behind, less = GAIN * reference, GAIN * (reference[1:] - 0.5 * reference[:-1])
+    plain = {"controller": {"numerator": [GAIN], "denominator": [1.0]}}
+    for form, told in zip((plain, *stated), (behind, behind, less), strict=True):
+        (opened,) = with_stated_controller([record], check(ClosedLoopData, form, source="test"))
+        np.testing.assert_allclose(opened.reference[:, 0], told, atol=1e-12)
 
 
 def test_a_clean_sensor_needs_no_reference_and_a_still_one_is_none(tmp_path):

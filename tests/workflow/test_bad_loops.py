@@ -139,13 +139,15 @@ def test_two_controllers_are_taken(taken, tmp_path):
     assert_right(taken(written(tmp_path, made)))
 
 
-@pytest.mark.parametrize("turned", ["u", pytest.param("y", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("turned", ["u", "y"])
 def test_a_turned_sign_is_turned_back(taken, tmp_path, turned):
     made = [{**one, turned: -one[turned]} for one in logs(levels=(0.2, 0.15))]
     assert_right(taken(written(tmp_path, made)))
 
 
-@pytest.mark.parametrize("column", ["u", pytest.param("applied", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("column", ["u", "applied"])
 def test_a_limit_of_the_amplifier_is_seen_before_and_after_it(taken, tmp_path, column):
     made = logs(levels=(0.2, 0.15, 0.2), machine=plant(limit=0.5))
     results = taken(written(tmp_path, made, COLUMNS | {"i_cmd_A": column}))

@@ -113,16 +113,10 @@ def drafted(flexlink, logs, *options):
             ("Sollwert [°]", "Strom [A]", "Winkel [°]"),
         ),
         (
-            ("time_s", "cmd_pos_mm", "torque_Nm", "pos_mm"),
-            (1, 50, 0.6, 50),
-            ("cmd_pos_mm", "torque_Nm", "pos_mm"),
-        ),
-        (
             ("time_us", "target_counts", "pwm", "position_counts"),
             (1e6, 65536 / (2 * np.pi), 100, 65536 / (2 * np.pi)),
             ("target_counts", "pwm", "position_counts"),
         ),
-        (("time", "r", "u", "y"), (1, 1, 1, 1), ("r", "u", "y")),
     ],
 )
 def test_columns_units_and_structure(flexlink, tmp_path, signals, names, units, columns):

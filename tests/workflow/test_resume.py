@@ -57,24 +57,13 @@ def whole(tmp_path_factory):
     return out, undisturbed(RUN, out)
 
 
-@pytest.fixture(scope="module")
-def reference(whole):
-    return whole[0]
-
-
-# A point is a file that has just appeared, and how long the next stage is then left working before the kill.
-@pytest.mark.parametrize(
-    ("appears", "pause_s"),
-    [
-        pytest.param("manifest.json", 0.0, marks=pytest.mark.slow),
-        ("stages/uncertainty.npz", 0.2),
-    ],
-)
-def test_killed_run_resumes_with_identical_numbers(reference, tmp_path, appears, pause_s):
+@pytest.mark.slow
+def test_killed_run_resumes_with_identical_numbers(whole, tmp_path):
+    """In the stage after the ellipses; at other moments: test_stopped_again_and_again below."""
     out = tmp_path / "run"
     process = start_flexlink("run", "--config", FAST_ARM, "--out", out)
-    wait_until((out / appears).exists, process)
-    time.sleep(pause_s)
+    wait_until((out / "stages/uncertainty.npz").exists, process)
+    time.sleep(0.2)
     kill(process)
     done_before = {
         path.name: path.stat().st_mtime_ns for path in (out / "stages").iterdir() if path.name[0] != "."
@@ -84,21 +73,20 @@ def test_killed_run_resumes_with_identical_numbers(reference, tmp_path, appears,
     assert not (out / "report.html").exists()
 
     finish(start_flexlink("run", "--config", FAST_ARM, "--out", out, "--resume"))
-    assert_same_run(reference, out)
+    assert_same_run(whole[0], out)
     after = {path.name: path.stat().st_mtime_ns for path in (out / "stages").iterdir()}
     assert {name: after[name] for name in done_before} == done_before, "a finished stage was made again"
     assert RunDirectory.open(out).manifest()["status"].startswith("complete")
 
 
-# SIGTERM comes while a command loads, SIGALRM at its time limit: below.
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-def test_interrupted_run_ends_at_once_and_says_how_to_go_on(tmp_path, number):
+# SIGTERM comes while a command loads, SIGALRM at its time limit, SIGHUP where it is stopped again and again.
+def test_interrupted_run_ends_at_once_and_says_how_to_go_on(tmp_path):
     out = tmp_path / "run"
     process = start_flexlink("run", "--config", FAST_ARM, "--out", out)
     wait_until((out / "stages/uncertainty.npz").exists, process)
-    process.send_signal(number)
+    process.send_signal(signal.SIGINT)
     sent_s = time.monotonic()
-    said = finish(process, 128 + number)
+    said = finish(process, 128 + signal.SIGINT)
     assert time.monotonic() - sent_s < 5.0  # two seconds on a machine that is not shared
     assert said.strip().endswith(f"flexlink run --config {FAST_ARM} --out {out} --resume continues")
 
@@ -257,16 +245,13 @@ def test_stopped_again_and_again_it_ends_with_the_same_files(whole, tmp_path):
     assert sum(one.past_the_end for one in found) < len(ways) / 2
 
 
-def test_a_run_leaves_its_controller(reference):
-    law = Controller.from_json((reference / "controller.json").read_text())
-    stored = RunResults(RunDirectory.open(reference)).design.synthesis.controller
+def test_a_run_leaves_its_controller(fast_run, tmp_path):
+    run, _ = fast_run
+    law = Controller.from_json((run / "controller.json").read_text())
+    stored = RunResults(RunDirectory.open(run)).design.synthesis.controller
     np.testing.assert_array_equal(law.A, stored.A)
-    assert "controller_step" in (reference / "controller.h").read_text()
-    assert "NOT CERTIFIED" not in (reference / "controller.c").read_text()
-
-
-def test_a_controller_that_is_not_certified_says_so(tmp_path, reference):
-    law = Controller.from_json((reference / "controller.json").read_text())
+    assert "controller_step" in (run / "controller.h").read_text()
+    assert "NOT CERTIFIED" not in (run / "controller.c").read_text()
     for path in write_controller(tmp_path, law, None, certified=False):
         assert b"NOT CERTIFIED" in path.read_bytes(), path.name
 

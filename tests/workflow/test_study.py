@@ -115,12 +115,6 @@ def test_points_of_one_design_share_controller_and_plant(small_study):
     assert len(list((out / "plants").iterdir())) == 1
 
 
-@pytest.mark.slow
-def test_numbers_do_not_depend_on_how_many_processes_there_are(small_study, tmp_path):
-    run_study(load_study(write_study(tmp_path)), tmp_path / "out", jobs=1)
-    assert_same_study(small_study[0], tmp_path / "out")
-
-
 def test_resuming_computes_only_what_is_missing(small_study, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(small_study[0], out)
