@@ -68,6 +68,7 @@ def test_a_spring_to_ground_is_nothing_of_the_list(tmp_path):
     assert spring.stiffness_Nm_rad == pytest.approx(true["stiffness_Nm_rad"], rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_drag_with_the_square_of_the_speed_is_nothing_of_the_list(tmp_path):
     cause = {"name": "gear_drag", "coefficient_Nms2": 0.05}
     found = diagnose(_case(tmp_path, cause, 1.0))
@@ -83,6 +84,7 @@ def test_viscous_friction_is_no_drag(tmp_path):
     assert found.probabilities["viscous_friction"] > 0.98
 
 
+@pytest.mark.slow
 def test_a_body_that_a_spring_holds_to_the_hub_is_nothing_of_the_list(tmp_path):
     held = {"inertia_kg_m2": 0.02, "stiffness_Nm_rad": 20.0, "damping_Nms": 0.05}
     found = diagnose(_case(tmp_path, {"name": "attachment", **held}, 1.0))

@@ -142,11 +142,12 @@ CASES: dict[str, tuple[Machine, str, str, str, float]] = {
 }
 
 
-SLOW = ("a limit below that stated", "spring", "centre", "shear", "stretch")
+# One of the values and one of what the repaired file can only note; the others take as long each.
+FAST = ("dead zone", "a limit")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in CASES]
+    "name", [pytest.param(name, marks=[] if name in FAST else [pytest.mark.slow]) for name in CASES]
 )
 def test_it_is_named_with_its_size_and_the_repaired_model_moves_as_the_machine(tmp_path, name):
     machine, stated, candidates, effect, size = CASES[name]

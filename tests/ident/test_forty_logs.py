@@ -401,7 +401,3 @@ def test_forty_logs(name, tmp_path: Path):
         np.testing.assert_allclose(record.output[:, 0], Y, rtol=1e-12, atol=1e-12)
     found = (*record.input_units, *record.output_units) or ("", "")
     assert found == log.units
-
-
-def test_there_are_forty_and_more():
-    assert len(LOGS) == 55

@@ -32,19 +32,6 @@ def test_units_of_signals_are_carried_along(header, unit):
     assert written_unit(header) == unit
 
 
-@pytest.mark.parametrize(
-    ("header", "stated"), [("Zeit [foo]", None), ("t (fortnight)", None), ("t_ms", "foo")]
-)
-def test_an_unknown_unit_is_one_line_with_those_that_are_known(tmp_path, header, stated):
-    path = tmp_path / "log.csv"
-    path.write_text(f"{header},u,y\n0,1,2\n1,3,4\n")
-    with pytest.raises(
-        ValueError, match=r"log\.csv: .*unknown unit.*expected s, ms, us, ns, min, h"
-    ) as error:
-        Record.from_file(path, ["u"], ["y"], time=header, time_unit=stated)
-    assert "\n" not in str(error.value)
-
-
 @given(st.sampled_from(sorted(PER_SECOND)), st.lists(st.integers(0, 10**6), min_size=1, max_size=9))
 def test_seconds_are_the_doubles_nearest_to_the_decimals_in_the_file(unit, ticks):
     """Whole numbers of any unit up to 1e6 are exact doubles, and one exact operation is rounded once."""

@@ -47,11 +47,6 @@ def ready(monkeypatch, results, pictures):
     monkeypatch.setattr(command, "render", pictures.__getitem__)
 
 
-def test_one_figure_for_each_of_the_paper(pictures):
-    assert list(pictures) == [item.number for item in REPORTED] == [1, 2, 3, 4, 5, 6, 7]
-    assert all(picture.kind == "svg" for picture in pictures.values())
-
-
 @pytest.mark.parametrize("number", list(DRAWERS))
 def test_figures_have_titles_units_and_nothing_is_hidden(results, number):
     figure = DRAWERS[number](results)

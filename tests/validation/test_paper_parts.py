@@ -10,7 +10,7 @@ from ident.data.record import Record
 from ident.search.error_surface import ErrorSurface
 from validation.comparators.prediction_error import arx_polynomials
 from validation.example_arms import paper_example
-from validation.paper.bounds import TWO_SIGMA_LEVEL, coverage_of
+from validation.paper.bounds import coverage_of
 from validation.paper.experiments import frequencies
 from validation.paper.machines import NOISE_STD, SNR_DB, LinkExperiment, SimulationExample
 from validation.paper.methods import fit_percent, is_mode, score
@@ -181,13 +181,6 @@ def test_shares_are_over_all_variants():
     shares = SearchShares(5, 500, hits)
     assert shares.share_percent("order 2", "raw") == 50
     assert shares.share_percent("order 4", "raw") == 0
-
-
-def test_two_sigma_in_the_plane():
-    """Share of a circular Gaussian within two standard deviations of each axis."""
-    draws = np.random.default_rng(0).standard_normal((200_000, 2))
-    share = np.mean(np.hypot(*draws.T) <= 2)
-    assert share == pytest.approx(TWO_SIGMA_LEVEL, abs=0.004)  # 5 standard errors
 
 
 @pytest.mark.slow

@@ -262,6 +262,7 @@ def test_a_band_leaves_out_drift_and_friction(flexlink, undrawn, tmp_path):
     assert [sentence for sentence in warnings if "outside the band of the data" in sentence]
 
 
+@pytest.mark.slow
 def test_friction_is_identified_from_logs_where_that_is_asked_for(flexlink, undrawn, tmp_path):
     """On records of the default arm: the model behind its friction simulates unseen ones better."""
     assert flexlink("simulate", "--out", tmp_path / "logs").code == 0

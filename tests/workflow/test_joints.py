@@ -101,6 +101,7 @@ def _check_the_ball(run: Path):
     return point, a
 
 
+@pytest.mark.slow
 def test_logs_of_a_closed_loop_give_a_certified_controller(run_of_the_arm, tmp_path, capsys):
     law = Controller.from_json((run_of_the_arm / "controller.json").read_text())
     config = load_joints(run_of_the_arm / "config.toml")[0]

@@ -14,7 +14,6 @@ from control_design.analysis.stability import ModeChange
 from control_design.convex.reference_filter import ReferenceFilter
 from control_design.plants.plant_set import Mode
 from tests.workflow import report_examples as example
-from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import drawings
 from workflow.report.pages import write_report
@@ -336,16 +335,6 @@ def test_hostile_names_are_escaped(tmp_path):
     assert "{% raw %}" in page.text
     for path in run.figures_path.iterdir():
         assert re.fullmatch(r"[a-z0-9-]+\.(svg|png)", path.name)
-
-
-def test_missing_stage_is_one_line(tmp_path):
-    settings = example.config()
-    run = RunDirectory.begin(
-        tmp_path / "run", config_text="", config=settings.to_document(), seed=3, inputs={}
-    )
-    with pytest.raises(InputError, match="is not there; run flexlink run --resume first"):
-        write_report(RunResults(run), settings)
-    assert not run.report_path.exists()
 
 
 def test_sensitivity_on_the_arm_is_compared_and_friction_named(tmp_path, undrawn):
