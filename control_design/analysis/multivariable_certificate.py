@@ -180,7 +180,7 @@ def _verdict(
     integrates = any(
         np.any(np.roots(w.denominator) == 0) for _, e in weights.values() for w in e if w is not None
     )
-    start = float(omega[0]) if integrates else 0.0
+    start = max(float(omega[0]) if integrates else 0.0, plant.ball.lowest_rad_s if plant.ball else 0.0)
     if plant.own_grid is not None:
         obstacle = "the uncertainty is known on its own frequencies only"
     elif not stable:

@@ -43,13 +43,15 @@ class ResponseBall:
 
     Lo (Y, P); Li: stable discrete `control.StateSpace` with U inputs, or an array (F, Q, U) at omega_rad_s
     (F,) [rad/s], between which nothing is known. radius: for a Kronecker covariance Lo Lo^H (x) Li^H Li,
-    sqrt(chi^2 quantile / 2) with 2 U Y degrees of freedom. Raises ValueError for shapes that do not fit.
+    sqrt(chi^2 quantile / 2) with 2 U Y degrees of freedom. lowest_rad_s: below it the ball says nothing, and
+    certificates begin there. Raises ValueError for shapes that do not fit.
     """
 
     Lo: Real
     Li: Any
     radius: float
     omega_rad_s: Real | None = None
+    lowest_rad_s: float = 0.0
 
     def __post_init__(self) -> None:
         lock(self, "Lo")
@@ -79,7 +81,8 @@ class ResponseBall:
         import control  # here, because it brings a plotting library with it
 
         li = control.ss(*posterior.input_factor(lowest_rad_s), posterior.dt_s, remove_useless_states=False)
-        return cls(posterior.output_factor, li, posterior.largest_radius(lowest_rad_s))
+        radius = posterior.largest_radius(lowest_rad_s)
+        return cls(posterior.output_factor, li, radius, lowest_rad_s=lowest_rad_s)
 
     def gram(self, omega_rad_s: Real) -> Complex:
         """radius^2 Li^H Li (F, U, U)."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import control
 import numpy as np
 import pytest
@@ -153,6 +155,15 @@ def test_the_smallest_destabilising_member_lies_at_the_predicted_radius():
         delta = -np.outer(right[0].conj(), left[:, 0].conj()) / sizes[0]
         assert abs(np.linalg.det(np.eye(2) + (rows.G[r] + lo @ delta @ li) @ K[r])) < 1e-9
         assert 1 / mu[r] == pytest.approx(np.linalg.norm(delta), rel=1e-6)
+
+
+def test_a_certificate_begins_where_the_ball_does():
+    plant, controller = plant_t(), given(problems.order_six_t())
+    for lowest in (0.0, 0.3):
+        ball = replace(plant.ball, lowest_rad_s=lowest)
+        verdict = certify_multivariable(controller, replace(plant, ball=ball), specification_t(6)).verdicts[0]
+        assert verdict.from_rad_s == lowest
+        assert verdict.proved
 
 
 def test_structured_norms_and_disk_margins():

@@ -87,7 +87,8 @@ class PointModel:
         nominal = self.model.to_control()
         if any(self.later):
             nominal, Li = (_behind(system, self.later) for system in (nominal, Li))
-        return MultivariablePlant(self.name, nominal, ResponseBall(self.Lo, Li, self.radius), input_error=off)
+        ball = ResponseBall(self.Lo, Li, self.radius, lowest_rad_s=float(self.shown.omega_rad_s[0]))
+        return MultivariablePlant(self.name, nominal, ball, input_error=off)
 
     @property
     def modes(self) -> tuple[tuple[float, float, Real | None], ...]:
