@@ -8,7 +8,7 @@ differences of slopes, so that steps near the end are those of Newton's method.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
@@ -128,9 +128,9 @@ class MatrixDescent:
         found = scaled_bound(self.stack.rows, K, log_t, accuracy=_ACCURACY, within=_FAR_BELOW)
         return found if np.all(np.isfinite(found.gamma)) else None
 
-    def run(self, start: Real, steps: int) -> tuple[Real, float, int]:
+    def run(self, start: Real, steps: int, *, curved: bool = False) -> tuple[Real, float, int]:
         """At most `steps` steps: parameters where it ended, worst case on the grid (inf: unstable start),
-        steps taken."""
+        steps taken. curved: a step that falls short is corrected to second order, for one evaluation more."""
         x = np.clip(np.asarray(start, dtype=np.float64), self._low, self._high)
         bound = self.bound(x, None)
         if bound is None:
@@ -155,6 +155,14 @@ class MatrixDescent:
             trial = np.clip(x + move * unit, self._low, self._high)
             after = self.bound(trial, bound.log_t)
             actual = -np.inf if after is None else best - 2 * float(np.log(np.max(after.gamma)))
+            if curved and after is not None and actual < 0.7 * predicted:
+                again = self._step(x, self._bent(local, move * unit, after, box), curvature, unit, box)
+                if again is not None:
+                    other = np.clip(x + again[0] * unit, self._low, self._high)
+                    there = self.bound(other, after.log_t)
+                    gained = -np.inf if there is None else best - 2 * float(np.log(np.max(there.gamma)))
+                    if gained > actual:
+                        trial, after, actual, multipliers = other, there, gained, again[2]
             if after is not None and actual > 0.02 * predicted:
                 outputs = local.basis.shape[1]
                 weights = np.zeros((self.stack.s.size, outputs, outputs), dtype=np.complex128)
@@ -209,6 +217,15 @@ class MatrixDescent:
         value[:, :width] = log[index][:, None] + sizes / top[:, None] - 1.0
         in_t = np.moveaxis(_entries(turned), 1, 2)
         return _Local(index, value, np.stack(slope, axis=1) / top[:, None, None], in_t, basis, top)
+
+    def _bent(self, local: _Local, change: Real, after: Bound, box: float) -> _Local:
+        """The rows with what they missed at x + change added: a second-order correction, with which the next
+        step from the same point follows a curved edge between rows."""
+        width = local.basis.shape[2]
+        said, _ = _lowered(local.value + local.slope @ change, local.in_t, _SCALING_BOX * box, width)
+        value = local.value.copy()
+        value[:, :width] += (2 * np.log(after.gamma[local.index]) - said)[:, None]
+        return replace(local, value=value)
 
     def _curvature(self, x: Real, bound: Bound, local: _Local, weights: Complex | None, unit: Real) -> Real:
         """Of the blocks' sum weighted by the multipliers of the step before, in natural units (n, n)."""
