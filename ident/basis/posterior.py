@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -53,7 +53,19 @@ def _centre_and_covariance(
     posterior: ResponsePosterior, omega: bytes, shape: tuple[int, ...]
 ) -> tuple[ComplexArray, RealArray]:
     rows = posterior.frequency_rows(np.frombuffer(omega).reshape(shape))
-    return rows @ posterior.mean, spread_covariance(rows @ posterior.covariance_factor)
+    return rows @ posterior.mean, spread_covariance(rows, posterior.square_factor)
+
+
+def _delays(z: ComplexArray, most: int) -> ComplexArray:
+    """z^-1 .. z^-most (F, most), by doubling: an exponential of each takes many times as long."""
+    powers = np.empty((z.size, most), dtype=np.complex128)
+    powers[:, :1] = z.conj()[:, None]  # on the unit circle
+    known = 1
+    while known < most:
+        more = min(known, most - known)
+        np.multiply(powers[:, :more], powers[:, known - 1 : known], out=powers[:, known : known + more])
+        known += more
+    return powers
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,14 +121,23 @@ class ResponsePosterior:
         parts = [basis_response(self.poles, z)]
         if self.has_feedthrough:
             parts.append(np.ones((omega.size, 1), dtype=np.complex128))
-        turn = self.dt_s * np.outer(omega, np.arange(1, self.fir_length + 1))
-        parts.append(np.cos(turn) - 1j * np.sin(turn))  # a complex exponential takes three times as long
+        parts.append(_delays(z, self.fir_length))
         common = front_response(omega, self.dt_s, self.integrators, self.input_delay_samples)
-        rows = np.asarray((common / all_pass_response(self.unstable, z))[:, None] * np.hstack(parts))
+        rows: ComplexArray = np.hstack(parts)
+        rows *= (common / all_pass_response(self.unstable, z))[:, None]
         if not self.unstable.order:
             return rows
         response = rows @ self.mean[: rows.shape[1]]
         return np.hstack([rows, -response[:, None] * log_all_pass_slopes(self.unstable, z)])
+
+    @cached_property
+    def square_factor(self) -> RealArray:
+        """(P,P) lower triangle L of the covariance L L^T, column-major."""
+        # P' may be larger than P, and half of a triangle is zero.
+        triangle = np.linalg.qr(self.covariance_factor.T, mode="r")
+        square = np.zeros((self.mean.size, self.mean.size), order="F")
+        square[:, : len(triangle)] = triangle.T
+        return square
 
     def at(self, omega_rad_s: npt.ArrayLike, level: float = 0.95) -> FrequencyUncertainty:
         """Centre and 2x2 covariances at any strictly increasing omega (F,) [rad/s]."""

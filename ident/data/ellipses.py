@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg.blas import dtrmm
 from scipy.special import fdtri
 
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import ComplexArray, RealArray, real_rows
 
 # Below this multiple of the centre's magnitude a semi-axis is rounding, not knowledge.
 _ROUNDING = 16 * np.finfo(np.float64).eps
@@ -66,10 +67,13 @@ def standard_axes(covariance: RealArray) -> tuple[RealArray, RealArray, ComplexA
     return s1, s2, np.exp(1j * angle)
 
 
-def spread_covariance(spread: ComplexArray) -> RealArray:
-    """Covariances (F,2,2) of (Re, Im) of spread (F,K) times K independent numbers of unit variance."""
-    parts = np.stack([spread.real, spread.imag])  # contiguous: sums over views take three times as long
-    covariance = np.empty((spread.shape[0], 2, 2))
+def spread_covariance(rows: ComplexArray, triangle: RealArray) -> RealArray:
+    """Covariances (F,2,2) of (Re, Im) of rows (F,P) times numbers whose covariance is L L^T, L the lower
+    triangle (P,P)."""
+    # In real numbers, as the triangle is: half the products.
+    spread = dtrmm(1.0, triangle, real_rows(rows).T, lower=1, trans_a=1, overwrite_b=1).T
+    parts = spread[: len(rows)], spread[len(rows) :]
+    covariance = np.empty((len(rows), 2, 2))
     for i, j in ((0, 0), (1, 1), (0, 1)):
         covariance[:, i, j] = covariance[:, j, i] = np.einsum("fk,fk->f", parts[i], parts[j])
     return covariance
