@@ -84,7 +84,7 @@ def nominal_margins(
     at_zero: the loop gain at zero frequency, None where it integrates (no finite gain moves a pole through
     z = 1 then). If refinable the crossings are found to rounding; else they are interpolated.
     """
-    found, modulus = _crossings(loop_gain, omega_rad_s, refinable)
+    found, modulus = _crossings(loop_gain, omega_rad_s, refinable, loop_gain(omega_rad_s))
     last = loop_gain(omega_rad_s[-1:])[0]
     if last.real < 0 and abs(last.imag) <= 1e-9 * abs(last):
         found.append((float(omega_rad_s[-1]), complex(last.real, 0.0)))
@@ -112,17 +112,17 @@ def _off_axis(value: Complex) -> Real:
 
 
 def _crossings(
-    loop_gain: Callable[[Real], Complex], omega_rad_s: Real, refinable: bool
+    loop_gain: Callable[[Real], Complex], omega_rad_s: Real, refinable: bool, value: Complex
 ) -> tuple[list[tuple[float, complex]], float]:
-    """(frequency, value) of the crossings of one loop between the ends of a grid; its least |1 + L|."""
-    omega, value = omega_rad_s, loop_gain(omega_rad_s)
+    """(frequency, value) of the crossings of one loop, value (F,) on a grid, between the ends of the grid;
+    its least |1 + L|."""
+    omega = omega_rad_s
     if refinable:
 
-        def sizes(w: Real) -> tuple[Real, ...]:
-            x = loop_gain(w)
+        def sizes(x: Complex) -> tuple[Real, ...]:
             return x.real, x.imag, _off_axis(x), np.abs(np.log(np.maximum(np.abs(x), 1e-300))), np.abs(1 + x)
 
-        omega, parts = _refined(sizes, omega, (2, 3, 4))
+        omega, parts = _refined(lambda w: sizes(loop_gain(w)), omega, sizes(value), (2, 3, 4))
         value = parts[0] + 1j * parts[1]
     found: list[tuple[float, complex]] = []
 
@@ -180,9 +180,13 @@ def ellipse_margins(
     if between is None:
         values = _members(loop_gain, ellipses)
     else:
-        crossed = [w for w, _ in _crossings(lambda w: _centre(*between(w)), grid, True)[0]]
-        start = np.union1d(grid, crossed)
-        grid, values = _refined(lambda w: _members(*between(w)), start, (0, 1, 2, 3, 4, 5))
+        centre = _centre(loop_gain, ellipses)
+        crossings, _ = _crossings(lambda w: _centre(*between(w)), grid, True, centre)
+        crossed = np.setdiff1d([w for w, _ in crossings], grid)
+        values = _members(loop_gain, ellipses)
+        if crossed.size:
+            grid, values = _joined(grid, values, crossed, _members(*between(crossed)))
+        grid, values = _refined(lambda w: _members(*between(w)), grid, values, (0, 1, 2, 3, 4, 5))
     up, down, phase, delay = (float(np.min(value)) for value in values[:4])
     ends = [(loop_gain[-1:], ellipses.subset(np.array([-1])))]
     if at_zero and between is not None:
@@ -284,11 +288,13 @@ def _unit_circle(centre: Complex, major: Complex, minor: Complex, omega: Real) -
 
 
 def _refined(
-    evaluate: Callable[[Real], tuple[Real, ...]], omega: Real, sought: tuple[int, ...]
+    evaluate: Callable[[Real], tuple[Real, ...]],
+    omega: Real,
+    values: tuple[Real, ...],
+    sought: tuple[int, ...],
 ) -> tuple[Real, tuple[Real, ...]]:
     """Grid and values with more points between the neighbours of the smallest local minima of the values
     sought."""
-    values = evaluate(omega)
     for _ in range(_ROUNDS):
         finer = []
         for which in sought:
@@ -302,8 +308,14 @@ def _refined(
         new = np.setdiff1d(np.concatenate(finer), omega)
         if not new.size:
             break
-        added = evaluate(new)
-        order = np.argsort(np.concatenate([omega, new]), kind="stable")
-        omega = np.concatenate([omega, new])[order]
-        values = tuple(np.concatenate([a, b])[order] for a, b in zip(values, added, strict=True))
+        omega, values = _joined(omega, values, new, evaluate(new))
     return omega, values
+
+
+def _joined(
+    omega: Real, values: tuple[Real, ...], new: Real, added: tuple[Real, ...]
+) -> tuple[Real, tuple[Real, ...]]:
+    """Grid and values with others, at other frequencies."""
+    order = np.argsort(np.concatenate([omega, new]), kind="stable")
+    joined = tuple(np.concatenate([a, b])[order] for a, b in zip(values, added, strict=True))
+    return np.concatenate([omega, new])[order], joined

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -154,6 +155,20 @@ class WorstCase:
         """Of the weighted requirements."""
         return tuple(name for name in self.values if name != "distance")
 
+    def joined(self, other: WorstCase) -> WorstCase:
+        """This and another, at other frequencies."""
+        order = np.argsort(np.concatenate([self.omega_rad_s, other.omega_rad_s]))
+
+        def both(a: Any, b: Any) -> Any:
+            return np.concatenate([a, b])[order]
+
+        return WorstCase(
+            both(self.omega_rad_s, other.omega_rad_s),
+            self.ellipses.joined(other.ellipses),
+            both(self.loop_factor, other.loop_factor),
+            {name: both(value, other.values[name]) for name, value in self.values.items()},
+        )
+
     def peak(self, kind: str) -> tuple[float, float]:
         """(largest value, its frequency) of one kind."""
         index = int(np.argmax(self.values[kind]))
@@ -173,20 +188,24 @@ def worst_case(
     response: controller without delay. Each round makes the grid ten times finer between the neighbours of
     the eight largest local maxima; plants known on their own grid only are not refined.
     """
-    omega = np.asarray(start, dtype=np.float64)
-    for left in range(rounds if plant.own_grid is None else 0, -1, -1):
+
+    def found_at(omega: Real) -> WorstCase:
         data, k = PlantData.build(plant, specification, omega), response(omega)
-        values = data.weighted(k)
-        finer = [omega]
-        for name, value in values.items():
+        return WorstCase(omega, data.ellipses, k * data.delay, data.weighted(k))
+
+    found = found_at(np.asarray(start, dtype=np.float64))
+    for _ in range(rounds if plant.own_grid is None else 0):
+        omega, finer = found.omega_rad_s, list[Real]()
+        for name, value in found.values.items():
             if name != "distance" and np.any(value > 0):
                 for index in local_maxima(value)[:_PEAKS]:
                     low, high = omega[max(index - 1, 0)], omega[min(index + 1, omega.size - 1)]
                     finer.append(np.linspace(low, high, _INSERTED + 2)[1:-1])
-        if left == 0:
+        new = np.setdiff1d(np.concatenate(finer), omega) if finer else omega[:0]
+        if not new.size:
             break
-        omega = np.unique(np.concatenate(finer))
-    return WorstCase(omega, data.ellipses, k * data.delay, values)
+        found = found.joined(found_at(new))
+    return found
 
 
 class Grids:

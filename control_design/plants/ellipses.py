@@ -123,6 +123,12 @@ class Ellipses:
         """The ellipses at the given positions."""
         return Ellipses(*(getattr(self, field.name)[index] for field in fields(self)))
 
+    def joined(self, other: Ellipses) -> Ellipses:
+        """These and others, at other frequencies, in ascending order."""
+        order = np.argsort(np.concatenate([self.omega_rad_s, other.omega_rad_s]))
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        return Ellipses(*(np.concatenate(pair)[order] for pair in pairs))
+
     def points(self, d1: Real, d2: Real) -> Complex:
         """Members centre + u1 s1 d1 + j u1 s2 d2; d1, d2 broadcast against (F,) on the last axis."""
         return np.asarray(
