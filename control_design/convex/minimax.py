@@ -162,33 +162,41 @@ def exchanged(
 
 
 class _Scaled:
-    """The rows in coordinates z that are orthonormal as seen by them: x = map z, z = back x, y = planar z."""
+    """The rows in coordinates z that are orthonormal as seen by them: x = map z, z = back x, y = planar z.
+
+    All rows at one frequency see the same y: what they say of z is said of y first, in the plane.
+    """
 
     def __init__(self, basis: Complex, rows: PlaneRows, accuracy: float) -> None:
         self.rows, self.accuracy = rows, accuracy
         planar = np.stack([basis.real, basis.imag], axis=1)  # (F, 2, n)
-        seen = np.concatenate(
-            [np.matmul(matrix, planar[rows.at]).reshape(-1, basis.shape[1]) for matrix in (rows.A, rows.C)]
-        )
-        _, sizes, directions = np.linalg.svd(np.linalg.qr(seen, mode="r"))
+        seen = np.einsum("rji,rjk->rik", rows.A, rows.A) + np.einsum("rji,rjk->rik", rows.C, rows.C)
+        triangle = np.linalg.qr(_half(_summed(rows.at, seen, len(basis)), planar), mode="r")
+        _, sizes, directions = np.linalg.svd(triangle)
         keep = sizes > _KEPT * sizes[0]
         self.map = directions[keep].T / sizes[keep] * np.sqrt(rows.at.size)
         self.back = (directions[keep] * sizes[keep][:, None]) / np.sqrt(rows.at.size)
         self.planar = planar @ self.map  # (F, 2, m)
-        by_row = self.planar[rows.at]  # (R, 2, m)
-        self._numerators = np.matmul(rows.A, by_row)
-        self._reaches = np.matmul(rows.C, by_row)
-        self._levels = np.einsum("rj,rjm->rm", rows.E, by_row)
         self.constant = not (np.any(rows.C) or np.any(rows.E))
         self._reach_rounding = _ROUND_REACH
         self._fixed_reach = np.hypot(rows.c[:, 0], rows.c[:, 1])
 
     def least_squares(self) -> Real:
-        seen = self._numerators.reshape(-1, self._numerators.shape[2])
-        return np.asarray(np.linalg.lstsq(seen, -self.rows.a.reshape(-1), rcond=None)[0])
+        rows = self.rows
+        seen = np.matmul(rows.A, self.planar[rows.at]).reshape(-1, self.planar.shape[2])
+        return np.asarray(np.linalg.lstsq(seen, -rows.a.reshape(-1), rcond=None)[0])
 
     def ratio(self, z: Real) -> float:
         return float(np.max(self.rows.ratio(self.planar @ z)))
+
+    def seen(self, z: Real) -> Real:
+        """y of every row, (R, 2)."""
+        return np.asarray((self.planar @ z)[self.rows.at])
+
+    def onto_z(self, vectors: Real) -> Real:
+        """Sum of forms vector y over the rows, (R, 2), as one form of z, (m,)."""
+        summed = _summed(self.rows.at, vectors, len(self.planar))
+        return np.asarray(summed.reshape(-1) @ self.planar.reshape(-1, self.planar.shape[2]))
 
     def lower(
         self, z: Real, gamma: float, scale: Real, *, stop_below: float = -np.inf, feasibility: bool = False
@@ -212,13 +220,15 @@ class _Scaled:
         best, best_value = z, begin
         final = feasibility or self.constant
         for _ in range(_MOST_STEPS):
-            by_row, hessian = self._derivatives(z, weight, factor, scale, dual)
+            by_row, blocks = self._derivatives(z, weight, factor, scale, dual)
             miss = h - v + slack
             ratio = dual / slack
             weighted = by_row * ratio[:, None]
+            blocks += by_row[:, :, None] * weighted[:, None, :]
+            half = _half(_summed(self.rows.at, blocks, len(self.planar)), self.planar)
             matrix = np.empty((n + 1, n + 1))
-            matrix[:n, :n] = hessian + by_row.T @ weighted
-            matrix[:n, n] = matrix[n, :n] = -np.sum(weighted, axis=0)
+            matrix[:n, :n] = half.T @ half  # of an array with itself: half the work
+            matrix[:n, n] = matrix[n, :n] = -self.onto_z(weighted)
             matrix[n, n] = np.sum(ratio)
             matrix[np.diag_indices(n + 1)] *= 1.0 + 1e-13
             factored = scipy.linalg.lu_factor(matrix, check_finite=False)
@@ -226,9 +236,10 @@ class _Scaled:
             target: Real | float = 0.0
             for corrector in (False, True):
                 pull = target / slack + ratio * miss
-                right = np.append(by_row.T @ pull, 1.0 - np.sum(pull))
+                right = np.append(self.onto_z(by_row * pull[:, None]), 1.0 - np.sum(pull))
                 step = -scipy.linalg.lu_solve(factored, right, check_finite=False)
-                change = by_row @ step[:n] - step[n]
+                rise = np.sum(by_row * self.seen(step[:n]), axis=1)
+                change = rise - step[n]
                 slack_step = -miss - change
                 dual_step = pull - dual + ratio * change
                 primal_length = _to_boundary(slack, slack_step)
@@ -243,7 +254,7 @@ class _Scaled:
             length = min(1.0, 0.99 * min(primal_length, dual_length))
             # What convex rows lie above their linearisation is its error: far from the kinks steps would run
             # away.
-            allowed, rise = float(np.max(slack)), by_row @ step[:n]
+            allowed = float(np.max(slack))
             h_new = self._values(z + length * step[:n], weight, factor, scale)
             while np.max(h_new - h - length * rise) > allowed and length > 1e-8:
                 length *= 0.5
@@ -267,19 +278,14 @@ class _Scaled:
 
     def _parts(self, z: Real, rounding: Real) -> tuple[Real, Real, Real, Real, Real]:
         """Vectors A y + a and C y + c, their rounded sizes, and e + E y."""
-        r = self.rows
-        p = self._numerators @ z + r.a
+        r, y = self.rows, self.seen(z)
+        p = np.einsum("rij,rj->ri", r.A, y) + r.a
         size_p = np.sqrt(p[:, 0] ** 2 + p[:, 1] ** 2 + rounding**2)
         if self.constant:
             return p, p, size_p, self._fixed_reach, r.e
-        q = self._reaches @ z + r.c
-        return (
-            p,
-            q,
-            size_p,
-            np.sqrt(q[:, 0] ** 2 + q[:, 1] ** 2 + self._reach_rounding**2),
-            r.e + self._levels @ z,
-        )
+        q = np.einsum("rij,rj->ri", r.C, y) + r.c
+        size_q = np.sqrt(q[:, 0] ** 2 + q[:, 1] ** 2 + self._reach_rounding**2)
+        return p, q, size_p, size_q, r.e + np.sum(r.E * y, axis=1)
 
     def _values(self, z: Real, weight: float, gamma: float, scale: Real) -> Real:
         _, _, size_p, size_q, level = self._parts(z, _ROUND_NUMERATOR * gamma * scale)
@@ -288,22 +294,42 @@ class _Scaled:
     def _derivatives(
         self, z: Real, weight: float, gamma: float, scale: Real, dual: Real
     ) -> tuple[Real, Real]:
-        """Gradient of h by row (R, m), and sum of dual times the Hessians of h (m, m).
+        """Gradients of h by y (R, 2), and dual times its Hessians (R, 2, 2).
 
         The Hessian of sqrt(|p|^2 + r^2) is (w w^T + (r/size)^2 u u^T)/size, u along p and w across it.
         """
-        rounding = _ROUND_NUMERATOR * gamma * scale
+        r, rounding = self.rows, _ROUND_NUMERATOR * gamma * scale
         p, q, size_p, size_q, _ = self._parts(z, rounding)
         share = dual / scale
-        gradient, hessian = _norm_derivatives(self._numerators, p, size_p, rounding, weight * share)
+        gradient, hessian = _norm_derivatives(r.A, p, size_p, rounding, weight * share)
         gradient *= (weight / scale)[:, None]
         if not self.constant:
             reach, curved = _norm_derivatives(
-                self._reaches, q, size_q, np.full(size_q.size, self._reach_rounding), gamma * share
+                r.C, q, size_q, np.full(size_q.size, self._reach_rounding), gamma * share
             )
-            gradient += (gamma / scale)[:, None] * (reach - self._levels)
+            gradient += (gamma / scale)[:, None] * (reach - r.E)
             hessian += curved
         return gradient, hessian
+
+
+def _summed(at: Integer, values: Real, count: int) -> Real:
+    """Sum of values (R, ...) over the rows at each of count frequencies, (count, ...)."""
+    flat = values.reshape(len(values), -1)
+    columns = [np.bincount(at, weights=column, minlength=count) for column in flat.T]
+    return np.stack(columns, axis=1).reshape(count, *values.shape[1:])
+
+
+def _half(blocks: Real, planar: Real) -> Real:
+    """H (2 F, m) with H^T H = sum of P^T B P over the frequencies, B (F, 2, 2) not negative, P (F, 2, m)."""
+    first, both, second = blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]
+    root = np.sqrt(first)
+    beside = np.divide(both, root, out=np.zeros_like(root), where=root > 0)
+    rest = np.sqrt(np.maximum(second - beside**2, 0.0))
+    half = np.empty((2, *planar.shape[::2]))
+    np.multiply(root[:, None], planar[:, 0], out=half[0])
+    half[0] += beside[:, None] * planar[:, 1]
+    np.multiply(rest[:, None], planar[:, 1], out=half[1])
+    return half.reshape(-1, planar.shape[2])
 
 
 def _to_boundary(value: Real, step: Real) -> float:
@@ -315,13 +341,13 @@ def _to_boundary(value: Real, step: Real) -> float:
 def _norm_derivatives(
     forms: Real, vector: Real, size: Real, rounding: Real, weight: Real
 ) -> tuple[Real, Real]:
-    """Gradient (R, m) of the rounded norms of vector = forms z, sum of weight times their Hessians (m, m)."""
+    """Gradients (R, 2) of the rounded norms of vector = forms y, weight times their Hessians (R, 2, 2)."""
     length = np.hypot(vector[:, 0], vector[:, 1])
     u = np.where(length[:, None] > 0, vector, [1.0, 0.0]) / np.where(length > 0, length, 1.0)[:, None]
     along = u[:, 0, None] * forms[:, 0] + u[:, 1, None] * forms[:, 1]
     gradient = along * (length / size)[:, None]
     across = u[:, 0, None] * forms[:, 1] - u[:, 1, None] * forms[:, 0]
-    each = np.sqrt(weight / size)[:, None]
-    across *= each
-    along *= each * (rounding / size)[:, None]
-    return gradient, across.T @ across + along.T @ along  # of an array with itself: half the work
+    each = weight / size
+    hessian = each[:, None, None] * across[:, :, None] * across[:, None, :]
+    hessian += (each * (rounding / size) ** 2)[:, None, None] * along[:, :, None] * along[:, None, :]
+    return gradient, hessian

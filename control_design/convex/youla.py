@@ -157,7 +157,7 @@ class BracketProblem:
             lean = self.grids.lean()[0]
             if region == "ellipse":
                 return self._ellipse(lean, begin)
-            rows = self._rows(lean, region)
+            rows = self._rows(lean, region, self._loop(lean))
             return smallest_ratio(self._basis(lean), rows, begin, accuracy=self.accuracy)
 
         found = exchanged(
@@ -177,7 +177,7 @@ class BracketProblem:
         point = MinimaxPoint(np.zeros(basis.shape[1]), np.inf)
         for _ in range(_ELLIPSE_ROUNDS):
             angles = None if start is None else _best_angles(loop, data, basis @ start)
-            rows = self._rows(data, "ellipse", angles)
+            rows = self._rows(data, "ellipse", loop, angles)
             new = smallest_ratio(basis, rows, start, accuracy=self.accuracy)
             before = point.gamma
             if new.gamma < before:
@@ -194,9 +194,11 @@ class BracketProblem:
     def _basis(self, data: PlantData) -> Complex:
         return with_constant(self.poles, data.ellipses.omega_rad_s, self.plant.dt_s)
 
-    def _rows(self, data: PlantData, region: Region, angles: Real | None = None) -> PlaneRows:
-        """Rows of one region on a grid, in the plane of Q = basis x."""
-        loop, e = self._loop(data), data.ellipses
+    def _rows(
+        self, data: PlantData, region: Region, loop: AffineLoop, angles: Real | None = None
+    ) -> PlaneRows:
+        """Rows of one region on a grid, where the loop is this, in the plane of Q = basis x."""
+        e = data.ellipses
         size = e.omega_rad_s.size
         turn = np.exp(-1j * (np.zeros(size) if angles is None else angles))
         offset = e.centre * data.delay - loop.base
@@ -238,13 +240,12 @@ class BracketProblem:
 
     def _dense_values(self, x: Real, region: Region) -> Real:
         """Worst case per frequency of the dense grid: exact geometry for the ellipse, the rows for discs."""
-        y = self.dense_basis @ x
+        y, loop = self.dense_basis @ x, self.dense_loop
         if region == "ellipse":
-            loop = self.dense_loop
             sensitivity = loop.sensitivity + loop.sensitivity_slope * y
             k = (loop.effort + loop.effort_slope * y) / np.where(sensitivity == 0, 1e-300, sensitivity)
             return worst_of(self.dense.weighted(k))
-        rows, values = self._rows(self.dense, region), np.zeros(y.size)
+        rows, values = self._rows(self.dense, region, loop), np.zeros(y.size)
         np.maximum.at(values, rows.at, rows.ratio(plane(y)))
         return values
 

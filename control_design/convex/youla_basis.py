@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 
 from control_design.plants.ellipses import Complex, Real
-from control_design.plants.plant_set import UncertainPlant, frequency_response, modes_of
+from control_design.plants.plant_set import UncertainPlant, matrix_response, modes_of
 from ident.basis.functions import basis_response
 from ident.basis.poles import Poles
 
@@ -62,7 +62,13 @@ class Factors:
 
     def loop(self, omega_rad_s: Real) -> AffineLoop:
         """K S = M (X + M Q), S = M (Y - N Q)."""
-        n, m, x, y = (frequency_response(part, omega_rad_s) for part in (self.N, self.M, self.X, self.Y))
+        # N and M share their states, X and Y theirs.
+        above, below = self.N, self.M
+        both = np.vstack([above.C, below.C]), np.vstack([above.D, below.D])
+        n, m = matrix_response(control.ss(above.A, above.B, *both, above.dt), omega_rad_s)[:, :, 0].T
+        one, other = self.X, self.Y
+        inputs, direct = np.hstack([one.B, other.B]), np.hstack([one.D, other.D])
+        x, y = matrix_response(control.ss(one.A, inputs, one.C, direct, one.dt), omega_rad_s)[:, 0].T
         return AffineLoop(n / m, m * x, m * m, m * y, -m * n)
 
 
