@@ -32,8 +32,10 @@ _REPEATS = 1e-3
 _STEPS, _LENGTHS = 8, (1.0, 0.5, 0.25, 0.1)
 # A residual sum of squares that falls by less than this many noise variances is at its end.
 WORTH = 0.5
-# Sizes of the changes that derivatives are taken from, relative to the motion and to the level.
-_CHANGE, _CHANGE_OF_LEVEL, _CHANGE_OF_LOG, _CHANGE_BEYOND = 1e-3, 2e-3, 0.02, 0.05
+# Sizes of the changes that derivatives are taken from, relative to the motion and to the level: of the
+# simulation, whose friction turns at other times after a large change, and where an observer tells it.
+_CHANGE = 1e-6
+_CHANGE_OF_LEVEL, _CHANGE_OF_LOG, _CHANGE_BEYOND = 2e-3, 0.02, 0.05
 # Samples of a record up to which its derivatives are kept for the next who asks: 32 of them take 130 MB.
 _LONGEST_KEPT = 20_000
 
@@ -170,7 +172,7 @@ def law_of(parameters: RealArray) -> FrictionLaw:
 
 
 def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray) -> Linearised:
-    """Central differences of the simulation with input u (T,): the friction follows every change."""
+    """Differences of the simulation with input u (T,): the friction follows every change."""
     if u.size > _LONGEST_KEPT:
         return _linearised(arm, coefficients, law, u)
     return _kept(arm, coefficients.tobytes(), law, u.tobytes())
@@ -191,22 +193,21 @@ def _linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: R
     parameters = parameters_of(law)
     by = np.empty((u.size, columns.shape[1] + parameters.size))
     friction_by = np.empty_like(by)
+
+    def differentiate(j: int, size: float, changed: RealArray, by_changed: FrictionLaw) -> None:
+        ends = arm.run(changed, u, by_changed)
+        by[:, j], friction_by[:, j] = (ends[0] - position) / size, (ends[1] - friction) / size
+
     for j, column in enumerate(columns.T):
-        size = _CHANGE * speed / max(float(np.std(np.diff(column))), np.finfo(np.float64).tiny)
         change = np.zeros(coefficients.size)
-        change[j] = size
-        ends = [arm.run(coefficients + sign * change, u, law) for sign in (1, -1)]
-        by[:, j], friction_by[:, j] = ((a - b) / (2 * size) for a, b in zip(*ends, strict=True))
+        change[j] = _CHANGE * speed / max(float(np.std(np.diff(column))), np.finfo(np.float64).tiny)
+        differentiate(j, change[j], coefficients + change, law)
+    n = columns.shape[1]
     for k in range(parameters.size):
         change = np.zeros(parameters.size)
         # An excess has no size of its own before it is known, and cannot be negative.
-        change[k] = size = _CHANGE_OF_LOG if k % 2 else _CHANGE_OF_LEVEL * law.level
-        below = law_of(parameters - change)
-        size += float((parameters - parameters_of(below))[k])
-        ends = [arm.run(coefficients, u, one) for one in (law_of(parameters + change), below)]
-        j = columns.shape[1] + k
-        by[:, j], friction_by[:, j] = ((a - b) / size for a, b in zip(*ends, strict=True))
-    n = columns.shape[1]
+        change[k] = _CHANGE if k % 2 else _CHANGE * law.level
+        differentiate(n + k, change[k], coefficients, law_of(parameters + change))
     return Linearised(position, friction, by[:, :n], by[:, n:], friction_by)
 
 
