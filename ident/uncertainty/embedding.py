@@ -25,6 +25,7 @@ from ident.uncertainty.embedding_algebra import (
     KernelPosterior,
     ReducedRegression,
     RegressionBlock,
+    StackedBlocks,
     alternating_factor,
     averaged_posterior,
     embedding_report,
@@ -32,6 +33,8 @@ from ident.uncertainty.embedding_algebra import (
     joint_factor,
     kernel_grid,
     reduce_regression,
+    reduce_stacked,
+    stack_blocks,
     tc_factor,
     total_log_evidence,
 )
@@ -123,8 +126,6 @@ def _embed(
 ) -> tuple[ResponsePosterior, RealArray, RealArray]:
     rows, n_off = _rows(records, model, model.poles.doubled(), options, beside), model.unstable.order
     rows = replace(rows, n_known=n_known)
-    if n_known:
-        rows = replace(rows, known_std=_noise_std(rows))
     # Coloured noise taken for white passes for modes: none are added before it has been whitened.
     first = options.model_copy(update={"prior_missed_mode": 0.0}) if options.coloured_noise else options
     solved = _solve(rows, first)
@@ -132,8 +133,7 @@ def _embed(
         for _ in range(NOISE_ROUNDS):
             residuals, absorbed = gls_residuals(solved.rows, solved.reduced, solved.kernel)
             whitening = fit_autoregression(residuals, options.max_ar_order, solved.rows.whitening, absorbed)
-            behind = replace(solved.rows, whitening=whitening)
-            solved = _solve(replace(behind, known_std=_noise_std(behind)) if n_known else behind, options)
+            solved = _solve(replace(solved.rows, whitening=whitening), options)
     poles = solved.rows.poles
     reduced, kernel, missed = solved.reduced, solved.kernel, solved.missed
     if missed is not None and missed.poles.size:
@@ -229,13 +229,15 @@ def _posterior(
     )
 
 
-def _noise_std(rows: EmbeddingRows) -> float:
-    """Standard deviation of what regressors and kernel leave, their coefficients as good as free.
+def _noise_std(rows: EmbeddingRows, stacked: StackedBlocks) -> float:
+    """Standard deviation of what regressors and kernel leave of the stacked records, their coefficients as
+    good as free.
 
     Not quite, for a column may do nothing in these records.
     """
     size = max(float(np.std(record.output)) for record in rows.records)
-    reduced = reduce_regression(replace(rows, known_std=_FREE * size).blocks())
+    free = replace(rows, known_std=_FREE * size).known_blocks()
+    reduced = reduce_stacked(stack_blocks(free, stacked))
     return float(np.sqrt(reduced.rest / max(reduced.degrees_of_freedom - reduced.fir_length, 1)))
 
 
@@ -282,7 +284,10 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
     """Posterior on these rows; modes that an order selection would have kept are added to their poles."""
     n_added = 0
     while True:
-        reduced = reduce_regression(rows.blocks())
+        stacked = stack_blocks(rows.record_blocks())
+        if rows.n_known and n_added == 0:
+            rows = replace(rows, known_std=_noise_std(rows, stacked))
+        reduced = reduce_stacked(stack_blocks(rows.known_blocks(), stacked))
         grid = kernel_grid(reduced, _SHAPES, order_given=bool(options.order_given))
         kernel = averaged_posterior(grid, options.no_remainder, options.hyperparameters)
         if not options.prior_missed_mode > 0:

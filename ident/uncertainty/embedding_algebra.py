@@ -142,15 +142,31 @@ def nuisance_basis(nuisance: RealArray) -> RealArray:
     return np.asarray(q[:, :rank])
 
 
+@dataclass(frozen=True, eq=False)
+class StackedBlocks:
+    """Triangle of p regressors, `length` kernel columns and the output of n_rows rows."""
+
+    triangle: RealArray
+    n_rows: int
+    p: int
+    length: int
+
+
 def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
     """One QR for all records: each block, its nuisance projected out, is stacked under the last triangle.
 
     Cost O(N (p + L)^2), memory that of the largest block's F and a piece of its Psi. Raises ValueError when
     rows do not exceed p + L or the input does not excite a regressor.
     """
+    return reduce_stacked(stack_blocks(blocks))
+
+
+def stack_blocks(blocks: Iterable[RegressionBlock], upon: StackedBlocks | None = None) -> StackedBlocks:
+    """The triangle of blocks, and of those already stacked. Raises ValueError where there are none."""
     triangle: RealArray | None = None
-    n_rows = 0
-    p = length = 0
+    n_rows = p = length = 0
+    if upon is not None:
+        triangle, n_rows, p, length = upon.triangle, upon.n_rows, upon.p, upon.length
     for block in blocks:
         p, length = block.regressors.shape[1], block.kernel.shape[1]
         basis = nuisance_basis(block.nuisance)
@@ -166,6 +182,12 @@ def reduce_regression(blocks: Iterable[RegressionBlock]) -> ReducedRegression:
         triangle = upper if triangle is None else triangle_of(np.vstack([triangle, upper]))
     if triangle is None:
         raise ValueError("need at least one record")
+    return StackedBlocks(triangle, n_rows, p, length)
+
+
+def reduce_stacked(stacked: StackedBlocks) -> ReducedRegression:
+    """Raises ValueError as `reduce_regression`."""
+    triangle, n_rows, p, length = stacked.triangle, stacked.n_rows, stacked.p, stacked.length
     if n_rows <= p + length + 1:
         raise ValueError(
             f"{n_rows} usable samples do not determine {p} regressors and {length} kernel coefficients: "

@@ -81,6 +81,11 @@ class EmbeddingRows:
             yield self._rows(record, self.beside[k] if self.beside else None)
 
     def blocks(self) -> Iterator[RegressionBlock]:
+        """Those of the records, and of what is known of shared coefficients."""
+        yield from self.record_blocks()
+        yield from self.known_blocks()
+
+    def record_blocks(self) -> Iterator[RegressionBlock]:
         """Rows with kernel columns; those that are dropped are left out, for they count as data here."""
         for rows in self:
             dropped = 0 if np.any(rows.first) else len(rows.first)
@@ -88,8 +93,10 @@ class EmbeddingRows:
             kernel = Delays(rows.input, self.fir_length, rows.first @ head[:], dropped)
             used = slice(dropped, None)
             yield RegressionBlock(rows.nuisance[used], rows.regressors[used], kernel, rows.output[used])
+
+    def known_blocks(self) -> Iterator[RegressionBlock]:
+        """What is known of the shared coefficients: as many measurements of them, each off by one."""
         if self.known_std is not None:
-            # What is known of the shared coefficients: as many measurements of them, each off by one.
             q = self.n_known
             known = np.zeros((q, self.poles.order + int(self.structure.feedthrough) + self.n_beside))
             known[:, -q:] = self.known_std * np.eye(q)
@@ -148,7 +155,7 @@ def gls_residuals(
     residuals, absorbed = [], []
     drops = rows.whitening.size > 1 and not np.any(first_rows(rows.whitening))
     # What is known beforehand is no record and leaves nothing.
-    for block in replace(rows, whitening=np.ones(1), known_std=None).blocks():
+    for block in replace(rows, whitening=np.ones(1)).record_blocks():
         rest = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
         shared = block.regressors[:, reduced.kept] / scale
         local = np.zeros((rest.size, 0))
