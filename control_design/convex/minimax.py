@@ -316,7 +316,7 @@ def _summed(at: Integer, values: Real, count: int) -> Real:
     """Sum of values (R, ...) over the rows at each of count frequencies, (count, ...)."""
     flat = values.reshape(len(values), -1)
     columns = [np.bincount(at, weights=column, minlength=count) for column in flat.T]
-    return np.stack(columns, axis=1).reshape(count, *values.shape[1:])
+    return np.asarray(np.stack(columns, axis=1).reshape(count, *values.shape[1:]), dtype=np.float64)
 
 
 def _half(blocks: Real, planar: Real) -> Real:

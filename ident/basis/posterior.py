@@ -134,7 +134,7 @@ class ResponsePosterior:
     def square_factor(self) -> RealArray:
         """(P,P) lower triangle L of the covariance L L^T, column-major."""
         # P' may be larger than P, and half of a triangle is zero.
-        triangle = np.linalg.qr(self.covariance_factor.T, mode="r")
+        triangle = np.asarray(np.linalg.qr(self.covariance_factor.T, mode="r"))
         square = np.zeros((self.mean.size, self.mean.size), order="F")
         square[:, : len(triangle)] = triangle.T
         return square
