@@ -50,7 +50,8 @@ def transitions(rates: Any, chain: Any, dt_s: float) -> Any:
     return moves
 
 
-@numba.njit(**INSIDE)
+# A step waits for the sum before it: sums in any order are a fifth faster.
+@numba.njit(**INSIDE, fastmath={"reassoc", "contract", "arcp", "nsz"})
 def advance(
     drive: float,
     state: Any,
