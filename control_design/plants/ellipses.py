@@ -9,10 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol, runtime_checkable
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
-from ident.data.arrays import lock
+from ident.data.arrays import INSIDE, lock
 
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -142,59 +143,124 @@ class Ellipses:
 
 
 def secular_root(p: Real, q: Real, c: Real, d: Real) -> Real:
-    """Root t >= 0 of (p/(c + t))^2 + (q/(d + t))^2 = 1 for p, q, c, d >= 0; 0 where the sum is below 1 there.
-    Convex and decreasing: Newton from the left never overshoots."""
-    # Lower bounds of the root: each term alone <= 1. Both make the sum >= 1, where Newton is monotone.
-    t = np.maximum(np.maximum(p - c, q - d), 0.0)
-    tiny = 1e-300
-    for _ in range(60):
-        dc, dd = c + t + tiny, d + t + tiny
-        pc, qd = (p / dc) ** 2, (q / dd) ** 2
-        value = pc + qd - 1.0
-        slope = -2.0 * (pc / dc + qd / dd)
-        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            step = np.where((value > 0) & (slope < 0), -value / np.where(slope < 0, slope, -1.0), 0.0)
-        t = t + step
-        if np.all(step <= 1e-15 * (t + 1e-16)):
-            break
-    return np.asarray(t, dtype=np.float64)
-
-
-def _to_scale(point: Complex, a: Real, b: Real) -> tuple[Real, Real, Real, Real, Real]:
-    """Coordinates of the point (absolute) and semi-axes in units of the largest of them, and that unit."""
-    x, y = np.abs(np.real(point)), np.abs(np.imag(point))
-    scale = np.maximum(np.maximum(x, y), np.maximum(a, 1e-300))
-    return x / scale, y / scale, a / scale, b / scale, scale
+    """Root t >= 0 (F,) of (p/(c + t))^2 + (q/(d + t))^2 = 1 for p, q, c, d >= 0; 0 where the sum is below 1
+    there."""
+    with np.errstate(all="ignore"):  # compiled loops divide first and choose then
+        return np.asarray(_root_of_each(p, q, c, d), dtype=np.float64)
 
 
 def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real:
     """Distance (F,) from `point` to the filled axis-parallel ellipse at the origin; 0 inside. The nearest
     point is (a^2 x/(a^2 + t), b^2 y/(b^2 + t)), t the `secular_root`."""
-    x, y, a, b, scale = _to_scale(point, semi_major, semi_minor)
-    t = secular_root(a * x, b * y, a * a, b * b)
-    da, db = a * a + t, b * b + t
-    # t = 0 on a degenerate axis: the point projects onto the segment itself.
-    nx, ny = quotient(a * a * x, da), quotient(b * b * y, db)
-    beside = ((a == 0) & (x > 0)) | ((b == 0) & (y > 0))
-    inside = (quotient(x, a) ** 2 + quotient(y, b) ** 2 <= 1.0) & ~beside
-    distance = np.hypot(x - nx, y - ny)
-    return np.asarray(np.where(inside, 0.0, distance) * scale, dtype=np.float64)
+    with np.errstate(all="ignore"):
+        return np.asarray(_nearest_of_each(point, semi_major, semi_minor), dtype=np.float64)
 
 
 def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real:
     """Distance (F,) from `point` to the farthest point of the axis-parallel ellipse at the origin: with x, y
     >= 0 the multiplier m is the largest root of (a x/(m - a^2))^2 + (b y/(m - b^2))^2 = 1, n = m - a^2 a
     `secular_root`."""
-    x, y, a, b, scale = _to_scale(point, semi_major, semi_minor)
+    with np.errstate(all="ignore"):
+        return np.asarray(_farthest_of_each(point, semi_major, semi_minor), dtype=np.float64)
+
+
+@numba.njit(**INSIDE)
+def _secular_root(p: float, q: float, c: float, d: float) -> float:
+    """Convex and decreasing: Newton from the left never overshoots."""
+    # Lower bounds of the root: each term alone <= 1. Both make the sum >= 1, where Newton is monotone.
+    t = max(max(p - c, q - d), 0.0)
+    tiny = 1e-300
+    for _ in range(60):
+        dc, dd = c + t + tiny, d + t + tiny
+        pc, qd = (p / dc) ** 2, (q / dd) ** 2
+        value, slope = pc + qd - 1.0, -2.0 * (pc / dc + qd / dd)
+        step = -value / slope if value > 0 and slope < 0 else 0.0
+        t += step
+        if not step > 1e-15 * (t + 1e-16):
+            break
+    return t
+
+
+@numba.njit(**INSIDE)
+def _nearest(point: complex, semi_major: float, semi_minor: float) -> float:
+    x, y = abs(point.real), abs(point.imag)
+    scale = max(max(x, y), max(semi_major, 1e-300))
+    x, y, a, b = x / scale, y / scale, semi_major / scale, semi_minor / scale
+    beside = (a == 0 and x > 0) or (b == 0 and y > 0)
+    if not beside and (x / a if a > 0 else 0.0) ** 2 + (y / b if b > 0 else 0.0) ** 2 <= 1.0:
+        return 0.0
+    t = _secular_root(a * x, b * y, a * a, b * b)
+    da, db = a * a + t, b * b + t
+    # t = 0 on a degenerate axis: the point projects onto the segment itself.
+    nx = a * a * x / da if da > 0 else 0.0
+    ny = b * b * y / db if db > 0 else 0.0
+    return np.hypot(x - nx, y - ny) * scale
+
+
+@numba.njit(**INSIDE)
+def _farthest(point: complex, semi_major: float, semi_minor: float) -> float:
+    x, y = abs(point.real), abs(point.imag)
+    scale = max(max(x, y), max(semi_major, 1e-300))
+    x, y, a, b = x / scale, y / scale, semi_major / scale, semi_minor / scale
     by, gap = b * y, a * a - b * b
-    n = secular_root(a * x, by, np.zeros_like(gap), gap)
-    sin_f = np.clip(quotient(by, n + gap), 0.0, 1.0)
+    n = _secular_root(a * x, by, 0.0, gap)
+    sin_f = min(max(by / (n + gap) if n + gap > 0 else 0.0, 0.0), 1.0)
     # cos from sin: when x = 0 the cosine term of the secular equation degenerates (n -> 0).
-    cos_f = np.sqrt(1.0 - sin_f**2)
-    distance = np.hypot(x + a * cos_f, y + b * sin_f)
+    distance = np.hypot(x + a * np.sqrt(1.0 - sin_f**2), y + b * sin_f)
     # The vertices are members too: they guard the degenerate circles and segments.
-    distance = np.maximum(distance, np.maximum(np.hypot(x + a, y), np.hypot(x, y + b)))
-    return np.asarray(distance * scale, dtype=np.float64)
+    return max(distance, max(np.hypot(x + a, y), np.hypot(x, y + b))) * scale
+
+
+@numba.vectorize(cache=True)
+def _root_of_each(p: float, q: float, c: float, d: float) -> float:
+    return _secular_root(p, q, c, d)
+
+
+@numba.vectorize(cache=True)
+def _nearest_of_each(point: complex, semi_major: float, semi_minor: float) -> float:
+    return _nearest(point, semi_major, semi_minor)
+
+
+@numba.vectorize(cache=True)
+def _farthest_of_each(point: complex, semi_major: float, semi_minor: float) -> float:
+    return _farthest(point, semi_major, semi_minor)
+
+
+@numba.vectorize(cache=True)
+def _bisected(
+    low: float,
+    high: float,
+    alpha: complex,
+    beta: complex,
+    k: complex,
+    centre: complex,
+    direction: complex,
+    semi_major: float,
+    semi_minor: float,
+    accuracy: float,
+) -> float:
+    """Upper end of the bisection of `largest_ratio`."""
+    for _ in range(60):
+        mid = 0.5 * (low + high)
+        a, part = abs(alpha) ** 2, (mid * abs(k)) ** 2
+        tiny = 1e-13 * (a + part) + 1e-300
+        gap = a - part
+        if abs(gap) < tiny:  # a half-plane is the limit of both cases
+            gap = tiny
+        middle = (mid**2 * np.conj(k) - np.conj(alpha) * beta) / gap
+        radius = mid * abs(alpha - k * beta) / abs(gap)
+        turned = (middle - centre) * np.conj(direction)
+        if gap > 0:
+            inside = _farthest(turned, semi_major, semi_minor) <= radius
+        else:
+            inside = _nearest(turned, semi_major, semi_minor) >= radius
+        if inside:
+            high = mid
+        else:
+            low = mid
+        if high - low <= accuracy * high:
+            break
+    return high
 
 
 def distance_to_minus_one(k: Complex, ellipses: Ellipses) -> Real:
@@ -243,20 +309,7 @@ def largest_ratio(
     low = centre_value / np.maximum(np.abs(1.0 + k * e.centre), 1e-300)
     high = np.maximum(upper, low) * (1 + 1e-12) + 1e-300
     low = np.minimum(low, high)
-    for _ in range(60):
-        mid = 0.5 * (low + high)
-        a, part = np.abs(alpha) ** 2, (mid * np.abs(k)) ** 2
-        tiny = 1e-13 * (a + part) + 1e-300
-        gap = np.where(np.abs(a - part) < tiny, tiny, a - part)  # a half-plane is the limit of both cases
-        middle = (mid**2 * np.conj(k) - np.conj(alpha) * beta) / gap
-        radius = mid * np.abs(alpha - k * beta) / np.abs(gap)
-        turned = (middle - e.centre) * np.conj(e.direction)
-        inside = np.where(
-            gap > 0,
-            farthest_distance(turned, e.semi_major, e.semi_minor) <= radius,
-            nearest_distance(turned, e.semi_major, e.semi_minor) >= radius,
-        )
-        high, low = np.where(inside, mid, high), np.where(inside, low, mid)
-        if np.all(high - low <= accuracy * high):
-            break
+    shape = e.centre, e.direction, e.semi_major, e.semi_minor
+    with np.errstate(all="ignore"):
+        high = _bisected(low, high, alpha, beta, k, *shape, accuracy)
     return np.asarray(np.where(blocked, np.inf, high), dtype=np.float64)

@@ -13,18 +13,20 @@ Newton's method: good for a direction, not for a certificate.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import numba
 import numpy as np
-from scipy.linalg import block_diag
 
 from control_design.controllers.biquads import Cascade, tustin_frequency
-from control_design.plants.ellipses import Complex, Integer, Real, quotient
+from control_design.plants.ellipses import Complex, Integer, Real
 from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.angle_program import Rows, parameter_bounds
 from control_design.synthesis.minimax_step import MinimaxStep, minimax_step
+from ident.data.arrays import INSIDE
 
 _BOUNDARY = 40  # every 9 degrees; parabola and Newton steps go on from the worst
 _FIRST_BOX, _LARGEST_BOX, _SMALLEST_BOX = 0.3, 1.0, 1e-4
@@ -158,21 +160,32 @@ class _Local(NamedTuple):
     unit: Real
 
 
+class _At(NamedTuple):
+    """One plant's loop at one x: K without its delay and with it, (F,), sections' numerators and denominators
+    (F, S), and members (3, D) with the largest |G^b/(1 + G K)|: G, and its derivatives along the boundary."""
+
+    x: Real
+    bare: Complex
+    k: Complex
+    tops: Complex
+    bottoms: Complex
+    nearest: Complex
+    of_plant: list[Complex]
+
+
 class _Boundary:
     """Members of every ellipse of one plant, fixed once."""
 
     def __init__(self, cascade: Cascade, rows: Rows) -> None:
         e = rows.ellipses
-        self._cascade, self._ellipses = cascade, e
-        self._omega, self._delay = e.omega_rad_s, rows.delay
-        angle = 2 * np.pi * np.arange(_BOUNDARY) / _BOUNDARY
-        self._members = (
-            e.centre[:, None]
-            + e.direction[:, None] * e.semi_major[:, None] * np.cos(angle)
-            + 1j * e.direction[:, None] * e.semi_minor[:, None] * np.sin(angle)
-        )
-        self._powers = 1j * tustin_frequency(self._omega, cascade.dt_s) / cascade.scale_rad_s
-        self._powers = np.where(np.abs(self._powers) > 1e6, 1e6j, self._powers)
+        self._cascade, self._delay = cascade, rows.delay
+        self._ellipses = e.centre.copy(), e.direction.copy(), e.semi_major.copy(), e.semi_minor.copy()
+        # Of a section over the square of the larger of |p| and 1: 1e16 at Nyquist stays exact.
+        p = 1j * tustin_frequency(e.omega_rad_s, cascade.dt_s) / cascade.scale_rad_s
+        big = np.abs(p) > 1.0
+        q = np.where(big, 1.0 / np.where(big, p, 1.0), p)
+        self._powers = np.stack([np.where(big, 1.0, q**2), q, np.where(big, q**2, 1.0)], axis=1)
+        self._pattern = _Pattern(cascade)
         # Of one closed-loop function each: positions of its frequencies and weights there, (D,).
         self._blocks: list[tuple[LoopFunction, Integer, Real]] = []
         for function in LoopFunction:
@@ -181,35 +194,36 @@ class _Boundary:
             if np.any(weight > 0):
                 index = np.flatnonzero(weight > 0)
                 self._blocks.append((function, index, weight[index]))
+        self._every = np.arange(p.size)
+        self._last: _At | None = None
 
     def covers_minus_one(self, x: Real) -> bool:
         """Whether some ellipse contains -1/K; its boundary alone would not show it."""
-        e = self._ellipses
-        k = self._cascade.response(x, self._omega) * self._delay
-        turned = (1.0 + k * e.centre) * np.conj(k * e.direction)
+        centre, direction, semi_major, semi_minor = self._ellipses
+        k = self._response(x)[0] * self._delay
+        turned = (1.0 + k * centre) * np.conj(k * direction)
         size = np.abs(k) ** 2
-        major, minor = turned.real * e.semi_minor, turned.imag * e.semi_major
-        return bool(np.any(np.hypot(major, minor) < size * e.semi_major * e.semi_minor))
+        major, minor = turned.real * semi_minor, turned.imag * semi_major
+        return bool(np.any(np.hypot(major, minor) < size * semi_major * semi_minor))
 
     def rows(self, x: Real, *, gradient: bool) -> tuple[Real, Real]:
         """Logarithms (R,) of all weighted values, block by block, and, if asked, their slopes (R, n)."""
-        bare = self._cascade.response(x, self._omega)
-        k = bare * self._delay
-        nearest, _, _ = self._worst(k, np.arange(k.size), 0.0)
+        here = self._at(x)
+        k, nearest = here.k, here.nearest[0]
         back = 1.0 + nearest * k
         distance = -np.log(np.maximum(np.abs(back), 1e-300))
-        size = np.log(np.maximum(np.abs(bare), 1e-300))
-        relative = self._relative_slope(x) if gradient else np.zeros((k.size, 0))  # dK/K
+        size = np.log(np.maximum(np.abs(here.bare), 1e-300))
+        relative = np.subtract(*self._terms(here)) if gradient else np.zeros((k.size, 0))  # dK/K
         turned = -(nearest * k / back)[:, None] * relative
-        logs, slopes = [], []
+        logs, slopes, members = [], [], iter(here.of_plant)
         for function, at, weight in self._blocks:
             of_k = size[at] if function.of_controller else 0.0
             if function.of_plant:
-                worst, _, _ = self._worst(k[at], at, 1.0)
-                here = 1.0 + worst * k[at]
-                gain = np.abs(worst) / np.maximum(np.abs(here), 1e-300)
+                worst = next(members)[0]
+                away = 1.0 + worst * k[at]
+                gain = np.abs(worst) / np.maximum(np.abs(away), 1e-300)
                 log = np.log(weight * gain) + of_k
-                slope = -(worst * k[at] / here)[:, None] * relative[at]
+                slope = -(worst * k[at] / away)[:, None] * relative[at]
             else:
                 log, slope = np.log(weight) + of_k + distance[at], turned[at]
             if function.of_controller:
@@ -224,29 +238,33 @@ class _Boundary:
         A row is the largest over the boundary angle of psi(x, angle), so its second derivative is psi_xx -
         psi_xa psi_xa' / psi_aa: a long ellipse bends the row although its worst member moves only along it.
         """
-        k = self._cascade.response(x, self._omega) * self._delay
-        relative = self._relative_slope(x)
+        here = self._at(x)
+        k, (tops, bottoms) = here.k, self._terms(here)
+        relative = tops - bottoms
         shared, of_controller = np.zeros(k.size), np.zeros(k.size)
-        total, second = np.zeros((x.size, x.size)), np.zeros(k.size, dtype=np.complex128)
-        start = 0
+        total, factor = np.zeros((x.size, x.size)), np.zeros(k.size, dtype=np.complex128)
+        start, members = 0, iter(here.of_plant)
         for function, at, _ in self._blocks:
             own = multipliers[start : start + at.size]
             start += at.size
             if function.of_controller:
                 of_controller[at] += own
             if function.of_plant:
-                member = self._worst(k[at], at, 1.0)
-                more, factor = self._bent(relative[at], k[at], own, member, 1.0)
-                total, second[at] = total + more, second[at] + factor
+                more, second = self._bent(relative[at], k[at], own, next(members), 1.0)
+                total, factor[at] = total + more, factor[at] + second
             else:
                 shared[at] += own
-        member = self._worst(k, np.arange(k.size), 0.0)
-        more, factor = self._bent(relative, k, shared, member, 0.0)
-        return total + more + self._section_curvature(x, second + factor + of_controller)
+        more, second = self._bent(relative, k, shared, here.nearest, 0.0)
+        factor += second + of_controller
+        # Of log K itself: products of one section's terms, and of the logarithms, whose exponential is its
+        # own derivative, the terms themselves.
+        product = (bottoms * factor[:, None]).T @ bottoms - (tops * factor[:, None]).T @ tops
+        own_bend = np.diag(np.real(factor @ relative) * self._pattern.logarithm)
+        return total + more + np.real(product) * self._pattern.together + own_bend
 
     @staticmethod
     def _bent(
-        relative: Complex, k: Complex, share: Real, member: tuple[Complex, Complex, Complex], open_loop: float
+        relative: Complex, k: Complex, share: Real, member: Complex, open_loop: float
     ) -> tuple[Real, Complex]:
         """Curvature of sum share log|g^open_loop/(1 + g K)| but for that of log K, and the factor of the
         latter, (F,)."""
@@ -255,106 +273,161 @@ class _Boundary:
         w = g * k / back
         total = -np.real((relative * (share * (w - w**2))[:, None]).T @ relative)
         mixed = -np.real((g1 * k / back**2)[:, None] * relative)
-        bend = _along_boundary(member, k, open_loop)[1]
+        bend = _bend_along_boundary(member, k, open_loop)
         use = (bend < -1e-12) & (share > 0)
         total = total + (mixed[use] * (share[use] / -bend[use])[:, None]).T @ mixed[use]
         return total, np.asarray(-share * w, dtype=np.complex128)
 
-    def _worst(self, k: Complex, index: Integer, open_loop: float) -> tuple[Complex, Complex, Complex]:
-        """Members (D,) with the largest |g^open_loop/(1 + g K)| at some of the frequencies, and their first
-        and second derivative along the boundary; k (D,).
+    def _response(self, x: Real) -> tuple[Complex, Complex, Complex]:
+        """K without delay (F,), and every section's numerator and denominator (F, S)."""
+        above, below = self._pattern.coefficients(x)
+        tops, bottoms = self._powers @ above, self._powers @ below
+        return np.asarray(np.prod(tops / bottoms, axis=1)), tops, bottoms
 
-        Best boundary point, vertex of the parabola through it, Newton from there. A point that does not gain
-        on the boundary's best is not taken.
-        """
-        e = self._ellipses
-        centre, turn = e.centre[index], e.direction[index]
-        major, minor = e.semi_major[index], e.semi_minor[index]
+    def _at(self, x: Real) -> _At:
+        if self._last is None or not np.array_equal(self._last.x, x):
+            blocks = [at for function, at, _ in self._blocks if function.of_plant]
+            bare, tops, bottoms = self._response(x)
+            k = bare * self._delay
+            of_plant = [self._worst(k, at, of_plant=True) for at in blocks]
+            nearest = self._worst(k, self._every, of_plant=False)
+            self._last = _At(x.copy(), bare, k, tops, bottoms, nearest, of_plant)
+        return self._last
 
-        def member(angle: Real) -> tuple[Complex, Complex, Complex]:
-            cos, sin = np.cos(angle), np.sin(angle)
-            away = turn * (major * cos + 1j * minor * sin)
-            return centre + away, turn * (-major * sin + 1j * minor * cos), -away
+    def _worst(self, k: Complex, index: Integer, *, of_plant: bool) -> Complex:
+        return np.asarray(_worst_members(k, index, *self._ellipses, of_plant))
 
-        def size(g: Complex, k: Complex) -> Real:
-            return np.asarray(np.abs(g) ** open_loop / np.maximum(np.abs(1.0 + g * k), 1e-300))
+    def _terms(self, here: _At) -> tuple[Complex, Complex]:
+        """Derivatives (F, n) of every parameter's section: of its numerator over the numerator, of its
+        denominator over the denominator."""
+        section = self._pattern.section
+        above, below = self._pattern.slopes(here.x)
+        return (
+            (self._powers @ above) / _not_zero(here.tops)[:, section],
+            (self._powers @ below) / here.bottoms[:, section],
+        )
 
-        value = size(self._members[index], k[:, None])
-        row = np.arange(index.size)
-        top = np.argmax(value, axis=1)
-        here, before, after = (value[row, (top + step) % _BOUNDARY] for step in (0, -1, 1))
-        bend = before - 2 * here + after
-        width = 2 * np.pi / _BOUNDARY
-        best = width * top
-        angle = best + width * np.clip(_newton(0.5 * (after - before), bend), -0.5, 0.5)
-        for _ in range(_REFINEMENTS + 1):
-            found = member(angle)
-            value = size(found[0], k)
-            better = value > here
-            best, here = np.where(better, angle, best), np.where(better, value, here)
-            change = _newton(*_along_boundary(found, k, open_loop))
-            angle = angle + np.clip(change, -0.5 * width, 0.5 * width)
-        return member(best)
 
-    def _sections(self, x: Real) -> list[tuple[Complex, Complex, Complex]]:
-        """Of every section, for its own parameters (F, m): derivatives of its numerator over the numerator,
-        of its denominator over the denominator, and second derivatives of log K but for products of those."""
-        p = self._powers
-        found, at = [], 0
-        for kind, (numerator, denominator) in zip(
-            self._cascade.sections, self._cascade.split(x), strict=True
-        ):
-            top, bottom = np.polyval(numerator, p), np.polyval(denominator, p)
-            top = np.where(np.abs(top) < 1e-300, 1e-300, top)
-            zero = np.zeros(p.size, dtype=np.complex128)
-            degree = numerator.size - 1
+class _Pattern:
+    """How the coefficients of all sections, each as one of second order, depend on the parameters.
+
+    Of every parameter: its section, whether it is a logarithm, (n,); which coefficients of the numerator and
+    of the denominator it moves, (3, n), highest power first; with which others it shares a section, (n, n).
+    """
+
+    def __init__(self, cascade: Cascade) -> None:
+        self._cascade = cascade
+        entries: list[tuple[int, bool, list[int], list[int]]] = []
+        for number, kind in enumerate(cascade.sections):
             if kind == "notch":
-                above = [np.exp(x[at]) * p / top, zero, denominator[2] / top]
-                below = [zero, denominator[1] * p / bottom, denominator[2] / bottom]
-                linear = 0
-            else:
-                above = [p ** (degree - power) / top for power in range(degree + 1)]
-                logs = range(0 if kind == "integrator" else degree)
-                below = [denominator[1 + j] * p ** (degree - 1 - j) / bottom for j in logs]
-                linear = len(above)
-                above, below = above + [zero] * len(below), [zero] * len(above) + below
-            tops, bottoms = np.stack(above, axis=1), np.stack(below, axis=1)
-            bend = tops - bottoms  # parameters are logarithms: exp is its own derivative
-            bend[:, :linear] = 0
-            found.append((tops, bottoms, bend))
-            at += tops.shape[1]
-        return found
+                entries += [(number, True, [1], []), (number, True, [], [1]), (number, True, [2], [2])]
+                continue
+            first = 0 if kind == "second_order" else 1
+            entries += [(number, False, [power], []) for power in range(first, 3)]
+            logs = range(first + 1, 3) if kind != "integrator" else ()
+            entries += [(number, True, [], [power]) for power in logs]
+        self.section = np.array([number for number, *_ in entries])
+        self.logarithm = np.array([logarithm for _, logarithm, *_ in entries])
+        self.together = self.section[:, None] == self.section
+        self._above, self._below = np.zeros((2, 3, len(entries)))
+        for at, (_, _, above, below) in enumerate(entries):
+            self._above[above, at], self._below[below, at] = 1.0, 1.0
 
-    def _section_curvature(self, x: Real, factor: Complex) -> Real:
-        """Real part of sum factor (F,) times the second derivative of log K, (n, n): block by section."""
-        blocks = []
-        for tops, bottoms, bend in self._sections(x):
-            product = (bottoms * factor[:, None]).T @ bottoms - (tops * factor[:, None]).T @ tops
-            blocks.append(np.real(product) + np.diag(np.real(factor @ bend)))
-        return np.asarray(block_diag(*blocks))
+    def coefficients(self, x: Real) -> tuple[Real, Real]:
+        """Of numerators and denominators, (3, S) each."""
+        pairs = self._cascade.split_with(x.tolist(), math.exp)
+        both = [[[0.0] * (3 - len(part)) + part for part in parts] for parts in zip(*pairs, strict=True)]
+        tops, bottoms = np.array(both).transpose(0, 2, 1)
+        return tops, bottoms
 
-    def _relative_slope(self, x: Real) -> Complex:
-        """(dK/dx)/K, (F, n)."""
-        return np.concatenate([tops - bottoms for tops, bottoms, _ in self._sections(x)], axis=1)
+    def slopes(self, x: Real) -> tuple[Real, Real]:
+        """Derivatives of the coefficients of each parameter's section, (3, n) each."""
+        tops, bottoms = self.coefficients(x)
+        return (
+            self._above * np.where(self.logarithm, tops[:, self.section], 1.0),
+            self._below * bottoms[:, self.section],
+        )
+
+
+@numba.njit(cache=True)
+def _worst_members(
+    k: Complex,
+    index: Integer,
+    centre: Complex,
+    direction: Complex,
+    semi_major: Real,
+    semi_minor: Real,
+    of_plant: bool,
+) -> Complex:
+    """Members (3, D) with the largest |1/(1 + G K)|, or |G/(1 + G K)|, at some of the frequencies, and their
+    first and second derivatives along the boundary; k (F,).
+
+    Best boundary point, vertex of the parabola through it, Newton from there. A point that does not gain on
+    the boundary's best is not taken.
+    """
+    width = 2 * np.pi / _BOUNDARY
+    cos, sin = np.empty(_BOUNDARY), np.empty(_BOUNDARY)
+    for j in range(_BOUNDARY):
+        cos[j], sin[j] = np.cos(j * width), np.sin(j * width)
+    found, values = np.empty((3, index.size), dtype=np.complex128), np.empty(_BOUNDARY)
+    for number in range(index.size):
+        i = index[number]
+        major, minor = direction[i] * semi_major[i], 1j * direction[i] * semi_minor[i]
+        top = 0
+        for j in range(_BOUNDARY):
+            values[j] = _size(centre[i] + cos[j] * major + sin[j] * minor, k[i], of_plant)
+            if values[j] > values[top]:
+                top = j
+        here, before, after = values[top], values[top - 1], values[(top + 1) % _BOUNDARY]
+        best = top * width
+        change = _vertex(0.5 * (after - before), before - 2 * here + after)
+        angle = best + width * min(max(change, -0.5), 0.5)
+        for _ in range(_REFINEMENTS + 1):
+            g1 = np.cos(angle) * minor - np.sin(angle) * major
+            g2 = -np.cos(angle) * major - np.sin(angle) * minor
+            g = centre[i] - g2
+            value = _size(g, k[i], of_plant)
+            if value > here:
+                here, best = value, angle
+            # Slope and bend of the logarithm along the boundary.
+            back = 1.0 + g * k[i]
+            if back == 0:
+                break
+            first, second = -g1 * k[i] / back, -g2 * k[i] / back
+            second += first * first
+            if of_plant and g != 0:
+                first, second = first + g1 / g, second + g2 / g - (g1 / g) ** 2
+            change = _vertex(first.real, second.real)
+            angle += min(max(change, -0.5 * width), 0.5 * width)
+        found[1, number] = np.cos(best) * minor - np.sin(best) * major
+        found[2, number] = -np.cos(best) * major - np.sin(best) * minor
+        found[0, number] = centre[i] - found[2, number]
+    return found
+
+
+@numba.njit(**INSIDE)
+def _size(g: complex, k: complex, of_plant: bool) -> float:
+    """|1/(1 + g k)|, or |g/(1 + g k)|; in squares, since a modulus costs more than all the rest."""
+    back = 1.0 + g * k
+    above = g.real * g.real + g.imag * g.imag if of_plant else 1.0
+    return np.sqrt(above / max(back.real * back.real + back.imag * back.imag, 1e-300))
+
+
+@numba.njit(**INSIDE)
+def _vertex(slope: float, bend: float) -> float:
+    """Step to the maximum of a parabola; 0 where it has none."""
+    return slope / -bend if bend < 0 else 0.0
 
 
 def _not_zero(value: Complex) -> Complex:
     return np.where(np.abs(value) < 1e-300, 1e-300, value)
 
 
-def _along_boundary(
-    member: tuple[Complex, Complex, Complex], k: Complex, open_loop: float
-) -> tuple[Real, Real]:
-    """Slope and bend of log|g^open_loop/(1 + g K)| along the boundary, from a member and its derivatives."""
+def _bend_along_boundary(member: Complex, k: Complex, open_loop: float) -> Real:
+    """Bend of log|g^open_loop/(1 + g K)| along the boundary, from members and their derivatives (3, D)."""
     g, g1, g2 = member
     back, own = _not_zero(1.0 + g * k), open_loop / _not_zero(g)
-    first = (own * g1 - g1 * k / back).real
-    return first, (own * g2 - own**2 * g1**2 - g2 * k / back + (g1 * k / back) ** 2).real
-
-
-def _newton(slope: Real, bend: Real) -> Real:
-    """Step to the maximum of a parabola; 0 where it has none."""
-    return np.asarray(quotient(slope, -bend), dtype=np.float64)
+    return np.asarray((own * g2 - own**2 * g1**2 - g2 * k / back + (g1 * k / back) ** 2).real)
 
 
 def natural_units(cascade: Cascade, x: Real) -> Real:

@@ -4,17 +4,19 @@
     with      f + F d <= s,  A d <= b,  low <= d <= high.
 
 A primal-dual interior point (Mehrotra's predictor and corrector) in n + 1 unknowns: the rows enter only
-through an (n + 1) x (n + 1) matrix, so hundreds of rows cost microseconds. H = 0 makes it a linear programme.
+through an (n + 1) x (n + 1) matrix, so hundreds of rows cost microseconds; compiled, since for so few
+numpy's calls would cost more than the arithmetic. H = 0 makes it a linear programme.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotrs  # without the checks that cost more than the work
 
 from control_design.plants.ellipses import Real
+from ident.data.arrays import INSIDE
 
 _MOST = 40  # iterations; 8 to 15 are usual
 _ACCURACY = 1e-8  # complementarity and row residuals, in the logarithm of the worst case
@@ -36,65 +38,139 @@ def minimax_step(
 ) -> MinimaxStep | None:
     """Solve it for value (R,), slope (R, n), curvature (n, n) positive semi-definite, low < 0 < high (n,), a
     (L, n), b (L,); None where the interior point fails (no d with a d <= b in the box, or rounding)."""
-    n, rows = slope.shape[1], value.size
-    eye = np.eye(n)
-    side = np.zeros((a.shape[0] + 2 * n, 1))
-    matrix = np.block([[slope, -np.ones((rows, 1))], [np.vstack([eye, -eye, a]), side]])
-    limit = np.concatenate(
-        [-value, np.maximum(high, _LEAST_ROOM), np.maximum(-low, _LEAST_ROOM), b + _LEAST_ROOM]
+    n, rows, bounds = slope.shape[1], value.size, 2 * slope.shape[1]
+    matrix, limit = np.zeros((rows + bounds + a.shape[0], n + 1)), np.empty(rows + bounds + a.shape[0])
+    matrix[:rows, :n], matrix[:rows, n] = slope, -1.0
+    matrix[rows : rows + n, :n], matrix[rows + n : rows + bounds, :n] = np.eye(n), -np.eye(n)
+    matrix[rows + bounds :, :n] = a
+    limit[:rows], limit[rows + bounds :] = -value, b + _LEAST_ROOM
+    limit[rows : rows + n], limit[rows + n : rows + bounds] = (
+        np.maximum(high, _LEAST_ROOM),
+        np.maximum(-low, _LEAST_ROOM),
     )
     hessian = np.zeros((n + 1, n + 1))
     hessian[:n, :n] = curvature
-    linear = np.append(np.zeros(n), 1.0)
     v = np.append(np.zeros(n), float(np.max(value)) + 0.1)
-    slack = np.maximum(limit - matrix @ v, 1e-3)
-    z = 0.1 / slack
-    z[:rows] /= np.sum(z[:rows])
-    count = limit.size
-    for _ in range(_MOST):
-        dual = hessian @ v + linear + z @ matrix
-        primal = matrix @ v + slack - limit
-        gap = float(slack @ z) / count
-        if gap * count < _ACCURACY and np.abs(dual).max() < _STATIONARY and np.abs(primal).max() < _ACCURACY:
-            break
-        with np.errstate(over="ignore"):
-            ratio = z / slack
-        if not np.all(np.isfinite(ratio)):
-            break  # a slack has run to its bound: no step from here
-        normal = hessian + (matrix * ratio[:, None]).T @ matrix
-        normal.flat[:: n + 2] += 1e-12 * (1.0 + np.diag(normal))
-        factor, failed = dpotrf(normal)
-        if failed:
-            break
-        centre = slack * z
-        change = _direction(factor, matrix, dual, primal, centre, slack, z, ratio)
-        length = _longest(slack, change[1]), _longest(z, change[2])
-        after = float((slack + length[0] * change[1]) @ (z + length[1] * change[2])) / count
-        aim = gap * min(1.0, after / gap) ** 3
-        centre = centre + change[1] * change[2] - aim
-        change = _direction(factor, matrix, dual, primal, centre, slack, z, ratio)
-        first, second = 0.995 * _longest(slack, change[1]), 0.995 * _longest(z, change[2])
-        v = v + first * change[0]
-        slack = slack + first * change[1]
-        z = z + second * change[2]
+    z, gap = _interior_point(matrix, limit, hessian, v, rows)
     d = v[:n]
-    done = float(slack @ z) < 1e-5 and np.all(np.isfinite(v))
+    done = gap < 1e-5 and np.all(np.isfinite(v))
     if not (done and np.all(d <= high + 1e-6) and np.all(d >= low - 1e-6)):
         return None
     return MinimaxStep(np.clip(d, low, high), float(np.max(value + slope @ d)), z[:rows] / np.sum(z[:rows]))
 
 
-def _direction(
-    factor: Real, matrix: Real, dual: Real, primal: Real, centre: Real, slack: Real, z: Real, ratio: Real
-) -> tuple[Real, Real, Real]:
-    """Newton direction (dv, dslack, dz) of the perturbed optimality conditions."""
-    right = -dual - ((z * primal - centre) / slack) @ matrix
-    dv = dpotrs(factor, right)[0]
-    moved = matrix @ dv
-    return dv, -primal - moved, ratio * (moved + primal) - centre / slack
+@numba.njit(cache=True)
+def _interior_point(matrix: Real, limit: Real, hessian: Real, v: Real, rows: int) -> tuple[Real, float]:
+    """From v (n + 1,) in place to the optimum: multipliers (rows of the matrix,) and complementarity.
+
+    Written out where numpy is short: an array expression costs numba a second of compilation.
+    """
+    count, n = matrix.shape
+    turned = np.ascontiguousarray(matrix.T)
+    slack, z, ratio, centre = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    dslack, dz = np.empty(count), np.empty(count)
+    primal, scaled, right = np.dot(matrix, v), np.empty((n, count)), np.empty(n)
+    for i in range(count):
+        slack[i] = max(limit[i] - primal[i], 1e-3)
+        z[i] = 0.1 / slack[i]
+    share = z[:rows].sum()
+    for i in range(rows):
+        z[i] /= share
+    for _ in range(_MOST):
+        dual = np.dot(turned, z) + np.dot(hessian, v)
+        dual[n - 1] += 1.0
+        primal = np.dot(matrix, v)
+        total, missed = 0.0, 0.0
+        for i in range(count):
+            primal[i] += slack[i] - limit[i]
+            total += slack[i] * z[i]
+            missed = max(missed, abs(primal[i]))
+        steepest = 0.0
+        for j in range(n):
+            steepest = max(steepest, abs(dual[j]))
+        if total < _ACCURACY and steepest < _STATIONARY and missed < _ACCURACY:
+            break
+        finite = True
+        for i in range(count):
+            ratio[i] = z[i] / slack[i]
+            finite &= np.isfinite(ratio[i])
+            for j in range(n):
+                scaled[j, i] = turned[j, i] * ratio[i]
+        if not finite:
+            break  # a slack has run to its bound: no step from here
+        normal = np.dot(scaled, matrix)
+        for j in range(n):
+            for k in range(n):
+                normal[j, k] += hessian[j, k]
+            normal[j, j] += 1e-12 * (1.0 + normal[j, j])
+        if not _factored(normal):
+            break
+        gap = total / count
+        for i in range(count):
+            centre[i] = slack[i] * z[i]
+        first, second = 0.0, 0.0
+        for corrector in range(2):
+            # Newton's direction of the perturbed optimality conditions.
+            for i in range(count):
+                dz[i] = (z[i] * primal[i] - centre[i]) / slack[i]
+            right = np.dot(turned, dz)
+            for j in range(n):
+                right[j] = -dual[j] - right[j]
+            _substituted(normal, right)
+            moved = np.dot(matrix, right)
+            first, second = 1.0, 1.0
+            for i in range(count):
+                dslack[i] = -primal[i] - moved[i]
+                dz[i] = ratio[i] * (moved[i] + primal[i]) - centre[i] / slack[i]
+                # The longest step in [0, 1] that keeps both positive.
+                if first * dslack[i] < -slack[i]:
+                    first = -slack[i] / dslack[i]
+                if second * dz[i] < -z[i]:
+                    second = -z[i] / dz[i]
+            if corrector == 0:
+                after = 0.0
+                for i in range(count):
+                    after += (slack[i] + first * dslack[i]) * (z[i] + second * dz[i])
+                aim = gap * min(1.0, after / count / gap) ** 3
+                for i in range(count):
+                    centre[i] += dslack[i] * dz[i] - aim
+        for j in range(n):
+            v[j] += 0.995 * first * right[j]
+        for i in range(count):
+            slack[i] += 0.995 * first * dslack[i]
+            z[i] += 0.995 * second * dz[i]
+    total = 0.0
+    for i in range(count):
+        total += slack[i] * z[i]
+    return z, total
 
 
-def _longest(value: Real, change: Real) -> float:
-    """Largest step in [0, 1] that keeps value + step change >= 0."""
-    steepest = float((change / value).min())
-    return 1.0 if steepest >= -1.0 else -1.0 / steepest
+@numba.njit(**INSIDE)
+def _factored(matrix: Real) -> bool:
+    """Cholesky's factor in place of the lower triangle; false where the matrix has none."""
+    for j in range(matrix.shape[0]):
+        for i in range(j, matrix.shape[0]):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= matrix[i, k] * matrix[j, k]
+            if i > j:
+                matrix[i, j] = value / matrix[j, j]
+            elif value > 0:
+                matrix[j, j] = np.sqrt(value)
+            else:
+                return False
+    return True
+
+
+@numba.njit(**INSIDE)
+def _substituted(factor: Real, right: Real) -> None:
+    """Solution in place of the right side (n,), from the factor of `_factored`."""
+    n = right.size
+    for i in range(n):
+        for k in range(i):
+            right[i] -= factor[i, k] * right[k]
+        right[i] /= factor[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            right[i] -= factor[k, i] * right[k]
+        right[i] /= factor[i, i]
