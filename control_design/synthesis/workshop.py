@@ -13,7 +13,7 @@ from control_design.synthesis.descent import MinimaxDescent
 from control_design.synthesis.problem import Problem
 from control_design.synthesis.synthesis_result import LARGEST_GAMMA, StartReport
 
-_STEPS = 100  # of the descent
+STEPS = 100  # of the descent
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,18 +22,21 @@ class StartTask:
 
     eased: first the interior point without W4 of the measured output, which crosses steep tracking weights
     better than the descent; the descent goes on from there, or from the start itself where that is unstable.
+    steps: of the descent. checked: on the dense grid, too.
     """
 
     cascade: Cascade
     parameters: Real
     grids: tuple[Real, ...]
     eased: bool = False
+    steps: int = STEPS
+    checked: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """Where a start ended: parameters, worst case on the lean grid it came from and on the dense grid (inf:
-    unstable), what was run."""
+    unstable, or not checked), what was run."""
 
     parameters: Real
     gamma_grid: float
@@ -73,8 +76,9 @@ class Workshop:
             reports.append(report)
             if np.isfinite(descent.value(found)):
                 start = found
-        end, gamma, steps = descent.run(start, _STEPS)
-        dense = self.problem.gamma(task.cascade, end) if np.isfinite(gamma) else float("inf")
+        end, gamma, steps = descent.run(start, task.steps)
+        checked = task.checked and np.isfinite(gamma)
+        dense = self.problem.gamma(task.cascade, end) if checked else float("inf")
         seen = min(gamma, LARGEST_GAMMA), dense if np.isfinite(dense) else None
         reports.append(StartReport("descent", steps, *seen))
         return Candidate(end, gamma, dense, tuple(reports))
