@@ -114,8 +114,10 @@ class BracketProblem:
         options: YoulaOptions,
         *,
         accuracy: float = 1e-5,
+        most_steps: int = 200,
     ) -> None:
-        self.plant, self.spec, self.options, self.accuracy = plant, specification, options, accuracy
+        self.plant, self.spec, self.options = plant, specification, options
+        self.accuracy, self.most_steps = accuracy, most_steps
         self.grids = Grids((plant,), specification, options)
         self.factors: Factors | None = None
         if np.any(np.abs(plant.poles) >= 1.0 - 1e-9):
@@ -158,7 +160,7 @@ class BracketProblem:
             if region == "ellipse":
                 return self._ellipse(lean, begin)
             rows = self._rows(lean, region, self._loop(lean))
-            return smallest_ratio(self._basis(lean), rows, begin, accuracy=self.accuracy)
+            return self._smallest(self._basis(lean), rows, begin)
 
         found = exchanged(
             solve,
@@ -172,13 +174,16 @@ class BracketProblem:
         x = start if found.x is None else found.x
         return found.worst, np.zeros(self.dense_basis.shape[1]) if x is None else x
 
+    def _smallest(self, basis: Complex, rows: PlaneRows, start: Real | None) -> MinimaxPoint:
+        return smallest_ratio(basis, rows, start, accuracy=self.accuracy, most_steps=self.most_steps)
+
     def _ellipse(self, data: PlantData, start: Real | None) -> MinimaxPoint:
         basis, loop = self._basis(data), self._loop(data)
         point = MinimaxPoint(np.zeros(basis.shape[1]), np.inf)
         for _ in range(_ELLIPSE_ROUNDS):
             angles = None if start is None else _best_angles(loop, data, basis @ start)
             rows = self._rows(data, "ellipse", loop, angles)
-            new = smallest_ratio(basis, rows, start, accuracy=self.accuracy)
+            new = self._smallest(basis, rows, start)
             before = point.gamma
             if new.gamma < before:
                 point, start = new, new.x

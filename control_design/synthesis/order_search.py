@@ -99,8 +99,9 @@ class OrderSearch:
         One fit of each, then fits with random weights, then shaped and random loops, each round a race: see
         `_raced`. It may end where the result lies within `_NEAR` of what the controllers of any order reach,
         or where as many ends as asked agree on it and it meets the specification. A design that misses the
-        specification gets all fits, as another valley may meet it, until `_SURE` rounds have ended in one.
-        Agreement before the last starts counts within `_FAIR` only.
+        specification gets all fits, as another valley may meet it, until `_SURE` rounds have ended in one:
+        then the last starts alone, which are of another kind. Agreement before the last starts counts within
+        `_FAIR` only.
         """
         found: list[Candidate] = []
         winners: list[Candidate] = []
@@ -114,22 +115,26 @@ class OrderSearch:
         def sure() -> bool:
             return self._agree(winners, max(_SURE, self.options.agreeing_starts))
 
-        for turn in range(_WEIGHTED + 2):
+        turn = 0
+        while turn < _WEIGHTED + 2:
             least = min((c.gamma_grid for c in found), default=np.inf)
             last = least <= 1.0 or turn > _WEIGHTED
-            if self._enough(found) or agreed(least, _FAIR) or (last and near(least)) or sure():
+            if self._enough(found) or agreed(least, _FAIR) or (last and near(least)):
                 break
+            if sure():
+                turn = _WEIGHTED + 1
             self.tell(0.1 * turn, f"start {turn + 1} of {_WEIGHTED + 2}, from controllers of any order")
             starts = self._fits(free, turn) if turn <= _WEIGHTED else self._others()
             raced = self._raced(starts)
-            found, winners = found + raced, winners + raced[:1]
+            found, winners, turn = found + raced, winners + raced[:1], turn + 1
         ends = self._retrieved(self._checked(found))
         if not ends:
             return OrderResult(None, tuple(self.reports), (), self._nearest(found) if found else None), False
         result = self._exchange(ends, hops=False)
         assert result.best is not None
         gamma = result.best.gamma
-        return result, self._enough([result.best]) or near(gamma) or agreed(gamma) or sure()
+        kept = gamma <= _NEAR * min(c.gamma_grid for c in winners)  # not lost between the grid's points
+        return result, self._enough([result.best]) or near(gamma) or agreed(gamma) or (kept and sure())
 
     def fits_only(self, free: FreeControllers, enough: float) -> OrderResult:
         """From one fit of each controller of any order; without exchange where that leaves more than
