@@ -20,6 +20,8 @@ Complex = npt.NDArray[np.complex128]
 Integer = npt.NDArray[np.int64]
 Boolean = npt.NDArray[np.bool_]
 
+_elementwise: Any = numba.vectorize  # which numba leaves untyped
+
 
 def radius_of(level: float) -> float:
     """Radius, in standard deviations, of the ellipse that holds a plane Gaussian with probability level."""
@@ -165,7 +167,7 @@ def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Rea
 
 
 @numba.njit(**INSIDE)
-def _secular_root(p: float, q: float, c: float, d: float) -> float:
+def _secular_root(p: float, q: float, c: float, d: float) -> Any:
     """Convex and decreasing: Newton from the left never overshoots."""
     # Lower bounds of the root: each term alone <= 1. Both make the sum >= 1, where Newton is monotone.
     t = max(max(p - c, q - d), 0.0)
@@ -182,7 +184,7 @@ def _secular_root(p: float, q: float, c: float, d: float) -> float:
 
 
 @numba.njit(**INSIDE)
-def _nearest(point: complex, semi_major: float, semi_minor: float) -> float:
+def _nearest(point: complex, semi_major: float, semi_minor: float) -> Any:
     x, y = abs(point.real), abs(point.imag)
     scale = max(max(x, y), max(semi_major, 1e-300))
     x, y, a, b = x / scale, y / scale, semi_major / scale, semi_minor / scale
@@ -198,7 +200,7 @@ def _nearest(point: complex, semi_major: float, semi_minor: float) -> float:
 
 
 @numba.njit(**INSIDE)
-def _farthest(point: complex, semi_major: float, semi_minor: float) -> float:
+def _farthest(point: complex, semi_major: float, semi_minor: float) -> Any:
     x, y = abs(point.real), abs(point.imag)
     scale = max(max(x, y), max(semi_major, 1e-300))
     x, y, a, b = x / scale, y / scale, semi_major / scale, semi_minor / scale
@@ -211,22 +213,22 @@ def _farthest(point: complex, semi_major: float, semi_minor: float) -> float:
     return max(distance, max(np.hypot(x + a, y), np.hypot(x, y + b))) * scale
 
 
-@numba.vectorize(cache=True)
-def _root_of_each(p: float, q: float, c: float, d: float) -> float:
+@_elementwise(cache=True)
+def _root_of_each(p: float, q: float, c: float, d: float) -> Any:
     return _secular_root(p, q, c, d)
 
 
-@numba.vectorize(cache=True)
-def _nearest_of_each(point: complex, semi_major: float, semi_minor: float) -> float:
+@_elementwise(cache=True)
+def _nearest_of_each(point: complex, semi_major: float, semi_minor: float) -> Any:
     return _nearest(point, semi_major, semi_minor)
 
 
-@numba.vectorize(cache=True)
-def _farthest_of_each(point: complex, semi_major: float, semi_minor: float) -> float:
+@_elementwise(cache=True)
+def _farthest_of_each(point: complex, semi_major: float, semi_minor: float) -> Any:
     return _farthest(point, semi_major, semi_minor)
 
 
-@numba.vectorize(cache=True)
+@_elementwise(cache=True)
 def _bisected(
     low: float,
     high: float,
@@ -238,7 +240,7 @@ def _bisected(
     semi_major: float,
     semi_minor: float,
     accuracy: float,
-) -> float:
+) -> Any:
     """Upper end of the bisection of `largest_ratio`."""
     for _ in range(60):
         mid = 0.5 * (low + high)

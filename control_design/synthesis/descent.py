@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -184,7 +184,8 @@ class _Boundary:
         p = 1j * tustin_frequency(e.omega_rad_s, cascade.dt_s) / cascade.scale_rad_s
         big = np.abs(p) > 1.0
         q = np.where(big, 1.0 / np.where(big, p, 1.0), p)
-        self._powers = np.stack([np.where(big, 1.0, q**2), q, np.where(big, q**2, 1.0)], axis=1)
+        powers = [np.where(big, 1.0, q**2), q, np.where(big, q**2, 1.0)]
+        self._powers = np.stack(powers, axis=1, dtype=np.complex128)
         self._pattern = _Pattern(cascade)
         # Of one closed-loop function each: positions of its frequencies and weights there, (D,).
         self._blocks: list[tuple[LoopFunction, Integer, Real]] = []
@@ -260,7 +261,7 @@ class _Boundary:
         # own derivative, the terms themselves.
         product = (bottoms * factor[:, None]).T @ bottoms - (tops * factor[:, None]).T @ tops
         own_bend = np.diag(np.real(factor @ relative) * self._pattern.logarithm)
-        return total + more + np.real(product) * self._pattern.together + own_bend
+        return np.asarray(total + more + np.real(product) * self._pattern.together + own_bend)
 
     @staticmethod
     def _bent(
@@ -282,7 +283,7 @@ class _Boundary:
         """K without delay (F,), and every section's numerator and denominator (F, S)."""
         above, below = self._pattern.coefficients(x)
         tops, bottoms = self._powers @ above, self._powers @ below
-        return np.asarray(np.prod(tops / bottoms, axis=1)), tops, bottoms
+        return np.prod(tops / bottoms, axis=1, dtype=np.complex128), tops, bottoms
 
     def _at(self, x: Real) -> _At:
         if self._last is None or not np.array_equal(self._last.x, x):
@@ -406,7 +407,7 @@ def _worst_members(
 
 
 @numba.njit(**INSIDE)
-def _size(g: complex, k: complex, of_plant: bool) -> float:
+def _size(g: complex, k: complex, of_plant: bool) -> Any:
     """|1/(1 + g k)|, or |g/(1 + g k)|; in squares, since a modulus costs more than all the rest."""
     back = 1.0 + g * k
     above = g.real * g.real + g.imag * g.imag if of_plant else 1.0
