@@ -3,8 +3,10 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $$p && break; done)
 VENV := .venv
 BIN := $(VENV)/bin
+PRODUCT := $(VENV)/.product
 PACKAGES := $(VENV)/.packages
 STAMP := $(VENV)/.installed
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 OUT ?= runs/default
 VERSION := $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
 
@@ -26,30 +28,37 @@ help:
 	@echo "make dist   wheel and source archive in build/dist, the same bytes from the same commit"
 	@echo "make check  what CI runs: tests, lint, types, wheel"
 
-$(PACKAGES): pyproject.toml constraints.txt
+
+# What a user needs. Not compiled to bytecode: of the large packages a run imports a small part.
+$(PRODUCT): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "flexlink needs Python 3.11 or newer with venv"; exit 2; }
-	@echo "installing flexlink and its pinned dependencies into $(VENV) (a minute or two, once)"
+	@echo "installing flexlink and its pinned dependencies into $(VENV) (half a minute, once)"
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@$(PIP) --no-compile -e '.[logs,mujoco]'
+	@touch $@
+
+$(PACKAGES): $(PRODUCT)
+	@echo "installing what tests and documentation need (a minute, once)"
+	@$(PIP) -e '.[dev]'
 	@touch $@
 
 # The run fills the cache of compiled code: code compiled in the same process may round otherwise than code from the
 # cache, and a killed run must resume to the same digits.
-$(STAMP): $(PACKAGES)
-	@echo "compiling the numerical kernels (a minute, once)"
-	@$(BIN)/flexlink run --out $(VENV)/compiled --replace >/dev/null
+$(STAMP): $(if $(filter-out run,$(or $(MAKECMDGOALS),help)),$(PACKAGES),$(PRODUCT))
+	@echo "compiling the numerical kernels (half a minute, once)"
+	@$(BIN)/flexlink run --config .ci/every_kernel.toml --out $(VENV)/compiled --replace >/dev/null
 	@rm -rf $(VENV)/compiled
 	@touch $@
 
-install: $(STAMP)
+install: $(STAMP) $(PACKAGES)
 
 run: $(STAMP)
 	$(BIN)/flexlink run --out $(OUT) --replace
 
-test: $(STAMP)
+test: $(STAMP) $(PACKAGES)
 	$(PYTEST) -m "not slow"
 
-test-all: $(STAMP)
+test-all: $(STAMP) $(PACKAGES)
 	$(PYTEST)
 
 lint: $(PACKAGES)
