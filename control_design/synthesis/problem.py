@@ -21,6 +21,7 @@ from control_design.synthesis.synthesis_options import SynthesisOptions
 
 EXCHANGE_TOLERANCE = 5e-4  # accepted relative excess of the dense check over the programme
 _LIGHT = 0.05  # damping ratio; wider resonances do not fit between the points of a dense grid
+_PER_DECADE = 10  # of points below the grids, where nothing but slow real poles and zeros is
 _DELAY_COPY_MODULUS = 0.1  # distance from -1 asked of the delayed copies: stability with something to spare
 
 
@@ -88,23 +89,28 @@ class Problem(Grids):
 
     def checks(self, cascade: Cascade, parameters: Real) -> list[tuple[int, PlantData]]:
         """(number of the plant, data) of the dense check of one controller: the dense grids, and points
-        around lightly damped poles and zeros of the controller and poles of its loops.
+        around lightly damped poles and zeros of the controller and poles of its loops, and below the grids
+        where one of them is slower.
 
-        A controller may hide a resonance between the points of any grid that does not know it, and an
-        optimiser finds that out.
+        A controller may hide a resonance between the points of any grid that does not know it, or a step
+        below them, and an optimiser finds that out.
         """
         found = list(enumerate(self.dense))
         roots = cascade.roots(parameters)
         for number, (plant, poles) in enumerate(
             zip(self.plants, self.closed_loop_poles(cascade, parameters), strict=True)
         ):
-            light = modes_of(np.concatenate([roots, poles]), self.dt_s, zeta_below=_LIGHT)
-            if plant.own_grid is not None or not light:
-                continue
-            points = np.concatenate([_around(mode) for mode in light])
+            own = np.concatenate([roots, poles])
+            light = modes_of(own, self.dt_s, zeta_below=_LIGHT)
             low = self.options.omega_min_rad_s or lowest_rad_s(plant.dt_s, plant.poles)
-            high = plant.nyquist_rad_s
-            points = np.unique(points[(points > low) & (points < high)])
+            begin = min(low, self.options.omega_min_rad_s or lowest_rad_s(plant.dt_s, own))
+            if plant.own_grid is not None or not (light or begin < low):
+                continue
+            below = np.geomspace(
+                begin, low, int(np.ceil(_PER_DECADE * np.log10(low / begin))), endpoint=False
+            )
+            points = np.unique(np.concatenate([below, *(_around(mode) for mode in light)]))
+            points = points[(points >= begin) & (points < plant.nyquist_rad_s)]
             if points.size:
                 found.append((number, PlantData.build(plant, self.spec, points)))
         return found

@@ -51,6 +51,15 @@ def test_returned_designs_are_proved_and_their_sampled_plants_stable(seed):
     assert unstable_samples(result.controller, posterior, np.random.default_rng(seed)) == 0
 
 
+@pytest.mark.parametrize("seed", [107, 155])
+def test_a_step_below_the_grids_is_seen(seed):
+    """Both lack an integrator and ask for rejection down to zero frequency: their slow pole, below every grid
+    of the plant, made a worst case of 22 and 73 that the search did not see."""
+    plant, _, specification = random_case(seed)
+    result = synthesise([plant], specification, LOW_EFFORT, rng=np.random.default_rng(seed))
+    assert certify(result.controller, [plant], specification).gamma == pytest.approx(result.gamma, rel=0.005)
+
+
 @pytest.mark.slow
 def test_a_case_without_a_design_is_not_handed_out_as_one():
     """Seed 149: nothing robust was found; a loop on the edge of stability must not pass for a design."""
