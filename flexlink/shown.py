@@ -56,12 +56,14 @@ def _lines(result: object) -> list[str]:
 def _macros() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    from workflow.text.formats import at_least, at_most, bound
+    from workflow.diagnose.words import times_noise
+    from workflow.text.formats import at_least, at_most, bound, listing
     from workflow.text.templates import words
 
     # Text; the HTML is escaped line by line.
     loader = PackageLoader("flexlink")
     environment = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"words": words, "at_least": at_least, "at_most": at_most, "bound": bound}
+    environment.filters |= {"listing": listing, "times_noise": times_noise}
     environment.globals |= {"zip": zip, "abs": abs}
     return environment.get_template("results.j2").module

@@ -34,8 +34,9 @@ def table(result: object) -> pd.DataFrame:
     Record, simulation, closed loop: a row per sample. Model, identification: a row per mode or real pole.
     Uncertainty, measured response: a row per frequency, with the range of gain and phase over the ellipse.
     Certificate: a row per requirement. Synthesis: a row per active constraint. Diagnosis: a row per effect
-    and parameter, with its 95 % interval. Error surface: a row per grid point. Youla bracket: a row per
-    plant. Raises TypeError for anything else.
+    and parameter, with its 95 % interval and two probabilities: that the effect is `present`, and that it is
+    the `main_cause` (these sum to one). Error surface: a row per grid point. Youla bracket: a row per plant.
+    Raises TypeError for anything else.
 
     Examples
     --------
@@ -145,7 +146,7 @@ def _synthesis(result: SynthesisResult) -> pd.DataFrame:
 def _diagnosis(found: Diagnosis) -> pd.DataFrame:
     rows = []
     for effect in found.effects:
-        about = {"effect": effect.name, "probability": effect.probability, "presence": effect.presence}
+        about = {"effect": effect.name, "present": effect.presence, "main_cause": effect.probability}
         for name, value in effect.parameters.items() or [(None, np.nan)]:
             low, high = effect.intervals.get(str(name), (np.nan, np.nan))
             sized = {"parameter": name, "value": value, "low": low, "high": high}

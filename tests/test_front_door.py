@@ -18,6 +18,8 @@ from scipy.signal import dlti, lfilter, lti
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import flexlink
+from flexlink.shown import dressed
+from tests.workflow.diagnosis_examples import KnownAnswer, write_case
 
 ROOT = Path(__file__).resolve().parents[1]
 GUIDE = ROOT / "docs" / "from_python.md"
@@ -95,6 +97,32 @@ def test_a_case_of_a_simulator_is_read_as_the_command_reads_it(tmp_path):
     assert sum(len(e.output) for e in case.experiments) == 300
     with pytest.raises(ValueError, match="no case is there"):
         flexlink.load_case(tmp_path / "other")
+
+
+def test_a_diagnosis_credits_everything_that_the_repaired_model_holds(tmp_path):
+    friction, delay = (
+        {"name": "coulomb_friction", "torque_Nm": 0.05},
+        {"name": "input_delay", "delay_s": 0.02},
+    )
+    case = flexlink.load_case(write_case(tmp_path / "arm", friction, delay), "rig_uncertain.toml")
+    answer = KnownAnswer((friction, delay))(case)
+    found = dressed(
+        flexlink.Diagnosis,
+        answer,
+        combination=("coulomb_friction",),
+        ambiguous_with=("input_delay", "backlash"),
+    )
+    first, *others = repr(found).splitlines()
+    assert first == (
+        f"Model error / noise: {found.gap_before:.1f} nominal, {found.gap_refit:.1f} re-estimated, "
+        f"{found.gap_after:.3f} with coulomb friction and input delay"
+    )
+    assert "  not excluded: backlash" in others
+    delayed = found.table().set_index("effect").loc["input_delay"]
+    assert (
+        f"  input delay: present with probability {delayed['present']:.2g}, in the repaired model" in others
+    )
+    assert delayed["main_cause"] == answer.probabilities["input_delay"]
 
 
 def test_every_name_is_there_and_shown_in_an_example():
