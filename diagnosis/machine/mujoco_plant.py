@@ -139,6 +139,8 @@ class MujocoArm(MujocoModel):
         for name, size in changed.items():
             now = ", ".join(f"{value:.6g}" for value in np.ravel(size))
             said.append(f"  {name}: {plant.parameters.get(name, 0.0):.6g} to {now}")
+        if any(name.endswith((".sensor_gain", ".sensor_offset")) for name in changed):
+            said.append("  Of a sensor: reading = gain * value + offset. MuJoCo does not apply it.")
         listed = "\n".join(said or ["  nothing"]).replace("--", "- -")
         return f"<!-- Changed by flexlink diagnose:\n{listed}\n-->\n{spec.to_xml()}"
 

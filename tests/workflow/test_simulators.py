@@ -29,15 +29,16 @@ def snippets(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", GUIDE.read_text(), re.S)
 
 
-def write_log(path: Path, seed: int, friction: float) -> None:
-    """A rod on a hinge under random torques, by hand: semi-implicit steps of 0.1 ms, dry friction exact."""
+def write_log(path: Path, seed: int, friction: float, gain: float = 1.0) -> None:
+    """A rod on a hinge under random torques, by hand: semi-implicit steps of 0.1 ms, dry friction exact.
+    gain : of the angle's sensor."""
     rng = np.random.default_rng(seed)
     torque = rng.uniform(-1, 1, 15).repeat(16)
     torque[:16] = 0.0
     x = v = 0.0
     h, rows = 1e-4, []
     for k, u in enumerate(torque):
-        rows.append([k * DT_S, u, x + 2e-4 * rng.standard_normal()])
+        rows.append([k * DT_S, u, gain * x + 2e-4 * rng.standard_normal()])
         for _ in range(round(DT_S / h)):
             free = v + h / 0.31 * (u - 0.2 * v)
             v = np.sign(free) * max(abs(free) - h / 0.31 * friction, 0.0)
@@ -47,9 +48,10 @@ def write_log(path: Path, seed: int, friction: float) -> None:
 
 def test_a_mujoco_model_is_diagnosed_and_comes_back_repaired(tmp_path, flexlink, monkeypatch):
     mujoco = pytest.importorskip("mujoco")
-    (tmp_path / "arm.xml").write_text(HINGE)
-    write_log(tmp_path / "first.csv", 0, 0.12)
-    write_log(tmp_path / "second.csv", 1, 0.12)
+    scaled = '<custom><numeric name="hinge.gain" data="1.1"/></custom><actuator>'
+    (tmp_path / "arm.xml").write_text(HINGE.replace("<actuator>", scaled))
+    write_log(tmp_path / "first.csv", 0, 0.12, gain=1.1)
+    write_log(tmp_path / "second.csv", 1, 0.12, gain=1.1)
     (tmp_path / "arm.toml").write_text('mjcf = "arm.xml"\nlog = ["first.csv", "second.csv"]\n')
     out = tmp_path / "found"
     answer = flexlink("diagnose", str(tmp_path / "arm.toml"), "--out", str(out), "--json", "--jobs", "1")
@@ -62,7 +64,7 @@ def test_a_mujoco_model_is_diagnosed_and_comes_back_repaired(tmp_path, flexlink,
     assert "hinge.frictionloss" in page
     assert 'href="arm.xml"' in page
     assert page.count('<animate attributeName="d"') == 3  # measured, stated, repaired
-    # The guide's replay, by MuJoCo alone, gives the number of the answer.
+    # The guide's replay gives the number of the answer, through the gain that MuJoCo does not apply.
     (replay,) = [text for text in snippets("python") if "genfromtxt" in text]
     monkeypatch.chdir(tmp_path)
     printed: list[float] = []
