@@ -48,7 +48,10 @@ from plant.effects.search_space import Dependence
 _SMOOTHED = 9  # samples, of a measured angle whose speed is asked
 # Numbers of a file have no more digits than this.
 _NO_LEVER_M = 1e-6
-_UNITS = {"hinge": ("Nm", "rad", "kg_m2"), "slide": ("N", "m", "kg")}
+_UNITS = {
+    mujoco.mjtJoint.mjJNT_HINGE: ("Nm", "rad", "kg_m2"),
+    mujoco.mjtJoint.mjJNT_SLIDE: ("N", "m", "kg"),
+}
 _STANDARD_GRAVITY = 9.81  # m/s^2, MuJoCo's own default
 # From this share of a limit on the stated model reaches it.
 _REACHED = 0.999
@@ -79,10 +82,9 @@ class Quantities:
         return {one.name: one for one in found}
 
     def _of_joint(self, joint: Any, force: float, travel: float, speed: float) -> Iterator[Quantity]:
-        kinds = {mujoco.mjtJoint.mjJNT_HINGE: "hinge", mujoco.mjtJoint.mjJNT_SLIDE: "slide"}
-        if joint.type not in kinds:
+        if joint.type not in _UNITS:
             return
-        F, x, m = _UNITS[kinds[joint.type]]
+        F, x, m = _UNITS[joint.type]
         name, h = joint.name, self.model.nominal.opt.timestep
         inertia = float(self.model.nominal.dof_M0[self.model.nominal.joint(name).dofadr[0]])
         # Name, where it stands, parameter, unit, largest size in it, dependence.
@@ -150,12 +152,20 @@ class Quantities:
             yield Quantity(f"{one.name}.forcerange", 1.0, partial(put_forcerange, one.name, limits))
         elif (force := max(-least, largest)) > 0:
             put = partial(put_limit, one.name, limits)
-            limit = of(f"{one.name}.forcerange", 0.0, put, "limit", force, (0.05, 1.0), (0.1, 0.98))
+            name = self._limit_name(stated)
+            limit = of(f"{one.name}.forcerange", 0.0, put, name, force, (0.05, 1.0), (0.1, 0.98))
             yield replace(limit, grows=False)
         if one.dyntype in LAGS:
             yield late(f"{one.name}.lag", lag, partial(put_lag, one.name), "time_constant_s")
         put = partial(put_delay, "actuator", one.name, self.model.spec.option.timestep)
         yield late(f"{one.name}.delay", float(one.delay), put, "delay_s")
+
+    def _limit_name(self, actuator: Any) -> str:
+        """Of a joint's actuator with the unit of its force, which the joint's kind says."""
+        if actuator.trntype[0] not in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+            return "limit"
+        kind = mujoco.mjtJoint(self.model.nominal.jnt_type[actuator.trnid[0]])
+        return f"limit_{_UNITS[kind][0]}" if kind in _UNITS else "limit"
 
     def _of_link(self, body: Any) -> Iterator[Quantity]:
         model = self.model.nominal

@@ -156,7 +156,8 @@ def test_it_is_named_with_its_size_and_the_repaired_model_moves_as_the_machine(t
     loaded = machine.case(tmp_path, stated, candidates=[*beside, candidates], **exclude)
     found = diagnose(loaded.case)
     assert found.combination == (effect,)
-    (value, *_) = next(change for change in found.repair if change.id == effect).values.values()
+    ((parameter, value), *_) = next(change for change in found.repair if change.id == effect).values.items()
+    assert name != "a limit" or parameter == "limit_Nm"
     (low, high) = next(iter(found.effects[0].intervals.values()))
     assert low < size < high
     assert value == pytest.approx(size, rel=0.1)
