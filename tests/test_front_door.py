@@ -95,6 +95,12 @@ def test_a_case_of_a_simulator_is_read_as_the_command_reads_it(tmp_path):
     case = flexlink.load_case(tmp_path / "motor.toml")
     assert (case.name, case.model_error, case.outputs) == ("motor", 0.02, ("level",))
     assert sum(len(e.output) for e in case.experiments) == 300
+    first, *roles = repr(case).splitlines()
+    assert re.fullmatch(r"PlantCase 'motor': \d records of level, \d+ candidate effects", first)
+    assert str(len(case.plant.missing)) in first
+    assert [sum(map(int, re.findall(r"(\d+) samples", role))) for role in roles] == [
+        sum(len(e.output) for e in records) for records in (case.estimation, case.held_out)
+    ]
     with pytest.raises(ValueError, match="no case is there"):
         flexlink.load_case(tmp_path / "other")
 

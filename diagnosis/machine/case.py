@@ -75,7 +75,7 @@ class Experiment:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Case(RecordedCase[Experiment]):
     """A rig as its maker knows it, and records of the machine.
 

@@ -21,6 +21,7 @@ Real = npt.NDArray[np.float64]
 Role = Literal["estimation", "held_out"]
 Record = TypeVar("Record", bound="RecordOfMachine")
 
+_NAMED = 6  # records of a role that a case lists when it is printed
 FEWEST_SAMPLES = 20  # fewer tell no more than a handful of parameters
 # A search simulates every record some thousand times: more records than this take hours, however short.
 MOST_RECORDS = 500
@@ -156,6 +157,17 @@ class RecordedCase(ABC, Generic[Record]):
         for role in get_args(Role):
             if role not in [experiment.role for experiment in self.experiments]:
                 raise ValueError(f"case {self.name}: no experiment has the role {role}")
+
+    def __repr__(self) -> str:
+        said = [
+            f"{type(self).__name__} '{self.name}': {len(self.experiments)} records of "
+            f"{', '.join(self.machine.output_names)}, {len(self.machine.weighing.listed)} candidate effects"
+        ]
+        for role, records in {"estimation": self.estimation, "validation": self.held_out}.items():
+            names = [f"{e.name} ({len(e.output)} samples)" for e in records]
+            more = [f"{len(names) - _NAMED} more"] if len(names) > _NAMED else []
+            said.append(f"  {role}: {', '.join(names[:_NAMED] + more)}")
+        return "\n".join(said)
 
     @property
     @abstractmethod

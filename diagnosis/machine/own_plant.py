@@ -264,7 +264,7 @@ class PlantExperiment:
         check_record(self)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PlantCase(RecordedCase[PlantExperiment]):
     """A plant as its makers know it, and what it did.
 
