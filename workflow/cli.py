@@ -703,7 +703,7 @@ def check(
     _show(look_at_case(case or settings_of(stated, "--log")), as_json)
 
 
-@app.command(cls=_OfSettings, short_help="Why machine and model differ: cause, size, closure.")
+@app.command(cls=_OfSettings, short_help="Cause and size of a model error; how much of it is explained.")
 def diagnose(
     out: Annotated[Path, typer.Option(help="Directory for answers, pages and repaired rigs; new or empty.")],
     case: Annotated[

@@ -78,8 +78,13 @@ def of_case(loaded: SimulatorCase, found: Telling) -> RunSummary:
         title=case.name,
         sections=rows_of("summary/check.j2", FILTERS.items(), **told),
         numbers={"logs": codec.plain(logs), **codec.plain(found), "advice": told["advice"]},
-        verdict=f"{len(shown) - len(found.hidden)} of {len(shown)} candidates show; {len(alike)} groups "
-        "of them look alike in these records, if one of them is present",
+        verdict=f"{len(shown) - len(found.hidden)} of {len(shown)} candidates show"
+        + (
+            f"; {len(alike)} groups of them look alike in these records, if one of them is present. "
+            "You may go on to the diagnosis: it says which of them it leaves open"
+            if alike
+            else ""
+        ),
     )
 
 
@@ -106,7 +111,8 @@ def _at_ends(command: Real) -> float:
 
 
 def _advice(found: Telling) -> Iterator[str]:
-    """What would tell apart what acts alike, and show what is hidden; for every group the first that fits."""
+    """What would tell apart what acts alike, most alike first, then show what is hidden; for every group the
+    first that fits."""
     rest: list[str] = []
     for one in found.alike:
         last = {name: name.rpartition(".")[2] for name in one.names}
