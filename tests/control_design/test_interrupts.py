@@ -32,7 +32,7 @@ AngleProgram.solve = solve
 try:
     synthesise(
         [flexible_link("B")],
-        flexible_link_specification(1),  # an order at which no fit of a controller of any order is near enough
+        flexible_link_specification(1),  # no fit of a controller of any order is near enough
         SynthesisOptions(starts=2, iterations=2000),
         rng=np.random.default_rng(1),
     )
