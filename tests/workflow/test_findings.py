@@ -13,7 +13,7 @@ from ident.data.finding import FindingKind, finding
 from workflow.cli import app
 from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.text.options import OPTIONS, speaking
-from workflow.text.templates import words
+from workflow.text.templates import said, words
 
 STORED = Path(__file__).parent / "data" / "findings.txt"
 # One value for every name that any sentence asks for.
@@ -214,3 +214,15 @@ def test_hints_of_a_configuration_name_its_keys():
             continue  # doubts about columns name both ways themselves
         assert "--" not in sentence, sentence
         assert set(re.findall(r"\b([a-z]+(?:_[a-zA-Z]+)+)\b", sentence)) <= told, sentence
+
+
+def test_a_loop_that_no_model_explains_is_told_about_dry_friction():
+    """Where nobody looked for friction: with the option of the command that refuses."""
+    with speaking("identify"):
+        refused = said("unexplained_logs", "enc", "its best fit to one is 49 %", False)
+    assert "dry friction is a common cause: if 'enc' is the position" in refused
+    assert '(--response "without friction")' in refused
+    assert "as recorded" not in refused
+    looked = said("unexplained_logs", "enc", "its best fit to one is 49 %", True)
+    assert "common cause" not in looked
+    assert 'set response = "as recorded"' in looked

@@ -57,7 +57,7 @@ from workflow.tasks.results import (
     UncertaintyResult,
 )
 from workflow.tasks.stage import StageInput
-from workflow.text.templates import words
+from workflow.text.templates import said, words
 
 _FEWEST_FREQUENCIES = 100  # over a band of the data, some decade: a nominal model has a tenth as many numbers
 _SHARE_INSIDE = 0.9  # of the ellipses: below it a nominal is no member of the set it stands for
@@ -308,11 +308,7 @@ def refuse_unexplained(
     elif late:
         why = "the motion comes before its command; was the command logged late?"
     if why:
-        instead = "" if friction is None else "set response = 'as recorded', or "
-        raise ValueError(
-            f"no model of '{result.output}' explains these logs: {why}; check what changes between the logs "
-            f"(load, filter, time stamps), {instead}record others: flexlink excite --closed-loop LOG..."
-        )
+        raise ValueError(said("unexplained_logs", result.output, why, friction is not None))
 
 
 def posterior_of(
