@@ -119,7 +119,11 @@ class Specification(Settings):
         "on their own frequencies only, half the relative spacing of these)",
     )
     computational_delay_samples: int = Field(
-        default=1, ge=0, le=10, description="samples between measuring and applying the command"
+        default=1,
+        ge=0,
+        le=10,
+        description="samples between measuring and applying the command, added to the delay that the "
+        "plant's model holds: 0 if that model starts at the command computed from the same sample",
     )
     sensitivity_weight: RationalWeight | None = Field(
         default=None, description="W1 itself, instead of bandwidth_rad_s"
