@@ -271,7 +271,7 @@ def draw_conditions(run: RunView) -> Figure | None:
 @style.drawing("friction-in-the-loop")
 def draw_friction(run: RunView) -> Figure | None:
     """Left: peak of |S| over the rms of the reference, predicted with friction, measured, certified. Right:
-    error on the slow sine. Nothing where friction was not identified."""
+    error on the sine. Nothing where friction was not identified."""
     if run.loop is None or run.loop.friction is None:
         return None
     loop, found, unit = run.loop, run.loop.friction, run.output_unit
@@ -302,7 +302,7 @@ def draw_friction(run: RunView) -> Figure | None:
         errors.axhline(
             sign * found.error_at_rest, **style.LIMIT_LINE, label="largest error that friction can hold"
         )
-    errors.set(xlabel="time [s]", title="Error on a slow sine")
+    errors.set(xlabel="time [s]", title="Error on a sine")
     errors.set_xlim(0.0, float(time_s[-1]))
     errors.set_ylabel(style.two_lines(name, unit))
     return figure
