@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_toeplitz
 from scipy.signal import correlate
 from scipy.stats import chi2, norm
 
@@ -51,6 +52,13 @@ class ResidualTest:
         """Lag (not negative) and value of the largest correlation."""
         at = int(np.argmax(np.where(self.lags >= 0, np.abs(self.correlation), 0)))
         return int(self.lags[at]), float(self.correlation[at])
+
+    @property
+    def predictable_share(self) -> float:
+        """Of the residual's power, what its own past over all lags predicts (Yule-Walker), by the
+        autocorrelation at lags 1..K of a whiteness test: 0 of white noise."""
+        first_row = np.append(1.0, self.correlation[:-1])
+        return float(np.clip(self.correlation @ solve_toeplitz(first_row, self.correlation), 0.0, 1.0))
 
     @property
     def finding(self) -> Finding:
@@ -137,7 +145,8 @@ def residual_advice(
     if not whiteness.passed:
         independent = independence.passed
         told = {"noise_order": noise_order, "independent": independent, "friction": friction}
-        found.append(finding(FindingKind.NOT_WHITE, **told, observer=observer))
+        share = whiteness.predictable_share
+        found.append(finding(FindingKind.NOT_WHITE, **told, observer=observer, predictable_share=share))
     return found
 
 

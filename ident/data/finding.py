@@ -69,6 +69,7 @@ class FindingKind(Enum):
     WHITENESS = auto()
     INDEPENDENCE = auto()
     NOT_WHITE = auto()
+    UNTRIED_FRICTION = auto()
     NOT_INDEPENDENT = auto()
     CHI_SQUARE = auto()
     # Records made in closed loop.

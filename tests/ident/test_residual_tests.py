@@ -43,6 +43,10 @@ def test_coloured_residuals_are_found_and_named():
     assert not result.passed
     assert result.largest == (1, result.correlation[0])
     assert result.correlation[0] == pytest.approx(0.5, abs=0.1)
+    # Of a first-order process with a factor of 0.5 its past predicts a quarter of the power; of noise none.
+    assert result.predictable_share == pytest.approx(0.25, abs=0.08)
+    white = whiteness_test([np.random.default_rng(3).standard_normal(5000)])
+    assert white.predictable_share < 0.02
 
 
 def test_missed_dynamics_are_found_at_their_lag():
@@ -112,20 +116,17 @@ def test_advice_is_about_the_tests_that_fail():
     driven[5:] += 0.5 * u[:-5]
     good = whiteness_test([white]), independence_test([u], [white])
     assert residual_advice(*good) == []
+    tested = whiteness_test([colour])
+    share = tested.predictable_share
     for order in (0, 8):
-        alone = residual_advice(whiteness_test([colour]), independence_test([u], [colour]), noise_order=order)
-        assert alone == [
-            finding(
-                FindingKind.NOT_WHITE, noise_order=order, independent=True, friction=False, observer=False
-            )
-        ]
+        alone = residual_advice(tested, independence_test([u], [colour]), noise_order=order)
+        told = {"independent": True, "friction": False, "observer": False, "predictable_share": share}
+        assert alone == [finding(FindingKind.NOT_WHITE, noise_order=order, **told)]
     missed = finding(FindingKind.NOT_INDEPENDENT, lag=5)
     assert residual_advice(good[0], independence_test([u], [driven])) == [missed]
-    both = residual_advice(whiteness_test([colour]), independence_test([u], [driven]), friction=True)
-    assert both == [
-        missed,
-        finding(FindingKind.NOT_WHITE, noise_order=0, independent=False, friction=True, observer=False),
-    ]
+    both = residual_advice(tested, independence_test([u], [driven]), friction=True)
+    told = {"independent": False, "friction": True, "observer": False, "predictable_share": share}
+    assert both == [missed, finding(FindingKind.NOT_WHITE, noise_order=0, **told)]
 
 
 @pytest.mark.parametrize("kind", ["held binary", "sweep"])

@@ -22,6 +22,7 @@ from control_design.specification.requirement import LoopFunction, Specification
 from control_design.synthesis.joint_synthesis import JointDesign
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import Outcome
+from ident.data.finding import FindingKind, finding
 from ident.uncertainty import FrequencyUncertainty
 from tests.compiler import compiled, needs_compiler
 from tests.control_design.plants import uncertain_hub
@@ -118,6 +119,24 @@ def test_verdict_of_a_missed_specification_says_whether_a_higher_order_helps():
     assert verdict_of(design, *rest, AchievablePerformance(), 3) == "specification not met: gamma 1.2"
     lost = replace(design, synthesis=SimpleNamespace(gamma=float("inf")))
     assert "does not prove that none exists" in verdict_of(lost, *rest, achievable(0.8), 3)
+
+
+def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_have_none():
+    design = DesignResult(SimpleNamespace(gamma=0.9), met=True, reason="")
+    certify = CertifyResult(None, certified=True, reason="")
+    check = SimpleNamespace(settled_draws=20, draws=20, friction=None, machine="identified")
+
+    def verdict(**changed):
+        loop = SimpleNamespace(check=SimpleNamespace(**(vars(check) | changed)))
+        return said("run_verdict", design, certify, loop, "")
+
+    assert verdict() == "certified: every requirement is met, and all 20 closed-loop runs settle"
+    assert verdict(friction=1, machine="simulated") == verdict()  # that arm has its friction
+    assert verdict(friction=1) == verdict() + " (linear plants, without dry friction)"
+    doubt = finding(FindingKind.UNTRIED_FRICTION, output="enc")
+    words = verdict_of(design, certify, SimpleNamespace(check=check), doubts=[doubt])
+    assert words.startswith(verdict() + ". But dry friction was not identified")
+    assert words.endswith('set response = "without friction" in [channels.uncertainty]')
 
 
 def test_achievable_performance_not_asked_for_or_impossible_says_why():

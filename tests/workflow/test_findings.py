@@ -72,6 +72,7 @@ VALUES = {
     "fit_percent": -0.123,
     "half_power_Hz": 0.512,
     "unpredictable_share": 0.0123,
+    "predictable_share": 0.0016,
     "passed": False,
     "probability": 1e-4,
     "max_lag": 25,

@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -391,3 +392,24 @@ def test_page_tells_of_any_order_whole_responses_and_reference_filter(tmp_path, 
         run.save_stage("reference_filter", ReferenceFilterResult(filtered), "x")
     text = text_of(run, settings)
     assert "0.19 with it, 0.95 without, 5 times smaller" in text
+
+
+def test_friction_range_says_which_bound_holds_and_which_way_friction_moves_the_peak():
+    check = SimpleNamespace(
+        tolerance_percent=5.0, certified_peak=1.676, nominal_peak=1.51, certified_from=0.001,
+        linear_from=None, sizes=np.array([0.1, 0.01]), low=np.array([1.2, 1.0]), high=np.array([1.3, 1.1]),
+    )  # fmt: skip
+    told = said("friction_range", check, "rad")
+    assert "predicted to be at most 5 % above the certified 1.676 for references from 0.001 rad" in told
+    assert "1.51, is lowered by friction by more than 5 %, even at the largest size" in told
+    check.nominal_peak = 1.1
+    assert "1.1, is raised by friction" in said("friction_range", check, "rad")
+
+
+def test_a_lowered_bandwidth_says_which_of_the_three_is_which():
+    asked = SimpleNamespace(bandwidth_rad_s=19.0, lowest_bandwidth_rad_s=3.0)
+    found = SimpleNamespace(bandwidth_rad_s=8.82)
+    told = said("lowered", asked, found, [], 12.2)
+    assert told.startswith("the specified 19 rad/s was not met; ")
+    assert told.endswith("a design for 8.82 rad/s, and this controller reaches at least 12.2 rad/s")
+    assert said("lowered", asked, asked, [], 12.2) == ""

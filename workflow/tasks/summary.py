@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ident.data.finding import Finding
+from ident.data.finding import Finding, FindingKind
 from ident.uncertainty import FrequencyUncertainty
 from workflow.config.joints_config import JointsConfig
 from workflow.config.run_config import RunConfig
@@ -54,6 +55,7 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
             achievable,
             (design.specification or config.specification).controller_order,
             untold_below_rad_s(results.uncertainty.channels[config.control_index].frequency),
+            results.uncertainty.channels[config.control_index].advice,
         ),
         report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
     )
@@ -88,14 +90,16 @@ def verdict_of(
     achievable: AchievablePerformance | None = None,
     order: int | str | None = None,
     untold_rad_s: float = 0.0,
+    doubts: Sequence[Finding] = (),
 ) -> str:
     """One line: certified, or what is missed, by how much and at which frequency; where the achievable
     performance is given, whether a higher order would help; up to where the ellipses are wider than the
-    gain, if they are."""
+    gain, if they are; and of the doubts about these, that nobody looked for friction."""
     advice, untold = "", said("untold", untold_rad_s)
     if achievable is not None and order is not None and design.gamma is not None:
         advice = said("order_advice", achievable, design.gamma, order)
-    return said("run_verdict", design, certify, loop, untold or advice, untold)
+    friction = [words(doubt) for doubt in doubts if doubt.kind is FindingKind.UNTRIED_FRICTION]
+    return said("run_verdict", design, certify, loop, untold or advice, untold, *friction)
 
 
 def untold_below_rad_s(found: FrequencyUncertainty) -> float:

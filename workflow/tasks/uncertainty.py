@@ -20,7 +20,7 @@ from ident.checks.answer import zero_is_inside
 from ident.checks.residual_tests import residual_advice, whiteness_test
 from ident.checks.validation import ScatterRow, repeat_scatter
 from ident.data.distortion import distortion_of
-from ident.data.finding import FindingKind, distinct
+from ident.data.finding import FindingKind, distinct, finding
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
 from ident.data.signal_filter import increments
@@ -171,12 +171,16 @@ def uncertainty_of(
             and precedes_command(friction, measured, channel.identification)
         )
         refuse_unexplained(result, found.agreement, friction, late=late)
+    # In a loop friction biases damping and poles, also where a noise model leaves white residuals.
+    rubs = friction is None and result.closed_loop is not None and not white
     advice = residual_advice(
         *tests,
         noise_order=found.noise_order,
-        friction=friction is None and band is None and not result.increments,
+        friction=friction is None and band is None and not result.increments and not rubs,
         observer=observer and at_shaft,
     )
+    if rubs:
+        advice.append(finding(FindingKind.UNTRIED_FRICTION, output=result.output))
     return replace(found, advice=tuple(advice)), equivalent
 
 
