@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 FIRST_LINE_S, LINE_EVERY_S = 0.4, 10.0
-COMPILING_S = 20.0  # all kernels that one command needs, the first time
+COMPILING_S = 25.0  # all kernels that one command needs, the first time
 # So much work as expected is taken for granted before the speed of this machine counts.
 _PRIOR_S = 10.0
 
