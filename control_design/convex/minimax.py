@@ -24,7 +24,7 @@ _ROUND_NUMERATOR = 1e-3
 _ROUND_REACH = 1e-4  # denominators are about one: off by at most 1e-4, at the kink alone
 _ROUND_FEASIBILITY = 1e-2  # while denominators are being made positive: their maximum may sit on the kink
 _EXCESS = 5e-4  # relative; accepted of the dense check over the programme
-_MOST_STEPS = 200  # by default, of the interior point in one round; 5 to 40 are usual
+_MOST_STEPS = 200  # of the interior point in one round; 5 to 40 are usual
 _KEPT = 1e-10  # singular values of the scaled basis below this fraction are no directions of the search
 
 
@@ -85,15 +85,13 @@ def smallest_ratio(
     *,
     most_rounds: int = 30,
     accuracy: float = 1e-5,
-    most_steps: int = _MOST_STEPS,
 ) -> MinimaxPoint:
-    """Minimise the largest numerator/denominator over real x (n,), to a relative accuracy,
-    in rounds of at most `most_steps` of the interior point.
+    """Minimise the largest numerator/denominator over real x (n,), to a relative accuracy.
 
     basis (F, n): y = basis x. start: x (n,) to begin from; else the least-squares solution of the numerators,
     shortened until all denominators are positive.
     """
-    step = _Scaled(basis, rows, accuracy, most_steps)
+    step = _Scaled(basis, rows, accuracy)
     if start is not None and not np.min(rows.denominator(plane(basis @ start))) > 0:
         start = None
     z = step.least_squares() if start is None else step.back @ start
@@ -169,8 +167,8 @@ class _Scaled:
     All rows at one frequency see the same y: what they say of z is said of y first, in the plane.
     """
 
-    def __init__(self, basis: Complex, rows: PlaneRows, accuracy: float, most_steps: int) -> None:
-        self.rows, self.accuracy, self.most_steps = rows, accuracy, most_steps
+    def __init__(self, basis: Complex, rows: PlaneRows, accuracy: float) -> None:
+        self.rows, self.accuracy = rows, accuracy
         planar = np.stack([basis.real, basis.imag], axis=1)  # (F, 2, n)
         seen = np.einsum("rji,rjk->rik", rows.A, rows.A) + np.einsum("rji,rjk->rik", rows.C, rows.C)
         triangle = np.linalg.qr(_half(_summed(rows.at, seen, len(basis)), planar), mode="r")
@@ -221,7 +219,7 @@ class _Scaled:
         dual /= np.sum(dual)
         best, best_value = z, begin
         final = feasibility or self.constant
-        for _ in range(self.most_steps):
+        for _ in range(_MOST_STEPS):
             by_row, blocks = self._derivatives(z, weight, factor, scale, dual)
             miss = h - v + slack
             ratio = dual / slack

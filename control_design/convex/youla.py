@@ -114,10 +114,9 @@ class BracketProblem:
         options: YoulaOptions,
         *,
         accuracy: float = 1e-5,
-        most_steps: int = 200,
     ) -> None:
         self.plant, self.spec, self.options = plant, specification, options
-        self.accuracy, self.most_steps = accuracy, most_steps
+        self.accuracy = accuracy
         self.grids = Grids((plant,), specification, options)
         self.factors: Factors | None = None
         if np.any(np.abs(plant.poles) >= 1.0 - 1e-9):
@@ -175,7 +174,7 @@ class BracketProblem:
         return found.worst, np.zeros(self.dense_basis.shape[1]) if x is None else x
 
     def _smallest(self, basis: Complex, rows: PlaneRows, start: Real | None) -> MinimaxPoint:
-        return smallest_ratio(basis, rows, start, accuracy=self.accuracy, most_steps=self.most_steps)
+        return smallest_ratio(basis, rows, start, accuracy=self.accuracy)
 
     def _ellipse(self, data: PlantData, start: Real | None) -> MinimaxPoint:
         basis, loop = self._basis(data), self._loop(data)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from control_design.plants.frequency_grid import lowest_rad_s
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification, SpecificationError
 from control_design.synthesis.synthesis import Progress, synthesise
@@ -41,14 +42,20 @@ def synthesise_widest(
         return with_order(specification, found), found
     count = 1 + int(np.ceil(np.log(top / lowest) / np.log(_RATIO)))
     tried = [stated(specification, value) for value in np.geomspace(top, lowest, max(count, 2)).tolist()]
-    root, quick = int(rng.integers(2**63)), options.model_copy(update=_QUICK)
+    # A trial ends before it can mend a pole that is slower than the plant's grids; a whole design does.
+    low_rad_s = options.omega_min_rad_s or min(lowest_rad_s(plant.dt_s, plant.poles) for plant in plants)
+    root, quick = int(rng.integers(2**63)), options.model_copy(update=_QUICK | {"omega_min_rad_s": low_rad_s})
 
     def gamma(one: Specification) -> float:
         tell(0.0, f"bandwidth {one.bandwidth_rad_s:.3g} rad/s")
-        try:
-            return synthesise(plants, one, quick, rng=np.random.default_rng(root), thorough=False).gamma
-        except SpecificationError:
-            return np.inf
+        for thorough in (False, True):  # where no fit is stable, the bandwidth may still be met
+            try:
+                found = synthesise(plants, one, quick, rng=np.random.default_rng(root), thorough=thorough)
+            except SpecificationError:
+                return np.inf
+            if np.isfinite(found.gamma):
+                break
+        return found.gamma
 
     low, high = 0, len(tried) - 1  # all from `high` on are met, or nothing is known of the last
     while low < high:

@@ -35,7 +35,6 @@ _WEIGHTED = 3  # rounds of fits with random weights
 # to 21: after ten it mostly, not always, leads to the best end of its round; after five less often.
 _TRIAL = 10
 _ROUGH_DRAWS = 50  # shaped loops drawn where ten steps choose between them
-_SURE = 3  # ends of separate rounds in one optimum, as many as `agreeing_starts` by default
 # Of the worst case that the small Youla problem reaches, and how far that lies above the default one's at
 # most: a design below both shows that it has ended in a valley, and is no bound.
 _NEAR, _FAIR, _FINER = 1.03, 1.05, 1.1
@@ -99,12 +98,10 @@ class OrderSearch:
         One fit of each, then fits with random weights, then shaped and random loops, each round a race: see
         `_raced`. It may end where the result lies within `_NEAR` of what the controllers of any order reach,
         or where as many ends as asked agree on it and it meets the specification. A design that misses the
-        specification gets all fits, as another valley may meet it, until `_SURE` rounds have ended in one:
-        then the last starts alone, which are of another kind. Agreement before the last starts counts within
-        `_FAIR` only.
+        specification gets all fits, as another valley may meet it. Agreement before the last starts
+        counts within `_FAIR` only.
         """
         found: list[Candidate] = []
-        winners: list[Candidate] = []
 
         def near(gamma: float) -> bool:
             return free.gamma / _FINER <= gamma <= _NEAR * free.gamma < np.inf
@@ -112,29 +109,23 @@ class OrderSearch:
         def agreed(gamma: float, fair: float = np.inf) -> bool:
             return gamma <= min(1.0, fair * free.gamma) and self._agree(found)
 
-        def sure() -> bool:
-            return self._agree(winners, max(_SURE, self.options.agreeing_starts))
-
         turn = 0
         while turn < _WEIGHTED + 2:
             least = min((c.gamma_grid for c in found), default=np.inf)
             last = least <= 1.0 or turn > _WEIGHTED
             if self._enough(found) or agreed(least, _FAIR) or (last and near(least)):
                 break
-            if sure():
-                turn = _WEIGHTED + 1
             self.tell(0.1 * turn, f"start {turn + 1} of {_WEIGHTED + 2}, from controllers of any order")
             starts = self._fits(free, turn) if turn <= _WEIGHTED else self._others()
             raced = self._raced(starts)
-            found, winners, turn = found + raced, winners + raced[:1], turn + 1
+            found, turn = found + raced, turn + 1
         ends = self._retrieved(self._checked(found))
         if not ends:
             return OrderResult(None, tuple(self.reports), (), self._nearest(found) if found else None), False
         result = self._exchange(ends, hops=False)
         assert result.best is not None
         gamma = result.best.gamma
-        kept = gamma <= _NEAR * min(c.gamma_grid for c in winners)  # not lost between the grid's points
-        return result, self._enough([result.best]) or near(gamma) or agreed(gamma) or (kept and sure())
+        return result, self._enough([result.best]) or near(gamma) or agreed(gamma)
 
     def fits_only(self, free: FreeControllers, enough: float) -> OrderResult:
         """From one fit of each controller of any order; without exchange where that leaves more than

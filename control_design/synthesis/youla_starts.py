@@ -27,9 +27,7 @@ from ident.data.arrays import real_rows
 _SMALL = YoulaOptions(
     real_poles=12, pairs_per_mode=4, grid_points=70, mode_points=40, exchange_rounds=0, dense_points=1000
 )
-# Of the small problems: relative accuracy, a tenth of the 3 % that the search asks of them; steps of a round,
-# where 40 instead of 200 changed the value of two of eleven problems, by 16 and -56 %.
-_ACCURACY, _MOST_STEPS = 3e-3, 40
+_ACCURACY = 3e-3  # relative, of the small problems: a tenth of the 3 % that the search asks of them
 _RELOCATIONS = 12  # of the poles; the fifth already moves them by less than a per cent
 _SPREAD = 1.5  # standard deviation of the logarithms of random weights, at `_KNOTS` frequencies
 _KNOTS = 8  # over four decades of frequency two a decade: weights bend, and do not jitter
@@ -61,9 +59,7 @@ def free_controllers(
     gamma = 0.0
     for plant in plants:
         try:
-            problem = BracketProblem(
-                plant, specification, options, accuracy=_ACCURACY, most_steps=_MOST_STEPS
-            )
+            problem = BracketProblem(plant, specification, options, accuracy=_ACCURACY)
         except (ValueError, ArithmeticError):  # no factorisation: the bound does not know such a plant
             return FreeControllers(tuple(found), np.inf)
         answers = problem.answers()
