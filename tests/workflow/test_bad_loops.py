@@ -233,7 +233,7 @@ def test_a_log_without_motion_is_named(line, tmp_path):
                 pytest.mark.slow,
                 pytest.mark.xfail(
                     strict=False,
-                    reason="where the fit with friction ends is up to last digits: on some processors it is taken",
+                    reason="where the fit with friction ends is up to last digits: some processors take it",
                 ),
             ],
         ),
