@@ -36,7 +36,7 @@ _ALL = (
     Column("gain_margin_dB", "gain margin", "dB", "larger"),
     Column("phase_margin_deg", "phase margin", "deg", "larger"),
     Column("delay_margin_ms", "delay margin", "ms", "larger"),
-    Column("disk_margin", "disk margin, all joints at once", "", "larger"),
+    Column("disk_margin", "nominal disk margin, all joints at once", "", "larger"),
     Column("bandwidth_rad_s", "bandwidth", "rad/s", "larger"),
     Column("mode_damping", "mode damping", "", "larger"),
     Column("mode_omega_rad_s", "of the mode at", "rad/s"),
