@@ -244,7 +244,7 @@ class Programme:
         dense grid."""
         grids = list(self.lean)
         best, least = x, self.worst(form, x)
-        # Not while it grows: the ends of the plain descent lead on to better ones (problem D of mimo_designs).
+        # Not while it grows: the plain descent leads on to better ends (problem D of mimo_designs).
         curved = form.order == self.spec.controller_order
         for _ in range(rounds):
             grids = [np.union1d(grid, light) for grid, light in zip(grids, self._light(form, x), strict=True)]
