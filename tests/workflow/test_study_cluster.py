@@ -153,12 +153,13 @@ def test_a_network_that_stalls(cluster, monkeypatch, who, words):
     """A process that is stopped keeps its connections and says nothing, as behind a dead switch. It is told
     within a minute: the time of silence, and what it takes to notice; here with a shorter one."""
     assert SILENT_S + 20 <= 60
-    for name, seconds in {"SILENT_S": 4, "WITHOUT_WORKERS_S": 4, "ANSWER_S": 1, "_ASK_S": 0.2}.items():
-        monkeypatch.setattr(f"workflow.engine.executor.{name}", seconds)
     cluster.add_worker()
     with closing(DaskCluster(cluster.address)) as far:
         found = far.run([Sleep(0.0), Sleep(300.0)])
         assert next(found) == (0, 0.0)
+        # Not before: a worker says nothing while it imports what its first task needs.
+        for name, seconds in {"SILENT_S": 4, "WITHOUT_WORKERS_S": 4, "ANSWER_S": 1, "_ASK_S": 0.2}.items():
+            monkeypatch.setattr(f"workflow.engine.executor.{name}", seconds)
         stalled = cluster.scheduler if who == "scheduler" else cluster.workers[0]
         stalled.send_signal(signal.SIGSTOP)
         began_s = time.monotonic()
