@@ -318,16 +318,12 @@ def test_the_notch_of_the_ruler_robot(flexlink, tmp_path, flexlink_data):
 def test_one_move_of_two_coupled_links_asks_for_another_experiment(
     refused, flexlink, tmp_path, flexlink_data
 ):
-    """20 s of smoothed steps, of which the response shows up to 1.2 Hz: the first mode is at 2.7 Hz. At
-    which of a dozen poles the fit with friction ends is up to last digits; what was asked is never met."""
+    """20 s of smoothed steps, of which the response shows up to 1.2 Hz: the first mode is at 2.7 Hz."""
     log, out = flexlink_data / "quanser_2dsfl" / "lqr_run.csv", tmp_path / "my.toml"
     line = refused("init", log, "--out", out)
     assert flexlink(*shlex.split(line.split("type: flexlink ")[1]), "--out", out).code == 0
-    answer = flexlink("run", "--config", out, "--out", tmp_path / "out")
-    if answer.code == 2:
-        assert re.search(r"response = ['\"]as recorded", answer.err.splitlines()[-1])
-    else:
-        assert answer.code == 3 or re.search(r"the specified 2\.\d rad/s was not met", answer.out)
+    line = refused("run", "--config", out, "--out", tmp_path / "out")
+    assert re.search(r"response = ['\"]as recorded", line)
     text = out.read_text().replace('"without friction"', '"as recorded"')
     out.write_text(text + '\n[closed_loop_data]\nmethod = "two_stage"\n')
     answer = flexlink("run", "--config", out, "--out", tmp_path / "recorded")

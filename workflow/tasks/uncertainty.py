@@ -69,6 +69,9 @@ _MOST = 50.0
 # So does one whose best fit to a log is below this, where the sensor's noise leaves a third of the rest at
 # most (right ones had 90 % and more, wrong ones 75 % and less).
 _EXPLAINED, _BEYOND_NOISE = 80.0, 3.0
+# So does one whose friction has a standard deviation above this share of the rms command: .0001 to .0027 for
+# 30 machines, .005 to .08 for wrong levels and logs behind a filter, whose ellipses missed the machine.
+_UNTOLD = 0.004
 T = TypeVar("T")
 
 N_BANDS = 6
@@ -170,7 +173,8 @@ def uncertainty_of(
             and FindingKind.ANSWERS_AT_ONCE in {warning.kind for warning in result.identification.warnings}
             and precedes_command(friction, measured, channel.identification)
         )
-        refuse_unexplained(result, found.agreement, friction, late=late)
+        rms = np.sqrt(np.mean(np.concatenate([record.input for record in measured]) ** 2))
+        refuse_unexplained(result, found.agreement, friction, rms_input=float(rms), late=late)
     # In a loop friction biases damping and poles, also where a noise model leaves white residuals.
     rubs = friction is None and result.closed_loop is not None and not white
     advice = residual_advice(
@@ -295,11 +299,12 @@ def refuse_unexplained(
     agreement: NominalAgreement,
     friction: FrictionFit | None,
     *,
+    rms_input: float,
     late: bool = False,
 ) -> None:
     """Raises ValueError, one line, where the model of logs made in a loop explains nothing, so that no number
-    of it means anything. friction: of the fit, None where none was identified; late: the motion comes before
-    its command."""
+    of it means anything. friction: of the fit, None where none was identified; rms_input: of the
+    commands; late: the motion comes before its command."""
     found = result.identification
     best = max(*found.fit_percent.tolist(), *(fit.fit_percent for fit in result.fresh), 0.0)
     why = ""
@@ -310,7 +315,10 @@ def refuse_unexplained(
         times = found.noise_std / friction.noise_std
         why = f"its best fit to one is {best:.0f} %, and it leaves {times:.0f} times the sensor's noise"
     elif late:
-        why = "the motion comes before its command; was the command logged late?"
+        why = "the motion comes before its command, as if that was logged late"
+    elif friction is not None and (untold := friction.level_std / rms_input) > _UNTOLD:
+        known = f"to {200 * untold:.2g} % of the rms command, at most {200 * _UNTOLD:g} %"
+        why = f"its friction cannot be told from slow poles ({known}), as behind a filter"
     if why:
         raise ValueError(said("unexplained_logs", result.output, why, friction is not None))
 
