@@ -1,6 +1,6 @@
 """The compiled time stepper on plain arrays; `plant.plan` makes them and explains the method.
 
-One loop serves records (T samples) and closed loops (one sample a call), so both give the same numbers.
+One loop serves records and closed loops, so both give the same numbers and are compiled once.
 """
 
 from __future__ import annotations
@@ -22,8 +22,10 @@ _SLACK_RAD = 1e-13  # rounding of some hundred steps of a radian
 _AT_START: Any = np.int64(0)
 _IN_THE_MIDDLE: Any = np.int64(1)
 _AT_END: Any = np.int64(2)
+_HUB, _TIP = _AT_START, _IN_THE_MIDDLE  # rows of what a loop measures
 _1, _2, _3, _4 = (np.uint64(i) for i in (1, 2, 3, 4))  # steps of unsigned indices
-_COMPILED: Any = {"cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
+_ENTRY: Any = {"cache": True, "no_cfunc_wrapper": True, "error_model": "numpy"}  # C calls none
+_COMPILED: Any = {**_ENTRY, "no_cpython_wrapper": True}
 
 
 def _called(function: _F) -> _F:
@@ -270,7 +272,7 @@ def _switch(
         mode[e] = wanted[e]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**_ENTRY)
 def run(
     inputs: Real,
     states: Real,
@@ -289,11 +291,23 @@ def run(
     channel_rows: Real,
     static_moment: Real,
     geometric_stiffness: Real,
+    signals: Real,
+    law: Real,
+    limits: Real,
+    grids: Real,
+    path: Real,
+    sensor: Real,
+    counts: Integer,
+    rows: Real,
+    output: Real,
+    command: Real,
+    limited: Any,
 ) -> None:
-    """Advance the state over T samples, writing down that at the start of each.
+    """Advance the state over T samples: of a record, signals (0, 8), writing down the state at the start of
+    each; or of a loop around hub angle or tip, filling output (T, 2), command (T,) and limited (T,).
 
-    inputs (T, 4): voltage of the first and second part of the sample, hub torque, tip force.
-    states (T, N): filled.
+    inputs (T, 4): voltage of the first and second part of the sample, hub torque, tip force. states (T, N):
+        filled. Of a loop both are work space, T = 1.
     x (N,), reference (E,), mode (E,): state, friction slider positions, slip and contact signs; changed in
         place.
     substeps (G,): steps per part of the sample: itself, or two with a fractional delay.
@@ -309,6 +323,16 @@ def run(
     element_rate (Q E, N + 4 + E + J): relative acceleration.
     channel_kind (J,), channel (J, 3), channel_rows (J, N): smooth forces and the position each depends on.
     static_moment (M,), geometric_stiffness (M, M): of the modes under gravity; empty without it.
+    signals (T, 8): set point, what joins the law's command before its limits, what joins the measurement and
+        the command that acts, hub torque, tip force, noise of hub angle and tip.
+    law (n + 1, n + 2): rows of the state and the output, columns A, B, M and C, D, - of x+ = A x + B e + M
+        (limited - wanted), wanted = C x + D e. limits (2,): of the command and of its change in a sample.
+        grids (2,): steps of measurement and command, 0 for none.
+    path (4,): limit that the machine clips its input at, then gain, dead zone and saturation of its voltage.
+    sensor (4,): step of the hub's encoder; gain, drift per sample and step of the tip sensor.
+    counts (4,): samples from computing a command to handing it over, column that is measured, samples of the
+        voltage's delay, parts of a sample.
+    rows (2, N): hub angle and tip of the state.
     """
     n, n_elements, n_channels = x.size, mode.size, channel_kind.size
     n_rows, n_sets = n + 4 + n_elements + 3 * n_channels, 1 << n_elements
@@ -317,7 +341,44 @@ def run(
     free, later = np.empty(reach.shape[1]), np.empty(reach.shape[1])
     position, force = np.zeros(3 * n_channels), np.zeros(3 * n_channels)
     wanted = np.zeros(n_elements, dtype=np.int64)
-    for k in range(inputs.shape[0]):
+    own, own_later = np.zeros(law.shape[0]), np.zeros(law.shape[0])
+    order, delay, column, wait, last = law.shape[0] - 1, counts[0], counts[1], counts[2], 0.0
+    queue, acting = np.zeros(delay + 1), np.zeros(wait + 2)
+    for sample in range(max(inputs.shape[0], signals.shape[0])):
+        k = sample
+        if signals.shape[0] > 0:
+            k = 0
+            hub = _along(rows, _HUB, x) + signals[sample, 6]
+            output[sample, 0] = hub if sensor[0] == 0 else sensor[0] * np.rint(hub / sensor[0])
+            tip = sensor[1] * _along(rows, _TIP, x) + sensor[2] * sample + signals[sample, 7]
+            output[sample, 1] = tip if sensor[3] == 0 else sensor[3] * np.rint(tip / sensor[3])
+            y = output[sample, column] + signals[sample, 2]
+            if grids[0] > 0:
+                y = grids[0] * np.rint(y / grids[0])
+            output[sample, column] = y
+            error = signals[sample, 0] - y
+            wanted_u = law[order, order] * error + signals[sample, 1]
+            for i in range(order):
+                wanted_u += law[order, i] * own[i]
+            u = min(max(wanted_u, last - limits[1]), last + limits[1])
+            u = min(max(u, -limits[0]), limits[0])
+            for i in range(order):
+                own_later[i] = law[i, order] * error + law[i, order + 1] * (u - wanted_u)
+                for j in range(order):
+                    own_later[i] += law[i, j] * own[j]
+            for i in range(order):
+                own[i] = own_later[i]
+            last, limited[sample] = u, u != wanted_u
+            if grids[1] > 0:
+                u = grids[1] * np.rint(u / grids[1])
+            queue[sample % (delay + 1)] = u
+            u = queue[(sample + 1) % (delay + 1)]
+            command[sample] = u
+            voltage = path[1] * min(max(u + signals[sample, 3], -path[0]), path[0])
+            acting[sample % (wait + 2)] = np.copysign(min(max(abs(voltage) - path[2], 0.0), path[3]), voltage)
+            inputs[0, 1] = acting[(sample - wait) % (wait + 2)]
+            inputs[0, 0] = acting[(sample + 1) % (wait + 2)] if counts[3] == 2 else inputs[0, 1]
+            inputs[0, 2], inputs[0, 3] = signals[sample, 4], signals[sample, 5]
         # What has died away is zero: numbers near the smallest there is take a hundred times as long.
         for i in range(n):
             states[k, i] = x[i]
@@ -385,73 +446,3 @@ def run(
                     while remaining > 0 and (remaining >> level) & 1 == 0:
                         level += 1
             part = next_part
-
-
-@njit(cache=True, error_model="numpy")
-def run_in_loop(
-    signals: Real,
-    law: Real,
-    limits: Real,
-    steps: Real,
-    path: Real,
-    sensor: Real,
-    counts: Integer,
-    rows: Real,
-    output: Real,
-    command: Real,
-    limited: Any,
-    x: Real,
-    reference: Real,
-    mode: Integer,
-    arguments: Any,
-) -> None:
-    """Fill output (T, 2), command (T,) and limited (T,) of a loop around hub angle or tip, from rest.
-
-    signals (T, 8): set point, what joins the law's command before its limits, what joins the measurement and
-        the command that acts, hub torque, tip force, noise of hub angle and tip.
-    law (n + 1, n + 2): rows of the state and the output, columns A, B, M and C, D, - of x+ = A x + B e + M
-        (limited - wanted), wanted = C x + D e. limits (2,): of the command and of its change in a sample.
-        steps (2,): of measurement and command, 0 for none.
-    path (4,): limit that the machine clips its input at, then gain, dead zone and saturation of its voltage.
-    sensor (4,): step of the hub's encoder; gain, drift per sample and step of the tip sensor.
-    counts (4,): samples from computing a command to handing it over, column that is measured, samples of the
-        voltage's delay, parts of a sample.
-    rows (2, N): hub angle and tip of the state. x, reference, mode, arguments: as of `run`.
-    """
-    n = law.shape[0] - 1
-    own, later = np.zeros(n), np.zeros(n)
-    delay, column, wait, last = counts[0], counts[1], counts[2], 0.0
-    queue, acting = np.zeros(delay + 1), np.zeros(wait + 2)
-    inputs, states = np.zeros((1, 4)), np.empty((1, x.size))
-    for k in range(signals.shape[0]):
-        hub = _along(rows, 0, x) + signals[k, 6]
-        output[k, 0] = hub if sensor[0] == 0 else sensor[0] * np.rint(hub / sensor[0])
-        tip = sensor[1] * _along(rows, 1, x) + sensor[2] * k + signals[k, 7]
-        output[k, 1] = tip if sensor[3] == 0 else sensor[3] * np.rint(tip / sensor[3])
-        y = output[k, column] + signals[k, 2]
-        if steps[0] > 0:
-            y = steps[0] * np.rint(y / steps[0])
-        output[k, column] = y
-        error = signals[k, 0] - y
-        wanted = law[n, n] * error + signals[k, 1]
-        for i in range(n):
-            wanted += law[n, i] * own[i]
-        u = min(max(wanted, last - limits[1]), last + limits[1])
-        u = min(max(u, -limits[0]), limits[0])
-        for i in range(n):
-            later[i] = law[i, n] * error + law[i, n + 1] * (u - wanted)
-            for j in range(n):
-                later[i] += law[i, j] * own[j]
-        for i in range(n):
-            own[i] = later[i]
-        last, limited[k] = u, u != wanted
-        if steps[1] > 0:
-            u = steps[1] * np.rint(u / steps[1])
-        queue[k % (delay + 1)] = u
-        command[k] = queue[(k + 1) % (delay + 1)]
-        voltage = path[1] * min(max(command[k] + signals[k, 3], -path[0]), path[0])
-        acting[k % (wait + 2)] = np.copysign(min(max(abs(voltage) - path[2], 0.0), path[3]), voltage)
-        inputs[0, 1] = acting[(k - wait) % (wait + 2)]
-        inputs[0, 0] = acting[(k + 1) % (wait + 2)] if counts[3] == 2 else inputs[0, 1]
-        inputs[0, 2], inputs[0, 3] = signals[k, 4], signals[k, 5]
-        run(inputs, states, x, reference, mode, *arguments)

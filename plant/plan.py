@@ -44,6 +44,17 @@ _SMALLEST_PART = 1e-9
 
 # Corner and damping ratio of the accelerometer: far above any mode, and its delay of 0.1 ms is none here.
 _ACCELEROMETER_RAD_S, _ACCELEROMETER_DAMPING = 2 * np.pi * 2000.0, float(np.sqrt(0.5))
+# The last arguments of `plant.kernel.run`, from `signals` on, for a record.
+_NO_LOOP = (
+    np.zeros((0, 8)),
+    np.zeros((1, 2)),
+    *np.zeros((2, 2)),
+    *np.zeros((2, 4)),
+    np.zeros(4, dtype=np.int64),
+    *np.zeros((2, 0, 2)),
+    np.zeros(0),
+    np.zeros(0, dtype=np.bool_),
+)
 # A search makes thousands of plans, always with the same nodes.
 _gauss_legendre = lru_cache(maxsize=16)(np.polynomial.legendre.leggauss)
 
@@ -58,7 +69,8 @@ class PlanState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The last arguments of `plant.kernel.run`, from `substeps` on, and what is needed beside them.
+    """The arguments of `plant.kernel.run` that are the machine's, from `substeps` on, and what is needed
+    beside them.
 
     parts: of a sample, two with a fractional delay. delay_samples: whole ones. output_rows: (6, N).
     start_columns: (N, 3 + 2M). State per unit of hub angle, hub speed, voltage, modal deflections and rates.
@@ -79,7 +91,7 @@ class Plan:
     def advance(self, inputs: Real, state: PlanState) -> Real:
         """(T, N) states at the start of every sample of inputs (T, 4); changes the state."""
         states = np.empty((len(inputs), state.x.size))
-        run(inputs, states, *state, *self.arguments)
+        run(inputs, states, *state, *self.arguments, *_NO_LOOP)
         return states
 
     def at(self, start: Real | None = None, time_s: float = 0.0) -> PlanState:

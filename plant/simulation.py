@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from plant.effects import Effect, make_machine
-from plant.kernel import run_in_loop
+from plant.kernel import run
 from plant.machine import Machine, Real, SensorPath
 from plant.modal import OUTPUT_NAMES
 from plant.plan import SUBSTEP_S, make_plan
@@ -306,7 +306,7 @@ class SampledArm(Simulator):
         """Outputs (T, 2), commands (T,) and whether they were limited (T,) of a loop, from rest: what
         `control_design.analysis.closed_loop.simulate` does, compiled.
 
-        signals (T, 5) and the law's arrays as of `plant.kernel.run_in_loop`; clip: of the machine's input.
+        signals (T, 5) and the law's arrays as of `plant.kernel.run`; clip: of the machine's input.
         A subclass that measures or advances otherwise sets `in_loop` to None.
         """
         n, voltage, sensor = len(signals), self.machine.voltage, self.machine.sensor
@@ -317,7 +317,8 @@ class SampledArm(Simulator):
             levels = self.machine.rig.sensors
             noise = self._rng.standard_normal((n, 2)) * (levels.hub_angle_noise_rad, levels.tip_noise_m)
         output, command, limited = np.empty((n, 2)), np.empty(n), np.empty(n, dtype=np.bool_)
-        run_in_loop(
+        state = self.plan.at()
+        loop: tuple[Any, ...] = (
             np.column_stack([signals, force, noise]),
             law,
             limits,
@@ -329,9 +330,8 @@ class SampledArm(Simulator):
             output,
             command,
             limited,
-            *self.plan.at(),
-            self.plan.arguments,
         )
+        run(np.zeros((1, 4)), np.empty((1, state.x.size)), *state, *self.plan.arguments, *loop)
         return output, command, limited
 
 
