@@ -26,7 +26,7 @@ from control_design.plants.ellipses import Complex, Integer, Real
 from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.angle_program import Rows, parameter_bounds
 from control_design.synthesis.minimax_step import MinimaxStep, minimax_step
-from ident.data.arrays import INSIDE
+from ident.data.arrays import COMPILED, INSIDE
 
 _BOUNDARY = 40  # every 9 degrees; parabola and Newton steps go on from the worst
 _FIRST_BOX, _LARGEST_BOX, _SMALLEST_BOX = 0.3, 1.0, 1e-4
@@ -350,7 +350,7 @@ class _Pattern:
         )
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def _worst_members(
     k: Complex,
     index: Integer,

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 
 from control_design.plants.ellipses import Real
-from ident.data.arrays import INSIDE
+from ident.data.arrays import COMPILED, INSIDE
 
 _MOST = 40  # iterations; 8 to 15 are usual
 _ACCURACY = 1e-8  # complementarity and row residuals, in the logarithm of the worst case
@@ -59,27 +59,29 @@ def minimax_step(
     return MinimaxStep(np.clip(d, low, high), float(np.max(value + slope @ d)), z[:rows] / np.sum(z[:rows]))
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def _interior_point(matrix: Real, limit: Real, hessian: Real, v: Real, rows: int) -> tuple[Real, float]:
     """From v (n + 1,) in place to the optimum: multipliers (rows of the matrix,) and complementarity.
 
-    Written out where numpy is short: an array expression costs numba a second of compilation.
+    Written out where numpy is short: of an array expression or a product numba compiles for a second.
     """
     count, n = matrix.shape
-    turned = np.ascontiguousarray(matrix.T)
     slack, z, ratio, centre = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
-    dslack, dz = np.empty(count), np.empty(count)
-    primal, scaled, right = np.dot(matrix, v), np.empty((n, count)), np.empty(n)
+    dslack, dz, primal, moved = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    normal, dual, right = np.empty((n, n)), np.empty(n), np.empty(n)
+    _along(matrix, v, primal)
+    share = 0.0
     for i in range(count):
         slack[i] = max(limit[i] - primal[i], 1e-3)
         z[i] = 0.1 / slack[i]
-    share = z[:rows].sum()
+        share += z[i] if i < rows else 0.0
     for i in range(rows):
         z[i] /= share
     for _ in range(_MOST):
-        dual = np.dot(turned, z) + np.dot(hessian, v)
+        _along(hessian, v, dual)
         dual[n - 1] += 1.0
-        primal = np.dot(matrix, v)
+        _add_rows(matrix, z, dual)
+        _along(matrix, v, primal)
         total, missed = 0.0, 0.0
         for i in range(count):
             primal[i] += slack[i] - limit[i]
@@ -90,18 +92,20 @@ def _interior_point(matrix: Real, limit: Real, hessian: Real, v: Real, rows: int
             steepest = max(steepest, abs(dual[j]))
         if total < _ACCURACY and steepest < _STATIONARY and missed < _ACCURACY:
             break
+        for j in range(n):
+            for k in range(n):
+                normal[j, k] = hessian[j, k]
         finite = True
         for i in range(count):
             ratio[i] = z[i] / slack[i]
             finite &= np.isfinite(ratio[i])
             for j in range(n):
-                scaled[j, i] = turned[j, i] * ratio[i]
+                factor = ratio[i] * matrix[i, j]
+                for k in range(j + 1):
+                    normal[j, k] += factor * matrix[i, k]
         if not finite:
             break  # a slack has run to its bound: no step from here
-        normal = np.dot(scaled, matrix)
         for j in range(n):
-            for k in range(n):
-                normal[j, k] += hessian[j, k]
             normal[j, j] += 1e-12 * (1.0 + normal[j, j])
         if not _factored(normal):
             break
@@ -113,11 +117,13 @@ def _interior_point(matrix: Real, limit: Real, hessian: Real, v: Real, rows: int
             # Newton's direction of the perturbed optimality conditions.
             for i in range(count):
                 dz[i] = (z[i] * primal[i] - centre[i]) / slack[i]
-            right = np.dot(turned, dz)
+            for j in range(n):
+                right[j] = 0.0
+            _add_rows(matrix, dz, right)
             for j in range(n):
                 right[j] = -dual[j] - right[j]
             _substituted(normal, right)
-            moved = np.dot(matrix, right)
+            _along(matrix, right, moved)
             first, second = 1.0, 1.0
             for i in range(count):
                 dslack[i] = -primal[i] - moved[i]
@@ -143,6 +149,22 @@ def _interior_point(matrix: Real, limit: Real, hessian: Real, v: Real, rows: int
     for i in range(count):
         total += slack[i] * z[i]
     return z, total
+
+
+@numba.njit(**INSIDE)
+def _along(matrix: Real, v: Real, product: Real) -> None:
+    for i in range(matrix.shape[0]):
+        total = 0.0
+        for j in range(v.size):
+            total += matrix[i, j] * v[j]
+        product[i] = total
+
+
+@numba.njit(**INSIDE)
+def _add_rows(matrix: Real, weight: Real, total: Real) -> None:
+    for i in range(weight.size):
+        for j in range(total.size):
+            total[j] += weight[i] * matrix[i, j]
 
 
 @numba.njit(**INSIDE)

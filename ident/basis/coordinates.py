@@ -18,7 +18,7 @@ from numba.extending import register_jitable
 
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.data.arrays import RealArray, kernel_array, lock
+from ident.data.arrays import COMPILED, RealArray, kernel_array, lock
 
 # A pair this close to critical damping is two real poles in disguise; its two columns become dependent.
 ZETA_LIMIT = 0.98
@@ -155,7 +155,7 @@ def _coordinates_of_point(unit: Any, n_real: int, low: Any, high: Any) -> Any:
     return point
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def blocks_of_point(unit: Any, n_real: int, low: Any, high: Any, raw: bool) -> Any:
     """Cascade blocks (`ident.basis.functions.block_parameters`) of a point of the unit cube."""
     point = _coordinates_of_point(unit, n_real, low, high)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ident.basis.poles import Poles
-from ident.data.arrays import ComplexArray, RealArray, one_signal
+from ident.data.arrays import COMPILED, ComplexArray, RealArray, one_signal
 
 
 class LosslessCascade(NamedTuple):
@@ -38,7 +38,7 @@ def block_parameters(poles: Poles) -> RealArray:
     return np.asarray(_blocks(*poles.writable()))
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def _blocks(real: Any, pairs: Any) -> Any:
     blocks = np.zeros((real.size + pairs.size, 4))
     for i in range(real.size):
@@ -199,7 +199,7 @@ def nuisance_columns(poles: Poles, n_samples: int, n_polynomials: int, free: boo
     return np.hstack([powers, free_response(poles, n_samples)]) if free else powers
 
 
-@numba.njit(cache=True, forceinline=True, fastmath={"contract"})
+@numba.njit(**COMPILED, forceinline=True, fastmath={"contract"})
 def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, hi: int) -> None:
     """Drive the cascade with w[lo:hi] from rest; rows[row:, lo:hi] receives the states, w the all-pass
     output. Two samples at a time, x(k+2) = A^2 x(k) + A B v(k) + B v(k+1): a chain of dependent operations
@@ -250,7 +250,7 @@ def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, 
             row += 2
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def run_cascade_free(blocks: Any, n_real: int, rows: Any, row: int, length: int) -> None:
     """Free responses A^k B of the whole cascade into rows[row:, :length]: the states after an impulse at k =
     -1. Zero once a block and its input are below 1e-30, which keeps (slow) denormal numbers away."""

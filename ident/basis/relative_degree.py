@@ -21,7 +21,7 @@ from scipy.special import comb
 
 from ident.basis.functions import basis_state_space
 from ident.basis.poles import Poles
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import COMPILED, ComplexArray, RealArray
 
 # Square roots are drawn until the matrix is this near the identity; 8 Gauss nodes then give the logarithm to
 # ((sqrt(1.25) - 1)/(sqrt(1.25) + 1))^16 = 1e-20.
@@ -112,7 +112,7 @@ def _schur_vectors(block: RealArray, pole: complex) -> ComplexArray:
     return np.asarray(vectors, dtype=np.complex128)
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def _square_root(matrix: Any) -> Any:
     """Of a lower triangular complex matrix, from the diagonal outwards (scipy's sqrtm loses two digits)."""
     root = np.zeros_like(matrix)

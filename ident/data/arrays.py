@@ -12,8 +12,10 @@ ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
-# Options of a numba function that compiled code alone calls: the ways in for Python and C are not compiled.
-INSIDE: Any = {"cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+# Options of numba functions. The way in for C, which nothing takes, is not compiled; nor is that for Python
+# of what compiled code alone calls.
+COMPILED: Any = {"cache": True, "no_cfunc_wrapper": True}
+INSIDE: Any = {**COMPILED, "no_cpython_wrapper": True}
 
 
 def kernel_array(array: RealArray) -> RealArray:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ident.basis.coordinates import blocks_of_point
 from ident.basis.functions import run_cascade, run_cascade_free
-from ident.data.arrays import INSIDE
+from ident.data.arrays import COMPILED, INSIDE
 
 # A column whose part outside the columns before it is below this share of its length says nothing.
 _RANK_TOLERANCE = 1e-11
@@ -163,7 +163,7 @@ def backward(factor: Any, n: int, b: Any) -> None:
         b[i] /= factor[i, i]
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def driven_rows(blocks: Any, n_real: int, signals: Any, starts: Any, rows: Any) -> None:
     """States of a cascade driven by each of the signals (U, N), record by record from rest, into rows
     (U B, N); signals become what its all-pass makes of them."""
@@ -173,7 +173,7 @@ def driven_rows(blocks: Any, n_real: int, signals: Any, starts: Any, rows: Any) 
             run_cascade(blocks, n_real, signals[i], rows, i * order, starts[r], starts[r + 1])
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**COMPILED, inline="always")
 def _free_rows(blocks: Any, n_real: int, starts: Any) -> Any:
     """Free responses of a cascade over the longest record (B, T)."""
     longest = starts[0]  # 0; of Python's own numba would compile `run_cascade_free` once more
@@ -184,7 +184,7 @@ def _free_rows(blocks: Any, n_real: int, starts: Any) -> Any:
     return rows
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def cost_of_point(
     unit: Any,
     n_real: int,
@@ -243,7 +243,7 @@ def cost_of_point(
     return float(_dot(residual, residual, _START, n_total) - schur_drop(gram, on_frozen[:, n_frozen].copy()))
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**COMPILED, inline="always")
 def _local_rows(blocks: Any, n_real: int, polynomials_q: Any, starts: Any) -> Any:
     """Polynomials and free responses (L, N), orthonormal in each record (modified Gram-Schmidt, twice)."""
     n_known = polynomials_q.shape[0]
@@ -286,7 +286,7 @@ def _off_local_products(rows: Any, first: int, local_q: Any, starts: Any, on_loc
     _subtract_squares(gram[:, :], on_local[: rows.shape[0], :], first)
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def linearise(
     blocks: Any,
     n_real: int,

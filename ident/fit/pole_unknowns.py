@@ -12,12 +12,13 @@ import numba
 import numpy as np
 
 from ident.basis.functions import _blocks
+from ident.data.arrays import COMPILED
 from ident.fit.kernels import backward, factorise, forward, schur_drop
 
 # Order of the numbers in an array of bounds (see `ident.fit.refinement.Bounds`).
 _DISTANCE_MIN, _DISTANCE_MAX, _OMEGA_MIN, _OMEGA_MAX, _ZETA_MIN, _ZETA_MAX, _S_MIN = range(7)
-# Pieces of the three functions at the end: as functions of their own they would all be compiled twice.
-_inlined = numba.njit(cache=True, inline="always")
+# Pieces of the two compiled functions at the end: as functions of their own they would be compiled twice.
+_inlined = numba.njit(**COMPILED, inline="always")
 _CLOSE = 1e-7  # poles pass through exp and log on their way to a bound
 
 
@@ -41,7 +42,7 @@ def clip_parameters(x: Any, n_free_real: int, bounds: Any) -> Any:
 @_inlined
 def blocked(x: Any, gradient: Any, n_free_real: int, bounds: Any) -> Any:
     """Unknowns on a bound that would be driven out of it (a step goes along +gradient = S^T r)."""
-    held = np.zeros(x.size, dtype=np.bool_)
+    held = np.zeros(x.size)  # 1: held; zeros of another type would be compiled for this alone
     low, high = 1 + _CLOSE, 1 - _CLOSE
     for i in range(n_free_real):
         if gradient[i] < 0:
@@ -107,7 +108,6 @@ def _by_unknowns(chain: Any, normal: Any, gradient: Any) -> tuple[Any, Any]:
     return system, slope
 
 
-@_inlined
 def free_parameters(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> Any:
     """1 - a of the free real poles, then s, f of each free pair."""
     n_free_real = real.size - n_fixed_real
@@ -132,24 +132,30 @@ def set_poles(x: Any, real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: i
         pairs[j] = math.exp(-s) * complex(math.cos(f), math.sin(f))
 
 
-@numba.njit(cache=True)
 def start(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int, bounds: Any) -> Any:
-    """The unknowns of the poles, brought inside the bounds, and the poles with them."""
+    """The unknowns of the poles, brought inside the bounds, and the poles with them. Too seldom to be
+    compiled."""
     x = free_parameters(real, pairs, n_fixed_real, n_fixed_pairs)
-    x = clip_parameters(x, real.size - n_fixed_real, bounds)
-    set_poles(x, real, pairs, n_fixed_real, n_fixed_pairs)
+    x = clip_parameters.py_func(x, real.size - n_fixed_real, bounds)
+    set_poles.py_func(x, real, pairs, n_fixed_real, n_fixed_pairs)
     return x
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def scaled_system(
-    real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int, bounds: Any, normal: Any, gradient: Any
+    x: Any,
+    real: Any,
+    pairs: Any,
+    n_fixed_real: int,
+    n_fixed_pairs: int,
+    bounds: Any,
+    normal: Any,
+    gradient: Any,
 ) -> Any:
-    """Normal matrix and S^T r of the unknowns that no bound holds, each unknown scaled to unit length.
+    """Normal matrix and S^T r of the unknowns x that no bound holds, each unknown scaled to unit length.
 
     Also the scales, the indices of these unknowns and the fall of J that the linearisation promises.
     """
-    x = free_parameters(real, pairs, n_fixed_real, n_fixed_pairs)
     chain = chain_rule(real, pairs, n_fixed_real, n_fixed_pairs)
     full_system, full_slope = _by_unknowns(chain, normal, gradient)
     held = blocked(x, full_slope, real.size - n_fixed_real, bounds)
@@ -169,7 +175,7 @@ def scaled_system(
     return system, slope, scale, free[:m], schur_drop(system.copy(), slope.copy())
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def damped_step(
     x: Any,
     n_fixed_real: int,

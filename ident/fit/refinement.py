@@ -17,7 +17,7 @@ from ident.basis.coordinates import ZETA_LEAST, ZETA_LIMIT
 from ident.basis.options import IdentOptions
 from ident.basis.poles import NO_POLES, Poles
 from ident.data.arrays import RealArray
-from ident.fit.pole_unknowns import chain_rule, damped_step, scaled_system, start
+from ident.fit.pole_unknowns import chain_rule, damped_step, free_parameters, scaled_system, start
 from ident.fit.problem import Linearisation, Linearised
 
 # Damping of the first step, in units of the scaled normal matrix: from afar a full step leads too far.
@@ -104,7 +104,7 @@ def refine(
     growth = _GROWTH
     for iteration in range(max_iterations):
         system, slope, scale, free, promised = scaled_system(
-            real, pairs, *n_fixed, limits, here.normal, here.gradient
+            x, real, pairs, *n_fixed, limits, here.normal, here.gradient
         )
         if here.rss <= floor or promised <= tolerance * here.rss:
             return Refined(Poles(real, pairs), here.rss, iteration, True)
@@ -141,5 +141,6 @@ def free_optimality(here: Linearisation, poles: Poles, bounds: Bounds, fixed: Po
     """|P r|/|r| over the tangent directions of the poles that are neither fixed nor held by a bound: 0 at an
     optimum. With records from rest and nothing held it is |Phi2^T r|/|r|, Phi2 the orthonormal doubled
     basis."""
-    promised = scaled_system(*poles.writable(), *fixed.counts, bounds.array, here.normal, here.gradient)[-1]
+    known = (*poles.writable(), *fixed.counts)
+    promised = scaled_system(free_parameters(*known), *known, bounds.array, here.normal, here.gradient)[-1]
     return float(np.sqrt(max(promised, 0.0) / here.rss)) if here.rss > 0 else 0.0

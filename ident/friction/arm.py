@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure, filter_input, front_response
 from ident.data.arrays import BoolArray, ComplexArray, RealArray, kernel_array, real_rows
 from ident.data.record import Record
-from ident.friction.kernel import step_through
+from ident.friction.kernel import STEPS, STRIDES, step_through
 
 # A pole at zero is a delay, which no motion in continuous time has: the fastest rate that is stepped.
 FASTEST_POLE = 2e-3
@@ -103,6 +104,18 @@ class SteppedArm:
         weights[twofold] += 1j * solved[rates.size :]
         return cls(poles, structure, dt_s, rates, chain, weights)
 
+    @cached_property
+    def moves(self) -> ComplexArray:
+        """(2, 3, N): over a step, and a stride, a state's decay, a unit of effort onto it, the state before
+        it onto it."""
+        length = self.dt_s / np.array([[STEPS], [STRIDES]])
+        decay = np.exp(self.rates * length)
+        carried = np.where(self.chain, length * decay, 0)
+        rates = np.where(self.rates == 0, 1, self.rates)
+        onto = np.where(self.rates == 0, length, (decay - 1) / rates)
+        onto = np.where(self.chain, (carried - onto) / rates, onto)
+        return np.stack([decay, onto, carried], axis=1)
+
     def run(
         self,
         coefficients: RealArray,
@@ -117,6 +130,7 @@ class SteppedArm:
         position, friction = np.empty(voltage.size), np.empty(voltage.size)
         step_through(
             kernel_array(filter_input(voltage, 0, self.structure.input_delay_samples)),
+            self.moves,
             self.rates,
             self.chain,
             weights,

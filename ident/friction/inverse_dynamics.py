@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import COMPILED, ComplexArray, RealArray
 from ident.data.record import Record
 
 # Lines over which a spectrum is smoothed, and what lines of white noise may have beyond their median.
@@ -81,7 +81,7 @@ def direction_of(position: RealArray, presliding: float) -> RealArray:
     return np.asarray(0.5 * (found + np.append(found[1:], found[-1])))
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def _slip(moved: Any) -> None:
     """Sum of moved (T,), in place, that never leaves -1 .. 1."""
     state = 0.0

@@ -22,32 +22,12 @@ from typing import Any
 import numba
 import numpy as np
 
-from ident.data.arrays import INSIDE
+from ident.data.arrays import COMPILED, INSIDE
 
-_STRIDES, _STEPS = 2, 16  # strides of a sample, steps of a stride
-_ALL = _STRIDES * _STEPS  # steps of a sample
+STRIDES, _STEPS = 2, 16  # strides of a sample, steps of a stride
+STEPS = STRIDES * _STEPS  # of a sample
 _OVER = 8.0  # speeds, in units of `fall`, from which on the excess is gone
 _TINY = np.finfo(np.float64).tiny
-
-
-@numba.njit(**INSIDE)
-def transitions(rates: Any, chain: Any, dt_s: float) -> Any:
-    """(2, 3, N): of a step, and a stride, a state's decay, a unit of effort onto it, the state before it onto
-    it."""
-    moves = np.zeros((2, 3, rates.size), dtype=np.complex128)
-    for k in range(2):
-        length = dt_s / _STRIDES if k else dt_s / (_STRIDES * _STEPS)
-        for j in range(rates.size):
-            s = rates[j]
-            if s == 0:
-                moves[k, 0, j], moves[k, 1, j] = 1.0, length
-            else:
-                moves[k, 0, j] = np.exp(s * length)
-                moves[k, 1, j] = (moves[k, 0, j] - 1) / s
-                if chain[j]:
-                    moves[k, 2, j] = length * moves[k, 0, j]
-                    moves[k, 1, j] = (moves[k, 2, j] - moves[k, 1, j]) / s
-    return moves
 
 
 # A step waits for the sum before it: sums in any order are a fifth faster.
@@ -76,10 +56,10 @@ def advance(
     level, presliding, excess, fall = law[0], law[1], law[2], law[3]
     position, deflection, speed = shaft[0], shaft[1], shaft[2]
     breakaway = max(level + excess, _TINY)
-    stiffness, limit, step_s = breakaway / presliding, level, dt_s / _ALL
+    stiffness, limit, step_s = breakaway / presliding, level, dt_s / STEPS
     most = presliding * max(limit, _TINY) / breakaway
     total, moment = 0.0, 0.0
-    for stride in range(_STRIDES):
+    for stride in range(STRIDES):
         constant = excess == 0 or abs(speed) > _OVER * fall
         if constant and abs(deflection) >= presliding * max(level, _TINY) / breakaway:
             force = level if deflection > 0 else -level
@@ -97,7 +77,7 @@ def advance(
                     state[j] = tried[j]
                 position = new
                 total += _STEPS * force
-                moment += _STEPS * force * (_STEPS * (stride + 0.5) - 0.5 * _ALL)
+                moment += _STEPS * force * (_STEPS * (stride + 0.5) - 0.5 * STEPS)
                 continue
             speed = 0.0
             for j in range(n):
@@ -116,7 +96,7 @@ def advance(
             force = stiffness * (deflection + 0.5 * (free - position)) / (1 + 0.5 * stiffness * gain)
             force = min(max(force, -limit), limit)
             total += force
-            moment += force * (_STEPS * stride + step + 0.5 - 0.5 * _ALL)
+            moment += force * (_STEPS * stride + step + 0.5 - 0.5 * STEPS)
             new = free - gain * force
             deflection = min(max(deflection + new - position, -most), most)
             speed = (new - position) / step_s
@@ -124,12 +104,13 @@ def advance(
             for j in range(n):
                 state[j] += onto[j] * (drive - force)
     shaft[0], shaft[1], shaft[2] = position, deflection, speed
-    return total / _ALL, moment / _ALL**2
+    return total / STEPS, moment / STEPS**2
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def step_through(
     drive: Any,
+    moves: Any,
     rates: Any,
     chain: Any,
     weights: Any,
@@ -143,10 +124,10 @@ def step_through(
     """Fill position (T,) and the friction (T,), held over every sample, for a drive (T,) held over each.
 
     At every sample the states take correction (N,) times what the measured (T,) position is off the one
-    predicted, which is the one that is told; correction of size 0: a free run.
+    predicted, which is the one that is told; correction of size 0: a free run. moves, rates, chain:
+    of `ident.friction.arm.SteppedArm`.
     """
     moments = np.empty(drive.size)
-    moves = transitions(rates, chain, dt_s)
     state, shaft = np.zeros(rates.size, dtype=np.complex128), np.zeros(3)
     for k in range(drive.size):
         position[k] = shaft[0]
@@ -160,7 +141,7 @@ def step_through(
         friction[k] += 0.5 * (moments[k - 1] - moments[k + 1])
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def loop_through(
     reference: Any,
     noise: Any,
@@ -170,6 +151,7 @@ def loop_through(
     steps: Any,
     delay: int,
     input_delay: int,
+    moves: Any,
     rates: Any,
     chain: Any,
     weights: Any,
@@ -189,14 +171,13 @@ def loop_through(
     for none. delay, input_delay: samples until a command is given to the arm, and until it acts.
     """
     order = law.shape[0] - 1
-    moves = transitions(rates, chain, dt_s)
     state, x, later = np.zeros(rates.size, dtype=np.complex128), np.zeros(order), np.zeros(order)
     shaft, last = np.zeros(3), 0.0
     queue, waiting = np.zeros(delay + 1), np.zeros(input_delay + 1)
     for k in range(reference.size):
         y = shaft[0] + noise[k]
         if steps[0] > 0:
-            y = steps[0] * np.round(y / steps[0])
+            y = steps[0] * np.rint(y / steps[0])
         error = reference[k] - y
         wanted = law[order, order] * error + added[k]
         for i in range(order):
@@ -211,7 +192,7 @@ def loop_through(
             x[i] = later[i]
         last = u
         if steps[1] > 0:
-            u = steps[1] * np.round(u / steps[1])
+            u = steps[1] * np.rint(u / steps[1])
         queue[k % (delay + 1)] = u
         u = queue[(k + 1) % (delay + 1)]
         measured[k], command[k], limited[k] = y, u, last != wanted

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from ident.basis.model import GobfModel
-from ident.data.arrays import RealArray
+from ident.data.arrays import COMPILED, RealArray
 from ident.friction.arm import FrictionLaw
 
 # A zero that is damped more than this, or lies above the first mode, is no load behind a spring.
@@ -71,7 +71,7 @@ class Spring:
         return found
 
 
-@numba.njit(cache=True)
+@numba.njit(**COMPILED)
 def _hold(
     motor: Any, omega: float, zeta: float, dt_s: float, level: float, excess: float, fall: float, found: Any
 ) -> None:

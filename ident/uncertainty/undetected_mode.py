@@ -22,7 +22,7 @@ from scipy.linalg import solve_triangular
 
 from ident.basis.functions import basis_response, block_parameters
 from ident.basis.poles import Poles
-from ident.data.arrays import BoolArray, ComplexArray, RealArray, kernel_array, readonly
+from ident.data.arrays import COMPILED, BoolArray, ComplexArray, RealArray, kernel_array, readonly
 from ident.uncertainty.embedding_algebra import (
     KernelPosterior,
     ReducedRegression,
@@ -165,7 +165,7 @@ def pair_statistics(
     return PairStatistics(matrices, inner[:, q].reshape(-1, 2), onto, residual, size)
 
 
-@numba.njit(cache=True, fastmath=True)
+@numba.njit(**COMPILED, fastmath=True)
 def _pair_rows(parameters: Any, signal: Any, states: Any) -> Any:
     """The two basis functions of every pair alone, driven by the signal (T,): two arrays (T,J). states (2,J):
     where the pairs start, and afterwards stand. All pairs advance together, neighbours in memory."""
@@ -189,18 +189,9 @@ def _pair_rows(parameters: Any, signal: Any, states: Any) -> Any:
     return out1, out2
 
 
-@numba.njit(cache=True, fastmath=True)
-def _pair_gram(x1: Any, x2: Any) -> Any:
+def _pair_gram(x1: RealArray, x2: RealArray) -> RealArray:
     """Entries (0,0), (0,1), (1,1) of X^T X for every pair; (3, J)."""
-    out = np.zeros((3, x1.shape[1]))
-    aa, ab, bb = out[0], out[1], out[2]
-    for k in range(x1.shape[0]):
-        p, q = x1[k], x2[k]
-        for i in range(p.size):
-            aa[i] += p[i] * p[i]
-            ab[i] += p[i] * q[i]
-            bb[i] += q[i] * q[i]
-    return out
+    return np.stack([np.einsum("kj,kj->j", a, b) for a, b in ((x1, x1), (x1, x2), (x2, x2))])
 
 
 def pair_evidence(statistics: PairStatistics, degrees_of_freedom: int) -> PairEvidence:

@@ -142,7 +142,6 @@ def test_kernels_are_compiled_once_for_one_kind_of_array():
         "kernels.cost_of_point",
         "kernels.linearise",
         "coordinates.blocks_of_point",
-        "pole_unknowns.start",
         "pole_unknowns.scaled_system",
         "pole_unknowns.damped_step",
     ):

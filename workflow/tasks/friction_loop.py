@@ -21,6 +21,7 @@ from control_design.analysis.closed_loop import (
     step_metrics,
 )
 from control_design.controllers.controller import Controller, FrictionFeedforward
+from ident.data.arrays import kernel_array
 from ident.friction import FrictionFit, FrictionLaw
 from ident.friction.kernel import loop_through
 from workflow.tasks.loop_sensitivity import SMALL, measured_on_arm, sensitivity_plan, settling_samples
@@ -67,13 +68,14 @@ class FrictionLoop:
         n = reference.size
         measured, command, limited = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
         loop_through(
-            np.ascontiguousarray(reference, dtype=np.float64),
+            kernel_array(reference),
             np.zeros(n) if noise is None else self.found.noise_std * noise.standard_normal(n),
             np.zeros(n) if law.feedforward is None else law.feedforward.signal(reference, law.dt_s),
             *law_arrays(law),
             np.array([self.measurement_step, self.command_step]),
             law.computational_delay_samples,
             arm.structure.input_delay_samples,
+            arm.moves,
             arm.rates,
             arm.chain,
             arm.weights @ self.coefficients,
