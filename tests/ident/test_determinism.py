@@ -96,25 +96,26 @@ def assert_same(first, second, what):
 
 @pytest.mark.slow
 def test_fits_do_not_depend_on_what_ran_before_or_who_compiled(tmp_path):
-    """Five roads to the same bytes: a process that compiles everything for these fits, one that finds all
-    compiled, one that has done everything else before, with the code of another order of compilation, and
-    this process."""
+    """Three roads to the same bytes: a process that compiles everything for these fits, one that finds that
+    compiled and has done everything else before, and one with another order of compilation."""
     fits, others = "print(json.dumps(the_fits()))", "everything_else(); "
     compiling = in_a_fresh_process(tmp_path / "a", fits)
-    assert_same(compiling, in_a_fresh_process(tmp_path / "a", fits), "compiled against found compiled")
-    assert_same(compiling, in_a_fresh_process(tmp_path / "a", others + fits), "after other fits")
+    assert_same(compiling, in_a_fresh_process(tmp_path / "a", others + fits), "compiled, after other fits")
     assert_same(compiling, in_a_fresh_process(tmp_path / "b", others + fits), "compiled by others")
-    assert_same(compiling, in_a_fresh_process(tmp_path / "b", fits), "found compiled by others")
 
 
-def test_a_fit_in_a_used_process_is_that_of_a_fresh_one():
-    cache = os.environ.get("NUMBA_CACHE_DIR", "")
+@pytest.fixture(scope="module")
+def fresh():
+    """The fits of a fresh process, and what was compiled there."""
+    code = "fits = the_fits(); everything_else(); print(json.dumps([fits, compiled()]))"
+    return in_a_fresh_process(os.environ.get("NUMBA_CACHE_DIR", ""), code)
+
+
+def test_a_fit_in_a_used_process_is_that_of_a_fresh_one(fresh):
     here = the_fits()
     everything_else()
     assert_same(here, the_fits(), "before and after other fits")
-    assert_same(
-        here, in_a_fresh_process(cache, "print(json.dumps(the_fits()))"), "this process against a fresh one"
-    )
+    assert_same(here, fresh[0], "this process against a fresh one")
 
 
 def compiled():
@@ -131,10 +132,9 @@ def compiled():
     return found
 
 
-def test_kernels_are_compiled_once_for_one_kind_of_array():
+def test_kernels_are_compiled_once_for_one_kind_of_array(fresh):
     """No locked array reaches compiled code: it would be another type there, and another compilation."""
-    code = "the_fits(); everything_else(); print(json.dumps(compiled()))"
-    found = in_a_fresh_process(os.environ.get("NUMBA_CACHE_DIR", ""), code)
+    found = fresh[1]
     assert [name for name, _, locked in found if locked] == []
     count = {name: number for name, number, _ in found}
     for entry in (
