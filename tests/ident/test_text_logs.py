@@ -206,125 +206,76 @@ def test_dates_counted_in_another_unit_are_asked_for(tmp_path, name, unit, digit
 
 
 SEVEN = (T_S - 0.2).round(9)
+# Lines above the numbers, with bars between them; the numbers; the names of time, input and output.
 SCOPES = {
     "Rigol": (
-        ["X,CH1,CH2,Start,Increment,", "Sequence,Volt,Volt,-2.000000e-01,5.000000e-03"],
+        "X,CH1,CH2,Start,Increment,|Sequence,Volt,Volt,-2.000000e-01,5.000000e-03",
         [f"{k},{U[k]:.3e},{Y[k]:.6e},," for k in K],
         ("X", "CH1", "CH2"),
     ),
     "Rigol, start and step in the head alone": (
-        ["X,CH1,CH2,Start,Increment", "Sequence,VOLT,VOLT,-5.000000e-01,5.000000e-03"],
+        "X,CH1,CH2,Start,Increment|Sequence,VOLT,VOLT,-5.000000e-01,5.000000e-03",
         [f"{k},{U[k]:.3e},{Y[k]:.6e}" for k in K],
         ("X", "CH1", "CH2"),
     ),
     "Infiniium": (
-        ["Revision:,1", "Type:,raw", "Points:,80", "XInc:,5.0E-3", "XOrg:,-5.0E-1", "YUnits:,Volt", "Data:,"],
+        "Revision:,1|Type:,raw|Points:,80|XInc:,5.0E-3|XOrg:,-5.0E-1|YUnits:,Volt|Data:,",
         [f"{U[k]:.3e},{Y[k]:.6e}" for k in K],
         ("time", "column 1", "column 2"),
     ),
-    "Rohde & Schwarz, semicolons": (
-        ["Time;Ch1Wfm1;Ch2Wfm1"],
-        rows(";", SEVEN),
-        ("Time", "Ch1Wfm1", "Ch2Wfm1"),
-    ),
+    "Rohde & Schwarz, semicolons": ("Time;Ch1Wfm1;Ch2Wfm1", rows(";", SEVEN), ("Time", "Ch1Wfm1", "Ch2Wfm1")),
     "Rigol without stamps": (
-        ["CH1V,CH2V,t0 =-0.2, tInc = 0.005,"],
+        "CH1V,CH2V,t0 =-0.2, tInc = 0.005,",
         [f"{U[k]:.3e},{Y[k]:.6e},," for k in K],
         ("time", "CH1V", "CH2V"),
     ),
     "Tektronix": (
-        [
-            "Model,MDO3024",
-            "Firmware Version,1.26",
-            "",
-            "Point Format,Y,",
-            "Horizontal Units,S,",
-            "Sample Interval,5e-03",
-            "Record Length,80",
-            "Probe Attenuation,1,10",
-            "Vertical Units,V,V",
-            "Label,,",
-            "TIME,CH1,CH2",
-        ],
+        "Model,MDO3024|Firmware Version,1.26||Point Format,Y,|Horizontal Units,S,|Sample Interval,5e-03|"
+        "Record Length,80|Probe Attenuation,1,10|Vertical Units,V,V|Label,,|TIME,CH1,CH2",
         rows(",", SEVEN),
         ("TIME", "CH1", "CH2"),
     ),
-    "Keysight": (["x-axis,1,2", "second,Volt,Volt"], rows(",", SEVEN), ("x-axis", "1", "2")),
+    "Keysight": ("x-axis,1,2|second,Volt,Volt", rows(",", SEVEN), ("x-axis", "1", "2")),
     "Siglent": (
-        [
-            "Record Length,Analog:80",
-            "Sample Interval,0.005",
-            "Vertical Units,V,V",
-            "Source,CH1,CH2",
-            "Second,Volt,Volt",
-        ],
+        "Record Length,Analog:80|Sample Interval,0.005|Vertical Units,V,V|Source,CH1,CH2|Second,Volt,Volt",
         rows(",", SEVEN),
         ("Source", "CH1", "CH2"),
     ),
     "LeCroy": (
-        [
-            "LECROYHDO4034,12345,Waveform",
-            "Segments,1,SegmentSize,80",
-            "Segment,TrigTime,TimeSinceSegment1",
-            "#1,01-Mar-2024 12:00:00,0",
-            "Time,Ampl,Ampl2",
-        ],
+        "LECROYHDO4034,12345,Waveform|Segments,1,SegmentSize,80|Segment,TrigTime,TimeSinceSegment1|"
+        "#1,01-Mar-2024 12:00:00,0|Time,Ampl,Ampl2",
         rows(",", SEVEN),
         ("Time", "Ampl", "Ampl2"),
     ),
-    "Rohde & Schwarz": (["in s,CH1 in V,CH2 in V"], rows(",", SEVEN), ("in s", "CH1 in V", "CH2 in V")),
+    "Rohde & Schwarz": ("in s,CH1 in V,CH2 in V", rows(",", SEVEN), ("in s", "CH1 in V", "CH2 in V")),
     "PicoScope": (
-        ["Time,Channel A,Channel B", "(ms),(V),(V)", ""],
+        "Time,Channel A,Channel B|(ms),(V),(V)|",
         rows(",", 1e3 * SEVEN),
         ("Time", "Channel A", "Channel B"),
     ),
     "LabVIEW": (
-        [
-            "LabVIEW Measurement\t",
-            "Writer_Version\t2",
-            "Separator\tTab",
-            "X_Columns\tOne",
-            "Date\t2024/03/01",
-            "***End_of_Header***\t",
-            "\t",
-            "Channels\t2\t\t",
-            "Samples\t80\t80\t",
-            "Date\t2024/03/01\t2024/03/01\t",
-            "Time\t12:00:00.5\t12:00:00.5\t",
-            "Y_Unit_Label\tVolts\tVolts\t",
-            "X_Dimension\tTime\tTime\t",
-            "X0\t0.0E+0\t0.0E+0\t",
-            "Delta_X\t0.005\t0.005\t",
-            "***End_of_Header***\t\t\t",
-            "X_Value\tDrive\tHub\tComment",
-        ],
+        "LabVIEW Measurement\t|Writer_Version\t2|Separator\tTab|X_Columns\tOne|Date\t2024/03/01|"
+        "***End_of_Header***\t|\t|Channels\t2\t\t|Samples\t80\t80\t|Date\t2024/03/01\t2024/03/01\t|"
+        "Time\t12:00:00.5\t12:00:00.5\t|Y_Unit_Label\tVolts\tVolts\t|X_Dimension\tTime\tTime\t|"
+        "X0\t0.0E+0\t0.0E+0\t|Delta_X\t0.005\t0.005\t|***End_of_Header***\t\t\t|"
+        "X_Value\tDrive\tHub\tComment",
         rows("\t"),
         ("X_Value", "Drive", "Hub"),
     ),
     "LabVIEW without stamps": (
-        [
-            "LabVIEW Measurement\t",
-            "X_Columns\tNo",
-            "***End_of_Header***\t",
-            "",
-            "Channels\t2\t\t",
-            "Samples\t80\t80\t",
-            "X_Dimension\tTime\tTime\t",
-            "X0\t0.0E+0\t0.0E+0\t",
-            "Delta_X\t0.005\t0.005\t",
-            "***End_of_Header***\t\t\t",
-            "X_Value\tDrive\tHub\tComment",
-        ],
+        "LabVIEW Measurement\t|X_Columns\tNo|***End_of_Header***\t||Channels\t2\t\t|Samples\t80\t80\t|"
+        "X_Dimension\tTime\tTime\t|X0\t0.0E+0\t0.0E+0\t|Delta_X\t0.005\t0.005\t|"
+        "***End_of_Header***\t\t\t|X_Value\tDrive\tHub\tComment",
         [f"\t{U[k]}\t{Y[k]}" for k in K],
         ("X_Value", "Drive", "Hub"),
     ),
     "CODESYS": (
-        ["Trace;MyTrace", "Task;MainTask", "", "Time [us];PLC_PRG.rDrive;PLC_PRG.rHub"],
+        "Trace;MyTrace|Task;MainTask||Time [us];PLC_PRG.rDrive;PLC_PRG.rHub",
         rows(";", 1e6 * T_S),
         ("Time [us]", "PLC_PRG.rDrive", "PLC_PRG.rHub"),
     ),
     "a data logger": (
-        ["Logger,5.2,0.1", "Channels,1,2", "Gain,1,10", "Offset,0,0", "Elapsed,Drive,Hub", "s,V,mm"],
+        "Logger,5.2,0.1|Channels,1,2|Gain,1,10|Offset,0,0|Elapsed,Drive,Hub|s,V,mm",
         rows(),
         ("Elapsed", "Drive", "Hub"),
     ),
@@ -335,14 +286,14 @@ SCOPES = {
 def test_instruments(name, tmp_path):
     above, lines, (time, drive, hub) = SCOPES[name]
     file = "a.lvm" if "LabVIEW" in name else "a.csv"
-    path = written(tmp_path, ",", [], above=above, lines=lines, file=file)
+    path = written(tmp_path, ",", [], above=above.split("|"), lines=lines, file=file)
     table = read_table(path)
     assert time_of(table) == time
     record = Record.from_file(table, [drive], [hub], time=time)
     assert record.dt_s == pytest.approx(DT_S, rel=1e-9)
     np.testing.assert_allclose(record.input[:, 0], U, rtol=1e-6)
     np.testing.assert_allclose(record.output[:, 0], Y, rtol=1e-6)
-    if "Volt" in "".join(above) and "Infiniium" not in name:
+    if "Volt" in above and "Infiniium" not in name:
         assert record.input_units == ("V",)
 
 
