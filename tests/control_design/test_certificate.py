@@ -60,23 +60,15 @@ def test_every_requirement_is_listed_with_its_number():
         performance=Channel(tip_acceleration(), RelativeDisc(tip_acceleration(), 0.02, 60.0)),
     )
     spec = Specification(
-        bandwidth_rad_s=2.0,
-        integrator=True,
-        modulus_margin=0.6,
-        effort_limit=10.0,
-        mode_peak_ratio=0.2,
+        bandwidth_rad_s=2.0, integrator=True, modulus_margin=0.6, effort_limit=10.0, mode_peak_ratio=0.2,
         delay_margin_s=0.01,
-    )
+    )  # fmt: skip
     certificate = certify(gain(0.3), [plant], spec)
     met = {item.requirement.split(",")[0]: item.met for item in certificate.items}
     assert met == {
-        "modulus margin": True,
-        "tracking": False,
-        "effort": True,
-        "damping of the mode": False,
-        "delay margin": True,
-        "integrators in the controller": False,
-    }
+        "modulus margin": True, "tracking": False, "effort": True, "damping of the mode": False,
+        "delay margin": True, "integrators in the controller": False,
+    }  # fmt: skip
     assert not certificate.certified
     assert certificate.plants[0].own_performance
 

@@ -166,16 +166,9 @@ def test_measured_sensitivity_of_a_linear_machine_is_the_analytic_one():
 def test_scatter_of_measured_sensitivity_is_stated_rightly(periods, draws):
     """Errors against the truth, in units of the stated deviation of the mean, have mean square near one."""
     found = measure_sensitivity(
-        _GAIN,
-        _Noisy(hub_arm(), np.random.default_rng(2), 0.01),
-        np.random.default_rng(3),
-        rms=0.1,
-        band_rad_s=(1.0, 200.0),
-        period_samples=2000,
-        periods=periods,
-        draws=draws,
-        lead_in_periods=2,
-    )
+        _GAIN, _Noisy(hub_arm(), np.random.default_rng(2), 0.01), np.random.default_rng(3), rms=0.1,
+        band_rad_s=(1.0, 200.0), period_samples=2000, periods=periods, draws=draws, lead_in_periods=2,
+    )  # fmt: skip
     error = np.abs(found.response) - np.abs(_analytic_sensitivity(found.omega_rad_s))
     # 300 lines: the ratio of mean squares has a relative standard deviation of 9 %; 4 of them allowed.
     assert np.mean(error**2) / np.mean(found.std**2) == pytest.approx(1.0, abs=0.36)

@@ -163,15 +163,9 @@ def _posterior(rng: np.random.Generator, integrators: int = 1) -> ResponsePoster
     poles = Poles(np.array([0.9, 0.0]), np.array([0.99 * np.exp(0.08j), 0.99 * np.exp(0.08j)]))
     size = poles.order + 1 + 12
     return ResponsePosterior(
-        poles=poles,
-        mean=rng.standard_normal(size),
-        covariance_factor=0.1 * rng.standard_normal((size, 8)),
-        dt_s=_DT,
-        fir_length=12,
-        has_feedthrough=True,
-        integrators=integrators,
-        input_delay_samples=2,
-    )
+        poles=poles, mean=rng.standard_normal(size), covariance_factor=0.1 * rng.standard_normal((size, 8)),
+        dt_s=_DT, fir_length=12, has_feedthrough=True, integrators=integrators, input_delay_samples=2,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("integrators", [0, 2])

@@ -24,6 +24,13 @@ def _system(zeros: Any, poles: Any, gain: float, dt_s: float = _DT) -> control.S
     return control.ss(control.zpk(zeros, poles, gain, dt=dt_s))
 
 
+def _response(system: control.StateSpace, omega_rad_s: Any) -> Any:
+    """At all frequencies at once: python-control takes seconds for these many."""
+    z = np.exp(1j * omega_rad_s * system.dt)[:, None, None]
+    states = np.linalg.solve(z * np.eye(system.nstates) - system.A, system.B + 0j)
+    return (system.C @ states + system.D)[:, 0, 0]
+
+
 def _certified(system: control.StateSpace, gain: float, *, delay: int = 0, relative: float = 0.0) -> Any:
     discs = RationalWeight(numerator=(relative or 1.0,), denominator=(1.0,))
     plant = UncertainPlant("plant", system, StatedDiscs(system, discs) if relative else None)
@@ -72,9 +79,9 @@ def test_a_touch_of_the_unit_circle_is_a_crossing():
     """|L| has a peak of exactly 1: no change of sign, and a phase margin all the same."""
     system = _system([], [0.9 * np.exp(0.5j), 0.9 * np.exp(-0.5j)], 1.0)
     omega = np.linspace(30, 60, 400_001)
-    size = np.abs(np.ravel(control.frequency_response(system, omega).complex))
-    at, peak = omega[np.argmax(size)], float(np.max(size))
-    value = complex(np.ravel(control.frequency_response(system, at).complex)[0])
+    response = _response(system, omega)
+    value = response[np.argmax(np.abs(response))]
+    peak = abs(value)
     margins = _certified(system, 1 / peak * (1 + 1e-12)).plants[0].nominal_margins
     turn = abs(np.angle(-value))
     assert margins.phase_rad == pytest.approx(turn, rel=1e-3)
@@ -98,7 +105,7 @@ def test_a_narrow_resonance_of_the_controller_is_seen_between_measured_points():
         assert on_points.worst_peak_sensitivity < 1.2
         assert between.assumed_linear
         dense = own[20] + (own[21] - own[20]) * np.linspace(0, 1, 200_001)
-        loop = np.ravel(control.frequency_response(k * system, dense).complex)
+        loop = _response(k, dense) * _response(system, dense)
         peaks.append((between.worst_peak_sensitivity, float(np.max(1 / np.abs(1 + loop)))))
     assert all(found >= true * (1 - 1e-3) for found, true in peaks)
     assert max(found for found, _ in peaks) > 3
@@ -151,8 +158,7 @@ def test_units_of_time_input_and_output_do_not_matter(time, input_unit, output_u
     assert b.bandwidth_rad_s == pytest.approx(a.bandwidth_rad_s / time, rel=1e-6)
 
 
-@pytest.mark.parametrize(("time", "gain"), [(1e6, 1.0), (1e-6, 1.0), (1.0, 1e-6), (1.0, 1e6), (1e6, 1e-6)])
-def test_units_do_not_matter_to_a_design(time, gain):
+def test_units_do_not_matter_to_a_design():
     options = SynthesisOptions(
         starts=2, grid_points=60, mode_points=30, dense_points=1000, exchange_rounds=1, iterations=40
     )
@@ -168,4 +174,5 @@ def test_units_do_not_matter_to_a_design(time, gain):
         plant = UncertainPlant("plant", system, StatedDiscs(system, discs))
         return synthesise([plant], spec, options, rng=np.random.default_rng(3)).gamma
 
-    assert gamma(time, gain) == pytest.approx(gamma(1.0, 1.0), rel=1e-5)
+    units = [(1e6, 1.0), (1e-6, 1.0), (1.0, 1e-6), (1.0, 1e6), (1e6, 1e-6)]
+    np.testing.assert_allclose([gamma(*one) for one in units], gamma(1.0, 1.0), rtol=1e-5)

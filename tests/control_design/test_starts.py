@@ -35,13 +35,9 @@ def _plant(relative_std: float = 0.02) -> UncertainPlant:
 
 def _damping(order: int, ratio: float = 0.3) -> Specification:
     return Specification(
-        controller_order=order,
-        modulus_margin=0.4,
-        effort_limit=2.0,
-        effort_rolloff_rad_s=90.0,
-        mode_peak_ratio=ratio,
-        mode_band_rad_s=(25.0, 110.0),
-    )
+        controller_order=order, modulus_margin=0.4, effort_limit=2.0, effort_rolloff_rad_s=90.0,
+        mode_peak_ratio=ratio, mode_band_rad_s=(25.0, 110.0),
+    )  # fmt: skip
 
 
 def _search(specification: Specification) -> tuple[Problem, Cascade, MinimaxDescent]:

@@ -79,14 +79,9 @@ def integrating_arm(integrators):
     system = hub_arm(integrators=integrators)
     plant = UncertainPlant("arm", system, RelativeDisc(system, 0.03, 60.0))
     specification = Specification(
-        bandwidth_rad_s=2.0,
-        integrator=True,
-        modulus_margin=0.45,
-        effort_limit=60.0,
-        effort_rolloff_rad_s=100.0,
-        controller_order=5,
-        input_limit=10.0,
-    )
+        bandwidth_rad_s=2.0, integrator=True, modulus_margin=0.45, effort_limit=60.0,
+        effort_rolloff_rad_s=100.0, controller_order=5, input_limit=10.0,
+    )  # fmt: skip
     options = SynthesisOptions(starts=12, exchange_rounds=2, sufficient_gamma=0.97)
     result = synthesise([plant], specification, options, rng=np.random.default_rng(2))
     return plant, result, certify(result.controller_or_raise(), [plant], specification)
