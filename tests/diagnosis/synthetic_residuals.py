@@ -9,22 +9,13 @@ from plant import multisine, multisine_lines, paper_link, prbs, simulate
 
 RIG = paper_link().perturbed(
     {
-        "link.length_m": 0.6,
-        "link.width_m": 0.025,
-        "link.thickness_m": 0.0011,
-        "link.density_kg_m3": 7850.0,
-        "link.youngs_modulus_Pa": 2e11,
-        "link.kelvin_voigt_s": 0.0018,
-        "hub.inertia_kg_m2": 0.007,
-        "hub.radius_m": 0.05,
-        "hub.viscous_friction_Nms": 0.006,
-        "motor.torque_constant_Nm_A": 0.024,
-        "motor.back_emf_Vs_rad": 0.024,
-        "motor.resistance_ohm": 2.6,
-        "motor.gear_ratio": 20.0,
+        "link.length_m": 0.6, "link.width_m": 0.025, "link.thickness_m": 0.0011, "link.density_kg_m3": 7850.0,
+        "link.youngs_modulus_Pa": 2e11, "link.kelvin_voigt_s": 0.0018, "hub.inertia_kg_m2": 0.007,
+        "hub.radius_m": 0.05, "hub.viscous_friction_Nms": 0.006, "motor.torque_constant_Nm_A": 0.024,
+        "motor.back_emf_Vs_rad": 0.024, "motor.resistance_ohm": 2.6, "motor.gear_ratio": 20.0,
         "sensors.tip_noise_m": 0.0008,
     }
-)
+)  # fmt: skip
 NOISE = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
 DT = RIG.sampling.dt_s
 PERIOD = 700

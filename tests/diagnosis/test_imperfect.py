@@ -684,24 +684,13 @@ def test_a_record_that_begins_in_free_play_is_followed_from_there(seed):
 def test_accelerations_are_those_of_enough_modes():
     # On a light link three modes miss 2.6 % of the acceleration of the independent arm, four 1.3 %.
     light = {
-        "hub.inertia_kg_m2": 0.02568,
-        "hub.radius_m": 0.0405,
-        "hub.viscous_friction_Nms": 0.01519,
-        "link.length_m": 0.8291,
-        "link.thickness_m": 0.001516,
-        "link.width_m": 0.03356,
-        "link.density_kg_m3": 7202.5,
-        "link.youngs_modulus_Pa": 1.8157e11,
-        "link.kelvin_voigt_s": 0.00176,
-        "motor.gear_ratio": 25.57,
-        "motor.resistance_ohm": 1.47,
-        "motor.torque_constant_Nm_A": 0.0272,
-        "motor.back_emf_Vs_rad": 0.03099,
-        "payload.mass_kg": 0.0,
-        "sampling.dt_s": 0.005,
-        "sampling.transport_delay_s": 0.003146,
-        "sensors.tip_acceleration_noise_m_s2": 0.04,
-    }
+        "hub.inertia_kg_m2": 0.02568, "hub.radius_m": 0.0405, "hub.viscous_friction_Nms": 0.01519,
+        "link.length_m": 0.8291, "link.thickness_m": 0.001516, "link.width_m": 0.03356,
+        "link.density_kg_m3": 7202.5, "link.youngs_modulus_Pa": 1.8157e11, "link.kelvin_voigt_s": 0.00176,
+        "motor.gear_ratio": 25.57, "motor.resistance_ohm": 1.47, "motor.torque_constant_Nm_A": 0.0272,
+        "motor.back_emf_Vs_rad": 0.03099, "payload.mass_kg": 0.0, "sampling.dt_s": 0.005,
+        "sampling.transport_delay_s": 0.003146, "sensors.tip_acceleration_noise_m_s2": 0.04,
+    }  # fmt: skip
     rig = RIG.perturbed(light)
     voltage = 2 * np.random.default_rng(1).choice([-1.0, 1.0], 60).repeat(10)
     truth = Truth(rig.model_dump(exclude={"tolerances"}), ())

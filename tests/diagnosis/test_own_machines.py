@@ -132,15 +132,10 @@ CASES = {
         ("width", 0.7),
     ),
     "input_delay": (
-        _shaft,
-        {"time_constant_s": 0.2, "gain_rad_Vs": 10.0},
-        {"time_constant_s": 0.1, "gain_rad_Vs": 0.05},
-        _late_motor,
-        (1.5, 3.0, 2.2),
-        0.05,
-        ("delay_s", 0.033),
+        _shaft, {"time_constant_s": 0.2, "gain_rad_Vs": 10.0}, {"time_constant_s": 0.1, "gain_rad_Vs": 0.05},
+        _late_motor, (1.5, 3.0, 2.2), 0.05, ("delay_s", 0.033),
     ),
-}
+}  # fmt: skip
 
 
 def _case(name, seed=0, **off):
@@ -437,15 +432,9 @@ def _rubbing(name, dry_N):
 
     effect = PlantEffect(name, (EffectParameter("force_N", 1e-3, 3.0),), dependence="continuous")
     plant = Plant(
-        simulate,
-        own_plant.STATED,
-        own_plant.TOLERANCES,
-        ("position_m",),
-        np.array([2e-4]),
-        (effect,),
-        0.05,
+        simulate, own_plant.STATED, own_plant.TOLERANCES, ("position_m",), np.array([2e-4]), (effect,), 0.05,
         0.01,
-    )
+    )  # fmt: skip
     return PlantCase("c", plant, tuple(_carriage_records(dry_N)))
 
 

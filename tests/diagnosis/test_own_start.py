@@ -91,15 +91,10 @@ def _rubbing(dry, angle, speed):
 
 def _held_plant(simulation, effect):
     return Plant(
-        simulation,
-        {"weight_Nm": 1.0},
-        {},
-        ("angle_rad",),
-        np.array([NOISE_RAD]),
-        (PlantEffect(effect, (EffectParameter("size", 1e-3, 1.0),)),),
-        model_error=0.05,
+        simulation, {"weight_Nm": 1.0}, {}, ("angle_rad",), np.array([NOISE_RAD]),
+        (PlantEffect(effect, (EffectParameter("size", 1e-3, 1.0),)),), model_error=0.05,
         start={"angle_rad": 1.0, "speed_rad_s": 5.0},
-    )
+    )  # fmt: skip
 
 
 def test_a_start_is_found_where_friction_holds_the_first_guess():

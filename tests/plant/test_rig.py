@@ -33,6 +33,9 @@ def test_the_recorded_rigs_are_read(gap_cases):
         Rig.from_toml(path)
 
 
+DT = "dt_s = 0.005"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
@@ -46,22 +49,10 @@ def test_the_recorded_rigs_are_read(gap_cases):
         ("[payload]\nmass_kg = 0.0", "", "payload: missing, expected a value"),
         ("[payload]", "[payloads]", "payloads: unknown key"),
         ("mass_kg = 0.0", "mass_kg = -0.1", "payload.mass_kg: expected greater than or equal to 0, got -0.1"),
-        (
-            "dt_s = 0.005",
-            "dt_s = 0.005\n[tolerances]\n'hub.mass_kg' = 0.1",
-            "tolerances.hub.mass_kg: unknown parameter",
-        ),
-        (
-            "dt_s = 0.005",
-            "dt_s = 0.005\n[tolerances]\n'hub.inertia_kg_m2' = 0.0",
-            "tolerances.hub.inertia_kg_m2: expected greater than 0, got 0.0",
-        ),
-        ("dt_s = 0.005", "dt_s = 5000.0", "sampling.dt_s: expected less than or equal to 10, got 5000.0"),
-        (
-            "dt_s = 0.005",
-            "dt_s = 0.005\ntransport_delay_s = 1e6",
-            "sampling.transport_delay_s: expected less than or equal to 60, got 1000000.0",
-        ),
+        (DT, f"{DT}\n[tolerances]\n'hub.mass_kg' = 0.1", "tolerances.hub.mass_kg: unknown parameter"),
+        (DT, f"{DT}\n[tolerances]\n'hub.radius_m' = 0.0", "hub.radius_m: expected greater than 0, got 0.0"),
+        (DT, "dt_s = 5000.0", "sampling.dt_s: expected less than or equal to 10, got 5000.0"),
+        (DT, f"{DT}\ntransport_delay_s = 1e6", "transport_delay_s: expected less than or equal to 60, got"),
         ("length_m = 1.0", "length_m = = 1.0", "not valid TOML: Invalid value (at line 4, column 12)"),
     ],
 )
