@@ -122,34 +122,19 @@ class KnownAnswer:
             for name, p in total.items()
         ]
         return Diagnosis(
-            case=case,
-            completeness=completeness_of(case, 0.1 if self.verdict == "unknown" else 0.97, after),
-            verdict=self.verdict,
-            detail_verdict=self.detail,
-            probabilities=total,
-            sets=sets,
+            case=case, completeness=completeness_of(case, 0.1 if self.verdict == "unknown" else 0.97, after),
+            verdict=self.verdict, detail_verdict=self.detail, probabilities=total, sets=sets,
             effects=tuple(sorted(named, key=lambda e: (e.name not in names, -e.probability))),
-            combination=tuple(names),
-            partial_model=tuple(fitted_names) if self.verdict == "unknown" else (),
-            ambiguous_with=self.ambiguous,
-            gap_before=start,
-            gap_refit=start,
-            gap_after=end,
-            noise_floor=1.0,
-            gap_closed=closed,
-            gap_closed_interval=(closed - 0.01, closed + 0.01),
+            combination=tuple(names), partial_model=tuple(fitted_names) if self.verdict == "unknown" else (),
+            ambiguous_with=self.ambiguous, gap_before=start, gap_refit=start, gap_after=end, noise_floor=1.0,
+            gap_closed=closed, gap_closed_interval=(closed - 0.01, closed + 0.01),
             deviations=dict.fromkeys(case.rig.tolerances, 0.0),
-            deviations_refit=dict.fromkeys(case.rig.tolerances, -2.6),
-            rig=case.rig,
-            repair=effects,
-            residuals_before=before,
-            residuals_refit=before,
-            residuals_after=after,
-            simulations=model.simulations,
-            unlisted=self.unlisted,
+            deviations_refit=dict.fromkeys(case.rig.tolerances, -2.6), rig=case.rig, repair=effects,
+            residuals_before=before, residuals_refit=before, residuals_after=after,
+            simulations=model.simulations, unlisted=self.unlisted,
             competing=() if case.model_error else self._competing(case, effects, sure),
             shares=self._shares(case, fitted_names) if case.model_error else None,
-        )
+        )  # fmt: skip
 
     def _shares(self, case: Case, names: list[str]) -> Shares:
         outputs = case.outputs

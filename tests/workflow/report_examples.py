@@ -74,17 +74,11 @@ def posterior(of: GobfModel, relative: float = 0.01) -> ResponsePosterior:
     stacked = np.vstack([rows.real, rows.imag])
     mean = np.linalg.lstsq(stacked, np.concatenate([wanted.real, wanted.imag]), rcond=None)[0]
     return ResponsePosterior(
-        poles=doubled,
-        mean=mean,
+        poles=doubled, mean=mean,
         covariance_factor=np.diag(np.full(mean.size, relative * float(np.abs(of.coefficients).min()))),
-        dt_s=DT_S,
-        fir_length=0,
-        has_feedthrough=False,
-        integrators=of.integrators,
-        input_delay_samples=0,
-        input_name=of.input_name,
-        output_name=of.output_name,
-    )
+        dt_s=DT_S, fir_length=0, has_feedthrough=False, integrators=of.integrators, input_delay_samples=0,
+        input_name=of.input_name, output_name=of.output_name,
+    )  # fmt: skip
 
 
 def record(models: list[GobfModel], name: str, seed: int) -> Record:
@@ -94,15 +88,10 @@ def record(models: list[GobfModel], name: str, seed: int) -> Record:
     y = np.column_stack([m.simulate(u) for m in models])
     y = y + 0.02 * y.std(axis=0) * rng.standard_normal(y.shape)
     return Record(
-        name=name,
-        input=u[:, None],
-        output=y,
-        dt_s=DT_S,
-        input_names=(models[0].input_name,),
-        output_names=tuple(m.output_name for m in models),
-        input_units=("V",),
+        name=name, input=u[:, None], output=y, dt_s=DT_S, input_names=(models[0].input_name,),
+        output_names=tuple(m.output_name for m in models), input_units=("V",),
         output_units=tuple("rad" if "rad" in m.output_name else "m" for m in models),
-    )
+    )  # fmt: skip
 
 
 def identification(of: GobfModel, used: list[Record]) -> Identification:
@@ -123,18 +112,12 @@ def identification(of: GobfModel, used: list[Record]) -> Identification:
         for e, r in zip(residuals, used, strict=True)
     ]
     return Identification(
-        model=of,
-        structure=Structure(of.integrators, 0, False, True, False),
-        record_names=tuple(r.name for r in used),
-        residuals=residuals,
-        fit_percent=np.array(fit),
-        rss=rss,
-        noise_std=float(np.sqrt(rss / sum(e.size for e in residuals))),
-        tangent_optimality=1e-9,
+        model=of, structure=Structure(of.integrators, 0, False, True, False),
+        record_names=tuple(r.name for r in used), residuals=residuals, fit_percent=np.array(fit), rss=rss,
+        noise_std=float(np.sqrt(rss / sum(e.size for e in residuals))), tangent_optimality=1e-9,
         order_table=(OrderStep(1, 1, 2.5 * rss, 812.4), OrderStep(1, 2, rss, -95.1)),
-        verdicts=(NuisanceTest("offset", 1, 0.3).finding,),
-        search=trace,
-    )
+        verdicts=(NuisanceTest("offset", 1, 0.3).finding,), search=trace,
+    )  # fmt: skip
 
 
 def stabilisation_plot() -> Stabilisation:
@@ -342,17 +325,9 @@ def achievable(reached: float = 0.8) -> AchievablePerformance:
 def sampled_responses(gamma: float) -> SampledResponses:
     """Sampled responses, made up: the worst case holds for 990 of 1000."""
     joint = JointCoverage(
-        coverage=0.95,
-        draws=1000,
-        gamma=0.99 * gamma,
-        level=0.9,
-        given_level=0.95,
-        gamma_given=gamma,
-        coverage_given=0.99,
-        simultaneous_given=0.4,
-        simultaneous_level=0.998,
-        stable_share=1.0,
-    )
+        coverage=0.95, draws=1000, gamma=0.99 * gamma, level=0.9, given_level=0.95, gamma_given=gamma,
+        coverage_given=0.99, simultaneous_given=0.4, simultaneous_level=0.998, stable_share=1.0,
+    )  # fmt: skip
     return SampledResponses(joint)
 
 
@@ -378,26 +353,14 @@ def loop_check(settings: RunConfig, settled: int, draws: int = 3) -> LoopCheck:
         sensitivity, conditions = beyond_the_trial(reference[:400], output[:400])
     rows = closed_loop_stage.describe(achieved, trial)
     return LoopCheck(
-        machine=settings.machine,
-        tracking=True,
-        reference_step=0.5,
-        disturbance_step=0.3,
-        quantisation=0.0,
-        measurement_step=0.0,
-        input_limit=24.0,
-        filtered=False,
+        machine=settings.machine, tracking=True, reference_step=0.5, disturbance_step=0.3, quantisation=0.0,
+        measurement_step=0.0, input_limit=24.0, filtered=False,
         predicted=closed_loop_stage.describe(predicted, trial)[0],
         achieved=tuple(replace(row, settled=number < settled) for number, row in enumerate(rows)),
-        time_s=time,
-        reference=reference,
-        disturbance=disturbance,
-        model_answer=None,
-        predicted_runs=predicted,
-        achieved_runs=achieved,
-        sensitivity=sensitivity,
-        conditions=conditions,
+        time_s=time, reference=reference, disturbance=disturbance, model_answer=None,
+        predicted_runs=predicted, achieved_runs=achieved, sensitivity=sensitivity, conditions=conditions,
         friction=None if sensitivity is None else friction_check(sensitivity),
-    )
+    )  # fmt: skip
 
 
 def friction_check(sensitivity: SensitivityCheck) -> FrictionCheck:
@@ -405,28 +368,15 @@ def friction_check(sensitivity: SensitivityCheck) -> FrictionCheck:
     sizes, peak = np.array([0.2, 0.02, 0.002]), sensitivity.nominal_peak
     error = 0.01 * np.sin(np.linspace(0, 6, 500))
     return FrictionCheck(
-        level=0.04,
-        level_interval=(0.039, 0.041),
-        presliding=1e-5,
-        sizes=sizes,
-        low=peak * np.array([0.99, 0.95, 0.9]),
-        high=peak * np.array([1.01, 0.98, 0.95]),
-        measured=peak * np.array([1.0, 0.97, 0.96]),
-        nominal_peak=peak,
-        certified_peak=sensitivity.certified_peak,
-        tolerance_percent=5.0,
-        certified_from=0.002,
-        linear_from=0.01,
-        sticking_step=0.0013,
-        sticking_interval=(0.0012, 0.0014),
-        error_at_rest=0.006,
-        error_interval=(0.0058, 0.0062),
-        step=StepMetrics(0.2, 0.1, 10.0, 0.0, 1.5, 0.001, 3.0, 0.0),
-        watched_s=20.0,
-        left=0.002,
-        output=0.2 - 0.2 * np.exp(-np.linspace(0, 6, 100)),
+        level=0.04, level_interval=(0.039, 0.041), presliding=1e-5, sizes=sizes,
+        low=peak * np.array([0.99, 0.95, 0.9]), high=peak * np.array([1.01, 0.98, 0.95]),
+        measured=peak * np.array([1.0, 0.97, 0.96]), nominal_peak=peak,
+        certified_peak=sensitivity.certified_peak, tolerance_percent=5.0, certified_from=0.002,
+        linear_from=0.01, sticking_step=0.0013, sticking_interval=(0.0012, 0.0014), error_at_rest=0.006,
+        error_interval=(0.0058, 0.0062), step=StepMetrics(0.2, 0.1, 10.0, 0.0, 1.5, 0.001, 3.0, 0.0),
+        watched_s=20.0, left=0.002, output=0.2 - 0.2 * np.exp(-np.linspace(0, 6, 100)),
         tracking=SlowSine(0.05, 0.1, 0.001, error, 0.2 * error),
-    )
+    )  # fmt: skip
 
 
 def beyond_the_trial(reference, output) -> tuple[SensitivityCheck, tuple[ConditionRun, ...]]:
@@ -438,21 +388,13 @@ def beyond_the_trial(reference, output) -> tuple[SensitivityCheck, tuple[Conditi
     names = ("arm as identified", "arm as identified, reference ten times smaller")
     rows = [
         MeasuredPeak(
-            name=name,
-            reference_rms=0.2 / 10**number,
-            peak=peak * (1 + off / 100),
-            peak_std=0.002,
-            peak_omega_rad_s=at,
-            off_nominal_percent=off,
-            off_certified_percent=off - 0.1,
-            peak_command=12.0,
-            limited_fraction=0.0,
-            omega_rad_s=omega,
-            magnitude=size * (1 + off / 100),
+            name=name, reference_rms=0.2 / 10**number, peak=peak * (1 + off / 100), peak_std=0.002,
+            peak_omega_rad_s=at, off_nominal_percent=off, off_certified_percent=off - 0.1, peak_command=12.0,
+            limited_fraction=0.0, omega_rad_s=omega, magnitude=size * (1 + off / 100),
             std=np.full(omega.size, 0.002),
         )
         for number, (name, off) in enumerate(zip(names, (0.4, -12.0), strict=True))
-    ]
+    ]  # fmt: skip
     conditions = []
     for name, factor in (("payload 200 %", 0.9), ("push at the tip", 1.1)):
         law = LoopTrajectory(np.arange(400) * DT_S, reference, output[:, None], output, output > 9, DT_S)

@@ -55,20 +55,10 @@ class Everything:
 
 
 VALUE = Everything(
-    text="θ <b>\0",
-    count=3,
-    yes=True,
-    gain=float("-inf"),
-    root=1e-300 + 2j,
-    colour=Colour.RED,
-    which="b",
-    signal=np.arange(6.0).reshape(2, 3)[:, ::2],
-    pair=(0.1, "x"),
-    several=(Small(1.0), Small(float("nan"))),
-    by_name={"a b": (1.0, 2.0)},
-    table={"x": [1, None, {"y": 2.5}]},
-    either=Other(7.0),
-)
+    text="θ <b>\0", count=3, yes=True, gain=float("-inf"), root=1e-300 + 2j, colour=Colour.RED, which="b",
+    signal=np.arange(6.0).reshape(2, 3)[:, ::2], pair=(0.1, "x"), several=(Small(1.0), Small(float("nan"))),
+    by_name={"a b": (1.0, 2.0)}, table={"x": [1, None, {"y": 2.5}]}, either=Other(7.0),
+)  # fmt: skip
 
 
 def same(one: Any, two: Any) -> bool:

@@ -457,7 +457,11 @@ def test_a_process_that_dies_is_that_cases_failure(cases, tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_and_resumed_ends_with_the_same_bytes(cases, tmp_path):
+def test_killed_and_resumed_ends_with_the_same_bytes(tmp_path):
+    cases = [
+        write_case(tmp_path / name, FRICTION, seed=k, records=2, samples=160)
+        for k, name in enumerate(("one", "two"))
+    ]
     quiet, killed = tmp_path / "quiet", tmp_path / "killed"
     call = ("diagnose", *cases, "--jobs", 1, "--no-controller", "--out")
     finish(start_flexlink(*call, quiet))

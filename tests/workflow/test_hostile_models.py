@@ -75,38 +75,17 @@ def test_damaged_bytes(name, many, tmp_path):
     assert damaged(name, tmp_path, often if many else few).wrong == []
 
 
-STRANGE_VALUES = (
-    *(
-        None,
-        True,
-        0,
-        -1,
-        1.5,
-        1e300,
-        10**12,
-        "x",
-        "x" * 500,
-        [],
-        {},
-        [1, 2],
-        {"$float": "nan"},
-        {"$float": [1]},
-    ),
-    *({"$float": "abc"}, {"$array": "nope"}, {"$array": ["a"]}, {"$complex": [1, "a"]}, {"$complex": 3}),
-    *({"$type": "Poles"}, {"$type": ["a"]}),
-)
-STRANGE_ARRAYS = (
-    *(lambda a: a.astype(complex) * (1 + 1j), lambda a: a.astype("U8"), lambda a: a * np.nan),
-    *(
-        lambda a: a * 1e200,
-        lambda a: 3 * a,
-        lambda a: a[None],
-        lambda a: a.ravel()[:0],
-        lambda a: a.sum(),
-    ),
-    *(lambda a: np.array([{}], dtype=object), lambda a: np.zeros(3, dtype=[("a", "f8")])),
-    *(lambda a: np.r_[a.ravel(), a.ravel()], lambda a: np.zeros(a.shape, dtype="M8[s]")),
-)
+STRANGE_VALUES = [
+    None, True, 0, -1, 1.5, 1e300, 10**12, "x", "x" * 500, [], {}, [1, 2], {"$float": "nan"}, {"$float": [1]},
+    {"$float": "abc"}, {"$array": "nope"}, {"$array": ["a"]}, {"$complex": [1, "a"]}, {"$complex": 3},
+    {"$type": "Poles"}, {"$type": ["a"]},
+]  # fmt: skip
+STRANGE_ARRAYS = [
+    lambda a: a.astype(complex) * (1 + 1j), lambda a: a.astype("U8"), lambda a: a * np.nan,
+    lambda a: a * 1e200, lambda a: 3 * a, lambda a: a[None], lambda a: a.ravel()[:0], lambda a: a.sum(),
+    lambda a: np.array([{}], dtype=object), lambda a: np.zeros(3, dtype=[("a", "f8")]),
+    lambda a: np.r_[a.ravel(), a.ravel()], lambda a: np.zeros(a.shape, dtype="M8[s]"),
+]  # fmt: skip
 
 
 def places(document, path=()):

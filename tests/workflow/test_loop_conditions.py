@@ -23,15 +23,10 @@ def bench(fast_run) -> ConditionBench:
     run = RunDirectory.open(fast_run[0])
     config, results = config_of(run), RunResults(run)
     return ConditionBench(
-        results.design.synthesis.controller,
-        results.uncertainty.channels[0].posterior,
-        config.source,
-        config.closed_loop,
-        rig_of(config.source),
-        np.where(np.arange(600) >= 30, 0.2, 0.0),
-        0,
+        results.design.synthesis.controller, results.uncertainty.channels[0].posterior, config.source,
+        config.closed_loop, rig_of(config.source), np.where(np.arange(600) >= 30, 0.2, 0.0), 0,
         np.random.default_rng(1),
-    )
+    )  # fmt: skip
 
 
 def test_prediction_is_the_feedback_of_model_and_controller(bench):

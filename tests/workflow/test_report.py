@@ -77,17 +77,9 @@ def test_page_and_pictures_are_written(drawn):
     families = {re.sub(r"(-\d.*)?\.(svg|png)$", "", name) for name in names}
     # Other pages have the rest; distortion is drawn of periodic records.
     elsewhere = (
-        "gap_",
-        "pareto",
-        "excitation",
-        "distortion",
-        "log",
-        "response",
-        "joint-",
-        "matrix-",
-        "mode-",
+        "gap_", "pareto", "excitation", "distortion", "log", "response", "joint-", "matrix-", "mode-",
         "singular-values",
-    )
+    )  # fmt: skip
     assert families == {name for name in drawings() if not name.startswith(elsewhere)}
     text = drawn.report_path.read_text(encoding="utf-8")
     page = Page(text)
@@ -379,15 +371,9 @@ def test_page_tells_of_any_order_whole_responses_and_reference_filter(tmp_path, 
     assert "All frequencies together: checked on models drawn from the posterior" in text
     assert "Reference filter" not in text
     filtered = ReferenceFilter(
-        A=np.array([[0.9]]),
-        B=np.array([[0.1]]),
-        C=np.array([[1.0]]),
-        D=np.array([[0.0]]),
-        dt_s=example.DT_S,
-        error_before=0.95,
-        error_after=0.19,
-        worst_rad_s=3.0,
-    )
+        A=np.array([[0.9]]), B=np.array([[0.1]]), C=np.array([[1.0]]), D=np.array([[0.0]]), dt_s=example.DT_S,
+        error_before=0.95, error_after=0.19, worst_rad_s=3.0,
+    )  # fmt: skip
     with run.locked():
         run.save_stage("reference_filter", ReferenceFilterResult(filtered), "x")
     text = text_of(run, settings)

@@ -125,14 +125,6 @@ def test_damaged_stage_counts_as_not_done(tmp_path):
     assert not run.is_done("identify", "1")
 
 
-def test_second_writer_is_refused_while_the_first_lives(tmp_path):
-    run = begin(tmp_path / "run")
-    with run.locked(), pytest.raises(InputError, match="another process"), RunDirectory(run.path).locked():
-        pass
-    with run.locked():
-        pass
-
-
 def test_lock_clears_what_a_killed_writer_left(tmp_path):
     run = begin(tmp_path / "run")
     (run.stages_path / ".records.npz.123.part").write_bytes(b"half")

@@ -20,15 +20,10 @@ def posterior(*, feedthrough: bool, integrators: int, delay: int, fir: int = 7) 
     poles = Poles(np.array([0.9, 0.2]), np.array([0.95 * np.exp(0.3j)]))
     size = poles.order + int(feedthrough) + fir
     return ResponsePosterior(
-        poles=poles,
-        mean=0.1 * rng.standard_normal(size),
-        covariance_factor=0.01 * rng.standard_normal((size, 3)),
-        dt_s=DT_S,
-        fir_length=fir,
-        has_feedthrough=feedthrough,
-        integrators=integrators,
-        input_delay_samples=delay,
-    )
+        poles=poles, mean=0.1 * rng.standard_normal(size),
+        covariance_factor=0.01 * rng.standard_normal((size, 3)), dt_s=DT_S, fir_length=fir,
+        has_feedthrough=feedthrough, integrators=integrators, input_delay_samples=delay,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("feedthrough", [False, True])

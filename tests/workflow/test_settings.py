@@ -41,50 +41,41 @@ class Config(Strict):
     channels: tuple[Channel, ...] = ()
 
 
-SIMULATED = {"kind": "simulated"}
+def source(**keys):
+    return {"source": {"kind": "simulated", **keys}}
+
+
+def channels(*given):
+    return source() | {"channels": list(given)}
+
+
+def options(**keys):
+    return channels({"input": "u", "options": keys})
+
+
+NO_NUMBER, LEVEL = "input should be a valid number, got", "channels[0].options.level: input should be"
 
 
 @pytest.mark.parametrize(
     ("document", "expected"),
     [
+        (source(bandwith_rad_s=2), "unknown key source.bandwith_rad_s (did you mean bandwidth_rad_s?)"),
+        (source() | {"zzz": 1}, "unknown key zzz (known keys: channels, source)"),
         (
-            {"source": {"kind": "simulated", "bandwith_rad_s": 2}},
-            "unknown key source.bandwith_rad_s (did you mean bandwidth_rad_s?)",
-        ),
-        ({"source": SIMULATED, "zzz": 1}, "unknown key zzz (known keys: channels, source)"),
-        (
-            {"source": SIMULATED, "channels": [{"input": "u"}, {"inptu": "u"}]},
+            channels({"input": "u"}, {"inptu": "u"}),
             "unknown key channels[1].inptu (did you mean input?) (and 1 more)",
         ),
-        ({"source": SIMULATED, "channels": [{}]}, "missing key channels[0].input"),
+        (channels({}), "missing key channels[0].input"),
         ({}, "missing key source"),
-        ({"source": SIMULATED, "channels": [{}, {}]}, "missing keys channels[0].input, channels[1].input"),
-        (
-            {"source": {"kind": "simulated", "bandwidth_rad_s": True}},
-            "source.bandwidth_rad_s: input should be a valid number, got True",
-        ),
-        (
-            {"source": SIMULATED, "channels": [{"input": "u", "options": {"level": "0.5"}}]},
-            "channels[0].options.level: input should be a valid number, got '0.5'",
-        ),
-        (
-            {"source": SIMULATED, "channels": [{"input": "u", "options": {"wide": 1}}]},
-            "channels[0].options.wide: input should be a valid boolean, got 1",
-        ),
+        (channels({}, {}), "missing keys channels[0].input, channels[1].input"),
+        (source(bandwidth_rad_s=True), f"source.bandwidth_rad_s: {NO_NUMBER} True"),
+        (source(bandwidth_rad_s="fast"), f"source.bandwidth_rad_s: {NO_NUMBER} 'fast'"),
+        (options(level="0.5"), f"channels[0].options.level: {NO_NUMBER} '0.5'"),
+        (options(wide=1), "channels[0].options.wide: input should be a valid boolean, got 1"),
         ({"source": {}}, "missing key source.kind"),
         ({"source": {"kind": "wire"}}, "source.kind: expected one of 'files', 'simulated', got 'wire'"),
-        (
-            {"source": SIMULATED, "channels": [{"input": "u", "options": {"level": 1.5}}]},
-            "channels[0].options.level: input should be less than 1, got 1.5",
-        ),
-        (
-            {"source": SIMULATED, "channels": [{"input": "u", "options": {"level": float("nan")}}]},
-            "channels[0].options.level: input should be a finite number, got nan",
-        ),
-        (
-            {"source": {"kind": "simulated", "bandwidth_rad_s": "fast"}},
-            "source.bandwidth_rad_s: input should be a valid number, got 'fast'",
-        ),
+        (options(level=1.5), f"{LEVEL} less than 1, got 1.5"),
+        (options(level=float("nan")), f"{LEVEL} a finite number, got nan"),
     ],
 )
 def test_first_complaint(document, expected):

@@ -220,18 +220,9 @@ def test_sensitivity_measured_on_the_arm_is_the_predicted_one(run):
 def test_every_condition_is_run_and_settles(run):
     check = run.closed_loop.check
     assert [row.name for row in check.conditions] == [
-        "slew",
-        "push at the tip",
-        "payload 0 %",
-        "payload 100 %",
-        "payload 200 %",
-        "late",
-        "no friction",
-        "double friction",
-        "coarse",
-        "voltage limit",
-        "no anti-windup",
-    ]
+        "slew", "push at the tip", "payload 0 %", "payload 100 %", "payload 200 %", "late", "no friction",
+        "double friction", "coarse", "voltage limit", "no anti-windup",
+    ]  # fmt: skip
     assert [row.name for row in check.conditions if not row.settled] == []
     assert all(row.achieved.size == check.time_s.size // 2 for row in check.conditions)
     assert max(np.max(np.abs(row.achieved_command)) for row in check.conditions[:-1]) <= check.input_limit

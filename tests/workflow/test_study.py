@@ -310,41 +310,29 @@ def test_killed_worker_is_replaced(small_study, tmp_path):
 # --------------------------------------------------------------------------------------
 
 
+BANDWIDTH, VALUES = "specification.bandwidth_rad_s", "values = [1.0, 1.5, 1e5]"
+PARETO = "[[pareto]]\nx = 'speed'\ny = 'modulus_margin'\n[study]"
+
+
 @pytest.mark.parametrize(
     ("was", "now", "expected"),
     [
-        (
-            "closed_loop.draws",
-            "closed_loop.drawz",
-            "changes: unknown key closed_loop.drawz (did you mean draws?)",
-        ),
+        ("draws", "drawz", "changes: unknown key closed_loop.drawz (did you mean draws?)"),
         ('"closed_loop.draws" = 2', '"closed_loop.draws" = 0', "closed_loop.draws"),
-        (
-            "specification.bandwidth_rad_s",
-            "specification.bandwith_rad_s",
-            "axes[0].values[0]: unknown key specification.bandwith_rad_s (did you mean bandwidth_rad_s?)",
-        ),
-        ("1.0, 1.5, 1e5", "1.0, -1.5", "axes[0].values[1]: specification.bandwidth_rad_s"),
-        (
-            "1.0, 1.5, 1e5",
-            "1.0, true",
-            "axes[0].values[1]: specification.bandwidth_rad_s: input should be a valid number",
-        ),
+        ("bandwidth", "bandwith", "values[0]: unknown key specification.bandwith_rad_s (did you mean bandwi"),
+        ("1.0, 1.5, 1e5", "1.0, -1.5", f"axes[0].values[1]: {BANDWIDTH}"),
+        ("1.0, 1.5, 1e5", "1.0, true", f"axes[0].values[1]: {BANDWIDTH}: input should be a valid number"),
         ("1.0, 1.5, 1e5", "1.0, 1.0", "axes[0]: the value 1.0 is listed twice"),
-        ("values = [1.0, 1.5, 1e5]", "from = 1.0", "axes[0]: a range needs from and to"),
-        ("values = [1.0, 1.5, 1e5]", "from = 1.0\nto = 2.0", "a grid over a range needs points"),
-        ("values = [1.0, 1.5, 1e5]", "from = 2.0\nto = 1.0", "from below to"),
-        ("values = [1.0, 1.5, 1e5]", "", "axes[0]: give values, or from and to"),
+        (VALUES, "from = 1.0", "axes[0]: a range needs from and to"),
+        (VALUES, "from = 1.0\nto = 2.0", "a grid over a range needs points"),
+        (VALUES, "from = 2.0\nto = 1.0", "from below to"),
+        (VALUES, "", "axes[0]: give values, or from and to"),
         ('key = "closed_loop.effects"', 'key = "closed loop"', "not a dotted key"),
         ("tip_payload", "tip_paylod", "axes[1].values[1]: closed_loop.effects[0]"),
         ('label = "effects"', 'label = "asked"', "two axes have the same label 'asked'"),
         ('title = "small"', 'titel = "small"', "unknown key study.titel (did you mean title?)"),
         (str(FAST_ARM), "nowhere.toml", "study.base: no such file or run directory"),
-        (
-            "[study]",
-            "[[pareto]]\nx = 'speed'\ny = 'modulus_margin'\n[study]",
-            "pareto[0].x: no column 'speed'",
-        ),
+        ("[study]", PARETO, "pareto[0].x: no column 'speed'"),
         ("[study]", "[search]\nmethod = 'optuna'\n[study]", "unknown key search"),
     ],
 )

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.workflow.command import ROOT, finish, start_flexlink, wait_until
+from tests.workflow.command import ROOT, start_flexlink, wait_until
 from tests.workflow.study_examples import SMALL_STUDY, TWO_POINTS, assert_same_study, write_study
 from workflow.engine.errors import StageError
 from workflow.engine.executor import SILENT_S, DaskCluster
@@ -99,19 +99,6 @@ def finished_points(out: Path) -> int:
     # Not through the links that have the points' numbers.
     folders = [point for point in out.glob("points/*") if not point.is_symlink()]
     return sum(1 for point in folders for _ in point.glob("stages/closed_loop.*"))
-
-
-@pytest.mark.slow
-def test_worker_killed_midway_changes_no_number(cluster, near, tmp_path):
-    cluster.add_worker()
-    cluster.add_worker()
-    _, call = far_study(tmp_path, cluster.address)
-    process = start_flexlink(*call)
-    wait_until(lambda: finished_points(tmp_path / "out") >= 1, process)
-    os.kill(cluster.workers[0].pid, signal.SIGKILL)
-    finish(process)
-    assert cluster.workers[1].poll() is None
-    assert_same_study(near, tmp_path / "out")
 
 
 @pytest.mark.slow

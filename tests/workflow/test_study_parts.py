@@ -37,7 +37,7 @@ from workflow.report.rendering import render_page
 from workflow.study.columns import COLUMNS, numbers_of
 from workflow.study.page import PointRow, StudyView, draw_pareto, pareto_front, row_of
 from workflow.study.points import Point, short
-from workflow.study.settings import Axis, ParetoPlot, last_name, load_study, parse_key, tidy, with_values
+from workflow.study.settings import Axis, ParetoPlot, last_name, parse_key, tidy, with_values
 from workflow.study.task import Task
 from workflow.tasks.results import (
     AchievablePerformance,
@@ -102,13 +102,6 @@ def test_names_of_values():
         "[1, 2.5]",
         "{a = 1}",
     ]
-
-
-def test_example_is_a_valid_study():
-    read = load_study(ROOT / "examples" / "study.toml")
-    config, base = read.config, read.base
-    assert base is None
-    assert {axis.name for axis in config.axes} == {"asked_rad_s", "order", "payload_kg"}
 
 
 def _row(number: int, bandwidth: float | None, margin: float | None, good: bool = True) -> PointRow:
@@ -328,13 +321,9 @@ def test_an_interrupt_while_a_process_begins_is_no_traceback(tmp_path):
 def test_tables_show_what_was_asked_for_and_no_empty_column():
     axis = Axis.model_validate({"key": "specification.bandwidth_rad_s", "label": "asked", "values": [1.0]})
     numbers = dict.fromkeys(COLUMNS) | {
-        "worst_gamma": 0.9,
-        "any_order_gamma": 0.8,
-        "predicted_peak_sensitivity": 1.4,
-        "measured_peak_sensitivity": 1.42,
-        "settled_draws": 1,
-        "draws": 2,
-    }
+        "worst_gamma": 0.9, "any_order_gamma": 0.8, "predicted_peak_sensitivity": 1.4,
+        "measured_peak_sensitivity": 1.42, "settled_draws": 1, "draws": 2,
+    }  # fmt: skip
     row = PointRow(1, "a", {axis.key: 1.0}, "keeps moving", "why", numbers)
     config: Any = SimpleNamespace(axes=(axis,), pareto=())
     view = StudyView("a study", config, "[study]", "the arm", [row], {})
