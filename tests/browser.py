@@ -13,20 +13,10 @@ from typing import Any
 
 PROGRAM = shutil.which("chromium")
 _FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--disable-dev-shm-usage",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--disable-extensions",
-    "--hide-scrollbars",
-    "--force-color-profile=srgb",
-    "--remote-debugging-pipe",
-)
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--disable-dev-shm-usage",
+    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--disable-extensions", "--hide-scrollbars", "--force-color-profile=srgb", "--remote-debugging-pipe",
+)  # fmt: skip
 
 
 class Browser:
@@ -112,14 +102,8 @@ class Browser:
 
     def press(self, key: str) -> None:
         codes = {
-            "Enter": 13,
-            "Escape": 27,
-            "Tab": 9,
-            "ArrowRight": 39,
-            "ArrowLeft": 37,
-            "PageDown": 34,
-            " ": 32,
-        }
+            "Enter": 13, "Escape": 27, "Tab": 9, "ArrowRight": 39, "ArrowLeft": 37, "PageDown": 34, " ": 32,
+        }  # fmt: skip
         text = {"Enter": "\r", " ": " "}.get(key, key if len(key) == 1 else "")
         more = {"text": text} if text else {}
         for kind in ("keyDown", "keyUp"):

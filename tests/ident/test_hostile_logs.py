@@ -19,16 +19,10 @@ from tests.ident.test_forty_logs import LOGS
 # Those that a process of its own reads take a second each.
 IN_PROCESS = ("semicolons, decimal commas", "day.month.year", "packed by gzip", "npz, a matrix")
 IN_A_CHILD = (
-    "a spreadsheet with preamble, units and dates",
-    "parquet with instants",
-    "HDF5 with groups and attributes",
-    "MATLAB 5",
-    "MATLAB 7.3",
-    "MCAP of JSON",
-    "MCAP of ROS 2, two topics",
-    "ROS 1 bag",
-    "ROS 2 bag",
-)
+    "a spreadsheet with preamble, units and dates", "parquet with instants",
+    "HDF5 with groups and attributes", "MATLAB 5", "MATLAB 7.3", "MCAP of JSON", "MCAP of ROS 2, two topics",
+    "ROS 1 bag", "ROS 2 bag",
+)  # fmt: skip
 
 
 def refusal(path) -> str | None:

@@ -9,15 +9,9 @@ from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 
 MODEL = GobfModel(
-    poles=Poles([0.5, 0.98], [0.97 * np.exp(0.3j)]),
-    coefficients=[0.3, -0.2, 0.5, 0.1],
-    dt_s=0.01,
-    feedthrough=0.4,
-    integrators=2,
-    input_delay_samples=3,
-    input_name="voltage",
-    output_name="angle",
-)
+    poles=Poles([0.5, 0.98], [0.97 * np.exp(0.3j)]), coefficients=[0.3, -0.2, 0.5, 0.1], dt_s=0.01,
+    feedthrough=0.4, integrators=2, input_delay_samples=3, input_name="voltage", output_name="angle",
+)  # fmt: skip
 OMEGA = np.geomspace(0.1, 300, 50)
 
 

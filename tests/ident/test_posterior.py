@@ -19,16 +19,10 @@ def posterior(seed=0, integrators=1, delay=2, direct=True, taps=4):
     rng = np.random.default_rng(seed)
     size = POLES.order + direct + taps
     return ResponsePosterior(
-        poles=POLES,
-        mean=rng.standard_normal(size),
-        covariance_factor=0.05 * rng.standard_normal((size, 6)),
-        dt_s=DT,
-        fir_length=taps,
-        has_feedthrough=direct,
-        integrators=integrators,
-        input_delay_samples=delay,
+        poles=POLES, mean=rng.standard_normal(size), covariance_factor=0.05 * rng.standard_normal((size, 6)),
+        dt_s=DT, fir_length=taps, has_feedthrough=direct, integrators=integrators, input_delay_samples=delay,
         report=EmbeddingReport("test", 0.1, 1.0, 0.9, 0.5, 2.0, 100, 3, (0.5, -0.1)),
-    )
+    )  # fmt: skip
 
 
 def transfer_function(p, coefficients):

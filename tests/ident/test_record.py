@@ -183,16 +183,10 @@ def test_a_format_of_ones_own_is_one_registered_reader(tmp_path, good, monkeypat
 
 def two_by_two(**change):
     fields = {
-        "name": "r",
-        "input": np.arange(8.0).reshape(4, 2),
-        "output": np.arange(12.0).reshape(4, 3),
-        "dt_s": 0.1,
-        "input_names": ("a", "b"),
-        "output_names": ("c", "d", "e"),
-        "reference": np.ones((4, 1)),
-        "reference_names": ("ref",),
-        "output_units": ("rad", "m", "m/s^2"),
-    }
+        "name": "r", "input": np.arange(8.0).reshape(4, 2), "output": np.arange(12.0).reshape(4, 3),
+        "dt_s": 0.1, "input_names": ("a", "b"), "output_names": ("c", "d", "e"), "reference": np.ones((4, 1)),
+        "reference_names": ("ref",), "output_units": ("rad", "m", "m/s^2"),
+    }  # fmt: skip
     return Record(**(fields | change))
 
 

@@ -158,15 +158,10 @@ def test_moments_are_those_of_the_mixture():
     rest = KernelPosterior(rng.standard_normal(length), factor, 0.5, 1.0, 0.9, 0.4, 0.0)
     half = rng.standard_normal((k, 2, 2))
     mixture = PairMixture(
-        poles=TRIAL,
-        weight=np.array([0.3, 0.1]),
-        mean=rng.standard_normal((k, 2)),
-        covariance=half @ half.transpose(0, 2, 1),
-        noise_variance=np.array([0.4, 0.7]),
-        onto=np.zeros((1, 4)),
-        probability=0.45,
-        visible=None,
-    )
+        poles=TRIAL, weight=np.array([0.3, 0.1]), mean=rng.standard_normal((k, 2)),
+        covariance=half @ half.transpose(0, 2, 1), noise_variance=np.array([0.4, 0.7]), onto=np.zeros((1, 4)),
+        probability=0.45, visible=None,
+    )  # fmt: skip
     found = with_pairs(rest, mixture)
     hypotheses = [(0.6, np.concatenate([rest.kernel_mean, np.zeros(4)]), np.zeros((7, 7)))]
     hypotheses[0][2][:3, :3] = factor @ factor.T

@@ -54,15 +54,9 @@ def looped(plant, seed, n=3000, noise=1e-3, gains=(1.2, 0.08), push=0.0, limit=n
         u[k] = np.clip(gains[0] * error + gains[1] * rate, -limit, limit)
         pushed[k] += u[k]
     return Record(
-        f"{seed}",
-        u[:, None],
-        measured[:, None],
-        DT,
-        ("u",),
-        ("y",),
-        reference=r[:, None],
+        f"{seed}", u[:, None], measured[:, None], DT, ("u",), ("y",), reference=r[:, None],
         reference_names=("r",),
-    )
+    )  # fmt: skip
 
 
 def sampled(numerator, denominator, dt_s=DT):

@@ -147,17 +147,10 @@ def _noise(rig):
 
 def test_answers_without_effects_are_toml():
     answer = {
-        "case": "a",
-        "verdict": "unknown",
-        "severity": "clear",
-        "max_ratio": 3.2,
-        "sort": "unlisted",
-        "nominal": "exact",
-        "effects": [],
-        "unlisted": [{"name": "air_drag", "coefficient_Ns2_m3": 0.2}],
-        "pooled_gap": {"held_out_gap_before": 2.0},
-        "experiments": {"01_prbs_low": {"hub_ratio": 1.0}},
-    }
+        "case": "a", "verdict": "unknown", "severity": "clear", "max_ratio": 3.2, "sort": "unlisted",
+        "nominal": "exact", "effects": [], "unlisted": [{"name": "air_drag", "coefficient_Ns2_m3": 0.2}],
+        "pooled_gap": {"held_out_gap_before": 2.0}, "experiments": {"01_prbs_low": {"hub_ratio": 1.0}},
+    }  # fmt: skip
     assert tomllib.loads(answer_toml(answer))["unlisted"][0]["name"] == "air_drag"
 
 

@@ -84,7 +84,7 @@ def test_perfect_answers_have_perfect_scores():
         "verdict and set right, every case",
         "95 % intervals cover",
     ):
-        assert rows[name]["share"] == 1.0, name
+        assert rows[name]["share"] == 1.0, name  # fmt: skip
     for name in ("false alarms", "missed effects", "confident and wrong (p > 0.8)"):
         assert rows[name]["share"] == 0.0, name
     assert rows["Brier of the first answer"]["value"] == 0.0
