@@ -216,15 +216,23 @@ def test_records_of_an_independent_simulator_with_imperfections(gap_cases, name,
         assert low < value < high
 
 
+RUBS = Background(dry_friction_Nm=2e-3, presliding_rad=1e-3)
+
+
+def _recorded(rng, size_V, count, hold, effects=(), background=RUBS, roles="eeh"):
+    """Name, role, random binary voltage (T,) and clean motion of records of an independent simulator."""
+    truth = Truth(RIG.model_dump(exclude={"tolerances"}), effects, background)
+    for name, role in zip("abc", roles, strict=False):
+        voltage = size_V * rng.choice([-1.0, 1.0], count).repeat(hold)
+        clean = truth.record(voltage, None, None, Before(0.4))
+        yield name, "held_out" if role == "h" else "estimation", voltage, clean
+
+
 def _simulated(effect, seed=15):
     """A case of an independent simulator: one effect beside a little dry friction."""
-    rng = np.random.default_rng(seed)
+    rng, records = np.random.default_rng(seed), []
     background = Background(dry_friction_Nm=0.015, presliding_rad=1e-3)
-    truth = Truth(RIG.model_dump(exclude={"tolerances"}), (effect,), background)
-    records = []
-    for name, role in (("a", "estimation"), ("b", "estimation"), ("c", "held_out")):
-        voltage = rng.choice([-3.0, 3.0], 40).repeat(15)
-        clean = truth.record(voltage, None, None, Before(0.4))
+    for name, role, voltage, clean in _recorded(rng, 3.0, 40, 15, (effect,), background):
         read = np.column_stack([clean.hub_angle_rad, clean.tip_m])
         noise = np.array([RIG.sensors.hub_angle_noise_rad, RIG.sensors.tip_noise_m])
         records.append(Experiment(name, role, voltage, read + noise * rng.standard_normal(read.shape)))
@@ -501,12 +509,9 @@ def test_a_tilt_across_the_link_is_not_the_listed_one(turned_rad, answer):
 
 def test_a_tilt_in_any_direction_is_found_where_the_tip_tells_the_zero():
     # Records of an independent simulator that turns far, on a plane that falls off across the link.
-    rng = np.random.default_rng(4)
-    truth = Truth(RIG.model_dump(exclude={"tolerances"}), (), Background(tilt_m_s2=0.3, tilt_angle_rad=-1.9))
-    records = []
-    for name, role in (("a", "estimation"), ("b", "held_out")):
-        voltage = 2.0 * rng.choice([-1.0, 1.0], 20).repeat(40)
-        clean = truth.record(voltage, None, None, Before(0.4))
+    tilted, records = Background(tilt_m_s2=0.3, tilt_angle_rad=-1.9), []
+    made = _recorded(np.random.default_rng(4), 2.0, 20, 40, (), tilted, "eh")
+    for name, role, voltage, clean in made:
         read = np.column_stack([clean.hub_angle_rad + 0.2, clean.tip_m])
         records.append(_experiment(name, role, read, voltage))
     case = Case("tilted", RIG, tuple(records), 0.05)
@@ -627,14 +632,9 @@ def test_beside_others_a_frequency_is_tried_as_simulated_not_as_a_linear_arm_wou
 
 def _hub_only(seed, *effects):
     """Search of records of the hub angle alone, of an independent simulator that rubs a little."""
-    rng = np.random.default_rng(seed)
-    truth = Truth(
-        RIG.model_dump(exclude={"tolerances"}), effects, Background(dry_friction_Nm=2e-3, presliding_rad=1e-3)
-    )
-    records = []
-    for name, role in (("a", "estimation"), ("b", "estimation"), ("c", "held_out")):
-        voltage = 1.5 * rng.choice([-1.0, 1.0], 20).repeat(40)
-        angle = truth.record(voltage, None, None, Before(0.4)).hub_angle_rad[:, None]
+    rng, records = np.random.default_rng(seed), []
+    for name, role, voltage, clean in _recorded(rng, 1.5, 20, 40, effects):
+        angle = clean.hub_angle_rad[:, None]
         read = angle + 3e-4 * rng.standard_normal(angle.shape)
         records.append(Experiment(name, role, voltage, read, outputs=("hub_angle_rad",)))
     search = Search(Case("hub", RIG, tuple(records), 0.05), lambda share, words: None)
@@ -662,10 +662,9 @@ def test_a_record_that_begins_in_free_play_is_followed_from_there(seed):
     # Cut out of a run: until the hub touches, it goes on as it went, which no linear arm does.
     rng = np.random.default_rng(seed)
     play = {"name": "backlash", "gap_rad": 0.1}
-    truth, records = Truth(RIG.model_dump(exclude={"tolerances"}), (play,), Background()), []
-    for name, role in (("a", "estimation"), ("b", "estimation"), ("c", "held_out")):
-        voltage = 1.5 * rng.choice([-1.0, 1.0], 30).repeat(40)
-        angle = truth.record(voltage, None, None, Before(0.4)).hub_angle_rad[:, None]
+    records = []
+    for name, role, voltage, clean in _recorded(rng, 1.5, 30, 40, (play,), Background()):
+        angle = clean.hub_angle_rad[:, None]
         first = int(rng.integers(250, 450))
         read = angle[first:] + 3e-4 * rng.standard_normal(angle[first:].shape)
         records.append(Experiment(name, role, voltage[first:], read, outputs=("hub_angle_rad",)))
@@ -933,13 +932,10 @@ def test_a_set_that_one_record_alone_prefers_is_less_sure():
 
 def test_a_simpler_effect_is_also_sought_where_the_one_that_contains_it_ended():
     # Dry friction whose fit was left in a poor minimum; one that falls with speed was not, and does not fall.
-    rng = np.random.default_rng(12)
-    rubbing = ({"name": "coulomb_friction", "torque_Nm": 0.1},)
-    truth = Truth(RIG.model_dump(exclude={"tolerances"}), rubbing, Background(presliding_rad=1e-4))
-    records = []
-    for name, role in (("a", "estimation"), ("b", "held_out")):
-        voltage = rng.choice([-3.0, 3.0], 30).repeat(15)
-        clean = truth.record(voltage, None, None, Before(0.4))
+    rubbing, records = ({"name": "coulomb_friction", "torque_Nm": 0.1},), []
+    sharp = Background(presliding_rad=1e-4)
+    made = _recorded(np.random.default_rng(12), 3.0, 30, 15, rubbing, sharp, "eh")
+    for name, role, voltage, clean in made:
         records.append(_experiment(name, role, np.column_stack([clean.hub_angle_rad, clean.tip_m]), voltage))
     search = Search(Case("rubs", RIG, tuple(records), 0.05), lambda share, words: None)
     kinds = {c.effect: c for c in search.case.machine.candidates(search.case.experiments)}
@@ -962,15 +958,10 @@ def test_gain_and_zeros_of_a_strain_gauge_and_a_tachometer():
     rng = np.random.default_rng(8)
     levels = {"sensors.tip_deflection_noise_m": 2e-4, "sensors.hub_speed_noise_rad_s": 0.02}
     rig = RIG.perturbed(levels).model_copy(update={"tolerances": {"hub.inertia_kg_m2": 0.05}})
-    truth = Truth(
-        RIG.model_dump(exclude={"tolerances"}), (), Background(dry_friction_Nm=2e-3, presliding_rad=1e-3)
-    )
     lever, dt_s = RIG.hub.radius_m + RIG.link.length_m, RIG.sampling.dt_s
     names = ("hub_angle_rad", "hub_speed_rad_s", "tip_deflection_m")
     records = []
-    for name, role in (("a", "estimation"), ("b", "estimation"), ("c", "held_out")):
-        voltage = rng.choice([-3.0, 3.0], 40).repeat(15)
-        clean = truth.record(voltage, None, None, Before(0.4))
+    for name, role, voltage, clean in _recorded(rng, 3.0, 40, 15):
         bent = clean.tip_m - lever * clean.hub_angle_rad
         read = np.column_stack(
             [clean.hub_angle_rad - 0.2, np.gradient(clean.hub_angle_rad, dt_s) + 0.1, 1.4 * bent + 0.004]
