@@ -107,14 +107,14 @@ STREAMS = {
 def test_any_kind_of_output_will_do(kind, more, tmp_path):
     (tmp_path / "l°g.csv").write_text(PRINTS_A_TABLE)
     set_, streams = STREAMS[kind]
-    command = (
-        f"{sys.executable} -m workflow look {tmp_path}/*.csv {more} --out {tmp_path}/page.html {streams}"
-    )
+    # Drawing is slow: a page where nothing else shows that the end was reached, and in the C locale.
+    page = f"--out {tmp_path}/page.html" if streams or "C" in kind else ""
+    command = f"{sys.executable} -m workflow look {tmp_path}/*.csv {more} {page} {streams}"
     shell = ["bash", "-o", "pipefail", "-c", command]
     done = subprocess.run(shell, cwd=ROOT, env={**os.environ, **set_}, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr
     assert b"rror" not in done.stderr
-    assert (tmp_path / "page.html").read_text().endswith("</html>\n")
+    assert not page or (tmp_path / "page.html").read_text().endswith("</html>\n")
     if not streams:
         text = done.stdout.decode("latin-1" if kind == "latin-1" else "ascii")
         assert json.loads(text) if more else "_" in text and "hub_angle_rad" in text
