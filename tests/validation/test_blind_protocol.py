@@ -103,10 +103,10 @@ def test_rigs_are_arms_and_what_is_stated_is_off_by_tolerances():
 @pytest.mark.slow
 def test_generated_cases_hold_what_their_answers_say(tmp_path):
     # Five cases: one of every sort.
-    answers = generate(5, 5, tmp_path / "open", open_cases=True)
+    answers = generate(5, 5, tmp_path, open_cases=True)
     assert [a["case"] for a in answers] == [f"case_{k:04d}" for k in range(1, 6)]
     for answer in answers:
-        folder = tmp_path / "open" / answer["case"]
+        folder = tmp_path / answer["case"]
         assert tomllib.loads((folder / "answer.toml").read_text())["verdict"] == answer["verdict"]
         assert folder_hash(folder) == answer["sha256"]
         exact = Rig.from_toml(folder / "rig_exact.toml")
@@ -137,8 +137,6 @@ def test_generated_cases_hold_what_their_answers_say(tmp_path):
             switching = {"backlash", "quantisation", "coulomb_friction", "stribeck_friction"}
             slack = 1.25 if names & switching else 1.03
             assert rms < slack * answer["pooled_gap"][f"{role}_gap_after_oracle"]
-    again = generate(5, 5, tmp_path / "again", finished={a["case"]: a for a in answers[:-1]})
-    assert again == [*answers[:-1], {**answers[-1], "sha256": again[-1]["sha256"]}]
 
 
 def _noise(rig):

@@ -148,7 +148,10 @@ def test_a_schedule_has_the_shares_and_no_effect_its_sensors_cannot_show():
 
 @pytest.mark.slow
 def test_generated_cases_load_and_hold_what_their_answers_say(tmp_path):
-    answers = generate(5, 1, tmp_path, open_cases=True, workshop=True)
+    # Of one effect there are two beside the pair; each case takes ten seconds.
+    left_out = {name: {"case": name} for name in ("case_0001", "case_0005")}
+    answers = generate(5, 1, tmp_path, open_cases=True, workshop=True, finished=left_out)
+    answers = [answer for answer in answers if answer["case"] not in left_out]
     assert {a["verdict"] for a in answers} == {"none", "effect", "unknown"}
     for answer in answers:
         case = load_case(tmp_path / answer["case"]).case
