@@ -10,12 +10,7 @@ import pytest
 
 from benchmarks import mimo_problems as problems
 from benchmarks.mimo_designs import DT_D, TS, plant_d, plant_t, specification_d, specification_t, tustin
-from control_design import (
-    Controller,
-    MultivariablePlant,
-    ResponseBall,
-    certify_multivariable,
-)
+from control_design import Controller, MultivariablePlant, ResponseBall, certify_multivariable
 from control_design.plants.ellipses import Ellipses, distance_to_minus_one
 from control_design.plants.multivariable import tustin_s
 from control_design.plants.scaled_bound import Rows, expansion, scaled_bound, stability_bound, structured_norm

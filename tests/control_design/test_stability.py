@@ -8,12 +8,7 @@ import pytest
 
 from control_design import Controller, Ellipses, UncertainPlant
 from control_design.analysis.margins import ellipse_margins, nominal_margins
-from control_design.analysis.stability import (
-    closed_loop_poles,
-    loop_integrators,
-    mode_changes,
-    nyquist_count,
-)
+from control_design.analysis.stability import closed_loop_poles, loop_integrators, mode_changes, nyquist_count
 from control_design.plants.ellipses import distance_to_minus_one
 from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import frequency_response

@@ -24,9 +24,7 @@ from diagnosis.fit.descent import Descent, descend, occam, refined, scanned
 from diagnosis.fit.levels import Levels, quietest
 from diagnosis.fit.records import Records, Start, StartColumns
 from diagnosis.fit.starts import Point, points_of
-from diagnosis.imperfect.answered import (
-    _in_part,
-)
+from diagnosis.imperfect.answered import _in_part
 from diagnosis.imperfect.carried import shares_of
 from diagnosis.imperfect.verdict import TEMPER, _enough, _weights, is_silent, judged
 from diagnosis.machine.flexible_arm import FlexibleArm

@@ -12,15 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.signal import lsim
 
-from diagnosis import (
-    EffectParameter,
-    Plant,
-    PlantCase,
-    PlantEffect,
-    PlantExperiment,
-    diagnose,
-    with_effects,
-)
+from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
 from diagnosis.machine.listed_effects import KINDS
 from diagnosis.machine.motion_effects import BodyForces, LinearBody, PulseResponse
 from diagnosis.machine.plant_effect import Change

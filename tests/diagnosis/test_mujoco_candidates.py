@@ -125,13 +125,7 @@ CASES: dict[str, tuple[Machine, str, str, str, float]] = {
     ),
     "spring": (Machine(SPRUNG), rod(), "*.elastic", "hinge.elastic", 60.0),
     "centre": (Machine(true_rod(com=0.36, **hanging)), rod(**hanging), "*.com_*", "rod.com_x", 0.06),
-    "shear": (
-        Machine(true_head(inertia=sheared), size=0.4),
-        head(),
-        "*.shear_*",
-        "head.shear_xz",
-        0.2,
-    ),
+    "shear": (Machine(true_head(inertia=sheared), size=0.4), head(), "*.shear_*", "head.shear_xz", 0.2),
     "stretch": (
         Machine(true_head(inertia=stretched), size=0.4),
         head(),

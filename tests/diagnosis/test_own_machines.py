@@ -17,15 +17,7 @@ from numba import njit
 from scipy.signal import lfilter
 
 from benchmarks import emps_axis
-from diagnosis import (
-    EffectParameter,
-    Plant,
-    PlantCase,
-    PlantEffect,
-    PlantExperiment,
-    diagnose,
-    with_effects,
-)
+from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
 from diagnosis.fit.descent import descend
 from diagnosis.imperfect.answered import beside_imperfections, searched
 from diagnosis.search.moves import Alone, Beside, Enlarge, FromContacts, Scan

@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from diagnosis import (
-    EffectParameter,
-    Plant,
-    PlantCase,
-    PlantEffect,
-    PlantExperiment,
-    diagnose,
-    with_effects,
-)
+from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
 from diagnosis.machine.machine_protocol import Weighing
 from diagnosis.machine.probed import doubts_about
 from examples import own_plant
@@ -91,10 +83,7 @@ def test_what_no_listed_effect_describes_is_unknown():
 
 def test_a_stated_model_error_is_no_unknown_cause():
     # The same tone, small beside what is stated that the simulation may miss.
-    case = _case(
-        lambda t, x, v, f: (f - 80.0 * x - 3.0 * v + 0.1 * np.sin(25 * t)) / 2.0,
-        model_error=0.05,
-    )
+    case = _case(lambda t, x, v, f: (f - 80.0 * x - 3.0 * v + 0.1 * np.sin(25 * t)) / 2.0, model_error=0.05)
     found = diagnose(case)
     assert (found.verdict, found.combination) == ("none", ())
     assert found.doubts == ()

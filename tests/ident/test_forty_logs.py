@@ -224,12 +224,7 @@ LOGS = {
         ("Time", "Drive", "Hub"),
     ),
     "tabs, blanks in the dates, comments of as many words": Log(
-        "a.tsv",
-        text(
-            "\t",
-            above=("# made by a script",),
-            time=lambda t: clock("%Y-%m-%d %H:%M:%S.%f")(t),
-        ),
+        "a.tsv", text("\t", above=("# made by a script",), time=lambda t: clock("%Y-%m-%d %H:%M:%S.%f")(t))
     ),
     "names and numbers in quotation marks": Log(
         "a.csv",

@@ -5,11 +5,7 @@ import pytest
 
 from plant import linear_arm, paper_link
 from plant.rig import Hub
-from validation.example_arms import (
-    paper_example,
-    two_link_matrices,
-    two_link_operating_point,
-)
+from validation.example_arms import paper_example, two_link_matrices, two_link_operating_point
 
 RIG = paper_link().perturbed({"hub.radius_m": 0.0, "payload.mass_kg": 0.03})
 HUBS = (

@@ -101,8 +101,7 @@ STREAMS = {
 
 # Text and JSON in every encoding that differs between them; of closed streams each once.
 @pytest.mark.parametrize(
-    ("kind", "more"),
-    [("ascii", "--json"), ("C locale", "--json"), *((kind, "") for kind in STREAMS)],
+    ("kind", "more"), [("ascii", "--json"), ("C locale", "--json"), *((kind, "") for kind in STREAMS)]
 )
 def test_any_kind_of_output_will_do(kind, more, tmp_path):
     (tmp_path / "l°g.csv").write_text(PRINTS_A_TABLE)

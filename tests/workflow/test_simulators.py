@@ -112,8 +112,7 @@ def write_pendulum_log(
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
-    ("integrator", "load_kg", "friction_Nm"),
-    [("implicitfast", 0.15, 0.12), ("implicit", 0.0, 0.1)],
+    ("integrator", "load_kg", "friction_Nm"), [("implicitfast", 0.15, 0.12), ("implicit", 0.0, 0.1)]
 )
 def test_a_load_and_friction_of_a_pendulum_without_a_site_are_found(
     tmp_path, flexlink, integrator, load_kg, friction_Nm
