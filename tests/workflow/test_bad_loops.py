@@ -140,9 +140,9 @@ def test_two_controllers_are_taken(taken, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("turned", ["u", "y"])
-def test_a_turned_sign_is_turned_back(taken, tmp_path, turned):
-    made = [{**one, turned: -one[turned]} for one in logs(levels=(0.2, 0.15))]
+def test_a_turned_sign_is_turned_back(taken, tmp_path):
+    """Of the encoder; of the command: tests/workflow/test_init.py."""
+    made = [{**one, "y": -one["y"]} for one in logs(levels=(0.2, 0.15))]
     assert_right(taken(written(tmp_path, made)))
 
 
