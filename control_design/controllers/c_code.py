@@ -43,13 +43,19 @@ def c_header(controller: Controller, prefix: str = "controller", number: Number 
     return _filled(
         "controller.h.in",
         controller,
-        about=re.sub(r"[^ -~]|\*/", "?", controller.name),
+        about=_ascii(controller.name),
         delay=controller.computational_delay_samples,
         dt_s=repr(controller.dt_s),
         guard=f"{prefix.upper()}_H",
         name=prefix,
         number=number,
+        signals=_ascii(controller.signals),
     )
+
+
+def _ascii(text: str) -> str:
+    """As it may stand in a comment."""
+    return re.sub(r"[^ -~]|\*/", "?", text)
 
 
 def c_source(controller: Controller, prefix: str = "controller", number: Number = "double") -> str:
@@ -140,6 +146,7 @@ def _filled(template: str, controller: Controller, **values: object) -> str:
         "friction": given is not None,
         "breakaway": given is not None and given.excess > 0,
         "matrix": controller.D.size > 1,
+        "signals": bool(controller.signals),
     }
     lines = []
     for line in _template(template):

@@ -4,7 +4,7 @@ delay, and what dry friction takes off the command given back from the reference
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -29,7 +29,8 @@ class Controller(Law):
     A (n, n), B (n, Y), C (U, n), D (U, Y); dt_s > 0. input_limit, rate_limit: saturation (both signs) and
     largest change per second of the command, or None; with U > 1 a tuple of these. anti_windup_gain M (n, U):
     back-calculation in observer form, A - M C stable; default `observer_gain`. computational_delay_samples:
-    from measurement to command. feedforward: joins u before it is limited, or None.
+    from measurement to command. feedforward: joins u before it is limited, or None. signals: the columns and
+    units of error and command, in words.
     """
 
     kind = "controller"
@@ -41,6 +42,7 @@ class Controller(Law):
     anti_windup_gain: Real | None = None
     name: str = "controller"
     feedforward: FrictionFeedforward | None = None
+    signals: str = field(default="", metadata={"since": 8})
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -97,13 +99,35 @@ class Controller(Law):
         each = value if isinstance(value, tuple) else (value,) * self.D.shape[0]
         return np.array([np.inf if one is None else one for one in each], dtype=np.float64)
 
+    def in_units(self, error: Real, command: Real) -> Controller:
+        """The same in other units: old = error (Y,) * new, old = command (U,) * new, of either sign."""
+        given, own = self.feedforward, {}
+        for name in ("input_limit", "rate_limit"):
+            most = tuple(None if one == np.inf else float(one) for one in self.limits(name) / np.abs(command))
+            own[name] = most if isinstance(getattr(self, name), tuple) else most[0]
+        if given is not None:
+            size, worth = abs(float(error[0])), float(np.sign(error[0]) / command[0])
+            given = FrictionFeedforward(
+                worth * given.level, given.width / size, given.lag_s, worth * given.excess, given.fall / size
+            )
+        assert self.anti_windup_gain is not None
+        return replace(
+            self,
+            B=self.B * error,
+            C=self.C / command[:, None],
+            D=self.D * error / command[:, None],
+            anti_windup_gain=self.anti_windup_gain * command,
+            feedforward=given,
+            **own,
+        )
+
     def to_control(self, *, include_delay: bool = False) -> control.StateSpace:
         """Linear part as `control.StateSpace`; with include_delay the delay's states come after K's."""
         return delayed(super().to_control(), self.computational_delay_samples if include_delay else 0)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Inverse of `to_dict`, as of `Law`; a file may lack the feed-forward."""
+        """Inverse of `to_dict`, as of `Law`; a file may lack feed-forward and signals."""
         given = data.get("feedforward")
         try:
             made = None if given is None else FrictionFeedforward(**given)
@@ -111,7 +135,7 @@ class Controller(Law):
             raise ValueError(
                 f"feedforward needs level, width, lag_s, excess and fall; got {given!r:.80}"
             ) from error
-        return super().from_dict({**data, "feedforward": made})
+        return super().from_dict({"signals": "", **data, "feedforward": made})
 
     def stepper(self) -> ControllerStepper:
         """A fresh machine-side instance of one loop at rest."""
@@ -227,9 +251,10 @@ class FrictionFeedforward:
     joins the command: p+ = p + share (friction - p). No feedback: poles and margins stay, and it dies out at
     rest.
 
-    level, excess >= 0 in units of the command, width > 0 of the reference, fall > 0 of the reference per
-    second, lag_s > 0. Neglected: friction that depends on position or load; motion that something other than
-    the reference causes; a reference that comes in steps longer than a sample.
+    level, excess in units of the command, both below 0 where a positive command moves the output down; width
+    > 0 of the reference, fall > 0 of the reference per second, lag_s > 0. Neglected: friction that depends on
+    position or load; motion that something other than the reference causes; a reference that comes in steps
+    longer than a sample.
     """
 
     level: float
@@ -239,10 +264,10 @@ class FrictionFeedforward:
     fall: float = 1.0
 
     def __post_init__(self) -> None:
-        good = min(self.level, self.excess) >= 0 and min(self.width, self.lag_s, self.fall) > 0
+        good = self.level * self.excess >= 0 and min(self.width, self.lag_s, self.fall) > 0
         if not (good and np.all(np.isfinite(list(vars(self).values())))):
             raise ValueError(
-                f"a friction feed-forward needs level, excess >= 0 and width, lag_s, fall > 0; got {self}"
+                f"a friction feed-forward needs level, excess of one sign, width, lag_s, fall > 0; got {self}"
             )
 
     def share(self, dt_s: float) -> float:

@@ -123,11 +123,13 @@ class Law:
 
     def to_mat(self) -> bytes:
         """MATLAB 5 file of all fields; a limit that is None is infinite (one per actuator: a row), a
-        feed-forward that is None is left out."""
+        feed-forward that is None and signals that nobody named are left out."""
         values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
         given = values.pop("feedforward", None)
         if given is not None:
             values["feedforward"] = vars(given)
+        if not values.get("signals"):
+            values.pop("signals", None)
         for name, value in values.items():
             if isinstance(value, tuple):
                 values[name] = np.array([np.inf if one is None else one for one in value])

@@ -128,8 +128,9 @@ def test_a_type_that_is_none_of_c_is_refused():
 
 @needs_compiler
 def test_header_and_source_belong_together(tmp_path):
-    controller = _controller(2, name="a */ tricky name \n")
+    controller = _controller(2, name="a */ tricky name \n", signals="error: y */ [°]; command: u [V]")
     (tmp_path / "arm.h").write_text(c_header(controller, "arm"))
+    assert "   error: y ? [?]; command: u [V].\n" in c_header(controller, "arm")
     (tmp_path / "main.c").write_text(
         '#include "arm.h"\nint main(void) { arm_state s; arm_reset(&s); return arm_step(&s, 0.0) != 0.0; }\n'
     )

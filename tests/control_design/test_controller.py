@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import control
 import numpy as np
@@ -74,6 +75,35 @@ def test_anti_windup_keeps_a_non_minimum_phase_controller_bounded():
     assert np.all(np.abs(stepper._x) < 100)
 
 
+@pytest.mark.parametrize(("error", "command"), [(1.0, -1.0), (-1e-3, 0.5), (2.0, 4.0)])
+def test_a_law_in_other_units_is_the_same_loop(error, command):
+    """Errors and commands that it takes and gives are those of the law in quantities, over the factors."""
+    given = FrictionFeedforward(0.04, 1e-3, 0.17, excess=0.02, fall=0.3)
+    law = _random(np.random.default_rng(6), input_limit=0.5, rate_limit=20.0, feedforward=given)
+    other = law.in_units(np.array([error]), np.array([command]))
+    reference = np.cumsum(0.003 * np.random.default_rng(7).standard_normal(400))
+    steppers, found = (law.stepper(), other.stepper()), np.empty((2, 400))
+    for k, at in enumerate(reference):
+        off = 20 * at * np.sin(k / 9)
+        found[:, k] = steppers[0].step(off, at), command * steppers[1].step(off / error, at / error)
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-12)
+    assert 10 < np.sum(np.abs(found[0]) == 0.5) < 390
+
+
+def test_a_law_of_two_joints_in_other_units():
+    rng, error, command = np.random.default_rng(8), np.array([2.0, -3.0]), np.array([-0.5, 4.0])
+    law = Controller(
+        0.8 * np.eye(3), rng.standard_normal((3, 2)), rng.standard_normal((2, 3)), np.eye(2), _DT,
+        input_limit=(1.0, None), rate_limit=(None, 300.0),
+    )  # fmt: skip
+    other = law.in_units(error, command)
+    assert (other.input_limit, other.rate_limit) == ((2.0, None), (None, 75.0))
+    steppers = law.matrix_stepper(), other.matrix_stepper()
+    for given in rng.standard_normal((50, 2)):
+        wanted = steppers[0].step(given)
+        np.testing.assert_allclose(command * steppers[1].step(given / error), wanted, atol=1e-12)
+
+
 def from_mat(path) -> Controller:
     """A controller from its MATLAB file, in which no limit is inf."""
     found = scipy.io.loadmat(path, simplify_cells=True)
@@ -87,6 +117,7 @@ def test_json_and_mat_round_trip_exactly(tmp_path):
         _pi(),
         Controller.proportional(2.0, _DT),
         Controller.proportional(2.0, _DT, feedforward=FrictionFeedforward(0.04, 1e-5, 0.17)),
+        replace(_pi(), signals="error: y [rad]; command: u [V]"),
     ):
         text = controller.to_json()
         copies = [Controller.from_json(text)]
@@ -103,6 +134,7 @@ def test_json_and_mat_round_trip_exactly(tmp_path):
                 "computational_delay_samples",
                 "name",
                 "feedforward",
+                "signals",
             ):
                 assert getattr(copy, name) == getattr(controller, name)
 

@@ -30,6 +30,7 @@ from workflow.tasks.stage import StageInput
 from workflow.tasks.uncertainty import find_uncertainty
 
 NAMES = ("time_s", "r_rad", "u_A", "y_rad")
+NO_REFERENCE = ("time_s", "", "u_A", "y_rad")
 
 
 def open_loop(seed: int) -> tuple[np.ndarray, ...]:
@@ -62,7 +63,7 @@ CASES = {
 
 
 def by_run(
-    logs, reference, options=None, described=None, band_rad_s=None, loop=None
+    logs, reference, options=None, described=None, band_rad_s=None, loop=None, **source
 ) -> tuple[IdentifiedChannel, UncertainChannel]:
     """The channel of a configuration that says no more than it has to."""
     channel = {"input": "u_A", "output": "y_rad"}
@@ -72,7 +73,7 @@ def by_run(
     roles = ["estimation"] * (len(logs) - 1) + ["validation"]
     records = [{"path": str(path), "role": role} for path, role in zip(logs, roles, strict=True)]
     document: dict[str, Any] = {
-        "source": {"kind": "files", "time": "time_s", "records": records},
+        "source": {"kind": "files", "time": "time_s", "records": records, **source},
         "channels": [channel],
         "specification": {"bandwidth_rad_s": 1.0},
     }
@@ -128,7 +129,7 @@ def noisy_loop(seed: int) -> tuple[np.ndarray, ...]:
 
 @pytest.fixture
 def noisy_logs(tmp_path):
-    return write(tmp_path, [noisy_loop(k) for k in (1, 2, 3)], (NAMES[0], "", *NAMES[2:]))
+    return write(tmp_path, [noisy_loop(k) for k in (1, 2, 3)], NO_REFERENCE)
 
 
 def share_held(spread: UncertainChannel) -> float:
@@ -152,14 +153,17 @@ def test_noise_in_a_loop_without_reference_is_refused(flexlink, noisy_logs):
     assert "as asked for: what the loop feeds back moves the response" in told["reason"]
 
 
-def test_a_stated_controller_opens_the_loop(noisy_logs, tmp_path):
+def test_a_stated_controller_opens_the_loop(tmp_path):
     law = Controller.proportional(GAIN, 0.01, computational_delay_samples=0)
     matrices = {"A": [[0.5]], "B": [[0.0]], "C": [[1.0]], "D": [[GAIN]], "dt_s": 0.01}
     files = {"controller.json": law.to_dict(), "matrices.json": matrices}
     for name, content in files.items():
         (tmp_path / name).write_text(json.dumps(content))
     stated = [{"controller_file": str(tmp_path / name)} for name in files]
-    about, spread = by_run(noisy_logs, None, loop=stated[0])
+    # The command is logged with its sign turned and halved: so is the controller of these logs.
+    turned = write(tmp_path, [(t, r, -u / 2, y) for t, r, u, y in map(noisy_loop, (1, 2, 3))], NO_REFERENCE)
+    half = {"controller": {"numerator": [-GAIN / 2], "denominator": [1.0]}}
+    about, spread = by_run(turned, None, loop=half, scale={"u_A": -2.0})
     assert about.closed_loop.kind is FindingKind.INDIRECT
     assert about.closed_loop.values["least_percent"] > 50
     assert about.modes[0].omega_rad_s == pytest.approx(30.0, rel=0.05)

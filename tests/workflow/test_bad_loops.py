@@ -278,18 +278,25 @@ def test_a_second_output_behind_the_friction_is_refused(flexlink, refused, tmp_p
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_what_is_taken_is_certified_and_holds_on_the_true_machine(flexlink, tmp_path):
+    """Logged with the sign of its command turned: the controller's files are for the machine as logged."""
     machine = plant(limit=0.5)
     made = [
         log(1, machine=machine),
         log(2, law=pid(1.5, 0.08), machine=machine),
         log(3, 0.15, machine=machine),
     ]
-    paths = written(tmp_path, made)
+    paths = written(tmp_path, [{**one, "u": -one["u"]} for one in made])
     assert flexlink("init", *paths, "--out", tmp_path / "my.toml").code == 0
     answer = flexlink("run", "--config", tmp_path / "my.toml", "--out", tmp_path / "out", "--json")
     assert answer.document()["certified"]
+    said = answer.document()["numbers"]["signals"]
+    assert said == (
+        "error: reference - measurement of enc_rad [rad]; command: i_cmd_A as logged (A = -1 * column)"
+    )
+    for name in ("controller.h", "controller.c", "controller.json"):
+        assert said in (tmp_path / "out" / name).read_text(), name
     results = RunResults(RunDirectory.open(tmp_path / "out"))
     (verdict,) = results.certify.certificate.plants
     law, delay = read_law(tmp_path / "out" / "controller.json")
     stated = {"worst_margins": vars(verdict.worst_margins), "bandwidth_rad_s": verdict.bandwidth_rad_s}
-    assert violations(replace(plant(), delay=1 + delay), 0.0, law, stated) == []
+    assert violations(replace(plant(), delay=1 + delay, torque_per_u=-TORQUE), 0.0, law, stated) == []

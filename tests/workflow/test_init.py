@@ -169,7 +169,7 @@ def test_the_sign_is_turned_where_the_output_falls(flexlink, tmp_path, signals):
     assert document["numbers"]["seen"]["turned"]
     assert config.source.scale == {"u_V": -1.0}
     assert config.source.units == {"u_V": "V"}
-    assert "negate what the controller gives" in text
+    assert "the controller's files have the sign of the logs" in text
 
 
 def test_open_loop_without_friction(flexlink, tmp_path):

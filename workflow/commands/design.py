@@ -101,6 +101,11 @@ def design_controller(
     if specification is None:
         raise InputError(f"{', '.join(map(str, paths))}: no specification for all: give --spec FILE")
     plants = [source.plant for source in sources_found]
+    logged = [source.logged for source in sources_found if source.logged is not None]
+    if len({(one.error, one.command) for one in logged}) > 1:
+        raise InputError(
+            f"{', '.join(map(str, paths))}: the runs scale their columns differently: no controller fits all"
+        )
     check_filter(asked.reference_filter, plants[0].dt_s, name)
     with progress.stage("design") as update:
         done = _design(plants, specification, asked, seed, update)
@@ -109,9 +114,10 @@ def design_controller(
     order = (done.design.specification or specification).controller_order
     files: list[Path] = []
     if out is not None and controller is not None:
+        law = logged[0].law(controller) if logged else controller
         found = done.reference_filter.filter
         known = "; ".join(dict.fromkeys(source.certified_for for source in sources_found))
-        files = write_controller(out, controller, found, certified=certified, about=known, dialect=dialect)
+        files = write_controller(out, law, found, certified=certified, about=known, dialect=dialect)
     gamma, advice = done.design.gamma, None
     if gamma is not None and gamma > 1:
         advice = said("order_advice", done.achievable, gamma, order) or None
@@ -126,6 +132,7 @@ def design_controller(
         verdict=done.certify,
         shares=shares,
         files=files,
+        signals=logged[0].signals if logged else "",
     )
     names = [plant.name for plant in plants]
     about = [

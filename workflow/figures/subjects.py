@@ -31,6 +31,7 @@ from workflow.config.run_config import Channel, RunConfig
 from workflow.figures.bands import Complex, Real
 from workflow.figures.style import ratio_unit
 from workflow.tasks.design import joint_numbers
+from workflow.tasks.exports import Logged
 from workflow.tasks.identification import as_fitted
 from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.results import IdentifiedChannel, LoopCheck, ModelMode, RunResults, UncertainChannel
@@ -224,6 +225,11 @@ class RunView:
         if self.synthesis is None:
             raise ValueError("the run has no design")
         return self.synthesis.controller
+
+    @property
+    def logged_controller(self) -> Controller:
+        """As the run's files have it."""
+        return Logged.of(self.config, self.results.records).law(self.controller)
 
     @property
     def certificate(self) -> Certificate | None:

@@ -32,7 +32,7 @@ from workflow.config.run_config import RunConfig
 from workflow.engine import codec
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.exports import read_model
+from workflow.tasks.exports import Logged, read_model
 from workflow.tasks.pipeline import certified_for, config_of
 from workflow.tasks.results import IdentifiedPlant, RunResults
 from workflow.tasks.system_files import DOCUMENTS, read_document, read_state_space
@@ -43,8 +43,8 @@ from workflow.text.templates import said, words
 @dataclass(frozen=True, eq=False)
 class DesignSource:
     """A plant as read; remarks say what is worth knowing about it; a run brings its own specification and
-    options (`config`), and knows what a certificate is about (`certified_for`) and the units of input and
-    output."""
+    options (`config`), and knows what a certificate is about (`certified_for`), the units of input and
+    output, and the columns they have in the logs (`logged`)."""
 
     plant: UncertainPlant
     origin: str
@@ -52,6 +52,7 @@ class DesignSource:
     config: RunConfig | None = None
     certified_for: str = ""
     units: tuple[str, str] = ("", "")
+    logged: Logged | None = None
 
 
 def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource]:
@@ -102,7 +103,8 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
         plant = results.uncertainty.plant(config)
         channel = config.control_channel
         units = results.records.unit(channel.input), results.records.unit(channel.output)
-        return DesignSource(plant, "run directory", (f"about {about}",), config, about, units)
+        logged = Logged.of(config, results.records)
+        return DesignSource(plant, "run directory", (f"about {about}",), config, about, units, logged)
     if _ending(path) in READERS and _ending(path) not in DOCUMENTS:
         return _measured(path, design)
     document = read_document(path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +12,13 @@ from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
 from ident.basis.model_files import ModelFile
 from ident.data.foreign_files import content_of
+from workflow.config.joints_config import JointsConfig
+from workflow.config.run_config import FileSource, RunConfig
 from workflow.engine import documents, storage
 from workflow.engine.errors import naming
 from workflow.engine.run_directory import CONTROLLER_SUFFIXES
-from workflow.text.templates import render_text
+from workflow.tasks.results import RecordsResult
+from workflow.text.templates import render_text, said
 
 
 def _as_law(found: ReferenceFilter) -> Controller:
@@ -53,6 +56,32 @@ def law_bytes(law: Controller | ReferenceFilter, suffix: str, dialect: Dialect =
     names = dialect.beside("reference_filter")
     note = render_text("reference_filter_note.h.j2", prefix=names.prefix).rstrip()
     return f"{note}\n{code(_as_law(law), names.prefix, names.number)}".encode("ascii")
+
+
+@dataclass(frozen=True)
+class Logged:
+    """Columns of the logs, of which quantity = scale * column + offset: scales of errors (Y,) and commands
+    (U,), and what they are in words. A law for them needs no scale and no turned sign on the machine."""
+
+    error: tuple[float, ...]
+    command: tuple[float, ...]
+    signals: str
+
+    @classmethod
+    def of(cls, config: RunConfig | JointsConfig, records: RecordsResult) -> Logged:
+        source, loops = (
+            config.source,
+            config.joints if isinstance(config, JointsConfig) else (config.control_channel,),
+        )
+        scale, offset = (source.scale, source.offset) if isinstance(source, FileSource) else ({}, {})
+        columns = [[loop.output for loop in loops], [loop.input for loop in loops]]
+        error, command = (tuple(scale.get(name, 1.0) for name in names) for names in columns)
+        units = {name: records.unit(name) for names in columns for name in names}
+        return cls(error, command, said("signals", *columns, units, scale, offset))
+
+    def law(self, law: Controller) -> Controller:
+        """Of a law in quantities."""
+        return replace(law.in_units(np.array(self.error), np.array(self.command)), signals=self.signals)
 
 
 def targets(out: Path) -> list[Path]:

@@ -96,6 +96,7 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
     in_loop = isinstance(config.source, FileSource) and (
         config.closed_loop_data.stated or made_in_loop(records.fitted(shaft))
     )
+    scale = config.source.scale if isinstance(config.source, FileSource) else {}
     channels = []
     for k, channel in enumerate(config.channels):
 
@@ -111,7 +112,10 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
                 )
             measured = records.fitted(channel)
             loop = config.closed_loop_data if in_loop else None
-            channels.append(identify_channel(channel, measured, unseen, loop, report, friction=known))
+            units = scale.get(channel.input, 1.0) / scale.get(channel.output, 1.0)
+            channels.append(
+                identify_channel(channel, measured, unseen, loop, report, friction=known, units=units)
+            )
     return IdentifyResult(tuple(channels), friction)
 
 
@@ -144,12 +148,13 @@ def identify_channel(
     *,
     friction: FrictionFit | None = None,
     with_plot: bool = True,
+    units: float = 1.0,
 ) -> IdentifiedChannel:
     """One channel from records: what `flexlink run` and `flexlink identify` do.
 
     measured: SISO, as recorded; unseen: others, with their roles; loop: how to use logs made in closed loop,
-    None for others; friction: of the shaft that the output is the position of. Raises ValueError, one line,
-    where the logs cannot carry it.
+    None for others; friction: of the shaft that the output is the position of; units: as of
+    `with_stated_controller`. Raises ValueError, one line, where the logs cannot carry it.
     """
     options, given = _searched_around(channel, measured[0].dt_s), None
     if friction is not None or loop is not None:
@@ -202,7 +207,7 @@ def identify_channel(
             if not spoilt or loop.method != "auto":
                 return replace(found, closed_loop=given)
             continue
-        known = measured if way == "two_stage" else with_stated_controller(measured, loop)
+        known = measured if way == "two_stage" else with_stated_controller(measured, loop, units)
         opened = two_stage([as_bounded(record, channel) for record in known], options)
         explained = min(opened.fit_percent)
         if explained >= _EXPLAINED_PERCENT or loop.method != "auto":
@@ -212,9 +217,12 @@ def identify_channel(
     raise ValueError(said("loop_refused", given.values, controlled))
 
 
-def with_stated_controller(measured: Sequence[Record], loop: ClosedLoopData) -> list[Record]:
-    """The records with what the stated controller tells of the reference. Raises InputError for a file that
-    holds none."""
+def with_stated_controller(
+    measured: Sequence[Record], loop: ClosedLoopData, units: float = 1.0
+) -> list[Record]:
+    """The records with what the stated controller tells of the reference. units: of the records, over those
+    of the logs, in which the controller is: scale of the input over that of the output. Raises InputError for
+    a file that holds none."""
     if loop.controller is not None:
         numerator, denominator = list(loop.controller.numerator), list(loop.controller.denominator)
     else:
@@ -222,6 +230,7 @@ def with_stated_controller(measured: Sequence[Record], loop: ClosedLoopData) -> 
 
         assert loop.controller_file is not None
         numerator, denominator = read_controller(loop.controller_file, measured[0].dt_s)
+    numerator = [units * one for one in numerator]
     return [with_controller(record, numerator, denominator) for record in measured]
 
 

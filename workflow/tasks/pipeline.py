@@ -20,7 +20,7 @@ from workflow.engine.code_version import code_digest
 from workflow.engine.errors import CommandInterruptedError, InputError, naming, one_line
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import KEPT_FILES, LAYOUT_VERSION, RunDirectory, hash_of
-from workflow.tasks.exports import model_bytes, write_controller
+from workflow.tasks.exports import Logged, model_bytes, write_controller
 from workflow.tasks.joints import JOINT_STAGES, JointsResults
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage, StageInput
@@ -233,7 +233,8 @@ def _keep_files(results: RunResults, config: RunConfig, dialect: Dialect) -> lis
     if (controller := results.design.controller) is None:
         return [model]
     second, certified = results.reference_filter, results.certify.certified
-    law, about = second.law(controller), certified_for(results, config)
+    law = Logged.of(config, results.records).law(second.law(controller))
+    about = certified_for(results, config)
     return [
         model,
         *write_controller(
@@ -245,6 +246,7 @@ def _keep_files(results: RunResults, config: RunConfig, dialect: Dialect) -> lis
 def _keep_joints_files(results: JointsResults, config: JointsConfig, dialect: Dialect) -> list[Path]:
     if (law := results.design.controller) is None:
         return []
+    law = Logged.of(config, results.records).law(law)
     about = f"{len(results.identify.points)} operating points"
     certified = results.certify.certified
     return write_controller(results.run.path, law, None, certified=certified, about=about, dialect=dialect)

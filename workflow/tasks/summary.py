@@ -13,6 +13,7 @@ from workflow.config.joints_config import JointsConfig
 from workflow.config.run_config import RunConfig
 from workflow.engine import codec
 from workflow.tasks.design import bracket_numbers, joint_numbers
+from workflow.tasks.exports import Logged
 from workflow.tasks.joints import JointsResults
 from workflow.tasks.results import (
     AchievablePerformance,
@@ -33,13 +34,15 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
     achievable, loop = results.achievable_performance, results.closed_loop
     pairs = list(zip(results.identify.channels, results.uncertainty.channels, strict=True))
     shares = joint_numbers(certify.sampled)
+    signals = Logged.of(config, results.records).signals
     settles = loop.check is not None and loop.check.settled_draws == loop.check.draws
     return RunSummary(
         title=config.run.title or config.run.name,
-        sections=rows_of("summary/run.j2", config=config, results=results, shares=shares),
+        sections=rows_of("summary/run.j2", config=config, results=results, shares=shares, signals=signals),
         numbers={
             "channels": [channel_numbers(found, spread) for found, spread in pairs],
             "design": design_numbers(design),
+            "signals": signals,
             "certificate": codec.plain(certify.certificate),
             "achievable_performance": bracket_numbers(achievable, design.gamma),
             "sampled_responses": shares,
