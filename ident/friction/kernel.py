@@ -26,6 +26,7 @@ from ident.data.arrays import COMPILED, INSIDE
 
 STRIDES, _STEPS = 2, 16  # strides of a sample, steps of a stride
 STEPS = STRIDES * _STEPS  # of a sample
+_LOAD_STEPS = 8  # steps of a sample of the load behind a spring, whose swing is slower than a shaft's stop
 _OVER = 8.0  # speeds, in units of `fall`, from which on the excess is gone
 _TINY = np.finfo(np.float64).tiny
 
@@ -141,6 +142,42 @@ def step_through(
         friction[k] += 0.5 * (moments[k - 1] - moments[k + 1])
 
 
+@numba.njit(**INSIDE)
+def hold_load(load: Any, start: float, end: float, spring: Any, dt_s: float) -> float:
+    """One sample of a load behind a motor that moves evenly from start to end: the mean of what reaches the
+    motor of its friction, per unit of the level. Changes load (4,) in place: position and speed, and those
+    that the friction by itself gives it, the motor held. spring: `ident.friction.spring.Spring.array`. Half
+    a drift, a kick in the middle, half a drift."""
+    h, soft, damp = dt_s / _LOAD_STEPS, spring[0] ** 2, 2 * spring[1] * spring[0]
+    level, excess, fall = spring[2], spring[3], spring[4]
+    place, speed, x, v = load[0], load[1], load[2], load[3]
+    rate, total = (end - start) / dt_s, 0.0
+    for step in range(_LOAD_STEPS):
+        place += 0.5 * h * speed
+        x += 0.5 * h * v
+        twist = start + (step + 0.5) * h * rate - place
+        free = speed + h * (soft * twist + damp * (rate - speed))
+        most = 1.0 if excess == 0 else 1 + excess * np.exp(-abs(speed) / fall)
+        kept = max(abs(free) - h * level * most, 0.0)
+        force = np.sign(free) * ((abs(free) - kept) / (h * level) if level > 0 else most)
+        speed = np.sign(free) * kept
+        v += h * (force - soft * x - damp * v)
+        total += soft * x + damp * v
+        place += 0.5 * h * speed
+        x += 0.5 * h * v
+    load[0], load[1], load[2], load[3] = place, speed, x, v
+    return total / _LOAD_STEPS
+
+
+@numba.njit(**COMPILED)
+def behind_motor(motor: Any, spring: Any, dt_s: float, found: Any) -> None:
+    """Fill found (T,) with what `hold_load` tells of each sample of a motor (T,), from rest."""
+    load = np.zeros(4)
+    load[0] = motor[0]
+    for k in range(motor.size):
+        found[k] = hold_load(load, motor[k], motor[min(k + 1, motor.size - 1)], spring, dt_s)
+
+
 @numba.njit(**COMPILED)
 def loop_through(
     reference: Any,
@@ -157,6 +194,7 @@ def loop_through(
     weights: Any,
     dt_s: float,
     law_of_friction: Any,
+    spring: Any,
     measured: Any,
     command: Any,
     limited: Any,
@@ -168,11 +206,13 @@ def loop_through(
     added (T,): joins the law's command before it is limited. law (n + 1, n + 2): rows of the state and the
     output, columns A, B, M and C, D, - of x+ = A x + B e + M (limited - wanted), wanted = C x + D e + added.
     limits: of the command and of its change per sample, inf for none; steps: of measurement and command, 0
-    for none. delay, input_delay: samples until a command is given to the arm, and until it acts.
+    for none. delay, input_delay: samples until a command is given to the arm, and until it acts. spring: as
+    of `hold_load`, level 0 for no friction at the load; it acts a sample after its motion.
     """
     order = law.shape[0] - 1
     state, x, later = np.zeros(rates.size, dtype=np.complex128), np.zeros(order), np.zeros(order)
     shaft, last = np.zeros(3), 0.0
+    load, held = np.zeros(4), 0.0
     queue, waiting = np.zeros(delay + 1), np.zeros(input_delay + 1)
     for k in range(reference.size):
         y = shaft[0] + noise[k]
@@ -198,4 +238,7 @@ def loop_through(
         measured[k], command[k], limited[k] = y, u, last != wanted
         waiting[k % (input_delay + 1)] = u
         applied = waiting[(k + 1) % (input_delay + 1)]
-        advance(applied, state, shaft, moves, rates, chain, weights, dt_s, law_of_friction)
+        before = shaft[0]
+        advance(applied - held, state, shaft, moves, rates, chain, weights, dt_s, law_of_friction)
+        if spring[5] > 0:
+            held = spring[5] * hold_load(load, before, shaft[0], spring, dt_s)

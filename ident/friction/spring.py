@@ -9,19 +9,18 @@ further springs.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-import numba
 import numpy as np
 
 from ident.basis.model import GobfModel
-from ident.data.arrays import COMPILED, RealArray
+from ident.data.arrays import RealArray
 from ident.friction.arm import FrictionLaw
+from ident.friction.kernel import behind_motor
 
 # A zero that is damped more than this, or lies above the first mode, is no load behind a spring.
 _LARGEST_DAMPING = 0.5
-# Of the zero: where the inertia is read off; steps per sample of the load.
-_RIGID, _STEPS = 0.5, 8
+# Of the zero: where the inertia is read off.
+_RIGID = 0.5
 
 
 @dataclass(frozen=True)
@@ -65,35 +64,12 @@ class Spring:
         motor, held over each sample. level: in units of the input; it holds the load where the spring pulls
         less. law: of the motor; that of the load falls with speed alike."""
         found = np.empty(position.size)
-        kept = level * self.compliance * self.omega_rad_s**2
-        shape = law.excess / max(law.level, np.finfo(np.float64).tiny), law.fall
-        _hold(position - position[0], self.omega_rad_s, self.zeta, self.dt_s, kept, *shape, found)
+        behind_motor(position - position[0], self.array(level, law), self.dt_s, found)
         return found
 
-
-@numba.njit(**COMPILED)
-def _hold(
-    motor: Any, omega: float, zeta: float, dt_s: float, level: float, excess: float, fall: float, found: Any
-) -> None:
-    """Fill found (T,): mean over each sample of what reaches the motor of the friction, per unit of its
-    level, on a load behind a motor (T,) that moves evenly between the samples. level: as an acceleration;
-    excess: per unit of it, gone at speeds above fall. Half a drift, a kick in the middle, half a drift."""
-    h, soft, damp = dt_s / _STEPS, omega**2, 2 * zeta * omega
-    load, speed = motor[0], 0.0
-    x, v = 0.0, 0.0  # what the friction makes of the load by itself, the motor held
-    for k in range(motor.size):
-        rate, total = (motor[min(k + 1, motor.size - 1)] - motor[k]) / dt_s, 0.0
-        for step in range(_STEPS):
-            load += 0.5 * h * speed
-            x += 0.5 * h * v
-            twist = motor[k] + (step + 0.5) * h * rate - load
-            free = speed + h * (soft * twist + damp * (rate - speed))
-            most = 1.0 if excess == 0 else 1 + excess * np.exp(-abs(speed) / fall)
-            kept = max(abs(free) - h * level * most, 0.0)
-            force = np.sign(free) * ((abs(free) - kept) / (h * level) if level > 0 else most)
-            speed = np.sign(free) * kept
-            v += h * (force - soft * x - damp * v)
-            total += soft * x + damp * v
-            load += 0.5 * h * speed
-            x += 0.5 * h * v
-        found[k] = total / _STEPS
+    def array(self, level: float, law: FrictionLaw) -> RealArray:
+        """(6,) for the kernel, as of `force`: frequency, damping, level as an acceleration, excess per unit
+        of it and the speed above which that is gone, level."""
+        kept = level * self.compliance * self.omega_rad_s**2
+        excess = law.excess / max(law.level, np.finfo(np.float64).tiny)
+        return np.array([self.omega_rad_s, self.zeta, kept, excess, law.fall, level])

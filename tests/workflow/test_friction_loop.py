@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.closed_loop_machines.simulator import Law, Plant, response
 from control_design import Controller, simulate
 from control_design.analysis.closed_loop import measure_sensitivity
 from control_design.controllers.controller import FrictionFeedforward
 from ident import GobfModel, IdentOptions, Poles, Record, Structure
 from ident.friction import FrictionFit, FrictionLaw, fit_friction
 from ident.friction.arm import SteppedArm
+from ident.friction.spring import Spring
 from plant import SampledArm, parse_effect
 from plant.presets import paper_link
 from workflow.tasks.friction_loop import FrictionLoop, drawn, friction_feedforward, holds_from, interval_of
@@ -156,6 +158,59 @@ def test_feedforward_is_as_late_as_the_loop_follows_a_ramp():
     given = friction_feedforward(controller(), found)
     assert (given.level, given.width) == (found.level, found.law.presliding)
     assert given.lag_s == pytest.approx(behind / 0.1, rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def belt():
+    """Motor and load on a belt, friction at both, and the fit that perfect records would give."""
+    friction = np.array([[0.03, 0.03, 1, 0, 0], [0.01, 0.01, 1, 0, 0]])
+    machine = Plant(
+        np.array([2e-3, 4e-3]), np.array([4e-3, 2e-3]), np.zeros(2), np.array([[0, 1, 3.33, 0.008, 0]]),
+        friction, np.zeros(3), 1.0, 0, 1.0, DT_S, 0, 1e-7, np.inf,
+    )  # fmt: skip
+    a, b, c = machine.sampled()
+    z, omega = np.linalg.eigvals(a), np.geomspace(0.1, 0.95 * np.pi / DT_S, 400)
+    slow = z[(z.imag == 0) & (z.real < 1 - 1e-6)].real
+    poles, models = Poles(np.append(0.0, slow), z[z.imag > 0]), []
+    for these in (poles, poles.doubled()):
+        one = GobfModel(these, np.zeros(these.order), DT_S, integrators=1)
+        rows = [replace(one, coefficients=unit).frequency_response(omega) for unit in np.eye(these.order)]
+        shares = np.array(rows).T / response(a, b, c, omega, DT_S)[:, None]
+        stacked = np.vstack([shares.real, shares.imag]), np.repeat([1.0, 0.0], omega.size)
+        models.append(replace(one, coefficients=np.linalg.lstsq(*stacked, rcond=None)[0]))
+    arm = SteppedArm.of(poles, Structure(integrators=1), DT_S)
+    model, twice = models
+    factor = np.zeros((11, 1))
+    factor[-1] = 0.001
+    law, spring = FrictionLaw(0.03), Spring.of(model)
+    return machine, FrictionFit(
+        law, model, arm, twice.coefficients, factor, 0.0, 0.0, spring=spring, beyond=0.01
+    )
+
+
+@pytest.mark.parametrize("jump", [0.0, -0.4])
+def test_friction_at_the_load_acts_in_the_loop(belt, jump):
+    """A step with integral action, against the two masses; also where the fit has the speed jump a little
+    against the force, which on a shaft that sticks would grow."""
+    machine, found = belt
+    keep = np.exp(-DT_S / 0.008)
+    steep = 0.05 * (1 - keep) / DT_S
+    law = Controller(
+        np.diag([keep, 1.0]), np.array([[1 - keep], [DT_S]]), np.array([[-steep, 0.5]]), [[1 + steep]], DT_S,
+        computational_delay_samples=0,
+    )  # fmt: skip
+    both = Law(law.A, np.hstack([law.B, -law.B]), law.C[0], np.append(law.D, -law.D), np.zeros(2))
+    step = np.full(4000, 0.12)
+    true = machine.run(both, step, 0.0, np.zeros(step.size))["true"]
+    weights = found.arm.weights.copy()
+    weights[np.argmax(np.abs(found.arm.rates)), 0] += jump / found.coefficients[0]
+    loop = FrictionLoop.of(law, replace(found, arm=replace(found.arm, weights=weights)))
+    assert np.max(np.abs(loop.run(step).measured - true)) < 1e-3
+    assert np.max(np.abs(replace(loop, beyond=0.0).run(step).measured - true)) > 9e-3
+    assert friction_feedforward(law, found).level == pytest.approx(0.04)
+    drawn_levels = [one.beyond for one in drawn(law, found, np.random.default_rng(1), 200)]
+    assert np.std(drawn_levels) == pytest.approx(0.001, rel=0.2)
+    assert replace(loop, controller=controller()).error_at_rest == pytest.approx(0.04 / 5, rel=1e-4)
 
 
 def test_predicted_response_is_that_of_the_nonlinear_arm():

@@ -46,27 +46,33 @@ _WATCHED, _MOST_WATCHED = 20, 100_000
 class FrictionLoop:
     """A controller, with its limits and feed-forward, around one arm of a fit.
 
-    coefficients (P,) and friction: of the arm; the steps as of
-    `control_design.analysis.closed_loop.simulate`. Neglected: limits other than the controller's own.
+    coefficients (P,) and friction: of the arm; beyond: level at the load behind its first spring, 0 for none;
+    the steps as of `control_design.analysis.closed_loop.simulate`. Neglected: limits other than the
+    controller's own.
     """
 
     controller: Controller
     found: FrictionFit
     coefficients: Real
     friction: FrictionLaw
+    beyond: float = 0.0
     measurement_step: float = 0.0
     command_step: float = 0.0
 
     @classmethod
     def of(cls, controller: Controller, found: FrictionFit, **steps: float) -> FrictionLoop:
         """On the arm as it was fitted."""
-        return cls(controller, found, found.coefficients, found.law, **steps)
+        return cls(controller, found, found.coefficients, found.law, found.beyond, **steps)
 
     def run(self, reference: Real, noise: np.random.Generator | None = None) -> ClosedLoopTrajectory:
         """From rest, reference (T,); noise: white, of the size of the fit's residual (sensor and encoder)."""
         law, arm = self.controller, self.found.arm
-        n = reference.size
+        n, spring = reference.size, self.found.spring
         measured, command, limited = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
+        weights = arm.weights @ self.coefficients
+        # An arm has inertia. Where the fit has the speed jump against the force, a shaft at rest would creep.
+        fastest = np.argmax(np.where(arm.chain | (arm.rates.imag != 0), 0.0, np.abs(arm.rates)))
+        weights[fastest] -= min(float(weights[~arm.chain].real.sum()), 0.0)
         loop_through(
             kernel_array(reference),
             np.zeros(n) if noise is None else self.found.noise_std * noise.standard_normal(n),
@@ -78,9 +84,10 @@ class FrictionLoop:
             arm.moves,
             arm.rates,
             arm.chain,
-            arm.weights @ self.coefficients,
+            weights,
             arm.dt_s,
             self.friction.array,
+            np.zeros(6) if spring is None else spring.array(self.beyond, self.friction),
             measured,
             command,
             limited,
@@ -119,12 +126,17 @@ class FrictionLoop:
 
     @property
     def error_at_rest(self) -> float:
-        """Largest error with which the arm may stay at rest: level over |K + 1 / G| at standstill, where an
-        arm that integrates has 1 / G = 0 and integral action leaves no error."""
+        """Largest error with which the arm may stay at rest: friction over |K + 1 / G| at standstill, where
+        an arm that integrates has 1 / G = 0 and integral action leaves no error."""
         # A millionth of the Nyquist frequency: there an integrator is as good as infinite.
         omega = np.array([1e-6 * np.pi / self.controller.dt_s])
         gain = self.controller.response(omega) + 1 / self.found.model.frequency_response(omega)
-        return self.friction.breakaway / float(np.abs(gain[0]))
+        return at_rest(self.friction, self.beyond) / float(np.abs(gain[0]))
+
+
+def at_rest(friction: FrictionLaw, beyond: float) -> float:
+    """What friction at shaft and load holds together: that of the load falls with speed alike."""
+    return friction.breakaway * (1 + beyond / friction.level if friction.level > 0 else 1)
 
 
 def drawn(
@@ -135,7 +147,8 @@ def drawn(
     for _ in range(draws):
         change = found.covariance_factor @ rng.standard_normal(found.covariance_factor.shape[1])
         coefficients, friction = found.moved(change)
-        loops.append(FrictionLoop(controller, found, coefficients, friction, **steps))
+        beyond = 0.0 if found.spring is None else max(found.beyond + float(change[-1]), 0.0)
+        loops.append(FrictionLoop(controller, found, coefficients, friction, beyond, **steps))
     return loops
 
 
@@ -151,14 +164,15 @@ def predicted_peak(
 
 
 def friction_feedforward(controller: Controller, found: FrictionFit) -> FrictionFeedforward:
-    """Of the identified friction, as late as T = G K / (1 + G K) is towards standstill."""
+    """Of the identified friction at shaft and load, as late as T = G K / (1 + G K) is towards standstill."""
     omega = np.array([1e-5 * np.pi / controller.dt_s])
     loop = controller.response(omega) * found.model.frequency_response(omega)
     delay_s = float(-np.angle(loop / (1 + loop))[0] / omega[0])
     law = found.law
+    both = found.level / law.level if law.level > 0 else 1.0
     fall = law.fall if law.excess > 0 else 1.0
     return FrictionFeedforward(
-        law.level, law.presliding, max(delay_s, controller.dt_s), excess=law.excess, fall=fall
+        found.level, law.presliding, max(delay_s, controller.dt_s), excess=both * law.excess, fall=fall
     )
 
 
@@ -206,14 +220,15 @@ def check_friction(
     sticking = [0.0 if integral else loop.sticking_step(rest) for loop in (fitted, *loops)]
     error_at_rest = 0.0 if integral else fitted.error_at_rest
     held = min(_WATCHED * reference.size, max(_MOST_WATCHED, reference.size)) - reference.size
+    level = at_rest(found.law, found.beyond)
     run = fitted.run(np.pad(given, (0, held), mode="edge"))
     run = replace(run, reference=np.pad(reference, (0, held), mode="edge"))
     moving = int(np.flatnonzero(run.reference)[0])
     error = np.abs(run.reference - run.measured)[moving:]
     tolerance = TOLERANCE_PERCENT / 100
     return FrictionCheck(
-        level=found.law.breakaway,
-        level_interval=_around(found.law.breakaway, found),
+        level=level,
+        level_interval=_around(level, found),
         presliding=found.law.presliding,
         sizes=sizes,
         low=low,
