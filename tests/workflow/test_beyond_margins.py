@@ -56,7 +56,7 @@ from workflow.tasks.results import (
     ReferenceFilterResult,
     SampledResponses,
 )
-from workflow.tasks.summary import untold_below_rad_s, verdict_of
+from workflow.tasks.summary import bandwidth_numbers, untold_below_rad_s, verdict_of
 from workflow.text.templates import environment, said
 
 
@@ -137,6 +137,18 @@ def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_h
     words = verdict_of(design, certify, SimpleNamespace(check=check), doubts=[doubt])
     assert words.startswith(verdict() + ". But dry friction was not identified")
     assert words.endswith('set response = "without friction" in [channels.uncertainty]')
+    asked = SimpleNamespace(bandwidth_rad_s=16.0, lowest_bandwidth_rad_s=1.6)
+    lower = replace(design, specification=SimpleNamespace(bandwidth_rad_s=7.43))
+    words = verdict_of(lower, certify, SimpleNamespace(check=check), asked=asked)
+    assert (
+        "every requirement is met for a bandwidth of 7.43 rad/s, not for the specified 16 rad/s, and" in words
+    )
+    plants = [SimpleNamespace(bandwidth_rad_s=8.7), SimpleNamespace(bandwidth_rad_s=8.5)]
+    proved = replace(certify, certificate=SimpleNamespace(plants=plants))
+    numbers = bandwidth_numbers(lower, proved, asked)
+    assert numbers == {"specified": 16.0, "designed_for": 7.43, "reached": 8.5}
+    given = SimpleNamespace(certified=True, plants=[]), ""
+    assert said("design_verdict", lower, *given, asked).startswith("; the specified 16 rad/s was not met")
 
 
 def test_achievable_performance_not_asked_for_or_impossible_says_why():

@@ -121,7 +121,7 @@ def design_controller(
     gamma, advice = done.design.gamma, None
     if gamma is not None and gamma > 1:
         advice = said("order_advice", done.achievable, gamma, order) or None
-    reason = said("design_verdict", done.design, certificate, advice)
+    reason = said("design_verdict", done.design, certificate, advice, specification)
     shares = joint_numbers(done.certify.sampled)
     rows = rows_of(
         "summary/design.j2",

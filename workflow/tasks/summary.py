@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from control_design.specification import Specification
 from ident.data.finding import Finding, FindingKind
 from ident.uncertainty import FrequencyUncertainty
 from workflow.config.joints_config import JointsConfig
@@ -41,7 +42,10 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
         sections=rows_of("summary/run.j2", config=config, results=results, shares=shares, signals=signals),
         numbers={
             "channels": [channel_numbers(found, spread) for found, spread in pairs],
-            "design": design_numbers(design),
+            "design": {
+                **design_numbers(design),
+                "bandwidth_rad_s": bandwidth_numbers(design, certify, config.specification),
+            },
             "signals": signals,
             "certificate": codec.plain(certify.certificate),
             "achievable_performance": bracket_numbers(achievable, design.gamma),
@@ -59,6 +63,7 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
             (design.specification or config.specification).controller_order,
             untold_below_rad_s(results.uncertainty.channels[config.control_index].frequency),
             results.uncertainty.channels[config.control_index].advice,
+            config.specification,
         ),
         report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
     )
@@ -94,15 +99,29 @@ def verdict_of(
     order: int | str | None = None,
     untold_rad_s: float = 0.0,
     doubts: Sequence[Finding] = (),
+    asked: Specification | None = None,
 ) -> str:
     """One line: certified, or what is missed, by how much and at which frequency; where the achievable
     performance is given, whether a higher order would help; up to where the ellipses are wider than the
-    gain, if they are; and of the doubts about these, that nobody looked for friction."""
+    gain, if they are; of the doubts about these, that nobody looked for friction; and where less bandwidth
+    than asked was designed for, both."""
     advice, untold = "", said("untold", untold_rad_s)
     if achievable is not None and order is not None and design.gamma is not None:
         advice = said("order_advice", achievable, design.gamma, order)
     friction = [words(doubt) for doubt in doubts if doubt.kind is FindingKind.UNTRIED_FRICTION]
-    return said("run_verdict", design, certify, loop, untold or advice, untold, *friction)
+    return said("run_verdict", design, certify, loop, untold or advice, untold, "".join(friction), asked)
+
+
+def bandwidth_numbers(
+    design: DesignResult, certify: CertifyResult, asked: Specification
+) -> dict[str, float | None]:
+    """Specified, designed for, and reached: up to there every plant has |S| below -3 dB."""
+    plants = () if certify.certificate is None else certify.certificate.plants
+    return {
+        "specified": asked.bandwidth_rad_s,
+        "designed_for": (design.specification or asked).bandwidth_rad_s,
+        "reached": min((plant.bandwidth_rad_s for plant in plants), default=None),
+    }
 
 
 def untold_below_rad_s(found: FrequencyUncertainty) -> float:
