@@ -122,6 +122,9 @@ class TerminalProgress(progress.Progress):
         if worked_s != self._worked_s:
             self._worked_s, self._reported_s = worked_s, time.monotonic()
 
+    def note(self, line: str) -> None:
+        self._say(line)
+
     def start(self, stage: str) -> None:
         self.update(stage, 0.0)
 

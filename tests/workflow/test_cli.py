@@ -554,3 +554,11 @@ def test_nothing_is_waited_for(tmp_path, refused, command, what):
         os.mkfifo(path := tmp_path / "pipe")
     out = ["--out", tmp_path / "out"] if command[0] in ("simulate", "study", "diagnose") else []
     assert "expected a f" in refused(*command, path, *out)  # a file, or a folder with case.toml
+
+
+def test_a_run_without_configuration_says_that_the_arm_is_built_in(flexlink, tmp_path):
+    (tmp_path / "other.txt").write_text("in the way")  # so that nothing is computed
+    own, given = (flexlink("run", *more, "--out", tmp_path) for more in ((), ("--config", FAST_ARM)))
+    assert (own.code, given.code) == (2, 2)
+    assert "no --config: this is the built-in default arm" in own.err.splitlines()[-2]
+    assert "built-in" not in given.err

@@ -54,6 +54,8 @@ def run_from_files(
         raise InputError(f"{out}: no run is there to resume; start one without --resume")
     else:
         config, text = built_in_config()
+        if progress is not None:
+            progress.note("no --config: this is the built-in default arm, not a machine of yours")
     # Here: what computes takes seconds to load, and a configuration that is refused does not need it.
     from workflow.report.pages import page_of
     from workflow.tasks.pipeline import run_pipeline

@@ -14,6 +14,9 @@ class Progress:
     def plan(self, stages: Sequence[tuple[str, float]]) -> None:
         """Names of the stages to come with the seconds each is expected to take."""
 
+    def note(self, line: str) -> None:
+        """Said at once."""
+
     def start(self, stage: str) -> None:
         """A stage begins."""
 
