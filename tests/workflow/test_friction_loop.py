@@ -18,6 +18,8 @@ from ident.friction.spring import Spring
 from plant import SampledArm, parse_effect
 from plant.presets import paper_link
 from workflow.tasks.friction_loop import FrictionLoop, drawn, friction_feedforward, holds_from, interval_of
+from workflow.tasks.results import SlowSine
+from workflow.text.templates import said
 
 DT_S = 0.005
 POLES = Poles(np.array([0.97]), np.array([0.93 + 0.24j]))
@@ -105,6 +107,23 @@ def test_a_claim_holds_from_where_its_excess_passes_zero():
     assert holds_from(sizes, np.array([-1.0, 1.0, -1.0])) == pytest.approx(10**-0.5)
     assert holds_from(sizes, np.array([-1.0, -1.0, 0.0])) == 0.01
     assert holds_from(sizes, np.array([0.1, -1.0, -1.0])) is None
+
+
+def test_a_sine_moves_the_arm_from_where_its_command_meets_the_friction():
+    loop = FrictionLoop.of(controller(), fit())
+    omega = 2 * np.pi / (600 * DT_S)
+    unit, from_here = np.sin(2 * np.pi * np.arange(2400) / 600), loop.moving_sine(omega)
+    runs = [loop.run(share * from_here * unit).measured.ravel()[1200:] for share in (0.9, 2.0)]
+    assert np.ptp(runs[0]) < 0.05 * from_here < from_here < np.ptp(runs[1])
+    sines = [
+        SlowSine(share * from_here, omega, 0.0, share * from_here * unit[1200:] - y, 0 * y, from_here)
+        for share, y in zip((0.9, 2.0), runs, strict=True)
+    ]
+    assert [sine.stands_still for sine in sines] == [True, False]
+    told = [said("stands_still", sine, "rad", False) for sine in sines]
+    assert "the arm stands still on a sine of 0.00" in told[0]
+    assert "friction_feedforward = true in [closed_loop] takes the rms error" in told[0]
+    assert told[1] == ""
 
 
 class Slider:

@@ -131,6 +131,7 @@ def test_columns_units_and_structure(flexlink, tmp_path, signals, names, units, 
     assert seen["motion"]["friction"]["value"] == pytest.approx(COULOMB * units[2], rel=0.2)
     assert seen["motion"]["inertia"]["value"] == pytest.approx((MOTOR + LOAD) * units[2] / units[3], rel=0.1)
     assert channel.uncertainty.response == "without friction"
+    assert "# friction_feedforward = true" in text
     assert channel.identification.integrators == 1
     assert not seen["turned"]
     wanted = config.specification
@@ -179,6 +180,7 @@ def test_open_loop_without_friction(flexlink, tmp_path):
     assert '# references = ["reference"]' in text
     assert not document["numbers"]["seen"]["friction"]
     assert config.channels[0].uncertainty.response == "as recorded"
+    assert "friction_feedforward" not in text
     assert document["numbers"]["seen"]["first_mode"][0] == pytest.approx(MODE_RAD_S, rel=0.01)
 
 

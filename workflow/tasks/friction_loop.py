@@ -133,6 +133,12 @@ class FrictionLoop:
         gain = self.controller.response(omega) + 1 / self.found.model.frequency_response(omega)
         return at_rest(self.friction, self.beyond) / float(np.abs(gain[0]))
 
+    def moving_sine(self, omega_rad_s: float) -> float:
+        """Amplitude of a sine from which on it moves the arm: friction over |K|, as the command of an
+        arm that stands is K times the reference."""
+        gain = self.controller.response(np.array([omega_rad_s]), with_delay=False)
+        return at_rest(self.friction, self.beyond) / float(np.abs(gain[0]))
+
 
 def at_rest(friction: FrictionLaw, beyond: float) -> float:
     """What friction at shaft and load holds together: that of the load falls with speed alike."""
@@ -279,6 +285,7 @@ def slow_sine(stage: StageInput, controller: Controller, amplitude: float, *, on
     assert found is not None
     forward = friction_feedforward(controller, found)
     period = int(min(_SLOW * forward.lag_s / controller.dt_s, _LONGEST))
+    omega = 2 * np.pi / (period * controller.dt_s)
     reference = amplitude * np.sin(2 * np.pi * np.arange(round(1.25 * period)) / period)
     given = stage.results.reference_filter.filter
     reference = reference if given is None else given.filtered(reference)
@@ -295,8 +302,9 @@ def slow_sine(stage: StageInput, controller: Controller, amplitude: float, *, on
     rest = (linear.reference - linear.measured)[period // 4 :]
     return SlowSine(
         amplitude=amplitude,
-        omega_rad_s=2 * np.pi / (period * controller.dt_s),
+        omega_rad_s=omega,
         linear_rms=float(np.sqrt(np.mean(rest**2))),
         without=errors[0],
         given=errors[1],
+        moves_from=FrictionLoop.of(controller, found).moving_sine(omega),
     )

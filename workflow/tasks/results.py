@@ -461,7 +461,8 @@ class SlowSine:
     """Errors (T,) of the loop on a slow sine, without and with friction feed-forward.
 
     linear_rms: of the loop on the arm without friction. The errors are those measured on the machine, or
-    those of the identified arm with its friction where there is no machine.
+    those of the identified arm with its friction where there is no machine. moves_from: amplitude from which
+    on a sine of this frequency moves the arm against its friction.
     """
 
     amplitude: float
@@ -469,6 +470,12 @@ class SlowSine:
     linear_rms: float
     without: Real
     given: Real
+    moves_from: float = field(default=0.0, metadata={"since": 8})
+
+    @property
+    def stands_still(self) -> bool:
+        """The arm without feed-forward: its error is nearly the whole sine."""
+        return self.amplitude < self.moves_from and self.rms[0] > 0.9 * self.amplitude / np.sqrt(2)
 
     @property
     def rms(self) -> tuple[float, float]:
