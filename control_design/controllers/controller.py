@@ -101,7 +101,7 @@ class Controller(Law):
 
     def in_units(self, error: Real, command: Real) -> Controller:
         """The same in other units: old = error (Y,) * new, old = command (U,) * new, of either sign."""
-        given, own = self.feedforward, {}
+        given, own = self.feedforward, dict[str, Any]()
         for name in ("input_limit", "rate_limit"):
             most = tuple(None if one == np.inf else float(one) for one in self.limits(name) / np.abs(command))
             own[name] = most if isinstance(getattr(self, name), tuple) else most[0]
