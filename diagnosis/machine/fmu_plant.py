@@ -78,6 +78,12 @@ class Fmu:
         return tuple(self._of("output"))
 
     @property
+    def step_s(self) -> float | None:
+        """The step that the file proposes; None where it does not."""
+        usual = self.description.defaultExperiment
+        return float(usual.stepSize) if usual is not None and usual.stepSize else None
+
+    @property
     def units(self) -> dict[str, str]:
         """Output -> unit, where the file declares one, of its own or of its type."""
         declared = {

@@ -44,6 +44,11 @@ def names(path: str) -> dict[str, list[str]]:
     return {**found, "joint": [name for name in found["joint"] if name not in read_by]}
 
 
+def step_of(path: str) -> float:
+    """The step [s] that an MJCF file states."""
+    return float(read(path).option.timestep)
+
+
 _FILES = re.compile(rb"""\b(file|(?:mesh|texture|asset)dir)\s*=\s*["']([^"'<]+)""")
 
 

@@ -141,7 +141,16 @@ class MujocoArm(MujocoModel):
             said.append(f"  {name}: {plant.parameters.get(name, 0.0):.6g} to {now}")
         if any(name.endswith((".sensor_gain", ".sensor_offset")) for name in changed):
             said.append("  Of a sensor: reading = gain * value + offset. MuJoCo does not apply it.")
-        listed = "\n".join(said or ["  nothing"]).replace("--", "- -")
+        said = said or ["  nothing"]
+        for what, past in (("Ctrl", model.actuator_history), ("Sensor", model.sensor_history)):
+            if late := ", ".join(map(str, np.flatnonzero(past[:, 0]))):
+                said.append(
+                    "  Of a delay: a keyframe holds no past values, so a replay would start with zeros."
+                )
+                said.append(
+                    f"  After mj_resetDataKeyframe: mj_init{what}History of {late}, with the first value."
+                )
+        listed = "\n".join(said).replace("--", "- -")
         return f"<!-- Changed by flexlink diagnose:\n{listed}\n-->\n{spec.to_xml()}"
 
     def plant(

@@ -5,12 +5,14 @@ from __future__ import annotations
 import doctest
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from diagnosis import PlantExperiment
+from diagnosis.machine.plant_effect import Change
 from tests.workflow.command import ROOT
 from workflow.diagnose import check
 from workflow.diagnose.simulator_case import load_simulator_case, settings_of
@@ -71,6 +73,30 @@ def test_a_mujoco_model_is_diagnosed_and_comes_back_repaired(tmp_path, flexlink,
     exec(replay, {"print": printed.append})
     # MJCF has six digits.
     assert printed == pytest.approx([case["replayed"]["hinge"]["repaired"]], rel=1e-3)
+
+
+def test_a_replay_of_a_delay_starts_with_the_commands_before_it(tmp_path, monkeypatch):
+    """As the guide and the head of the repaired file say: a keyframe holds none."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "arm.xml").write_text(HINGE)
+    write_log(tmp_path / "second.csv", 1, 0.0)
+    rows = np.loadtxt(tmp_path / "second.csv", delimiter=",", skiprows=1)
+    rows[:, 1] += 0.5  # whatever moved it: the commands before the first are not zero
+    np.savetxt(tmp_path / "second.csv", rows, delimiter=",", header="time_s,motor,hinge", comments="")
+    settings = settings_of({"mjcf": "arm.xml", "log": ["second.csv", "second.csv"]}, "case.toml")
+    case = load_simulator_case(settings, tmp_path, "case.toml").case
+    record = replace(case.held_out[0], name="second")
+    changes = (Change("motor.delay", {"delay_s": 0.05}),)
+    text = case.plant.simulation.arm.repaired(case.plant, case.plant, changes, (record,))
+    assert "mj_initCtrlHistory of 0, with the first value" in text.split("-->")[0]
+    (tmp_path / "found").mkdir()
+    (tmp_path / "found" / "arm.xml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    printed: list[float] = []
+    (replay,) = [text for text in snippets("python") if "genfromtxt" in text]
+    exec(replay, {"print": printed.append})
+    left = record.output - case.plant.replayed(changes)(record.input)
+    assert printed == pytest.approx([np.sqrt(np.mean(left**2))], rel=1e-3)
 
 
 PENDULUM = """<mujoco><option timestep="0.002" integrator="{integrator}"/><worldbody><body name="arm">
@@ -352,6 +378,42 @@ def test_what_a_log_lacks_is_asked_for_with_options_that_exist(tmp_path, refused
     model = ("--mjcf", tmp_path / "arm.xml", "--log", tmp_path / "one.csv")
     arguments = (tmp_path / "arm.toml",) if columns else model
     assert complaint in refused("diagnose", *arguments, "--out", tmp_path / "out")
+
+
+@pytest.mark.parametrize("model", ['mjcf = "arm.xml"', 'python = "gain.py"'], ids=["mjcf", "python"])
+@pytest.mark.parametrize(
+    ("header", "per_s", "unit"),
+    [("time_s", 1e3, "ms"), ("t", 1e3, "ms"), ("t", 1e6, "us"), ("t", 1 / DT_S, "ms"), ("t_ms", 1.0, "s")],
+)
+def test_time_in_another_unit_is_refused_before_anything_runs(tmp_path, model, header, per_s, unit):
+    """10 ms are two steps of the model: 10 s, 1 s (counted samples) and 10 us are no sampling of it. Without
+    a step whole numbers give it away."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "arm.xml").write_text(HINGE)
+    (tmp_path / "gain.py").write_text(
+        'INPUTS, OUTPUTS, PARAMETERS = "motor", "hinge", {"k": 2.0}\n'
+        'def simulate(p, effects, inputs):\n    return p["k"] * inputs\n'
+    )
+    write_log(tmp_path / "one.csv", 0, 0.1)
+    rows = np.loadtxt(tmp_path / "one.csv", delimiter=",", skiprows=1)
+    rows[:, 0] = np.round(rows[:, 0] * per_s, 6)
+    names = f"{header},motor,hinge"
+    np.savetxt(tmp_path / "one.csv", rows, delimiter=",", header=names, comments="", fmt="%.8g")
+
+    def load(more: str = "") -> float:
+        settings = settings_of(tomllib.loads(f'{model}\nlog = "one.csv"\n{more}'), "case.toml")
+        return load_simulator_case(settings, tmp_path, "case.toml").case.dt_s
+
+    if "python" in model and header == "t_ms":
+        assert load() == pytest.approx(1e-3 * DT_S)  # of 10 us nobody knows that they are wrong
+        return
+    with pytest.raises(InputError, match=rf"one.csv: '{header}' steps by .*: is it in {unit}\?") as raised:
+        load()
+    (remedy,) = re.findall(r"columns = \{time_s.*?\}\}", str(raised.value))
+    assert load(remedy) == pytest.approx(DT_S if per_s != 1 / DT_S else 1e-3)
+    if "mjcf" in model:
+        with pytest.raises(InputError, match="2000 steps of the model"):
+            load(f"{remedy}\nresample_s = 10")
 
 
 def test_the_command_refuses_with_exit_code_2(tmp_path, refused):

@@ -49,6 +49,11 @@ _TOLERANCE = 0.05
 _Moves = Literal["position", "speed"]
 _MOTIONS: Mapping[str, _Moves] = {"m": "position", "rad": "position", "m/s": "speed", "rad/s": "speed"}
 _DRIVES = ("N", "N m", "V", "A")
+# Steps of the model that one sample may be: factors between units of time are a thousand and more, and logs
+# are taken at one to twenty steps; and the samples that one step may be.
+_MOST_STEPS, _MOST_SAMPLES = 500, 100
+_UNITS_OF_TIME = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
+_SLOWEST_S = 0.5  # machines are logged faster than twice a second
 # Third differences of white noise have twenty times its variance; no motion is left in them.
 _THIRD = 20.0
 
@@ -284,9 +289,10 @@ def _needs(package: str) -> None:
 
 def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s: float) -> Any:
     _needs("mujoco")
-    from diagnosis.machine.mujoco_model import names
+    from diagnosis.machine.mujoco_model import names, step_of
     from diagnosis.machine.mujoco_plant import MujocoArm
 
+    _refuse_other_unit(tables, settings, dt_s, step_of(str(model)))
     there = names(str(model))
     kinds: dict[str, list[str]] = {}
     for kind, several in there.items():
@@ -368,6 +374,7 @@ def _fmu(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s
     from diagnosis.machine.fmu_plant import Fmu
 
     fmu = Fmu(model, dt_s)
+    _refuse_other_unit(tables, settings, dt_s, fmu.step_s)
     finish = _with_all(fmu, fmu.parameters, {}, fmu.effects, fmu.inputs, fmu.outputs, settings, dt_s)
     return fmu.inputs, fmu.outputs, finish
 
@@ -389,6 +396,7 @@ def _python(model: Path, tables: Sequence[Table], settings: SimulatorSettings, d
         if not isinstance(values, Mapping):
             raise ValueError(f'{key} must be name -> number, as {{"mass_kg": 1.2}}; got {values!r}')
     simulate, parameters = there["simulate"], there["PARAMETERS"]
+    _refuse_other_unit(tables, settings, dt_s, None)
     finish = _with_all(simulate, parameters, tolerances, effects, inputs, outputs, settings, dt_s)
     return inputs, outputs, finish
 
@@ -496,10 +504,9 @@ def _time(table: Table, settings: SimulatorSettings) -> tuple[str | None, str | 
     """Column of the time, and its unit where a scale states it."""
     stated = settings.columns.get("time_s")
     if stated is not None:
-        units = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
-        if stated.scale is not None and stated.scale not in units:
+        if stated.scale is not None and stated.scale not in _UNITS_OF_TIME:
             raise ValueError(f"columns: time_s: scale is {stated.scale:g}; expected 1, 1e-3, 1e-6 or 1e-9")
-        return stated.column, units[stated.scale] if stated.scale is not None else None
+        return stated.column, _UNITS_OF_TIME[stated.scale] if stated.scale is not None else None
     return ("time_s" if "time_s" in table.names else time_of(table)), None
 
 
@@ -530,6 +537,39 @@ def _sampling(tables: Sequence[Table], settings: SimulatorSettings) -> float:
             f"one grid: --resample-s {max(found):.6g} (resample_s)"
         )
     return found[0]
+
+
+def _refuse_other_unit(
+    tables: Sequence[Table], settings: SimulatorSettings, dt_s: float, step_s: float | None
+) -> None:
+    """Raises InputError where a sample is no plausible number of the model's steps (step_s; None: unknown),
+    or time is whole numbers whose unit nobody states: it is in another one, or counts samples."""
+
+    def fits(seconds: float) -> bool:
+        return step_s is None or 1 / _MOST_SAMPLES < seconds / step_s < _MOST_STEPS
+
+    for table in tables:
+        name, unit = _time(table, settings)
+        if name is None or unit is not None or table.is_clock(name):
+            continue
+        stamps = table.columns([name])[name]
+        seconds, column = table.seconds(name, stamps, unit)
+        step, written = (float(np.ptp(one)) / max(len(stamps) - 1, 1) for one in (seconds, stamps))
+        if fits(step) and not column.doubtful:
+            continue
+        likely = [per for per in _UNITS_OF_TIME if written * per < _SLOWEST_S and fits(written * per)]
+        per = (likely or [1e-3])[0]
+        of_model = f", {step / step_s:.4g} steps of the model ({step_s:g} s)" if step_s else ""
+        raise InputError(
+            f"{table.path}: {name!r} steps by {step:.4g} s{of_model}: is it in {_UNITS_OF_TIME[per]}? Say "
+            f'columns = {{time_s = {{column = "{name}", scale = {per:g}}}}} in a case file (1: in s). If it '
+            "counts samples, take it out: --dt-s (dt_s)"
+        )
+    if not fits(dt_s) and (settings.resample_s or settings.dt_s):
+        raise InputError(
+            f"a sample every {dt_s:g} s is {dt_s / (step_s or 1):.4g} steps of the model ({step_s:g} s): "
+            "state --dt-s or --resample-s (dt_s, resample_s) in seconds"
+        )
 
 
 def _signals(table: Table, names: Sequence[str], held: int, settings: SimulatorSettings) -> Real:
