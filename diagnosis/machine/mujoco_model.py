@@ -168,6 +168,12 @@ class MujocoModel:
         return tuple(found)
 
     @property
+    def measured_joints(self) -> set[str]:
+        """Names of the joints whose position or speed is an output."""
+        read_by = [self.spec.sensor(name) for name in self.outputs]
+        return {one.objname for one in read_by if one.type in _JOINT_UNITS}
+
+    @property
     def units(self) -> dict[str, str]:
         """Output -> unit, of sensors that say what they measure."""
         found = {}

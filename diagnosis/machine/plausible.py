@@ -32,7 +32,7 @@ _LARGEST = 1e9  # no voltage, angle or length of an arm in SI units comes near i
 # Of 93 recorded cases with effects of every kind, all records together correlate by 0.45 at least and move
 # between 0.29 and 1.6 times as far as predicted.
 _LEAST, _LEAST_OF_ONE = 0.3, 0.8
-_FARTHER, _LESS = 6.0, 1 / 15
+FARTHER, LESS = 6.0, 1 / 15
 _ACCELERATION_FARTHER, _ACCELERATION_LESS = 4.0, 1 / 6
 # Ratios within this factor of each other may be one fault.
 _ALIKE = 8.0
@@ -196,7 +196,7 @@ def _fault(case: Case, found: Sequence[_Match], least: float) -> str:
             "see scale in [columns]"
         )
     ratios = {name: m.ratio for name, m in followed.items()}
-    far = {name: ratio for name, ratio in ratios.items() if not _LESS < ratio < _FARTHER}
+    far = {name: ratio for name, ratio in ratios.items() if not LESS < ratio < FARTHER}
     hub, tip = ratios.get("hub_angle_rad"), ratios.get("tip_acceleration_m_s2")
     # Both follow from one speed, whatever made it: the motor does not matter.
     if not far and hub and tip and not _ACCELERATION_LESS < tip / hub < _ACCELERATION_FARTHER:
@@ -213,8 +213,8 @@ def _fault(case: Case, found: Sequence[_Match], least: float) -> str:
     guesses = [guess for distance, guess in near if distance < np.log(_ALIKE / 2)]
     return (
         f"{' and '.join(far)} {ratio:.3g} times what the rig and voltage_V predict: "
-        f"{' or '.join(guesses) or 'unit of a column, or value of the rig file'}? Expected {_LESS:.2g} to "
-        f"{_FARTHER:g}; see scale in [columns]"
+        f"{' or '.join(guesses) or 'unit of a column, or value of the rig file'}? Expected {LESS:.2g} to "
+        f"{FARTHER:g}; see scale in [columns]"
     )
 
 

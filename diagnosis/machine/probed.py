@@ -8,6 +8,7 @@ import numpy as np
 
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.own_plant import RUNAWAY, Plant, PlantCase
+from diagnosis.machine.plausible import FARTHER, LESS
 
 # Of a tolerance: the step of a fit's slopes, and the largest change of a value (in logarithms) looked at.
 _STEP, _FARTHEST = 1e-3, 0.5
@@ -15,6 +16,9 @@ _STEP, _FARTHEST = 1e-3, 0.5
 _BENT = 0.5
 # Records in which a value or an effect may show.
 _RECORDS = 5
+# From this correlation on an output follows the simulation closely enough to compare how far both move.
+_FOLLOWED = 0.8
+_FACTORS = {180 / np.pi: "degrees", 1e3: "thousandths", 100.0: "hundredths", 30 / np.pi: "rpm"}
 
 
 def doubts_about(case: PlantCase, deadline_s: float = np.inf) -> tuple[str, ...]:
@@ -26,7 +30,7 @@ def doubts_about(case: PlantCase, deadline_s: float = np.inf) -> tuple[str, ...]
     Raises ValueError, one line: a simulation that is random beside its stated values.
     """
     plant = case.plant
-    found: list[str] = []
+    found = list(doubtful_scales(case))
     inputs = [e.input for e in case.estimation[:_RECORDS]]
     moved = plant.scaled({key: np.exp(min(t, _FARTHEST)) for key, t in plant.tolerances.items()})
     first, second = _outputs(moved, inputs[0]), _outputs(moved, inputs[0])
@@ -52,6 +56,28 @@ def doubts_about(case: PlantCase, deadline_s: float = np.inf) -> tuple[str, ...]
         for other in case.estimation:
             if np.array_equal(e.output, other.output):
                 found.append(f"the validation record {e.name} is the same as {other.name}: add another one")
+    return tuple(found)
+
+
+def doubtful_scales(case: PlantCase) -> tuple[str, ...]:
+    """Sentences on outputs that move as the nominal simulation does under the commands alone, but by a factor
+    more or less that no missing effect makes: a unit. The first halves may differ by their start."""
+    run, found = case.plant.replayed(()), []
+    pairs = [(run(e.input), e.output) for e in case.estimation[:_RECORDS]]
+    for k, name in enumerate(case.outputs):
+        ratios = []
+        for simulated, measured in pairs:
+            x, y = (
+                one[len(one) // 2 :, k] - np.mean(one[len(one) // 2 :, k]) for one in (simulated, measured)
+            )
+            both = np.sqrt(np.sum(x**2) * np.sum(y**2))
+            if both > 0 and abs(np.sum(x * y)) > _FOLLOWED * both:
+                ratios.append(np.std(y) / np.std(x))
+        ratio = float(np.median(ratios)) if ratios else 1.0
+        if not LESS < ratio < FARTHER:
+            near = min(_FACTORS, key=lambda factor: abs(np.log(ratio / factor)))
+            unit = f"in {_FACTORS[near]}" if 0.5 < ratio / near < 2 else "in another unit"
+            found.append(f"{name} moves {ratio:.3g} times as far as in the simulation: is its column {unit}?")
     return tuple(found)
 
 

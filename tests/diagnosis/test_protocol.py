@@ -197,6 +197,11 @@ def _doubts(simulation, **how):
         (lambda p, e, u: _with_offset(e, np.sin(3e4 * p["k"]) * u), {}, ["not smooth in k"]),
         (lambda p, e, u: _with_offset(e, p["k"] * u), {"tolerances": {"k": 10.0}}, []),
         (lambda p, e, u: _with_offset(e, p["k"] ** 3 * u), {}, []),
+        (
+            lambda p, e, u: _with_offset(e, p["k"] * np.deg2rad(np.cumsum(u, axis=0)) / 2),
+            {},
+            ["y moves 57.3 times as far as in the simulation: is its column in degrees?"],
+        ),
         (lambda p, e, u: _with_offset(e, p["k"] * u), {"tolerances": {"k": 1.0}}, []),
     ],
 )

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from diagnosis import PlantExperiment
 from diagnosis.machine.plant_effect import Change
@@ -341,9 +342,13 @@ def test_a_log_is_read_as_it_is_written(tmp_path, kind):
     settings = settings_of(tomllib.loads(f'mjcf = "arm.xml"\nlog = "one.csv"\n{more}'), "case.toml")
     if kind == "dead":
         with pytest.warns(UserWarning, match="left out: grip"):
-            case = load_simulator_case(settings, tmp_path, "case.toml").case
+            loaded = load_simulator_case(settings, tmp_path, "case.toml")
+        assert loaded.doubts == ("columns that never change are left out: grip",)
     else:
-        case = load_simulator_case(settings, tmp_path, "case.toml").case
+        loaded = load_simulator_case(settings, tmp_path, "case.toml")
+        (doubt,) = loaded.doubts
+        assert "no column measures grip" in doubt
+    case = loaded.case
     assert case.plant.dt_s == pytest.approx(DT_S, rel=1e-4)
     assert case.outputs == ("hinge",)
     first = case.experiments[0]
@@ -472,6 +477,19 @@ def test_the_logs_of_the_example_are_what_its_script_records(tmp_path):
         np.testing.assert_allclose(again, kept, rtol=0, atol=1e-3)
 
 
+def set_point(seed: int, rate_s: float = 0.06) -> np.ndarray:
+    """Levels of a servo behind a filter, as its log has it: six digits."""
+    rng = np.random.default_rng(seed)
+    levels = rng.uniform(-1, 1, 14).repeat(rng.integers(30, 150, 14))
+    return np.round(lfilter([1 - np.exp(-DT_S / rate_s)], [1, -np.exp(-DT_S / rate_s)], levels), 6)
+
+
+# From level to level at a steady speed, and held there for as long.
+RAMPS = np.interp(
+    np.arange(1200), np.arange(0, 1200, 20), np.random.default_rng(3).uniform(-1, 1, 30).repeat(2)
+)
+
+
 @pytest.mark.parametrize(
     ("command", "cut"),
     [
@@ -480,8 +498,13 @@ def test_the_logs_of_the_example_are_what_its_script_records(tmp_path):
         (np.sin(np.arange(1500) / 40), False),
         (np.sin(np.arange(1500) / 40).clip(-0.9, 0.7), True),
         (np.where(np.random.default_rng(0).random(1500) > 0.5, 1.0, -1.0), False),
+        *((set_point(seed), False) for seed in range(4)),
+        (set_point(0).clip(-0.3, 0.3), True),
+        (RAMPS, False),
     ],
-    ids=["levels", "levels cut off", "sine", "sine cut off", "two levels"],
+    ids=["levels", "levels cut off", "sine", "sine cut off", "two levels"]
+    + ["set point"] * 4
+    + ["set point cut off", "ramps"],
 )
 def test_a_command_is_cut_off_where_it_stays_at_its_ends(command, cut):
     assert bool(check._at_ends(command)) == cut
@@ -538,6 +561,7 @@ def test_check_says_what_logs_can_tell(tmp_path, flexlink, refused):
     rows_of = {(row["section"], row["label"]): row["value"] for row in document["table"]}
     assert "is it cut off?" in rows_of["two", "motor"]
     assert ("one", "motor") not in rows_of
+    assert document["numbers"]["doubts"] == []
     assert rows_of["smallest size that shows", "motor.gain"].endswith("% of 1")
     groups = [{*one["names"]} for one in document["numbers"]["alike"]]
     assert {"hinge.damping", "rod.mass", "motor.gain"} in groups
@@ -545,6 +569,11 @@ def test_check_says_what_logs_can_tell(tmp_path, flexlink, refused):
     (tmp_path / "arm.toml").write_text('mjcf = "arm.xml"\nlog = ["one.csv", "two.csv"]\n')
     again = flexlink("check", str(tmp_path / "arm.toml"), "--json").document()
     assert again["numbers"]["alike"] == document["numbers"]["alike"]
+    rows = np.loadtxt(tmp_path / "one.csv", delimiter=",", skiprows=1)
+    rows[:, 2] = np.rad2deg(rows[:, 2])
+    np.savetxt(tmp_path / "one.csv", rows, delimiter=",", header="time_s,motor,hinge", comments="")
+    (doubt,) = flexlink("check", *arguments, "--json").document()["numbers"]["doubts"]
+    assert "is its column in degrees?" in doubt
     (tmp_path / "rig.toml").write_text('rig = "rig.toml"\nexperiments = []\n')
     assert "names no simulator's model" in refused("check", tmp_path / "rig.toml")
     assert "expected a case file, or --mjcf" in refused("check", "--mjcf", tmp_path / "arm.xml")

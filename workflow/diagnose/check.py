@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.probed import doubtful_scales
 from diagnosis.machine.telling import Telling, telling
 from workflow.diagnose.case_settings import case_document
 from workflow.diagnose.simulator_case import (
@@ -29,8 +30,10 @@ from workflow.text.templates import RunSummary, rows_of
 # Groups that are shown, those that are most alike; candidates of every list; what a next record needs.
 _MOST_SHOWN, _MOST_LISTED, _MOST_ADVICE = 8, 20, 6
 # A command with more values than these may be cut that is at the ends of its range for this share of the
-# time, and at one of them so many times longer than at a usual value.
+# time, and at one of them so many times longer than at other levels that it holds.
 _VALUES, _LIMITED, _LONGER = 20, 0.02, 3.0
+# A limit is met in motion: by at least this share of a usual step. A set point settles at its level.
+_MET = 0.05
 _INERTIAL = ("mass", "inertia", "armature", "damping", "payload", "frictionloss")
 
 
@@ -52,11 +55,13 @@ def of_case(loaded: SimulatorCase, found: Telling) -> RunSummary:
     case = loaded.case
     of = getattr(case.plant.simulation, "quantities", {})  # of MuJoCo, whose names have no units
     logs = [_log(loaded, k) for k in range(len(case.experiments))]
+    doubts = (*loaded.doubts, *doubtful_scales(case))
     alike = tuple(sorted(found.alike, key=lambda one: (len(one.names), one.left)))
     shown = dict(sorted(found.least.items(), key=lambda item: item[1]))
     first = replace(found, least=shown, alike=alike[:_MOST_SHOWN])
     told = {
         "logs": logs,
+        "doubts": doubts,
         "dt_s": case.dt_s,
         "telling": first,
         "shows": [name for name in shown if name not in found.hidden],
@@ -77,7 +82,12 @@ def of_case(loaded: SimulatorCase, found: Telling) -> RunSummary:
     return RunSummary(
         title=case.name,
         sections=rows_of("summary/check.j2", FILTERS.items(), **told),
-        numbers={"logs": codec.plain(logs), **codec.plain(found), "advice": told["advice"]},
+        numbers={
+            "logs": codec.plain(logs),
+            "doubts": list(doubts),
+            **codec.plain(found),
+            "advice": told["advice"],
+        },
         verdict=f"{len(shown) - len(found.hidden)} of {len(shown)} candidates show"
         + (
             f"; {len(alike)} groups of them look alike in these records, if one of them is present. "
@@ -102,12 +112,18 @@ def _log(loaded: SimulatorCase, k: int) -> dict[str, Any]:
 def _at_ends(command: Real) -> float:
     """Share of the time that a command is at the ends of its range, 1 if it never moves; 0 unless it may be
     cut off there: one of held levels is at every level for as long."""
-    values, counts = np.unique(command, return_counts=True)
+    values, level, counts = np.unique(command, return_inverse=True, return_counts=True)
     if values.size == 1:
         return 1.0
     share = float(counts[[0, -1]].sum() / command.size)
-    longer = max(counts[[0, -1]]) > _LONGER * np.median(counts)
-    return min(share, 0.99) if share > _LIMITED and values.size > _VALUES and longer else 0.0
+    steps = np.diff(command)
+    begins = np.flatnonzero(np.r_[True, steps != 0])
+    lengths, ends = np.diff(np.r_[begins, command.size]), np.isin(level[begins], [0, values.size - 1])
+    held = level[begins[~ends & (lengths >= np.max(lengths[ends]) / _LONGER)]]
+    longer = max(counts[[0, -1]]) > _LONGER * (np.median(counts[held]) if held.size else 1)
+    met = np.abs(steps[begins[ends & (begins > 0)] - 1])
+    sharp = met.size and np.median(met) > _MET * np.sqrt(np.mean(steps**2))
+    return min(share, 0.99) if share > _LIMITED and values.size > _VALUES and longer and sharp else 0.0
 
 
 def _advice(found: Telling) -> Iterator[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +91,7 @@ class Work:
         name = loaded.case.name
         with naming(f"case {name}"):
             found = self.diagnose(loaded.case, progress=lambda f, m: report(_CONTROLLER * f, m))
-            found = with_units(found, loaded.units)
+            found = with_units(replace(found, doubts=(*loaded.doubts, *found.doubts)), loaded.units)
             coming = following(found)
             told = of_case(loaded, telling(loaded.case, time.monotonic() + _TOLD_S))
             files = {}

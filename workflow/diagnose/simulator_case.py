@@ -111,7 +111,7 @@ class SimulatorSettings(Section):
 class SimulatorCase:
     """See `workflow.diagnose.case_files.LoadedCase`. repaired: diagnosis, folder -> MJCF to write there, None
     of other simulators. inputs: names of the commands. model_error: as stated.
-    units: effect -> its parameters with units."""
+    units: effect -> its parameters with units. doubts: sentences on what the logs leave open."""
 
     case: PlantCase
     rig_file: str
@@ -122,6 +122,7 @@ class SimulatorCase:
     model_error: float = 0.0
     units: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     suspected: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
 
 def is_simulator(document: Mapping[str, Any]) -> bool:
@@ -153,7 +154,7 @@ def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) 
     experiments = _experiments(paths, tables, settings, inputs, outputs, tracked=settings.mjcf is not None)
     noise = _noise(experiments, outputs, settings)
     with naming(str(model)):
-        plant, repaired = finish(experiments, noise)
+        plant, repaired, doubts = finish(experiments, noise)
         unknown = [key for key in settings.tolerances if key not in plant.parameters]
         if unknown:
             raise InputError(
@@ -172,6 +173,7 @@ def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) 
         inputs=tuple(inputs),
         model_error=settings.model_error,
         units={effect.name: _with_units(effect, plant, inputs) for effect in plant.effects},
+        doubts=doubts,
     )
 
 
@@ -275,8 +277,9 @@ def _chosen(plant: Plant, settings: SimulatorSettings) -> Plant:
 
 
 # A simulator is opened in two steps: it names the inputs and outputs that the logs are read for, and makes
-# its plant (and what writes a repaired model) of what was read.
-_Finish = Callable[[Sequence[PlantExperiment], Real], tuple[Plant, Callable[[Diagnosis, Path], str] | None]]
+# its plant (and what writes a repaired model, and doubts) of what was read.
+_Repairs = Callable[[Diagnosis, Path], str] | None
+_Finish = Callable[[Sequence[PlantExperiment], Real], tuple[Plant, _Repairs, tuple[str, ...]]]
 _Simulator = Callable[
     [Path, Sequence[Table], SimulatorSettings, float], tuple[tuple[str, ...], tuple[str, ...], _Finish]
 ]
@@ -317,10 +320,10 @@ def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_
     dead = [
         name for name in labels if all(np.ptp(t.columns([columns[name]])[columns[name]]) == 0 for t in tables)
     ]
+    doubts = []
     if dead and len(dead) < len(labels):
-        warnings.warn(
-            f"columns that never change are left out: {', '.join(columns[n] for n in dead)}", stacklevel=2
-        )
+        doubts.append(f"columns that never change are left out: {', '.join(columns[n] for n in dead)}")
+        warnings.warn(doubts[0], stacklevel=2)
         labels = tuple(name for name in labels if name not in dead)
     if not labels:
         raise ValueError(
@@ -351,6 +354,10 @@ def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_
                 f"column {columns[both[0]]!r} is both {name} and {both[0]}: say which of the two"
             )
 
+    known = {*arm.measured_joints, *dead}
+    if loose := [one for one in there["joint"] if one not in known and one.partition(" ")[0] not in known]:
+        doubts.append(f"no column measures {listing(loose)}: simulated from where the model rests")
+
     def finish(experiments: Sequence[PlantExperiment], noise: Real) -> Any:
         tracking = settings.tracking_rad_s
         if tracking is None:
@@ -364,7 +371,7 @@ def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_
         def repaired(found: Diagnosis, folder: Path) -> str:
             return arm.repaired(plant, found.rig, found.repair, found.case.held_out, folder)
 
-        return plant, repaired
+        return plant, repaired, tuple(doubts)
 
     return commands, labels, finish
 
@@ -416,7 +423,7 @@ def _with_all(
 ) -> _Finish:
     """A simulation with the listed effects around inputs and outputs, and around its body where stated."""
 
-    def finish(experiments: Sequence[PlantExperiment], noise: Real) -> tuple[Plant, None]:
+    def finish(experiments: Sequence[PlantExperiment], noise: Real) -> tuple[Plant, None, tuple[str, ...]]:
         every = {name: tolerances.get(name, _TOLERANCE) for name in parameters}
         plant = Plant(
             simulation,
@@ -444,7 +451,7 @@ def _with_all(
             plant = around(plant, kinds["input"], input=column, prefix=f"{name}_")
         for name in outputs[1:]:
             plant = around(plant, kinds["output"], output=name, prefix=f"{name}_")
-        return plant, None
+        return plant, None, ()
 
     return finish
 
