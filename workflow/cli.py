@@ -680,7 +680,7 @@ def study(
 @app.command(cls=_OfSettings, short_help="What logs can tell of a simulator's model, in seconds.")
 def check(
     case: Annotated[
-        Path | None, typer.Argument(help="TOML file that names a simulator's model and its logs.")
+        list[Path] | None, typer.Argument(help="TOML file that names a simulator's model and its logs.")
     ] = None,
     mjcf: Mjcf = None,
     fmu: Fmu = None,
@@ -695,12 +695,14 @@ def check(
 ) -> None:
     """Quality of logs, smallest sizes that show, candidates that act alike, what a next record needs."""
     of_logs = {"motion": motion, "dt_s": dt_s, "repair": repair or None, "resample_s": resample_s}
-    stated = _of_simulator("check", [case] if case else [], mjcf, fmu, python, log, of_logs)
-    need(case)
+    stated = _of_simulator("check", case or [], mjcf, fmu, python, log, of_logs)
+    need(*case or [])
+    if case and len(case) > 1:
+        raise InputError("check: expected one case file")
     from workflow.diagnose.check import check as look_at_case
     from workflow.diagnose.simulator_case import settings_of
 
-    _show(look_at_case(case or settings_of(stated, "--log")), as_json)
+    _show(look_at_case(case[0] if case else settings_of(stated, "--log")), as_json)
 
 
 @app.command(cls=_OfSettings, short_help="Cause and size of a model error; how much of it is explained.")
@@ -799,6 +801,10 @@ def _of_simulator(
 ) -> dict[str, Any]:
     """A simulator's case as the options state it; empty beside case files. Raises InputError."""
     model, of_logs = _stated({"mjcf": mjcf, "fmu": fmu, "python": python}), _stated(of_logs)
+    if cases and model and log:
+        raise InputError(f"{command}: {cases[0]}: write --log before each log, as --log A.csv --log B.csv")
+    if model and not log:
+        raise InputError(f"{command}: --{next(iter(model))} needs the logs: --log FILE, once for each")
     if bool(cases) == bool(model) or bool(model) != bool(log):
         raise InputError(f"{command}: expected a case file, or --mjcf, --fmu or --python with --log")
     if of_logs and not model:
@@ -1017,6 +1023,12 @@ def _explain(error: Exception) -> tuple[str, int]:
         return str(error), error.exit_code
     if replaced := _REPLACED.get(getattr(error, "option_name", "")):
         return f"No such option: {error.option_name}; it is now {replaced} (flexlink --help)", EXIT_BAD_INPUT  # type: ignore[attr-defined]
+    called = getattr(getattr(error, "ctx", None), "info_name", "")
+    if called in ("check", "diagnose") and (key := _key_of_case(getattr(error, "option_name", ""))):
+        return (
+            f"{called}: {key} has no option: write {key} = ... in a case file (.toml) with model "
+            f"and log = [...], and call {called} on that (docs/simulators.md)"
+        ), EXIT_BAD_INPUT
     if hasattr(error, "format_message"):  # typer's own: unknown option, missing argument ...
         return f"{error.format_message() or 'no command given'} (flexlink --help)", EXIT_BAD_INPUT
     if isinstance(error, OSError):  # a file that none of ours asks about, a pipe or a terminal
@@ -1026,6 +1038,14 @@ def _explain(error: Exception) -> tuple[str, int]:
         return f"out of memory ({error}); shorter records, delays and searches need less", EXIT_INTERNAL
     cause = error.__cause__ if isinstance(error, typer.Abort) else error  # what typer makes of an EOFError
     return f"internal error: {type(cause).__name__}: {cause} (--debug shows where)", EXIT_INTERNAL
+
+
+def _key_of_case(option: str) -> str:
+    """The key of a simulator's case file that has the name of an option; empty without one."""
+    from workflow.diagnose.simulator_case import SimulatorSettings
+
+    key = option.removeprefix("--").replace("-", "_")
+    return key if key in SimulatorSettings.model_fields else ""
 
 
 def _complain(message: str, code: int) -> int:

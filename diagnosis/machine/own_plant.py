@@ -13,9 +13,11 @@ or effects that merely resemble it win.
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -42,10 +44,20 @@ Simulate = Callable[..., Real]
 _MOST_EFFECTS = 5
 # What a good model of a real machine may miss of its motion, where nobody has stated it.
 _USUAL_MODEL_ERROR = 0.05
+# Advice beside an error of a trial's values; with those stated it is an error of the program.
+OF_TRIAL = "; of values it cannot take, return nan"
 # In noise deviations: beyond any record, and its square is still a number.
 RUNAWAY = 1e12
 # What a simulation may raise where a trial runs away; any other error is one of the simulation.
 _NUMERICAL = (ArithmeticError, RuntimeWarning, np.linalg.LinAlgError)
+
+
+def place_of(error: BaseException, file: str = "") -> str:
+    """The last line of a user's file on the way to an error, as " (FILE, line N)". file : that file;
+    by default the one that is called first from where the error is caught."""
+    frames = traceback.extract_tb(error.__traceback__)[1:]
+    own = [one for one in frames if one.filename == (file or frames[0].filename)]
+    return f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
 
 
 def _is_number(value: object) -> bool:
@@ -225,10 +237,10 @@ class Plant:
             except _NUMERICAL:
                 raise
             except (Exception, SystemExit) as error:
+                at = place_of(error)
                 reason = " ".join(f"{type(error).__name__}: {error}".split())
                 raise ValueError(
-                    f"{self._at(effects)} the simulation ended with {reason}; of values it cannot take, "
-                    "return nan"
+                    f"{self._at(effects)} the simulation ended with {reason}{at}{OF_TRIAL}"
                 ) from error
             if found.ndim != 2 or len(found) != len(inputs) or found.shape[1] < self.noise.size:
                 raise ValueError(
@@ -288,7 +300,7 @@ class PlantCase(RecordedCase[PlantExperiment]):
             try:
                 found, again = run(e.input), run(e.input)
             except ValueError as error:
-                raise ValueError(f"{where}: {error}") from error
+                raise ValueError(f"{where}: {str(error).removesuffix(OF_TRIAL)}") from error
             except _NUMERICAL as error:
                 raise ValueError(f"{where}: the simulation as stated ended with {error!r}") from error
             if not np.all(np.isfinite(found)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import re
+import shlex
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -183,12 +184,24 @@ def test_a_load_and_friction_of_a_pendulum_without_a_site_are_found(
         ),
         ('mjcf = "one.csv"\nlog = "one.csv"', "one.csv: not a model that MuJoCo reads"),
         ('mjcf = "arm.xml"\nlog = "one.csv"\ncolumns = {hinge = "q"}', "is named after a joint or sensor"),
-        ('mjcf = "arm.xml"\nlog = "one.csv"\ncolumns = {motor = "u"}', "u"),
+        ('mjcf = "arm.xml"\nlog = "other.csv"', 'columns = {hinge = "COLUMN"}; the log has t'),
+        (
+            'mjcf = "arm.xml"\nlog = "one.csv"\ncolumns = {motor = "u"}',
+            "no column for motor: in a case file (.toml) with mjcf = ... and log = [...] write "
+            'columns = {motor = "COLUMN"}; the log has time_s',
+        ),
         ('mjcf = "arm.xml"\nlog = "one.csv"\ntolerances = {mass = 0.1}', "no parameter is called 'mass'"),
         ('mjcf = "arm.xml"\nlog = "one.csv"\nnoise = {elbow = 0.1}', "no output is called 'elbow'"),
         ('mjcf = "arm.xml"\nlog = "one.csv"\nmodel_err = 0.1', "did you mean model_error?"),
         ('python = "empty.py"\nlog = "one.csv"', "does not define simulate"),
-        ('python = "wrong.py"\nlog = "one.csv"', "ended with NameError"),
+        (
+            'python = "wrong.py"\nlog = "one.csv"',
+            "ended with NameError: name 'nothing' is not defined (wrong.py, line 1)",
+        ),
+        (
+            'python = "bug.py"\nlog = "one.csv"',
+            "ended with AttributeError: 'list' object has no attribute 'shape' (bug.py, line 5)",
+        ),
         ('python = "left.py"\nlog = "one.csv"', "ended with SystemExit"),
         ('python = "list.py"\nlog = "one.csv"', "TOLERANCES must be name -> number"),
         ('python = "gain.py"\nlog = "short.csv"', "last third validates; give more of it, or a second --log"),
@@ -207,15 +220,21 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, text, complaint):
     gain = 'INPUTS, OUTPUTS, PARAMETERS = "motor", "hinge", {"k": 2.0}\n'
     gain += 'def simulate(p, effects, inputs):\n    return p["k"] * inputs\n'
     (tmp_path / "gain.py").write_text(gain)
+    (tmp_path / "bug.py").write_text(
+        gain.replace("return", "return shape_of(").rstrip() + ")\ndef shape_of(y):\n    return [y].shape\n"
+    )
     (tmp_path / "list.py").write_text(gain + 'TOLERANCES = ["k"]\n')
     (tmp_path / "left.py").write_text("raise SystemExit")
     write_log(tmp_path / "one.csv", 0, 0.0)
+    text_of = (tmp_path / "one.csv").read_text()
+    (tmp_path / "other.csv").write_text(text_of.replace("motor,hinge", "u1,q1").replace("time_s", "t"))
     for name, rows in (("short", 13), ("row", 2)):
         lines = (tmp_path / "one.csv").read_text().splitlines()[:rows]
         (tmp_path / f"{name}.csv").write_text("\n".join(lines))
     with pytest.raises(InputError, match=re.escape(complaint)) as raised:
         load_simulator_case(settings_of(tomllib.loads(text), "case.toml"), tmp_path, "case.toml")
     assert "\n" not in str(raised.value)
+    assert "return nan" not in str(raised.value)  # advice on trials; these are the stated values
 
 
 @pytest.mark.parametrize(
@@ -576,4 +595,22 @@ def test_check_says_what_logs_can_tell(tmp_path, flexlink, refused):
     assert "is its column in degrees?" in doubt
     (tmp_path / "rig.toml").write_text('rig = "rig.toml"\nexperiments = []\n')
     assert "names no simulator's model" in refused("check", tmp_path / "rig.toml")
-    assert "expected a case file, or --mjcf" in refused("check", "--mjcf", tmp_path / "arm.xml")
+    next_command = shlex.join(["flexlink", "diagnose", *arguments])
+    assert document["verdict"].endswith(f"Next: {next_command} --out found")
+    assert again["verdict"].endswith(f"Next: flexlink diagnose {tmp_path / 'arm.toml'} --out found")
+
+
+@pytest.mark.parametrize("command", [("check",), ("diagnose", "--out", "found")])
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("--mjcf arm.xml", "--log FILE, once for each"),
+        ("--mjcf arm.xml --log a.csv b.csv c.csv", "b.csv: write --log before each log"),
+        ("--log a.csv", "expected a case file, or --mjcf"),
+        ("--mjcf arm.xml --log a.csv --exclude *.mass", "write exclude = ... in a case file"),
+        ("--mjcf arm.xml --log a.csv --model-error 0.1", "write model_error = ... in a case file"),
+        ("--mjcf arm.xml --log a.csv --sizes", "No such option: --sizes"),
+    ],
+)
+def test_a_call_that_is_no_case_is_told_what_to_write(refused, command, arguments, said):
+    assert said in refused(*command, *arguments.split())

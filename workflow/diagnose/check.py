@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -42,12 +43,21 @@ def check(place: Path | SimulatorSettings, time_limit_s: float = np.inf) -> RunS
     deadline_s = time.monotonic() + time_limit_s
     if isinstance(place, SimulatorSettings):
         loaded = load_simulator_case(place, Path(), "--log")
+        stated = place.model_dump(exclude_defaults=True)
+        words = []
+        for key, value in stated.items():
+            for one in value if isinstance(value, (list, tuple)) else [value]:
+                words += [f"--{key.replace('_', '-')}", *([] if one is True else [str(one)])]
     else:
         file, document = case_document(place)
         if not is_simulator(document):
             raise InputError(f"{file}: names no simulator's model; of a log alone: flexlink look LOG")
         loaded = load_simulator_case(settings_of(document, str(file)), file.parent, str(file))
-    return of_case(loaded, telling(loaded.case, deadline_s))
+        words = [str(file)]
+    told = of_case(loaded, telling(loaded.case, deadline_s))
+    return replace(
+        told, verdict=f"{told.verdict}. Next: {shlex.join(['flexlink', 'diagnose', *words])} --out found"
+    )
 
 
 def of_case(loaded: SimulatorCase, found: Telling) -> RunSummary:
@@ -91,7 +101,7 @@ def of_case(loaded: SimulatorCase, found: Telling) -> RunSummary:
         verdict=f"{len(shown) - len(found.hidden)} of {len(shown)} candidates show"
         + (
             f"; {len(alike)} groups of them look alike in these records, if one of them is present. "
-            "You may go on to the diagnosis: it says which of them it leaves open"
+            "The diagnosis says which of them it leaves open"
             if alike
             else ""
         ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import json
 import re
 import runpy
 import sys
@@ -21,7 +22,7 @@ from diagnosis.answer import Diagnosis, NamedEffect
 from diagnosis.machine.around import Body
 from diagnosis.machine.listed_effects import WHERE
 from diagnosis.machine.machine_protocol import Real, check_count
-from diagnosis.machine.own_plant import Plant, PlantCase, PlantExperiment
+from diagnosis.machine.own_plant import OF_TRIAL, Plant, PlantCase, PlantExperiment, place_of
 from diagnosis.machine.plant_effect import PlantEffect
 from diagnosis.machine.with_effects import with_effects
 from ident.data.record import Record
@@ -327,8 +328,8 @@ def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_
         labels = tuple(name for name in labels if name not in dead)
     if not labels:
         raise ValueError(
-            f"no column of {tables[0].path} is named after a joint or sensor "
-            f"({', '.join(columns.values())}); state which is which under [columns]"
+            f"no column of {tables[0].path.name} is named after a joint or sensor: "
+            f"{_which_column([*columns], tables[0], settings)}"
         )
     # A joint beside a sensor of its name is known to the plant by its label, any other by its own name.
     outputs = tuple(
@@ -390,7 +391,8 @@ def _python(model: Path, tables: Sequence[Table], settings: SimulatorSettings, d
     try:
         there = runpy.run_path(str(model))
     except (Exception, SystemExit) as error:
-        raise ValueError(f"ended with {type(error).__name__}: {error}") from error
+        at = place_of(error, str(model))
+        raise ValueError(f"ended with {type(error).__name__}: {error}{at}") from error
     missing = [key for key in ("simulate", "PARAMETERS", "INPUTS", "OUTPUTS") if key not in there]
     if missing:
         raise ValueError(f"does not define {missing[0]}; expected simulate, PARAMETERS, INPUTS and OUTPUTS")
@@ -440,10 +442,10 @@ def _with_all(
         motion, motion_is = (outputs[0], settings.motion) if settings.motion else _motion(inputs, outputs)
         try:
             plant = around(plant, "all", motion=motion, motion_is=motion_is)
-        except ValueError:
+        except ValueError as error:
             # A motion that was only guessed may be none: its effects then stay untried, and the page says so.
             if settings.motion or motion is None:
-                raise
+                raise ValueError(str(error).removesuffix(OF_TRIAL)) from error
             plant = around(plant, "all")
         there = {effect.name for effect in plant.effects}
         kinds = {place: [k for k in WHERE if k in there and WHERE[k] == place] for place in _PLACES}
@@ -579,9 +581,22 @@ def _refuse_other_unit(
         )
 
 
+def _which_column(names: Sequence[str], table: Table, settings: SimulatorSettings) -> str:
+    """What to write where quantities of the model have no column."""
+    kind = next(kind for kind in _KINDS if getattr(settings, kind))
+    columns = ", ".join(f'{name if name.isidentifier() else json.dumps(name)} = "COLUMN"' for name in names)
+    return (
+        f"in a case file (.toml) with {kind} = ... and log = [...] write "
+        f"columns = {{{columns}}}; the log has {table.listed()}"
+    )
+
+
 def _signals(table: Table, names: Sequence[str], held: int, settings: SimulatorSettings) -> Real:
     """(T, N) in the model's units on the log's grid; the first ones (held) are commands."""
     columns = [_column(name, table, settings) for name in names]
+    absent = [name for name, one in zip(names, columns, strict=True) if one.column not in table.names]
+    if absent:
+        raise ValueError(f"no column for {listing(absent)}: {_which_column(absent, table, settings)}")
     commands = list(dict.fromkeys(column.column for column in columns[:held]))
     time, unit = _time(table, settings)
     record = Record.from_file(
