@@ -54,10 +54,11 @@ def parse_effects(entries: Iterable[Mapping[str, Any]]) -> tuple[Effect, ...]:
 
 
 def in_words(name: str) -> str:
-    """An effect, "none" or "unknown" in a sentence; an effect of one's own by its id without underscores."""
+    """An effect, "none" or "unknown" in a sentence; an effect of one's own by its id without underscores, but
+    for names of a model (elbow_cmd.delay)."""
     kind = EFFECTS.get(name) or LOOK_ALIKES.get(name)
     answers = {"none": "no effect at all", "unknown": "none of the candidate effects"}
-    return kind.words if kind else answers.get(name, name.replace("_", " "))
+    return kind.words if kind else answers.get(name, name if "." in name else name.replace("_", " "))
 
 
 def make_machine(rig: Rig, effects: Sequence[Effect] = ()) -> Machine:

@@ -153,11 +153,19 @@ def test_the_first_screen_of_a_diagnosis(files, tmp_path, browser):
     ],
     ids=["none", "parametric", "unknown", "not_converged", "ambiguous", "two"],
 )
-def test_every_verdict_has_its_words(folder, engine, words, undrawn):
+def test_every_verdict_has_its_words(folder, engine, words, undrawn, tmp_path):
     files = made(folder, engine)
     assert words in files["arm.html"].decode()
     answer = json.loads(files["arm.json"])
     assert (answer["verdict"], answer["detail_verdict"]) == (engine.verdict, engine.detail)
+    shown = command._summary([answer], [], [], tmp_path / "arm.html").sections
+    decides = [row.value for section in shown for row in section.rows if row.label == "to decide"]
+    assert len(decides) == (engine.detail == "ambiguous")
+    assert set(decides) <= {f"run {tmp_path}/arm.next.csv"}
+    answer["next_experiment"] = {"record": "two", "change": "third", "separates": True}
+    shown = command._summary([answer], [], [], tmp_path / "arm.html").sections
+    repeats = [row.value for section in shown for row in section.rows if row.label == "to decide"]
+    assert set(repeats) <= {"repeat two at a third of its size"}
 
 
 def test_doubts_are_said_on_the_page_and_in_the_terminal(folder, undrawn, tmp_path):

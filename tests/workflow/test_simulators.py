@@ -15,9 +15,11 @@ from scipy.signal import lfilter
 
 from diagnosis import PlantExperiment
 from diagnosis.machine.plant_effect import Change
+from diagnosis.machine.telling import Alike, Telling
 from tests.workflow.command import ROOT
 from workflow.diagnose import check
 from workflow.diagnose.simulator_case import load_simulator_case, settings_of
+from workflow.diagnose.words import FILTERS
 from workflow.engine.errors import InputError
 
 GUIDE, EXAMPLE = ROOT / "docs" / "simulators.md", ROOT / "examples" / "mujoco_arm"
@@ -580,6 +582,7 @@ def test_check_says_what_logs_can_tell(tmp_path, flexlink, refused):
     rows_of = {(row["section"], row["label"]): row["value"] for row in document["table"]}
     assert "is it cut off?" in rows_of["two", "motor"]
     assert ("one", "motor") not in rows_of
+    assert rows_of["two", "samples"].endswith("validation")
     assert document["numbers"]["doubts"] == []
     assert rows_of["smallest size that shows", "motor.gain"].endswith("% of 1")
     groups = [{*one["names"]} for one in document["numbers"]["alike"]]
@@ -598,6 +601,14 @@ def test_check_says_what_logs_can_tell(tmp_path, flexlink, refused):
     next_command = shlex.join(["flexlink", "diagnose", *arguments])
     assert document["verdict"].endswith(f"Next: {next_command} --out found")
     assert again["verdict"].endswith(f"Next: flexlink diagnose {tmp_path / 'arm.toml'} --out found")
+
+
+def test_advice_stays_a_sentence_and_names_are_those_of_the_model():
+    alike = tuple(Alike((f"a_{k}.x", f"b_{k}.y"), 0.1) for k in range(8))
+    (words,) = check._advice(Telling({}, (), alike))
+    assert words.startswith("for a_0.x and b_0.y; a_1.x and b_1.y and 6 more groups: record at another speed")
+    assert FILTERS["effect"]("elbow_cmd.delay") == "elbow_cmd.delay"
+    assert FILTERS["effect"]("own_effect") == "own effect"
 
 
 @pytest.mark.parametrize("command", [("check",), ("diagnose", "--out", "found")])

@@ -30,6 +30,7 @@ from workflow.text.templates import RunSummary, rows_of
 
 # Groups that are shown, those that are most alike; candidates of every list; what a next record needs.
 _MOST_SHOWN, _MOST_LISTED, _MOST_ADVICE = 8, 20, 6
+_NAMED = 2  # groups that one sentence of advice names: it stays a sentence
 # A command with more values than these may be cut that is at the ends of its range for this share of the
 # time, and at one of them so many times longer than at other levels that it holds.
 _VALUES, _LIMITED, _LONGER = 20, 0.02, 3.0
@@ -163,9 +164,10 @@ def _advice(found: Telling) -> Iterator[str]:
         else:
             rest.append(listing(one.names))
     if rest:
+        more = f" and {len(rest) - _NAMED} more groups" if len(rest) > _NAMED else ""
         yield (
-            f"for {'; '.join(rest)}: record at another speed and amplitude, or exclude what you know is "
-            "as stated (exclude = [...] in the case file)"
+            f"for {'; '.join(rest[:_NAMED])}{more}: record at another speed and amplitude, or exclude "
+            "what you know is as stated (exclude = [...] in the case file)"
         )
     if found.hidden:
         yield f"for {listing(found.hidden)}: move what they act on farther or faster"
