@@ -42,6 +42,8 @@ class FindingKind(Enum):
     WRAPS = auto()
     LONG_STEPS = auto()
     UNIT_CONTRADICTED = auto()
+    UNIT_OF_LOOP = auto()
+    UNIT_OF_REFERENCE = auto()
     FEW_SAMPLES = auto()
     UNKNOWN_TIME_CONSTANT = auto()
     UNKNOWN_DAMPING = auto()

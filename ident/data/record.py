@@ -14,7 +14,7 @@ from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record_files import read_table
 from ident.data.table import LARGEST, Table
 from ident.data.time_grid import CoarseGrid, Repair, TimeGrid, clock_doubts, sampling_time
-from ident.data.units import TimeColumn
+from ident.data.units import TimeColumn, contradicted_by_loop
 from ident.data.wrapping import unwrapped, wraps_at
 
 T = TypeVar("T")
@@ -279,14 +279,20 @@ class Record:
             found = tuple(units.get(item, "" if item in scale else table.unit(item)) for item in names)
             return found if any(found) else ()
 
+        output = stack(outputs)
+        reference = stack(references, held=True) if references else None
+        if reference is not None and len(references) == len(outputs) == 1:
+            looked = references[0], outputs[0]
+            of = "".join(stated(references)), "".join(stated(outputs))
+            notes += contradicted_by_loop(reference[:, 0], output[:, 0], looked, of, scale)
         return cls(
             name=table.path.stem if name is None else name,
             input=stack(inputs, held=True),
-            output=stack(outputs),
+            output=output,
             dt_s=step,
             input_names=tuple(inputs),
             output_names=tuple(outputs),
-            reference=stack(references, held=True) if references else None,
+            reference=reference,
             reference_names=tuple(references),
             input_units=stated(inputs),
             output_units=stated(outputs),

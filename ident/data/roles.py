@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ident.data.finding import Finding, FindingKind, finding
 from ident.data.foreign_files import shown
 from ident.data.table import Table
-from ident.data.units import TIME_UNITS, ends_with_time, says_time
+from ident.data.units import TIME_UNITS, ends_with_time, per, says_time, scaled_by
 
 _INPUT = re.compile(
     r"(u|v|input|command|commanded|cmd|drive|voltage|spannung|current|strom|torque|moment|force|pwm|duty)(?![a-z])",
@@ -43,12 +44,14 @@ _RATE_NAME = re.compile(r"(^|[^a-z])(speed|velocity|vel|drehzahl|omega|accel\w*|
 
 @dataclass(frozen=True)
 class Roles:
-    """Names of the columns; time and reference are None where no column looks like it."""
+    """Names of the columns; time and reference are None where no column looks like it. doubts: of a column
+    that would be the reference, were it in the output's unit."""
 
     time: str | None
     input: str
     output: str
     reference: str | None = None
+    doubts: tuple[Finding, ...] = ()
 
 
 def roles_of(table: Table, log: str, command: str = "identify", **stated: str | None) -> Roles:
@@ -133,7 +136,15 @@ def roles_with_reference(table: Table, log: str, command: str, **stated: str | N
             f"{table.path}: {listed} may be the reference of '{shown(roles.output, 30)}'; type: flexlink "
             f"{command} {log} {typed}"
         )
-    return replace(roles, reference=_only(fitting))
+    other = _only([name for name in wished if name not in (roles.input, roles.output)])
+    unit, of = table.unit(other or ""), table.unit(roles.output)
+    if fitting or other is None or is_position(other, unit) != is_position(roles.output, of):
+        return replace(roles, reference=_only(fitting))
+    factor = per(unit, of)
+    told = {"name": other, "unit": unit, "output": roles.output, "of": of}
+    scaled = scaled_by(other, factor) if factor else f"--scale {shlex.quote(f'{other}=FACTOR')}"
+    options = f"--reference {shlex.quote(other)} {scaled}"
+    return replace(roles, doubts=(finding(FindingKind.UNIT_OF_REFERENCE, **told, options=options),))
 
 
 def _not_in(wished: list[str], names: list[str]) -> list[str]:

@@ -6,7 +6,9 @@ Time is converted to seconds; every other signal keeps its unit, which is carrie
 from __future__ import annotations
 
 import re
+import shlex
 import unicodedata
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,6 +73,18 @@ _COUNTS = re.compile(
     r"months?|years?|picosec\w*|[cdkpf]s"
 )
 _AFTER = re.compile(r"\sin\s+(\S+)\s*$|^\w+\s*/\s*(\w+)\s*$")
+
+# Units of one quantity, each in the first of its kind; a rate has them before its stroke.
+_SIZES = {
+    "rad": ("rad", 1.0), "mrad": ("rad", 1e-3), **dict.fromkeys(("deg", "°", "grad"), ("rad", np.pi / 180)),
+    "m": ("m", 1.0), "cm": ("m", 1e-2), "mm": ("m", 1e-3),
+}  # fmt: skip
+# By how much a signal is larger in another unit.
+_TIMES = ((180 / np.pi, "degrees and radians"), (1e3, "mm and m"))
+# Where a loop follows best: lowest lines with this share of the reference's power, so many at least.
+_SLOW, _FEWEST_LINES = 0.03, 8
+# Measured and simulated loops follow there to a factor of 1.1, with a coherence of 0.9 and more.
+_FOLLOWS, _COHERENT = 1.3, 0.5
 
 # A log of more samples than this, with steps of at least so many seconds, is rather one in milliseconds.
 _MANY_SAMPLES = 1000
@@ -169,7 +183,12 @@ class TimeColumn:
 
     def doubt(self, dt_s: float) -> Finding:
         """What there is to say of a doubtful column with steps of dt_s."""
-        return finding(FindingKind.TIME_UNIT, name=self.name, in_header=self.in_header, dt_s=dt_s)
+        # Machines are logged faster than twice a second: steps of 4 are milliseconds, of 4000 microseconds.
+        unit = next((unit for unit in ("ms", "us") if dt_s < _LONG_STEP_S * _PER_SECOND[unit]), "ns")
+        options = f"--time-unit {unit}"
+        return finding(
+            FindingKind.TIME_UNIT, name=self.name, in_header=self.in_header, dt_s=dt_s, options=options
+        )
 
     @classmethod
     def of(cls, name: str, stated: str | None = None, beside: str = "") -> TimeColumn:
@@ -223,6 +242,54 @@ class TimeColumn:
         step = (stamps[-1] - stamps[0]) / (stamps.size - 1)
         integers = bool(np.all(stamps == np.round(stamps)) and stamps[-1] > 1)
         return integers or bool(step >= _LONG_STEP_S and stamps.size > _MANY_SAMPLES)
+
+
+def per(unit: str, other: str) -> float | None:
+    """How many of the other unit one is: 57.3 of rad and deg; None where they are not of one quantity."""
+    (first, *rate), (second, *same) = unit.split("/"), other.split("/")
+    (kind, size), (like, one) = _SIZES.get(first, ("", 0.0)), _SIZES.get(second, (" ", 1.0))
+    return size / one if (kind, rate) == (like, same) else None
+
+
+def contradicted_by_loop(
+    reference: RealArray,
+    output: RealArray,
+    names: tuple[str, str],
+    units: tuple[str, str],
+    scale: Mapping[str, float],
+) -> tuple[Finding, ...]:
+    """The finding on an output (T,) that follows its reference (T,) but for the factor between two units.
+    names, units: of reference and output; scale: as stated, by name."""
+    window = np.hanning(output.size)
+    r, y = (np.fft.rfft((signal - signal.mean()) * window)[1:] for signal in (reference, output))
+    power = np.cumsum(np.abs(r) ** 2)
+    if r.size < _FEWEST_LINES or not power[-1] > 0:
+        return ()
+    slow = slice(max(_FEWEST_LINES, int(np.searchsorted(power, _SLOW * power[-1])) + 1))
+    own, both, answer = (np.vdot(a[slow], b[slow]).real for a, b in ((r, r), (r, y), (y, y)))
+    if both <= 0 or both**2 < _COHERENT * own * answer:
+        return ()
+    larger = both > own  # the output
+    found = [(times if larger else 1 / times, like) for times, like in _TIMES]
+    found = [(times, like) for times, like in found if 1 / _FOLLOWS < both / own / times < _FOLLOWS]
+    # The reference is in the wrong unit where the output's header says that of its numbers, or each its own.
+    small = _SIZES.get(units[1].split("/")[0], ("", 1.0))[1] < 1
+    wrong = int(larger != small and not (all(units) and units[0] != units[1]))
+    return tuple(
+        finding(
+            FindingKind.UNIT_OF_LOOP, reference=names[0], output=names[1], times=times, like=like,
+            options=scaled_by(
+                names[wrong], times ** (1 - 2 * wrong) * scale.get(names[wrong], 1.0), units[1] * wrong
+            ),
+        )
+        for times, like in found
+    )  # fmt: skip
+
+
+def scaled_by(name: str, factor: float, unit: str = "") -> str:
+    """The options that take a column times a factor, in a unit."""
+    said = {"--scale": f"{factor:.10g}", "--unit": unit}
+    return " ".join(f"{option} {shlex.quote(f'{name}={value}')}" for option, value in said.items() if value)
 
 
 def written_unit(name: str) -> str:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from ident.data.record import Record
-from ident.data.units import TimeColumn, written_unit
+from ident.data.units import TimeColumn, contradicted_by_loop, written_unit
 
 PER_SECOND = {"s": 1, "ms": 1000, "us": 10**6, "ns": 10**9, "min": Fraction(1, 60), "h": Fraction(1, 3600)}
 
@@ -30,6 +30,31 @@ PER_SECOND = {"s": 1, "ms": 1000, "us": 10**6, "ns": 10**9, "min": Fraction(1, 6
 )
 def test_units_of_signals_are_carried_along(header, unit):
     assert written_unit(header) == unit
+
+
+@pytest.mark.parametrize(
+    ("gain", "units", "options"),
+    [
+        (180 / np.pi, ("rad", "rad"), "--scale y=0.01745329252 --unit y=rad"),
+        (180 / np.pi, ("deg/s", "deg/s"), "--scale r=57.29577951"),
+        (np.pi / 180, ("rad", "rad"), "--scale r=0.01745329252"),
+        (np.pi / 180, ("", ""), "--scale r=0.01745329252"),
+        (0.9 * 1e3, ("m", "m"), "--scale y=0.001 --unit y=m"),
+        (1e-3, ("mm", "mm"), "--scale y=1000 --unit y=mm"),
+        (1e-3, ("mm", "m"), "--scale r=0.001"),
+        *[(gain, ("rad", "rad"), None) for gain in (1.0, 0.3, 20.0, 100.0, -180 / np.pi)],
+    ],
+)
+def test_an_output_that_follows_but_for_a_unit(gain, units, options):
+    """First order at 36 rad/s, sampled at 100 Hz, behind a reference that is white up to 50 Hz."""
+    rng = np.random.default_rng(4)
+    reference, output = rng.standard_normal(4000), np.zeros(4000)
+    for k in range(1, 4000):
+        output[k] = 0.7 * output[k - 1] + 0.3 * reference[k - 1]
+    noise = 0.01 * rng.standard_normal(4000)
+    found = contradicted_by_loop(reference, gain * (output + noise) + 7, ("r", "y"), units, {})
+    assert [item.values["options"] for item in found] == ([options] if options else [])
+    assert contradicted_by_loop(reference, gain * rng.standard_normal(4000), ("r", "y"), units, {}) == ()
 
 
 @given(st.sampled_from(sorted(PER_SECOND)), st.lists(st.integers(0, 10**6), min_size=1, max_size=9))

@@ -142,6 +142,39 @@ def test_columns_units_and_structure(flexlink, tmp_path, signals, names, units, 
     assert f"{1 / DT_S:g} Hz" in text
 
 
+@pytest.mark.parametrize(
+    ("names", "factors", "words", "typed"),
+    [
+        (("t_s", "ref_rad", "u_A", "y_rad"), (1, 1, 180 / np.pi), "'y_rad' follows the reference 'ref_rad'",
+         "--scale y_rad=0.01745329252 --unit y_rad=rad"),
+        (("t_s", "ref_deg", "u_A", "y_deg"), (1, 1, 180 / np.pi), "'y_deg' follows the reference 'ref_deg'",
+         "--scale ref_deg=57.29577951"),
+        (("t_s", "ref_mm", "u_A", "y_m"), (1, 1e3, 1), "'ref_mm' looks like the reference of 'y_m'",
+         "--reference ref_mm --scale ref_mm=0.001"),
+        (("t", "ref_m", "u_A", "y_m"), (1e3, 1, 1), "'t' is taken as seconds", "--time-unit ms"),
+    ],
+)  # fmt: skip
+def test_a_wrong_unit_is_doubted_and_the_next_command_states_it(
+    flexlink, tmp_path, signals, names, factors, words, typed
+):
+    (tmp_path / "right").mkdir()
+    right = write(tmp_path / "right", signals, ("t_s", "ref_rad", "u_A", "y_rad"))
+    logs = write(tmp_path, signals, names, (factors[0], factors[1], 1, factors[2]))
+    # Limits of the terminal cut sentences into lines.
+    seen = flexlink("look", logs[0]).out
+    assert words in " ".join(seen.replace("│", " ").split())
+    assert seen.splitlines()[-1] == f"flexlink init {logs[0]} {typed} --out my.toml"
+    doubted = " ".join(flexlink("init", *logs, "--out", tmp_path / "a.toml").out.replace("│", " ").split())
+    assert words in doubted
+    assert typed in doubted
+    config = drafted(flexlink, logs, *typed.split())[2]
+    honest = drafted(flexlink, right)[2].specification
+    in_degrees = 180 / np.pi if names[-1] == "y_deg" else 1
+    assert config.specification.effort_limit == pytest.approx(honest.effort_limit / in_degrees, rel=0.05)
+    assert config.specification.bandwidth_rad_s == pytest.approx(honest.bandwidth_rad_s, rel=0.05)
+    assert "doubts" not in flexlink("init", *logs, *typed.split(), "--out", tmp_path / "b.toml").out
+
+
 def uncommented(text):
     """Every text with one of the lines that are left out taken in, and the one with all of them."""
     lines = text.splitlines()

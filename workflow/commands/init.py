@@ -14,6 +14,7 @@ import numpy as np
 import tomlkit
 from markupsafe import Markup
 
+from ident.data.finding import Finding, distinct
 from ident.data.record import Record
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response
@@ -61,6 +62,10 @@ class Found:
     def time_unit(self) -> str:
         column = self.read.records[0].time_column
         return "s" if column is None else column.unit
+
+    @property
+    def doubts(self) -> tuple[Finding, ...]:
+        return distinct([doubt for record in self.read.records for doubt in record.doubts])
 
     @property
     def input_unit(self) -> str:
@@ -145,6 +150,7 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> Channel
         input_name=roles.input,
         output_name=roles.output,
         reference=roles.reference,
+        doubts=roles.doubts,
         time=roles.time,
         time_unit=stated.time_unit if roles.time else None,
         repair="--repair" in options and not steps,

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from ident.data.finding import Finding
 from ident.data.record import Record
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response
@@ -19,7 +20,8 @@ from workflow.engine.errors import naming
 class Reading:
     """Columns of one channel and how they are read, as stated; the rest as in `Record.from_file`.
 
-    reference: column of logs made in closed loop; input_limit: larger commands are taken as that.
+    reference: column of logs made in closed loop; input_limit: larger commands are taken as that; doubts: of
+    how the columns were found.
     """
 
     input_name: str | None = None
@@ -36,6 +38,8 @@ class Reading:
     unwrap: Mapping[str, float] = field(default_factory=dict)
     decimal: str | None = None
     input_limit: float | None = None
+
+    doubts: tuple[Finding, ...] = ()
 
     def roles(self, table: Table, logs: str, command: str) -> Roles:
         """What is stated, and what names and units of the table tell. Raises ValueError."""
@@ -68,6 +72,7 @@ class Reading:
                 unwrap=self.unwrap,
                 decimal=self.decimal,
             )
+            record = replace(record, notes=(*record.notes, *self.doubts))
             return record if self.input_limit is None else record.limited(self.input_limit)
 
 
@@ -105,6 +110,7 @@ def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: S
             output_name=roles.output,
             reference=found if everywhere else how.reference,
             time=roles.time if how.time is None and how.dt_s is None else how.time,
+            doubts=roles.doubts,
         )
     measured, fresh = (tuple(how.record(path) for path in paths) for paths in (logs, validation))
     return Logs(measured, fresh, (*logs, *validation), how.input_limit)

@@ -45,9 +45,18 @@ def _next(found: LogLook) -> str:
         return said("response_next", found.response, shlex.quote(str(found.path)))
     if found.roles is None:
         return found.unclear
-    roles = found.roles
-    if roles.reference:  # made in closed loop
-        return f"flexlink init {shlex.quote(str(found.path))} --out my.toml"
+    roles, log = found.roles, shlex.quote(str(found.path))
+    used = found.taken_as.values()
+    why = [column.why for column in found.columns if column.name in used and column.values is None]
+    if found.time and found.time.why:
+        why.append(found.time.why)
+    elif found.time and found.time.option == "split":
+        why.append(f"{found.time.gap_place}: {found.time.missing} rows are missing, split the file there")
+    if why:
+        return f"{found.path}, {why[0]}"
+    doubted = [str(doubt.values["options"]) for doubt in found.doubts if "options" in doubt.values]
+    if roles.reference or roles.doubts:  # made in closed loop
+        return " ".join(["flexlink init", log, *doubted, "--out my.toml"])
     named = {"--input": roles.input, "--output": roles.output, "--time": roles.time}
     options = [f"{option} {shlex.quote(name)}" for option, name in named.items() if name]
     options += [] if roles.time else ["--dt-s SECONDS"]
@@ -57,7 +66,7 @@ def _next(found: LogLook) -> str:
         for doubt in found.doubts
         if doubt.kind is FindingKind.WRAPS and doubt.values["name"] == roles.output
     ]
-    return " ".join(["flexlink identify", shlex.quote(str(found.path)), *options])
+    return " ".join(["flexlink identify", log, *options, *doubted])
 
 
 def _numbers(found: LogLook) -> dict[str, object]:

@@ -18,7 +18,10 @@ from ident.data.roles import Roles, roles_with_reference, times_in
 from ident.data.table import Table
 from ident.data.text_tables import Layout
 from ident.data.time_grid import LARGEST_JITTER, clock_doubts, jitter_of, only_rounded, option_for
+from ident.data.units import contradicted_by_loop
 from workflow.engine.errors import naming
+
+_EXACT = 1e-6  # of a step: stamps of a few digits as doubles stray by less
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +131,17 @@ def look_at(
                 outputs = [roles.output]
             values = {name: table.columns([name])[name] for name in (*inputs, *outputs)}
             doubts += reading_notes(table, values, inputs, outputs)
+    doubts += _of_the_loop(table, roles) if roles else ()
     return LogLook(path, rows, table.layout, about, columns, roles, unclear, response, distinct(doubts))
+
+
+def _of_the_loop(table: Table, roles: Roles) -> tuple[Finding, ...]:
+    """What reference and output say of their units."""
+    names = roles.reference or "", roles.output
+    if not roles.reference or any(_column(table, name).values is None for name in names):
+        return roles.doubts
+    reference, output = table.columns(names, roles.output if table.sparse else None).values()
+    return contradicted_by_loop(reference, output, names, (table.unit(names[0]), table.unit(names[1])), {})
 
 
 def _response(table: Table) -> ResponseLook | None:
@@ -153,13 +166,14 @@ def _time(table: Table, name: str, unit: str | None, rows_of: str | None) -> tup
     steps = np.diff(stamps)
     period = float(np.median(steps))
     counts = np.maximum(np.rint(steps / period), 1)
-    rounded, jitter = only_rounded(stamps), jitter_of(stamps)
+    jitter = jitter_of(stamps)
+    rounded = jitter > _EXACT and only_rounded(stamps)
     row = int(np.argmax(steps))
     found = TimeLook(
         name,
         column.unit,
         float((stamps[-1] - stamps[0]) / steps.size) if rounded else period,
-        0.0 if rounded else jitter,
+        0.0 if rounded or jitter <= _EXACT else jitter,
         rounded,
         int(np.sum(counts - 1)) if jitter <= LARGEST_JITTER else 0,
         float(steps[row]),

@@ -30,7 +30,6 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "level": "--level",
         "response": "--response",
         "band_rad_s": "--band",
-        "time_unit": "--time-unit",
         "resample_s": "--resample-s",
         "validation": "--validation",
         "closed_loop_data.method": "--loop-method",
