@@ -203,9 +203,16 @@ class Table:
                     f"{self.place(len(cells) - 1, name)}; expected equal lengths: cut the rows behind it"
                 )
         sign = " with a decimal comma" if self.layout and self.layout.decimal == "," else ""
+        remedy = ""
+        if 2 * bad.size < numbers.size and not np.isfinite(numbers[row]):  # else it is no column of numbers
+            remedy = (
+                f"; take such rows out ({bad.size} here): with a time column --repair fills them in, and "
+                "flexlink init does so by itself"
+            )
         raise ValueError(
             f"{self.path}, {self.place(row, name)}: column '{shown(name)}' is {found}; "
             f"expected a finite number{sign}{' up to 1e100' if np.isfinite(numbers[row]) else ''}"
+            f"{remedy}"
         )
 
     def seconds(self, name: str, stamps: RealArray, unit: str | None) -> tuple[RealArray, TimeColumn]:

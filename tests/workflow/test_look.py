@@ -69,6 +69,7 @@ def test_table_and_page(log, flexlink, tmp_path, faults_seen):
     [
         ("preamble", "semicolons, decimal comma, names in line 5, numbers from line 6"),
         ("128 Hz rounded to milliseconds", "rounded to their last digit"),
+        ("commas", "read in seconds; no jitter; no row missing"),
         ("no names", "which columns? It has column 1"),
         ("words in another column", "note"),
     ],
@@ -79,6 +80,30 @@ def test_what_is_said_of_text(name, words, flexlink, tmp_path):
     answer = flexlink("look", path)
     assert answer.code == 0
     assert words in " ".join(answer.out.split())
+
+
+@pytest.mark.parametrize("cell", ["nan", "", "overflow"])
+def test_a_cell_without_a_number_is_taken_out_and_filled_in(cell, flexlink, refused, tmp_path):
+    rng, path = np.random.default_rng(1), tmp_path / "log.csv"
+    u = np.repeat(rng.choice([-1.0, 1.0], 400), 10)
+    y = np.cumsum(np.cumsum(u - u.mean())) * 1e-4
+    rows = [f"{0.01 * k:.2f},{u[k]},{y[k] if k != 2000 else cell}" for k in range(u.size)]
+    path.write_text("\n".join(["t_s,u_V,y_rad", *rows]) + "\n")
+    last = flexlink("look", path).out.splitlines()[-1]
+    assert last.startswith(f"{path}, line 2002: column 'y_rad' is")
+    assert "take such rows out (1 here)" in last
+    assert "--repair fills them in" in refused("init", path, "--out", tmp_path / "a.toml")
+    path.write_text("\n".join(["t_s,u_V,y_rad", *(row for row in rows if cell not in row.split(","))]) + "\n")
+    seen = " ".join(flexlink("look", path).out.replace("│", " ").split())
+    assert "1 row missing" in seen
+    assert "flexlink init takes that by itself, identify with --repair" in seen
+    answer = flexlink("init", path, "--out", tmp_path / "a.toml")
+    assert answer.code == 0
+    assert "none shows: give further logs" in answer.out
+    assert "repair = true" in (tmp_path / "a.toml").read_text()
+    # A gap that no command fills: the next step is to split.
+    path.write_text("\n".join(["t_s,u_V,y_rad", *rows[:1000], *rows[1100:1900]]) + "\n")
+    assert flexlink("look", path).out.splitlines()[-1].endswith("100 rows are missing, split the file there")
 
 
 def test_a_log_that_is_none_is_one_line(flexlink, tmp_path):
