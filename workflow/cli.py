@@ -1018,11 +1018,17 @@ def _interrupted(arguments: Sequence[str], out: Path | None = None) -> int:
 _REPLACED = {"--promise": "--response"}
 
 
+def _help(error: Exception) -> str:
+    """What to type for the help of the command that complains."""
+    context = getattr(error, "ctx", None)
+    return f"flexlink {context.info_name} -h" if context and context.parent else "flexlink --help"
+
+
 def _explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, (InputError, StageError)):
         return str(error), error.exit_code
     if replaced := _REPLACED.get(getattr(error, "option_name", "")):
-        return f"No such option: {error.option_name}; it is now {replaced} (flexlink --help)", EXIT_BAD_INPUT  # type: ignore[attr-defined]
+        return f"No such option: {error.option_name}; it is now {replaced} ({_help(error)})", EXIT_BAD_INPUT  # type: ignore[attr-defined]
     called = getattr(getattr(error, "ctx", None), "info_name", "")
     if called in ("check", "diagnose") and (key := _key_of_case(getattr(error, "option_name", ""))):
         return (
@@ -1030,7 +1036,7 @@ def _explain(error: Exception) -> tuple[str, int]:
             f"and log = [...], and call {called} on that (docs/simulators.md)"
         ), EXIT_BAD_INPUT
     if hasattr(error, "format_message"):  # typer's own: unknown option, missing argument ...
-        return f"{error.format_message() or 'no command given'} (flexlink --help)", EXIT_BAD_INPUT
+        return f"{error.format_message() or 'no command given'} ({_help(error)})", EXIT_BAD_INPUT
     if isinstance(error, OSError):  # a file that none of ours asks about, a pipe or a terminal
         what = "cannot use " if error.filename else "cannot write the output: "
         return what + describe_os_error(error), EXIT_BAD_INPUT

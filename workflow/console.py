@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 
 FIRST_LINE_S, LINE_EVERY_S = 0.4, 10.0
+_STARTING, _REFUSED_S = "starting", 3.0  # what is refused in one line is refused by then
 COMPILING_S = 25.0  # all kernels that one command needs, the first time
 # So much work as expected is taken for granted before the speed of this machine counts.
 _PRIOR_S = 10.0
@@ -47,7 +48,7 @@ class TerminalProgress(progress.Progress):
             transient=True,
             disable=quiet or not console.is_terminal,
         )
-        self._doing, self._task = "starting", self._bar.add_task("starting", total=1.0, left="")
+        self._doing, self._task = _STARTING, self._bar.add_task(_STARTING, total=1.0, left="")
         self._expected: dict[str, float] = {}
         self._done_s = 0.0
         self._reported_s = self._began_s  # when work was last reported
@@ -68,7 +69,10 @@ class TerminalProgress(progress.Progress):
     def _tell(self) -> None:
         pause_s = FIRST_LINE_S
         while not self._over.wait(pause_s):
-            spent_s, pause_s = time.monotonic() - self._began_s, LINE_EVERY_S
+            spent_s = time.monotonic() - self._began_s
+            if self._doing == _STARTING and spent_s < _REFUSED_S:
+                continue
+            pause_s = LINE_EVERY_S
             self._say(f"{spent_s:.0f} s: {printable(self._doing)}{self._ahead()}")
 
     def _say(self, line: str) -> None:

@@ -80,6 +80,12 @@ def test_empty_directory_that_was_there_stays_and_is_usable_again(refused, tmp_p
     assert not (tmp_path / "run").exists() or list((tmp_path / "run").iterdir()) == []
 
 
+def test_a_log_in_place_of_a_configuration_and_a_missing_option_say_what_to_type(refused, tmp_path):
+    log = write_case(tmp_path, good_table()).with_name("log.csv")
+    assert refused("run", "--config", log).endswith(f"flexlink init {log} --out my.toml\n")
+    assert refused("init", log).endswith("(flexlink init -h)\n")
+
+
 BAD_CONFIGS = {
     "unknown key": (
         "[synthesis]\nstart = 3",

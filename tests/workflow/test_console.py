@@ -30,8 +30,9 @@ def test_the_first_word_comes_at_once(capfd):
         told.update("reading", 0.0)
         time.sleep(console.FIRST_LINE_S + 0.2)
     assert re.fullmatch(r"flexlink: \d s: reading\n", capfd.readouterr().err)
-    with console.TerminalProgress(quiet=True):
-        time.sleep(console.FIRST_LINE_S + 0.2)
+    for quiet in (True, False):  # what is refused at once is one line
+        with console.TerminalProgress(quiet=quiet):
+            time.sleep(console.FIRST_LINE_S + 0.2)
     assert capfd.readouterr().err == ""
 
 
