@@ -17,6 +17,7 @@ import pytest
 from workflow.config.run_config import RunConfig, load_config
 from workflow.config.settings import check
 from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.records import read_record
 from workflow.tasks.results import RunResults
 
 DT_S, STEPS = 0.002, 20
@@ -167,6 +168,10 @@ def test_a_wrong_unit_is_doubted_and_the_next_command_states_it(
     doubted = " ".join(flexlink("init", *logs, "--out", tmp_path / "a.toml").out.replace("│", " ").split())
     assert words in doubted
     assert typed in doubted
+    if "--reference" not in typed:  # else nobody told the run of one
+        written = load_config(tmp_path / "a.toml")[0]
+        (doubt,) = read_record(written.source, written.source.records[0], written.channels).doubts
+        assert doubt.values["options"] == typed
     config = drafted(flexlink, logs, *typed.split())[2]
     honest = drafted(flexlink, right)[2].specification
     in_degrees = 180 / np.pi if names[-1] == "y_deg" else 1
