@@ -35,9 +35,9 @@ from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import PREDICTED, render
 from workflow.report.rendering import render_page
 from workflow.study.columns import COLUMNS, numbers_of
-from workflow.study.page import PointRow, StudyView, draw_pareto, pareto_front, row_of
-from workflow.study.points import Point, short
-from workflow.study.settings import Axis, ParetoPlot, last_name, parse_key, tidy, with_values
+from workflow.study.page import PointRow, StudyView, draw_pareto, pareto_front, row_of, study_summary
+from workflow.study.points import Point, PointMaker, load_base, short
+from workflow.study.settings import Axis, ParetoPlot, last_name, load_study, parse_key, tidy, with_values
 from workflow.study.task import Task
 from workflow.tasks.results import (
     AchievablePerformance,
@@ -208,7 +208,7 @@ _METRICS = dict.fromkeys(
 
 
 def _view(rows: list[PointRow], plots: int = 1) -> StudyView:
-    config: Any = SimpleNamespace(pareto=(_PLOT,) * plots)
+    config: Any = SimpleNamespace(axes=(), pareto=(_PLOT,) * plots)
     return StudyView("a study", config, "", "", rows, {})
 
 
@@ -224,6 +224,56 @@ def test_picture_tells_certified_from_uncertified():
     assert "1" in texts
     assert "2 not drawn: no number here" in texts
     assert render(figure).kind == "svg"
+
+
+def test_an_axis_over_the_bandwidth_is_no_question_of_a_lower_one(tmp_path):
+    base = tmp_path / "base.toml"
+    text = FAST_ARM.read_text()
+    asked = re.search(r"^bandwidth_rad_s = (.+)$", text, re.MULTILINE)
+    base.write_text(text.replace(asked[0], f"{asked[0]}\nlowest_bandwidth_rad_s = 0.2"))
+    axis = '[[axes]]\nkey = "specification.{}"\nvalues = [{}]\n'
+    width, order = axis.format("bandwidth_rad_s", "0.1, 1.0"), axis.format("controller_order", "4")
+    lowest = axis.format("lowest_bandwidth_rad_s", "0.05")
+    found = {}
+    for axes in (width, order, width + lowest):
+        (tmp_path / "study.toml").write_text(f'[study]\nbase = "base.toml"\n{axes}')
+        file = load_study(tmp_path / "study.toml")
+        made = load_base(file.config, file.path, file.base)
+        points = PointMaker(file.config, file.path, made).grid()
+        lowest_of = [point.config.specification.lowest_bandwidth_rad_s for point in points]
+        found[axes] = made.left_out, lowest_of
+    assert found == {
+        width: (0.2, [None, None]), order: (None, [0.2]), width + lowest: (None, [0.05, 0.05])
+    }  # fmt: skip
+
+
+def test_a_point_at_a_lower_bandwidth_is_marked_everywhere():
+    numbers = dict.fromkeys(COLUMNS) | {
+        "bandwidth_rad_s": 5.7, "modulus_margin": 0.6, "worst_gamma": 0.8, "design_bandwidth_rad_s": 4.0
+    }  # fmt: skip
+    why = "the specified 9 rad/s was not met; the requirements are those of a design for 4 rad/s"
+    lower = PointRow(1, "a", {}, "certified at a lower bandwidth", why, numbers)
+    whole = replace(lower, number=2, state="certified", why="certified")
+    axes = Axis.model_validate({"key": "specification.modulus_margin", "label": "asked", "values": [0.5]})
+    for rows, config_axes, judged in (
+        ([lower, whole], (), False),
+        ([whole, whole], (), True),
+        ([replace(whole, values={axes.key: 0.5})], (axes,), False),
+    ):
+        view = replace(_view(rows), config=SimpleNamespace(axes=config_axes, pareto=(_PLOT,)))
+        assert ("worst_gamma" in [column.name for column, _ in view.best]) == judged
+    view = replace(_view([lower, whole]), left_out=1.6)
+    axes = draw_pareto(view).axes[0]
+    ring = {line.get_label(): line for line in axes.lines}["certified at a lower bandwidth than specified"]
+    assert list(ring.get_xdata()) == [5.7]
+    page = render_page("study.html.j2", title="a study", study=view).html
+    assert "2 of 2 points certified, 1 of them at a lower bandwidth than specified" in page
+    assert f"Point 1 (certified at a lower bandwidth): {why}" in page
+    assert "bandwidth of the design [rad/s]" in page
+    assert "lowest_bandwidth_rad_s = 1.6 of the base is left out" in page
+    told = [row.value for section in study_summary(view, "").sections for row in section.rows]
+    assert any("lowest_bandwidth_rad_s = 1.6 of the base is left out" in value for value in told)
+    assert any(value.startswith("certified at a lower bandwidth") for value in told)
 
 
 def test_picture_of_nothing_is_drawn():
@@ -352,15 +402,22 @@ def test_a_loop_at_rest_beside_its_reference_does_not_settle(offset, state, tmp_
     )
     run.save_stage("closed_loop", ClosedLoopResult(check=replace(check, achieved=achieved)), "00")
     run.save_stage("certify", replace(found.certify, certified=True), "00")
+    designed_for = Specification(bandwidth_rad_s=1.0)
+    run.save_stage("design", replace(found.design, specification=designed_for), "00")
     point: Any = SimpleNamespace(
         number=1,
         name="1",
         values={},
-        config=SimpleNamespace(specification=Specification(bandwidth_rad_s=1.0)),
+        config=SimpleNamespace(specification=designed_for),
     )
     row = row_of(point, RunDirectory.open(tmp_path / "run"))
     assert (row.state, row.good) == (state, state == "certified")
     assert ("1 of 3 runs never settle" in row.why) == (offset > 0)
+    point.config.specification = Specification(bandwidth_rad_s=9.0, lowest_bandwidth_rad_s=0.1)
+    lower = row_of(point, RunDirectory.open(tmp_path / "run"))
+    assert lower.state == ("does not settle" if offset else "certified at a lower bandwidth")
+    assert lower.why.startswith("the specified 9 rad/s was not met")
+    assert lower.numbers["design_bandwidth_rad_s"] == 1.0
     view = _view([row, replace(row, number=2, state="certified")])
     assert [each.number for each in view.in_order] == ([2, 1] if offset else [1, 2])
     assert view.best == [] or all(best.good for _, best in view.best)

@@ -38,6 +38,7 @@ _ALL = (
     Column("delay_margin_ms", "delay margin", "ms", "larger"),
     Column("disk_margin", "nominal disk margin, all joints at once", "", "larger"),
     Column("bandwidth_rad_s", "bandwidth", "rad/s", "larger"),
+    Column("design_bandwidth_rad_s", "bandwidth of the design", "rad/s"),
     Column("mode_damping", "mode damping", "", "larger"),
     Column("mode_omega_rad_s", "of the mode at", "rad/s"),
     Column("settling_time_s", "settling time", "s", "smaller"),
@@ -78,6 +79,8 @@ def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None)
     found: dict[str, Number] = dict.fromkeys(COLUMNS)
     gamma, certify = results.design.gamma, results.certify
     found["design_gamma"] = plain(gamma)
+    if results.design.specification is not None:
+        found["design_bandwidth_rad_s"] = results.design.specification.bandwidth_rad_s
     bracket = bracket_numbers(results.achievable_performance, gamma)
     found["any_order_gamma"] = bracket["reached"]
     found["above_any_order_percent"] = bracket["above_percent"]

@@ -26,7 +26,15 @@ from workflow.tasks.results import RunResults
 from workflow.tasks.summary import summarise_joints, verdict_of
 from workflow.text.templates import RunSummary, render_text, rows_of, said
 
-State = Literal["certified", "does not settle", "keeps moving", "not certified", "impossible", "failed"]
+State = Literal[
+    "certified",
+    "certified at a lower bandwidth",
+    "does not settle",
+    "keeps moving",
+    "not certified",
+    "impossible",
+    "failed",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +48,12 @@ class PointRow(Combination):
     @property
     def good(self) -> bool:
         """Certified, and every run in closed loop stops at its reference."""
-        return self.state == "certified"
+        return self.state == "certified" or self.lowered
+
+    @property
+    def lowered(self) -> bool:
+        """Certified for a lower bandwidth than specified."""
+        return self.state == "certified at a lower bandwidth"
 
 
 def row_of(point: Point, run: RunDirectory) -> PointRow:
@@ -69,8 +82,13 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
         why = f"{why}; {advice}" if advice else why
     if certify.certified:
         why = verdict_of(replace(design, met=True), certify, loop)
+    lowered = said("lowered", specification, design.specification, (), numbers["bandwidth_rad_s"] or 0)
     if state == "does not settle":
         why = said("never_settles", loop.check)
+    elif state == "certified" and lowered:
+        state = "certified at a lower bandwidth"
+    if lowered:
+        why = f"{lowered}; {why}"
     return PointRow(point.number, point.name, point.values, state, why, numbers)
 
 
@@ -130,12 +148,15 @@ def pareto_front(rows: Sequence[PointRow], plot: ParetoPlot) -> list[int]:
     return [placed[i].number for i in np.flatnonzero(~np.any(beats, axis=0))]
 
 
+_REQUIREMENTS = ("specification", "joints[")
+_CONTROLLERS = ("specification.controller_order", "specification.structure")
 _BEST_BY = ("worst_gamma", "bandwidth_rad_s", "modulus_margin", "disk_margin", "rise_time_s")
 
 
 @dataclass(frozen=True, eq=False)
 class StudyView:
-    """A finished study. text: its file; units: those of columns whose unit the rig decides."""
+    """A finished study. text: its file; units: those of columns whose unit the rig decides; left_out: as
+    in `Base`."""
 
     title: str
     config: StudyConfig
@@ -143,6 +164,7 @@ class StudyView:
     base: str
     rows: Sequence[PointRow]
     units: Mapping[str, str]
+    left_out: float | None = None
 
     @cached_property
     def fronts(self) -> list[list[int]]:
@@ -176,7 +198,11 @@ class StudyView:
     def best(self) -> list[tuple[Column, PointRow]]:
         """The best certified point by each of the columns one asks for first."""
         found = []
-        for column in (COLUMNS[name] for name in _BEST_BY):
+        # Where requirements differ, so does what a gamma of 1 means.
+        same = not any(row.lowered for row in self.rows) and not any(
+            axis.key.startswith(_REQUIREMENTS) and axis.key not in _CONTROLLERS for axis in self.config.axes
+        )
+        for column in (COLUMNS[name] for name in _BEST_BY if same or name != "worst_gamma"):
             good = [row for row in self.rows if row.good and row.numbers[column.name]]
             if good:
                 key = column.name
@@ -187,10 +213,10 @@ class StudyView:
 
     @property
     def reasons(self) -> list[tuple[State, str, list[int]]]:
-        """State and reason of the points that are not good; points of one design miss the same items."""
+        """State and reason of the points that miss something; points of one design miss the same items."""
         together: dict[tuple[State, str], list[int]] = {}
         for row in self.rows:
-            if not row.good:
+            if row.state != "certified":
                 together.setdefault((row.state, row.why), []).append(row.number)
         return [(state, why, numbers) for (state, why), numbers in together.items()]
 
@@ -231,6 +257,7 @@ def study_summary(study: StudyView, path: str) -> RunSummary:
 
 _DOT: dict[str, Any] = {"ls": "none", "zorder": 3, "marker": "o", "ms": 6}
 _HOLLOW = _DOT | {"mfc": "none", "mec": style.LIMIT, "mew": 1.2}
+_RING = _HOLLOW | {"ms": 11}
 _DOMINATED = _DOT | {"color": "#a8adb4", "mew": 0}
 _FRONT = _DOT | {"color": style.PREDICTED, "marker": "D", "ms": 7, "mew": 0}
 
@@ -265,6 +292,8 @@ def _draw(axes: Axes, study: StudyView, plot: ParetoPlot, front: list[int]) -> N
     ):
         if (kind & there).any():
             axes.plot(*at[kind & there].T, label=label, **look)
+    if (lower := there & np.array([row.lowered for row in study.rows])).any():
+        axes.plot(*at[lower].T, label="certified at a lower bandwidth than specified", **_RING)
     if on.sum() > 1:
         axes.plot(*at[on][np.lexsort(at[on].T[::-1])].T, color=style.PREDICTED, lw=0.9, ls=":", zorder=2)
     if there.any():

@@ -24,12 +24,16 @@ from workflow.tasks.pipeline import Kind, any_config_of, kind_of
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """What every point starts from: a configuration, and the run whose plant is used where one was given."""
+    """What every point starts from: a configuration, and the run whose plant is used where one was given.
+
+    left_out: lowest_bandwidth_rad_s that the configuration had, where an axis sets the bandwidth.
+    """
 
     config: AnyConfig
     inputs: Mapping[str, str]
     run: RunDirectory | None
     folder: Path
+    left_out: float | None = None
 
     @property
     def kind(self) -> Kind:
@@ -123,10 +127,16 @@ def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
     else:
         config, _ = load_any(base)
     values: dict[str, Any] = dict(study.changes)
+    lowest, left_out = "specification.lowest_bandwidth_rad_s", None
+    axes = {axis.key for axis in study.axes}
+    # An axis asks for each of its bandwidths: falling back to a lower one would answer another question.
+    if "specification.bandwidth_rad_s" in axes and lowest not in axes | set(values):
+        left_out = getattr(getattr(config, "specification", None), "lowest_bandwidth_rad_s", None)
+        values |= {} if left_out is None else {lowest: None}
     if study.study.seed is not None:
         values["run.seed"] = study.study.seed
     inputs = {} if run is None else run.manifest()["inputs"]
-    start = Base(config, inputs, run, study_path.absolute().parent)
+    start = Base(config, inputs, run, study_path.absolute().parent, left_out)
     changed = start.changed(values, f"{study_path}: changes")
     return replace(start, config=changed, inputs=start.inputs_of(changed))
 

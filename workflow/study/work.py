@@ -203,7 +203,9 @@ def _write_up(directory: StudyDirectory, file: StudyFile, base: Base, rows: Sequ
         study = study.model_copy(update={"pareto": JOINTS_PLOTS})
     title = study.study.title or base.config.run.title or base.config.run.name
     where = str(base.run.path) if base.run is not None else study.study.base or "the built-in arm"
-    view = StudyView(title, study, file.text, where, rows, _units(directory, base.config, rows))
+    view = StudyView(
+        title, study, file.text, where, rows, _units(directory, base.config, rows), base.left_out
+    )
     directory.link_numbers(rows)
     page = render_page("study.html.j2", title=title, study=view)
     files = {f"{name}.{picture.kind}": picture.content for name, picture in page.pictures.items()}
