@@ -42,8 +42,8 @@ class IdentOptions(Settings):
     )
     fixed_poles: tuple[tuple[float, float], ...] = Field(
         (),
-        description="known poles in the z plane: flexlink.Poles, complex numbers, or (real part, imaginary "
-        "part >= 0) each; not changed",
+        description="known poles in the z plane, not changed: a number for a real one, [real part, imaginary "
+        "part] for a pair, as [0.9, [0.95, 0.2]]; from Python flexlink.Poles or complex numbers, too",
     )
 
     unstable_poles: tuple[tuple[float, float], ...] = Field(
@@ -114,11 +114,16 @@ class IdentOptions(Settings):
         """`Poles` and complex numbers as parts; of a conjugate pair, the upper one."""
         poles = list(given.values) if isinstance(given, Poles) else given
         if not isinstance(poles, (list, tuple, np.ndarray)):
-            return poles
-        if not any(isinstance(p, Number) for p in poles):
-            return tuple(tuple(p) if isinstance(p, list) else p for p in poles)
-        upper = [complex(p) for p in poles if np.imag(p) >= 0 or np.conj(p) not in poles]
-        return tuple((p.real, p.imag) for p in upper)
+            raise ValueError(
+                "expected a list, with a number for a real pole and [real part, imaginary part] for a pair: "
+                "[0.9, [0.95, 0.2]]"
+            )
+        values = [complex(p) if isinstance(p, Number) else p for p in poles]
+        upper = [p for p in values if not isinstance(p, complex) or p.imag >= 0 or np.conj(p) not in values]
+        return tuple(
+            (p.real, p.imag) if isinstance(p, complex) else tuple(p) if isinstance(p, list) else p
+            for p in upper
+        )
 
     @model_validator(mode="after")
     def _consistent(self) -> IdentOptions:

@@ -79,6 +79,12 @@ def fixed_poles_test(
     )
     small = PoleSearch(prepare(*searched), options)
     ends = [small.descend(poles, "fixed poles freed", ROUGH), OrderSelection(small).run()]
+    n_real = poles.real.size - k
+    if n_real > 1:  # no number of real poles makes a mode: two of them may be a pair
+        n_pairs = min(poles.pairs.size + n_real // 2, options.max_pairs)
+        turned = {"n_real": n_real % 2, "n_pairs": n_pairs}
+        paired = PoleSearch(small.data, options.model_copy(update=turned))
+        ends.append(OrderSelection(paired).run())
     best = min(ends, key=lambda end: end.rss)
     search = PoleSearch(given.data, options)
     freed = Fitted(search, search.descend(best.poles, "fixed poles freed"))

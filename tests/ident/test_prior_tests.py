@@ -138,6 +138,17 @@ def test_fixed_poles_are_judged():
     (test,) = [test for test in identify([truth.record], known).prior_tests if test.prior == "fixed_poles"]
     assert not test.refused
     assert test.degrees_of_freedom == 2
+    # Real poles cannot come near the mode, free or fixed: pairs in their place can.
+    laguerre = IdentOptions(fixed_poles=[0.95] * 4, n_real=0, n_pairs=0, integrators=1)
+    assert refused(identify([truth.record], laguerre))["fixed_poles"]
+
+
+def test_how_poles_are_written():
+    pair = (0.95, 0.2)
+    for given in ([0.9, [*pair]], [0.9, complex(*pair)], [(0.9, 0.0), pair], [0.9, 0.95 + 0.2j, 0.95 - 0.2j]):
+        assert IdentOptions(fixed_poles=given).fixed_poles == ((0.9, 0.0), pair)
+    with pytest.raises(ValueError, match=r"a number for a real pole .* \[0.9, \[0.95, 0.2\]\]"):
+        IdentOptions(fixed_poles={"real": [0.9]})
 
 
 def test_delays_are_judged():
