@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import Any
 
 import control
@@ -24,8 +25,10 @@ from control_design.specification import Specification
 from control_design.specification.multivariable import MultivariableSpecification
 from control_design.synthesis import joint_synthesis, multivariable, synthesis, synthesis_result
 from control_design.synthesis.synthesis_options import MultivariableOptions, SynthesisOptions
-from flexlink.models import Uncertainty
+from flexlink.models import Uncertainty, nominal_outside, warned
 from flexlink.shown import Shown, dressed
+from ident.checks.residual_tests import conditions_of
+from ident.data.finding import Finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.uncertainty.matrix_response import MatrixPosterior
 
@@ -61,9 +64,9 @@ class WrongSystemError(ValueError, TypeError):
     """A system of another package that has no place here; one line that says what to do."""
 
 
-def state_space(system: Any, what: str = "the system") -> control.StateSpace:
+def state_space(system: Any, what: str = "the system", *, several: bool = False) -> control.StateSpace:
     """A system of python-control (ss, tf, zpk) or scipy.signal (dlti), or anything with `to_control()`, as a
-    discrete `control.StateSpace` with one input and one output.
+    discrete `control.StateSpace` with one input and one output (several: any number, of a state space).
 
     what: its name in a refusal. Raises WrongSystemError (a ValueError) for a system in continuous time or
     without a sampling time, with several inputs or outputs, or with more zeros than poles; for a measured
@@ -89,7 +92,7 @@ def state_space(system: Any, what: str = "the system") -> control.StateSpace:
             f"{what} is a {type(system).__name__}; expected a discrete system of python-control: "
             "control.ss(A, B, C, D, dt_s) or control.tf(num, den, dt_s)"
         )
-    _checked(system, what)
+    _checked(system, what, several=several and isinstance(system, control.StateSpace))
     if isinstance(system, control.StateSpace):
         return system
     try:
@@ -109,9 +112,9 @@ def measured_response(system: control.FrequencyResponseData, what: str = "the fr
     return FrequencyUncertainty(omega, centre, np.zeros((omega.size, 2, 2)), float(system.dt))
 
 
-def _checked(system: Any, what: str) -> None:
-    """Refuses another number of signals than one, and a system without a sampling time."""
-    if (system.ninputs, system.noutputs) != (1, 1):
+def _checked(system: Any, what: str, *, several: bool = False) -> None:
+    """Refuses another number of signals than one (unless several), and a system without a sampling time."""
+    if not several and (system.ninputs, system.noutputs) != (1, 1):
         raise WrongSystemError(
             f"{what} has {system.ninputs} inputs and {system.noutputs} outputs; take one channel: "
             "system[output, input], as system[0, 0]; or design for all with "
@@ -200,6 +203,17 @@ class Certificate(Shown, certificate.Certificate):
     controller: Controller | None = None
     uncertain_plants: tuple[plant_set.UncertainPlant, ...] = ()
     specification: Specification = field(default_factory=Specification)
+
+    @cached_property
+    def warnings(self) -> tuple[Finding, ...]:
+        """What the certificate stands or falls with: doubts about the ellipses of its plants."""
+        found: list[Finding] = []
+        for plant in self.uncertain_plants:
+            found += conditions_of(getattr(plant.uncertainty, "advice", ()))
+            if isinstance(plant.uncertainty, Uncertainty):
+                response = partial(plant_set.frequency_response, plant.nominal)
+                found += nominal_outside(plant.uncertainty, response, plant.dt_s, plant.level)
+        return warned(*found)
 
     @property
     def nominal_only(self) -> bool:
@@ -371,14 +385,20 @@ def synthesise_multivariable(
 
 
 def certify_multivariable(
-    controller: Controller | MultivariableResult,
+    controller: Any,
     plants: MultivariablePlant | Sequence[MultivariablePlant],
     specification: MultivariableSpecification,
     *,
     dense_points: int = 1500,
 ) -> MultivariableCertificate:
-    """Certify a controller of all sensors and actuators; `control_design.certify_multivariable`."""
-    law = controller if isinstance(controller, Controller) else controller.controller
+    """Certify a controller of all sensors and actuators; `control_design.certify_multivariable`.
+
+    controller: a `Controller`, a result of `synthesise_multivariable`, or a discrete `control.StateSpace`
+    from errors to commands, as in `certify`.
+    """
+    law = getattr(controller, "controller", controller)
+    if not isinstance(law, Controller):
+        law = _as_controller(law, specification.computational_delay_samples, several=True)
     with threadpool_limits(1):
         found = multivariable_certificate.certify_multivariable(
             law, plants, specification, dense_points=dense_points
@@ -429,8 +449,8 @@ def simulate_loop(controller: Any, machine: Any, reference: npt.ArrayLike, **mor
     return dressed(LoopRun, closed_loop.simulate(controller, chosen, reference, **more))
 
 
-def _as_controller(system: Any, delay_samples: int) -> Controller:
-    found = state_space(system, "the controller")
+def _as_controller(system: Any, delay_samples: int, *, several: bool = False) -> Controller:
+    found = state_space(system, "the controller", several=several)
     return Controller(
         found.A, found.B, found.C, found.D, float(found.dt), computational_delay_samples=delay_samples
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -20,6 +21,7 @@ from ident.basis.model import GobfModel as PlainModel
 from ident.basis.model_files import ModelFile
 from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.poles import Poles
+from ident.checks.residual_tests import residual_advice
 from ident.data.finding import Finding
 from ident.data.foreign_files import distinct
 from ident.data.frequency_uncertainty import FrequencyUncertainty
@@ -117,6 +119,8 @@ class Record(Shown, PlainRecord):
             u, y, dt_s = _time_response(u, dt_s)
         if dt_s is None:
             raise ValueError("a record needs dt_s, the sampling time in seconds")
+        if isinstance(dt_s, bool) or not isinstance(dt_s, Real):
+            raise ValueError(f"dt_s must be a positive number of seconds; got {dt_s!r}")
         u, y = (_either(*pair) for pair in (("u", u, "input", input), ("y", y, "output", output)))
         _refuse_other_rows(u, y, reference)
         inputs, input_names = _signals("u", u, input_names)
@@ -300,7 +304,25 @@ class _Warned:
     @cached_property
     def warnings(self) -> tuple[Finding, ...]:
         """What to look at before trusting the model."""
-        return tuple(_Sentence(each.kind, each.values) for each in super().warnings)  # type: ignore[misc]
+        return warned(*super().warnings)  # type: ignore[misc]
+
+
+def warned(*findings: Finding) -> tuple[Finding, ...]:
+    """Findings that print as their sentences, each once."""
+    told = {str(each): each for each in (_Sentence(found.kind, found.values) for found in findings)}
+    return tuple(told.values())
+
+
+def nominal_outside(uncertainty: Any, response: Any, dt_s: float, level: float = 0.95) -> list[Finding]:
+    """The doubt about a nominal response, rad/s (F,) to G (F,), outside most ellipses of an uncertainty."""
+    from workflow.tasks.uncertainty import agreement_of, nominal_doubt
+
+    return nominal_doubt(agreement_of(uncertainty.at(_nominal_grid(dt_s), level), response))
+
+
+def _nominal_grid(dt_s: float) -> npt.NDArray[np.float64]:
+    nyquist = np.pi / dt_s
+    return np.geomspace(1e-3 * nyquist, nyquist, _NOMINAL_POINTS)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -357,6 +379,12 @@ class Uncertainty(Shown, posterior.ResponsePosterior):
 
     nominal_poles: Poles = Poles()  # noqa: RUF009 (frozen)
     prior_missed_mode: float = 0.0
+    advice: tuple[Finding, ...] = ()
+
+    @cached_property
+    def warnings(self) -> tuple[Finding, ...]:
+        """What to look at before trusting the ellipses: residuals, and a nominal outside most of them."""
+        return warned(*self.advice, *nominal_outside(self, self.nominal().frequency_response, self.dt_s))
 
     @property
     def missed_mode_suspected(self) -> bool:
@@ -366,9 +394,7 @@ class Uncertainty(Shown, posterior.ResponsePosterior):
 
     def nominal(self) -> GobfModel:
         """Model on the identified poles, nearest to the centre in units of the ellipses."""
-        nyquist = np.pi / self.dt_s
-        omega = np.geomspace(1e-3 * nyquist, nyquist, _NOMINAL_POINTS)
-        return dressed(GobfModel, nominal_near(self, self.nominal_poles, omega))
+        return dressed(GobfModel, nominal_near(self, self.nominal_poles, _nominal_grid(self.dt_s)))
 
     def at_modes(self) -> list[tuple[float, float]]:
         """(frequency [rad/s], major semi-axis of the 95 % ellipse over gain) at every mode."""
@@ -473,12 +499,25 @@ def uncertainty(
     used = _records_of(identification, records)
     with threadpool_limits(1):
         found = tangent(used, identification.model, chosen)
+        advice = _advice(found, used)
     return dressed(
         Uncertainty,
         found,
+        advice=advice,
         nominal_poles=identification.model.poles,
         prior_missed_mode=chosen.prior_missed_mode,
     )
+
+
+def _advice(found: posterior.ResponsePosterior, records: Sequence[PlainRecord]) -> tuple[Finding, ...]:
+    """What the residuals say about the ellipses, as `flexlink run` says it."""
+    from workflow.tasks.identification import residual_tests
+
+    order = 0 if found.report is None else len(found.report.ar_coefficients)
+    try:
+        return tuple(residual_advice(*residual_tests(found, records), noise_order=order))
+    except ValueError:  # records too short for a test, or nothing left to test
+        return ()
 
 
 def error_surface(

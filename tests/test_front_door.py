@@ -131,6 +131,33 @@ def test_a_diagnosis_credits_everything_that_the_repaired_model_holds(tmp_path):
     assert delayed["main_cause"] == answer.probabilities["input_delay"]
 
 
+def test_ellipses_that_miss_the_model_are_in_doubt_and_so_is_their_certificate():
+    """Four real poles cannot be this mode, whose response no ellipse around them has then to hold."""
+    system = control.tf([10 / 15 / 100], [1 / 15, 1]) * control.tf([1.6, 1.6, 1600], [1, 1.6, 1600])
+    plant = control.sample_system(control.ss(system), 0.01, "zoh")
+    rng = np.random.default_rng(3)
+    u = rng.choice([-5.0, 5.0], 2000)
+    y = control.forced_response(plant, np.arange(2000) * 0.01, u).outputs
+    record = flexlink.Record(u, y + 0.002 * rng.standard_normal(2000), 0.01)
+    law, asked = flexlink.Controller([[1.0]], [[0.02]], [[1.0]], [[0.0]], 0.01), flexlink.Specification()
+    poles = {"fixed_poles": flexlink.Poles(real=[0.9] * 4), "n_real": 0, "n_pairs": 0}
+    for how, doubted in ((poles, True), ({"n_real": 1, "n_pairs": 1}, False)):
+        found = flexlink.identify(record, integrators=0, **how)
+        spread = flexlink.uncertainty(found)
+        certificate = flexlink.certify(law, spread, asked)
+        first = repr(certificate).splitlines()[0]
+        assert certificate.certified
+        assert ("the ellipses are in doubt" in first) == doubted
+        for said in (spread, certificate):
+            assert bool(said.warnings) == ("! the nominal model lies outside" in repr(said)) == doubted
+    noisy = lfilter([1.0], [1.0, -1.9, 0.95], rng.standard_normal(2000))  # a line that order 1 cannot whiten
+    record = flexlink.Record(u, y + 0.002 * noisy, 0.01)
+    found = flexlink.identify(record, integrators=0, n_real=1, n_pairs=1)
+    spread = flexlink.uncertainty(found, coloured_noise=True, max_ar_order=1)
+    assert "the ellipses, and what is certified for them, may be too small" in repr(spread)
+    assert "may be too small" in repr(flexlink.certify(law, spread, asked))
+
+
 def test_every_name_is_there_and_shown_in_an_example():
     shown = GUIDE.read_text(encoding="utf-8")
     named = set()
@@ -401,6 +428,14 @@ def test_another_sampling_time_is_refused_with_what_to_do():
         (lambda: flexlink.uncertainty(example_record()), "result of flexlink.identify"),
         (lambda: flexlink.uncertainty(None, level=0.9), r"spread\.at"),
         (lambda: flexlink.simulate_loop(TF, flexlink.paper_link(), [1.0]), "SampledArm"),
+        (
+            lambda: flexlink.Record([1.0], [1.0], "5ms"),
+            "dt_s must be a positive number of seconds; got '5ms'",
+        ),
+        (
+            lambda: flexlink.MultivariablePlant("two", control.ss(TF), 3.0),
+            r"expected a ResponseBall, .*\.of\(",
+        ),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(call, message):
@@ -423,6 +458,29 @@ def test_an_unstable_loop_is_called_so_and_has_no_margins():
     given = flexlink.Controller(np.zeros((1, 1)), np.zeros((1, 2)), np.zeros((2, 1)), -3 * np.eye(2), 0.01)
     matrix = flexlink.certify_multivariable(given, flexlink.MultivariablePlant("two", both), wanted)
     assert "UNSTABLE" in repr(matrix)
+
+
+@pytest.mark.parametrize("harder", [0, 1])
+def test_of_several_joints_the_one_that_is_worst_is_named(harder):
+    """Two motors that do not touch each other; one has twice the gain, or the only bandwidth."""
+    motor = control.ss([[0.9]], [[1.0]], [[0.1]], [[0.0]], 0.01)
+    plant = flexlink.MultivariablePlant("two", control.append(motor, motor))
+    joint = flexlink.Specification(modulus_margin=0.3, effort_limit=10.0)
+    faster = joint.model_copy(update={"bandwidth_rad_s": 5.0})
+    wanted = flexlink.MultivariableSpecification(joints=(joint, joint), controller_order=2)
+    gains = 0.25 * np.diag(1.0 + (np.arange(2) == harder))
+    given = control.ss([], [], [], gains, 0.01)
+    found = flexlink.certify_multivariable(given, plant, wanted)
+    assert found.verdicts[0].worst_joint == {"effort": harder, "modulus": harder}
+    assert f"(largest at joints[{harder}], " in repr(found)
+    asked = wanted.model_copy(update={"joints": (faster, joint)[:: 1 - 2 * harder]})
+    quick = flexlink.MultivariableOptions(
+        rounds=1, candidates=1, growth_steps=1, growth_rounds=1, steps=1, renewals=0
+    )
+    designed = flexlink.synthesise_multivariable(plant, asked, quick)
+    assert re.search(rf"tracking: .* against 1 \(joints\[{harder}\] of 'two' at ", repr(designed))
+    with pytest.raises(ValueError, match="2 joints needed for 2 inputs and 2 outputs; got 1"):
+        flexlink.certify_multivariable(given, plant, wanted.model_copy(update={"joints": (joint,)}))
 
 
 def test_without_uncertainty_the_certificate_is_of_the_nominal_plant_and_says_so():

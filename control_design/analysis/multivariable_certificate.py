@@ -21,7 +21,13 @@ from control_design.plants.ellipses import Complex, Real
 from control_design.plants.frequency_grid import frequency_grid, lowest_rad_s, near_the_circle
 from control_design.plants.multivariable import MultivariablePlant, tustin_s
 from control_design.plants.plant_set import Mode, modes_of
-from control_design.plants.scaled_bound import Rows, scaled_bound, stability_bound, structured_norm
+from control_design.plants.scaled_bound import (
+    Rows,
+    largest_channel,
+    scaled_bound,
+    stability_bound,
+    structured_norm,
+)
 from control_design.plants.weights import RationalWeight
 from control_design.specification.multivariable import MultivariableSpecification, gram
 
@@ -58,9 +64,10 @@ class MultivariableVerdict:
 
     stable: all nominal poles inside the circle, pole_radius the largest. winding: of det(I + G K), a second
     way to the same. worst: largest worst case of each requirement on the dense grid, worst_at its frequency
-    [rad/s]. bounds: upper bound for all frequencies from from_rad_s to Nyquist, inf where none was proved;
-    obstacle says why. stability_radius: factor by which the uncertainty may grow before a member is unstable
-    (inf without uncertainty), on the grid. input_disk, output_disk: of the nominal loop, on the grid.
+    [rad/s], worst_joint the index of the joint that carries most of it. bounds: upper bound for all
+    frequencies from from_rad_s to Nyquist, inf where none was proved; obstacle says why. stability_radius:
+    factor by which the uncertainty may grow before a member is unstable (inf without uncertainty), on the
+    grid. input_disk, output_disk: of the nominal loop, on the grid.
     exact: the worst case is exact at a frequency, not an upper bound (up to two blocks).
     """
 
@@ -78,6 +85,7 @@ class MultivariableVerdict:
     output_disk: DiskMargin
     frequencies: int
     exact: bool
+    worst_joint: dict[str, int] = field(default_factory=dict, metadata={"since": 2})
 
     @property
     def proved(self) -> bool:
@@ -128,6 +136,7 @@ def certify_multivariable(
             )
         if controller.computational_delay_samples != specification.computational_delay_samples:
             raise ValueError("controller and specification differ in computational_delay_samples")
+        specification.pattern(plant.inputs, plant.outputs)  # refuses another number of joints
     return MultivariableCertificate(
         tuple(_verdict(controller, p, specification, dense_points) for p in listed)
     )
@@ -151,10 +160,11 @@ def _verdict(
         on_y, on_u = (size, none_u) if of == "y" else (none_y, size)
         return Rows(G, seen, entering, on_y, on_u, False)
 
-    worst, worst_at, scalings = {}, {}, {}
+    worst, worst_at, worst_joint, scalings = {}, {}, {}, {}
     for name, (of, each) in weights.items():
         found = scaled_bound(rows(of, each), K)
         at = int(np.argmax(found.gamma))
+        worst_joint[name] = int(largest_channel(rows(of, each), K, found.right)[at])
         worst[name], worst_at[name] = float(found.gamma[at]), float(omega[at])
         scalings[name] = found.log_t
     at_one = [int(np.sum(np.abs(each - 1) < _AT_ONE)) for each in (plant.poles, controller.poles)]
@@ -206,7 +216,7 @@ def _verdict(
     return MultivariableVerdict(
         plant.name, stable, radius, winding, worst, worst_at, bounds, start, obstacle,
         1.0 / largest if largest > 0 else float("inf"), _disk(at_input), _disk(sensitivity), int(omega.size),
-        blocks <= 2,
+        blocks <= 2, worst_joint,
     )  # fmt: skip
 
 

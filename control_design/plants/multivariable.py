@@ -77,7 +77,12 @@ class ResponseBall:
     @classmethod
     def of(cls, posterior: IdentifiedMatrix, lowest_rad_s: float) -> ResponseBall:
         """Of an identified matrix response, from lowest_rad_s on: Li exact, the radius the largest of a
-        grid."""
+        grid.
+
+        lowest_rad_s: the slowest motion that the records tell, 2 pi over the length of the longest, or the
+        lowest frequency that was excited. Below, an integrator's uncertainty grows without bound and is kept
+        as it is there. Lower values widen every ball (one radius for all), higher ones leave more unchecked.
+        """
         import control  # here, because it brings a plotting library with it
 
         li = control.ss(*posterior.input_factor(lowest_rad_s), posterior.dt_s, remove_useless_states=False)
@@ -132,6 +137,11 @@ class MultivariablePlant:
                 raise ValueError(f"plant {self.name!r}: {words} needs {count} weights; got {len(given)}")
         if self.input_error and self.output_error:
             raise ValueError(f"plant {self.name!r}: give input_error or output_error, not both")
+        if self.ball is not None and not isinstance(self.ball, ResponseBall):
+            raise ValueError(
+                f"plant {self.name!r}: ball is a {type(self.ball).__name__}; expected a ResponseBall, of an "
+                "identified matrix ResponseBall.of(posterior, lowest_rad_s)"
+            )
         if self.ball is not None:
             li = self.ball.Li
             columns = li.ninputs if self.ball.omega_rad_s is None else li.shape[2]

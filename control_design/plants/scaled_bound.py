@@ -157,6 +157,17 @@ def scaled_bound(
     return Bound(gamma, t, np.where(np.isfinite(left), left, 0.0), x)
 
 
+def largest_channel(rows: Rows, K: Array, right: Array) -> Integer:
+    """Output (weight on S) or actuator (weight on K S) that carries most of each worst case (R,); right: of
+    its `Bound`."""
+    shares = [
+        np.diagonal(weight, axis1=1, axis2=2).real * np.abs(signal) ** 2
+        for weight, signal in ((rows.V_y, right), (rows.V_u, apply(K, right)))
+    ]
+    of_y, of_u = (np.argmax(share, axis=1) for share in shares)
+    return np.where(np.any(rows.V_u, axis=(1, 2)), of_u, of_y)
+
+
 @dataclass(frozen=True, eq=False)
 class Expansion:
     """The matrix H = (A^-1 - C)^-1 (R, Y, Y), whose largest eigenvalue is gamma^2, to first order:

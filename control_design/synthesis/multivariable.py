@@ -19,7 +19,7 @@ from control_design.plants.ellipses import Real
 from control_design.plants.frequency_grid import frequency_grid, local_maxima, lowest_rad_s
 from control_design.plants.multivariable import MultivariablePlant, tustin_s
 from control_design.plants.plant_set import Mode, matrix_response, modes_of
-from control_design.plants.scaled_bound import scaled_bound
+from control_design.plants.scaled_bound import largest_channel, scaled_bound
 from control_design.specification.multivariable import MultivariableSpecification
 from control_design.specification.specification import SpecificationError
 from control_design.synthesis.modal_controller import ModalForm
@@ -322,7 +322,9 @@ class Programme:
 
     def result(self, gamma: float, form: ModalForm, x: Real) -> MultivariableResult:
         """The controller and what is known of it."""
-        stack, value = self.dense, self._gamma(form, x, self.dense, np.inf)
+        stack, K = self.dense, form.response(x[None], self.dense.s)[0]
+        found = scaled_bound(stack.rows, K, accuracy=1e-6)
+        value, joint = found.gamma, largest_channel(stack.rows, K, found.right)
         worst, blocking = {}, []
         for which, name in enumerate(self.names):
             rows = np.flatnonzero(stack.requirement == which)
@@ -330,7 +332,8 @@ class Programme:
                 at = rows[np.argmax(value[rows])]
                 worst[name] = float(value[at])
                 plant = self.plants[int(stack.plant[at])].name
-                blocking.append(BlockingPoint(plant, name, float(stack.omega_rad_s[at]), float(value[at])))
+                omega = float(stack.omega_rad_s[at])
+                blocking.append(BlockingPoint(plant, name, omega, float(value[at]), int(joint[at])))
         limits, rates = self.spec.limits(form.inputs)
         a, b, c, d = form.discrete(x)
         controller = Controller(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 from control_design.controllers.controller import Controller
@@ -34,13 +34,15 @@ class BlockingPoint:
     """A frequency at which a requirement keeps gamma from getting smaller.
 
     weight: name of a weighted requirement; without a stable design, one of the words of `synthesis`. value:
-    weighted worst case there, inf where the loop or a member of the ellipse is unstable.
+    weighted worst case there, inf where the loop or a member of the ellipse is unstable. joint: index of the
+    joint it lies at, of several.
     """
 
     plant: str
     weight: str
     omega_rad_s: float
     value: float
+    joint: int | None = field(default=None, metadata={"since": 2})
 
 
 LARGEST_GAMMA = 1e300

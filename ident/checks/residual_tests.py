@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -126,6 +126,13 @@ def independence_test(
     return ResidualTest(
         "independence", lags.astype(np.float64), correlation, band, level, probability, passed, precedes
     )
+
+
+def conditions_of(advice: Iterable[Finding]) -> list[Finding]:
+    """What a certificate over ellipses stands or falls with, of the findings about these. Where an observer's
+    prediction errors are not white, the ellipses were widened for it."""
+    kinds = {FindingKind.NOT_WHITE, FindingKind.NOMINAL_OUTSIDE, FindingKind.UNTRIED_FRICTION}
+    return [each for each in advice if each.kind in kinds and not each.values.get("observer")]
 
 
 def residual_advice(

@@ -72,6 +72,7 @@ class FindingKind(Enum):
     INDEPENDENCE = auto()
     NOT_WHITE = auto()
     UNTRIED_FRICTION = auto()
+    NOMINAL_OUTSIDE = auto()
     NOT_INDEPENDENT = auto()
     CHI_SQUARE = auto()
     # Records made in closed loop.

@@ -22,6 +22,7 @@ from control_design.specification.requirement import LoopFunction, Specification
 from control_design.synthesis.joint_synthesis import JointDesign
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import Outcome
+from ident.checks.residual_tests import conditions_of
 from ident.data.finding import FindingKind, finding
 from ident.uncertainty import FrequencyUncertainty
 from tests.compiler import compiled, needs_compiler
@@ -53,10 +54,12 @@ from workflow.tasks.results import (
     CertifyResult,
     ClosedLoopResult,
     DesignResult,
+    NominalAgreement,
     ReferenceFilterResult,
     SampledResponses,
 )
 from workflow.tasks.summary import bandwidth_numbers, untold_below_rad_s, verdict_of
+from workflow.tasks.uncertainty import nominal_doubt
 from workflow.text.templates import environment, said
 
 
@@ -134,7 +137,7 @@ def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_h
     assert verdict(friction=1, machine="simulated") == verdict()  # that arm has its friction
     assert verdict(friction=1) == verdict() + " (linear plants, without dry friction)"
     doubt = finding(FindingKind.UNTRIED_FRICTION, output="enc")
-    words = verdict_of(design, certify, SimpleNamespace(check=check), doubts=[doubt])
+    words = verdict_of(design, certify, SimpleNamespace(check=check), conditions=[doubt])
     assert words.startswith(verdict() + ". But dry friction was not identified")
     assert words.endswith('set response = "without friction" in [channels.uncertainty]')
     asked = SimpleNamespace(bandwidth_rad_s=16.0, lowest_bandwidth_rad_s=1.6)
@@ -149,6 +152,14 @@ def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_h
     assert numbers == {"specified": 16.0, "designed_for": 7.43, "reached": 8.5}
     given = SimpleNamespace(certified=True, plants=[]), ""
     assert said("design_verdict", lower, *given, asked).startswith("; the specified 16 rad/s was not met")
+    white = {"noise_order": 8, "independent": True, "friction": False, "predictable_share": 0.3}
+    small, widened = (finding(FindingKind.NOT_WHITE, **white, observer=known) for known in (False, True))
+    lag = finding(FindingKind.NOT_INDEPENDENT, lag=3)
+    outside = [nominal_doubt(NominalAgreement(share, 7.0, 12.0)) for share in (49.0, 51.0)]
+    assert conditions_of([lag, small, *outside[0], widened, *outside[1]]) == [small, *outside[0]]
+    words = verdict_of(design, certify, SimpleNamespace(check=check), conditions=[small, *outside[0]])
+    assert words.startswith(verdict() + ". But the residuals are not white, even after a noise model of")
+    assert ". Also, the nominal model lies outside 51 % of its own ellipses, most near 12 rad/s" in words
 
 
 def test_achievable_performance_not_asked_for_or_impossible_says_why():

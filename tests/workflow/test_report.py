@@ -14,6 +14,7 @@ import pytest
 from control_design.analysis.stability import ModeChange
 from control_design.convex.reference_filter import ReferenceFilter
 from control_design.plants.plant_set import Mode
+from ident.data.finding import FindingKind, finding
 from tests.workflow import report_examples as example
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import drawings
@@ -271,6 +272,15 @@ def test_a_design_that_takes_damping_from_a_mode_says_so(undrawn, tmp_path):
         assert changes[1]["closed_loop"]["zeta"] == after
         design = said("design_verdict", results.design, changed.certificate, "")
         assert (lost in design) == told
+    doubt, spread = finding(FindingKind.UNTRIED_FRICTION, output="enc"), results.uncertainty
+    doubted = tuple(replace(channel, advice=(doubt,)) for channel in spread.channels)
+    run.save_stage("uncertainty", replace(spread, channels=doubted), "x")
+    text, summary = text_of(run, settings), summarise(RunResults(run), settings)
+    assert "Certified, but the ellipses are in doubt" in text
+    assert "Certified: all 2 requirements are met" not in text
+    told = summary.numbers["certificate_conditions"]
+    assert [words[:31] for words in told] == ["dry friction was not identified"]
+    assert "But dry friction was not identified" in summary.verdict
 
 
 def test_a_mode_of_several_plants_is_named_once_where_it_loses_most(tmp_path):

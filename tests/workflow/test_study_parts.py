@@ -408,7 +408,7 @@ def test_a_loop_at_rest_beside_its_reference_does_not_settle(offset, state, tmp_
         number=1,
         name="1",
         values={},
-        config=SimpleNamespace(specification=designed_for),
+        config=SimpleNamespace(specification=designed_for, control_index=0, performance_index=None),
     )
     row = row_of(point, RunDirectory.open(tmp_path / "run"))
     assert (row.state, row.good) == (state, state == "certified")

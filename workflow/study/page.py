@@ -81,7 +81,8 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
         advice = said("order_advice", achievable, design.gamma, order)
         why = f"{why}; {advice}" if advice else why
     if certify.certified:
-        why = verdict_of(replace(design, met=True), certify, loop)
+        conditions = results.uncertainty.conditions(point.config)
+        why = verdict_of(replace(design, met=True), certify, loop, conditions=conditions)
     lowered = said("lowered", specification, design.specification, (), numbers["bandwidth_rad_s"] or 0)
     if state == "does not settle":
         why = said("never_settles", loop.check)

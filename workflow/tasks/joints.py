@@ -327,7 +327,8 @@ def design_joints(stage: StageInput) -> JointsDesignResult:
     first = found.blocking[0]
     return JointsDesignResult(
         found,
-        f"worst case {found.gamma:.3f} (at most 1 is needed), of {first.weight} of {first.plant} at "
+        f"worst case {found.gamma:.3f} (at most 1 is needed), of {first.weight} of joints[{first.joint}], "
+        f"{first.plant}, at "
         f"{first.omega_rad_s:.3g} rad/s",
     )
 

@@ -24,10 +24,10 @@ from control_design.specification import Specification
 from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
 from ident.basis.model import GobfModel
 from ident.checks.plausible_modes import PairKind, kind_of_pair
-from ident.checks.residual_tests import ResidualTest
+from ident.checks.residual_tests import ResidualTest, conditions_of
 from ident.checks.validation import FreshFit, ScatterRow
 from ident.data.ellipses import chi2_radius
-from ident.data.finding import Finding
+from ident.data.finding import Finding, distinct
 from ident.data.record import Record
 from ident.friction import EquivalentFriction, FrictionFit
 from ident.identification import Identification
@@ -283,6 +283,13 @@ class UncertaintyResult:
 
     channels: tuple[UncertainChannel, ...]
     equivalent: EquivalentFriction | None = None
+
+    def conditions(self, config: RunConfig) -> tuple[Finding, ...]:
+        """What a certificate over these ellipses stands or falls with."""
+        used = dict.fromkeys((config.control_index, config.performance_index))
+        return distinct(
+            [found for k in used if k is not None for found in conditions_of(self.channels[k].advice)]
+        )
 
     def plant(self, config: RunConfig, *, behind_friction: bool = False) -> UncertainPlant:
         """What the controller is designed for: control channel and first performance channel; or the

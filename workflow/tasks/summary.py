@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from control_design.specification import Specification
-from ident.data.finding import Finding, FindingKind
+from ident.data.finding import Finding
 from ident.uncertainty import FrequencyUncertainty
 from workflow.config.joints_config import JointsConfig
 from workflow.config.run_config import RunConfig
@@ -36,6 +36,7 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
     pairs = list(zip(results.identify.channels, results.uncertainty.channels, strict=True))
     shares = joint_numbers(certify.sampled)
     signals = Logged.of(config, results.records).signals
+    conditions = results.uncertainty.conditions(config)
     settles = loop.check is not None and loop.check.settled_draws == loop.check.draws
     return RunSummary(
         title=config.run.title or config.run.name,
@@ -48,6 +49,7 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
             },
             "signals": signals,
             "certificate": codec.plain(certify.certificate),
+            "certificate_conditions": [words(doubt) for doubt in conditions],
             "achievable_performance": bracket_numbers(achievable, design.gamma),
             "sampled_responses": shares,
             "amplitude_cost": cost_numbers(results.amplitude_cost),
@@ -62,7 +64,7 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
             achievable,
             (design.specification or config.specification).controller_order,
             untold_below_rad_s(results.uncertainty.channels[config.control_index].frequency),
-            results.uncertainty.channels[config.control_index].advice,
+            conditions,
             config.specification,
         ),
         report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
@@ -98,18 +100,18 @@ def verdict_of(
     achievable: AchievablePerformance | None = None,
     order: int | str | None = None,
     untold_rad_s: float = 0.0,
-    doubts: Sequence[Finding] = (),
+    conditions: Sequence[Finding] = (),
     asked: Specification | None = None,
 ) -> str:
     """One line: certified, or what is missed, by how much and at which frequency; where the achievable
     performance is given, whether a higher order would help; up to where the ellipses are wider than the
-    gain, if they are; of the doubts about these, that nobody looked for friction; and where less bandwidth
-    than asked was designed for, both."""
+    gain, if they are; what the certificate stands or falls with; and where less bandwidth than asked was
+    designed for, both."""
     advice, untold = "", said("untold", untold_rad_s)
     if achievable is not None and order is not None and design.gamma is not None:
         advice = said("order_advice", achievable, design.gamma, order)
-    friction = [words(doubt) for doubt in doubts if doubt.kind is FindingKind.UNTRIED_FRICTION]
-    return said("run_verdict", design, certify, loop, untold or advice, untold, "".join(friction), asked)
+    told = ". Also, ".join(words(doubt) for doubt in conditions)
+    return said("run_verdict", design, certify, loop, untold or advice, untold, told, asked)
 
 
 def bandwidth_numbers(

@@ -20,7 +20,7 @@ from ident.checks.answer import zero_is_inside
 from ident.checks.residual_tests import residual_advice, whiteness_test
 from ident.checks.validation import ScatterRow, repeat_scatter
 from ident.data.distortion import distortion_of
-from ident.data.finding import FindingKind, distinct, finding
+from ident.data.finding import Finding, FindingKind, distinct, finding
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
 from ident.data.signal_filter import increments
@@ -185,7 +185,7 @@ def uncertainty_of(
     )
     if rubs:
         advice.append(finding(FindingKind.UNTRIED_FRICTION, output=result.output))
-    return replace(found, advice=tuple(advice)), equivalent
+    return replace(found, advice=(*advice, *nominal_doubt(found.agreement))), equivalent
 
 
 def _with_noise_model(
@@ -404,6 +404,14 @@ def agreement_of(
         largest_distance=float(distance[worst]),
         at_rad_s=float(frequency.omega_rad_s[worst]),
     )
+
+
+def nominal_doubt(found: NominalAgreement) -> list[Finding]:
+    """What to say of a nominal that lies outside most of its ellipses; empty for others."""
+    if found.share_inside_percent >= _MOST:
+        return []
+    told = {"outside_percent": 100 - found.share_inside_percent, "times": found.largest_distance}
+    return [finding(FindingKind.NOMINAL_OUTSIDE, **told, at_rad_s=found.at_rad_s)]
 
 
 def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> Intervals | None:
