@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from numbers import Real
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -119,7 +118,7 @@ class Record(Shown, PlainRecord):
             u, y, dt_s = _time_response(u, dt_s)
         if dt_s is None:
             raise ValueError("a record needs dt_s, the sampling time in seconds")
-        if isinstance(dt_s, bool) or not isinstance(dt_s, Real):
+        if isinstance(dt_s, bool) or not isinstance(dt_s, (int, float, np.integer, np.floating)):
             raise ValueError(f"dt_s must be a positive number of seconds; got {dt_s!r}")
         u, y = (_either(*pair) for pair in (("u", u, "input", input), ("y", y, "output", output)))
         _refuse_other_rows(u, y, reference)

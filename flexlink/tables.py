@@ -139,7 +139,8 @@ def _certificate(certificate: Certificate) -> pd.DataFrame:
 
 @table.register(SynthesisResult)
 def _synthesis(result: SynthesisResult) -> pd.DataFrame:
-    return pd.DataFrame([vars(point) for point in result.blocking])
+    # Of one loop no joint is named.
+    return pd.DataFrame([vars(point) for point in result.blocking]).dropna(axis=1, how="all")
 
 
 @table.register(Diagnosis)

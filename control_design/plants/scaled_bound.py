@@ -165,7 +165,7 @@ def largest_channel(rows: Rows, K: Array, right: Array) -> Integer:
         for weight, signal in ((rows.V_y, right), (rows.V_u, apply(K, right)))
     ]
     of_y, of_u = (np.argmax(share, axis=1) for share in shares)
-    return np.where(np.any(rows.V_u, axis=(1, 2)), of_u, of_y)
+    return np.asarray(np.where(np.any(rows.V_u, axis=(1, 2)), of_u, of_y))
 
 
 @dataclass(frozen=True, eq=False)

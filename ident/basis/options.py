@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from numbers import Number
+from numbers import Complex
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -118,7 +118,7 @@ class IdentOptions(Settings):
                 "expected a list, with a number for a real pole and [real part, imaginary part] for a pair: "
                 "[0.9, [0.95, 0.2]]"
             )
-        values = [complex(p) if isinstance(p, Number) else p for p in poles]
+        values = [complex(p) if isinstance(p, Complex) else p for p in poles]
         upper = [p for p in values if not isinstance(p, complex) or p.imag >= 0 or np.conj(p) not in values]
         return tuple(
             (p.real, p.imag) if isinstance(p, complex) else tuple(p) if isinstance(p, list) else p
