@@ -327,6 +327,12 @@ PARETO = "[[pareto]]\nx = 'speed'\ny = 'modulus_margin'\n[study]"
         (VALUES, "from = 1.0\nto = 2.0", "a grid over a range needs points"),
         (VALUES, "from = 2.0\nto = 1.0", "from below to"),
         (VALUES, "", "axes[0]: give values, or from and to"),
+        (VALUES, "values = []", "axes[0]: values is empty"),
+        (
+            SMALL_STUDY,
+            FAST_ARM.read_text(),
+            "a configuration of a run; name it in a study file: [study] base = ",
+        ),
         ('key = "closed_loop.effects"', 'key = "closed loop"', "not a dotted key"),
         ("tip_payload", "tip_paylod", "axes[1].values[1]: closed_loop.effects[0]"),
         ('label = "effects"', 'label = "asked"', "two axes have the same label 'asked'"),
@@ -359,6 +365,7 @@ def test_places_that_are_taken_are_refused(refused, small_study, tmp_path):
         line = refused("study", "--config", study, "--out", tmp_path / "other", option)
         assert "no study is there" in line
     assert (tmp_path / "other" / "thesis.tex").is_file()
+    assert "it is a study: open its study.html, or name a point" in refused("report", small_study[0])
     line = refused("study", "--config", study, "--out", small_study[0], "--resume", "--replace")
     assert "--resume and --replace contradict each other" in line
 

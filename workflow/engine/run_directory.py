@@ -83,7 +83,9 @@ class RunDirectory(Store):
         if not run.path.is_dir():
             raise InputError(f"{path}: no such run directory")
         if not run.manifest_path.is_file():
-            raise InputError(f"{path}: not a run directory (manifest.json is missing)")
+            study = "; it is a study: open its study.html, or name a point: points/NUMBER"
+            why = study if (run.path / "study.json").is_file() else " (manifest.json is missing)"
+            raise InputError(f"{path}: not a run directory{why}")
         if run.manifest().get("layout") != LAYOUT_VERSION:
             raise InputError(f"{path}: written by another version of flexlink; start a new run")
         return run

@@ -50,7 +50,7 @@ class Axis(Section):
     label: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.]*$", max_length=24)] | None = Field(
         None, description="short name in the table and in the names of points; default: last name of the key"
     )
-    values: tuple[Any, ...] | None = Field(None, min_length=1, description="list of values")
+    values: tuple[Any, ...] | None = Field(None, description="list of values")
     from_: int | float | None = Field(None, alias="from", description="lower end of a range")
     to: int | float | None = Field(None, description="upper end of a range")
     points: int | None = Field(None, ge=2, le=1000, description="points of the range in a grid")
@@ -62,6 +62,8 @@ class Axis(Section):
         if (self.values is not None) == ranged:
             raise ValueError("give values, or from and to")
         if self.values is not None:
+            if not self.values:
+                raise ValueError("values is empty: give one or more")
             if self.points is not None or self.log:
                 raise ValueError("points and log go with from and to")
             if (twice := repeated([repr(value) for value in self.values])) is not None:
@@ -183,6 +185,10 @@ class StudyFile:
 def load_study(path: Path) -> StudyFile:
     """Raises InputError: one line naming file, key and what was expected."""
     text, document = read_toml(path)
+    if "study" not in document and "specification" in document:
+        raise InputError(
+            f'{path}: a configuration of a run; name it in a study file: [study] base = "{path}"'
+        )
     config = check(StudyConfig, document, source=str(path))
     if config.study.base is None:
         return StudyFile(path, config, text, None)
