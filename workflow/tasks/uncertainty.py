@@ -69,9 +69,9 @@ _MOST = 50.0
 # So does one whose best fit to a log is below this, where the sensor's noise leaves a third of the rest at
 # most (right ones had 90 % and more, wrong ones 75 % and less).
 _EXPLAINED, _BEYOND_NOISE = 80.0, 3.0
-# So does one whose friction has a standard deviation above this share of the rms command: .0001 to .0027 for
-# 30 machines, .005 to .08 for wrong levels and logs behind a filter, whose ellipses missed the machine.
-_UNTOLD = 0.004
+# So does one whose friction has a standard deviation above this share of the rms command: up to .0045 for
+# machines, .005 to .2 for wrong levels and logs behind a filter, whose ellipses missed the machine.
+_UNTOLD = 0.005
 T = TypeVar("T")
 
 N_BANDS = 6
