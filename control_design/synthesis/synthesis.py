@@ -130,16 +130,18 @@ def _of_lowest_order(problem: Problem, root: int, tell: Progress) -> SynthesisRe
         found[order] = np.inf if result.best is None else result.best.gamma, result
         return found[order][0]
 
-    order, within = _MIDDLE, enough
+    def within() -> float:
+        return max(enough, _WITHIN * min(value for value, _ in found.values()))
+
+    order = _MIDDLE
     while gamma(order) > enough and order < _HIGHEST:
         if order - 2 in found and found[order][0] > _GAINS * found[order - 2][0]:
             break
         order += 1
     if found[order][0] > enough:
-        within = _WITHIN * min(value for value, _ in found.values())
-        order = min(number for number, (value, _) in found.items() if value <= within)
+        order = min(number for number, (value, _) in found.items() if value <= within())
     if order == _MIDDLE:
-        while order > 1 and gamma(order - 1) <= within:
+        while order > 1 and gamma(order - 1) <= within():
             order -= 1
     own = search(order)
     result = found[order][1]

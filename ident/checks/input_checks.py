@@ -209,7 +209,9 @@ def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[Fin
     normal, _ = pole_system(here, poles, fixed)
     if normal.size == 0 or not data.n_samples > data.n_parameters(poles.order):
         return []
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    size = np.diag(normal)
+    # Poles that coincide leave an unknown without a size, up to rounding.
+    scale = np.sqrt(np.maximum(size, max(1e-30 * float(size.max()), 1e-300)))
     inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-12, hermitian=True)
     noise = here.rss / (data.n_samples - data.n_parameters(poles.order))
     deviation = np.sqrt(noise * np.maximum(np.diag(inverse), 0.0)) / scale

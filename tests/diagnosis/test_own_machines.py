@@ -529,7 +529,8 @@ def test_a_value_that_is_pinned_at_its_bound_is_no_answer(ratio):
         experiments.append(PlantExperiment(role, role, pushed, moved))
     offset = PlantEffect("offset", (EffectParameter("size", 1e-3, 10.0),), signed=True)
     plant = Plant(simulate, {"gain": 2.0}, {"gain": 0.05}, ("y",), np.array([1e-3]), (offset,), 0.05, 0.01)
-    found = diagnose(PlantCase("one", plant, tuple(experiments)))
+    with pytest.warns(UserWarning, match="times as far as in the simulation: is its column in"):
+        found = diagnose(PlantCase("one", plant, tuple(experiments)))
     assert found.combination == (("wrong_gain",) if ratio == 8.0 else ())
     (gain,) = [e for e in found.effects if e.name == "wrong_gain"]
     if ratio == 8.0:

@@ -247,7 +247,7 @@ def before_lag(signal, a):
             "logged late",
             marks=pytest.mark.slow,
         ),
-        (lambda one, k: log(k, machine=plant(load=3 * LOAD)) if k == 1 else {}, "parts of them differ"),
+        (lambda one, k: log(k, machine=plant(load=3 * LOAD)) if k == 1 else {}, "explains these logs"),
     ],
     ids=[
         "filtered position",

@@ -40,6 +40,7 @@ VALUES = {
     "most_to_Hz": 22.0, "chance_percent": 0.81, "shift_percent": -0.65, "shift_from_Hz": 16.2,
     "shift_to_Hz": 22.0, "gain_percent": 4.86, "gain_from_Hz": 2.2, "gain_to_Hz": 2.9, "reference": "r",
     "like": "degrees and radians", "of": "deg", "options": "--scale y=57.3",
+    "outside_percent": 51.0, "at_rad_s": 12.0,
 }  # fmt: skip
 # Other values that lead to other words.
 OTHERWISE = {

@@ -44,6 +44,7 @@ def run_from_files(
             f"{'--resume' if resume else '--replace'} needs --out DIR, the directory of the earlier run"
         )
     config: AnyConfig
+    note = ""
     if config_path is not None:
         config, text = load_any(config_path)
     elif resume and out is not None and (out / "manifest.json").is_file():
@@ -54,8 +55,7 @@ def run_from_files(
         raise InputError(f"{out}: no run is there to resume; start one without --resume")
     else:
         config, text = built_in_config()
-        if progress is not None:
-            progress.note("no --config: this is the built-in default arm, not a machine of yours")
+        note = "no --config: this is the built-in default arm, not a machine of yours"
     # Here: what computes takes seconds to load, and a configuration that is refused does not need it.
     from workflow.report.pages import page_of
     from workflow.tasks.pipeline import run_pipeline
@@ -69,6 +69,7 @@ def run_from_files(
         resume=resume,
         replace=replace,
         c_code=c_code,
+        note=note,
         progress=progress,
     )
 

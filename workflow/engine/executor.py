@@ -335,6 +335,8 @@ class DaskCluster:
                     missing = f"the Dask cluster at {self.address} had no worker that answers for {seconds}"
                 if missing:
                     raise StageError(f"{missing}; --resume continues it")
+            if finished:  # what finishes tells of both
+                self._heard_s = self._staffed_s = time.monotonic()
             for future in finished:
                 yield futures.pop(future), self._result(future)
 

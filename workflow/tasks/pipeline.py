@@ -55,13 +55,15 @@ def run_pipeline(
     replace: bool = False,
     page: Stage | None = None,
     c_code: Mapping[str, Any] | None = None,
+    note: str = "",
     progress: Progress | None = None,
 ) -> RunSummary:
     """Run every stage into `out` and return the table of numbers.
 
     config_text: kept as config.toml (`called` in complaints); resume takes up a run that is there, replace
     starts it afresh; page: the last stage, which writes the page; c_code: the fields of `Dialect` that are
-    stated, kept for when it is resumed. A result that is not certified is no error.
+    stated, kept for when it is resumed; note: said once nothing refuses the run. A result that is not
+    certified is no error.
 
     Raises InputError (one line) for anything wrong with what the user gave; what this call created is removed
     then, unless identification had already been paid for. Raises StageError when a computation fails.
@@ -92,6 +94,8 @@ def run_pipeline(
         run.record_status("running", c_code=asdict(dialect))
         stages = kind.stages if page is None else (*kind.stages, page)
         progress.plan([(stage.name, stage.expected_s) for stage in stages])
+        if note:
+            progress.note(note)
         try:
             for stage in stages:
                 _perform(stage, given, inputs, ready if stage is stages[0] else None)
