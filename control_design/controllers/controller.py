@@ -73,7 +73,10 @@ class Controller(Law):
         object.__setattr__(self, "anti_windup_gain", gain)
         lock(self, "anti_windup_gain")
         if n and (self.input_limit is not None or self.rate_limit is not None):
-            radius = float(np.max(np.abs(np.linalg.eigvals(self.A - gain @ self.C))))
+            with np.errstate(over="ignore", invalid="ignore"):
+                inner = self.A - gain @ self.C
+            finite = bool(np.all(np.isfinite(inner)))
+            radius = float(np.max(np.abs(np.linalg.eigvals(inner)))) if finite else np.inf
             if not radius < 1:
                 raise ValueError(
                     f"anti_windup_gain leaves a pole of A - M C at radius {radius:.6g}: it would wind up"
