@@ -362,9 +362,13 @@ def test_one_move_of_two_coupled_links_asks_for_another_experiment(
     log, out = flexlink_data / "quanser_2dsfl" / "lqr_run.csv", tmp_path / "my.toml"
     line = refused("init", log, "--out", out)
     assert flexlink(*shlex.split(line.split("type: flexlink ")[1]), "--out", out).code == 0
-    # How wrong the fit with friction is, and so the reason, is up to last digits.
-    line = refused("run", "--config", out, "--out", tmp_path / "out")
-    assert re.search(r"response = ['\"]as recorded|check columns, wiring and unit", line)
+    # At which of a dozen poles the fit with friction ends is up to last digits; what was asked is never met.
+    answer = flexlink("run", "--config", out, "--out", tmp_path / "out")
+    if answer.code == 2:
+        refusal = r"response = ['\"]as recorded|check columns, wiring and unit"
+        assert re.search(refusal, answer.err.splitlines()[-1])
+    else:
+        assert answer.code == 3 or "not for the specified" in answer.out
     text = out.read_text().replace('"without friction"', '"as recorded"')
     out.write_text(text + '\n[closed_loop_data]\nmethod = "two_stage"\n')
     answer = flexlink("run", "--config", out, "--out", tmp_path / "recorded")

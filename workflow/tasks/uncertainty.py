@@ -69,9 +69,9 @@ _MOST = 50.0
 # So does one whose best fit to a log is below this, where the sensor's noise leaves a third of the rest at
 # most (right ones had 90 % and more, wrong ones 75 % and less).
 _EXPLAINED, _BEYOND_NOISE = 80.0, 3.0
-# So does one whose friction has a standard deviation above this share of the rms command: up to .0045 for
-# machines, .005 to .2 for wrong levels and logs behind a filter, whose ellipses missed the machine.
-_UNTOLD = 0.005
+# So does one whose friction has a standard deviation above both of these shares, of its level and of the rms
+# command: wrong levels, and logs behind a filter, whose ellipses missed the machine (docs/decisions.md).
+_UNTOLD, _UNTOLD_OF_COMMAND = 0.07, 0.004
 T = TypeVar("T")
 
 N_BANDS = 6
@@ -316,8 +316,12 @@ def refuse_unexplained(
         why = f"its best fit to one is {best:.0f} %, and it leaves {times:.0f} times the sensor's noise"
     elif late:
         why = "the motion comes before its command, as if that was logged late"
-    elif friction is not None and (untold := friction.level_std / rms_input) > _UNTOLD:
-        known = f"to {200 * untold:.2g} % of the rms command, at most {200 * _UNTOLD:g} %"
+    elif friction is not None and friction.level_std > max(
+        _UNTOLD * friction.level, _UNTOLD_OF_COMMAND * rms_input
+    ):
+        known = (
+            f"twice its standard deviation is {200 * friction.level_std / rms_input:.2g} % of the rms command"
+        )
         why = f"its friction cannot be told from slow poles ({known}), as behind a filter"
     if why:
         raise ValueError(said("unexplained_logs", result.output, why, friction is not None))
