@@ -79,6 +79,7 @@ def run_command(command: str, flexlink: Callable[..., Answer]) -> str:
         assert told.code == 0, f"{command}\n{told.err}"
         return told.out
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment.pop("PYTEST_ADDOPTS", None)  # they are for these tests, not for the page's
     command = command.replace("python ", f"{sys.executable} ", 1) if name == "python" else command
     done = subprocess.run(command, shell=True, check=False, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, f"{command}\n{done.stderr}"
