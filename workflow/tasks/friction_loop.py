@@ -71,8 +71,10 @@ class FrictionLoop:
         measured, command, limited = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
         weights = arm.weights @ self.coefficients
         # An arm has inertia. Where the fit has the speed jump against the force, a shaft at rest would creep.
-        fastest = np.argmax(np.where(arm.chain | (arm.rates.imag != 0), 0.0, np.abs(arm.rates)))
-        weights[fastest] -= min(float(weights[~arm.chain].real.sum()), 0.0)
+        # It is taken off the fastest real pole: off an integrator it would change the gain at standstill.
+        size = np.where(arm.chain | (arm.rates.imag != 0), 0.0, np.abs(arm.rates))
+        if np.any(size):
+            weights[np.argmax(size)] -= min(float(weights[~arm.chain].real.sum()), 0.0)
         loop_through(
             kernel_array(reference),
             np.zeros(n) if noise is None else self.found.noise_std * noise.standard_normal(n),
