@@ -71,6 +71,19 @@ def too_little_memory() -> str:
     return f"ulimit -v leaves {soft >> 20} MiB of memory, {wanted}"
 
 
+class _Told(io.TextIOWrapper):
+    """Standard error: a full disk or a terminal that is gone ends no computation; the exit code tells."""
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            super().write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            super().flush()
+
+
 def usable_streams() -> None:
     """Streams that are closed go nowhere; one that is not UTF-8 gets what it has no character for in others.
 
@@ -89,6 +102,9 @@ def usable_streams() -> None:
                 mode = "r" if number == 0 else "w"
                 setattr(sys, name, os.fdopen(number, mode, encoding="utf-8", closefd=False))
     codecs.register_error("flexlink", _plainer)
+    if isinstance(old := sys.stderr, io.TextIOWrapper):
+        encoding, errors = old.encoding, old.errors
+        sys.stderr = _Told(old.detach(), encoding, errors, line_buffering=True)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and stream.errors in ("strict", "surrogateescape"):
             stream.reconfigure(errors="flexlink")

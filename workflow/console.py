@@ -39,6 +39,7 @@ class TerminalProgress(progress.Progress):
         self._quiet, self._lines = quiet, not quiet and not console.is_terminal
         self._began_s, self._compiled_s, self._worked_s = time.monotonic(), 0.0, 0.0
         self._over, self._watching = threading.Event(), ExitStack()
+        self._teller = threading.Thread(target=self._tell, daemon=True)
         self._bar = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}", table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis")),
@@ -56,13 +57,15 @@ class TerminalProgress(progress.Progress):
     def __enter__(self) -> Self:
         self._bar.start()
         if self._lines:
-            threading.Thread(target=self._tell, daemon=True).start()
+            self._teller.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._over.set()
+        if self._lines:
+            self._teller.join()  # what comes later may have another standard error, or none
         self._watching.close()
         self._bar.stop()
 

@@ -36,6 +36,38 @@ def test_the_first_word_comes_at_once(capfd):
     assert capfd.readouterr().err == ""
 
 
+def test_nothing_is_told_after_the_end(monkeypatch):
+    said = []
+    monkeypatch.setattr(
+        console.TerminalProgress, "_say", lambda told, line: (time.sleep(0.3), said.append(line))
+    )
+    with console.TerminalProgress() as told:
+        told.update("reading", 0.0)
+        time.sleep(console.FIRST_LINE_S + 0.1)  # it is being said
+    assert len(said) == 1
+    assert not told._teller.is_alive()
+
+
+@pytest.mark.parametrize("errors", ["2>/dev/full", "2> >(true)"])
+def test_no_computation_ends_because_nobody_can_be_told(errors, tmp_path):
+    program = """import time
+from workflow.__main__ import usable_streams
+usable_streams()
+from workflow.console import FIRST_LINE_S, TerminalProgress
+with TerminalProgress() as told:
+    told.update("reading", 0.0)
+    time.sleep(FIRST_LINE_S + 0.2)
+    told.note("something")
+print("ended")
+"""
+    (tmp_path / "program.py").write_text(program)
+    shell = ["bash", "-c", f"{sys.executable} {tmp_path}/program.py {errors}"]
+    done = subprocess.run(
+        shell, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stdout) == (0, b"ended\n")
+
+
 def test_time_left_follows_the_speed_of_the_machine(clock):
     told = console.TerminalProgress(quiet=True)
     told.plan([("first", 20.0), ("second", 80.0)])
