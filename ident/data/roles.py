@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 import shlex
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.signal import correlate
 
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.foreign_files import shown
@@ -24,7 +26,8 @@ _OUTPUT = re.compile(
 )
 # What the motion should be: the command of a control loop, neither its drive nor what a sensor read.
 _WISHED = re.compile(
-    r"(^|[^a-z])(ref|reference|setpoint|set_point|desired|target|soll|sollwert|des|demand|goal)(?![a-z])|"
+    r"(^|[^a-z])(ref|reference|setpoint|set_point|set|sp|desired|target|soll[a-z]*|vorgabe|des|demand|goal|"
+    r"consigne|consigna|referencia|riferimento)(?![a-z])|给定|设定|目标|参考|目標|"
     r"(^|[^a-z])(cmd|command|commanded)_?(pos|position|angle|theta|q|speed|vel|velocity)(?![a-z])|"
     r"(^|[^a-z])(pos|position|angle|theta|q|speed|vel|velocity)_?(cmd|command|commanded)(?![a-z])",
     re.I,
@@ -37,6 +40,8 @@ _ERROR = re.compile(r"(^|[^a-z])(e|err|error|fehler|abweichung|regelabweichung|r
 _PREFIX = re.compile(r"^(l?r|f|n|i|di|ui|w)(?=[A-Z])")
 _DRIVEN = re.compile(r"[mkµμ]?(V|A|N|Nm)")
 _MOVED = re.compile(r"[mµμ]?(rad|deg|m)((/|_)s2?|/s\^2|/s²)?|°|grad|[cm]m|rpm|u/min|counts?|ticks?", re.I)
+# Least correlation of the changes of a set point and of what follows it.
+_FOLLOWS = 0.5
 # Of what changes per time.
 _RATE = re.compile(r"/s|_s|rpm|u/min|/min|hz", re.I)
 _RATE_NAME = re.compile(r"(^|[^a-z])(speed|velocity|vel|drehzahl|omega|accel\w*|acc|rate|rpm)(?![a-z])", re.I)
@@ -92,6 +97,8 @@ def roles_of(table: Table, log: str, command: str = "identify", **stated: str | 
     second = output or next((name for name in [*outputs, *inputs] if name != first), "NAME")
     options = [("--input", first), ("--output", second)]
     reference = stated.get("reference") or _only(wished)
+    if not (output or reference) and (pair := _led_and_follower(table, outputs)):
+        reference, options[1] = pair[0], ("--output", pair[1])
     options += [("--reference", reference)] if reference else []
     times = [] if time else times_in(table)
     options += [("--time", time or times[0])] if time or times else [("--dt-s", "SECONDS")]
@@ -156,6 +163,23 @@ def _only(names: list[str]) -> str | None:
     return names[0] if len(names) == 1 else None
 
 
+def _led_and_follower(table: Table, names: list[str]) -> tuple[str, str] | None:
+    """Of two columns the one that comes first and the one that follows it, in the same unit and by their
+    changes; None where they tell neither."""
+    if len(names) != 2 or table.unit(names[0]) != table.unit(names[1]):
+        return None
+    with suppress(ValueError):
+        first, second = (
+            np.diff(column) - np.mean(np.diff(column)) for column in table.columns(names).values()
+        )
+        size = np.linalg.norm(first) * np.linalg.norm(second)
+        alike = correlate(second, first, method="fft") / max(size, np.finfo(float).tiny)
+        late = int(np.argmax(alike)) - (first.size - 1)
+        if late and np.max(alike) > _FOLLOWS:
+            return (names[0], names[1]) if late > 0 else (names[1], names[0])
+    return None
+
+
 def is_time(table: Table, name: str) -> bool:
     """Whether a column looks like time: dates, a unit of time, or its name."""
     if table.is_clock(name) or says_time(name):
@@ -202,7 +226,8 @@ def is_position(name: str, unit: str) -> bool:
 
 def _is_wished(table: Table, name: str) -> bool:
     bare = re.sub(r"[\W_]*$", "", name.removesuffix(table.unit(name).replace("/", "_")))
-    return _WISHED.search(name) is not None or _TEXTBOOK.fullmatch(bare) is not None
+    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)  # posRef, SetAngle
+    return _WISHED.search(apart) is not None or _TEXTBOOK.fullmatch(bare) is not None
 
 
 def _says(table: Table, name: str, unit: re.Pattern[str], word: re.Pattern[str]) -> bool:

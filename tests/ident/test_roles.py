@@ -55,6 +55,32 @@ def test_a_reference_is_neither_input_nor_output():
     assert roles_of(LOOP, "a.csv", **named) == Roles("t_s", "v_drive_counts", "theta_rad")
 
 
+@pytest.mark.parametrize(
+    ("wished", "drive", "moved"),
+    [
+        ("Sollwinkel [deg]", "Strom Soll [A]", "Istwinkel [deg]"),
+        ("set_deg", "current_A", "angle_deg"),
+        ("Consigne [deg]", "Courant [A]", "Mesure [deg]"),
+        ("给定角度(deg)", "电流(A)", "实际角度(deg)"),
+        ("posRef_rad", "u_V", "pos_rad"),
+        ("SP_mm", "i_A", "PV_mm"),
+    ],
+)
+def test_set_points_by_other_names(wished, drive, moved):
+    names = ("t_s", moved, wished, drive)
+    roles = roles_with_reference(table(*names), "a.csv", "init")
+    assert roles == Roles("t_s", drive, moved, wished)
+
+
+def test_of_two_columns_without_a_known_name_the_follower_is_the_output():
+    wave = np.cumsum(np.random.default_rng(3).standard_normal(400))
+    columns = {"t_s": np.arange(400) * 0.01, "a_deg": wave[5:], "b_deg": wave[:-5], "i_A": np.sin(wave)}
+    shortest = min(column.size for column in columns.values())
+    log = Table("a.csv", {name: column[:shortest] for name, column in columns.items()}, units={})
+    with pytest.raises(ValueError, match=r"--input i_A --output b_deg --reference a_deg --time t_s$"):
+        roles_with_reference(log, "a.csv", "init")
+
+
 def test_the_reference_of_a_voltage_may_be_what_drives_the_arm():
     assert roles_of(table("t_s", "u_ref_V", "hub_rad"), "a.csv") == Roles("t_s", "u_ref_V", "hub_rad")
 
