@@ -13,7 +13,7 @@ from scipy.signal import correlate
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.foreign_files import shown
 from ident.data.table import Table
-from ident.data.units import TIME_UNITS, ends_with_time, per, says_time, scaled_by
+from ident.data.units import TIME_UNITS, ends_with_time, follows_as_it_stands, per, says_time, scaled_by
 
 _INPUT = re.compile(
     r"(u|v|input|command|commanded|cmd|drive|voltage|spannung|current|strom|torque|moment|force|pwm|duty)(?![a-z])",
@@ -147,11 +147,14 @@ def roles_with_reference(table: Table, log: str, command: str, **stated: str | N
     unit, of = table.unit(other or ""), table.unit(roles.output)
     if fitting or other is None or is_position(other, unit) != is_position(roles.output, of):
         return replace(roles, reference=_only(fitting))
-    factor = per(unit, of)
-    told = {"name": other, "unit": unit, "output": roles.output, "of": of}
+    factor, same = per(unit, of), False
+    with suppress(ValueError):  # cells that hold no number are somebody else's to say
+        same = follows_as_it_stands(*table.columns([other, roles.output]).values())
     scaled = scaled_by(other, factor) if factor else f"--scale {shlex.quote(f'{other}=FACTOR')}"
-    options = f"--reference {shlex.quote(other)} {scaled}"
-    return replace(roles, doubts=(finding(FindingKind.UNIT_OF_REFERENCE, **told, options=options),))
+    header = f"--unit {shlex.quote(f'{other}={of}')}"
+    options = f"--reference {shlex.quote(other)} {header if same else scaled}"
+    told = {"name": other, "unit": unit, "output": roles.output, "of": of, "options": options}
+    return replace(roles, doubts=(finding(FindingKind.UNIT_OF_REFERENCE, **told, same=same),))
 
 
 def _not_in(wished: list[str], names: list[str]) -> list[str]:

@@ -251,6 +251,26 @@ def per(unit: str, other: str) -> float | None:
     return size / one if (kind, rate) == (like, same) else None
 
 
+def followed_times(reference: RealArray, output: RealArray) -> float | None:
+    """How many times its reference (T,) an output (T,) is, where a loop follows best; None: it does not."""
+    window = np.hanning(output.size)
+    r, y = (np.fft.rfft((signal - signal.mean()) * window)[1:] for signal in (reference, output))
+    power = np.cumsum(np.abs(r) ** 2)
+    if r.size < _FEWEST_LINES or not power[-1] > 0:
+        return None
+    slow = slice(max(_FEWEST_LINES, int(np.searchsorted(power, _SLOW * power[-1])) + 1))
+    own, both, answer = (np.vdot(a[slow], b[slow]).real for a, b in ((r, r), (r, y), (y, y)))
+    if both <= 0 or both**2 < _COHERENT * own * answer:
+        return None
+    return float(both / own)
+
+
+def follows_as_it_stands(reference: RealArray, output: RealArray) -> bool:
+    """Whether an output (T,) follows its reference (T,) in numbers of one unit."""
+    followed = followed_times(reference, output)
+    return followed is not None and 1 / _FOLLOWS < followed < _FOLLOWS
+
+
 def contradicted_by_loop(
     reference: RealArray,
     output: RealArray,
@@ -260,18 +280,12 @@ def contradicted_by_loop(
 ) -> tuple[Finding, ...]:
     """The finding on an output (T,) that follows its reference (T,) but for the factor between two units.
     names, units: of reference and output; scale: as stated, by name."""
-    window = np.hanning(output.size)
-    r, y = (np.fft.rfft((signal - signal.mean()) * window)[1:] for signal in (reference, output))
-    power = np.cumsum(np.abs(r) ** 2)
-    if r.size < _FEWEST_LINES or not power[-1] > 0:
+    followed = followed_times(reference, output)
+    if followed is None:
         return ()
-    slow = slice(max(_FEWEST_LINES, int(np.searchsorted(power, _SLOW * power[-1])) + 1))
-    own, both, answer = (np.vdot(a[slow], b[slow]).real for a, b in ((r, r), (r, y), (y, y)))
-    if both <= 0 or both**2 < _COHERENT * own * answer:
-        return ()
-    larger = both > own  # the output
+    larger = followed > 1  # the output
     found = [(times if larger else 1 / times, like) for times, like in _TIMES]
-    found = [(times, like) for times, like in found if 1 / _FOLLOWS < both / own / times < _FOLLOWS]
+    found = [(times, like) for times, like in found if 1 / _FOLLOWS < followed / times < _FOLLOWS]
     # The reference is in the wrong unit where the output's header says that of its numbers, or each its own.
     small = _SIZES.get(units[1].split("/")[0], ("", 1.0))[1] < 1
     wrong = int(larger != small and not (all(units) and units[0] != units[1]))
