@@ -206,8 +206,8 @@ class Table:
         remedy = ""
         if 2 * bad.size < numbers.size and not np.isfinite(numbers[row]):  # else it is no column of numbers
             remedy = (
-                f"; take such rows out ({bad.size} here): with a time column --repair fills them in, and "
-                "flexlink init does so by itself"
+                f"; delete such rows ({bad.size} here): with a time column, flexlink init fills the gap that "
+                "this leaves, other commands with --repair"
             )
         raise ValueError(
             f"{self.path}, {self.place(row, name)}: column '{shown(name)}' is {found}; "

@@ -116,10 +116,18 @@ class FrictionFit:
     def _run(self, record: Record, law: FrictionLaw) -> tuple[RealArray, RealArray]:
         if self.correction is None:
             return self.arm.run(self.coefficients, record.input[:, 0], law)
-        delay, position = self.arm.structure.input_delay_samples, record.output[:, 0]
+        delay, position = self.arm.structure.input_delay_samples, self._position(record)
         driving = less_friction(record, self.steady(record), delay).input[:, 0]
-        start = position[0] if self.arm.structure.integrators else self.centre
-        return self.arm.run(self.coefficients, driving, law, position - start, self.correction)
+        return self.arm.run(self.coefficients, driving, law, position, self.correction)
+
+    def _position(self, record: Record) -> RealArray:
+        """(T,) from where an observer counts: the start, where the arm integrates."""
+        position = record.output[:, 0]
+        return np.asarray(position - (position[0] if self.arm.structure.integrators else self.centre))
+
+    def prediction_error(self, record: Record) -> RealArray:
+        """(T,) what an observer leaves of the position, its mean, which a constant force makes, with it."""
+        return self._position(record) - self.motion(record)[0]
 
     def steady(self, record: Record) -> RealArray:
         """(T,) bias and friction beyond the spring, at the shaft: what the observer need not simulate."""

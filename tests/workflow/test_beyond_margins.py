@@ -134,8 +134,12 @@ def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_h
         return said("run_verdict", design, certify, loop, "")
 
     assert verdict() == "certified: every requirement is met, and all 20 closed-loop runs settle"
-    assert verdict(friction=1, machine="simulated") == verdict()  # that arm has its friction
-    assert verdict(friction=1) == verdict() + " (linear plants, without dry friction)"
+    step = SimpleNamespace(settling_time_s=7.2)
+    friction = SimpleNamespace(step=step, watched_s=30.0)
+    assert verdict(friction=friction, machine="simulated") == verdict()  # that arm has its friction
+    assert verdict(friction=friction) == verdict() + " (linear plants; with dry friction in 7.2 s)"
+    step.settling_time_s = None
+    assert verdict(friction=friction) == verdict() + " (linear plants; with dry friction not in 30 s)"
     doubt = finding(FindingKind.UNTRIED_FRICTION, output="enc")
     words = verdict_of(design, certify, SimpleNamespace(check=check), conditions=[doubt])
     assert words.startswith(verdict() + ". But dry friction was not identified")

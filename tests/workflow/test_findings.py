@@ -40,13 +40,14 @@ VALUES = {
     "most_to_Hz": 22.0, "chance_percent": 0.81, "shift_percent": -0.65, "shift_from_Hz": 16.2,
     "shift_to_Hz": 22.0, "gain_percent": 4.86, "gain_from_Hz": 2.2, "gain_to_Hz": 2.9, "reference": "r",
     "like": "degrees and radians", "of": "deg", "options": "--scale y=57.3",
-    "outside_percent": 51.0, "at_rad_s": 12.0,
+    "outside_percent": 51.0, "at_rad_s": 12.0, "same": False,
 }  # fmt: skip
 # Other values that lead to other words.
 OTHERWISE = {
     "SLOW_BOUND": [{"integrators": 1}],
     "TIME_UNIT": [{"in_header": ""}],
     "UNIT_OF_LOOP": [{"options": "--scale y=57.3 --unit y=rad"}],
+    "UNIT_OF_REFERENCE": [{"same": True, "options": "--reference y --unit y=deg"}],
     "REPAIRED": [{"missing": 0}],
     "SKIPPED_ROWS": [{"rows": 1}],
     "WRAPS": [{"name": "hub angle", "period": 2 * 3.141592653589793}],

@@ -71,7 +71,7 @@ _MOST = 50.0
 _EXPLAINED, _BEYOND_NOISE = 80.0, 3.0
 # So does one whose friction has a standard deviation above both of these shares, of its level and of the rms
 # command: wrong levels, and logs behind a filter, whose ellipses missed the machine (docs/decisions.md).
-_UNTOLD, _UNTOLD_OF_COMMAND = 0.07, 0.004
+_UNTOLD, _UNTOLD_OF_COMMAND = 0.05, 0.004
 T = TypeVar("T")
 
 N_BANDS = 6
