@@ -173,7 +173,7 @@ def fit_friction_in_loop(
         raise ValueError(
             f"no arm with dry friction explains these logs: parts of them differ {spread:.3g} times as much "
             f"as their noise (at most {_CONTRADICTORY:g}); look for what changes between or within them "
-            "(position, load, temperature), or use response = 'as recorded'"
+            "(position, load, temperature)"
         )
     return replace(found, covariance_factor=np.sqrt(spread) * found.covariance_factor)
 

@@ -92,7 +92,7 @@ def test_a_cell_without_a_number_is_taken_out_and_filled_in(cell, flexlink, refu
     last = flexlink("look", path).out.splitlines()[-1]
     assert last.startswith(f"{path}, line 2002: column 'y_rad' is")
     assert "delete such rows (1 here)" in last
-    assert "flexlink init fills the gap that this leaves" in refused("init", path, "--out", tmp_path / "a.toml")
+    assert "init fills the gap that this leaves" in refused("init", path, "--out", tmp_path / "a.toml")
     path.write_text("\n".join(["t_s,u_V,y_rad", *(row for row in rows if cell not in row.split(","))]) + "\n")
     seen = " ".join(flexlink("look", path).out.replace("│", " ").split())
     assert "1 row missing" in seen
