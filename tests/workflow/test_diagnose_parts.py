@@ -129,6 +129,21 @@ def test_an_answer_of_which_nothing_was_tried_names_none_of_the_candidates(verdi
 
 
 @pytest.mark.parametrize(
+    ("complete", "said"),
+    [
+        (0.745, "no significant model error"),
+        (0.009, "no candidate effect, but more remains than the threshold"),
+    ],
+)
+def test_no_model_error_is_significant_only_where_that_is_all(complete, said):
+    document = {
+        "detail_verdict": "none", "verdict": "none", "combination": [], "presence": {}, "shares": {},
+        "completeness": {"probability": complete},
+    }  # fmt: skip
+    assert short_answer(document) == said
+
+
+@pytest.mark.parametrize(
     ("name", "words", "unit"),
     [
         ("rate_per_s", "rate", "1/s"),

@@ -72,8 +72,13 @@ def short_answer(document: Mapping[str, Any]) -> str:
     if not present:
         if nothing_tried(document):
             return "no answer: nothing was tried"
-        none = "no significant model error" if "shares" in document else "no model error"
-        return none if document["verdict"] == "none" else "none of the candidate effects"
+        if document["verdict"] != "none":
+            return "none of the candidate effects"
+        if "shares" not in document:
+            return "no model error"
+        if document["completeness"]["probability"] < 0.5:
+            return "no candidate effect, but more remains than the threshold"
+        return "no significant model error"
     more = "" if document["completeness"]["probability"] >= 0.5 else ", and something else"
     unsure = " (ambiguous)" if document["detail_verdict"] == "ambiguous" else ""
     return listing([in_words(name) for name in present]) + unsure + more
