@@ -30,7 +30,7 @@ def doubts_about(case: PlantCase, deadline_s: float = np.inf) -> tuple[str, ...]
     Raises ValueError, one line: a simulation that is random beside its stated values.
     """
     plant = case.plant
-    found = list(doubtful_scales(case))
+    found = list(doubtful_columns(case))
     inputs = [e.input for e in case.estimation[:_RECORDS]]
     moved = plant.scaled({key: np.exp(min(t, _FARTHEST)) for key, t in plant.tolerances.items()})
     first, second = _outputs(moved, inputs[0]), _outputs(moved, inputs[0])
@@ -59,25 +59,41 @@ def doubts_about(case: PlantCase, deadline_s: float = np.inf) -> tuple[str, ...]
     return tuple(found)
 
 
-def doubtful_scales(case: PlantCase) -> tuple[str, ...]:
-    """Sentences on outputs that move as the nominal simulation does under the commands alone, but by a factor
-    more or less that no missing effect makes: a unit. The first halves may differ by their start."""
-    run, found = case.plant.replayed(()), []
-    pairs = [(run(e.input), e.output) for e in case.estimation[:_RECORDS]]
+def doubtful_columns(case: PlantCase) -> tuple[str, ...]:
+    """Sentences on outputs that move as the nominal simulation does under the commands alone, but the other
+    way round, as another output's does, or by a factor that no missing effect makes: a sign, columns that
+    are exchanged, a unit. The first halves may differ by their start."""
+    run, correlations, ratios = case.plant.replayed(()), [], []
+    for e in case.estimation[:_RECORDS]:
+        x, y = (
+            one[len(one) // 2 :] - np.mean(one[len(one) // 2 :], axis=0) for one in (run(e.input), e.output)
+        )
+        own, moved = np.linalg.norm(x, axis=0), np.linalg.norm(y, axis=0)
+        both = np.outer(own, moved)
+        correlations.append(np.divide(x.T @ y, both, out=np.zeros_like(both), where=both > 0))
+        ratios.append(np.divide(moved, own, out=np.ones_like(own), where=own > 0))
+    alike, ratio = np.median(correlations, axis=0), np.median(ratios, axis=0)
+    found = []
     for k, name in enumerate(case.outputs):
-        ratios = []
-        for simulated, measured in pairs:
-            x, y = (
-                one[len(one) // 2 :, k] - np.mean(one[len(one) // 2 :, k]) for one in (simulated, measured)
+        if abs(alike[k, k]) <= _FOLLOWED:
+            found += [
+                f"{name} of the simulation moves as the column of {case.outputs[j]} does, not as its own: "
+                "are columns exchanged?"
+                for j in range(len(case.outputs))
+                if alike[k, j] > _FOLLOWED and alike[k, k] < 0.5 * _FOLLOWED
+            ]
+            continue
+        if alike[k, k] < 0:
+            found.append(
+                f"{name} moves the other way round than in the simulation: is its sign, or its command's, "
+                "turned?"
             )
-            both = np.sqrt(np.sum(x**2) * np.sum(y**2))
-            if both > 0 and abs(np.sum(x * y)) > _FOLLOWED * both:
-                ratios.append(np.std(y) / np.std(x))
-        ratio = float(np.median(ratios)) if ratios else 1.0
-        if not LESS < ratio < FARTHER:
-            near = min(_FACTORS, key=lambda factor: abs(np.log(ratio / factor)))
-            unit = f"in {_FACTORS[near]}" if 0.5 < ratio / near < 2 else "in another unit"
-            found.append(f"{name} moves {ratio:.3g} times as far as in the simulation: is its column {unit}?")
+        if not LESS < ratio[k] < FARTHER:
+            near = min(_FACTORS, key=lambda factor: abs(np.log(ratio[k] / factor)))
+            unit = f"in {_FACTORS[near]}" if 0.5 < ratio[k] / near < 2 else "in another unit"
+            found.append(
+                f"{name} moves {ratio[k]:.3g} times as far as in the simulation: is its column {unit}?"
+            )
     return tuple(found)
 
 

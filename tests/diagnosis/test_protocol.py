@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
 from diagnosis.machine.machine_protocol import Weighing
-from diagnosis.machine.probed import doubts_about
+from diagnosis.machine.probed import doubtful_columns, doubts_about
 from examples import own_plant
 from plant import simulate
 from tests.diagnosis.synthetic_residuals import RIG, made, white
@@ -202,6 +203,11 @@ def _doubts(simulation, **how):
             {},
             ["y moves 57.3 times as far as in the simulation: is its column in degrees?"],
         ),
+        (
+            lambda p, e, u: _with_offset(e, -p["k"] * np.cumsum(u, axis=0) / 2),
+            {},
+            ["y moves the other way round than in the simulation"],
+        ),
         (lambda p, e, u: _with_offset(e, p["k"] * u), {"tolerances": {"k": 1.0}}, []),
     ],
 )
@@ -210,6 +216,20 @@ def test_what_makes_an_answer_doubtful_is_said(simulation, how, said):
     assert len(found) == len(said)
     for sentence, words in zip(found, said, strict=True):
         assert words in sentence
+
+
+def test_exchanged_columns_are_doubted():
+    moves = np.cumsum(np.random.default_rng(4).standard_normal((400, 2)), axis=0)
+    plant = SimpleNamespace(replayed=lambda effects: lambda u: moves)
+
+    def doubts(measured):
+        record = SimpleNamespace(input=moves, output=measured)
+        return doubtful_columns(SimpleNamespace(plant=plant, estimation=[record], outputs=("a", "b")))
+
+    assert doubts(0.7 * moves) == ()
+    first, second = doubts(moves[:, ::-1])
+    assert first.startswith("a of the simulation moves as the column of b does")
+    assert second.startswith("b of the simulation moves as the column of a does")
 
 
 def test_a_validation_record_that_was_fitted_validates_nothing():

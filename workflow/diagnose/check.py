@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.machine.probed import doubtful_scales
+from diagnosis.machine.probed import doubtful_columns
 from diagnosis.machine.telling import Telling, telling
 from workflow.diagnose.case_settings import case_document
 from workflow.diagnose.simulator_case import (
@@ -66,7 +66,7 @@ def of_case(loaded: SimulatorCase, found: Telling) -> RunSummary:
     case = loaded.case
     of = getattr(case.plant.simulation, "quantities", {})  # of MuJoCo, whose names have no units
     logs = [_log(loaded, k) for k in range(len(case.experiments))]
-    doubts = (*loaded.doubts, *doubtful_scales(case))
+    doubts = (*loaded.doubts, *doubtful_columns(case))
     alike = tuple(sorted(found.alike, key=lambda one: (len(one.names), one.left)))
     shown = dict(sorted(found.least.items(), key=lambda item: item[1]))
     first = replace(found, least=shown, alike=alike[:_MOST_SHOWN])
