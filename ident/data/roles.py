@@ -100,7 +100,7 @@ def roles_of(table: Table, log: str, command: str = "identify", **stated: str | 
     if not (output or reference) and (pair := _led_and_follower(table, outputs)):
         reference, options[1] = pair[0], ("--output", pair[1])
     options += [("--reference", reference)] if reference else []
-    times = [] if time else times_in(table)
+    times = [] if time else times_in(table) or rising(table)
     options += [("--time", time or times[0])] if time or times else [("--dt-s", "SECONDS")]
     typed = " ".join(f"{option} {shlex.quote(shown(value, 30))}" for option, value in options)
     raise ValueError(f"{table.path}: which columns? It has {listed}; type: flexlink {command} {log} {typed}")
@@ -197,6 +197,15 @@ def times_in(table: Table) -> list[str]:
     found = [name for name in table.names if is_time(table, name)]
     found = found or [name for name in table.names if ends_with_time(name) and _increases(table, name)]
     return found if len(found) < 2 else [name for name in found if _increases(table, name)] or found
+
+
+def rising(table: Table) -> list[str]:
+    """The first column if it increases by no whole numbers, as a row's number does: it may be time."""
+    return [
+        name
+        for name in table.names[:1]
+        if _increases(table, name) and np.any(table.columns([name])[name] % 1 != 0)
+    ]
 
 
 def time_of(table: Table) -> str | None:

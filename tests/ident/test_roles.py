@@ -81,6 +81,15 @@ def test_of_two_columns_without_a_known_name_the_follower_is_the_output():
         roles_with_reference(log, "a.csv", "init")
 
 
+def test_a_first_column_that_rises_may_be_time_but_a_rows_number_is_none():
+    for dt, typed in ((0.002, "--time a$"), (1.0, "--dt-s SECONDS$")):
+        log = Table(
+            "a.csv", {"a": np.arange(9) * dt, "u_V": np.arange(9) % 3, "b": np.arange(9) % 4}, units={}
+        )
+        with pytest.raises(ValueError, match=typed):
+            roles_of(log, "a.csv")
+
+
 def test_the_reference_of_a_voltage_may_be_what_drives_the_arm():
     assert roles_of(table("t_s", "u_ref_V", "hub_rad"), "a.csv") == Roles("t_s", "u_ref_V", "hub_rad")
 

@@ -18,7 +18,7 @@ from ident.data.finding import Finding, distinct
 from ident.data.record import Record
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response
-from ident.data.roles import Roles, is_position
+from ident.data.roles import Roles, is_position, rising
 from ident.data.table import Table
 from ident.data.time_grid import option_for
 from ident.data.wrapping import wraps_at
@@ -140,9 +140,9 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> Channel
         if stated.dt_s is not None and stated.time is None:
             roles = replace(roles, time=None)
         if roles.time is None and stated.dt_s is None:
-            raise ValueError(
-                f"no column looks like time: type flexlink {command} {typed} --dt-s SECONDS, or --time NAME"
-            )
+            named = shlex.quote(next(iter(rising(tables[0])), "NAME"))
+            ways = f"--dt-s SECONDS, or --time {named}"
+            raise ValueError(f"no column looks like time: type flexlink {command} {typed} {ways}")
     options = [_stamps(table, roles, stated.time_unit) for table in tables]
     steps = [float(text.split()[1]) for text in options if text.startswith("--resample-s")]
     how = replace(
