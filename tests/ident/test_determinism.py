@@ -94,16 +94,6 @@ def assert_same(first, second, what):
             pytest.fail(f"{what}: {name} differs", pytrace=False)
 
 
-@pytest.mark.slow
-def test_fits_do_not_depend_on_what_ran_before_or_who_compiled(tmp_path):
-    """Three roads to the same bytes: a process that compiles everything for these fits, one that finds that
-    compiled and has done everything else before, and one with another order of compilation."""
-    fits, others = "print(json.dumps(the_fits()))", "everything_else(); "
-    compiling = in_a_fresh_process(tmp_path / "a", fits)
-    assert_same(compiling, in_a_fresh_process(tmp_path / "a", others + fits), "compiled, after other fits")
-    assert_same(compiling, in_a_fresh_process(tmp_path / "b", others + fits), "compiled by others")
-
-
 @pytest.fixture(scope="module")
 def fresh():
     """The fits of a fresh process, and what was compiled there."""
@@ -116,6 +106,14 @@ def test_a_fit_in_a_used_process_is_that_of_a_fresh_one(fresh):
     everything_else()
     assert_same(here, the_fits(), "before and after other fits")
     assert_same(here, fresh[0], "this process against a fresh one")
+
+
+@pytest.mark.slow
+def test_fits_do_not_depend_on_who_compiled(fresh, tmp_path):
+    """The fresh process does these fits first and finds everything compiled; here everything is compiled
+    anew, for other fits before them."""
+    others_first = in_a_fresh_process(tmp_path, "everything_else(); print(json.dumps(the_fits()))")
+    assert_same(fresh[0], others_first, "compiled by others")
 
 
 def compiled():

@@ -189,9 +189,12 @@ def refusal(arguments: list[str], folder: Path) -> str | None:
     return line if code == 2 else None
 
 
-# A fault that one damage in forty (of a directory: in twenty) shows is found by `all` of a kind with 95 %.
+# A fault that one damage in forty (of a directory: in twenty) shows is found by all of a kind with 95 %.
 # benchmarks/damaged_files.py goes on with these seeds, to one in 150 and one in a hundred.
-FEW_AND_ALL = pytest.mark.parametrize("amount", ["few", pytest.param("all", marks=pytest.mark.slow)])
+@pytest.fixture
+def few(pytestconfig: pytest.Config) -> bool:
+    """`make test`, which leaves out what is slow, tries the first of all."""
+    return "not slow" in pytestconfig.option.markexpr
 
 
 KINDS = (
@@ -363,18 +366,15 @@ def spoilt_controllers(count: int) -> Tally:
     return tally(attempt, count, 98)
 
 
-@FEW_AND_ALL
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.usefixtures("cut_off")
-def test_spoilt_files_are_refused_or_taken(kinds, tmp_path, kind, amount):
-    count = 12 if amount == "few" else 120
-    assert spoilt_files(kinds[kind], KINDS.index(kind), tmp_path, count).wrong == []
+def test_spoilt_files_are_refused_or_taken(kinds, tmp_path, kind, few):
+    assert spoilt_files(kinds[kind], KINDS.index(kind), tmp_path, 12 if few else 120).wrong == []
 
 
-@FEW_AND_ALL
 @pytest.mark.usefixtures("cut_off", "undrawn")
-def test_tampered_run_directories(fast_run, tmp_path, amount):
-    assert tampered(run_output(fast_run[0]), tmp_path, 8 if amount == "few" else 60, 99).wrong == []
+def test_tampered_run_directories(fast_run, tmp_path, few):
+    assert tampered(run_output(fast_run[0]), tmp_path, 8 if few else 60, 99).wrong == []
 
 
 @pytest.fixture(scope="module")
@@ -385,12 +385,11 @@ def replayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Output
 
 
 @pytest.mark.usefixtures("undrawn")
-@FEW_AND_ALL
-def test_tampered_studies_and_diagnoses(replayed, tmp_path, monkeypatch, amount):
+def test_tampered_studies_and_diagnoses(replayed, tmp_path, monkeypatch, few):
     outputs, replay = replayed
     monkeypatch.setattr(LocalProcesses, "run", replay)
     for number, one in enumerate(outputs.values(), 96):
-        assert tampered(one, tmp_path, 12 if amount == "few" else 60, number).wrong == []
+        assert tampered(one, tmp_path, 12 if few else 60, number).wrong == []
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
@@ -400,9 +399,8 @@ def test_damaged_logs(tmp_path, damage):
     assert damaged_logs(damage, tmp_path, 5, binary=0.2).wrong == []
 
 
-@FEW_AND_ALL
-def test_spoilt_controllers(amount):
-    assert spoilt_controllers(50 if amount == "few" else 1000).wrong == []
+def test_spoilt_controllers(few):
+    assert spoilt_controllers(50 if few else 1000).wrong == []
 
 
 @pytest.mark.parametrize(

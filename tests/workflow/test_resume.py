@@ -204,15 +204,15 @@ def test_c_code_stays_as_it_was_asked_for(fast_run, tmp_path):
 
 @pytest.mark.slow
 def test_stopped_again_and_again_it_ends_with_the_same_files(tmp_path):
-    """A kill and interrupts at random moments, continued as the line says: benchmarks/interruptions.py makes
-    many, of studies and diagnoses too."""
-    ways = (KILLS[1], *INTERRUPTS[-2:])
+    """A kill and an interrupt at random moments, continued as the line says: benchmarks/interruptions.py
+    makes many, of studies and diagnoses too."""
+    ways = (KILLS[1], INTERRUPTS[-1])
     # In a process like those that are stopped: this one has other compiled variants of the kernels in memory.
     whole = undisturbed(RUN, tmp_path / "whole")
     found = stopped(print, RUN, tmp_path / "run", whole, ways, len(ways), len(ways), seed=15).values()
     assert [line for one in found for line in one.bad] == []
     assert sum(one.stops for one in found) >= len(ways)
-    assert sum(one.past_the_end for one in found) < len(ways) / 2
+    assert sum(one.past_the_end for one in found) < len(ways)
 
 
 def test_a_run_leaves_its_controller(fast_run, tmp_path):
