@@ -171,12 +171,12 @@ def test_bad_input_is_refused(plant):
 
 
 @pytest.mark.slow
-def test_ellipses_cover_and_pole_deviations_are_right_over_60_seeds(plant):
+def test_ellipses_cover_and_pole_deviations_are_right_over_many_seeds(plant):
     grid = np.geomspace(0.5, 300, 200)
     truth, response = plant.response(grid), plant.response(OMEGA)
     true = np.concatenate([TRUE_DECAY, TRUE_OMEGA, P2_ZETA])
     hits, scores, right = [], [], 0
-    for seed in range(60):
+    for seed in range(34):
         found = identify_frf(measured(response, 1000 + seed))
         poles = found.model.poles
         hits.append(found.posterior.at(grid).contains(truth))
@@ -186,10 +186,10 @@ def test_ellipses_cover_and_pole_deviations_are_right_over_60_seeds(plant):
         estimate = np.concatenate([poles.decay_per_s(DT_S), poles.omega_rad_s(DT_S), poles.zeta()])
         deviation = np.concatenate([found.decay_std_per_s, found.omega_std_rad_s, found.zeta_std])
         scores.append((estimate - true) / deviation)
-    assert right >= 57
+    assert right >= 33
     covered = np.array(hits)
-    # Responses of one seed are smooth: about 15 independent frequencies each, sd of the mean 0.8 %.
+    # Responses of one seed are smooth: about 15 independent frequencies each, sd of the mean 1.0 %.
     assert covered.mean() == pytest.approx(0.95, abs=0.025)
-    assert covered.mean(axis=0).min() > 0.82  # 4.6 sd of a binomial
-    # 60 draws: the sampling error of a standard deviation is 9 %; 4 of those.
+    assert covered.mean(axis=0).min() > 0.82  # 3.5 sd of a binomial
+    # 34 draws: the sampling error of a standard deviation is 12 %; 3 of those.
     np.testing.assert_allclose(np.std(scores, axis=0), 1.0, atol=0.36)

@@ -210,7 +210,7 @@ def test_error_rates_of_the_verdicts(colour):
 
     Measured over 40 seeds: one of 80 records with a true prior refused in white noise, two in AR(1) 0.9.
     """
-    seeds = range(20)
+    seeds = range(10)
 
     def record(truth, seed):
         white = np.random.default_rng(1000 + seed).normal(size=truth.clean.size + 500)
