@@ -15,10 +15,13 @@ from validation.blind.rigs import rig_toml
 from validation.blind.truth import Truth
 
 
-def recorded_case(folder, rig="rig.toml"):
+def recorded_case(folder, rig="rig.toml", without=()):
+    """without: beginnings of names of records that are left out."""
     meta = tomllib.loads((folder / "case.toml").read_text(encoding="utf-8"))
     experiments = []
     for entry in meta["experiments"]:
+        if entry["file"].startswith(tuple(f"experiments/{name}" for name in without)):
+            continue
         data = np.loadtxt(folder / entry["file"], delimiter=",", skiprows=1)
         experiments.append(Experiment(entry["file"], entry["role"], data[:, 1], data[:, 2:4], entry["kind"]))
     return Case(folder.name, Rig.from_toml(folder / rig), tuple(experiments))

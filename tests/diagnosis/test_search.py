@@ -8,10 +8,13 @@ import pytest
 from diagnosis import diagnose
 from tests.diagnosis.recorded import answer, recorded_case
 
+# Of four estimation records, where all of them take half a minute: what is sought is found without these.
+SPARE = ("01_", "03_")
 
-def _diagnosed(gap_cases, name, rig):
+
+def _diagnosed(gap_cases, name, rig, without=()):
     folder = gap_cases / "labelled" / name
-    return diagnose(recorded_case(folder, rig)), answer(folder)
+    return diagnose(recorded_case(folder, rig, without)), answer(folder)
 
 
 @pytest.mark.parametrize(
@@ -25,7 +28,7 @@ def _diagnosed(gap_cases, name, rig):
     ],
 )
 def test_one_effect_is_named_sized_and_closes_the_gap(gap_cases, name, rig):
-    found, truth = _diagnosed(gap_cases, name, rig)
+    found, truth = _diagnosed(gap_cases, name, rig, SPARE if name == "backlash" else ())
     assert found.verdict == "effect"
     assert found.combination == (name,)
     assert found.effects[0].name == name
@@ -66,7 +69,7 @@ def test_an_effect_outside_the_list_is_unknown(gap_cases):
 
 @pytest.mark.slow
 def test_two_effects_are_told_apart(gap_cases):
-    found, truth = _diagnosed(gap_cases, "coulomb_friction_and_tip_payload", "rig_uncertain.toml")
+    found, truth = _diagnosed(gap_cases, "coulomb_friction_and_tip_payload", "rig_uncertain.toml", SPARE)
     assert set(found.combination) == {"coulomb_friction", "tip_payload"}
     assert {found.effects[0].name, found.effects[1].name} == set(found.combination)
     assert min(entry.presence for entry in found.effects[:2]) > 0.9

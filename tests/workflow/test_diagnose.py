@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from benchmarks.fleet import write_fleet
 from diagnosis.fit.residual import pooled_rms
 from plant import EFFECTS, Rig, parse_effects, simulate
 from plant.effects.joint import GroundSpring
@@ -466,21 +467,19 @@ def test_a_process_that_dies_is_that_cases_failure(cases, tmp_path):
 
 @pytest.mark.slow
 def test_killed_and_resumed_ends_with_the_same_bytes(tmp_path):
-    cases = [
-        write_case(tmp_path / name, FRICTION, seed=k, records=2, samples=160)
-        for k, name in enumerate(("one", "two"))
-    ]
+    short = {"records": 2, "samples": 160}
+    cases = *write_fleet(tmp_path / "fleet", 1, samples=90), write_case(tmp_path / "arm", FRICTION, **short)
     quiet, killed = tmp_path / "quiet", tmp_path / "killed"
     call = ("diagnose", *cases, "--jobs", 1, "--no-controller", "--out")
     finish(start_flexlink(*call, quiet))
     process = start_flexlink(*call, killed)
-    wait_until((killed / "one.json").exists, process)
+    wait_until((killed / "unit-0000.json").exists, process)
     time.sleep(2.0)  # the second case is being computed
     kill(process)
-    assert not (killed / "two.json").exists()
-    before = (killed / "one.json").stat().st_mtime_ns
+    assert not (killed / "arm.json").exists()
+    before = (killed / "unit-0000.json").stat().st_mtime_ns
     finish(start_flexlink(*call, killed, "--resume"))
-    assert (killed / "one.json").stat().st_mtime_ns == before
+    assert (killed / "unit-0000.json").stat().st_mtime_ns == before
     assert everything(killed) == everything(quiet)
 
 
