@@ -12,8 +12,10 @@ title = "small"
 base = "{FAST_ARM}"
 
 [changes]
+"achievable_performance.compute" = false
 "closed_loop.draws" = 2
 "closed_loop.conditions" = false
+"closed_loop.sensitivity" = false
 
 [[axes]]
 key = "specification.bandwidth_rad_s"

@@ -18,16 +18,11 @@ from pathlib import Path
 import pytest
 
 from tests.workflow.command import ROOT, start_flexlink, wait_until
-from tests.workflow.study_examples import SMALL_STUDY, TWO_POINTS, assert_same_study, write_study
+from tests.workflow.study_examples import TWO_POINTS, assert_same_study, write_study
 from workflow.engine.errors import StageError
 from workflow.engine.executor import SILENT_S, DaskCluster
 from workflow.study.settings import load_study
 from workflow.study.work import run_study
-
-# As many points as the small study, without what adds nothing to where they are computed.
-FAR = SMALL_STUDY.replace(
-    "[changes]", '[changes]\n"achievable_performance.compute" = false\n"closed_loop.sensitivity" = false'
-)
 
 
 def free_port() -> int:
@@ -83,7 +78,7 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
 
 def far_study(folder: Path, address: str) -> tuple[Path, tuple[object, ...]]:
     """A study as a file, and the arguments that run it on the scheduler at this address."""
-    study = write_study(folder, FAR)
+    study = write_study(folder)
     return study, ("study", "--config", study, "--out", folder / "out", "--scheduler", address)
 
 
@@ -91,7 +86,7 @@ def far_study(folder: Path, address: str) -> tuple[Path, tuple[object, ...]]:
 def near(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same study computed here."""
     folder = tmp_path_factory.mktemp("near")
-    run_study(load_study(write_study(folder, FAR)), folder / "near", jobs=2)
+    run_study(load_study(write_study(folder)), folder / "near", jobs=2)
     return folder / "near"
 
 
