@@ -89,19 +89,13 @@ def _rounded(case, step):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "rig", "step", "others"),
-    [
-        ("none", "rig.toml", 4.2e-3, set()),
-        ("tip_payload", "rig.toml", 2e-3, {"tip_payload"}),
-        ("tip_payload", "rig_uncertain.toml", 2e-3, {"tip_payload"}),
-    ],
+    ("name", "step", "others"), [("none", 4.2e-3, set()), ("tip_payload", 2e-3, {"tip_payload"})]
 )
-def test_rounded_records_name_quantisation_beside_the_rest(gap_cases, name, rig, step, others):
-    found = diagnose(_rounded(recorded_case(gap_cases / "labelled" / name, rig), step))
+def test_rounded_records_name_quantisation_beside_the_rest(gap_cases, name, step, others):
+    found = diagnose(_rounded(recorded_case(gap_cases / "labelled" / name), step))
     assert found.verdict == "effect"
     assert set(found.combination) == {"quantisation", *others}
-    if rig == "rig.toml":  # stated values that may move take most of the payload's gap
-        assert found.effects[0].name == (name if others else "quantisation")
+    assert found.effects[0].name == (name if others else "quantisation")
     assert found.probabilities[found.effects[0].name] > 0.9
     assert sum(found.probabilities.values()) == pytest.approx(1.0)
     (rounding,) = (e for e in found.effects if e.name == "quantisation")

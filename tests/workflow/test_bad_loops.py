@@ -238,7 +238,6 @@ def before_lag(signal, a):
     ("change", "said"),
     [
         pytest.param(lambda one, k: {"y": behind_lag(one["y"], 0.9)}, UNEXPLAINED, marks=pytest.mark.slow),
-        pytest.param(lambda one, k: {"u": behind_lag(one["u"], 0.9)}, UNEXPLAINED, marks=pytest.mark.slow),
         # The drive lags: what turns the motor is the command behind a filter.
         pytest.param(lambda one, k: {"u": before_lag(one["u"], 0.7)}, UNEXPLAINED, marks=pytest.mark.slow),
         pytest.param(lambda one, k: {"u": log(10 + k)["u"]}, "'enc_rad'", marks=pytest.mark.slow),
@@ -251,7 +250,6 @@ def before_lag(signal, a):
     ],
     ids=[
         "filtered position",
-        "filtered command",
         "lagging drive",
         "command of another axis",
         "late command",
