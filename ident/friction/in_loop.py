@@ -208,7 +208,7 @@ def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: R
         if not logs.worth(tried) < logs.worth(found):  # a pair more in place of a delay is no better
             break
         found = tried
-    return found
+    return _without_needless_stribeck(logs, found)
 
 
 def _of_structure(logs: _Logs, options: IdentOptions) -> list[tuple[IdentOptions, FrictionFit]]:
@@ -394,6 +394,21 @@ def _with_stribeck(logs: _Logs, found: FrictionFit) -> FrictionFit:
     return best if best.law.excess > 0 and better else found
 
 
+def _without_needless_stribeck(logs: _Logs, found: FrictionFit) -> FrictionFit:
+    """The same without friction that falls with speed, where that is no longer worth its two parameters: it
+    was let in before dead time and further poles were known, and makes the level uncertain."""
+    law = found.law
+    if not law.excess > 0:
+        return found
+    plain = replace(found, law=replace(law, level=law.level + law.excess, excess=0.0, fall=np.inf))
+    with suppress(LostError):
+        for _ in range(_STRIBECK_STEPS):
+            plain = _stepped(logs, plain)
+        if logs.errors(plain) * (1 - 2 * logs.criterion) < logs.errors(found):
+            return plain
+    return found
+
+
 def _with_friction_beyond(logs: _Logs, found: FrictionFit, few: IdentOptions) -> FrictionFit:
     """The same with friction on the other side of the first spring, where that is worth its parameter. The
     spring is read off the arm once more when most of the friction is known, which bends the arm's zero."""
@@ -432,7 +447,7 @@ def precedes_command(found: FrictionFit, records: Sequence[Record], options: Ide
             errors.append(logs.errors(_in_turns(logs, found, same, _FEW_ROUNDS)))
         except LostError:
             errors.append(np.inf)
-    return errors[1] < _MUCH_BETTER * errors[0]
+    return errors[1] < _MUCH_BETTER * min(errors[0], _Logs.of(records).errors(found))
 
 
 def identify_behind(
