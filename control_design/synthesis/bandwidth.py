@@ -46,16 +46,20 @@ def synthesise_widest(
     low_rad_s = options.omega_min_rad_s or min(lowest_rad_s(plant.dt_s, plant.poles) for plant in plants)
     root, quick = int(rng.integers(2**63)), options.model_copy(update=_QUICK | {"omega_min_rad_s": low_rad_s})
 
+    searches = [False, True]  # where no fit is stable, the bandwidth may still be met
+
     def gamma(one: Specification) -> float:
         tell(0.0, f"bandwidth {one.bandwidth_rad_s:.3g} rad/s")
-        for thorough in (False, True):  # where no fit is stable, the bandwidth may still be met
+        for thorough in tuple(searches):
             try:
                 found = synthesise(plants, one, quick, rng=np.random.default_rng(root), thorough=thorough)
             except SpecificationError:
                 return np.inf
             if np.isfinite(found.gamma):
-                break
-        return found.gamma
+                return found.gamma
+        # What nothing stabilises, nothing stabilises at another bandwidth: the last design looks once more.
+        searches[1:] = []
+        return np.inf
 
     low, high = 0, len(tried) - 1  # all from `high` on are met, or nothing is known of the last
     while low < high:

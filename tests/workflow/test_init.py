@@ -375,7 +375,7 @@ def test_one_move_of_two_coupled_links_asks_for_another_experiment(
     # At which of a dozen poles the fit with friction ends is up to last digits; what was asked is never met.
     answer = flexlink("run", "--config", out, "--out", tmp_path / "out")
     if answer.code == 2:
-        refusal = r"response = ['\"]as recorded|check columns, wiring and unit"
+        refusal = r"flexlink excite --closed-loop LOG|check columns, wiring and unit"
         assert re.search(refusal, answer.err.splitlines()[-1])
     else:
         assert answer.code == 3 or "not for the specified" in answer.out
