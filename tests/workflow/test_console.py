@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import threading
 import time
 
 import numba
@@ -37,13 +38,17 @@ def test_the_first_word_comes_at_once(capfd):
 
 
 def test_nothing_is_told_after_the_end(monkeypatch):
-    said = []
-    monkeypatch.setattr(
-        console.TerminalProgress, "_say", lambda told, line: (time.sleep(0.3), said.append(line))
-    )
+    begun, said = threading.Event(), []
+
+    def say(told, line):
+        begun.set()
+        time.sleep(0.3)
+        said.append(line)
+
+    monkeypatch.setattr(console.TerminalProgress, "_say", say)
     with console.TerminalProgress() as told:
         told.update("reading", 0.0)
-        time.sleep(console.FIRST_LINE_S + 0.1)  # it is being said
+        assert begun.wait(60.0)
     assert len(said) == 1
     assert not told._teller.is_alive()
 
