@@ -72,28 +72,29 @@ def doubtful_columns(case: PlantCase) -> tuple[str, ...]:
         both = np.outer(own, moved)
         correlations.append(np.divide(x.T @ y, both, out=np.zeros_like(both), where=both > 0))
         ratios.append(np.divide(moved, own, out=np.ones_like(own), where=own > 0))
-    alike, ratio = np.median(correlations, axis=0), np.median(ratios, axis=0)
+    alike, ratio = np.array(correlations), np.array(ratios)
     found = []
     for k, name in enumerate(case.outputs):
-        if abs(alike[k, k]) <= _FOLLOWED:
+        told = np.abs(alike[:, k, k]) > _FOLLOWED  # false where the simulation runs away
+        if not np.any(told):
+            row = np.median(alike[:, k], axis=0)
             found += [
-                f"{name} of the simulation moves as the column of {case.outputs[j]} does, not as its own: "
-                "are columns exchanged?"
-                for j in range(len(case.outputs))
-                if alike[k, j] > _FOLLOWED and alike[k, k] < 0.5 * _FOLLOWED
+                f"{name} of the simulation moves as the column of {other} does, not as its own: are columns "
+                "exchanged?"
+                for other, value in zip(case.outputs, row, strict=True)
+                if value > _FOLLOWED and row[k] < 0.5 * _FOLLOWED
             ]
             continue
-        if alike[k, k] < 0:
+        if np.median(alike[:, k, k]) < -_FOLLOWED:
             found.append(
                 f"{name} moves the other way round than in the simulation: is its sign, or its command's, "
                 "turned?"
             )
-        if not LESS < ratio[k] < FARTHER:
-            near = min(_FACTORS, key=lambda factor: abs(np.log(ratio[k] / factor)))
-            unit = f"in {_FACTORS[near]}" if 0.5 < ratio[k] / near < 2 else "in another unit"
-            found.append(
-                f"{name} moves {ratio[k]:.3g} times as far as in the simulation: is its column {unit}?"
-            )
+        times = float(np.median(ratio[told, k]))
+        if not LESS < times < FARTHER:
+            near = min(_FACTORS, key=lambda factor: abs(np.log(times / factor)))
+            unit = f"in {_FACTORS[near]}" if 0.5 < times / near < 2 else "in another unit"
+            found.append(f"{name} moves {times:.3g} times as far as in the simulation: is its column {unit}?")
     return tuple(found)
 
 

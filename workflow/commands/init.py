@@ -15,6 +15,7 @@ import tomlkit
 from markupsafe import Markup
 
 from ident.data.finding import Finding, distinct
+from ident.data.foreign_files import shown
 from ident.data.record import Record
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response
@@ -140,7 +141,7 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> Channel
         if stated.dt_s is not None and stated.time is None:
             roles = replace(roles, time=None)
         if roles.time is None and stated.dt_s is None:
-            named = shlex.quote(next(iter(rising(tables[0])), "NAME"))
+            named = shlex.quote(shown(next(iter(rising(tables[0])), "NAME"), 30))
             ways = f"--dt-s SECONDS, or --time {named}"
             raise ValueError(f"no column looks like time: type flexlink {command} {typed} {ways}")
     options = [_stamps(table, roles, stated.time_unit) for table in tables]
