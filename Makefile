@@ -16,13 +16,14 @@ export OPENBLAS_NUM_THREADS := 1
 export NO_MKDOCS_2_WARNING := 1
 # A process a core, from two to four: each takes .8 GB.
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$((n < 2 ? 2 : n > 4 ? 4 : n)))
-PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -q
+# Times of all tests are kept: `python -m benchmarks.durations` tells where they go.
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -q --junitxml=build/tests.xml
 
-.PHONY: help install run test test-all lint types wheel dist check docs clean
+.PHONY: help install run test test-all test-long lint types wheel dist check docs clean
 
 help:
 	@echo "make run    install into .venv and run the default arm end to end (OUT=$(OUT))"
-	@echo "make test   everything that guards behaviour   make test-all   with the long Monte Carlo"
+	@echo "make test   everything that guards behaviour   make test-all   with what takes longer   make test-long   Monte Carlo"
 	@echo "make docs   the documentation as a site, build/site/index.html, with a gallery of pages"
 	@echo "make wheel  a wheel with the newest dependencies, tried on every Python from 3.11 to 3.13 that is here"
 	@echo "make dist   wheel and source archive in build/dist, the same bytes from the same commit"
@@ -55,10 +56,15 @@ run: $(STAMP)
 	$(BIN)/flexlink run --out $(OUT) --replace
 
 test: $(STAMP) $(PACKAGES)
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -m "not slow and not long"
 
 test-all: $(STAMP) $(PACKAGES)
-	$(PYTEST)
+	$(PYTEST) -m "not long" --durations=100 --durations-min=1
+
+# Monte Carlo that decides nothing from day to day: hours apart, its results kept with commit and seeds.
+test-long: $(STAMP) $(PACKAGES)
+	$(PYTEST) -m long --junitxml=build/long.xml
+	$(BIN)/python -m benchmarks.durations --junit build/long.xml --name long_tests
 
 lint: $(PACKAGES)
 	$(BIN)/ruff check .
