@@ -26,10 +26,11 @@ from ident.data.foreign_files import distinct
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
 from ident.data.nonparametric import empirical_frf
-from ident.data.record import Record as PlainRecord
+from ident.data.record import Record as PlainRecord, in_one_unit
 from ident.data.settings import Settings
 from ident.data.signal_filter import band_limited
 from ident.data.table import Table
+from ident.data.units import refuse_step
 from ident.frequency_fit import identify_frf
 from ident.identification import Identification as Identified, MimoIdentification as MimoIdentified
 from ident.one_input import identify as identify_records
@@ -137,6 +138,7 @@ class Record(Shown, PlainRecord):
             reference_names=_listed(reference_names),
             **more,
         )
+        refuse_step(self.label, self.dt_s, self.output, self.time_column)
 
     @classmethod
     def from_file(cls, path: Any, inputs: Any, outputs: Any, *, references: Any = (), **more: Any) -> Self:
@@ -198,11 +200,12 @@ class GobfModel(Shown, PlainModel):
 
     def save(self, path: str | Path) -> None:
         """Write poles, coefficients and state space to a .json or .mat file, as `identify --export` does."""
+        from workflow.engine.storage import write_bytes
         from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
 
         if Path(path).suffix.lower() not in MODEL_SUFFIXES:
             raise ValueError(f"{path}: expected a file name that ends in {' or '.join(MODEL_SUFFIXES)}")
-        Path(path).write_bytes(model_bytes(Path(path), ModelFile(self)))
+        write_bytes(Path(path), model_bytes(Path(path), ModelFile(self)))
 
 
 def _listed(names: str | Sequence[str]) -> tuple[str, ...]:
@@ -559,7 +562,7 @@ def _records(records: Any) -> tuple[PlainRecord, ...]:
             f"expected a flexlink.Record or several, got {type(records).__name__}: "
             "flexlink.Record(u=u, y=y, dt_s=dt_s)"
         )
-    return tuple(used)
+    return tuple(in_one_unit(used))
 
 
 def _records_of(identification: Any, records: Any) -> tuple[PlainRecord, ...]:

@@ -72,15 +72,18 @@ def too_little_memory() -> str:
 
 
 class _Told(io.TextIOWrapper):
-    """Standard error: a full disk or a terminal that is gone ends no computation; the exit code tells."""
+    """A stream whose loss ends no computation: of standard error any, of standard output a reader that has
+    left. Files are written all the same, and the exit code tells."""
+
+    forgiven: type[OSError] = OSError
 
     def write(self, text: str) -> int:
-        with suppress(OSError):
+        with suppress(self.forgiven):
             super().write(text)
         return len(text)
 
     def flush(self) -> None:
-        with suppress(OSError):
+        with suppress(self.forgiven):
             super().flush()
 
 
@@ -102,12 +105,13 @@ def usable_streams() -> None:
                 mode = "r" if number == 0 else "w"
                 setattr(sys, name, os.fdopen(number, mode, encoding="utf-8", closefd=False))
     codecs.register_error("flexlink", _plainer)
-    if isinstance(old := sys.stderr, io.TextIOWrapper):
-        encoding, errors = old.encoding, old.errors
-        sys.stderr = _Told(old.detach(), encoding, errors, line_buffering=True)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper) and stream.errors in ("strict", "surrogateescape"):
-            stream.reconfigure(errors="flexlink")
+    for name, forgiven in (("stdout", BrokenPipeError), ("stderr", OSError)):
+        if isinstance(old := getattr(sys, name), io.TextIOWrapper):
+            encoding, by_line = old.encoding, old.line_buffering or name == "stderr"
+            errors = "flexlink" if old.errors in ("strict", "surrogateescape") else old.errors
+            told = _Told(old.detach(), encoding, errors, line_buffering=by_line)
+            told.forgiven = forgiven
+            setattr(sys, name, told)
 
 
 def _plainer(error: UnicodeError) -> tuple[str, int]:

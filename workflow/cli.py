@@ -956,9 +956,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _interrupted(arguments)
     except CommandInterruptedError as error:
         return _interrupted(arguments, error.out)
-    except BrokenPipeError:
-        _no_more_output()  # whoever read it has left; there is nobody to tell
-        return EXIT_OK
     except Exception as error:
         if interrupts.came():  # this is what a library has made of it
             return _interrupted(arguments)

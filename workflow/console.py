@@ -155,18 +155,11 @@ class TerminalProgress(progress.Progress):
             self._bar.console.print(f"  {escape(stage):<12} {words}", highlight=False)
 
 
-class _Output(Console):
-    """Standard output; a reader that left is the caller's business (rich would leave with code 1)."""
-
-    def on_broken_pipe(self) -> None:
-        raise BrokenPipeError
-
-
 def print_summary(summary: RunSummary) -> None:
     """The table of numbers on standard output, and the verdict where it is no complaint on standard error."""
     # A pipe has no width; 120 columns keep the rows on one line there, where COLUMNS does not say less.
     told = sys.stdout.isatty() or "COLUMNS" in os.environ
-    console = _Output(file=sys.stdout, width=None if told else 120)
+    console = Console(file=sys.stdout, width=None if told else 120)
     table = Table(title=_text(summary.title), title_justify="left", show_header=False, pad_edge=False)
     table.add_column("section", style="bold")
     table.add_column("quantity")

@@ -133,13 +133,14 @@ STREAMS = {
     "stdout closed": ({}, ">&-"),
     "both closed": ({}, ">&- 2>&-"),
     "all closed": ({}, "<&- >&- 2>&-"),
-    "reader leaves": ({}, "| head -1"),
+    "reader leaves": ({}, "| head -0"),
 }
 
 
 # Text and JSON in every encoding that differs between them; of closed streams each once.
 @pytest.mark.parametrize(
-    ("kind", "more"), [("ascii", "--json"), ("C locale", "--json"), *((kind, "") for kind in STREAMS)]
+    ("kind", "more"),
+    [(kind, "--json") for kind in ("ascii", "C locale", "reader leaves")] + [(kind, "") for kind in STREAMS],
 )
 def test_any_kind_of_output_will_do(kind, more, tmp_path):
     (tmp_path / "l°g.csv").write_text(PRINTS_A_TABLE)
@@ -155,6 +156,16 @@ def test_any_kind_of_output_will_do(kind, more, tmp_path):
     if not streams:
         text = done.stdout.decode("latin-1" if kind == "latin-1" else "ascii")
         assert json.loads(text) if more else "_" in text and "hub_angle_rad" in text
+
+
+@pytest.mark.parametrize("how", ["-h", "--version", "look -h", "gone"])
+def test_a_reader_that_has_left_changes_no_exit_code(how):
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "workflow", *how.split()]
+    done = subprocess.run(command, cwd=ROOT, stdout=writing, stderr=subprocess.PIPE, check=False)
+    os.close(writing)
+    assert (done.returncode, done.stderr.count(b"\n")) == ((2, 1) if how == "gone" else (0, 0)), done.stderr
 
 
 def test_too_little_memory_is_said_before_anything_is_loaded(tmp_path):

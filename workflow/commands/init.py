@@ -87,7 +87,7 @@ def init(
 ) -> RunSummary:
     """Write the configuration of one channel of these logs. Raises InputError, one line."""
     storage.refuse_in_the_way(logs, [("--out", out)])
-    if out.exists() and not replace_file:
+    if out.is_file() and not replace_file:
         raise InputError(f"{out} exists: take another --out, or --replace to write over it")
     stated = stated or Reading()
     read = read_channel("init", logs, stated)

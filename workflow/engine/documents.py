@@ -24,7 +24,7 @@ _LOGS = (".csv", ".tsv", ".npz", ".mat", ".xlsx", ".parquet", ".h5", ".hdf5", ".
 
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
     """UTF-8 text of a file. Raises InputError naming it."""
-    with cannot("read", path), open(path, "rb", opener=_at_once) as stream:
+    with cannot("read", path), open(path, "rb", opener=at_once) as stream:
         content = stream.read(most_bytes + 1)  # pipes have no size: one byte more than is allowed
     if len(content) > most_bytes:
         raise InputError(f"{path}: larger than {most_bytes / 2**20:g} MiB")
@@ -34,9 +34,9 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
         raise InputError(f"{path}: not UTF-8 text (byte {error.start})") from error
 
 
-def _at_once(path: str, flags: int) -> int:
-    # Else a pipe that nobody writes to is waited for.
-    descriptor = os.open(path, flags | os.O_NONBLOCK)
+def at_once(path: str, flags: int) -> int:
+    """Open what is there; a pipe without anybody at its other end is not waited for. Raises OSError."""
+    descriptor = os.open(path, flags & ~os.O_CREAT | os.O_NONBLOCK)
     os.set_blocking(descriptor, True)
     return descriptor
 

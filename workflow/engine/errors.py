@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from errno import ENXIO
 from pathlib import Path
 
 EXIT_OK = 0  # all done
@@ -88,7 +89,8 @@ def cannot(do: str, path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(f"cannot {do} {path}: {error.strerror or error}") from error
+        reason = "a pipe or socket that nobody reads" if error.errno == ENXIO else error.strerror or error
+        raise InputError(f"cannot {do} {path}: {reason}") from error
 
 
 @contextmanager

@@ -10,6 +10,7 @@ import hashlib
 import io
 import json
 import os
+import stat
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -36,27 +37,42 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 def write_together(contents: Mapping[Path, bytes]) -> None:
     """Replace files that belong together: none where the disk has no room for all of them, each atomically.
+    Of a link the file that it names is replaced; a device or pipe gets its content before.
 
     Raises InputError (one line) where the disk refuses.
     """
-    temporary = {path: _temporary(path) for path in contents}
+    places = {path: place for path in contents if (place := _replaced(path)) is not None}
+    temporary = {path: _temporary(place) for path, place in places.items()}
     try:
-        for path, content in contents.items():
-            with cannot("write", path), open(temporary[path], "wb") as stream:
-                stream.write(content)
+        for path, whole in temporary.items():
+            with cannot("write", path), open(whole, "wb") as stream:
+                stream.write(contents[path])
                 stream.flush()
                 os.fsync(stream.fileno())
-        for path in contents:
+        for path in contents.keys() - places.keys():
+            with cannot("write", path), open(path, "wb", opener=documents.at_once) as stream:
+                stream.write(contents[path])
+        for path, whole in temporary.items():
             with cannot("write", path):
-                os.replace(temporary[path], path)
+                os.replace(whole, places[path])
     except BaseException:
         for leftover in temporary.values():
             with suppress(OSError):  # what went wrong first is what is said
                 leftover.unlink(missing_ok=True)
         raise
-    for folder in {path.parent for path in contents}:
+    for folder in {place.parent for place in places.values()}:
         with cannot("write", folder):
             _flush_directory(folder)
+
+
+def _replaced(path: Path) -> Path | None:
+    """The regular file, there or not, that a new one takes the place of; links are followed. None for what is
+    written into: devices, pipes, files without a name (of /proc). Raises InputError."""
+    target = Path(os.path.realpath(path))
+    with cannot("write", path), suppress(FileNotFoundError):
+        if not stat.S_ISREG(path.stat().st_mode) or not target.exists():
+            return None
+    return target
 
 
 def _temporary(path: Path) -> Path:
@@ -74,27 +90,33 @@ def try_out(path: Path) -> None:
 
 def check_writable(path: Path) -> None:
     """Refuse an output file before the work is done: its directory must be there and take new files."""
-    parent = path.absolute().parent
-    if path.is_dir():
-        raise InputError(f"cannot write {path}: it is a directory")
-    if not parent.is_dir():
-        raise InputError(f"cannot write {path}: {parent} is not a directory")
+    place = _replaced(path)
     with cannot("write", path):
-        try_out(path)
+        if path.is_dir():
+            raise InputError(f"cannot write {path}: it is a directory")
+        if place is None:
+            if not os.access(path, os.W_OK):
+                raise InputError(f"cannot write {path}: permission denied")
+        elif not place.parent.is_dir():
+            raise InputError(f"cannot write {path}: {place.parent} is not a directory")
+        elif path.exists() and os.path.samestat(path.stat(), os.fstat(1)):
+            raise InputError(f"cannot write {path}: standard output goes there already")
+        else:
+            try_out(place)
 
 
 def refuse_in_the_way(read: Iterable[Path], written: Iterable[tuple[str, Path]]) -> None:
     """Refuse, before the work is done, a file that is read twice, and an output (option, file) that is read,
     another output, or out of reach."""
-    seen: dict[Path, str] = {}
+    seen = dict[str, str]()
     for path in read:
-        if path.resolve() in seen:
+        if (place := os.path.realpath(path)) in seen:
             raise InputError(f"{path}: given twice; every source counts once")
-        seen[path.resolve()] = "a source"
+        seen[place] = "a source"
     for option, target in written:
-        if target.resolve() in seen:
-            raise InputError(f"{option} {target}: that is {seen[target.resolve()]} already")
-        seen[target.resolve()] = option
+        if (place := os.path.realpath(target)) in seen:
+            raise InputError(f"{option} {target}: that is {seen[place]} already")
+        seen[place] = option
         check_writable(target)
 
 

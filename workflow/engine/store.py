@@ -7,6 +7,7 @@ anybody else is ever touched.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -42,7 +43,7 @@ class Store:
         nothing can be written there."""
         with cannot("write", self.path):
             ancestor = self.path.absolute()
-            while not ancestor.exists():
+            while not os.path.lexists(ancestor):
                 ancestor = ancestor.parent
             if not ancestor.is_dir():
                 raise InputError(f"cannot write {self.path}: {ancestor} is not a directory")
