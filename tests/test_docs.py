@@ -86,7 +86,11 @@ def run_command(command: str, flexlink: Callable[..., Answer]) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("name", CONSOLE)
+@pytest.mark.parametrize(
+    "name",
+    # The margins of the same run are held by test_margins.py.
+    [pytest.param(n, marks=pytest.mark.slow) if n == "margins_in_ci.md" else n for n in CONSOLE],
+)
 @pytest.mark.usefixtures("examples_alone")
 def test_commands_of_a_page_print_what_it_says(name, flexlink):
     if name == "c_code.md" and shutil.which("gcc") is None:
@@ -183,6 +187,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_site_is_built_whole_and_asks_no_network(site):
     made = {str(page.relative_to(site)) for page in site.rglob("*.html")}
     assert {
@@ -201,6 +206,7 @@ def test_the_site_is_built_whole_and_asks_no_network(site):
         assert fetched == [], page.name
 
 
+@pytest.mark.slow
 def test_the_search_works_in_pages_that_are_opened_as_files(site, browser):
     browser.open(site / "theory" / "arm.html")
     browser.ask("document.querySelector('#__search').click()")

@@ -540,7 +540,7 @@ def test_a_plant_module_of_the_users_own_is_not_taken_for_ours(tmp_path):
     (tmp_path / "plant.py").write_text("raise RuntimeError('not ours')\n")
     for arguments in (
         ["-c", "import flexlink; flexlink.paper_link()"],
-        ["-c", "from flexlink.__main__ import main; import workflow.commands.run"],
+        ["-c", "from flexlink.__main__ import main; from plant.presets import paper_link"],
     ):
         done = subprocess.run(
             [sys.executable, *arguments],
