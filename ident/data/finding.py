@@ -42,6 +42,7 @@ class FindingKind(Enum):
     WRAPS = auto()
     LONG_STEPS = auto()
     UNIT_CONTRADICTED = auto()
+    UNIT_CONVERTED = auto()
     UNIT_OF_LOOP = auto()
     UNIT_OF_REFERENCE = auto()
     FEW_SAMPLES = auto()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import Self, TypeVar
 
@@ -11,10 +11,11 @@ import numpy as np
 
 from ident.data.arrays import RealArray, readonly
 from ident.data.finding import Finding, FindingKind, finding
+from ident.data.foreign_files import shown
 from ident.data.record_files import read_table
 from ident.data.table import LARGEST, Table
 from ident.data.time_grid import CoarseGrid, Repair, TimeGrid, clock_doubts, sampling_time
-from ident.data.units import TimeColumn, contradicted_by_loop
+from ident.data.units import TimeColumn, contradicted_by_loop, per, refuse_step
 from ident.data.wrapping import unwrapped, wraps_at
 
 T = TypeVar("T")
@@ -31,7 +32,7 @@ class Record:
     empty or one per column. name: shown to the user; source: the file, named in error messages. time_column:
     what time stamps were taken for, None where dt_s was given without. repair: what was done to rows that
     jittered or were missing. cut: samples of the commanded input beyond what the amplifier gives (`limited`).
-    notes: how the file was read.
+    notes: how the file was read. own_units: by column, what the file says, before anything is stated.
 
     Raises ValueError if a shape or a name does not fit, dt_s is not positive, or a sample is not finite or
     above 1e100 (names the first one).
@@ -52,6 +53,7 @@ class Record:
     repair: Repair | None = None
     cut: int = 0
     notes: tuple[Finding, ...] = ()
+    own_units: Mapping[str, str] = field(default_factory=dict, metadata={"since": 2})
 
     def __post_init__(self) -> None:
         for key in ("input_names", "output_names", "reference_names", "input_units", "output_units"):
@@ -254,6 +256,10 @@ class Record:
                     finding(FindingKind.LONG_STEPS, record=str(table.path), name=item, share=longest)
                 )
         notes = (*doubtful, *reading_notes(table, columns, inputs, outputs))
+        step = dt_s if stamps is None else float(np.median(np.diff(stamps))) if stamps.size > 1 else None
+        if step is not None and step > 0:
+            moved = np.column_stack([columns[item] for item in outputs])
+            refuse_step(str(table.path), step, moved, time_column)
         grid: TimeGrid | CoarseGrid | None = None
         if resample_s is not None:
             if time is None or stamps is None or dt_s is not None:
@@ -300,6 +306,13 @@ class Record:
             time_column=time_column,
             repair=None if grid is None else grid.repair,
             notes=notes,
+            own_units={
+                item: f"{scale[item]:g} * {table.unit(item)}"
+                if item in scale
+                else units.get(item, table.unit(item))
+                for item in wanted
+                if table.unit(item)
+            },
         )
 
 
@@ -323,6 +336,53 @@ def reading_notes(
         if period := wraps_at(columns[name]):
             found.append(finding(FindingKind.WRAPS, record=record, name=name, period=period))
     return tuple(found)
+
+
+def in_one_unit(records: Sequence[Record]) -> list[Record]:
+    """Records of one set, each column in the unit that it has in the first that says one; a note says what
+    was converted. Raises ValueError, one line, for units that are not of one quantity."""
+    first, found = dict[str, tuple[str, str]](), list[Record]()
+    for record in records:
+        named = (*record.input_names, *record.output_names)
+        units = dict(zip(named, (*record.input_units, *record.output_units), strict=False))
+        units |= record.own_units
+        factors, notes = dict[str, float](), list[Finding]()
+        for name, unit in ((name, unit) for name, unit in units.items() if unit):
+            wanted, whose = first.setdefault(name, (unit, record.label))
+            factor = 1.0 if unit == wanted else per(unit, wanted)
+            if factor is None:
+                raise ValueError(
+                    f"{record.label}: '{shown(name, 40)}' is in {shown(unit, 30)}, in {whose} in "
+                    f"{shown(wanted, 30)}; expected one unit in all logs that are read together: convert "
+                    f"one, or state --unit {shown(name, 40)}=UNIT if a header is wrong"
+                )
+            if factor != 1.0:
+                factors[name], units[name] = factor, wanted
+                told = {"record": record.label, "name": name, "unit": unit, "of": wanted, "times": factor}
+                notes.append(finding(FindingKind.UNIT_CONVERTED, **told))
+        found.append(_converted(record, factors, units, notes) if factors else record)
+    return found
+
+
+def _converted(
+    record: Record, factors: Mapping[str, float], units: Mapping[str, str], notes: Iterable[Finding]
+) -> Record:
+    def times(signal: RealArray, names: Sequence[str]) -> RealArray:
+        return signal * [factors.get(name, 1.0) for name in names]
+
+    def said(names: Sequence[str]) -> tuple[str, ...]:
+        return tuple(units.get(name, "") for name in names) if any(map(units.get, names)) else ()
+
+    return replace(
+        record,
+        input=times(record.input, record.input_names),
+        output=times(record.output, record.output_names),
+        reference=None if record.reference is None else times(record.reference, record.reference_names),
+        input_units=said(record.input_names),
+        output_units=said(record.output_names),
+        own_units=units,
+        notes=(*record.notes, *notes),
+    )
 
 
 def in_groups(items: Iterable[T], alike: Callable[[T, T], bool]) -> list[list[T]]:

@@ -12,7 +12,16 @@ import numpy as np
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.foreign_files import shown
 from ident.data.table import Table
-from ident.data.units import TIME_UNITS, ends_with_time, follows_as_it_stands, per, says_time, scaled_by
+from ident.data.units import (
+    COUNTED,
+    TIME_UNITS,
+    ends_with_time,
+    follows_as_it_stands,
+    kind_of,
+    per,
+    says_time,
+    scaled_by,
+)
 
 _INPUT = re.compile(
     r"(u|v|input|command|commanded|cmd|drive|voltage|spannung|current|strom|torque|moment|force|pwm|duty)(?![a-z])",
@@ -37,8 +46,9 @@ _TEXTBOOK = re.compile(r"r", re.I)
 _ERROR = re.compile(r"(^|[^a-z])(e|err|error|fehler|abweichung|regelabweichung|residual)(?![a-z])", re.I)
 # Of a PLC's variable, its type: rVoltage, lrAngle.
 _PREFIX = re.compile(r"^(l?r|f|n|i|di|ui|w)(?=[A-Z])")
-_DRIVEN = re.compile(r"[mkµμ]?(V|A|N|Nm)")
-_MOVED = re.compile(r"[mµμ]?(rad|deg|m)((/|_)s2?|/s\^2|/s²)?|°|grad|[cm]m|rpm|u/min|counts?|ticks?", re.I)
+# Units by their kind.
+_DRIVEN = frozenset({"V", "A", "N", "Nm"})
+_MOVED = frozenset(f"{kind}{rate}" for kind in ("rad", "m", *COUNTED - {"%"}) for rate in ("", "/s", "/s2"))
 # Least correlation of the changes of a set point and of what follows it.
 _FOLLOWS = 0.5
 # Of what changes per time.
@@ -113,7 +123,7 @@ def roles_with_reference(table: Table, log: str, command: str, **stated: str | N
     if stated.get("reference"):
         return replace(roles_of(table, log, command, **stated), reference=stated["reference"])
     moving = [name for name in table.names if _is_signal(table, name) and name not in stated.values()]
-    wished = [name for name in moving if _is_wished(table, name) and not _DRIVEN.fullmatch(table.unit(name))]
+    wished = [name for name in moving if _is_wished(table, name) and kind_of(table.unit(name)) not in _DRIVEN]
     drives = [name for name in moving if _says(table, name, _DRIVEN, _INPUT)]
     if not (stated.get("input") or set(drives) - set(wished)):
         wished = [name for name in wished if name not in drives]
@@ -234,7 +244,7 @@ def _is_signal(table: Table, name: str) -> bool:
 def is_position(name: str, unit: str) -> bool:
     """Whether an output is a position by its unit, else by its name; not its speed or acceleration."""
     if unit:
-        return _RATE.search(unit) is None
+        return "/" not in kind_of(unit) and _RATE.search(unit) is None
     return _RATE_NAME.search(name) is None
 
 
@@ -244,11 +254,11 @@ def _is_wished(table: Table, name: str) -> bool:
     return _WISHED.search(apart) is not None or _TEXTBOOK.fullmatch(bare) is not None
 
 
-def _says(table: Table, name: str, unit: re.Pattern[str], word: re.Pattern[str]) -> bool:
+def _says(table: Table, name: str, kinds: frozenset[str], word: re.Pattern[str]) -> bool:
     """What the unit says, where there is one; else what the name does."""
     stated = table.unit(name)
     if stated:
-        return unit.fullmatch(stated) is not None
+        return kind_of(stated) in kinds
     # Of a topic, /cmd/voltage, and of a PLC's variable, PLC_PRG.rVoltage, the last word counts too.
     last = re.split(r"[/.]", name)[-1]
     return any(word.match(part) for part in (name, last, _PREFIX.sub("", last)))

@@ -16,7 +16,7 @@ from ident.data.arrays import RealArray
 from ident.data.foreign_files import as_numbers, shown
 from ident.data.text_tables import Layout, doubtful_groups, is_number, number
 from ident.data.time_stamps import StampError, is_stamp, may_be_minutes, seconds_since_first
-from ident.data.units import SIGNAL_WORDS, TimeColumn, is_unit, written_unit
+from ident.data.units import SIGNAL_WORDS, TimeColumn, per, size_of, written_unit
 
 # Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
 LARGEST = 1e100
@@ -80,12 +80,22 @@ class Table:
         unit = self.units.get(name, "") or written_unit(name)
         return SIGNAL_WORDS.get(unit.lower(), unit)
 
+    def times_for(self, name: str, unit: str) -> float:
+        """What makes of a column a quantity in this unit: 0.01745 of deg for rad, 1 where the file says none.
+        Raises ValueError for a unit of something else, or one that is not known."""
+        own = self.unit(name)
+        factor = per(own, unit) if own and own != unit else 1.0
+        if factor is None:
+            raise ValueError(
+                f"column {name!r} is in {shown(own, 30)}: state what makes it {unit} (scale = ...)"
+            )
+        return factor
+
     def contradiction(self, name: str) -> str:
         """The two units of a signal whose name says another one than the file does beside it, else empty."""
         beside, written = self.units.get(name, ""), written_unit(name)
-        both = [SIGNAL_WORDS.get(unit.lower(), unit).replace("_", "/").lower() for unit in (beside, written)]
-        known = is_unit(beside) and is_unit(written.replace("/", "_"))
-        return f"{written} and {beside}" if known and both[0] != both[1] else ""
+        both = size_of(beside), size_of(written)
+        return f"{written} and {beside}" if all(both) and both[0] != both[1] else ""
 
     def columns(self, wanted: Sequence[str], rows_of: str | None = None) -> dict[str, RealArray]:
         """The wanted columns as equally long finite vectors; dates and clock times in seconds. With clocks,
@@ -221,7 +231,7 @@ class Table:
             return self._clock_seconds(name, stamps, unit)
         try:
             column = TimeColumn.of(name, unit, self.units.get(name, ""))
-            column.refuse_dates(float(stamps[0]) if stamps.size else 0.0)
+            column.refuse_stamps(stamps)
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from None
         doubtful = column.doubtful_for(stamps)
@@ -237,7 +247,7 @@ class Table:
             )
         if unit is not None and not (doubt and unit in ("h", "min")):
             raise ValueError(f"{self.path}: '{shown(name)}' holds clock times; they have no unit")
-        return (stamps / 60 if unit == "min" else stamps), TimeColumn(name, "s", "s")
+        return (stamps / 60 if unit == "min" else stamps), TimeColumn(name, "s", "s", stated=True)
 
     def _since_first(self, name: str, stamps: RealArray) -> RealArray:
         """Stamps; of integers and text with more digits than doubles keep what passed since the first."""

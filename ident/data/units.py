@@ -35,24 +35,40 @@ TIME_UNITS = {spelling: unit for unit, spellings in _SPELLED.items() for spellin
 """The unit of each spelling in lower case; values: s, ms, us, ns, min, h, d."""
 KNOWN_TIME_UNITS = tuple(_SPELLED)
 
-# Of signals, where no bracket says that it is a unit: a name's last letters must be no other word.
-_SIGNAL = re.compile(
-    r"[mukµμM]?(V|A|N|Nm|rad|W|Hz|Pa)|[cmuµμk]?m|deg|rpm|(rad|deg|m|mm)(_s|/s|_s2|/s2|/s\^2|/s²)|°|%"
+# Of signals: the first of their kind, how many of it one is, and spellings. Counts of each sort stand alone.
+_SIGNALS = (
+    ("V", 1.0, "V volt volts"),
+    ("A", 1.0, "A ampere amperes amp amps"),
+    ("N", 1.0, "N newton newtons"),
+    ("rad", 1.0, "rad radian radians"),
+    ("rad", np.pi / 180, "deg degree degrees"),
+    *(
+        ("rad", np.pi / 180, "° grad"),
+        ("m", 1.0, "m meter metre meters metres"),
+        ("m", 0.0254, "inch inches"),
+    ),
+    ("rad", 2 * np.pi, "rev revs rot rots turn turns rotation rotations revolution revolutions"),
+    *(("Nm", 1.0, "Nm N·m N*m"), ("W", 1.0, "W"), ("Hz", 1.0, "Hz"), ("Pa", 1.0, "Pa"), ("%", 1.0, "%")),
+    *(("counts", 1.0, "counts count cnts cnt"), ("inc", 1.0, "inc increments increment")),
+    *(("steps", 1.0, "steps step"), ("ticks", 1.0, "ticks tick"), ("pulses", 1.0, "pulses pulse imp")),
+    ("1", 1.0, "1"),
 )
+COUNTED = frozenset({"counts", "inc", "steps", "ticks", "pulses", "%"})
+"""Kinds of units whose size only the machine knows."""
+_SIZES = {word: (kind, size) for kind, size, words in _SIGNALS for word in words.split()}
 # Words for them, as instruments write them in a line of units.
-SIGNAL_WORDS = {
-    **dict.fromkeys(("volt", "volts"), "V"),
-    **dict.fromkeys(("ampere", "amperes", "amp", "amps"), "A"),
-    **dict.fromkeys(("degree", "degrees"), "deg"),
-    **dict.fromkeys(("radian", "radians"), "rad"),
-    **dict.fromkeys(("newton", "newtons"), "N"),
-}
+SIGNAL_WORDS = {word: words.split()[0] for _, _, words in _SIGNALS[:5] for word in words.split()[1:]}
+_PREFIXES = {"n": 1e-9, "u": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
+_PREFIXED = re.compile(r"([nuμmckM])(V|A|N|Nm|rad|m|W|Hz|Pa)")
+_RATE = re.compile(r"(.*?)(/|_|_?per_?)([^\W\d_]+)(?:\^?([23]))?")
+_OWN_NAMES = {"rpm": "rev/min", "u/min": "rev/min", "1/min": "rev/min", "rps": "rev/s", "dps": "deg/s"}
+# Where no bracket says that it is a unit, a name's last letters must be no other word.
+_BARE = re.compile(r"[mukµμM]?(V|A|N|Nm|rad|W|Hz|Pa)|[cmuµμk]?m|deg|rpm|rps|dps|°|%")
 _BRACKETED = re.compile(r"\[([^\[\]]*)\]\s*$|\(([^()]*)\)\s*$")
 _BRACKETS = re.compile(r"[\[({<【〔]([^\[\](){}<>【】〔〕]*)[\])}>】〕]")
 # timeMs is time and Ms, TimeUS is Time and US.
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
 _WORD = re.compile(r"[^\W\d_]+")
-_GLUED = re.compile(r"(?:t|time|timestamp)((?:[mun]|milli|micro|nano)s(?:ecs?|econds?)?|secs?|seconds?)")
 # A number just before a word, or behind it: 0.1 ms, 100us, sec/1000; not that of a word, as in t0 ms.
 _FACTOR = re.compile(
     r"(?<![^\W_])(?<![.,])\d[\d.,]*(?:e[+-]?\d+)?\s*[x*·]?\s*([^\W\d_]+)|([^\W\d_]+)\s*[/x*·^]\s*\d",
@@ -62,6 +78,19 @@ _TIME_WORD = re.compile(
     r"t|ts|time|zeit|uhrzeit|timestamps?|zeitstempel|zeitpunkt|elapsed|clock|stamp|temps|tiempo|tempo|date|datum|"
     r"datetime|время|时间|時間"
 )
+# A unit without a blank behind a word for time, 'elapsedms', 'tms'; not the plural 'times'.
+_LONG_UNITS = "|".join(sorted((unit for unit in TIME_UNITS if len(unit) > 1), key=len, reverse=True))
+_GLUED = re.compile(
+    rf"(t(?!min|[hdt])|[^\W\d_]*(?:{_TIME_WORD.pattern.removeprefix('t|ts|')}))({_LONG_UNITS}|(?<=\w\w\w\w)[hm])"
+)
+# The prefix of a second that stands apart: 'm s', 'time_milli', 'milli seconds'.
+_APART = re.compile(
+    r"(?<![^\W\d_])(milli|micro|nano)(?:[\s_.-]*s(?:ec(?:ond)?s?)?)?(?![^\W\d_])", re.IGNORECASE
+)
+# Behind the word for time: of minutes or seconds, or a transpose of MATLAB.
+_PRIME = re.compile(r"""^[^'"]*[^\W_]['"′″]+$""")
+# A factor on what has its unit in brackets: [ns]/1000.
+_CHANGED = re.compile(r"[\])}>]\s*[/x*·^]\s*\d|^[\d.,e+-]+\s*[x*·]")
 # What stands beside these and says nothing of the unit.
 _NO_UNIT = re.compile(
     r"in|of|to|by|at|on|up|no|nr|id|ch|io|pc|ab|is|since|start|begin|epoch|unix|posix|utc|gmt|ce?s?t|local|rel|abs|"
@@ -74,11 +103,6 @@ _COUNTS = re.compile(
 )
 _AFTER = re.compile(r"\sin\s+(\S+)\s*$|^\w+\s*/\s*(\w+)\s*$")
 
-# Units of one quantity, each in the first of its kind; a rate has them before its stroke.
-_SIZES = {
-    "rad": ("rad", 1.0), "mrad": ("rad", 1e-3), **dict.fromkeys(("deg", "°", "grad"), ("rad", np.pi / 180)),
-    "m": ("m", 1.0), "cm": ("m", 1e-2), "mm": ("m", 1e-3),
-}  # fmt: skip
 # By how much a signal is larger in another unit.
 _TIMES = ((180 / np.pi, "degrees and radians"), (1e3, "mm and m"))
 # Where a loop follows best: lowest lines with this share of the reference's power, so many at least.
@@ -89,6 +113,10 @@ _FOLLOWS, _COHERENT = 1.3, 0.5
 # A log of more samples than this, with steps of at least so many seconds, is rather one in milliseconds.
 _MANY_SAMPLES = 1000
 _LONG_STEP_S = 0.5  # machines are logged faster than twice a second
+# No machine is logged with shorter steps, nor one whose motion the samples show with longer ones.
+_SHORTEST_S, _LONGEST_S = 1e-6, 1.0
+# Share of a motion's power in its steps: 2 of samples that have nothing to do with each other.
+_RESOLVED = 1.0
 # Seconds since 1970 of the years 2001 and 2100: stamps in between, in whatever unit, are dates.
 _DATES_S = (978_307_200.0, 4_102_444_800.0)
 # No clock counts 3000 years.
@@ -110,28 +138,25 @@ class UnitEvidence:
         texts = [beside.strip("[](){}<> "), *_BRACKETS.findall(name)]
         said, strange = dict[str, str](), ""
         for text in (text for text in texts if _WORD.search(text)):
-            words = [word.lower() for word in _words(text)]
-            units = ["d"] if words == ["d"] else [TIME_UNITS[word] for word in words if word in TIME_UNITS]
-            known = units or all(_TIME_WORD.fullmatch(word) or _NO_UNIT.fullmatch(word) for word in words)
-            if not known or (units and re.search(r"\d", text)):
+            words, units = _words_and_units(text)
+            words, units = ([], ["d"]) if words == ["d"] else (words, units)
+            odd = [word for word in words if not (word in TIME_UNITS or _means_nothing(word))]
+            if (odd and (not units or min(map(len, odd)) <= 2)) or (units and re.search(r"\d", text)):
                 strange = strange or text
             said |= dict.fromkeys(units, text)
         outside = _BRACKETS.sub(" ", name)
-        words = [word.lower() for word in _words(outside)]
-        if any(word.lower() in TIME_UNITS for found in _FACTOR.findall(outside) for word in found):
-            strange = strange or outside.strip()
-        units = [TIME_UNITS[word] for word in words if word in TIME_UNITS]
-        if not units and not said and not strange:
-            # After the word for time a short one is rather a unit than a name: t_m, time_cs.
-            strange = next(
-                (
-                    word
-                    for k, word in enumerate(words)
-                    if _COUNTS.fullmatch(word)
-                    or (k and len(word) <= 2 and not (_TIME_WORD.fullmatch(word) or _NO_UNIT.fullmatch(word)))
-                ),
-                "",
-            )
+        words, units = _words_and_units(outside)
+        factors = [word.lower() for found in _FACTOR.findall(outside) for word in found]
+        if _PRIME.search(name) or (said and _CHANGED.search(name)) or set(factors) & TIME_UNITS.keys():
+            strange = strange or name
+        if not strange:
+            # After the word for time a short one is rather a unit, or its prefix, than a name: t_m, time_cs.
+            short = [
+                word for k, word in enumerate(words) if k and len(word) <= 2 and not _means_nothing(word)
+            ]
+            short = [word for word in short if word not in TIME_UNITS and (not units or word in _PREFIXES)]
+            counts = [] if units else [word for word in words if _COUNTS.fullmatch(word)]
+            strange = "" if said else next(iter((*counts, *short)), "")
         for unit in units:
             said.setdefault(unit, name)
         if strange:
@@ -142,31 +167,47 @@ class UnitEvidence:
 
 
 def _words(text: str) -> list[str]:
-    """The words of a name, without digits; a unit that is glued to the word for time is one of its own."""
-    found = []
-    for part in _CAMEL.split(text):
-        for word in _WORD.findall(part.replace("_", " ")):
+    """The words of a name in lower case, without digits; a unit that is glued to the word for time is one of
+    its own."""
+    text = _APART.sub(lambda found: {"milli": "ms", "micro": "us", "nano": "ns"}[found[1].lower()], text)
+    found = list[str]()
+    for whole in _WORD.findall(text.replace("_", " ")):
+        for word in (
+            [whole] if whole.lower() in TIME_UNITS or _GLUED.fullmatch(whole.lower()) else _CAMEL.split(whole)
+        ):
             glued = _GLUED.fullmatch(word.lower())
-            found += ["t", glued[1]] if glued else [word]
+            found += [glued[1], glued[2]] if glued else [word.lower()]
     return found
 
 
+def _words_and_units(text: str) -> tuple[list[str], list[str]]:
+    """Words as of `_words`, and the units of time that are among them; 'm s' is one."""
+    whole = re.sub(r"[\s._-]", "", text).lower()
+    words = [whole] if whole in TIME_UNITS else _words(text)
+    return words, [TIME_UNITS[word] for word in words if word in TIME_UNITS]
+
+
+def _means_nothing(word: str) -> bool:
+    return _TIME_WORD.fullmatch(word) is not None or _NO_UNIT.fullmatch(word) is not None
+
+
 def says_time(name: str) -> bool:
-    """Whether a name is one of time: 'Zeit', '__time', 'timeMs', 'millis', 'us since start'."""
-    words = [word.lower() for word in _words(unicodedata.normalize("NFKC", name))]
+    """Whether a name is one of time: 'Zeit', 'timeMs', 'millis', 'us since start'; not 'counts_s'."""
+    words = _words(unicodedata.normalize("NFKC", name))
     return bool(words) and (
         _TIME_WORD.fullmatch(words[0]) is not None
         or (
             all(word in TIME_UNITS or _NO_UNIT.fullmatch(word) or _COUNTS.fullmatch(word) for word in words)
             and any(word in TIME_UNITS for word in words)
+            and not kind_of(written_unit(name)).endswith("/s")
         )
     )
 
 
 def ends_with_time(name: str) -> bool:
-    """Whether a name may be one of time: 'host_time', 'rosbagTimestamp', but also 'cycle_time'."""
-    words = [word.lower() for word in _words(name)]
-    return bool(words) and re.fullmatch(r"time|timestamp|stamp|zeit|clock", words[-1]) is not None
+    """Whether a name may be one of time: 'host_time', 'uptimems', 'bagTimestamp', but also 'cycle_time'."""
+    words = [word for word in _words(name) if word not in TIME_UNITS]
+    return bool(words) and re.fullmatch(r"\w*(time|timestamp|stamp|zeit|clock)", words[-1]) is not None
 
 
 @dataclass(frozen=True)
@@ -208,25 +249,41 @@ class TimeColumn:
             )
         return cls(name, evidence.unit or "s", evidence.unit)
 
-    def refuse_dates(self, first: float) -> None:
-        """Raise ValueError where stamps that begin with this number are dates of this century in another unit
-        than the one taken, or no time of any clock."""
-        others = [
-            unit
-            for unit in ("s", "ms", "us", "ns")
-            if _DATES_S[0] <= first / _PER_SECOND[unit] <= _DATES_S[1] and unit != self.unit
-        ]
-        if not self.stated and first > 0 and float(self.seconds(np.array(first))) > _NO_CLOCK_S:
-            taken = "no unit is stated" if not self.in_header else f"its unit is said to be {self.unit}"
-            looks = (
-                f"{others[0]} since 1970: state --time-unit {others[0]}"
-                if others
-                else ("another unit: state it with --time-unit, or give --dt-s SECONDS instead of --time")
-            )
+    def refuse_stamps(self, stamps: RealArray) -> None:
+        """Raise ValueError where stamps are no time of any clock, dates of this century in another unit than
+        the one taken, or have steps that are too short for a machine."""
+        if self.stated or not stamps.size:
+            return
+        first, taken = float(stamps[0]), f"its unit is said to be {self.in_header}"
+        taken = taken if self.in_header else "no unit is stated"
+        if first > 0 and float(self.seconds(np.array(first))) > _NO_CLOCK_S:
+            looks = [
+                f"{unit} since 1970: state --time-unit {unit}"
+                for unit in _PER_SECOND
+                if self._dates(first, unit)
+            ]
+            looks += ["another unit: state it with --time-unit, or give --dt-s SECONDS instead of --time"]
             raise ValueError(
                 f"time column '{shown(self.name, 60)}' begins with {first:.6g}, {taken}; this looks "
-                f"like {looks}"
+                f"like {looks[0]}"
             )
+        written = float(np.median(np.diff(stamps))) if stamps.size > 2 else 0.0
+        step_s = float(self.seconds(np.array(written)))
+        # Where nobody says seconds, what makes less than a second in days is rather that: Excel, datenum.
+        if 0 < step_s < (_SHORTEST_S if self.in_header else 1.01 * _LONGEST_S / _SECONDS_PER["d"]):
+            likely = [
+                f"--time-unit {unit} (a step of {written * size:.4g} s)"
+                for unit, size in (_SECONDS_PER | {"s": 1}).items()
+                if unit != self.unit and 1e2 * _SHORTEST_S <= written * size <= 1.01 * _LONGEST_S
+            ]
+            raise ValueError(
+                f"time column '{shown(self.name, 60)}' has steps of {step_s:.4g} s, {taken}: no machine is "
+                f"logged that fast; state {' or '.join(likely[::-1]) or 'the right --time-unit'}, or "
+                f"--time-unit {self.unit} if it is right"
+            )
+
+    def _dates(self, first: float, unit: str) -> bool:
+        return unit != self.unit and _DATES_S[0] <= first / _PER_SECOND[unit] <= _DATES_S[1]
 
     def seconds(self, stamps: RealArray) -> RealArray:
         """The stamps in seconds."""
@@ -244,11 +301,63 @@ class TimeColumn:
         return integers or bool(step >= _LONG_STEP_S and stamps.size > _MANY_SAMPLES)
 
 
+def refuse_step(label: str, dt_s: float, output: RealArray, column: TimeColumn | None = None) -> None:
+    """Raise ValueError for a sampling time that no machine has: too short, or too long while the samples of
+    an output (T, Y) show its motion. column: where the time stamps come from; None: dt_s was given."""
+    if column is not None and column.stated:
+        return
+    spread = np.var(output, axis=0)
+    moves = (
+        np.any(np.mean(np.diff(output, axis=0) ** 2, axis=0) < _RESOLVED * spread)
+        if dt_s > _LONGEST_S
+        else False
+    )
+    if dt_s >= _SHORTEST_S and not moves:
+        return
+    if column is None:
+        rate = f"; of a rate of {dt_s:g} Hz it is {1 / dt_s:.6g}" if moves else ""
+        what = f"dt_s = {dt_s:g} is in seconds, and no machine is logged that {'slowly' if moves else 'fast'}"
+        raise ValueError(f"{label}: {what}{rate}; expected {_SHORTEST_S:g} to {_LONGEST_S:g} s")
+    unit = next((unit for unit in ("ms", "us", "ns") if dt_s < _LONG_STEP_S * _PER_SECOND[unit]), "ns")
+    said = f"its unit is said to be {column.in_header}" if column.in_header else "no unit is stated"
+    raise ValueError(
+        f"{label}: time column '{shown(column.name, 60)}' has steps of {dt_s:.4g} s, {said}: no machine that "
+        f"moves is logged that slowly; state --time-unit {unit}, or --time-unit {column.unit} if it is right"
+    )
+
+
+def size_of(unit: str) -> tuple[str, float] | None:
+    """Of what a unit is, 'rad' or 'rad/s', and how many of that one is: ('rad/s', 0.1047) of rpm. None where
+    it is not known."""
+    text = "".join(unicodedata.normalize("NFKC", unit).split())
+    text = _OWN_NAMES.get(text.lower(), text)
+    if text.lower() in TIME_UNITS:
+        own = TIME_UNITS[text.lower()]
+        return "s", 1 / _PER_SECOND[own] if own in _PER_SECOND else _SECONDS_PER[own]
+    if found := _SIZES.get(text) or _SIZES.get(text.lower() if len(text) > 2 else ""):
+        return found
+    if prefixed := _PREFIXED.fullmatch(text):
+        kind, size = _SIZES[prefixed[2]]
+        return kind, size * _PREFIXES[prefixed[1]]
+    rate = _RATE.fullmatch(text)
+    over, under = (size_of(rate[1] or "1"), size_of(rate[3])) if rate else (None, None)
+    if rate is None or over is None or under is None or under[0] != "s":
+        return None
+    # Behind an underscore only a second is sure: angle_deg_min is the least, ticks_ms counts milliseconds.
+    if rate[2] == "_" and under[1] != 1 and not (over == _SIZES["rev"] and under[1] == _SECONDS_PER["min"]):
+        return None
+    return f"{over[0]}/s{rate[4] or ''}", over[1] / under[1] ** int(rate[4] or 1)
+
+
+def kind_of(unit: str) -> str:
+    """Of what a unit is, as of `size_of`; empty where it is not known."""
+    return (size_of(unit) or ("",))[0]
+
+
 def per(unit: str, other: str) -> float | None:
     """How many of the other unit one is: 57.3 of rad and deg; None where they are not of one quantity."""
-    (first, *rate), (second, *same) = unit.split("/"), other.split("/")
-    (kind, size), (like, one) = _SIZES.get(first, ("", 0.0)), _SIZES.get(second, (" ", 1.0))
-    return size / one if (kind, rate) == (like, same) else None
+    one, like = size_of(unit), size_of(other)
+    return one[1] / like[1] if one and like and one[0] == like[0] else None
 
 
 def followed_times(reference: RealArray, output: RealArray) -> float | None:
@@ -287,7 +396,7 @@ def contradicted_by_loop(
     found = [(times if larger else 1 / times, like) for times, like in _TIMES]
     found = [(times, like) for times, like in found if 1 / _FOLLOWS < followed / times < _FOLLOWS]
     # The reference is in the wrong unit where the output's header says that of its numbers, or each its own.
-    small = _SIZES.get(units[1].split("/")[0], ("", 1.0))[1] < 1
+    small = (size_of(units[1]) or ("", 1.0))[1] < 1
     wrong = int(larger != small and not (all(units) and units[0] != units[1]))
     return tuple(
         finding(
@@ -314,10 +423,10 @@ def written_unit(name: str) -> str:
     if found:
         text = (found[1] if found[1] is not None else found[2]).strip()
         return "" if re.fullmatch(r"[\d.,:\s-]*", text) else text
-    suffixes = (name[found.end() :] for found in re.finditer("_", name))
-    unit = next((text for text in suffixes if is_unit(text)), "")
+    starts = (0, *(found.end() for found in re.finditer("_", name)))
+    unit = next((name[k:] for k in starts if is_unit(name[k:]) and (k or "/s" in kind_of(name))), "")
     if unit:
-        return unit.replace("_", "/")
+        return re.sub(r"^(?=/)", "1", re.sub(r"_?per_?|_", "/", unit))
     found = _AFTER.search(name)
     unit = (found[1] or found[2]) if found else ""
     return unit if is_unit(unit) else ""
@@ -325,4 +434,5 @@ def written_unit(name: str) -> str:
 
 def is_unit(text: str) -> bool:
     """Whether the word is a unit that headers use: of time, or of a signal."""
-    return text.lower() in TIME_UNITS or text.lower() in SIGNAL_WORDS or _SIGNAL.fullmatch(text) is not None
+    known = text.lower() in TIME_UNITS or text.lower() in SIGNAL_WORDS or _BARE.fullmatch(text) is not None
+    return known or "/s" in kind_of(text)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+import flexlink
 from ident.data.finding import FindingKind
 from ident.data.record import Record
 from ident.data.record_files import read_table
@@ -35,6 +36,17 @@ T_S, U, Y = DT_S * K, 1.5 * (-1.0) ** (K // 3), 0.125 * K
         *[(name, "", "s") for name in ("timeSeconds", "in s", "t, s", "Zeit in Sekunden", "elapsed sec")],
         *[("t/ms", "", "ms"), ("time msec", "", "ms"), ("t [min]", "", "min"), ("Time (Sec)", "", "s")],
         *[(name, "", "") for name in ("t", "time", "__time", "t[0]", "Time (UTC)", "time_stamp", "Uhrzeit")],
+        *[
+            (name, "", "ms")
+            for name in ("elapsedms", "time_milli", "Time (mS)", "t [m s]", "zeitms", "uptimems")
+        ],
+        *[
+            ("time milli sec", "", "ms"),
+            ("clockus", "", "us"),
+            ("elapsedh", "", "h"),
+            ("time_1 [ms]", "", "ms"),
+        ],
+        *[("times", "", ""), ("'time'", "", ""), ("Time (m.s.)", "", "ms"), ("t micro", "", "us")],
         *[("Time", "Second", "s"), ("t", "[ms]", "ms"), ("t_ms", "ms", "ms"), ("Time [d]", "", "d")],
     ],
 )
@@ -50,6 +62,10 @@ def test_units_that_are_known(name, beside, unit):
             for name in ("t_m", "t_cs", "time_ps", "ticks", "frame index", "Time [foo]")
         ],
         *[(name, "", "unknown unit") for name in ("t [0.1 ms]", "time_100us", "sec/1000", "t (1/100 s)")],
+        *[
+            (name, "", "unknown unit")
+            for name in ("time [ns]/1000", "time'", "t [m/s]", "t_m_s", "10*t [ms]", "t″")
+        ],
         *[("t", "fortnights", "unknown unit"), ("t_ms", "s", "contradicting units")],
         *[("time_ms [s]", "", "contradicting units"), ("ms since start (s)", "", "contradicting units")],
     ],
@@ -203,6 +219,38 @@ def test_dates_counted_in_another_unit_are_asked_for(tmp_path, name, unit, digit
     with pytest.raises(ValueError, match=f"since 1970: state --time-unit {unit}"):
         Record.from_file(path, ["u_V"], ["y_rad"], time=name)
     assert Record.from_file(path, ["u_V"], ["y_rad"], time=name, time_unit=unit).dt_s == DT_S
+
+
+@pytest.mark.parametrize(
+    ("name", "stamp", "unit"),
+    [
+        *[
+            ("time", lambda k, start=start: start + DT_S * k / 86400, "d")
+            for start in (45987.5, 739000.5, 0.25)
+        ],
+        *[("Datum", lambda k: 45987.5 + 0.1 * k / 86400, "d"), ("t", lambda k: 0.5 + k / 86400, "d")],
+        *[("t", lambda k: DT_S * k / 3600, "h"), ("t [us]", lambda k: DT_S * k, "s")],
+        *[("time", lambda k: 0.371 + 5 * k + 0.011 * (k % 3), "ms"), ("time_s", lambda k: 5e3 * k, "us")],
+        ("t", lambda k: 2.5 * k, "ms"),
+    ],
+)
+def test_steps_that_no_machine_has_are_asked_for(tmp_path, name, stamp, unit):
+    """Days, hours and milliseconds taken for seconds: a step is a microsecond at least, a second at most."""
+    path = written(tmp_path, ";", [name, "u_V", "y_rad"], lines=[f"{stamp(k):.14g};{U[k]};{Y[k]}" for k in K])
+    with pytest.raises(ValueError, match=rf"no machine .*--time-unit {unit}\b"):
+        Record.from_file(path, ["u_V"], ["y_rad"], time=name)
+    read = Record.from_file(path, ["u_V"], ["y_rad"], time=name, time_unit=unit, repair=True)
+    assert 1e-3 < read.dt_s < 1.001
+
+
+def test_slow_samples_of_a_motion_are_asked_for_and_others_taken():
+    """Of white noise, or of what stands still, nobody can say that the samples are too close."""
+    seen, unseen = np.sin(0.1 * K), np.random.default_rng(0).standard_normal(N)
+    for dt_s, words in ((200.0, "of a rate of 200 Hz it is 0.005"), (1e-7, "logged that fast")):
+        with pytest.raises(ValueError, match=words):
+            flexlink.Record(u=U, y=seen, dt_s=dt_s)
+    for dt_s, y in ((1.0, seen), (200.0, unseen), (1e-6, seen)):
+        assert flexlink.Record(u=U, y=y, dt_s=dt_s).dt_s == dt_s
 
 
 SEVEN = (T_S - 0.2).round(9)

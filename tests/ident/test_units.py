@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
 from ident.data.record import Record
-from ident.data.units import TimeColumn, contradicted_by_loop, written_unit
+from ident.data.roles import roles_of, time_of
+from ident.data.table import Table
+from ident.data.units import TimeColumn, contradicted_by_loop, kind_of, per, says_time, size_of, written_unit
 
 PER_SECOND = {"s": 1, "ms": 1000, "us": 10**6, "ns": 10**9, "min": Fraction(1, 60), "h": Fraction(1, 3600)}
 
@@ -26,10 +29,50 @@ PER_SECOND = {"s": 1, "ms": 1000, "us": 10**6, "ns": 10**9, "min": Fraction(1, 6
             ("tip (furlong)", "furlong"),
         ],
         *[("u", ""), ("u_reaction_torque", ""), ("y[1]", ""), ("motor_command", ""), ("set_point", "")],
+        *[
+            ("speed_rev_s", "rev/s"),
+            ("counts_s", "counts/s"),
+            ("velocity_rot_per_s", "rot/s"),
+            ("u_step", ""),
+        ],
+        *[
+            ("gyro_dps", "dps"),
+            ("wheel_rev_min", "rev/min"),
+            ("x_per_s", "1/s"),
+            ("n_turns", ""),
+            ("t_s", "s"),
+        ],
+        *[("flow_pulses_s", "pulses/s"), ("acc_deg_s2", "deg/s2"), ("slide_inch_s", "inch/s")],
     ],
 )
 def test_units_of_signals_are_carried_along(header, unit):
     assert written_unit(header) == unit
+
+
+@pytest.mark.parametrize(
+    "unit",
+    ["rev", "rot", "turn", "counts", "step", "tick", "pulse", "inch", "per", "x_per", "inc", "imp_per"],
+)
+def test_what_is_per_second_is_a_speed_and_no_time(unit):
+    """Neither alone nor behind a word, nor beside a column of time."""
+    k = np.arange(9.0)
+    for name in (f"{unit}_s", f"speed_{unit}_s"):
+        table = Table(Path("a.csv"), {"t_s": 0.01 * k, "u_V": k % 2, name: k % 3})
+        assert not says_time(name)
+        assert (time_of(table), kind_of(table.unit(name))[-2:]) == ("t_s", "/s")
+        if unit not in ("per", "x_per"):
+            assert roles_of(table, "a.csv").output == name
+
+
+def test_a_rate_is_its_quantity_over_its_time():
+    for over in ("rad", "deg", "rev", "mm", "counts"):
+        for under, seconds in (("s", 1), ("ms", 1e-3), ("min", 60), ("h", 3600)):
+            kind, size = size_of(over)
+            assert size_of(f"{over}/{under}") == (f"{kind}/s", pytest.approx(size / seconds))
+    assert per("rpm", "deg/s") == pytest.approx(6)
+    assert per("dps", "rad/s") == pytest.approx(np.pi / 180)
+    assert per("counts", "rad") is None
+    assert size_of("angle_deg_min") is None
 
 
 @pytest.mark.parametrize(

@@ -154,7 +154,6 @@ def test_columns_units_and_structure(flexlink, tmp_path, signals, names, units, 
          "--reference ref_mm --scale ref_mm=0.001"),
         (("t_s", "ref_deg", "u_A", "y_rad"), (1, 1, 1), "the output follows it in numbers as they stand",
          "--reference ref_deg --unit ref_deg=rad"),
-        (("t", "ref_m", "u_A", "y_m"), (1e3, 1, 1), "'t' is taken as seconds", "--time-unit ms"),
     ],
 )  # fmt: skip
 def test_a_wrong_unit_is_doubted_and_the_next_command_states_it(

@@ -158,11 +158,11 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> Channel
         resample_s=max(steps, default=None),
         unwrap=stated.unwrap or _wrapping(tables, roles.output),
     )
-    records = [how.record(table) for table in tables]
+    records = how.records(tables)
     repeats = min(_repeats(record) for record in records)
     if repeats > 1 and not steps:
         how = replace(how, resample_s=float(f"{repeats * records[0].dt_s:.9g}"))
-        records = [how.record(table) for table in tables]
+        records = how.records(tables)
     for record in records:
         refuse_constant_input(record)
     unit_of = {

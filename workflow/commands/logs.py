@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ident.data.finding import Finding
-from ident.data.record import Record
+from ident.data.record import Record, in_one_unit
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response
 from ident.data.roles import Roles, roles_with_reference
@@ -53,27 +53,33 @@ class Reading:
             reference=self.reference,
         )
 
-    def record(self, log: Path | Table) -> Record:
-        """Of a log, where input and output are named. Raises InputError naming file, column or line."""
-        with naming(str(log.path if isinstance(log, Table) else log)):
-            record = Record.from_file(
-                log,
-                [str(self.input_name)],
-                [str(self.output_name)],
-                time=self.time,
-                dt_s=self.dt_s,
-                time_unit=self.time_unit,
-                references=[self.reference] if self.reference else [],
-                scale=self.scale,
-                offset=self.offset,
-                units=self.units,
-                repair=self.repair,
-                resample_s=self.resample_s,
-                unwrap=self.unwrap,
-                decimal=self.decimal,
-            )
-            record = replace(record, notes=(*record.notes, *self.doubts))
-            return record if self.input_limit is None else record.limited(self.input_limit)
+    def records(self, logs: Sequence[Path | Table]) -> list[Record]:
+        """Of logs that are used together, where input and output are named; each column in one unit. Raises
+        InputError naming file, column or line."""
+        found = list[Record]()
+        for log in logs:
+            with naming(str(log.path if isinstance(log, Table) else log)):
+                record = Record.from_file(
+                    log,
+                    [str(self.input_name)],
+                    [str(self.output_name)],
+                    time=self.time,
+                    dt_s=self.dt_s,
+                    time_unit=self.time_unit,
+                    references=[self.reference] if self.reference else [],
+                    scale=self.scale,
+                    offset=self.offset,
+                    units=self.units,
+                    repair=self.repair,
+                    resample_s=self.resample_s,
+                    unwrap=self.unwrap,
+                    decimal=self.decimal,
+                )
+                found.append(replace(record, notes=(*record.notes, *self.doubts)))
+        with naming(""):
+            found = in_one_unit(found)
+            limit = self.input_limit
+            return found if limit is None else [record.limited(limit) for record in found]
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,5 +118,5 @@ def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: S
             time=roles.time if how.time is None and how.dt_s is None else how.time,
             doubts=roles.doubts,
         )
-    measured, fresh = (tuple(how.record(path) for path in paths) for paths in (logs, validation))
-    return Logs(measured, fresh, (*logs, *validation), how.input_limit)
+    records = tuple(how.records([*logs, *validation]))
+    return Logs(records[: len(logs)], records[len(logs) :], (*logs, *validation), how.input_limit)

@@ -12,6 +12,7 @@ from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.plausible import refuse_implausible
 from ident.data.record_files import read_table
 from ident.data.time_grid import TimeGrid
+from ident.data.units import written_unit
 from plant.rig import Rig
 from workflow.config.rig_settings import read_rig
 from workflow.config.settings import expand, repeated
@@ -115,7 +116,12 @@ def _experiment(
             both = [quantity for quantity in wanted if names[quantity].column == column]
             raise InputError(f"{here}: {both[0]} and {both[1]} are both {column!r}")
         read = table.columns(taken)
-        values = {quantity: names[quantity].quantity(read[names[quantity].column]) for quantity in wanted}
+        values = {}
+        for quantity in wanted:
+            place, unit = names[quantity], written_unit(quantity)
+            by_header = place.scale is None and quantity != "time_s"
+            usual = table.times_for(place.column, unit) if by_header else 1.0
+            values[quantity] = place.quantity(read[place.column], usual)
         n_rows = len(values["voltage_V"])
         grid = TimeGrid.uniform(n_rows, settings.dt_s or rig.sampling.dt_s)
         if "time_s" in values:

@@ -26,8 +26,8 @@ class Column(Section):
     column: str = Field(min_length=1, description="name of the column")
     scale: float | None = Field(
         None,
-        description="unit of the quantity per unit of the column, not 0; default 1, for time the unit "
-        "in the header",
+        description="unit of the quantity per unit of the column, not 0; default: by the unit in the "
+        "header, else 1",
     )
     offset: float = Field(0.0, description="added after scaling, in the unit of the quantity")
 
@@ -35,10 +35,11 @@ class Column(Section):
         None, gt=0, allow_inf_nan=False, description="period of a column that wraps: 4096 counts, 360 degrees"
     )
 
-    def quantity(self, values: RealArray) -> RealArray:
+    def quantity(self, values: RealArray, usual: float = 1.0) -> RealArray:
+        """usual: the scale where none is stated."""
         if self.unwrap is not None:
             values = unwrapped(values, self.unwrap)[0]
-        return values * (1.0 if self.scale is None else self.scale) + self.offset
+        return values * (usual if self.scale is None else self.scale) + self.offset
 
 
 def _column(value: object) -> object:

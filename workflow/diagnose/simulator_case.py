@@ -30,7 +30,7 @@ from ident.data.record_files import read_table
 from ident.data.roles import time_of
 from ident.data.table import Table
 from ident.data.time_grid import TimeGrid, sampling_time
-from ident.data.units import written_unit
+from ident.data.units import COUNTED, per, size_of, written_unit
 from plant.effects.search_space import geometric
 from workflow.config.settings import Section, check
 from workflow.diagnose.case_settings import CaseName, Column, ColumnChoice
@@ -482,31 +482,19 @@ def _column(name: str, table: Table, settings: SimulatorSettings) -> Column:
     return Column(column=alike[0] if len(alike) == 1 else name)
 
 
-_UNITS = re.compile(r"([uµμmckM]?)(rad|deg|°|N ?m|N|V|A|m)([/_]s(?:\^?2|²)?)?")
-_PREFIXES = {"": 1.0, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
-_TURN = {"rpm": np.pi / 30, "u/min": np.pi / 30}
-
-
-def _in_si(unit: str) -> float | None:
-    """SI units in one of these; None of what is no unit of a motion or its drive."""
-    found = _UNITS.fullmatch(unit)
-    if found is None:
-        return _TURN.get(unit.lower())
-    return _PREFIXES[found[1]] * (np.pi / 180 if found[2] in ("deg", "°") else 1.0)
-
-
 def _scale(name: str, column: Column, table: Table, settings: SimulatorSettings) -> float:
     """What makes of a column the quantity in the model, which is in SI units unless its name says another."""
     unit, own = table.unit(column.column), "" if settings.mjcf else written_unit(name)
     if column.scale is not None or not unit or unit == own:
         return 1.0 if column.scale is None else column.scale
-    per, of = _in_si(unit), _in_si(own) if own else 1.0
-    if per is None or of is None:
+    kind, size = size_of(unit) or ("", 1.0)
+    factor = per(unit, own) if own else size if kind and kind.split("/")[0] not in COUNTED else None
+    if factor is None:
         raise ValueError(
             f"column {column.column!r} is in {unit}: state what makes it {own or 'SI units'}, "
             f'columns = {{"{name}" = {{column = "{column.column}", scale = ...}}}}'
         )
-    return per / of
+    return factor
 
 
 def _time(table: Table, settings: SimulatorSettings) -> tuple[str | None, str | None]:

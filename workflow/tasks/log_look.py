@@ -18,7 +18,7 @@ from ident.data.roles import Roles, roles_with_reference, times_in
 from ident.data.table import Table
 from ident.data.text_tables import Layout
 from ident.data.time_grid import LARGEST_JITTER, clock_doubts, jitter_of, only_rounded, option_for
-from ident.data.units import contradicted_by_loop
+from ident.data.units import contradicted_by_loop, refuse_step
 from workflow.engine.errors import naming
 
 _EXACT = 1e-6  # of a step: stamps of a few digits as doubles stray by less
@@ -121,7 +121,8 @@ def look_at(
         # the most.
         own = [name for name in table.clocks if name != time] if table.sparse else []
         longest = max(own, key=lambda name: table.clocks[name].size, default=None)
-        about, doubts = _time(table, time, time_unit, roles.output if roles and own else longest)
+        moved = roles.output if roles else None
+        about, doubts = _time(table, time, time_unit, moved if own and moved else longest, moved)
     for column in columns:
         if column.values is not None:
             inputs, outputs = (
@@ -156,15 +157,22 @@ def _response(table: Table) -> ResponseLook | None:
     return ResponseLook(omega.size, different.size, float(different[0]), float(different[-1]), spread)
 
 
-def _time(table: Table, name: str, unit: str | None, rows_of: str | None) -> tuple[TimeLook, list[Finding]]:
+def _time(
+    table: Table, name: str, unit: str | None, rows_of: str | None, moved: str | None
+) -> tuple[TimeLook, list[Finding]]:
+    """rows_of: the column whose rows count in a table whose columns have rows of their own; moved: the
+    output."""
     try:
         wanted = [name] if rows_of is None else [name, rows_of]
         stamps, column = table.seconds(name, table.columns(wanted, rows_of)[name], unit)
         table.increasing(stamps, name)
+        steps = np.diff(stamps)
+        period = float(np.median(steps))
+        if moved:
+            own = table.columns([name, moved], rows_of)[moved]
+            refuse_step(str(table.path), period, own[:, None], column)
     except ValueError as error:
         return TimeLook(name, why=str(error).removeprefix(str(table.path)).lstrip(":, ")), []
-    steps = np.diff(stamps)
-    period = float(np.median(steps))
     counts = np.maximum(np.rint(steps / period), 1)
     jitter = jitter_of(stamps)
     rounded = jitter > _EXACT and only_rounded(stamps)

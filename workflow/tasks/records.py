@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.data.record import Record
+from ident.data.record import Record, in_one_unit
 from workflow.config.run_config import (
     Channel,
     FileRecord,
@@ -91,8 +91,8 @@ def refuse_constant_input(record: Record) -> None:
 
 
 def with_common_sampling_time(records: Sequence[Record]) -> list[Record]:
-    """The records with the first one's sampling time. Raises InputError where they really differ, or are
-    together longer than the memory of most machines allows.
+    """The records with the first one's sampling time and units. Raises InputError where they really differ,
+    or are together longer than the memory of most machines allows.
 
     Clocks of hosts differ by some ten parts in a million, and time stamps are written with a few digits.
     """
@@ -102,6 +102,8 @@ def with_common_sampling_time(records: Sequence[Record]) -> list[Record]:
             f"{records[0].name}: {samples} samples in all, at most {MOST_SAMPLES} are identified together "
             "(4 kB of memory each); take fewer or shorter records, or a longer sampling period"
         )
+    with naming(""):
+        records = in_one_unit(records)
     first = records[0]
     for other in records[1:]:
         if not other.sampled_like(first):
