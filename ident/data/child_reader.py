@@ -289,6 +289,8 @@ def mat_variables(content: bytes) -> bytes:
     from scipy.io.matlab import MatlabFunction, MatlabOpaque, mat_struct
 
     warnings.simplefilter("error")  # a variable that is there twice
+    # scipy calls every object of MATLAB's own "None".
+    warnings.filterwarnings("ignore", 'Duplicate variable name "None"')
     arrays: list[Any] = []
 
     def tree(value: Any) -> dict[str, Any]:
@@ -329,8 +331,10 @@ def _archive(about: Any, arrays: list[Any]) -> bytes:
 def main(kind: str) -> int:
     """kind: hdf5, parquet, xlsx, mat, mcap, bag (ROS 1) or db3 (ROS 2)."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
+    for kind_of_limit, most in ((resource.RLIMIT_CPU, CPU_SECONDS), (resource.RLIMIT_AS, _MEMORY_BYTES)):
+        soft, hard = resource.getrlimit(kind_of_limit)
+        allowed = min([most, *(limit for limit in (soft, hard) if limit != resource.RLIM_INFINITY)])
+        resource.setrlimit(kind_of_limit, (allowed, hard))
     content = sys.stdin.buffer.read()
     try:
         if kind == "xlsx":

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import subprocess
 import sys
 import zipfile
@@ -20,7 +21,8 @@ LARGEST_BYTES = 2**30
 """Of a file, and of what it unpacks to: some hundred channels at 1 kHz for twenty minutes as doubles."""
 
 _SCRIPT = Path(__file__).with_name("child_reader.py")
-_SECONDS = 150  # 30 more than the processor time that `child_reader` allows itself
+_CPU_SECONDS = 120  # that `child_reader` allows itself
+_SECONDS = 150  # of waiting for it
 _REFUSED, _NO_LIBRARY = 2, 3
 _ENCRYPTED = 0x1  # bit 0 of the flags of a zip entry (APPNOTE 4.4.4)
 
@@ -97,6 +99,11 @@ def read_in_child(kind: str, library: str, content: bytes) -> bytes:
         raise ValueError(f": not read in {_SECONDS} s; a smaller file, or CSV, is") from None
     if done.returncode == 0:
         return done.stdout
+    if done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+        raise ValueError(
+            f": not read within {_CPU_SECONDS} s of processor time, or the time and memory that this session "
+            "allows (ulimit -t, ulimit -v); a smaller file, or CSV, is"
+        )
     said = shown(done.stderr.decode("utf-8", "replace"))
     if done.returncode == _NO_LIBRARY:
         raise ValueError(f": {kind} files need {library}: {sys.executable} -m pip install {library}")

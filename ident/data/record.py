@@ -10,13 +10,13 @@ from typing import Self, TypeVar
 import numpy as np
 
 from ident.data.arrays import RealArray, readonly
-from ident.data.finding import Finding, FindingKind, finding
+from ident.data.finding import Finding, FindingKind, Value, finding
 from ident.data.foreign_files import shown
 from ident.data.record_files import read_table
 from ident.data.table import LARGEST, Table
 from ident.data.time_grid import CoarseGrid, Repair, TimeGrid, clock_doubts, sampling_time
 from ident.data.units import TimeColumn, contradicted_by_loop, per, refuse_step
-from ident.data.wrapping import unwrapped, wraps_at
+from ident.data.wrapping import spikes_in, unwrapped, wraps_at
 
 T = TypeVar("T")
 
@@ -326,6 +326,8 @@ def reading_notes(
         found.append(
             finding(FindingKind.SKIPPED_ROWS, record=record, rows=table.layout.commented, line=first)
         )
+    if table.layout is not None and table.layout.cut:
+        found.append(finding(FindingKind.CUT_ROW, record=record, line=table.layout.cut))
     if table.sparse:
         others = [name for name in inputs if not np.array_equal(table.clocks[name], table.clocks[outputs[0]])]
         found += [finding(FindingKind.HELD, record=record, name=name, output=outputs[0]) for name in others]
@@ -335,6 +337,10 @@ def reading_notes(
     for name in outputs:
         if period := wraps_at(columns[name]):
             found.append(finding(FindingKind.WRAPS, record=record, name=name, period=period))
+        elif (spikes := spikes_in(columns[name])).size:
+            value, place = float(columns[name][spikes[0]]), table.place(int(spikes[0]), name)
+            told = {"name": name, "value": value, "place": place, "rows": spikes.size}
+            found.append(finding(FindingKind.SPIKES, record=record, **told))
     return tuple(found)
 
 
@@ -358,8 +364,8 @@ def in_one_unit(records: Sequence[Record]) -> list[Record]:
                 )
             if factor != 1.0:
                 factors[name], units[name] = factor, wanted
-                told = {"record": record.label, "name": name, "unit": unit, "of": wanted, "times": factor}
-                notes.append(finding(FindingKind.UNIT_CONVERTED, **told))
+                told: dict[str, Value] = {"name": name, "unit": unit, "of": wanted, "times": factor}
+                notes.append(finding(FindingKind.UNIT_CONVERTED, record=record.label, **told))
         found.append(_converted(record, factors, units, notes) if factors else record)
     return found
 

@@ -56,7 +56,8 @@ class Layout:
     numbered where there is no header line. units: by name, of a line of units. header, first: line (from 1)
     of the names, 0 for none, and of the first row. skipped: lines from there on that are no rows; commented:
     how many of them are commented out. increment: (start, step) of the rows [s], where lines above say so.
-    plain: the decimal sign separates no groups of digits for certain; stated: by the user.
+    plain: the decimal sign separates no groups of digits for certain; stated: by the user. cut: the last line
+    that was left out because the file ends inside of it, 0 for none.
     """
 
     separator: str
@@ -70,6 +71,7 @@ class Layout:
     increment: tuple[float, float] | None = None
     plain: bool = True
     stated: bool = False
+    cut: int = 0
 
     def line(self, row: int) -> int:
         """The line of a row, which is counted from 0."""
@@ -125,6 +127,9 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
     found = tuple(k + 1 for k in sorted(skipped))
     layout = replace(layout, skipped=found, commented=len(commented))
     rows, width = _rows(body, layout.separator), len(layout.names)
+    if not text.endswith("\n") and len(lines) not in skipped and _is_cut(rows, layout.decimal):
+        del rows[-1]
+        layout = replace(layout, cut=len(lines))
     lengths = set(map(len, rows))
     if max(lengths) > width:
         for k, row in enumerate(rows):
@@ -141,6 +146,19 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
     )
     layout = replace(layout, plain=sure)
     return layout, dict(zip(layout.names, zip(*rows, strict=True), strict=True))
+
+
+def _is_cut(rows: Sequence[Sequence[str]], decimal: str) -> bool:
+    """Whether the last of four rows and more ends too early: with fewer cells than all others, or in a number
+    of fewer digits (behind the decimal sign, where there is one)."""
+    widths = [len(row) - _empty_at_end(row) for row in rows]
+    if len(rows) < 4 or not widths[-1] or widths[-1] < min(widths[:-1]):
+        return len(rows) > 3
+    cells = [row[widths[-1] - 1].lstrip("+-") for row in rows if len(row) >= widths[-1]]
+    parts = [cell.partition(decimal) for cell in cells]
+    digits = [len(part[2] if any(part[2] for part in parts) else part[0]) for part in parts]
+    known = len(cells) > 3 and all(is_number(cell, decimal) for cell in cells[:-1])
+    return known and (digits[-1] < min(digits[:-1]) or not is_number(cells[-1], decimal))
 
 
 def _layout(lines: Sequence[str], n_lines: int) -> Layout:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.data.arrays import RealArray
+from ident.data.arrays import IntArray, RealArray
 
 # Where readings start again: powers of two, turns in several units, round numbers of an encoder's lines.
 _PERIODS = tuple(
@@ -34,6 +34,8 @@ _SMOOTHER = 0.5
 _NEARLY_HALF = 0.4
 # A speed that changes by less than this share of a period per sample leaves no doubt: half would.
 _SAME_SPEED = 0.25
+# Spikes: this share of the samples at most, and steps so many times longer than any other.
+_FEW, _JUMPS = 0.05, 10.0
 
 
 def wraps_at(values: RealArray) -> float:
@@ -67,6 +69,29 @@ def wraps_at(values: RealArray) -> float:
             return 0.0
     smooth = np.std(np.diff(going_on, 2))
     return period if smooth <= _SMOOTHER * np.std(np.diff(values, 2)) else 0.0
+
+
+def spikes_in(values: RealArray) -> IntArray:
+    """The samples (of T) to which a signal jumps, and from which it comes back or where it ends: around them
+    are steps many times longer than all others. What goes on moving there, as in a shock, is none."""
+    nothing, most, size = np.zeros(0, dtype=np.int64), int(_FEW * values.size), np.abs(np.diff(values))
+    longest = np.sort(size)[::-1][: most + 1]
+    larger = np.flatnonzero(longest[:-1] > _JUMPS * longest[1:]) if most and longest[-1] > 0 else nothing
+    if not larger.size:
+        return nothing
+    other = longest[larger[-1] + 1]
+    parts = np.split(np.arange(values.size), np.flatnonzero(size > other) + 1)
+    # Every other part, beside the longest.
+    away = parts[(1 + int(np.argmax([part.size for part in parts]))) % 2 :: 2]
+    # At an end, where nothing tells whether it comes back, a single sample.
+    ends = {0, values.size - 1}
+    comes_back = (
+        part.size == 1
+        if {part[0], part[-1]} & ends
+        else abs(values[part[-1] + 1] - values[part[0] - 1]) <= (part.size + 1) * other
+        for part in away
+    )
+    return np.concatenate(away) if sum(map(len, away)) <= most and all(comes_back) else nothing
 
 
 def unwrapped(values: RealArray, period: float) -> tuple[RealArray, float]:

@@ -72,6 +72,10 @@ def test_a_child_that_dies_or_hangs_is_a_refusal(tmp_path, monkeypatch):
     for code, words in (
         ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "not a HDF5 file, or a damaged one"),
         ("import time; time.sleep(60)", "not read in 2 s"),
+        (
+            "import os, signal; os.kill(os.getpid(), signal.SIGXCPU)",
+            "not read within 120 s of processor time",
+        ),
         ("import sys; sys.stderr.write('h5py'); sys.exit(3)", r"need h5py: .*python.* -m pip install h5py$"),
     ):
         script.write_text(code)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import io
+import resource
 import struct
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 import scipy.io
 
+from ident.data import foreign_files
 from ident.data.mat_files import mat_variables
 
 RNG = np.random.default_rng(14)
@@ -50,6 +54,47 @@ def test_what_is_no_array_is_told_when_it_is_asked_for():
     found = mat_variables(written({"s": scipy.sparse.eye_array(3).tocsc(), "x": 1.0}), "f")
     assert found["x"].item() == 1.0
     assert "sparse matrix" in found["s"].why
+
+
+def opaque(name):
+    """An object of MATLAB's own, as of `string`: a variable of class 17 without a name where scipy looks."""
+
+    def element(kind, content):
+        return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
+
+    flags, sizes = (struct.pack("<II", kind, 0) for kind in (17, 13)), struct.pack("<ii", 6, 1)
+    place = np.array([0xDD000000, 2, 1, 1, 1, 1], "<u4").tobytes()
+    own, of_array = flags
+    array = element(6, of_array) + element(5, sizes) + element(1, b"") + element(6, place)
+    return element(
+        14,
+        element(6, own)
+        + b"".join(element(1, text) for text in (name, b"MCOS", b"string"))
+        + element(14, array),
+    )
+
+
+def test_objects_of_matlab_do_not_hide_the_vectors_beside_them():
+    for count in range(4):
+        content = written({"t": np.arange(4.0)}) + b"".join(opaque(f"s{k}".encode()) for k in range(count))
+        found = mat_variables(content, "f")
+        np.testing.assert_array_equal(found.pop("t"), [[0, 1, 2, 3]])
+        assert all("a MATLAB object" in other.why for other in found.values())
+
+
+def test_a_reader_keeps_to_limits_that_are_there():
+    """Of time and memory: an allowance of its own that is larger cannot be had."""
+
+    def less():
+        resource.setrlimit(resource.RLIMIT_CPU, (100, 100))
+        resource.setrlimit(resource.RLIMIT_AS, (2**32, 2**32))
+
+    done = subprocess.run(
+        [sys.executable, "-I", str(foreign_files._SCRIPT), "mat"],
+        input=written({"t": 1.0}), capture_output=True, preexec_fn=less, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout
 
 
 def test_names_that_crash_compiled_readers_are_refused():

@@ -148,6 +148,29 @@ def test_line_ends_written_twice_make_no_rows(tmp_path):
     np.testing.assert_array_equal(record.output[:, 0], Y)
 
 
+@pytest.mark.parametrize("lost", [*range(1, 12), 15])
+@pytest.mark.parametrize("form", ["{:.6f}", "{:.5e}", "{:+.4f}"])
+def test_a_row_in_which_the_file_ends_is_left_out(tmp_path, lost, form):
+    """However much of it is there; whole rows stay, with a line end or without."""
+    path = tmp_path / "a.csv"
+    lines = [f"{T_S[k]:.3f};{U[k]:.1f};{form.format(Y[k] - 3)}" for k in K]
+    text = "\n".join(["t_s;u_V;y_rad", *lines])
+    for written, n in ((text, N), (text + "\n", N), (text[:-lost], N - 1)):
+        path.write_text(written)
+        record = Record.from_file(path, ["u_V"], ["y_rad"], time="t_s")
+        assert record.n_samples == n
+        assert [(note.kind, note.values["line"]) for note in record.doubts] == [
+            (FindingKind.CUT_ROW, N + 1)
+        ] * (N - n)
+
+
+def test_an_integer_in_which_the_file_ends_is_left_out(tmp_path):
+    (tmp_path / "a.csv").write_text(
+        "t_s,u_V,y_counts\n" + "\n".join(f"{t:.3f},1,{1000 + k}" for k, t in zip(K, T_S, strict=True))[:-1]
+    )
+    assert len(read_table(tmp_path / "a.csv").columns(["y_counts"])["y_counts"]) == N - 1
+
+
 WHOLE = 127 * K + 898.0  # to 10931
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, strategies as st
 from ident.data.finding import FindingKind
 from ident.data.record import Record
 from ident.data.table import Table
-from ident.data.wrapping import unwrapped, wraps_at
+from ident.data.wrapping import spikes_in, unwrapped, wraps_at
 
 K = np.arange(4000)
 # A machine that turns to and fro, in turns: six revolutions, and a swing about zero of a tenth of one.
@@ -74,6 +74,49 @@ NO_WRAP = {
 @pytest.mark.parametrize("kind", NO_WRAP)
 def test_what_does_not_wrap_is_left_alone(kind):
     assert wraps_at(NO_WRAP[kind]) == 0
+
+
+MOVES = {
+    "counts": (30000 + 30000 * np.sin(0.01 * K)).round(),
+    "smooth": np.sin(0.02 * K),
+    "steps": NO_WRAP["levels held"][: K.size],
+}
+
+
+@pytest.mark.parametrize("value", [9.9e37, 65535.0, -9999.0, 2.0**31 - 1])
+@pytest.mark.parametrize("places", [(0,), (7, 8, 9), (100, 2000), (K.size - 1,), (300, 303, 304, 2500)])
+def test_readings_that_are_none_are_named(value, places):
+    """What instruments write for no reading, wherever it stands."""
+    for name, motion in MOVES.items():
+        values = motion.copy()
+        values[list(places)] = value
+        found = () if name == "counts" and value == 65535 and 300 in places else places
+        assert tuple(spikes_in(values)) in {found, places}
+    record = Record.from_file(table(values=values), ["u"], ["enc"], time="t")
+    (note,) = record.doubts
+    assert (note.kind, note.values["value"], note.values["rows"]) == (FindingKind.SPIKES, value, len(places))
+    assert note.values["place"] == f"index {places[0]}"
+
+
+SHOCK = np.where((K > 700) & (K < 720), 20 * np.sin(0.3 * (K - 700)), 0) + 0.01 * NO_WRAP["white noise"]
+
+
+ALL = (
+    MOVES
+    | NO_WRAP
+    | {
+        "a shock": SHOCK,
+        "a step": np.where(K > 900, 5.0, 0.0),
+        "a late step": np.where(K > 3990, 5.0, 0.0) + 1e-3 * np.sin(K),
+    }
+)
+
+
+@pytest.mark.parametrize("kind", sorted(set(ALL) - {"a sensor that drops out"}))
+def test_no_motion_is_a_spike(kind):
+    """The square waves begin with a sample that is alone."""
+    alone = {"a spike": {700}, "a square wave": {0}, "a noisy square wave of 0 and 4000": {0}}
+    assert set(spikes_in(ALL[kind])) <= alone.get(kind, set())
 
 
 @given(
