@@ -24,6 +24,7 @@ PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -q --junitxml=b
 help:
 	@echo "make run    install into .venv and run the default arm end to end (OUT=$(OUT))"
 	@echo "make test   everything that guards behaviour   make test-all   with what takes longer   make test-long   Monte Carlo"
+	@echo "make frozen some eighty questions: which answers moved from the stored ones (STORE=1 stores them)"
 	@echo "make docs   the documentation as a site, build/site/index.html, with a gallery of pages"
 	@echo "make wheel  a wheel with the newest dependencies, tried on every Python from 3.11 to 3.13 that is here"
 	@echo "make dist   wheel and source archive in build/dist, the same bytes from the same commit"
@@ -65,6 +66,10 @@ test-all: $(STAMP) $(PACKAGES)
 test-long: $(STAMP) $(PACKAGES)
 	$(PYTEST) -m long --junitxml=build/long.xml
 	$(BIN)/python -m benchmarks.durations --junit build/long.xml --name long_tests
+
+# In six minutes of two cores; exit code 1 where an answer moved. Measured machines: FLEXLINK_DATA, or ../shared/data.
+frozen: $(STAMP) $(PACKAGES)
+	$(BIN)/python -m benchmarks.frozen_answers $(if $(STORE),--store)
 
 lint: $(PACKAGES)
 	$(BIN)/ruff check .

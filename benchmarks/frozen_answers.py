@@ -1,9 +1,13 @@
-"""Answers to a fixed subset of cases, frozen, and told beside those of another version.
+"""Some eighty questions (`frozen_questions`): which answers moved from the stored ones, from what to what.
 
-Labelled and sealed cases of the shared folder (with the truth, where that is told) and three real machines.
-Per case: CPU, simulations, the answer with its size, and the probabilities of sets. `--against NAME` tells
-where benchmarks/results/NAME.txt says otherwise; what a constant or a move of
-the search earns is seen with `--change "module:NAME=value ..."` and `--without "Scan LookAlike"`.
+    make frozen                               asks them in two processes; exit code 1 where an answer moved
+    make frozen STORE=1                       stores the answers: benchmarks/results/frozen_answers.txt
+    python -m benchmarks.frozen_answers --only "exact|EMPS" --against other --store
+
+Every kind of value has its tolerance and the reason for it (`KINDS`). A value that appears or vanishes moved,
+as does an error that is raised, or not any more. `--slow` asks what takes too long for every day as well, to
+be stored under another name by `--against NAME --store`. What a constant or a move of the diagnosis' search
+earns is seen with `--change "module:NAME=value ..."` and `--without "Scan LookAlike"`.
 """
 
 from __future__ import annotations
@@ -12,141 +16,345 @@ import importlib
 import json
 import os
 import re
-import tomllib
-from collections.abc import Callable, Iterator, Mapping
+import resource
+import signal
+import sys
+import time
+import traceback
+import warnings
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks import emps_axis, ruler_robot, serial_link_stage
-from benchmarks.harness import RESULTS, Print, data_folder, main, timed
-from diagnosis import Diagnosis, diagnose
-from diagnosis.machine.machine_protocol import CaseOfMachine
+from benchmarks.frozen_questions import QUESTIONS, Answer, Question
+from benchmarks.harness import RESULTS, Print, main
 from diagnosis.search import moves
-from workflow.diagnose.case_files import load_case
 
-# Folder below the shared cases, with the rig file where it is not the usual one: without a model error, with.
-SHARED = {
-    "exact": (
-        "labelled/backlash",
-        "labelled/coulomb_friction_and_tip_payload",
-        "labelled/coulomb_friction_and_tip_payload:rig_uncertain.toml",
-        "labelled/faint_viscous_friction:rig_uncertain.toml",
-        "labelled/none:rig_uncertain.toml",
-        "labelled/unlisted_effect",
-        "labelled/gravity:rig_uncertain.toml",
-        "sealed/case-06",
-        "sealed/case-12",
-    ),
-    "workshop": (
-        "workshop/labelled/work-05",
-        "workshop/labelled/work-06",
-        "workshop/labelled/work-09",
-        "workshop/labelled/work-15",
-        "workshop/labelled/work-18",
-        "workshop/labelled/work-19",
-        "workshop/labelled/work-22",
-        "workshop/sealed/case-06",
-        "workshop/sealed/case-09",
-        "workshop/sealed/case-12",
-        "workshop/sealed/case-16",
-    ),
+# CPU seconds of one question, after which it has no answer; seconds until a process that hangs is given up.
+LONGEST_S, HANGS_S = 180.0, 1800.0
+# CPU seconds assumed of a question that was never stored.
+_GUESS_S = 8.0
+# A stored duration stays where it is until it is off by this factor, so that storing changes answers only.
+_OTHER_DURATION = 1.5
+
+
+class Kind(NamedTuple):
+    """How far a value may move: relative to the stored one, or by so much if that is more."""
+
+    relative: float
+    absolute: float
+    why: str
+
+
+KINDS = {
+    "said": Kind(0.0, 0.0, "a verdict, a name or a count is another one or is not"),
+    "lines": Kind(2e-2, 0.0, "numbers in words are rounded to two or three digits; the words are the same"),
+    "margins": Kind(1e-3, 1e-9, "a flat optimum ends elsewhere by rounding, .05 % in gamma (margins.toml)"),
+    "model": Kind(1e-3, 1e-9, "least squares repeat to 1e-6; below what any interval of theirs resolves"),
+    "spread": Kind(1e-2, 1e-9, "evidence is flat in its hyperparameters, and some are drawn"),
+    "sizes": Kind(2e-2, 1e-9, "a descent ends where the likelihood changes little; a tenth of an interval"),
+    "probabilities": Kind(0.0, 5e-2, "Monte Carlo of a few hundred draws, and odds are exponentials of gaps"),
+    "gaps": Kind(2e-2, 1e-2, "follow the sizes"),
 }
-REAL: dict[str, tuple[Callable[[Path], CaseOfMachine], tuple[str, ...]]] = {
-    "EMPS": (lambda folder: emps_axis.case(folder, "passes"), ("coulomb_friction", "constant_offset")),
-    "EMPS in its loop": (
-        lambda folder: emps_axis.case(folder, "fast", "loop"),
-        ("coulomb_friction", "constant_offset"),
-    ),
-    "2DSFL stage 1": (lambda folder: serial_link_stage.case(folder, 1), ()),
-    "2DSFL stage 2": (lambda folder: serial_link_stage.case(folder, 2), ()),
-    "SLFR": (ruler_robot.case, ()),
-}
-# Changes of a probability, and of a size relative to it, that are told.
-TOLD, TOLD_SIZE = 0.1, 0.02
+_NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
-def cases(only: str) -> Iterator[tuple[str, CaseOfMachine, tuple[str, ...]]]:
-    """Name, case, effects that are there (none where nobody says)."""
-    data = data_folder("emps", "quanser_2dsfl", "slfr_krauss_2009")
-    gap = Path(os.environ.get("FLEXLINK_GAP", data.parent / "gap"))
-    for kind, places in SHARED.items():
-        for place in places:
-            folder, _, rig = place.partition(":")
-            if re.search(only, f"{kind} {place}"):
-                answer = gap / folder / "answer.toml"
-                told = tomllib.loads(answer.read_text("utf-8")) if answer.is_file() else {}
-                names = tuple(e["name"] for e in told.get("effects", ())) or (told.get("verdict"),)
-                yield f"{kind} {place}", load_case(gap / folder, rig or None).case, tuple(filter(None, names))
-    for name, (make, truth) in REAL.items():
-        if re.search(only, f"real {name}"):
-            yield f"real {name}", make(data), truth
+class Moved(NamedTuple):
+    """A value that is not the stored one. share: of its tolerance; above 1 it fails."""
+
+    kind: str
+    name: str
+    before: Any
+    now: Any
+    share: float
+
+    def __str__(self) -> str:
+        shown = (
+            json.dumps(one, ensure_ascii=False) if one is not _NOTHING else "(nothing)" for one in self[2:4]
+        )
+        return f"{self.kind}: {self.name}: " + " -> ".join(shown)
 
 
-def answer(found: Diagnosis, truth: tuple[str, ...], cpu_s: float) -> dict[str, Any]:
-    """What is frozen of an answer."""
-    entries = {e.name: e for e in found.effects}
-    sets = {" + ".join(key) or "none": round(p, 3) for key, p in found.sets.items() if p >= 0.02}
-    wanted = " + ".join(sorted(truth))
-    named = found.combination or found.partial_model
+_NOTHING = object()
+
+
+def moved(before: Answer, now: Answer) -> list[Moved]:
+    """What is not as it was stored, within its tolerance or not."""
+    found = []
+    for kind in KINDS:
+        old, new = before.get(kind, {}), now.get(kind, {})
+        for name in {**old, **new}:
+            absent = 0.0 if kind == "probabilities" else _NOTHING
+            pair = old.get(name, absent), new.get(name, absent)
+            if (share := _share(KINDS[kind], *pair, of_lines=kind == "lines")) > 0:
+                found.append(Moved(kind, name, *pair, share))
+    return found
+
+
+def _share(kind: Kind, before: Any, now: Any, *, of_lines: bool) -> float:
+    """Of the tolerance that the difference takes; infinite where none is tolerated."""
+    if before == now or (before != before and now != now):
+        return 0.0
+    if of_lines and isinstance(before, str) and isinstance(now, str):
+        return _share_of_line(kind, before, now)
+    both = before, now
+    if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in both):
+        return np.inf
+    allowed = max(kind.absolute, kind.relative * abs(before))
+    off = abs(now - before)
+    return float(off / allowed) if allowed > 0 and np.isfinite(off) else np.inf
+
+
+def _share_of_line(kind: Kind, before: str, now: str) -> float:
+    """Of two sentences: their words are the same; numbers differ by a unit of the last digit or the share."""
+    if _NUMBER.sub("#", before) != _NUMBER.sub("#", now):
+        return np.inf
+    worst = 0.0
+    for old, new in zip(_NUMBER.findall(before), _NUMBER.findall(now), strict=True):
+        a, b = (float(one.replace("−", "-")) for one in (old, new))
+        mantissa, _, power = old.partition("e")
+        digit = 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2])) if "." in old else 0.0
+        allowed = max(1.01 * digit, kind.relative * abs(a))
+        worst = max(worst, abs(a - b) / allowed if allowed else np.inf * (a != b or 0))
+    return worst
+
+
+@dataclass
+class Stored:
+    """Answers of a file and the CPU seconds they took: a line per question, and one per kind of value."""
+
+    path: Path
+    answers: dict[str, Answer] = field(default_factory=dict)
+    cpu_s: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, path: Path) -> Stored:
+        found, name = cls(path), ""
+        for line in path.read_text("utf-8").splitlines() if path.is_file() else ():
+            if line.startswith("    "):
+                kind, _, values = line.strip().partition(" ")
+                found.answers[name][kind] = json.loads(values)
+            elif line and line[0] != "#":
+                name, _, seconds = line.rpartition(" | ")
+                found.answers[name], found.cpu_s[name] = {}, float(seconds.removesuffix(" s"))
+        return found
+
+    def put(self, name: str, answer: Answer, cpu_s: float) -> None:
+        before = self.cpu_s.get(name, 0.0)
+        self.answers[name] = answer
+        if not before / _OTHER_DURATION < cpu_s < before * _OTHER_DURATION:
+            self.cpu_s[name] = float(f"{cpu_s:.1f}")
+
+    def write(self, order: Sequence[str]) -> None:
+        """In this order; answers to questions that are not asked any more are left out."""
+        lines = [f"# python -m benchmarks.frozen_answers --store --against {self.path.stem}"]
+        for name in order:
+            if name in self.answers:
+                lines.append(f"{name} | {self.cpu_s[name]:g} s")
+                lines += [
+                    f"    {kind} {json.dumps(self.answers[name][kind], ensure_ascii=False)}"
+                    for kind in KINDS
+                    if kind in self.answers[name]
+                ]
+        self.path.write_text("\n".join(lines) + "\n", "utf-8")
+
+
+def plain(answer: Answer) -> Answer:
+    """As it is after a file: floats with six digits, nothing of numpy."""
+
+    def value(one: Any) -> Any:
+        if isinstance(one, np.generic):
+            one = one.item()
+        if isinstance(one, float):
+            return float(f"{one:.6g}")
+        return [value(part) for part in one] if isinstance(one, list | tuple) else one
+
     return {
-        "cpu_s": round(cpu_s, 1),
-        "simulations": found.simulations,
-        "answer": " + ".join(sorted(found.combination)) or found.verdict,
-        "truth": wanted,
-        "p_truth": sets.get(wanted, 0.0),
-        "gap": [round(g, 3) for g in (found.gap_before, found.gap_refit, found.gap_after)],
-        "sizes": {n: {k: float(f"{v:.4g}") for k, v in entries[n].parameters.items()} for n in named},
-        "sets": dict(sorted(sets.items(), key=lambda item: -item[1])),
+        kind: {name: value(one) for name, one in values.items()} for kind, values in answer.items() if values
     }
 
 
-def differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
-    """In words."""
-    told = []
-    if before["answer"] != after["answer"]:
-        told.append(f"answer {before['answer']} -> {after['answer']}")
-    for key in {**before["sets"], **after["sets"]}:
-        old, new = (which["sets"].get(key, 0.0) for which in (before, after))
-        if abs(new - old) >= TOLD:
-            told.append(f"{key} {old:.2f} -> {new:.2f}")
-    for name in before["sizes"].keys() & after["sizes"].keys():
-        for key, old in before["sizes"][name].items():
-            new = after["sizes"][name][key]
-            if abs(new - old) > TOLD_SIZE * abs(old):
-                told.append(f"{name} {key} {old:.3g} -> {new:.3g}")
-    if after["gap"][2] > (1 + TOLD_SIZE) * before["gap"][2]:
-        told.append(f"gap after {before['gap'][2]} -> {after['gap'][2]}")
-    return told
+def asked(question: Question) -> tuple[Answer, str]:
+    """The answer, or the error as one; and where that was raised."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return plain(question.ask()), ""
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        line = " ".join(f"{type(error).__name__}: {error}".split())
+        return {"lines": {"raises": line}}, f"{Path(place.filename).name}:{place.lineno}"
 
 
-def frozen(name: str) -> dict[str, dict[str, Any]]:
-    """Answers of a results file."""
-    lines = (RESULTS / f"{name}.txt").read_text("utf-8").splitlines()
-    parts = (line.partition(": {") for line in lines)
-    return {case: json.loads("{" + rest) for case, found, rest in parts if found}
-
-
-def run(out: Print, *, only: str = "", against: str = "", change: str = "", without: str = "") -> None:
+def serve(connection: Connection, change: str, without: str) -> None:
+    """A process that answers questions by name until none comes."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    quiet = os.open(os.devnull, os.O_WRONLY)
+    for descriptor in (1, 2):
+        os.dup2(quiet, descriptor)
     for name in without.split():
         getattr(moves, name).proposed = lambda *told: []
     for module, name, value in re.findall(r"(\S+):(\w+)=(\S+)", change):
         setattr(importlib.import_module(module), name, eval(value, {"np": np}))
-    before = frozen(against) if against else {}
-    cpu: dict[str, list[float]] = {}
-    for name, case, truth in cases(only):
-        found, cpu_s = timed(lambda case=case: diagnose(case))
-        now = answer(found, truth, cpu_s)
-        cpu.setdefault(name.split()[0], []).append(cpu_s)
-        out(f"{name}: {json.dumps(now)}")
-        if name in before:
-            cpu_before = before[name]["cpu_s"]
-            for words in (*differences(before[name], now), f"CPU {cpu_before} -> {cpu_s:.1f} s"):
-                out(f"    {words}")
-    for kind, times in cpu.items():
-        out(f"{kind}: CPU median {np.median(times):.1f} s, sum {sum(times):.0f} s")
+    while name := connection.recv():
+        signal.setitimer(signal.ITIMER_PROF, LONGEST_S)  # its signal ends the process, in compiled code too
+        begin = _cpu_s()
+        answer, place = asked(QUESTIONS[name])
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        connection.send((answer, place, _cpu_s() - begin))
+
+
+def _cpu_s() -> float:
+    """Of this process and of those it has waited for."""
+    used = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(one.ru_utime + one.ru_stime for one in used)
+
+
+class Worker:
+    """A process, the question it has, and since when."""
+
+    def __init__(self, *changes: str) -> None:
+        context = get_context("spawn")
+        self.connection, other = context.Pipe()
+        self.process = context.Process(target=serve, args=(other, *changes))
+        self.process.start()
+        other.close()
+        self.name, self.since = "", 0.0
+
+    def ask(self, name: str) -> None:
+        self.name, self.since = name, time.monotonic()
+        self.connection.send(name)
+
+    def take(self) -> tuple[Answer, str, float]:
+        """The answer, or how the process ended without one."""
+        try:
+            return self.connection.recv()  # type: ignore[no-any-return]
+        except EOFError:
+            self.process.join()
+            code = self.process.exitcode or 0
+            how = (
+                f"no answer after {LONGEST_S:g} s of CPU" if code == -signal.SIGPROF else f"died, exit {code}"
+            )
+            return {"lines": {"raises": how}}, "", LONGEST_S
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.join()
+
+
+def answers(
+    names: Sequence[str], jobs: int, *changes: str
+) -> Iterator[tuple[str, tuple[Answer, str, float]]]:
+    """Name and answer with its place and CPU seconds, as they come."""
+    left, workers = deque(names), list[Worker]()
+    try:
+        for _ in range(min(jobs, len(names))):
+            workers.append(Worker(*changes))
+            workers[-1].ask(left.popleft())
+        while workers:
+            ready = wait([one.connection for one in workers], timeout=10.0)
+            for worker in [*workers]:
+                if time.monotonic() - worker.since > HANGS_S and worker.connection not in ready:
+                    worker.process.kill()
+                if worker.connection not in ready:
+                    continue
+                name, found = worker.name, worker.take()
+                if not left or not worker.process.is_alive():
+                    workers.remove(worker)
+                    worker.end()
+                    if left:
+                        workers.append(worker := Worker(*changes))
+                if left:
+                    worker.ask(left.popleft())
+                yield name, found
+    finally:
+        for worker in workers:
+            worker.end()
+
+
+def run(
+    out: Print,
+    *,
+    only: str = "",
+    slow: bool = False,
+    store: bool = False,
+    against: str = "frozen_answers",
+    change: str = "",
+    without: str = "",
+    stop: bool = False,
+    jobs: int = 2,
+) -> None:
+    """only: a pattern of names; stop: at the first answer that moved."""
+    stored = Stored.read(RESULTS / f"{against}.txt")
+    wanted = [name for name, one in QUESTIONS.items() if re.search(only, name) and (slow or not one.slow)]
+    skipped = {
+        name: next(place for place in QUESTIONS[name].needs if not place.exists())
+        for name in wanted
+        if not all(place.exists() for place in QUESTIONS[name].needs)
+    }
+    for place in dict.fromkeys(skipped.values()):
+        out(f"skipped, {place} is not here: {', '.join(name for name in skipped if skipped[name] == place)}")
+
+    def expected_s(name: str) -> float:
+        return stored.cpu_s.get(name, _GUESS_S)
+
+    ready = sorted((name for name in wanted if name not in skipped), key=expected_s, reverse=True)
+    left_s, begin, count = sum(map(expected_s, ready)), time.monotonic(), 0
+    all_s, spent_s, wrong, within = left_s, 0.0, list[str](), list[tuple[float, str]]()
+    for name, (answer, place, cpu_s) in answers(ready, jobs, change, without):
+        count, left_s, spent_s = count + 1, left_s - expected_s(name), spent_s + cpu_s
+        before = stored.answers.get(name)
+        off = moved(before or {}, answer)
+        told = [str(one) for one in off if one.share > 1] if before is not None else []
+        state = "moved" if told else "same"
+        if before is None:
+            state, told = "not stored", [] if store else [f"it is stored by: {_storing(name, against)}"]
+        else:
+            within += [(one.share, f"{name}: {one}") for one in off if one.share <= 1]
+        if place and (told or before is None):
+            told.append(f"{answer['lines']['raises']} (raised in {place})")
+        wrong += [name] if told else []
+        rest = left_s * (time.monotonic() - begin) / max(all_s - left_s, 1.0)
+        out(
+            f"[{count}/{len(ready)}] {name}: {state}, {cpu_s:.1f} s CPU ({expected_s(name):g} s expected); "
+            f"about {rest / 60:.1f} min left"
+        )
+        for line in told:
+            out(f"    {line}")
+        if store:
+            stored.put(name, answer, cpu_s)
+        if stop and wrong:
+            break
+    if store:
+        stored.write(list(QUESTIONS))
+    out()
+    if within:
+        share, line = max(within)
+        out(f"{len(within)} values moved within their tolerance, the furthest by {share:.0%} of it: {line}")
+    out(
+        f"{len(ready)} questions, {spent_s:.0f} s CPU in {(time.monotonic() - begin) / 60:.1f} min; "
+        f"skipped {len(skipped)}; {'stored, of them moved' if store else 'not as stored'} {len(wrong)}"
+        + (f": {', '.join(wrong)}" if wrong else "")
+    )
+    if wrong and not store:
+        out(f"if that is meant, {_storing('', against)} and say why in the commit")
+        sys.exit(1)
+
+
+def _storing(name: str, against: str) -> str:
+    """The command that stores answers."""
+    if not name and against == "frozen_answers":
+        return "make frozen STORE=1"
+    words = f" --only '^{re.escape(name)}$'" if name else ""
+    words += f" --against {against}" if against != "frozen_answers" else ""
+    return f"python -m benchmarks.frozen_answers --store{words}"
 
 
 if __name__ == "__main__":
-    main(run)
+    main(run, writes=False)

@@ -47,13 +47,17 @@ class Results:
 
 
 def main(
-    run: Callable[..., None], arguments: Sequence[str] | None = None, *, seeds: str | None = None
+    run: Callable[..., None],
+    arguments: Sequence[str] | None = None,
+    *,
+    seeds: str | None = None,
+    writes: bool = True,
 ) -> None:
     """Call `run` with the options of the command line; the results file begins with command, seeds, commit
     and date.
 
     seeds: in words, where they are not the options `seeds` (0 to seeds - 1) or `seed`; may name options in
-    braces.
+    braces; writes: a run with all options as they are writes its results file.
     """
     file = Path(inspect.getfile(run))
     module = file.parent.name if file.stem == "__main__" else file.stem  # a package is named by its folder
@@ -73,7 +77,7 @@ def main(
         parser.add_argument(f"--{name.replace('_', '-')}", **_kind(default))
     given = vars(parser.parse_args(arguments))
     options = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
-    target = options.pop("name") or (module if options == defaults else None)
+    target = options.pop("name") or (module if writes and options == defaults else None)
     command = shlex.join(["python", "-m", f"benchmarks.{module}", *arguments])
     threads = os.environ.get("OMP_NUM_THREADS")
     rests_on = seeds.format(**options) if seeds is not None else _seeds(options)
