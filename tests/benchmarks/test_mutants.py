@@ -1,0 +1,245 @@
+"""Mutants: one change each, of code inside functions, in a copy only."""
+
+import ast
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.mutants import ROOMS, ROOT, Copy, Judge, changed, drawn, files_of, mutants_of, placed
+
+SOURCE = b'''"""Docs with 3 * 4."""
+from dataclasses import dataclass
+LIMIT = 3.0
+
+
+@dataclass(frozen=True)
+class Beam:
+    """A beam of 2 parts."""
+
+    length: int = 7
+
+    def inertia(self, scale: "float" = 2.0) -> "tuple[1, 2]":
+        """Of 5 - 4 parts."""
+        if not scale > 0.5:  # 8 - 9
+            raise ValueError(f"scale is {scale - 1}; expected more than {6 + 7}")
+        a = (self.length  # above - below
+             - scale)
+        b = -(1.5 if a else a) ** 2
+        b += 11
+        \xce\xb1 = "\xc2\xb0"; c = a if b and True else \xce\xb1
+        return c
+
+    def __repr__(self):
+        return str(12 + 13)
+
+
+def nothing():
+    return None
+'''
+
+
+def change(mutant):
+    return mutant.before.decode(), mutant.after.decode()
+
+
+def test_every_operator_sign_constant_and_return_inside_functions_and_nothing_else():
+    assert sorted(map(change, mutants_of("plant", "plant/a.py", SOURCE))) == sorted(
+        [
+            (">", "<"),
+            ("0.5", "1.0"),
+            ("-", "+"),
+            ("-", "+"),
+            ("+=", "-="),
+            ("11", "12"),
+            ("(1.5 if a else a) ** 2", "((1.5 if a else a) * 2)"),
+            ("1.5", "3.0"),
+            ("2", "3"),
+            ("b and True", "(b or True)"),
+            ("True", "False"),
+            ("c", "None"),
+        ]
+    )
+
+
+def tops(before: ast.AST, after: ast.AST) -> int:
+    """How many nodes differ, those below a differing one not counted."""
+    if type(before) is not type(after):
+        return 1
+    own = [
+        value
+        for node in (before, after)
+        for _, value in ast.iter_fields(node)
+        if not isinstance(value, list | ast.AST)
+    ]
+    if own[: len(own) // 2] != own[len(own) // 2 :]:
+        return 1
+    children = [list(ast.iter_child_nodes(node)) for node in (before, after)]
+    if len(children[0]) != len(children[1]):
+        return 1
+    return sum(tops(*pair) for pair in zip(*children, strict=True))
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_mutant_of_the_product_parses_and_differs_in_one_node(room):
+    rng = np.random.default_rng(1)
+    files = files_of(room, ROOT)
+    checked = 0
+    for k in rng.permutation(len(files))[:4]:
+        source = files[k].read_bytes()
+        tree, every = ast.parse(source), mutants_of(room, "a.py", source)
+        for j in rng.permutation(len(every))[:10]:
+            text = changed(every[j], source)
+            assert text != source
+            assert tops(tree, ast.parse(text)) == 1, every[j]
+            # The line that is told is the line that differs.
+            line = every[j].line - 1
+            assert text.splitlines()[:line] == source.splitlines()[:line]
+            assert text.splitlines()[line] != source.splitlines()[line]
+            checked += 1
+    assert checked >= 10 or room == "flexlink"
+
+
+def test_the_same_seed_draws_the_same_and_two_a_room():
+    found = drawn(ROOT, 3, 2)
+    assert [one.room for one in found] == [room for room in ROOMS for _ in "ab"]
+    assert len(set(found)) == len(found)
+    assert drawn(ROOT, 3, 2, ["plant"]) == [one for one in found if one.room == "plant"]
+    assert drawn(ROOT, 4, 2, ["flexlink"]) != [one for one in found if one.room == "flexlink"]
+    assert not any(one.file.startswith("ident/data/") for one in found if one.room == "ident")
+
+
+CODE = """def area(width, height):
+    return width * height
+
+
+def twice(x):
+    y = 2 * x
+    return y
+"""
+TEST = """import sys
+from pathlib import Path
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from plant.shape import area
+
+
+def test_area():
+    assert area(2, 3) == 6
+
+
+def test_fails_anyway():
+    assert not Path("wrong").exists() and False
+"""
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """A small one: one function is tested, one is not, and one test fails."""
+    root = tmp_path / "checkout"
+    for file, text in {
+        "plant/shape.py": CODE,
+        "tests/plant/test_shape.py": TEST,
+        "pyproject.toml": "[tool.pytest.ini_options]\nmarkers = ['slow: long']\n",
+        ".git/config": "",
+    }.items():
+        (root / file).parent.mkdir(parents=True, exist_ok=True)
+        (root / file).write_text(text)
+    return root
+
+
+def texts(root: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+def by_function(root: Path, function: str):
+    return next(one for one in drawn(root, 0, 9, ["plant"]) if one.function == function)
+
+
+def test_what_tests_see_and_what_survives_and_the_checkout_stays_as_it_is(checkout, tmp_path):
+    before = texts(checkout)
+    copy = Copy(checkout, tmp_path / "copies")
+    judge = Judge(copy, slow=False)
+    assert judge.verdict(by_function(checkout, "area"), frozen=False) == (
+        "killed by tests/plant/test_shape.py::test_area"
+    )
+    assert judge.verdict(by_function(checkout, "twice"), frozen=True) == (
+        "survived the tests; no frozen answers are stored"
+    )
+    assert judge.fail_anyway == {"tests/plant/test_shape.py::test_fails_anyway"}
+    assert judge.cpu_s > 0
+    assert texts(checkout) == before
+    assert copy.left_behind() == []
+    assert not (copy.path / ".git").exists()
+
+
+def test_a_mutant_left_behind_in_the_copy_is_seen_before_the_next(checkout, tmp_path):
+    copy, mutant = Copy(checkout, tmp_path / "copies"), by_function(checkout, "twice")
+    with contextlib.suppress(KeyboardInterrupt), copy.holding(mutant):
+        assert copy.left_behind() == ["plant/shape.py"]
+        raise KeyboardInterrupt
+    assert copy.left_behind() == []
+    (copy.path / "plant/shape.py").write_bytes(changed(mutant, CODE.encode()))
+    with (
+        pytest.raises(RuntimeError, match=r"left behind by an earlier mutant: plant/shape\.py"),
+        copy.holding(mutant),
+    ):
+        pass
+
+
+def test_compiled_kernels_are_those_of_the_mutant_and_then_those_of_the_checkout(checkout, tmp_path):
+    kernel = checkout / "plant/kernel.py"
+    kernel.write_text("from numba import njit\n\n\n@njit\ndef f(x):\n    return x + 1\n")
+    cache = "plant/__pycache__/kernel.f-6.nbi"
+    (checkout / cache).parent.mkdir()
+    (checkout / cache).write_bytes(b"compiled")
+    copy = Copy(checkout, tmp_path / "copies")
+    with copy.holding(by_function(checkout, "f")) as root:
+        assert not (root / cache).exists()
+        (root / cache).write_bytes(b"wrong")
+    assert (copy.path / cache).read_bytes() == b"compiled"
+    with copy.holding(by_function(checkout, "twice")) as root:
+        assert (root / cache).exists()
+
+
+def test_a_statement_is_found_in_another_checkout_where_it_is_there_once(checkout, tmp_path):
+    mutant, other = by_function(checkout, "twice"), tmp_path / "other"
+    (other / "plant").mkdir(parents=True)
+    file = other / "plant/shape.py"
+    file.write_text("# a line more\n" + CODE.replace("twice", "double"))
+    assert placed(mutant, other) == (file, changed(mutant, file.read_bytes()))
+    moved = file.rename(other / "plant/moved.py")
+    assert placed(mutant, other)[0] == moved
+    moved.write_text(CODE.replace("2 * x", "3 * x").replace("return y", "return x"))
+    with pytest.raises(ValueError, match="its statement is in 0 files"):
+        placed(mutant, other)
+    for name in "ab":
+        (other / f"plant/{name}.py").write_text(CODE)
+    with pytest.raises(ValueError, match="its statement is in 2 files"):
+        placed(mutant, other)
+
+
+def test_an_end_by_signal_leaves_nothing(checkout, tmp_path):
+    code = (
+        "import tempfile, time\nfrom pathlib import Path\nfrom benchmarks import mutants\n"
+        f"mutants.ROOT, mutants.ROOMS = Path({str(checkout)!r}), {{'plant': ('tests/plant',)}}\n"
+        "mutants.Judge._ran = lambda self, root, *words: print('now', flush=True) or time.sleep(60)\n"
+        "mutants.run(print, rooms=('plant',), frozen=False)\n"
+    )
+    before, temporary = texts(checkout), tmp_path / "temporary"
+    temporary.mkdir()
+    environment = {**os.environ, "TMPDIR": str(temporary)}
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], cwd=ROOT, env=environment, stdout=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"now\n"
+    process.send_signal(signal.SIGTERM)
+    process.communicate()
+    assert process.returncode == 143
+    assert texts(checkout) == before
+    assert list(temporary.iterdir()) == []
