@@ -95,13 +95,37 @@ def state_space(system: Any, what: str = "the system", *, several: bool = False)
     _checked(system, what, several=several and isinstance(system, control.StateSpace))
     if isinstance(system, control.StateSpace):
         return system
-    try:
-        return control.tf2ss(system)
-    except ValueError:
+    above, below = (np.trim_zeros(np.atleast_1d(part[0][0]), "f") for part in (system.num, system.den))
+    if above.size > below.size:
         raise WrongSystemError(
             f"{what} has more zeros than poles, so it answers before it is asked: expected as many poles, "
             "control.tf(num, den, dt_s) with num no longer than den"
-        ) from None
+        )
+    return _in_sections(above, below, system.dt)
+
+
+def _in_sections(above: npt.NDArray[Any], below: npt.NDArray[Any], dt_s: float) -> control.StateSpace:
+    """above(z)/below(z) as sections of first and second order in a row: of slow poles that are close together
+    one companion form leaves nothing but rounding."""
+    if not above.size:
+        return control.ss([], [], [], 0.0, dt_s)
+    # Poles that the rounding of coefficients cannot tell from one are one.
+    integrators, rest = 0, below
+    while rest.size > 1 and abs(np.sum(rest)) <= rest.size * np.finfo(float).eps * np.sum(np.abs(rest)):
+        integrators, rest = integrators + 1, np.cumsum(rest)[:-1]
+    poles, zeros = _factors(np.append(np.roots(rest), np.ones(integrators))), _factors(np.roots(above))
+    zeros += [np.ones(1)] * (len(poles) - len(zeros))
+    found = control.ss([], [], [], above[0] / below[0], dt_s)
+    for pole, zero in zip(poles, zeros, strict=True):
+        found = control.series(found, control.tf2ss(control.tf(zero, pole, dt_s)))
+    return found
+
+
+def _factors(roots: npt.NDArray[Any]) -> list[npt.NDArray[np.float64]]:
+    """Factors of second order and, of an odd number of roots, one of first order."""
+    real = np.sort(roots[roots.imag == 0].real)[::-1]
+    pairs = [np.poly([root, root.conj()]).real for root in roots[roots.imag > 0]]
+    return pairs + [np.poly(real[at : at + 2]) for at in range(0, real.size, 2)]
 
 
 def measured_response(system: control.FrequencyResponseData, what: str = "the frd") -> FrequencyUncertainty:

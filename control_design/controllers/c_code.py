@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from string import Template
@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
+from control_design.controllers.law import in_sections
+
 if TYPE_CHECKING:
     from control_design.controllers.controller import Controller
     from control_design.plants.ellipses import Real
 
 Number = Literal["double", "float"]
+_ROUNDED = 0.01  # of the response: more than this, 0.1 dB, single precision must not change it
 _NO_LIMIT = 3e38  # written for an actuator without a limit beside others that have one; fits a float
 
 
@@ -71,14 +74,15 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
     has `<prefix>_step(&state, error, command)` with arrays of these lengths. With a friction feed-forward it
     is `<prefix>_step(&state, error, reference)`.
 
-    Raises ValueError if the prefix is no C identifier, or the number is neither.
+    Raises ValueError if the prefix is no C identifier, the number is neither, or does not hold the law.
 
     Same law and same order of operations as `ControllerStepper`: x+ = A x + B e + M (u_limited - u). In
-    `double` the two differ by the rounding of sums only. The computational delay is not in the code: a
-    real-time loop that writes its command one sample later has it by itself.
+    `double` the two differ by the rounding of sums only; `float` may have other states: see `law_in`. The
+    computational delay is not in the code: a real-time loop that writes its command one sample later has it
+    by itself.
 
     No fixed point: word lengths that keep the certificate depend on the scaling on the processor. An error
-    that is not finite gives a command that is not finite: check the sensor before the call.
+    that is not finite gives NaN, limits or not, which states keep until `<prefix>_reset`: check the sensor.
 
     Examples
     --------
@@ -87,39 +91,47 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
     >>> "float hub_step(hub_state *state, float error)" in code, "INPUT_LIMIT = 24.0f" in code
     (True, True)
     """
+    Dialect(prefix, number)
+    controller = law_in(number, controller)
     assert controller.anti_windup_gain is not None
-    suffix = "f" if number == "float" else ""
+    kind, suffix = (np.float32, "f") if number == "float" else (np.float64, "")
 
     def literal(value: float) -> str:
-        # The shortest decimal that reads back as the same double.
-        text = repr(float(value))
+        # The shortest decimal that reads back as the same number.
+        with np.errstate(over="ignore", under="ignore"):
+            text = str(kind(value))
         return text + suffix if any(mark in text for mark in ".e") else f"{text}.0{suffix}"
+
+    def constant(what: str, value: float) -> str:
+        with np.errstate(over="ignore", under="ignore"):
+            if value and not 0 < abs(kind(value)) < np.inf:
+                raise ValueError(f"{what} = {value:.6g} does not fit in a C {number}; use number = 'double'")
+        return literal(value)
 
     def vector(values: Real) -> str:
         return "{" + ", ".join(literal(value) for value in (values if values.size else [0.0])) + "}"
 
     values = {"f": suffix}
     if (given := controller.feedforward) is not None:
-        values |= {
-            "level": literal(given.level),
-            "turn": literal(given.turn(controller.dt_s)),
-            "share": literal(given.share(controller.dt_s)),
-            "excess": literal(given.excess),
-            "fall": literal(given.fall * controller.dt_s),
+        own = {
+            "level": given.level,
+            "turn": given.turn(controller.dt_s),
+            "share": given.share(controller.dt_s),
         }
+        own |= {"excess": given.excess, "fall": given.fall * controller.dt_s}
+        values |= {name: constant(f"feedforward {name}", value) for name, value in own.items()}
     one = controller.D.size == 1
 
     def table(matrix: Real) -> str:
         return ",\n    ".join(vector(row) for row in matrix) or vector(np.zeros(matrix.shape[1]))
 
-    def limits(name: str, factor: float) -> str:
-        most = np.minimum(factor * controller.limits(name), _NO_LIMIT)
-        return literal(float(most[0])) if one else vector(most)
-
-    if controller.input_limit is not None:
-        values["input_limit"] = limits("input_limit", 1.0)
-    if controller.rate_limit is not None:
-        values["largest_change"] = limits("rate_limit", controller.dt_s)
+    for name, key, factor in (
+        ("input_limit", "input_limit", 1.0),
+        ("rate_limit", "largest_change", controller.dt_s),
+    ):
+        if getattr(controller, name) is not None:
+            most = np.minimum(factor * controller.limits(name), _NO_LIMIT)
+            values[key] = constant(name, float(most[0])) if one else vector(most)
     return _filled(
         "controller.c.in",
         controller,
@@ -135,6 +147,45 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
     )
 
 
+def law_in(number: Number, controller: Controller) -> Controller:
+    """The controller in the states that its code has: its own, or those of `in_sections` where `float` would
+    change what it does by rounding its own. Raises ValueError where it does in both."""
+    if number == "double" or controller.order == 0:
+        return controller
+    own, there, back = in_sections(controller.A)
+    sections = replace(
+        controller,
+        A=own,
+        B=back @ controller.B,
+        C=controller.C @ there,
+        anti_windup_gain=back @ controller.anti_windup_gain,
+    )
+    omega = np.geomspace(1e-4, 1.0, 400) * np.pi / controller.dt_s
+    exact = controller.response(omega).reshape(omega.size, -1)
+    size = _ROUNDED * np.linalg.norm(exact, axis=1)
+    radius = max(1.0, *_radii(controller)) * (1 + np.finfo(np.float32).eps)
+    for form in (controller, sections):
+        rounded = {
+            name: np.clip(getattr(form, name), -_NO_LIMIT, _NO_LIMIT).astype(np.float32)
+            for name in ("A", "B", "C", "D", "anti_windup_gain")
+        }
+        law = replace(controller, **rounded, input_limit=None, rate_limit=None)
+        off = np.linalg.norm(law.response(omega).reshape(exact.shape) - exact, axis=1)
+        if np.all(off <= size) and max(_radii(law)) <= radius:
+            return form
+    raise ValueError(
+        f"single precision changes the response of {controller.name!r} by more than {_ROUNDED:.0%}: use "
+        "number = 'double', or give the controller in sections"
+    )
+
+
+def _radii(law: Controller) -> tuple[float, float]:
+    """Of the poles, and of those while a limit is active."""
+    return tuple(
+        float(np.max(np.abs(np.linalg.eigvals(a)))) for a in (law.A, law.A - law.anti_windup_gain @ law.C)
+    )
+
+
 def _filled(template: str, controller: Controller, **values: object) -> str:
     """A template with its values. A line that begins with `@what:` is for controllers that have it (`!what`:
     that have it not; several with commas: all of them)."""
@@ -144,7 +195,7 @@ def _filled(template: str, controller: Controller, **values: object) -> str:
         "rate_limit": controller.rate_limit is not None,
         "limits": controller.input_limit is not None or controller.rate_limit is not None,
         "friction": given is not None,
-        "breakaway": given is not None and given.excess > 0,
+        "breakaway": given is not None and given.excess != 0,
         "matrix": controller.D.size > 1,
         "signals": bool(controller.signals),
     }

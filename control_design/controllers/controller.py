@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from control_design.controllers.law import Law
+from control_design.controllers.law import Law, in_sections
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import delayed
 from ident.data.arrays import lock
@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 else:
     Limit = float | tuple[float | None, ...] | None
 
+_NO_GAIN = (
+    "no anti-windup gain found for the limits: the controller has a marginal mode that its output does not "
+    "show, or too many poles close together for its state space; give it in sections, or anti_windup_gain"
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Controller(Law):
@@ -28,9 +33,9 @@ class Controller(Law):
 
     A (n, n), B (n, Y), C (U, n), D (U, Y); dt_s > 0. input_limit, rate_limit: saturation (both signs) and
     largest change per second of the command, or None; with U > 1 a tuple of these. anti_windup_gain M (n, U):
-    back-calculation in observer form, A - M C stable; default `observer_gain`. computational_delay_samples:
-    from measurement to command. feedforward: joins u before it is limited, or None. signals: the columns and
-    units of error and command, in words.
+    back-calculation in observer form, A - M C stable; default `observer_gain`, without limits zero.
+    computational_delay_samples: from measurement to command. feedforward: joins u before it is limited, or
+    None. signals: the columns and units of error and command, in words.
     """
 
     kind = "controller"
@@ -46,41 +51,39 @@ class Controller(Law):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        n = self.order
-        if not self.computational_delay_samples >= 0:
-            raise ValueError(
-                f"computational_delay_samples must not be negative; got {self.computational_delay_samples}"
-            )
-        inputs = self.D.shape[0]
+        n, inputs = self.order, self.D.shape[0]
+        delay = self.computational_delay_samples
+        if not (delay >= 0 and int(delay) == delay):
+            raise ValueError(f"computational_delay_samples must not be negative, and whole; got {delay}")
+        object.__setattr__(self, "computational_delay_samples", int(delay))
         for name in ("input_limit", "rate_limit"):
             value = getattr(self, name)
-            if isinstance(value, tuple | list):
-                value = tuple(value)
-                object.__setattr__(self, name, value)
-            each = value if isinstance(value, tuple) else (value,)
-            if (isinstance(value, tuple) or (value is not None and inputs > 1)) and len(each) != inputs:
+            several = isinstance(value, tuple | list) or np.ndim(value) > 0
+            each = tuple(None if one is None else float(one) for one in (value if several else (value,)))
+            if (several or (value is not None and inputs > 1)) and len(each) != inputs:
                 raise ValueError(f"{name} needs one value for each of {inputs} actuators; got {value!r:.80}")
             if not all(one is None or one > 0 for one in each):
                 raise ValueError(f"{name} must be positive or None; got {value}")
+            object.__setattr__(self, name, each if several else each[0])
         if self.feedforward is not None and self.D.size > 1:
             raise ValueError("a friction feed-forward is for one loop; got a controller of several")
+        limited = bool(np.isfinite([self.limits("input_limit"), self.limits("rate_limit")]).any())
         gain = self.anti_windup_gain
-        gain = (
-            observer_gain(self.A, self.B, self.C, self.D) if gain is None else np.asarray(gain, dtype=float)
-        )
-        if gain.shape != (n, inputs) or not np.all(np.isfinite(gain)):
-            raise ValueError(f"anti_windup_gain must be finite and ({n}, {inputs}); got shape {gain.shape}")
+        if gain is None:
+            gain = observer_gain(self.A, self.B, self.C, self.D) if limited else np.zeros((n, inputs))
+        gain, sought = np.asarray(gain, dtype=float), gain is not self.anti_windup_gain
         object.__setattr__(self, "anti_windup_gain", gain)
         lock(self, "anti_windup_gain")
-        if n and (self.input_limit is not None or self.rate_limit is not None):
+        if gain.shape != (n, inputs) or not np.all(np.isfinite(gain)):
+            raise ValueError(f"anti_windup_gain must be finite and ({n}, {inputs}); got shape {gain.shape}")
+        if n and limited:
             with np.errstate(over="ignore", invalid="ignore"):
                 inner = self.A - gain @ self.C
             finite = bool(np.all(np.isfinite(inner)))
             radius = float(np.max(np.abs(np.linalg.eigvals(inner)))) if finite else np.inf
             if not radius < 1:
-                raise ValueError(
-                    f"anti_windup_gain leaves a pole of A - M C at radius {radius:.6g}: it would wind up"
-                )
+                told = f"anti_windup_gain leaves a pole of A - M C at radius {radius:.6g}: it would wind up"
+                raise ValueError(_NO_GAIN if sought else told)
 
     @classmethod
     def proportional(cls, gain: float, dt_s: float, **settings: Any) -> Controller:
@@ -178,14 +181,15 @@ class ControllerStepper:
     def step(self, error: float, reference: float = 0.0) -> float:
         """Command for the error at this sample; `limited` tells whether a limit was active.
 
-        reference: the set point, which the feed-forward (if any) looks at; it rested at zero before.
+        reference: the set point, which the feed-forward (if any) looks at; it rested at zero before. An error
+        that is not finite gives NaN, whatever the limits; states keep it until `reset`.
         """
         if self._given is not None:
             moved = reference - self._reference
             friction = float(self._given.friction(np.asarray(moved), self._controller.dt_s)) if moved else 0.0
             self._smoothed += self._share * (friction - self._smoothed)
         self._reference = reference
-        wanted = float(self._c @ self._x) + self._d * error + self._smoothed
+        wanted = float(self._c @ self._x) + self._d * error + (error - error) + self._smoothed
         command = min(max(wanted, self._last - self._change), self._last + self._change)
         command = min(max(command, -self._limit), self._limit)
         self.limited = command != wanted
@@ -209,9 +213,13 @@ class MatrixStepper:
         """Commands (U,) for the errors (Y,) at this sample."""
         k = self._k
         assert k.anti_windup_gain is not None
-        wanted = k.C @ self._x + k.D @ error
-        command = np.clip(wanted, self._last - self._change, self._last + self._change)
-        command = np.clip(command, -self._limit, self._limit)
+        wanted = k.C @ self._x + k.D @ error + np.sum(error - error)  # NaN, as of one loop
+        command = wanted  # compared as the code in C compares, also what is not a number
+        for low, high in (
+            (self._last - self._change, self._last + self._change),
+            (-self._limit, self._limit),
+        ):
+            command = np.where(command > high, high, np.where(command < low, low, command))
         self.limited = command != wanted
         self._x = k.A @ self._x + k.B @ error + k.anti_windup_gain @ (command - wanted)
         self._last = command
@@ -234,14 +242,15 @@ def observer_gain(A: Real, B: Real, C: Real, D: Real) -> Real:
     state_noise = B @ B.T + 1e-6 * size * np.eye(n)
     scale = float(np.trace(C @ state_noise @ C.T)) or 1.0
     output_noise = D @ D.T + 1e-4 * scale * np.eye(C.shape[0])
+    # In companion form poles that are close together leave nothing of the equation but rounding.
+    own, there, back = in_sections(A)
+    seen = C @ there
     try:
-        p = solve_discrete_are(A.T, C.T, state_noise, output_noise)
+        p = solve_discrete_are(own.T, seen.T, back @ state_noise @ back.T, output_noise)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise ValueError(
-            "no anti-windup gain found: the controller has a marginal mode that its output does not show"
-        ) from error
-    gain = np.linalg.solve(C @ p @ C.T + output_noise, (A @ p @ C.T).T).T * (state_unit / output_unit)
-    return np.asarray(gain, dtype=np.float64)
+        raise ValueError(_NO_GAIN) from error
+    gain = there @ np.linalg.solve(seen @ p @ seen.T + output_noise, (own @ p @ seen.T).T).T
+    return np.asarray(gain * (state_unit / output_unit), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -267,6 +276,9 @@ class FrictionFeedforward:
     fall: float = 1.0
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, np.generic):  # whose truths are not those of Python
+                object.__setattr__(self, name, value.item())
         good = self.level * self.excess >= 0 and min(self.width, self.lag_s, self.fall) > 0
         if not (good and np.all(np.isfinite(list(vars(self).values())))):
             raise ValueError(

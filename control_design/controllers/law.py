@@ -47,6 +47,7 @@ class Law:
                 raise ValueError(f"{self.kind} matrix {name} has a value that is not finite")
         if not (self.dt_s > 0 and np.isfinite(self.dt_s)):
             raise ValueError(f"dt_s must be positive; got {self.dt_s}")
+        object.__setattr__(self, "dt_s", float(self.dt_s))  # of numpy: not as C or JSON would have it
 
     @property
     def order(self) -> int:
@@ -146,6 +147,16 @@ class Law:
         if not isinstance(data, dict):
             raise ValueError(f"{cls.kind} JSON must be an object; got {type(data).__name__}")
         return cls.from_dict(data)
+
+
+def in_sections(A: Real) -> tuple[Real, Real, Real]:
+    """(S, T, T^-1), A = T S T^-1 for states in real Schur form: sections in a row, whose poles rounding moves
+    by as much as it rounds, however close together they are."""
+    from scipy.linalg import matrix_balance, schur  # here: every command would wait for it
+
+    balanced, (size, _) = matrix_balance(A, permute=False, separate=True)
+    own, turn = schur(balanced)
+    return own, size[:, None] * turn, turn.T / size
 
 
 def _holds_truth(value: Any) -> bool:

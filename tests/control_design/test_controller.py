@@ -9,7 +9,9 @@ import control
 import numpy as np
 import pytest
 import scipy.io
+import scipy.signal
 
+import flexlink
 from control_design import Controller
 from control_design.controllers.controller import FrictionFeedforward
 
@@ -162,7 +164,9 @@ def test_files_that_are_no_controller_are_refused(text, message):
         ({"B": np.ones((2, 1))}, "needs A"),
         ({"input_limit": -1.0}, "input_limit must be positive"),
         ({"computational_delay_samples": -1}, "must not be negative"),
+        ({"computational_delay_samples": 1.5}, "and whole; got 1.5"),
         ({"input_limit": 1.0, "anti_windup_gain": np.zeros((1, 1))}, "would wind up"),
+        ({"input_limit": 1.0, "C": np.zeros((1, 1))}, "no anti-windup gain found for the limits"),
     ],
 )
 def test_controllers_that_cannot_run_are_refused(fields, message):
@@ -175,3 +179,46 @@ def test_a_controller_is_frozen():
     controller = _pi()
     with pytest.raises(ValueError, match="read-only"):
         controller.A[0, 0] = 2
+
+
+_NOTCHES = ((), (5.0,), (5.0, 12.0), (20.0, 60.0), (50.0, 200.0), (50.0, 200.0, 500.0))
+
+
+@pytest.mark.parametrize("dt_s", [5e-3, 2e-3, 1e-3, 2.5e-4])
+def test_companion_forms_of_slow_controllers_are_taken(dt_s):
+    """PI and notches: poles so close together that rounding moves them. A gain is sought for a limit only."""
+    for corners in _NOTCHES:
+        above, below = np.array([1.0, -1 + 2 * dt_s]), np.array([1.0, -1.0])
+        for corner in dt_s * np.array(corners):
+            zero, pole = np.exp((-0.02 + 1j) * corner), np.exp(0.7 * (-1 + 1j) * corner)
+            above = np.polymul(above, np.poly([zero, zero.conj()]).real)
+            below = np.polymul(below, np.poly([pole, pole.conj()]).real)
+        law = scipy.signal.tf2ss(above, below)
+        assert not Controller(*law, dt_s).anti_windup_gain.any()
+        if dt_s * min(corners, default=1e3) > 1e-3 * 5 ** len(corners):  # else A - M C is lost in rounding
+            limited = Controller(*law, dt_s, input_limit=5.0)
+            inner = limited.A - limited.anti_windup_gain @ limited.C
+            assert np.max(np.abs(np.linalg.eigvals(inner))) < 1
+        plant = control.c2d(control.tf([0.5], [0.1, 1]), dt_s)
+        found = flexlink.certify(
+            control.tf(above, below, dt_s), plant, flexlink.Specification(modulus_margin=0.3)
+        )
+        assert found.certified
+        # Proved for all frequencies, which takes poles and zeros that agree with the state space to 1e-6.
+        assert found.gamma_bound < 1.01 * found.gamma
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_a_transfer_function_keeps_its_integrators(order):
+    """Three integrators in a loop, of which rounding leaves a triangle about z = 1 in companion form."""
+    dt_s = 1e-3
+    k = control.tf(5 * np.poly([0.998] * order), np.poly([1.0] * order), dt_s)
+    plant = control.c2d(control.tf([1], [0.1, 1]), dt_s)
+    found = flexlink.certify(k, plant, flexlink.Specification(modulus_margin=0.3))
+    assert found.certified
+    assert found.plants[0].nyquist.required == order / 2
+    assert np.sum(found.controller.poles == 1) == order
+    omega = np.geomspace(10, 3000, 50)
+    z = np.exp(1j * omega * dt_s)
+    exact = 5 * ((z - 0.998) / (z - 1)) ** order
+    np.testing.assert_allclose(found.controller.response(omega, with_delay=False), exact, rtol=1e-6)
