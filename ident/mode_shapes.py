@@ -87,7 +87,9 @@ def one_shape_each(
         return None
     modes = [replace(mode, rank_one=False) for mode in modes]
     best = ModalFit(data, modes)
-    for k in np.argsort([_second_size(mode, best.sizes(mode)) for mode in modes]):
+    # By the second singular value of a residue over its first, inputs weighed by how much they drive it.
+    sizes = [np.linalg.svd(mode.residue * best.sizes(mode), compute_uv=False) for mode in modes]
+    for k in np.argsort([one[1] / max(one[0], 1e-300) for one in sizes]):
         trial = [
             replace(mode, rank_one=mode.rank_one or at == int(k))
             for at, mode in enumerate(best.modes_found())
@@ -99,12 +101,6 @@ def one_shape_each(
     if not any(mode.rank_one for mode in best.modes):
         return None
     return best.shaped(poles)
-
-
-def _second_size(mode: Mode, sizes: RealArray) -> float:
-    """Second singular value of a residue over its first, inputs weighed by how much they drive it."""
-    values = np.linalg.svd(mode.residue * sizes, compute_uv=False)
-    return float(values[1] / max(values[0], 1e-300))
 
 
 def modes_of(

@@ -195,10 +195,15 @@ def _described(
     noise = residual @ residual.T / (residual.shape[1] * (1 - unknowns / data.n_samples))
     own, segments = back @ residual, data.each[0].segments
     measured = back @ np.stack([one.y for one in data.each])
-    fits_percent = [
-        [_fit_percent(own[k, part], y[part]) for k, y in enumerate(measured)] for part in segments
-    ]
-    by_output = np.array(fits_percent)
+    by_output = np.array(
+        [
+            [
+                100 * (1 - np.linalg.norm(own[k, part]) / np.linalg.norm(y[part] - y[part].mean()))
+                for k, y in enumerate(measured)
+            ]
+            for part in segments
+        ]
+    )
     return MimoIdentification(
         model=model,
         noise_covariance=back @ noise @ back.T,
@@ -220,10 +225,6 @@ def _described(
         search=SearchTrace(tuple(search.stages), tuple(search.minima), (), search.evaluations),
         advise=partial(_advice, records, search, model, residual),
     )
-
-
-def _fit_percent(residual: RealArray, y: RealArray) -> float:
-    return float(100 * (1 - np.linalg.norm(residual) / np.linalg.norm(y - y.mean())))
 
 
 def _model(

@@ -187,11 +187,6 @@ class IdentOptions(Settings):
         """Nobody stated a delay, not even that there is none."""
         return "input_delay_samples" not in self.model_fields_set
 
-    @property
-    def integrators_left_to_data(self) -> bool:
-        """Nobody stated integrators or unstable poles, not even that there are none."""
-        return not self.model_fields_set & {"integrators", "unstable_poles"}
-
     def with_delay_stated(self) -> IdentOptions:
         """The same, the delay no longer sought: what is no record of one input and one output has none."""
         return self.model_copy(update={"input_delay_samples": self.input_delay_samples})

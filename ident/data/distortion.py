@@ -266,13 +266,13 @@ class _Steady:
             and abs(self.rms / other.rms - 1) < _SAME
         )
 
-    def same_input(self, other: _Steady) -> bool:
-        return bool(np.linalg.norm(self.input - other.input) < _SAME * np.linalg.norm(self.input))
-
 
 def _levels(group: Sequence[_Steady]) -> Distortion:
     first = group[0]
-    realisations = in_groups(group, _Steady.same_input)
+    realisations = in_groups(
+        group,
+        lambda one, its: bool(np.linalg.norm(one.input - its.input) < _SAME * np.linalg.norm(one.input)),
+    )
     outputs = [np.vstack([steady.output for steady in same]) for same in realisations]
     inputs = np.stack([same[0].input for same in realisations])
     periods = min(output.shape[0] for output in outputs)

@@ -17,12 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from ident.data.child_reader import CPU_SECONDS
+
 LARGEST_BYTES = 2**30
 """Of a file, and of what it unpacks to: some hundred channels at 1 kHz for twenty minutes as doubles."""
 
 _SCRIPT = Path(__file__).with_name("child_reader.py")
-_CPU_SECONDS = 120  # that `child_reader` allows itself
-_SECONDS = 150  # of waiting for it
+_SECONDS = CPU_SECONDS + 30  # of waiting
 _REFUSED, _NO_LIBRARY = 2, 3
 _ENCRYPTED = 0x1  # bit 0 of the flags of a zip entry (APPNOTE 4.4.4)
 
@@ -101,7 +102,7 @@ def read_in_child(kind: str, library: str, content: bytes) -> bytes:
         return done.stdout
     if done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
         raise ValueError(
-            f": not read within {_CPU_SECONDS} s of processor time, or the time and memory that this session "
+            f": not read within {CPU_SECONDS} s of processor time, or the time and memory that this session "
             "allows (ulimit -t, ulimit -v); a smaller file, or CSV, is"
         )
     said = shown(done.stderr.decode("utf-8", "replace"))

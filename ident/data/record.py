@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -366,29 +366,16 @@ def in_one_unit(records: Sequence[Record]) -> list[Record]:
                 factors[name], units[name] = factor, wanted
                 told: dict[str, Value] = {"name": name, "unit": unit, "of": wanted, "times": factor}
                 notes.append(finding(FindingKind.UNIT_CONVERTED, record=record.label, **told))
-        found.append(_converted(record, factors, units, notes) if factors else record)
+        if factors:
+            changed: dict[str, Any] = {"own_units": units, "notes": (*record.notes, *notes)}
+            for key in ("input", "output", "reference"):
+                names, signal = getattr(record, f"{key}_names"), getattr(record, key)
+                changed[key] = None if signal is None else signal * [factors.get(name, 1.0) for name in names]
+                if key != "reference" and any(map(units.get, names)):
+                    changed[f"{key}_units"] = tuple(units.get(name, "") for name in names)
+            record = replace(record, **changed)
+        found.append(record)
     return found
-
-
-def _converted(
-    record: Record, factors: Mapping[str, float], units: Mapping[str, str], notes: Iterable[Finding]
-) -> Record:
-    def times(signal: RealArray, names: Sequence[str]) -> RealArray:
-        return signal * [factors.get(name, 1.0) for name in names]
-
-    def said(names: Sequence[str]) -> tuple[str, ...]:
-        return tuple(units.get(name, "") for name in names) if any(map(units.get, names)) else ()
-
-    return replace(
-        record,
-        input=times(record.input, record.input_names),
-        output=times(record.output, record.output_names),
-        reference=None if record.reference is None else times(record.reference, record.reference_names),
-        input_units=said(record.input_names),
-        output_units=said(record.output_names),
-        own_units=units,
-        notes=(*record.notes, *notes),
-    )
 
 
 def in_groups(items: Iterable[T], alike: Callable[[T, T], bool]) -> list[list[T]]:

@@ -22,20 +22,15 @@ def _times(factor: float) -> Convert:
     return lambda values: np.asarray(values * factor, dtype=np.float64)
 
 
-def _of_decibels(values: RealArray) -> RealArray:
-    return np.asarray(10 ** (values / 20), dtype=np.float64)
-
-
-_RPM = 2 * np.pi / 60  # rad/s of a turn a minute
 _UNITS: Mapping[str, Mapping[str, Convert]] = {
     "frequency": {
         **dict.fromkeys(("hz", "1/s", "cycles/s"), _times(2 * np.pi)),
         **dict.fromkeys(("khz",), _times(2e3 * np.pi)),
         **dict.fromkeys(("rad/s", "rad/sec", "rads/sec", "rad/second", "rad/per/s", "rads"), _times(1.0)),
-        **dict.fromkeys(("rpm", "1/min"), _times(_RPM)),
+        **dict.fromkeys(("rpm", "1/min"), _times(2 * np.pi / 60)),
     },
     "gain": {
-        "db": _of_decibels,
+        "db": lambda values: np.asarray(10 ** (values / 20), dtype=np.float64),
         **dict.fromkeys(("abs", "absolute", "1", "-", "lin", "linear", "ratio", "factor"), _times(1.0)),
     },
     "phase": {
@@ -151,7 +146,8 @@ def response_columns(table: Table) -> ResponseColumns | None:
             found[role].append(name)
     rectangular = bool(found["real"] and found["imag"])
     polar = bool(found["phase"]) or any(_words(name) & _CLEARLY for name in found["gain"])
-    if not found["frequency"] or not (polar or rectangular) or any(map(_is_time, table.names)):
+    timed = any(_words(name) & {"time", "zeit", "timestamp", "t"} for name in table.names)
+    if not found["frequency"] or not (polar or rectangular) or timed:
         return None
     wanted = ("real", "imag") if rectangular else ("gain", "phase")
     lacking = [role for role in wanted if not found[role]]
@@ -281,10 +277,6 @@ def _unit(name: str, stated: str) -> str:
     if bracket and len(bracket[1]) <= 2 and bracket[1].isalpha() and not text:
         return ""
     return "" if bracket and text == bracket[1] and re.fullmatch(r"\w", text) else text
-
-
-def _is_time(name: str) -> bool:
-    return bool(_words(name) & {"time", "zeit", "timestamp", "t"})
 
 
 def _refuse_apart(table: Table, apart: BoolArray, one: str, two: str) -> None:

@@ -16,7 +16,7 @@ from ident.data.arrays import RealArray
 from ident.data.foreign_files import as_numbers, shown
 from ident.data.text_tables import Layout, doubtful_groups, is_number, number
 from ident.data.time_stamps import StampError, is_stamp, may_be_minutes, seconds_since_first
-from ident.data.units import SIGNAL_WORDS, TimeColumn, per, size_of, written_unit
+from ident.data.units import SIGNAL_WORDS, TimeColumn, size_of, written_unit
 
 # Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
 LARGEST = 1e100
@@ -79,17 +79,6 @@ class Table:
         """The unit of a column as the file has it, beside the name or in it; empty if there is none."""
         unit = self.units.get(name, "") or written_unit(name)
         return SIGNAL_WORDS.get(unit.lower(), unit)
-
-    def times_for(self, name: str, unit: str) -> float:
-        """What makes of a column a quantity in this unit: 0.01745 of deg for rad, 1 where the file says none.
-        Raises ValueError for a unit of something else, or one that is not known."""
-        own = self.unit(name)
-        factor = per(own, unit) if own and own != unit else 1.0
-        if factor is None:
-            raise ValueError(
-                f"column {name!r} is in {shown(own, 30)}: state what makes it {unit} (scale = ...)"
-            )
-        return factor
 
     def contradiction(self, name: str) -> str:
         """The two units of a signal whose name says another one than the file does beside it, else empty."""

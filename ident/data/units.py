@@ -91,9 +91,9 @@ _APART = re.compile(
 _PRIME = re.compile(r"""^[^'"]*[^\W_]['"′″]+$""")
 # A factor on what has its unit in brackets: [ns]/1000.
 _CHANGED = re.compile(r"[\])}>]\s*[/x*·^]\s*\d|^[\d.,e+-]+\s*[x*·]")
-# What stands beside these and says nothing of the unit.
+# These, and what stands beside them and says nothing of the unit.
 _NO_UNIT = re.compile(
-    r"in|of|to|by|at|on|up|no|nr|id|ch|io|pc|ab|is|since|start|begin|epoch|unix|posix|utc|gmt|ce?s?t|local|rel|abs|"
+    rf"{_TIME_WORD.pattern}|in|of|to|by|at|on|up|no|nr|id|ch|io|pc|ab|is|since|start|begin|epoch|unix|posix|utc|gmt|ce?s?t|local|rel|abs|"
     r"relative|absolute|from|seit|beginn|log|host|sys|system|boot|trigger|raw|the|a|and|hh|mm|ss|hhmmss|day"
 )
 # Counts of something whose length nobody has said, and units of time that are not known.
@@ -115,8 +115,6 @@ _MANY_SAMPLES = 1000
 _LONG_STEP_S = 0.5  # machines are logged faster than twice a second
 # No machine is logged with shorter steps, nor one whose motion the samples show with longer ones.
 _SHORTEST_S, _LONGEST_S = 1e-6, 1.0
-# Share of a motion's power in its steps: 2 of samples that have nothing to do with each other.
-_RESOLVED = 1.0
 # Seconds since 1970 of the years 2001 and 2100: stamps in between, in whatever unit, are dates.
 _DATES_S = (978_307_200.0, 4_102_444_800.0)
 # No clock counts 3000 years.
@@ -138,22 +136,22 @@ class UnitEvidence:
         texts = [beside.strip("[](){}<> "), *_BRACKETS.findall(name)]
         said, strange = dict[str, str](), ""
         for text in (text for text in texts if _WORD.search(text)):
-            words, units = _words_and_units(text)
-            words, units = ([], ["d"]) if words == ["d"] else (words, units)
-            odd = [word for word in words if not (word in TIME_UNITS or _means_nothing(word))]
+            whole = re.sub(r"[\s._-]", "", text).lower()  # 'm s' is one
+            words = ["days"] if whole == "d" else [whole] if whole in TIME_UNITS else _words(text)
+            units = [TIME_UNITS[word] for word in words if word in TIME_UNITS]
+            odd = [word for word in words if not (word in TIME_UNITS or _NO_UNIT.fullmatch(word))]
             if (odd and (not units or min(map(len, odd)) <= 2)) or (units and re.search(r"\d", text)):
                 strange = strange or text
             said |= dict.fromkeys(units, text)
         outside = _BRACKETS.sub(" ", name)
-        words, units = _words_and_units(outside)
+        words = _words(outside)
+        units = [TIME_UNITS[word] for word in words if word in TIME_UNITS]
         factors = [word.lower() for found in _FACTOR.findall(outside) for word in found]
         if _PRIME.search(name) or (said and _CHANGED.search(name)) or set(factors) & TIME_UNITS.keys():
             strange = strange or name
         if not strange:
             # After the word for time a short one is rather a unit, or its prefix, than a name: t_m, time_cs.
-            short = [
-                word for k, word in enumerate(words) if k and len(word) <= 2 and not _means_nothing(word)
-            ]
+            short = [word for word in words[1:] if len(word) <= 2 and not _NO_UNIT.fullmatch(word)]
             short = [word for word in short if word not in TIME_UNITS and (not units or word in _PREFIXES)]
             counts = [] if units else [word for word in words if _COUNTS.fullmatch(word)]
             strange = "" if said else next(iter((*counts, *short)), "")
@@ -171,24 +169,12 @@ def _words(text: str) -> list[str]:
     its own."""
     text = _APART.sub(lambda found: {"milli": "ms", "micro": "us", "nano": "ns"}[found[1].lower()], text)
     found = list[str]()
-    for whole in _WORD.findall(text.replace("_", " ")):
-        for word in (
-            [whole] if whole.lower() in TIME_UNITS or _GLUED.fullmatch(whole.lower()) else _CAMEL.split(whole)
-        ):
-            glued = _GLUED.fullmatch(word.lower())
-            found += [glued[1], glued[2]] if glued else [word.lower()]
+    for word in _WORD.findall(text.replace("_", " ")):
+        known = word.lower() in TIME_UNITS or _GLUED.fullmatch(word.lower())
+        for part in [word.lower()] if known else _CAMEL.sub(" ", word).lower().split():
+            glued = _GLUED.fullmatch(part)
+            found += glued.groups() if glued else [part]
     return found
-
-
-def _words_and_units(text: str) -> tuple[list[str], list[str]]:
-    """Words as of `_words`, and the units of time that are among them; 'm s' is one."""
-    whole = re.sub(r"[\s._-]", "", text).lower()
-    words = [whole] if whole in TIME_UNITS else _words(text)
-    return words, [TIME_UNITS[word] for word in words if word in TIME_UNITS]
-
-
-def _means_nothing(word: str) -> bool:
-    return _TIME_WORD.fullmatch(word) is not None or _NO_UNIT.fullmatch(word) is not None
 
 
 def says_time(name: str) -> bool:
@@ -257,11 +243,9 @@ class TimeColumn:
         first, taken = float(stamps[0]), f"its unit is said to be {self.in_header}"
         taken = taken if self.in_header else "no unit is stated"
         if first > 0 and float(self.seconds(np.array(first))) > _NO_CLOCK_S:
-            looks = [
-                f"{unit} since 1970: state --time-unit {unit}"
-                for unit in _PER_SECOND
-                if self._dates(first, unit)
-            ]
+            since = {unit: first / size for unit, size in _PER_SECOND.items() if unit != self.unit}
+            dates = [unit for unit, seconds in since.items() if _DATES_S[0] <= seconds <= _DATES_S[1]]
+            looks = [f"{unit} since 1970: state --time-unit {unit}" for unit in dates]
             looks += ["another unit: state it with --time-unit, or give --dt-s SECONDS instead of --time"]
             raise ValueError(
                 f"time column '{shown(self.name, 60)}' begins with {first:.6g}, {taken}; this looks "
@@ -281,9 +265,6 @@ class TimeColumn:
                 f"logged that fast; state {' or '.join(likely[::-1]) or 'the right --time-unit'}, or "
                 f"--time-unit {self.unit} if it is right"
             )
-
-    def _dates(self, first: float, unit: str) -> bool:
-        return unit != self.unit and _DATES_S[0] <= first / _PER_SECOND[unit] <= _DATES_S[1]
 
     def seconds(self, stamps: RealArray) -> RealArray:
         """The stamps in seconds."""
@@ -306,12 +287,9 @@ def refuse_step(label: str, dt_s: float, output: RealArray, column: TimeColumn |
     an output (T, Y) show its motion. column: where the time stamps come from; None: dt_s was given."""
     if column is not None and column.stated:
         return
-    spread = np.var(output, axis=0)
-    moves = (
-        np.any(np.mean(np.diff(output, axis=0) ** 2, axis=0) < _RESOLVED * spread)
-        if dt_s > _LONGEST_S
-        else False
-    )
+    # Of samples that have nothing to do with each other the steps have twice the variance.
+    steps = np.mean(np.diff(output, axis=0) ** 2, axis=0) if dt_s > _LONGEST_S else np.inf
+    moves = bool(np.any(steps < np.var(output, axis=0)))
     if dt_s >= _SHORTEST_S and not moves:
         return
     if column is None:

@@ -80,7 +80,8 @@ class SteppedArm:
         real = np.maximum(poles.real, FASTEST_POLE).astype(np.complex128)
         single = np.concatenate([np.log(real), np.log(poles.pairs)]) / dt_s
         # Of the mirror image of an unstable pole one is that pole itself.
-        images = np.isin(np.concatenate([poles.real, poles.pairs]), _upper(structure.unstable))
+        mirrored = np.concatenate([structure.unstable.real, structure.unstable.pairs])
+        images = np.isin(np.concatenate([poles.real, poles.pairs]), mirrored)
         both = np.column_stack([np.where(images, -single.conj(), single), single]).ravel()
         rates = np.concatenate([np.zeros(structure.integrators, np.complex128), both])
         second = np.column_stack([np.zeros(single.size, np.bool_), ~images]).ravel()
@@ -142,11 +143,6 @@ class SteppedArm:
             friction,
         )
         return position, friction
-
-
-def _upper(poles: Poles) -> ComplexArray:
-    """Real poles, and of each pair the upper one."""
-    return np.concatenate([poles.real.astype(np.complex128), poles.pairs])
 
 
 def less_friction(record: Record, friction: RealArray, delay_samples: int) -> Record:

@@ -214,7 +214,7 @@ def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: R
 def _of_structure(logs: _Logs, options: IdentOptions) -> list[tuple[IdentOptions, FrictionFit]]:
     """The options with each structure that is possible, and the fit with the fewest poles: where the
     integrators are not stated, one of them, or a weight that throws the arm over."""
-    if not options.integrators_left_to_data:
+    if options.model_fields_set & {"integrators", "unstable_poles"}:
         found = _simple(logs, options)
         assert found is not None
         return [found]
@@ -527,7 +527,12 @@ def heterogeneity(
 ) -> float:
     """How much more the parts of the records differ in arm and friction than their noise makes them (Chow's
     F, Econometrica 28(3), 1960; not below 1): halves of records, whitened."""
-    parts = [half for record in records for half in _halves(record)]
+    middle = [record.n_samples // 2 for record in records]
+    parts = [
+        record.slice(*ends)
+        for record, half in zip(records, middle, strict=True)
+        for ends in ((0, half), (half, record.n_samples))
+    ]
     blocks, targets = _equations(found, parts, whiten)
     nothing = np.zeros((0, blocks[0].shape[1] + 1))
     together = least_squares(blocks, targets, nothing)
@@ -541,8 +546,3 @@ def heterogeneity(
 def _rank(triangle: RealArray) -> int:
     size = np.linalg.norm(triangle, axis=0)
     return int(np.linalg.matrix_rank(triangle / np.where(size > 0, size, 1.0), tol=_RANK))
-
-
-def _halves(record: Record) -> tuple[Record, Record]:
-    half = record.n_samples // 2
-    return record.slice(0, half), record.slice(half, record.n_samples)

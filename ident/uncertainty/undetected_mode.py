@@ -152,7 +152,7 @@ def pair_statistics(
             if start == 0 and block.head.size:
                 plain = _pair_rows(parameters, kernel_array(block.head), np.zeros((2, poles.size)))
                 x1[: block.head.size], x2[: block.head.size] = (block.first @ x for x in plain)
-            gram_here += _pair_gram(x1, x2)
+            gram_here += [np.einsum("kj,kj->j", a, b) for a, b in ((x1, x1), (x1, x2), (x2, x2))]
             products[:, 0::2] += others[part].T @ x1
             products[:, 1::2] += others[part].T @ x2
         size += gram_here[0] + gram_here[2]
@@ -187,11 +187,6 @@ def _pair_rows(parameters: Any, signal: Any, states: Any) -> Any:
             a[i] = gb[i] * p - gs[i] * q + sg[i] * v
             b[i] = sb[i] * p + beta[i] * q
     return out1, out2
-
-
-def _pair_gram(x1: RealArray, x2: RealArray) -> RealArray:
-    """Entries (0,0), (0,1), (1,1) of X^T X for every pair; (3, J)."""
-    return np.stack([np.einsum("kj,kj->j", a, b) for a, b in ((x1, x1), (x1, x2), (x2, x2))])
 
 
 def pair_evidence(statistics: PairStatistics, degrees_of_freedom: int) -> PairEvidence:

@@ -10,9 +10,10 @@ import numpy as np
 
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.plausible import refuse_implausible
+from ident.data.foreign_files import shown
 from ident.data.record_files import read_table
 from ident.data.time_grid import TimeGrid
-from ident.data.units import written_unit
+from ident.data.units import per, written_unit
 from plant.rig import Rig
 from workflow.config.rig_settings import read_rig
 from workflow.config.settings import expand, repeated
@@ -119,8 +120,11 @@ def _experiment(
         values = {}
         for quantity in wanted:
             place, unit = names[quantity], written_unit(quantity)
-            by_header = place.scale is None and quantity != "time_s"
-            usual = table.times_for(place.column, unit) if by_header else 1.0
+            own = table.unit(place.column) if place.scale is None and quantity != "time_s" else ""
+            if (usual := per(own, unit) if own else 1.0) is None:
+                raise ValueError(
+                    f"column {place.column!r} is in {shown(own, 30)}: state what makes it {unit} (scale)"
+                )
             values[quantity] = place.quantity(read[place.column], usual)
         n_rows = len(values["voltage_V"])
         grid = TimeGrid.uniform(n_rows, settings.dt_s or rig.sampling.dt_s)
