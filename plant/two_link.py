@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy.optimize
 
 from plant.beam import clamped_free_modes
 from plant.rig import Hub, Link, Motor
@@ -172,6 +171,8 @@ class TwoLinkArm:
 
         held = np.zeros(n)
         if self.gravity_m_s2:
+            import scipy.optimize  # takes its time to load
+
             held = np.asarray(scipy.optimize.root(pulled, held, tol=1e-12).x)
         return np.concatenate([angles, held[2:], np.zeros(n)]), held[:2]
 

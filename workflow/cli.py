@@ -756,13 +756,12 @@ def diagnose(
     _one_of(jobs, scheduler)
     if case and not any(place.exists() for place in case):
         need(*case)
-    from workflow.config.settings import check
-    from workflow.diagnose.case_settings import CaseSettings, case_document
+    from workflow.diagnose.case_settings import case_document
 
-    if len(case) == 1:
-        file, document = case_document(case[0])
-        if not {"mjcf", "fmu", "python"} & set(document):
-            check(CaseSettings, document, source=str(file))  # before what diagnoses is loaded: seconds
+    if len(case) == 1 and not {"mjcf", "fmu", "python"} & set(case_document(case[0])[1]):
+        from workflow.diagnose.case_files import load_case
+
+        load_case(case[0], rig)  # what is refused does not wait for what diagnoses to be loaded: seconds
     with _watched(quiet) as progress:
         from workflow.diagnose.command import diagnose_cases
         from workflow.diagnose.simulator_case import settings_of

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from scipy.signal import fftconvolve
+import scipy
 
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.motion_effects import BodyForces, PulseResponse, with_forces
@@ -167,7 +167,7 @@ class Drive:
             extra = np.zeros(len(inputs))
             found, command = with_added(extra)
             for _ in range(_ROUNDS):
-                beyond = command - fftconvolve(response, extra)[: extra.size]
+                beyond = command - scipy.signal.fftconvolve(response, extra)[: extra.size]
                 extra, expected = _fixed(changed, beyond, response, extra)
                 found, command = with_added(extra)
                 missed, size = _norm(command - expected), _norm(extra)
@@ -189,7 +189,7 @@ def _fixed(changed: Callable[[Real], Real], beyond: Real, response: Real, start:
     """x (T,) = changed(beyond + response * x), and that command; Anderson's mixing of the last steps."""
     points, steps, x = list[Real](), list[Real](), start
     for _ in range(_STEPS):
-        command = beyond + fftconvolve(response, x)[: x.size]
+        command = beyond + scipy.signal.fftconvolve(response, x)[: x.size]
         step = changed(command) - x
         if not _norm(step) > _STANDS * _norm(x):
             break
@@ -199,7 +199,7 @@ def _fixed(changed: Callable[[Real], Real], beyond: Real, response: Real, start:
             moves, turns = np.diff(points, axis=0).T, np.diff(steps, axis=0).T
             mixed = np.linalg.lstsq(turns, step, rcond=1e-12)[0]
             x = x - (moves + turns) @ mixed
-    return x, np.asarray(beyond + fftconvolve(response, x)[: x.size])
+    return x, np.asarray(beyond + scipy.signal.fftconvolve(response, x)[: x.size])
 
 
 @dataclass(frozen=True, eq=False)

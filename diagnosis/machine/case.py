@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.fft import prev_fast_len
+import scipy
 
-from diagnosis.machine.flexible_arm import NOISE, FlexibleArm
 from diagnosis.machine.machine_protocol import Real, RecordedCase, Role, check_record
 from diagnosis.machine.quantisation_grid import grid_step
 from ident.data.arrays import lock
 from plant.rig import Output, Rig
+
+if TYPE_CHECKING:
+    from diagnosis.machine.flexible_arm import FlexibleArm
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +102,8 @@ class Case(RecordedCase[Experiment]):
             )
         for name, level in zip(self.outputs, self.noise, strict=True):
             if not level > 0:
+                from diagnosis.machine.flexible_arm import NOISE  # what simulates takes seconds to load
+
                 raise ValueError(
                     f"case {self.name}: sensors.{NOISE[name]} is {level:g}; {name} needs a noise level above "
                     "zero to judge a gap by"
@@ -107,7 +112,7 @@ class Case(RecordedCase[Experiment]):
     def at_fast_lengths(self) -> Case:
         """With its records cut at their ends to lengths without large prime factors, at which a cosine
         transform is fast."""
-        parts = (e.part(e.name, e.role, 0, prev_fast_len(len(e.output))) for e in self.experiments)
+        parts = (e.part(e.name, e.role, 0, scipy.fft.prev_fast_len(len(e.output))) for e in self.experiments)
         return replace(self, experiments=tuple(parts))
 
     @property
@@ -128,4 +133,6 @@ class Case(RecordedCase[Experiment]):
     @property
     def machine(self) -> FlexibleArm:
         """The rig in the form that fits and evidence ask for (see `diagnosis.machine.machine_protocol`)."""
+        from diagnosis.machine.flexible_arm import FlexibleArm
+
         return FlexibleArm(self.rig, self.outputs, self.model_error)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from diagnosis.machine.around import Where
 from diagnosis.machine.machine_protocol import Real
@@ -57,7 +57,7 @@ def _lagged(signal: Real, values: Values, dt_s: float, before: float) -> Real:
     """A held signal behind 1/(T s + 1), as its mean over each sample."""
     T = values["time_constant_s"]
     decay = np.exp(-dt_s / T)
-    state, _ = lfilter([1 - decay], [1.0, -decay], signal, zi=[decay * before])
+    state, _ = scipy.signal.lfilter([1 - decay], [1.0, -decay], signal, zi=[decay * before])
     start = np.concatenate([[before], state[:-1]])
     return np.asarray(signal + (start - signal) * T / dt_s * (1 - decay))
 
@@ -68,7 +68,7 @@ def _lagged_sensor(signal: Real, values: Values, dt_s: float, before: float) -> 
     decay = np.exp(-dt_s / T)
     new = 1 - T / dt_s * (1 - decay)
     taps = [new, (1 - decay) - new]
-    return np.asarray(lfilter(taps, [1.0, -decay], signal, zi=[before * (1 - new)])[0])
+    return np.asarray(scipy.signal.lfilter(taps, [1.0, -decay], signal, zi=[before * (1 - new)])[0])
 
 
 def _drifting(signal: Real, values: Values, dt_s: float, before: float) -> Real:

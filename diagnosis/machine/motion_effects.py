@@ -20,9 +20,8 @@ from dataclasses import astuple, dataclass, field
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numba import njit
-from scipy.linalg import expm, logm
-from scipy.signal import lfilter
 
 from diagnosis.machine.machine_protocol import Real
 
@@ -112,7 +111,7 @@ def _logarithm(matrix: Real) -> Real:
     with warnings.catch_warnings():
         # It warns from a thousand roundings on, next to a double pole.
         warnings.simplefilter("ignore", RuntimeWarning)
-        return np.asarray(np.real(logm(matrix)))
+        return np.asarray(np.real(scipy.linalg.logm(matrix)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +147,7 @@ class LinearBody:
         own, command = rates[:n, :n], rates[:n, n]
         at_once, later = command[0], own[0] @ command
         early = 0.0 if of_speed or abs(at_once) > abs(later) else at_once / later
-        force = expm(-early * own) @ command
+        force = scipy.linalg.expm(-early * own) @ command
         # Position of a speed is one more state.
         N = n + of_speed
         generator, rows = np.zeros((N + 2, N + 2)), np.zeros((2, N))
@@ -163,7 +162,7 @@ class LinearBody:
     @cached_property
     def turns(self) -> tuple[float, float, float]:
         """Radians that it swings by in a sample; position and speed after a unit force over one."""
-        step = expm(self.generator)
+        step = scipy.linalg.expm(self.generator)
         swing = float(np.max(np.abs(np.angle(np.linalg.eigvals(step[:-2, :-2])))))
         moved = self.rows @ step[:-2, -1]
         return swing, float(moved[0]), float(moved[1])
@@ -189,11 +188,11 @@ class LinearBody:
             np.concatenate([np.zeros(self.ahead), self.numerator]),
             np.concatenate([[1.0], -self.poles]),
         )
-        beyond = np.asarray(simulated - lfilter(head, own, force))
+        beyond = np.asarray(simulated - scipy.signal.lfilter(head, own, force))
         travel = np.cumsum(simulated) * self.dt_s if self.of_speed else simulated
         parts = self.parts(forces, float(np.max(np.abs(travel))))
         if parts not in self._steps:
-            step = expm(self.generator / parts)
+            step = scipy.linalg.expm(self.generator / parts)
             of_states, of_command, of_force = step[:-2, :-2], step[:-2, -2], step[:-2, -1]
             self._steps[parts] = (of_states.copy(), of_command.copy(), of_force.copy())
         of_states, of_command, of_force = self._steps[parts]
@@ -218,7 +217,7 @@ class LinearBody:
         moment += self.early * held
         held[1:] += 0.5 * moment[:-1]
         held[:-1] -= 0.5 * moment[1:]
-        return held, v if self.of_speed else x, beyond + lfilter(head, own, command + held)
+        return held, v if self.of_speed else x, beyond + scipy.signal.lfilter(head, own, command + held)
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,7 +326,7 @@ def _filter(response: Real, ahead: int) -> tuple[Real, Real]:
         if np.max(np.abs(roots)) > _UNSTABLE or np.any((roots.real <= 0) & (np.abs(roots.imag) < _REAL)):
             continue
         rows = np.concatenate([np.arange(ahead, first), rows])
-        alone = lfilter([1.0], own, pulse)
+        alone = scipy.signal.lfilter([1.0], own, pulse)
         if not np.max(np.abs(alone)) < _GROWS:
             continue  # faster than any response that ends at one
         delayed = np.column_stack(

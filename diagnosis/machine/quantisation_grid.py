@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import log_ndtr
+import scipy
 
-from diagnosis.machine.machine_protocol import Real
+from ident.data.arrays import RealArray as Real
 
 # Records are written with so many significant digits at least; rounding in the file is not significant.
 _DIGITS = 6
@@ -78,5 +78,5 @@ def cell_residual(measured: Real, model: Real, step: float, noise: float) -> Rea
 
 def _log_difference(a: Real, b: Real) -> Real:
     """log(Phi(b) - Phi(a)) for a < b, a below zero."""
-    upper, lower = log_ndtr(b), log_ndtr(a)
+    upper, lower = scipy.special.log_ndtr(b), scipy.special.log_ndtr(a)
     return np.asarray(upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-300))))

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from scipy.signal import savgol_filter
+import scipy
 
 from diagnosis.machine.around import Acts, AnyBody, Body, Drive, MeasuredBody, Where
 from diagnosis.machine.listed_effects import KINDS, WHERE, Sizes
@@ -197,7 +197,7 @@ def _of_body(
     if motion_is == "speed":
         position, speed = _largest(np.cumsum(v) * dt_s for v in moved), _largest(moved)
     else:
-        smooth = (savgol_filter(x, _SMOOTHED, 2, deriv=1, delta=dt_s) for x in moved)
+        smooth = (scipy.signal.savgol_filter(x, _SMOOTHED, 2, deriv=1, delta=dt_s) for x in moved)
         position, speed = _largest(moved), _largest(smooth)
     return Sizes(force=pushed, position=position, speed=speed)
 

@@ -54,3 +54,26 @@ def readonly(values: Any, dtype: npt.DTypeLike = np.float64) -> Any:
     array = np.array(values, dtype=dtype)
     array.setflags(write=False)
     return array
+
+
+def clipped_share(signal: RealArray) -> float:
+    """Share of samples that stand at a suspiciously frequent extreme value, else 0.
+
+    Suspicious: 1 % of the samples, five times as many as at the next level, in more than one stretch unless
+    that one is 5 % of the record. Rest before and after is left out, as are signals of a few levels and those
+    mostly at both extremes, which are binary by design.
+    """
+    levels, counts = np.unique(signal, return_counts=True)
+    if levels.size < 10 or counts[0] + counts[-1] > 0.5 * signal.size:
+        return 0.0
+    changes = np.flatnonzero(np.diff(signal))
+    inside = signal[changes[0] + 1 : changes[-1] + 1]
+    share = 0.0
+    for extreme, neighbour in ((levels[0], counts[1]), (levels[-1], counts[-2])):
+        at = inside == extreme
+        count = int(np.count_nonzero(at))
+        stretches = np.count_nonzero(at[1:] & ~at[:-1]) + int(at[:1].any())
+        often = stretches >= 2 or count >= 0.05 * signal.size
+        if often and count >= max(0.01 * signal.size, 5, 5 * neighbour):
+            share += count / signal.size
+    return share

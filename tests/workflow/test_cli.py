@@ -501,43 +501,57 @@ def test_numpy_is_loaded_after_its_threads_are_settled(given):
     assert answer.stdout.splitlines()[-1] == "False 1 1"
 
 
-_ARM = FAST_ARM.read_text()
-REFUSED = [
-    ("run --config gone.toml", "cannot read gone.toml", True),
-    ("run --config bad.toml", "unknown key run.sead", False),
-    ("identify gone.csv --input u --output y --dt-s 1", "cannot read gone.csv", True),
-    ("identify log.csv --input v --output y --dt-s 1", "no column 'v'", True),
-    ("design gone.npz", "cannot read gone.npz", True),
-    ("design log.csv --spec wish.toml", "unknown key specification.bandwith_rad_s", True),
-    ("study --config gone.toml --out s", "cannot read gone.toml", True),
-    ("study --config study.toml --out s", "unknown key axis", True),
-    ("diagnose gone --out d", "cannot read gone", True),
-]
+REFUSED = {
+    "run --config gone.toml": "cannot read gone.toml",
+    "run --config bad.toml": "unknown key run.sead",
+    "run --config own.toml --out r": "no column 'v'",
+    "run --config own_gone.toml --out r": "no such file",
+    "look gone.csv": "cannot read gone.csv",
+    "look log.csv --time v": "no column 'v'",
+    "init gone.csv --out a.toml": "cannot read gone.csv",
+    "init log.csv --input v --output y --dt-s 1 --out a.toml": "no column 'v'",
+    "excite --closed-loop log.csv --input v --output y --out e": "no column 'v'",
+    "identify gone.csv --input u --output y --dt-s 1": "cannot read gone.csv",
+    "identify log.csv --input v --output y --dt-s 1": "no column 'v'",
+    "design gone.npz": "cannot read gone.npz",
+    "study --config gone.toml --out s": "cannot read gone.toml",
+    "study --config study.toml --out s": "unknown key axis",
+    "diagnose gone --out d": "cannot read gone",
+    "diagnose gap/case.toml --out d": "no column 'voltage_V'",
+    "diagnose gone/case.toml --out d": "cannot read gone/case.toml",
+    "check --python log.csv --log gone.csv": "cannot read gone.csv",
+    "design log.csv --spec wish.toml": "unknown key specification.bandwith_rad_s",
+}
 
 
-@pytest.mark.parametrize(("command", "words", "without_arm"), REFUSED)
-def test_what_is_refused_is_refused_before_anything_slow_is_loaded(tmp_path, command, words, without_arm):
-    """A run configuration holds settings of the simulated arm, whose compiled code comes with them."""
-    (tmp_path / "bad.toml").write_text(_ARM.replace("\nseed =", "\nsead ="))
+def test_what_is_refused_is_refused_before_anything_slow_is_loaded(tmp_path):
+    """Whatever is missing, a file, a key or a column: after each of them nothing that computes is there."""
+    (tmp_path / "bad.toml").write_text(FAST_ARM.read_text().replace("\nseed =", "\nsead ="))
     (tmp_path / "wish.toml").write_text("[specification]\nbandwith_rad_s = 1.0\n")
     (tmp_path / "study.toml").write_text("[axis]\n'specification.bandwidth_rad_s' = [1.0]\n")
-    write_case(tmp_path, good_table())
-    slow = {"control", "matplotlib", "casadi", "nlopt"} | (
-        {"numba", "scipy.signal"} if without_arm else set()
-    )
-    code = "import sys\nfrom workflow.cli import app, main\n"
-    code += f"print(main({command.split()!r}), *({slow!r} & sys.modules.keys()))"
+    own = write_case(tmp_path, good_table()).read_text()
+    (tmp_path / "own.toml").write_text(own.replace('"u"', '"v"'))
+    (tmp_path / "own_gone.toml").write_text(own.replace("log.csv", "gone.csv"))
+    shutil.copytree(ROOT / "examples/gap_case", tmp_path / "gap")
+    for log in (tmp_path / "gap/logs").iterdir():
+        log.write_text(log.read_text().replace("voltage_V", "V", 1))
+    slow = {"control", "matplotlib", "casadi", "nlopt", "numba", "pandas", "mujoco"}
+    slow |= {"scipy.signal", "scipy.stats", "scipy.optimize"}
+    code = "import sys\nfrom workflow.cli import main\nfor text in sys.argv[1:]:\n"
+    code += f"    print(main(text.split()), *({slow!r} & sys.modules.keys()))"
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
-        [sys.executable, "-c", code],
+        [sys.executable, "-c", code, *REFUSED],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": path},
         capture_output=True,
         text=True,
         check=True,
     )
-    assert words in done.stderr
-    assert done.stdout.split() == ["2"]
+    answers = zip(REFUSED.items(), done.stdout.splitlines(), done.stderr.splitlines(), strict=True)
+    for (command, words), loaded, line in answers:
+        assert loaded == "2", (command, loaded)
+        assert words in line, command
 
 
 @pytest.mark.parametrize(

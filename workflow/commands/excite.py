@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,9 +13,10 @@ from workflow.commands.init import read_channel
 from workflow.commands.logs import Reading
 from workflow.engine import codec, storage
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.experiment import Limits, PlannedExperiment, plan_experiment
-from workflow.tasks.reference_plan import plan_reference
 from workflow.text.templates import RunSummary, rows_of
+
+if TYPE_CHECKING:
+    from workflow.tasks.experiment import Limits, PlannedExperiment
 
 PLAN_FILE, PAGE_FILE = "plan.json", "plan.html"
 
@@ -27,6 +28,8 @@ def write_experiment(
 
     settings: fields of `plant.ExperimentPlan` by name. Raises InputError.
     """
+    from workflow.tasks.experiment import plan_experiment
+
     RunDirectory(out).refuse_unless_free()
     found = plan_experiment(limits, seed=seed, lead_in_s=lead_in_s, **settings)
     # Here: these take seconds to load, and limits that are refused do not need them.
@@ -67,6 +70,8 @@ def write_reference(
     the plan. wanted: as `plan_reference`. Raises InputError."""
     RunDirectory(out).refuse_unless_free()
     read = read_channel("excite --closed-loop", logs, stated)
+    from workflow.tasks.reference_plan import plan_reference  # takes seconds to load
+
     roles = read.roles
     position = is_position(roles.output, read.unit_of[roles.output])
     found = plan_reference(read.records, position=position, **wanted)

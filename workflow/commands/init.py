@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tomlkit
@@ -24,13 +24,13 @@ from ident.data.table import Table
 from ident.data.time_grid import option_for
 from ident.data.wrapping import wraps_at
 from workflow.commands.logs import Reading
-from workflow.config.run_config import RunConfig
-from workflow.config.settings import check
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
-from workflow.tasks.draft import Draft, draft_of
 from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
 from workflow.text.templates import RunSummary, environment, rows_of
+
+if TYPE_CHECKING:
+    from workflow.tasks.draft import Draft
 
 _SHORT = 60  # letters of a log's name that leave room for a command in a line
 _NEARLY_ALL = 0.99  # rows of a held log: one may be missing
@@ -91,6 +91,11 @@ def init(
         raise InputError(f"{out} exists: take another --out, or --replace to write over it")
     stated = stated or Reading()
     read = read_channel("init", logs, stated)
+    # A log that is refused does not wait for what looks at it: that takes seconds to load.
+    from workflow.config.run_config import RunConfig
+    from workflow.config.settings import check
+    from workflow.tasks.draft import draft_of
+
     output, unit_of = read.roles.output, read.unit_of
     with naming("init"):
         draft = draft_of(

@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ident.data.record import Record
 from workflow.config.joints_config import AnyConfig, TwoJointSource, is_for_joints, load_any, load_joints
 from workflow.config.run_config import (
+    FileSource,
+    RunConfig,
     SimulatedSource,
     built_in_config,
     load_simulation,
@@ -19,9 +22,9 @@ from workflow.engine import storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory, default_directory
+from workflow.tasks.records import read_records
 
 if TYPE_CHECKING:
-    from ident.data.record import Record
     from workflow.text.templates import RunSummary
 
 
@@ -56,13 +59,18 @@ def run_from_files(
     else:
         config, text = built_in_config()
         note = "no --config: this is the built-in default arm, not a machine of yours"
-    # Here: what computes takes seconds to load, and a configuration that is refused does not need it.
+    place, read = out if out is not None else default_directory(config.run.name), list[Record]()
+    # What is refused does not wait for what computes: that takes seconds to load.
+    if isinstance(config.source, FileSource) and not (resume and place.exists()):
+        RunDirectory(place).refuse_unless_free(resume=resume, replace=replace)
+        channels: Any = config.channels if isinstance(config, RunConfig) else config.joints
+        read = read_records(config.source, channels)
     from workflow.report.pages import page_of
     from workflow.tasks.pipeline import run_pipeline
 
     return run_pipeline(
         config,
-        out if out is not None else default_directory(config.run.name),
+        place,
         config_text=text,
         called=str(config_path or "default arm"),
         page=page_of(config),
@@ -70,6 +78,7 @@ def run_from_files(
         replace=replace,
         c_code=c_code,
         note=note,
+        read=read,
         progress=progress,
     )
 

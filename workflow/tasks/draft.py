@@ -10,7 +10,8 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from diagnosis.machine.quantisation_grid import grid_step
-from ident.checks.input_checks import clipped_share, refuse_few_lines
+from ident.checks.input_checks import refuse_few_lines
+from ident.data.arrays import clipped_share
 from ident.data.record import Record
 from ident.friction import recorded_in_loop
 from workflow.tasks.first_look import (

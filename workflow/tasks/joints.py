@@ -31,7 +31,7 @@ from plant import TwoLinkMachine, multisine, multisine_lines, two_link_arm
 from workflow.config.joints_config import JointsConfig, OperatingPoint, TwoJointSource
 from workflow.engine.errors import InputError, naming
 from workflow.engine.randomness import stage_rng
-from workflow.tasks.records import read_record, refuse_constant_input, with_common_sampling_time
+from workflow.tasks.records import read_records, refuse_constant_input, with_common_sampling_time
 from workflow.tasks.results import RecordsResult, RunRecord, StageResult, StageResults
 from workflow.tasks.stage import Stage, StageInput
 
@@ -197,7 +197,7 @@ def make_records(stage: StageInput) -> RecordsResult:
             )
         return RecordsResult(tuple(records))
     channels: Any = config.joints
-    read = [read_record(source, entry, channels) for entry in source.records]
+    read = stage.read or read_records(source, channels)
     found = RecordsResult(
         tuple(
             RunRecord(record.limited(source.input_limit or np.inf), entry.role, entry.condition, entry.remark)

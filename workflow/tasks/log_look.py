@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from diagnosis.machine.quantisation_grid import grid_step
-from ident.checks.input_checks import clipped_share
-from ident.data.arrays import RealArray
+from ident.data.arrays import RealArray, clipped_share
 from ident.data.finding import Finding, distinct
 from ident.data.record import reading_notes
 from ident.data.record_files import read_table

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, replace as changed
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from control_design.controllers.c_code import Dialect
 from ident.basis.model_files import ModelFile
+from ident.data.record import Record
 from workflow.config.joints_config import AnyConfig, JointsConfig
 from workflow.config.run_config import RunConfig
 from workflow.engine import interrupts, storage
@@ -56,14 +57,15 @@ def run_pipeline(
     page: Stage | None = None,
     c_code: Mapping[str, Any] | None = None,
     note: str = "",
+    read: Sequence[Record] = (),
     progress: Progress | None = None,
 ) -> RunSummary:
     """Run every stage into `out` and return the table of numbers.
 
     config_text: kept as config.toml (`called` in complaints); resume takes up a run that is there, replace
     starts it afresh; page: the last stage, which writes the page; c_code: the fields of `Dialect` that are
-    stated, kept for when it is resumed; note: said once nothing refuses the run. A result that is not
-    certified is no error.
+    stated, kept for when it is resumed; note: said once nothing refuses the run; read: the logs,
+    where they have been read. A result that is not certified is no error.
 
     Raises InputError (one line) for anything wrong with what the user gave; what this call created is removed
     then, unless identification had already been paid for. Raises StageError when a computation fails.
@@ -78,7 +80,7 @@ def run_pipeline(
     if not (resume and existed):
         started = time.monotonic()
         with threadpool_limits(1):
-            ready = kind.stages[0].run(given), time.monotonic() - started
+            ready = kind.stages[0].run(changed(given, read=read)), time.monotonic() - started
     # More threads round otherwise.
     with run.writing(resume=resume, replace=replace), threadpool_limits(1):
         RunDirectory.begin(
@@ -225,8 +227,8 @@ def _dialect(run: RunDirectory, stated: Mapping[str, Any]) -> Dialect:
     """How its C code is written: as stated now, or else before. Raises InputError."""
     kept = run.manifest().get("c_code", {})
     with naming(str(run.manifest_path)):
-        before = replace(Dialect(), **{name: kept[name] for name in ("prefix", "number") if name in kept})
-    return replace(before, **stated)
+        before = changed(Dialect(), **{name: kept[name] for name in ("prefix", "number") if name in kept})
+    return changed(before, **stated)
 
 
 def _keep_files(results: RunResults, config: RunConfig, dialect: Dialect) -> list[Path]:

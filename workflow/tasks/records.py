@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,9 +18,10 @@ from workflow.config.run_config import (
     record_name,
 )
 from workflow.engine.errors import InputError, naming
-from workflow.tasks.results import RecordsResult, RunRecord
-from workflow.tasks.simulated_rig import simulate_record
-from workflow.tasks.stage import StageInput
+
+if TYPE_CHECKING:
+    from workflow.tasks.results import RecordsResult
+    from workflow.tasks.stage import StageInput
 
 MOST_SAMPLES = 20_000_000  # of 4 kB each, 80 GB: more memory than most machines have
 
@@ -30,15 +32,19 @@ def make_records(stage: StageInput) -> RecordsResult:
     Raises InputError: a file or an excitation that is none, sampling times that differ, or a record to
     identify from whose input stands still.
     """
-    source, made = stage.config.source, []
+    # Late: logs are read and refused before what computes is loaded, which takes seconds.
+    from workflow.tasks.results import RecordsResult, RunRecord
+    from workflow.tasks.simulated_rig import simulate_record
+
+    source, made = stage.config.source, list(stage.read)
     entries: Sequence[SimulatedRecord | FileRecord] = source.records
     if isinstance(source, SimulatedSource):
         for index, entry in enumerate(source.records):
             stage.progress.update("records", index / len(source.records), entry.name)
             with naming(f"{stage.called}: source.records[{index}] ({entry.name})"):
                 made.append(simulate_record(source, entry, stage.config.run.seed))
-    else:
-        made = [read_record(source, entry, stage.config.channels) for entry in source.records]
+    elif not made:
+        made = read_records(source, stage.config.channels)
     limit, records = source.input_limit or np.inf, list[RunRecord]()
     for about, record in zip(entries, with_common_sampling_time(made), strict=True):
         kind = about.excitation.kind if isinstance(about, SimulatedRecord) else "file"
@@ -47,6 +53,11 @@ def make_records(stage: StageInput) -> RecordsResult:
     for item in result.of_role("estimation"):
         refuse_constant_input(item.record)
     return result
+
+
+def read_records(source: FileSource, channels: Sequence[Channel]) -> list[Record]:
+    """Every log file of a configuration. Raises InputError: one line naming file and place."""
+    return [read_record(source, entry, channels) for entry in source.records]
 
 
 def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channel]) -> Record:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
+from ident.data.record import Record
 from workflow.config.joints_config import AnyConfig
 from workflow.config.run_config import RunConfig
 from workflow.engine.progress import Progress
@@ -21,12 +22,14 @@ from workflow.tasks.results import RunResults
 
 @dataclass(frozen=True)
 class StageInput:
-    """What a stage may look at. results: of those before it; called: the configuration, in a complaint."""
+    """What a stage may look at. results: of those before it; called: the configuration, in a complaint; read:
+    its logs, where they have been read."""
 
     config: RunConfig
     results: RunResults
     progress: Progress
     called: str = "the configuration"
+    read: Sequence[Record] = ()
 
     @property
     def plant(self) -> UncertainPlant:
