@@ -121,7 +121,7 @@ class Shares:
     def horizon_closed(self) -> float:
         """Share of the gap that the effects close in the windows; nan without a gap there."""
         before, after = (float(np.sum(np.square(s))) for s in (self.horizon_before, self.horizon_after))
-        return 1 - after / before if before > 0 else float("nan")
+        return min(1 - after / before, 1.0) if before > 0 else float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +241,20 @@ class Diagnosis:
     @property
     def instead(self) -> tuple[str, ...]:
         """Answers that the records cannot rule out in place of the first."""
-        return tuple(name for name in self.ambiguous_with if name not in self.beside)
+        others = {*self.beside, *self.perhaps}
+        return tuple(name for name in self.ambiguous_with if name not in others)
+
+    @property
+    def perhaps(self) -> tuple[str, ...]:
+        """Of `ambiguous_with`, effects that are likely beside the answer alone: one of another output cannot
+        take its place."""
+        answer = set(self.combination)
+        if not answer:
+            return ()
+        named = [name for name in self.ambiguous_with if name not in self.beside]
+        whole = {key: p for key, p in self.sets.items() if answer <= {*key}}
+        beside = {name: sum(p for key, p in whole.items() if name in key) for name in named}
+        return tuple(n for n, p in beside.items() if p >= POSSIBLE > self.presence(n) - p)
 
     @property
     def runner_up(self) -> str:
@@ -408,7 +421,8 @@ def share_closed(
         explainable = total[..., 0] / total[..., 2] - floor**2
         left = total[..., 1] / total[..., 2] - floor**2
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(np.where(explainable > 0, 1 - left / explainable, np.nan))
+            # Less than noise leaves is by chance: no more than all is explained.
+            return np.asarray(np.where(explainable > 0, np.minimum(1 - left / explainable, 1.0), np.nan))
 
     # A gap that the noise of so many samples could make is none to close.
     count = sums[:, 2].sum()

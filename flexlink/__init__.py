@@ -25,6 +25,11 @@ Tables      `table`
 `LoopRun`, `Simulation` and `SynthesisResult` are what `simulate_loop`, `simulate` and `synthesise` return.
 """
 
+import sys
+
+if sys.argv[0] == "-m" and "flexlink" in sys.orig_argv:
+    del sys.path[0]  # of the current folder: no csv.py in it is taken for Python's own
+
 import lazy_loader
 
 from flexlink.own_packages import find_own_first

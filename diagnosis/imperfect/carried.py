@@ -58,7 +58,7 @@ def shares_of(
         value = _shapley(name, names, {c: b.sum(keepdims=True) for c, b in blocks.items()})[0]
         spread = _shapley(name, names, {c: b[drawn].sum(axis=1) for c, b in blocks.items()})
         low, high = np.quantile(spread, [0.025, 0.975])
-        carried[name] = (float(value), float(low), float(high))
+        carried[name] = (float(value), min(float(low), 1.0), min(float(high), 1.0))
     ranked = sorted(search.found, key=lambda e: e.evidence)
     closed = {e.key: closed_by(search, e, nominal) for e in ranked if e.names}
     told = sorted(((c, key) for key, c in closed.items() if _tells(key, closed)), reverse=True)[:SEVERAL]
@@ -79,7 +79,7 @@ def shares_of(
 
 def closed_by(search: Search, explanation: Explanation, nominal: Explanation) -> float:
     """Share of the energy of the held-out residuals beyond noise that a set closes."""
-    return 1 - float(np.sum(_blocks(search, explanation)) / np.sum(_blocks(search, nominal)))
+    return min(1 - float(np.sum(_blocks(search, explanation)) / np.sum(_blocks(search, nominal))), 1.0)
 
 
 def _tells(key: tuple[str, ...], closed: Mapping[tuple[str, ...], float]) -> bool:

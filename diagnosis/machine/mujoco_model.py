@@ -128,7 +128,7 @@ class MujocoModel:
                 )
         model = spec.compile()
         for name in self.outputs:
-            refuse_free_base(model, name)
+            refuse_free_base(spec, model, name)
             if model.sensor(name).dim[0] != 1:
                 raise ValueError(f"sensor {name} has {model.sensor(name).dim[0]} numbers, expected one")
         put_compiled(spec, model)
@@ -189,8 +189,7 @@ class MujocoModel:
     @cached_property
     def filtered(self) -> tuple[int, ...]:
         """Actuators with a state that follows the command."""
-        model = self.nominal
-        return tuple(u for u in range(model.nu) if model.actuator_dyntype[u] in LAGS[1:])
+        return tuple(u for u, one in enumerate(self.spec.actuators) if one.dyntype in LAGS[1:])
 
     def number(self, name: str, without: float) -> float:
         """A <numeric> of the file."""
@@ -198,14 +197,14 @@ class MujocoModel:
         return without if one is None else float(one.data[0])
 
 
-def refuse_free_base(model: Any, output: str) -> None:
+def refuse_free_base(spec: Any, model: Any, output: str) -> None:
     """Raises ValueError where a joint hangs on a body that flies, of which nobody logs where it is."""
-    sensor = model.sensor(output)
-    if sensor.objtype[0] != mujoco.mjtObj.mjOBJ_JOINT:
+    sensor = spec.sensor(output)
+    if sensor.objtype != mujoco.mjtObj.mjOBJ_JOINT:
         return
-    root = model.body_rootid[model.jnt_bodyid[sensor.objid[0]]]
+    root = model.body_rootid[model.joint(sensor.objname).bodyid[0]]
     first = model.body_jntadr[root]
-    if first >= 0 and model.jnt_type[first] == mujoco.mjtJoint.mjJNT_FREE:
+    if first >= 0 and spec.joints[first].type == mujoco.mjtJoint.mjJNT_FREE:
         name = model.body(root).name
         raise ValueError(
             f"the base {name!r} moves freely, and no log says where it is: take its <freejoint/> out if it "

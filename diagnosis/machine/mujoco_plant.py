@@ -81,7 +81,8 @@ class MujocoArm(MujocoModel):
             axis, body = data.xaxis[joint.id], joint.bodyid[0]
             pull = np.linalg.norm(np.cross(axis, model.opt.gravity)) * float(model.body_subtreemass[body])
             arm = np.linalg.norm(np.cross(axis, data.subtree_com[body] - data.xanchor[joint.id]))
-            falls = np.sqrt(pull * arm / inertia) if joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE else 0.0
+            turns = self.spec.joint(name).type == mujoco.mjtJoint.mjJNT_HINGE
+            falls = np.sqrt(pull * arm / inertia) if turns else 0.0
             fastest = max(fastest, 0.5 * speed / travel, _HELD * float(falls))
         return fastest
 
@@ -167,11 +168,14 @@ class MujocoArm(MujocoModel):
         model_error : share of the motion that commands make; beside the tracking that is less than all of it.
         named : patterns that choose quantities which are tried by name only.
         """
+        there = self.quantities(experiments)
         every = {
             name: one
-            for name, one in self.quantities(experiments).items()
+            for name, one in there.items()
             if not one.by_name or any(fnmatchcase(name, pattern) for pattern in named)
         }
+        # Stated, and taken as exact: the damping of the joint does the same.
+        exact = [f"wrong_{name}" for name in there if name.endswith(".kv") and name not in every]
         stated = {name: one.value for name, one in every.items() if one.value != 0.0}
         tolerances = {name: self.number(f"tolerance.{name}", _usual_tolerance(name)) for name in stated}
         simulation = Simulation(self, every, noise)
@@ -203,7 +207,11 @@ class MujocoArm(MujocoModel):
             tuple(effect for effect in missing if effect.name in shown),
             share,
             self.dt_s,
-            inactive={**self._untried(every), **dict.fromkeys(silent, "records in which it shows")},
+            inactive={
+                **self._untried(every),
+                **dict.fromkeys(exact, "its name in candidates"),
+                **dict.fromkeys(silent, "records in which it shows"),
+            },
             settled=simulation.settled,
             untracked=Simulation(
                 replace(self, tracking_rad_s=0.0), every, noise, False, _starts=simulation._starts

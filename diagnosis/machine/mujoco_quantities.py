@@ -134,7 +134,8 @@ class Quantities:
         kinds, (_, stiffness, damping) = (int(one.gaintype), int(one.biastype)), one.biasprm[:3]
         if kinds == (0, 1) and stiffness == -one.gainprm[0] != 0:
             put = partial(put_kp, one.name, one.gainprm[0])
-            yield Quantity(f"{one.name}.kp", float(one.gainprm[0]), put, by_name=True)
+            # Without damping of its own it is what the gain is.
+            yield Quantity(f"{one.name}.kp", float(one.gainprm[0]), put, by_name=not damping)
             if damping:
                 put = partial(put_scaled, one.name, "biasprm", (2,), -damping)
                 yield Quantity(f"{one.name}.kv", -float(damping), put, by_name=True)
@@ -152,7 +153,7 @@ class Quantities:
             yield Quantity(f"{one.name}.forcerange", 1.0, partial(put_forcerange, one.name, limits))
         elif (force := max(-least, largest)) > 0:
             put = partial(put_limit, one.name, limits)
-            name = self._limit_name(stated)
+            name = self._limit_name(one)
             limit = of(f"{one.name}.forcerange", 0.0, put, name, force, (0.05, 1.0), (0.1, 0.98))
             yield replace(limit, grows=False)
         if one.dyntype in LAGS:
@@ -162,9 +163,9 @@ class Quantities:
 
     def _limit_name(self, actuator: Any) -> str:
         """Of a joint's actuator with the unit of its force, which the joint's kind says."""
-        if actuator.trntype[0] not in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+        if actuator.trntype not in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
             return "limit"
-        kind = mujoco.mjtJoint(self.model.nominal.jnt_type[actuator.trnid[0]])
+        kind = self.model.spec.joint(actuator.target).type
         return f"limit_{_UNITS[kind][0]}" if kind in _UNITS else "limit"
 
     def _of_link(self, body: Any) -> Iterator[Quantity]:

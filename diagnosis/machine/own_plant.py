@@ -242,10 +242,13 @@ class Plant:
                 raise ValueError(
                     f"{self._at(effects)} the simulation ended with {reason}{at}{OF_TRIAL}"
                 ) from error
+            asked = (len(inputs), self.noise.size)
+            if found.shape == asked[:1] and asked[1] == 1:
+                found = found[:, None]
             if found.ndim != 2 or len(found) != len(inputs) or found.shape[1] < self.noise.size:
+                turned = "; transpose it" if found.shape == asked[::-1] else ""
                 raise ValueError(
-                    f"{self._at(effects)} the simulation must give outputs "
-                    f"({len(inputs)}, {self.noise.size}); got {found.shape}"
+                    f"{self._at(effects)} the simulation must give outputs {asked}; got {found.shape}{turned}"
                 )
             return found
 
@@ -264,7 +267,8 @@ class Plant:
 
 @dataclass(frozen=True, eq=False)
 class PlantExperiment:
-    """One record of a plant: input (T, U), output (T, Y) as measured; held-out records fit no parameter."""
+    """One record of a plant: input (T, U), output (T, Y) as measured, a single one as (T,) too; held-out
+    records fit no parameter."""
 
     name: str
     role: Role
@@ -273,6 +277,9 @@ class PlantExperiment:
 
     def __post_init__(self) -> None:
         lock(self, "input", "output")
+        for key in ("input", "output"):
+            signal = getattr(self, key)
+            object.__setattr__(self, key, signal[:, None] if signal.ndim == 1 else signal)
         check_record(self)
 
 

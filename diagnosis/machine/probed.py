@@ -18,6 +18,9 @@ _BENT = 0.5
 _RECORDS = 5
 # From this correlation on an output follows the simulation closely enough to compare how far both move.
 _FOLLOWED = 0.8
+# Steps of the simulation that may be one sample, or samples that may be one step: of fewer, an inertia a few
+# times as large would do as much. Samples compared at least.
+_STEPS, _COMPARED = (5, 10, 20, 50, 100), 100
 _FACTORS = {180 / np.pi: "degrees", 1e3: "thousandths", 100.0: "hundredths", 30 / np.pi: "rpm"}
 
 
@@ -62,7 +65,7 @@ def doubts_about(case: PlantCase, deadline_s: float = np.inf) -> tuple[str, ...]
 def doubtful_columns(case: PlantCase) -> tuple[str, ...]:
     """Sentences on outputs that move as the nominal simulation does under the commands alone, but the other
     way round, as another output's does, or by a factor that no missing effect makes: a sign, columns that
-    are exchanged, a unit. The first halves may differ by their start."""
+    are exchanged, a unit. The first halves may differ by their start. And on a step that is not the log's."""
     run, correlations, ratios = case.plant.replayed(()), [], []
     for e in case.estimation[:_RECORDS]:
         x, y = (
@@ -95,7 +98,36 @@ def doubtful_columns(case: PlantCase) -> tuple[str, ...]:
             near = min(_FACTORS, key=lambda factor: abs(np.log(times / factor)))
             unit = f"in {_FACTORS[near]}" if 0.5 < times / near < 2 else "in another unit"
             found.append(f"{name} moves {times:.3g} times as far as in the simulation: is its column {unit}?")
-    return tuple(found)
+    return (*found, *_other_step(case))
+
+
+def _other_step(case: PlantCase) -> list[str]:
+    """On a simulation whose step seems not to be the sampling period: where a sample is several of its steps,
+    or a step several samples, it follows the first record far better, whatever the sizes. MuJoCo is told."""
+    plant, e = case.plant, case.estimation[0]
+    run = plant.replayed(())
+
+    def left(steps: int, samples: int, *, scaled: bool = False) -> float:
+        """Share of the motion, in as many samples as take no longer than the record, at least `_COMPARED`."""
+        part = slice(0, max(len(e.input) // steps, _COMPARED), samples)
+        x = run(np.repeat(e.input[part], steps, axis=0))[::steps]
+        own, y = x - np.mean(x, axis=0), e.output[part] - np.mean(e.output[part], axis=0)
+        energy = np.sum(own**2, axis=0)
+        gain = np.divide(np.sum(own * y, axis=0), energy, out=np.ones_like(energy), where=energy > 0)
+        rest = y - np.where(scaled, gain, 1.0) * own
+        return float(np.sqrt(np.mean(np.sum(rest**2, axis=0) / np.sum(y**2, axis=0))))
+
+    if plant.untracked is not None or left(1, 1) < 0.5:
+        return []
+    tried = [(n, 1) for n in _STEPS] + [(1, n) for n in _STEPS if len(e.input) >= n * _COMPARED]
+    best, (n, samples) = min((left(*one), one) for one in tried)
+    if best > 0.5 * min(left(1, 1, scaled=True), 1.0):
+        return []
+    what = f"a sample is {n} of its steps" if n > 1 else f"its step is {samples} samples"
+    period = f" ({plant.dt_s:g} s)" if plant.dt_s > 0 else ""
+    return [
+        f"the simulation follows {e.name} far better where {what}: is its step the sampling period{period}?"
+    ]
 
 
 def _of_value(plant: Plant, key: str, tolerance: float, inputs: list[Real], stated: list[Real]) -> list[str]:

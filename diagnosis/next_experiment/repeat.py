@@ -35,17 +35,14 @@ class Repeat:
     record, change : Which, and how changed.
     separations : tuple of Separation. Every pair of hypotheses, the most probable ones first; same : of the
         record as it was.
+    separates : bool. Whether some pair comes apart.
     """
 
     record: str
     change: Change
     separations: tuple[Separation, ...]
     same: tuple[Separation, ...]
-
-    @property
-    def separates(self) -> bool:
-        """Whether some pair comes apart."""
-        return any(pair.separated for pair in self.separations)
+    separates: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +95,7 @@ def best_repeat(case: CaseOfMachine, competing: Sequence[CompetingHypothesis]) -
         return None
     same = next((c for c in choices if (c.record, c.change) == (best.record, "same")), best)
     parted, before = (separations(competing, choice.apart) for choice in (best, same))
-    return Repeat(best.record, best.change, parted, before)
+    return Repeat(best.record, best.change, parted, before, any(pair.separated for pair in parted))
 
 
 def _choice(

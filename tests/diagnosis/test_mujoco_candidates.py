@@ -211,6 +211,26 @@ def test_names_choose_what_is_tried(tmp_path):
         assert ("hinge.backlash" in names) == ("*" in candidates)
 
 
+@pytest.mark.parametrize(("kv", "tried", "not_tried"), [(4, True, True), (0, False, False)])
+def test_the_stiffness_of_a_servo_is_tried_and_its_damping_is_said_not_to_be(tmp_path, kv, tried, not_tried):
+    """Without damping of its own its stiffness is its gain."""
+    stated = rod(drive=SERVO.format(40, kv))
+    plant = Machine(true_rod(drive=SERVO.format(40, kv))).case(tmp_path, stated).case.plant
+    assert ("motor.kp" in plant.tolerances) == tried
+    assert ("wrong_motor.kv" in plant.inactive) == not_tried
+    assert set(plant.inactive.values()) >= {"its name in candidates"} or not not_tried
+    named = Machine(true_rod(drive=SERVO.format(40, kv))).case(tmp_path, stated, candidates=["*", "*.k?"])
+    assert "wrong_motor.kv" not in named.case.plant.inactive
+
+
+@pytest.mark.parametrize(("gravity", "rate"), [(-9.81, 1.5 * np.sqrt(9.81 * 0.3 / 0.17)), (0.0, 0.5 / 0.49)])
+def test_tracking_holds_a_rod_that_would_fall(gravity, rate):
+    """Half as fast again as it falls; else half its speed over its travel."""
+    slow = PlantExperiment("slow", "estimation", np.zeros((50, 2)), np.linspace(0, 1e-3, 50)[:, None])
+    arm = MujocoArm(mujoco.MjSpec.from_string(rod(gravity=gravity)), ("hinge",), DT_S)
+    assert arm.tracking([slow]) == pytest.approx(rate, rel=1e-3)
+
+
 def test_any_stretch_and_shear_leaves_an_inertia_that_a_body_can_have():
     from diagnosis.machine.mujoco_edits import put_shape
 

@@ -6,8 +6,10 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.signal import cont2discrete, lfilter
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
 from diagnosis.machine.machine_protocol import Weighing
@@ -218,9 +220,52 @@ def test_what_makes_an_answer_doubtful_is_said(simulation, how, said):
         assert words in sentence
 
 
+def _swings(step_s):
+    """A sprung mass, by steps of this length."""
+    numerator, denominator, _ = cont2discrete(([60.0], [1.0, 3.0, 60.0]), step_s)
+    return lambda u: lfilter(numerator[0], denominator, u, axis=0)
+
+
+@pytest.mark.parametrize(
+    ("simulated", "recorded", "said"),
+    [
+        (_swings(0.001), _swings(0.01), "where a sample is 10 of its steps: is its step the sampling period"),
+        (_swings(0.002), _swings(0.01), "where a sample is 5 of its steps"),
+        (_swings(0.05), _swings(0.01), "where its step is 5 samples"),
+        # With something missing as well.
+        (_swings(0.001), lambda u: _swings(0.01)(u) + 0.15 * np.abs(u), "where a sample is 10 of its steps"),
+        (_swings(0.01), _swings(0.01), ""),
+        (_swings(0.01), lambda u: 57.3 * _swings(0.01)(u), "is its column in degrees"),
+        # Less than a factor of five is as well an inertia.
+        (_swings(0.005), _swings(0.01), ""),
+        (lambda u: 0 * u, _swings(0.01), ""),
+    ],
+)
+def test_a_step_that_is_not_that_of_the_log_is_doubted(simulated, recorded, said):
+    u = np.random.default_rng(3).uniform(-1, 1, 60).repeat(15)[:, None]
+    record = PlantExperiment("log", "estimation", u, recorded(u))
+    plant = replace(PLANT, simulation=lambda p, e, u: simulated(u), dt_s=0.01)
+    found = doubtful_columns(SimpleNamespace(plant=plant, estimation=[record], outputs=("y",)))
+    assert len(found) == bool(said)
+    assert all(said in one for one in found)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [lambda y: y[:, 0], lambda y: y[:, 0].tolist(), lambda y: y.tolist(), lambda y: pd.Series(y[:, 0])],
+)
+def test_one_output_is_a_column_in_whatever_form(given):
+    u = np.linspace(-1, 1, 30)
+    plant = replace(PLANT, simulation=lambda p, e, u: given(p["k"] * u))
+    records = [PlantExperiment(name, role, u, u) for name, role in (("a", "estimation"), ("b", "held_out"))]
+    case = PlantCase("c", plant, tuple(records))
+    np.testing.assert_array_equal(case.machine.simulator(())(records[0].input), 2.0 * u[:, None])
+    assert records[1].output.shape == (30, 1)
+
+
 def test_exchanged_columns_are_doubted():
     moves = np.cumsum(np.random.default_rng(4).standard_normal((400, 2)), axis=0)
-    plant = SimpleNamespace(replayed=lambda effects: lambda u: moves)
+    plant = SimpleNamespace(replayed=lambda effects: lambda u: moves, untracked=0)
 
     def doubts(measured):
         record = SimpleNamespace(input=moves, output=measured)
@@ -287,7 +332,7 @@ def _by(simulation):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: replace(GOOD, input=np.ones(30)), r"needs input \(T, U\)"),
+        (lambda: replace(GOOD, input=np.ones((30, 1, 1))), r"needs input \(T, U\)"),
         (lambda: replace(GOOD, input=np.ones((31, 1))), r"got \(31, 1\) and \(30, 1\)"),
         (lambda: replace(GOOD, role="test"), "role must be"),
         (lambda: replace(GOOD, output=np.full((30, 1), np.nan)), "not finite"),
@@ -316,6 +361,7 @@ def _by(simulation):
         (lambda: PlantCase("c", PLANT, (GOOD, GOOD)), "given twice"),
         (lambda: PlantCase("c", PLANT, (GOOD, replace(BOTH[1], output=GOOD.input))), "is the sensor dead"),
         (lambda: _by(lambda p, e, u: u[:-1]), r"with k 2 .* must give outputs \(30, 1\); got \(29, 1\)"),
+        (lambda: _by(lambda p, e, u: u.T), r"must give outputs \(30, 1\); got \(1, 30\); transpose it"),
         (lambda: _by(lambda p, e, u: u * np.nan), "c, experiment a: .* as stated does not give finite out"),
         (lambda: _by(_random), "a: two simulations as stated differ by up to .*; is something random"),
         (lambda: _by(lambda p, e, u: p["m"] * u), "plant: with k 2 the simulation ended with KeyError: 'm'"),

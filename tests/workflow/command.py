@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
@@ -67,6 +68,17 @@ def finish(process: subprocess.Popen[bytes], code: int = 0, *, seconds: float = 
 def without_progress(error: str) -> str:
     """Standard error without the lines that come every ten seconds, and where something is compiled."""
     return re.sub(r"^flexlink: (?:\d+ s: |compiling, once).*\n", "", error, flags=re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Imported:
+    """For a process of ours: where it finds modules, and what its children would be told."""
+
+    names: tuple[str, ...]
+
+    def run(self, report: object) -> tuple[list[str], str | None]:
+        found = [str(import_module(name).__file__) for name in self.names]
+        return found, os.environ.get("PYTHONSAFEPATH")
 
 
 def wait_until(condition: Callable[[], object], process: subprocess.Popen[bytes]) -> None:

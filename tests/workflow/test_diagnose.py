@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import shutil
+import subprocess
+import sys
 import time
 import tomllib
 from contextlib import closing
@@ -18,7 +21,7 @@ from benchmarks.fleet import write_fleet
 from diagnosis.fit.residual import pooled_rms
 from plant import EFFECTS, Rig, parse_effects, simulate
 from plant.effects.joint import GroundSpring
-from tests.workflow.command import finish, kill, start_flexlink, wait_until
+from tests.workflow.command import ROOT, finish, kill, start_flexlink, wait_until
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from tests.workflow.page_shape import shape_faults
 from workflow.config.run_config import SimulatedSource
@@ -453,6 +456,29 @@ def test_json_is_all_there_is_on_standard_output(cases, tmp_path, here, flexlink
 
 
 # Processes
+
+
+NAMES = ("random", "csv", "json", "types", "queue", "numpy", "ast", "threading", "tempfile")
+
+
+def test_no_name_of_the_standard_library_in_the_current_folder_is_taken_for_it(tmp_path):
+    """Nor one of numpy: by the processes of a command, and by `python -m flexlink`."""
+    for name in NAMES:
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('of the user')")
+    begin = (
+        "import sys; del sys.path[0]; sys.path.append(sys.argv[1])\n"  # as the script `flexlink` begins
+        "from workflow.engine.executor import LocalProcesses\n"
+        "from tests.workflow.command import Imported\n"
+        f"print(*LocalProcesses(1).run([Imported({NAMES})]))"
+    )
+    run = partial(subprocess.run, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = run([sys.executable, "-c", begin, str(ROOT)])
+    assert done.returncode == 0, done.stderr
+    (index, (files, safe)) = ast.literal_eval(done.stdout)
+    assert (index, len(files), safe) == (0, len(NAMES), None)
+    assert not any(str(tmp_path) in file for file in files)
+    version = run([sys.executable, "-m", "flexlink", "--version"])
+    assert version.stdout.startswith("flexlink "), version.stderr
 
 
 @pytest.mark.slow

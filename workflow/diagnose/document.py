@@ -57,6 +57,8 @@ def document_of(
         "completeness": found.completeness,
         "partial_model": found.partial_model,
         "ambiguous_with": found.ambiguous_with,
+        "instead": found.instead,
+        "perhaps": found.perhaps,
         "probability": found.probability,
         "probabilities": found.probabilities,
         "sets": [

@@ -5,8 +5,11 @@ An interrupt while a worker is begun leaves half of its task in the pipe, and a 
 
 from __future__ import annotations
 
+import os
 import sys
 from types import TracebackType
+
+from workflow.engine.threads import SAFE_PATH
 
 
 def _tell(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
@@ -15,3 +18,5 @@ def _tell(kind: type[BaseException], error: BaseException, trace: TracebackType 
 
 
 sys.excepthook = _tell
+if SAFE_PATH.items() <= os.environ.items():  # what a user's simulation starts is the user's
+    del os.environ["PYTHONSAFEPATH"]

@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 _VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+# A process of ours takes no random.py in the current folder for Python's own; any value does, this is ours.
+SAFE_PATH = {"PYTHONSAFEPATH": "flexlink"}
 
 
 def one_thread() -> None:
@@ -21,8 +23,9 @@ def one_thread() -> None:
 @contextmanager
 def one_thread_each() -> Iterator[None]:
     """For processes begun inside: libraries read the number of threads when they load."""
-    before = {name: os.environ.get(name) for name in _VARIABLES}
-    os.environ.update(dict.fromkeys(_VARIABLES, "1"))
+    ours = dict.fromkeys(_VARIABLES, "1") | ({} if "PYTHONSAFEPATH" in os.environ else SAFE_PATH)
+    before = {name: os.environ.get(name) for name in ours}
+    os.environ.update(ours)
     try:
         yield
     finally:

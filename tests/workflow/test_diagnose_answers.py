@@ -1,0 +1,279 @@
+"""Every answer that a diagnosis can have is drawn: JSON, page and terminal, from answers made by hand.
+
+Of every verdict and every proposal of a next experiment, for a rig, a rig beside a model error, and one's own
+simulation, with all that an answer may hold beside and without it. Nothing is searched.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from itertools import product
+from typing import get_args, get_type_hints
+
+import numpy as np
+import pytest
+from jinja2 import StrictUndefined
+
+from diagnosis.answer import Completeness, DetailVerdict, Diagnosis, NamedEffect, Shares, share_closed
+from diagnosis.machine.own_plant import Plant, PlantCase, PlantExperiment
+from diagnosis.machine.plant_effect import Change, EffectParameter, PlantEffect
+from diagnosis.next_experiment.discrimination import CompetingHypothesis
+from diagnosis.next_experiment.next_experiment import Considered, NextExperiment, Separation
+from diagnosis.next_experiment.repeat import Change as Changed, Repeat
+from flexlink.causes import Diagnosis as Printed
+from flexlink.shown import dressed
+from plant.effects.joint import GroundSpring
+from tests.workflow.command import build_nothing
+from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
+from workflow.diagnose import command, outputs, pages
+from workflow.diagnose.case_files import load_case
+from workflow.diagnose.fleet import Machine
+from workflow.diagnose.following import Following
+from workflow.diagnose.outputs import Work
+from workflow.diagnose.simulator_case import SimulatorCase
+from workflow.text.templates import RunSummary, environment
+
+TWO = ("dry friction", "backlash")
+APART, ALIKE = Separation(TWO, 5.0, 12.5), Separation(TWO, 0.4, 0.08)
+REPEATS = [
+    Repeat("a", change, (pair,), (ALIKE,), pair.separated)
+    for change in get_args(Changed)
+    for pair in (APART, ALIKE)
+]
+ADVICES = get_args(get_type_hints(Following)["advice"])
+
+
+def proposed(pair: Separation, decided: bool) -> NextExperiment:
+    looked_at = (Considered("chirp", {"from_Hz": 1.0}, 2.0, True, 3.0, None),)
+    return NextExperiment(
+        "chirp", {"from_Hz": 1.0, "shape": "up"}, 2.0, 3.0, 0.01, np.ones(300), (pair,), 2.0,
+        (-0.1, 0.2), (-1e-3, 2e-3), pair.separated, decided, looked_at,
+    )  # fmt: skip
+
+
+def followings(kind: str, competing: tuple[CompetingHypothesis, ...]) -> list[Following]:
+    """Every advice, with every experiment that may stand beside it: repeats are of one's own machine."""
+    named = tuple(replace(one, name=name) for one, name in zip(competing, TWO, strict=True))
+    found = [Following(advice, competing=named) for advice in ADVICES if advice != "separate"]
+    if kind == "own":
+        return [*found, *(Following("look", competing=named, repeat=one) for one in REPEATS)]
+    choices = product((APART, ALIKE), (True, False))
+    return [*found, *(Following("separate", proposed(*choice), named) for choice in choices)]
+
+
+def simulate(parameters, effects, inputs):
+    drag = effects.get("drag", {"force_N": 0.0})["force_N"]
+    return np.column_stack([parameters["gain"] * inputs[:, 0] - drag, inputs[:, 0] ** 2])
+
+
+def own_case() -> PlantCase:
+    """Two outputs, one effect of its own and one that nobody could try."""
+    plant = Plant(
+        simulate, {"gain": 2.0}, {"gain": 0.1}, ("x_m", "second"), np.array([0.1, 0.1]),
+        (PlantEffect("drag", (EffectParameter("force_N", 0.1, 1.0),)),), 0.05, 0.01,
+        inactive={"kv": "its name in candidates"}, units={"second": "N"},
+    )  # fmt: skip
+    rng, records = np.random.default_rng(0), []
+    for name, role in (("a", "estimation"), ("b", "held_out")):
+        u = rng.standard_normal((200, 1))
+        output = simulate(plant.parameters, {}, u) + 0.1 * rng.standard_normal((200, 2))
+        records.append(PlantExperiment(name, role, u, output))
+    return PlantCase("own", plant, tuple(records))
+
+
+def own_answer(case: PlantCase) -> Diagnosis:
+    rng = np.random.default_rng(1)
+    left = {e.name: rng.standard_normal(e.output.shape) for e in case.experiments}
+    drag = NamedEffect("drag", 0.9, 0.9, {"force_N": 0.3}, {"force_N": (0.2, 0.4)}, 1.0, (0.9, 0.8, 0.95))
+    others = (
+        replace(drag, name=name, probability=p, presence=p, parameters={}, intervals={}, untried=why)
+        for name, p, why in (
+            ("wrong_gain", 0.06, ""),
+            ("kv", 0.0, "its name in candidates"),
+            ("none", 0.0, ""),
+            ("unknown", 0.04, ""),
+        )
+    )
+    return Diagnosis(
+        case=case, verdict="effect", detail_verdict="effect",
+        probabilities={"drag": 0.9, "wrong_gain": 0.06, "kv": 0.0, "none": 0.0, "unknown": 0.04},
+        sets={("drag",): 0.9, ("wrong_gain",): 0.06, ("unknown",): 0.04}, effects=(drag, *others),
+        combination=("drag",), ambiguous_with=("wrong_gain",), gap_before=9.0, gap_refit=8.0, gap_after=1.0,
+        noise_floor=1.0, gap_closed=0.99, gap_closed_interval=(0.98, 1.0), deviations={"gain": 1.5},
+        deviations_refit={"gain": -2.5}, rig=case.plant.scaled({"gain": 1.1}),
+        repair=(Change("drag", {"force_N": 0.3}),),
+        residuals_before={name: 9 * e for name, e in left.items()},
+        residuals_refit={name: 8 * e for name, e in left.items()}, residuals_after=left, simulations=7,
+        completeness=Completeness(0.97, 0.05, {"x_m": 0.01, "second": 0.0}, {"x_m": 0.1, "second": 0.0}),
+        shares=Shares(case.outputs, (0.3, 0.3), (0.1, 0.1), 0.05, {"drag": (0.9, 0.8, 0.95)}, (),
+                      ((("drag",), 0.9), (("wrong_gain",), 0.3)), ()),
+    )  # fmt: skip
+
+
+def beside(found: Diagnosis) -> Diagnosis:
+    """With all that an answer may hold."""
+    first, *others = found.effects
+    key = next(iter(first.parameters))
+    first = replace(first, remarks={key: "anywhere in its range"}, widened_by=next(iter(found.deviations)))
+    name = first.name
+    shares = found.shares and replace(
+        found.shares, small=("gravity",), silent=(name,), not_tried=("backlash",), horizon_samples=50,
+        horizon_before=(0.3,) * len(found.shares.names), horizon_after=(0.1,) * len(found.shares.names),
+        carried={**found.shares.carried, "gravity": (0.02, 0.01, 0.03)},
+    )  # fmt: skip
+    second = replace(others[0], name="gravity", presence=0.3, probability=0.0)
+    return replace(
+        found, effects=(first, second, *(e for e in others if e.name != "gravity")), shares=shares,
+        doubts=("the simulation ignores its gain", "is that the right log?"), held_out_decided=True,
+        noise_below_stated=((found.case.outputs[0], 0.01, 0.1),),
+        unlisted=(GroundSpring(stiffness_Nm_rad=0.2),),
+        sets={**found.sets, tuple(sorted((name, "gravity"))): 0.0},
+    )  # fmt: skip
+
+
+def as_judged(found: Diagnosis, verdict: str, detail: str) -> Diagnosis:
+    """The same with another verdict."""
+    if verdict == "effect":
+        return replace(found, detail_verdict=detail)
+    partial = tuple(found.combination) if found.unlisted and verdict == "unknown" else ()
+    return replace(
+        found, verdict=verdict, detail_verdict=detail, combination=(), partial_model=partial,
+        probabilities={**found.probabilities, verdict: 0.9},
+    )  # fmt: skip
+
+
+VERDICTS = [
+    (verdict, detail)
+    for detail in get_args(DetailVerdict)
+    for verdict in (
+        ("none", "effect", "unknown")
+        if detail == "not_converged"
+        else ({"parametric": "none", "ambiguous": "effect"}.get(detail, detail),)
+    )
+]
+
+
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory):
+    """Kind of case -> it, its answer; a rig's answer may be beside a model error."""
+    folder = write_case(tmp_path_factory.mktemp("answers") / "arm", FRICTION, records=2)
+    exact = load_case(folder, "rig_uncertain.toml")
+    text = (folder / "case.toml").read_text()
+    (folder / "case.toml").write_text("model_error = 0.05\n" + text)
+    rough, own = load_case(folder, "rig_uncertain.toml"), own_case()
+    engine = KnownAnswer((FRICTION,), ambiguous=("viscous_friction",))
+    mine = SimulatorCase(
+        own, "arm.xml", "", lambda found, folder: "<mujoco/>", model_error=0.1,
+        units={"drag": {"force_N": "force_kN"}}, doubts=("columns that never change are left out: u",),
+    )  # fmt: skip
+    return {
+        "exact": (exact, engine(exact.case)),
+        "rough": (rough, engine(rough.case)),
+        "own": (mine, own_answer(own)),
+    }
+
+
+@pytest.fixture
+def quick(loaded, monkeypatch, undrawn):
+    """What is computed of the records is computed once; figures are built by the tests of single pages."""
+    build_nothing(monkeypatch)
+    once = {kind: pages.remains_of(found) for kind, (_, found) in loaded.items()}
+    kinds = {id(one.case): kind for kind, (one, _) in loaded.items()}
+    for module in (outputs, pages):
+        for name in ("where", "where_in_records", "remains_of"):
+            monkeypatch.setattr(
+                module, name, lambda case, *_: once[kinds[id(getattr(case, "case", case))]], raising=False
+            )
+    monkeypatch.setattr(outputs, "answer_text", json.dumps)  # of plain values; the other one hashes itself
+    monkeypatch.setattr(outputs, "telling", lambda *_: None)
+    told = RunSummary("own", (), {"alike": []})
+    monkeypatch.setattr(outputs, "of_case", lambda *_: told)
+
+
+def drawn(loaded, found, coming, monkeypatch):
+    """JSON answer, words of the page, rows of the terminal."""
+    monkeypatch.setattr(outputs, "following", lambda _: coming)
+    made_from = {"options": {"controller": False}}
+    files, _ = Work(loaded, made_from, lambda case, progress: found).run(lambda f, m: None)
+    document = json.loads(files[f"{loaded.case.name}.json"])
+    page = re.sub(r"<script.*?</script>|<[^>]*>", " ", files[f"{loaded.case.name}.html"].decode(), flags=re.S)
+    one, several = (
+        command._summary([document] * count, [Machine.of(document)] * count, [], outputs.Path("found/a.html"))
+        for count in (1, 2)
+    )
+    assert several.sections
+    command._overview([Machine.of(document)] * 2, {"other": "no such luck"})
+    rows = [(row.label, row.value) for section in one.sections for row in section.rows]
+    assert str(dressed(Printed, found))
+    return document, " ".join(page.split()), rows
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("kind", ["exact", "rough", "own"])
+def test_every_verdict_is_drawn_with_every_proposal(loaded, monkeypatch, kind):
+    """Each with all that an answer may hold, and without, in turns."""
+    assert environment().undefined is StrictUndefined
+    case, answer = loaded[kind]
+    competing = tuple(CompetingHypothesis(0.5, answer.rig, noise=np.ones(2)) for _ in TWO)
+    # What a page says of an experiment does not depend on a model error.
+    comings = followings(kind, competing)[:: 3 if kind == "rough" else 1]
+    for i, j in product(range(len(VERDICTS)), range(len(comings))):
+        (verdict, detail), coming = VERDICTS[i], comings[j]
+        found = beside(answer) if (i + j) % 2 else answer
+        document, page, rows = drawn(case, as_judged(found, verdict, detail), coming, monkeypatch)
+        assert (document["verdict"], document["detail_verdict"]) == (verdict, detail)
+        assert document["next_experiment"]["advice"] == coming.advice
+        values = dict(rows)
+        decides = values.get("to decide", "")
+        assert bool(decides) == (detail == "ambiguous")
+        repeat = coming.repeat
+        if decides and repeat and repeat.separates:
+            assert decides.startswith(f"repeat {repeat.record} ")
+            assert f"Repeat {repeat.record} " in page
+        elif decides:
+            written = bool(kind != "own" and coming.proposal and coming.proposal.separates)
+            assert written == decides.startswith("run found/")
+        for text in (page, *values.values()):
+            assert not re.search(r"\bUndefined\b|\bNone\b(?! of)|\bnan\b|object at 0x", text)
+        assert all(
+            doubt in page and doubt in [v for k, v in rows if k == "doubtful"] for doubt in found.doubts
+        )
+
+
+@pytest.mark.parametrize(
+    ("sets", "instead", "perhaps"),
+    [
+        # Of another output: in no set without the answer.
+        ({("drag",): 0.8, ("drag", "second_offset"): 0.15, ("unknown",): 0.05}, (), ("second_offset",)),
+        ({("drag",): 0.8, ("second_offset",): 0.15, ("unknown",): 0.05}, ("second_offset",), ()),
+        ({("drag",): 0.7, ("second_offset",): 0.1, ("drag", "second_offset"): 0.2}, ("second_offset",), ()),
+        ({("drag",): 0.7, ("second_offset",): 0.01, ("drag", "second_offset"): 0.29}, (), ("second_offset",)),
+    ],
+)
+@pytest.mark.usefixtures("quick")
+def test_what_can_only_stand_beside_the_answer_takes_no_place(loaded, monkeypatch, sets, instead, perhaps):
+    case, answer = loaded["own"]
+    p = sum(share for names, share in sets.items() if "second_offset" in names)
+    other = replace(answer.effects[1], name="second_offset", presence=p)
+    found = replace(
+        answer, sets=sets, ambiguous_with=("second_offset",), detail_verdict="ambiguous",
+        effects=(answer.effects[0], other, *answer.effects[2:]),
+    )  # fmt: skip
+    assert (found.instead, found.perhaps) == (instead, perhaps)
+    document, page, rows = drawn(case, found, Following("look"), monkeypatch)
+    assert (document["instead"], document["perhaps"]) == ([*instead], [*perhaps])
+    assert ("or instead" in dict(rows), "perhaps also" in dict(rows)) == (bool(instead), bool(perhaps))
+    assert ("; or instead second offset" in page, "; perhaps also second offset" in page) == (
+        bool(instead),
+        bool(perhaps),
+    )
+
+
+def test_no_more_than_all_is_explained(loaded):
+    """A model that leaves less than noise does, by chance, explains 100 % and no more."""
+    (_, answer), rng = loaded["own"], np.random.default_rng(2)
+    before, after = ({e.name: size * np.ones((200, 2)) for e in answer.case.experiments} for size in (9, 0.9))
+    assert share_closed(answer.case, before, after, rng, 1.0) == (1.0, (1.0, 1.0))
+    assert share_closed(answer.case, before, before, rng, 1.0) == (0.0, (0.0, 0.0))
