@@ -30,6 +30,7 @@ def test_coulomb_friction_and_an_offset_are_named_with_the_published_values(flex
         assert low < PUBLISHED[key] < high
 
 
+@pytest.mark.slow
 def test_what_slow_strokes_say_of_fast_ones_is_named_and_not_sure(flexlink_data):
     found = diagnose(emps_axis.case(flexlink_data, "fast"))
     # Fitted below 0.083 m/s, the two leave nearly twice what does not interest of motions up to 0.125 m/s.
@@ -40,20 +41,11 @@ def test_what_slow_strokes_say_of_fast_ones_is_named_and_not_sure(flexlink_data)
     assert found.probability < 0.7
 
 
+@pytest.mark.slow
 def test_with_friction_by_direction_listed_it_explains_more_than_an_offset(flexlink_data):
     # Not in the published model: half the sum of forces at plus and minus one speed grows with the speed.
     found = diagnose(emps_axis.case(flexlink_data, "passes", refined=True))
     assert {"coulomb_friction", "viscous_asymmetry"} <= set(found.combination)
-
-
-@pytest.mark.slow
-def test_the_simulated_loop_names_the_same_two(flexlink_data):
-    found = diagnose(emps_axis.case(flexlink_data, "passes", "loop"))
-    assert set(found.combination) == {"coulomb_friction", "constant_offset"}
-    intervals = {e.name: e.intervals["force_N"] for e in found.effects if e.name in found.combination}
-    for name, key in (("coulomb_friction", "coulomb_N"), ("constant_offset", "offset_N")):
-        low, high = intervals[name]
-        assert low < PUBLISHED[key] < high
 
 
 def test_published_values_reproduce_the_record_in_both_simulations(flexlink_data):

@@ -34,7 +34,7 @@ def _found(folder, cause, acceleration_m_s2, amplitude_V):
     return diagnose(case)
 
 
-@pytest.mark.parametrize("cause", ["gravity", "spring"])
+@pytest.mark.parametrize("cause", [pytest.param("gravity", marks=pytest.mark.slow), "spring"])
 def test_what_the_records_cannot_tell_apart_is_gravity_or_unknown(tmp_path, cause):
     # 0.04 rad of motion, a gap of a tenth of the noise.
     found = _found(tmp_path, cause, 0.1, 0.05)
@@ -50,6 +50,7 @@ def test_what_the_records_cannot_tell_apart_is_gravity_or_unknown(tmp_path, caus
     assert found.probabilities["gravity"] == pytest.approx(0.78, abs=0.06)
 
 
+@pytest.mark.slow
 def test_gravity_that_also_bends_the_link_is_gravity(tmp_path):
     found = _found(tmp_path, "gravity", 0.4, 0.15)
     assert found.combination == ("gravity",)
@@ -78,6 +79,7 @@ def test_a_drag_with_the_square_of_the_speed_is_nothing_of_the_list(tmp_path):
     assert sizes == [pytest.approx(0.05, rel=0.01)]
 
 
+@pytest.mark.slow
 def test_viscous_friction_is_no_drag(tmp_path):
     found = diagnose(_case(tmp_path, {"name": "viscous_friction", "coefficient_Nms": 0.02}, 1.0))
     assert found.combination == ("viscous_friction",)
@@ -94,6 +96,7 @@ def test_a_body_that_a_spring_holds_to_the_hub_is_nothing_of_the_list(tmp_path):
     assert body.parameters() == pytest.approx(held, rel=0.05)
 
 
+@pytest.mark.slow
 def test_hub_inertia_is_no_body_that_a_spring_holds(tmp_path):
     found = diagnose(_case(tmp_path, {"name": "hub_inertia", "ratio": 1.3}, 1.0))
     assert found.combination == ("hub_inertia",)

@@ -136,12 +136,18 @@ CASES: dict[str, tuple[Machine, str, str, str, float]] = {
 }
 
 
-# One of the values and one of what the repaired file can only note; the others take as long each.
-FAST = ("dead zone", "a limit")
+# One of what the repaired file can only note, one each of the values, forces and shapes; all take as long.
+FAST, SLOW = ("dead zone",), ("kp", "a limit", "stretch")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in FAST else [pytest.mark.slow]) for name in CASES]
+    "name",
+    [
+        pytest.param(
+            name, marks=[] if name in FAST else getattr(pytest.mark, "slow" if name in SLOW else "long")
+        )
+        for name in CASES
+    ],
 )
 def test_it_is_named_with_its_size_and_the_repaired_model_moves_as_the_machine(tmp_path, name):
     machine, stated, candidates, effect, size = CASES[name]

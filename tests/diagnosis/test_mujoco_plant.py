@@ -57,8 +57,8 @@ def test_a_stick_figure_stands_where_its_joint_says():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("limit", "stated"), [(0.4, 0.8), (0.7, 0.35)])
-def test_a_force_limit_that_is_stated_wrong_is_named(limit, stated):
+def test_a_force_limit_that_is_stated_wrong_is_named():
+    limit, stated = 0.7, 0.35
     text = ROD.replace(
         'joint="hinge"/></actuator>', f'joint="hinge" forcerange="-{stated} {stated}"/></actuator>'
     )
@@ -147,12 +147,18 @@ def in_motion(xml: str, noise: float, seed: int, servo: bool = False) -> PlantEx
     return PlantExperiment(f"log {seed}", "held_out" if seed else "estimation", log, log[:, 2:])
 
 
-@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
-@pytest.mark.parametrize("kind", ["motor", "cart", "servo"])
-@pytest.mark.parametrize("tracking_rad_s", [9.0, 20.0])
+@pytest.mark.parametrize(
+    ("integrator", "kind", "tracking_rad_s"),
+    [  # any two of them together
+        ("Euler", "motor", 9.0), ("Euler", "cart", 20.0), ("Euler", "servo", 9.0), ("RK4", "motor", 20.0),
+        ("RK4", "cart", 9.0), ("RK4", "servo", 20.0), ("implicit", "motor", 9.0), ("implicit", "cart", 20.0),
+        ("implicit", "servo", 9.0), ("implicitfast", "motor", 20.0), ("implicitfast", "cart", 9.0),
+        ("implicitfast", "servo", 20.0),
+    ],
+)  # fmt: skip
 def test_the_true_model_leaves_the_noise_of_a_log_that_begins_in_motion(integrator, kind, tracking_rad_s):
     noise, xml = 2e-4, two_links(integrator, 0.005, kind)
-    logs = [in_motion(xml, noise, seed, kind == "servo") for seed in range(3)]
+    logs = [in_motion(xml, noise, seed, kind == "servo") for seed in range(2)]
     arm = MujocoArm(mujoco.MjSpec.from_string(xml), ("one", "two"), DT_S, tracking_rad_s)
     plant = arm.plant(logs, np.full(2, noise))
     for log in logs:
@@ -163,13 +169,12 @@ def test_the_true_model_leaves_the_noise_of_a_log_that_begins_in_motion(integrat
         assert np.std(log.output, axis=0).min() > 200 * noise
 
 
-@pytest.mark.parametrize("integrator", ["RK4", "implicitfast"])
 @pytest.mark.parametrize(
-    ("name", "stated", "factor"),
+    ("integrator", "name", "stated", "factor"),
     [
-        ("one.armature", 'armature="0.02"', 4.0),
-        ("one.damping", 'damping="0.3"', 4.0),
-        ("body1.mass", 'mass="1.2" diaginertia="0.01 0.01 0.01"', 1.5),
+        ("RK4", "one.armature", 'armature="0.02"', 4.0),
+        ("implicitfast", "one.damping", 'damping="0.3"', 4.0),
+        ("implicitfast", "body1.mass", 'mass="1.2" diaginertia="0.01 0.01 0.01"', 1.5),
     ],
 )
 def test_a_start_in_motion_is_fitted_with_the_values_that_are_tried(integrator, name, stated, factor):
@@ -187,8 +192,10 @@ def test_a_start_in_motion_is_fitted_with_the_values_that_are_tried(integrator, 
         assert left < 1.2 * noise < 20 * noise < stated_left
 
 
-@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
-@pytest.mark.parametrize("kind", ["lag", "delay", "servo delay"])
+@pytest.mark.parametrize(
+    ("integrator", "kind"),
+    [("Euler", "lag"), ("implicitfast", "lag"), ("implicitfast", "delay"), ("Euler", "servo delay")],
+)
 def test_commands_before_a_record_are_fitted(integrator, kind):
     """What a lag or delay that the model lacks still feels of them, where the log begins in motion."""
     noise, late_s, drive = 2e-4, 0.05, kind.split()[0] if "servo" in kind else "motor"
@@ -695,14 +702,3 @@ def test_a_joint_on_a_base_that_flies_is_refused_in_one_line(base, refused):
             MujocoArm(spec, ("hip",), DT_S)
     else:
         MujocoArm(spec, ("hip",), DT_S)
-
-
-@pytest.mark.slow
-def test_a_load_that_a_gain_imitates_stays_open_beside_it():
-    """A load, a mass and a gain leave alike; what is small beside one of them does not decide."""
-    truth, case = cases.case_of(63, 51)
-    found = diagnose(case)
-    assert truth.name == "link1.payload"
-    presence = {e.name: e.presence for e in found.effects}
-    assert presence["link1.payload"] > 0.2
-    assert max(presence["wrong_motor1.gain"], presence["wrong_link1.mass"]) < 0.8

@@ -70,11 +70,6 @@ def test_stiffening_spring_is_found_and_sized():
     assert found.rig.parameters["mass_kg"] == pytest.approx(2.03, rel=0.02)
 
 
-def test_a_plant_as_stated_is_no_alarm():
-    found = diagnose(_case(lambda t, x, v, f: (f - 80.0 * x - 3.0 * v) / 2.0))
-    assert (found.verdict, found.combination) == ("none", ())
-
-
 def test_what_no_listed_effect_describes_is_unknown():
     found = diagnose(_case(lambda t, x, v, f: (f - 80.0 * x - 3.0 * v + 2 * np.sin(25 * t)) / 2.0))
     assert found.verdict == "unknown"
@@ -84,23 +79,18 @@ def test_what_no_listed_effect_describes_is_unknown():
     assert any(f"{100 * left:.2g} % of the motion" in d and "model_error=0.05" in d for d in found.doubts)
 
 
-def test_a_stated_model_error_is_no_unknown_cause():
-    # The same tone, small beside what is stated that the simulation may miss.
-    case = _case(lambda t, x, v, f: (f - 80.0 * x - 3.0 * v + 0.1 * np.sin(25 * t)) / 2.0, model_error=0.05)
-    found = diagnose(case)
-    assert (found.verdict, found.combination) == ("none", ())
-    assert found.doubts == ()
-
-
 @pytest.mark.parametrize(
     ("cubic_N_m3", "tone_N", "stated", "verdict"),
     [
         # The simulation can be exact: less than 5 % of the motion is named all the same.
         (150.0, 0.0, None, "effect"),
         (150.0, 0.0, 0.05, "none"),
+        pytest.param(0.0, 0.0, None, "none", marks=pytest.mark.slow),
         # Something small is always missing: that must not hide what is large.
         (4e3, 0.6, None, "effect"),
-        (4e3, 0.6, 0.0, "unknown"),
+        pytest.param(4e3, 0.6, 0.0, "unknown", marks=pytest.mark.slow),
+        # A tone alone, small beside what is stated that the simulation may miss.
+        pytest.param(0.0, 0.1, 0.05, "none", marks=pytest.mark.slow),
     ],
 )
 def test_without_a_stated_model_error_the_records_say_whether_there_is_one(
@@ -111,13 +101,14 @@ def test_without_a_stated_model_error_the_records_say_whether_there_is_one(
 
     found = diagnose(_case(acceleration, model_error=stated))
     assert (found.verdict, found.combination) == (verdict, ("stiffening",) * (verdict == "effect"))
+    assert found.doubts == ()
 
 
-def test_the_example_runs_and_finds_what_it_lacks(capsys):
-    own_plant.main()
-    said = capsys.readouterr().out
-    assert "verdict: effect" in said
+def test_the_example_runs_and_finds_what_it_lacks(capsys, monkeypatch):
     found = own_plant.run(seed=1)
+    monkeypatch.setattr(own_plant, "run", lambda: found)
+    own_plant.main()
+    assert "verdict: effect" in capsys.readouterr().out
     assert set(found.combination) == {"coulomb_friction", "input_offset"}
     by_name = {effect.name: effect.parameters for effect in found.effects}
     # Friction around the simulation, in the records inside it: 1 % is several of the intervals' widths.

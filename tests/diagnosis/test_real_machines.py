@@ -29,29 +29,6 @@ def test_stage_model_is_the_manufacturers(flexlink_data, stage):
 
 
 @pytest.mark.slow
-def test_the_first_stage_of_the_serial_link_feels_the_other(flexlink_data):
-    found = diagnose(serial_link_stage.case(flexlink_data, 1))
-    # Present, and something else is missing besides.
-    assert found.presence("other_stage") > 0.8
-    assert found.completeness.probability < 0.1
-    assert found.completeness.remains["alpha_rad"] > 0.2
-    assert found.shares is not None
-    assert found.shares.closes
-    assert all((closed > 0.6) == ("other_stage" in names) for names, closed in found.shares.closes)
-    assert "other_stage" in found.combination
-    assert found.gap_closed > 0.6
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fitted", [(50, 75), (50,)])
-def test_friction_of_the_ruler_robot_is_present_at_both_amplitudes(flexlink_data, fitted):
-    found = diagnose(ruler_robot.case(flexlink_data, fitted, (50, 75)))
-    # Measured .86 and .74; what it explains lies within half as much noise again as is stated.
-    assert found.presence("coulomb_friction") > 0.5
-    assert found.presence("drive_offset") > 0.5
-
-
-@pytest.mark.slow
 def test_the_offset_of_the_ruler_robot_found_at_one_amplitude_holds_at_the_other(flexlink_data):
     found = diagnose(ruler_robot.case(flexlink_data, (50,), (75,)))
     assert found.combination == ("drive_offset",)

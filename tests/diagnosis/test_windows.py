@@ -64,7 +64,15 @@ def _late_tank(u, rng):
 @pytest.mark.parametrize(
     ("simulate", "stated", "truth", "motion", "name", "size"),
     [
-        (_motor, {"time_s": 0.2, "gain": 10.0}, _rubbing_motor, "y", "coulomb_friction", 0.4),
+        pytest.param(
+            _motor,
+            {"time_s": 0.2, "gain": 10.0},
+            _rubbing_motor,
+            "y",
+            "coulomb_friction",
+            0.4,
+            marks=pytest.mark.slow,
+        ),
         (_tank, {"area": 2.04}, _late_tank, None, "input_delay", 0.045),
     ],
 )

@@ -71,8 +71,8 @@ def test_own_logs_with_a_column_map_give_the_same_case(folder, tmp_path):
 
 
 WORKSHOP = [
-    *(f"labelled/work-{n:02d}" for n in range(1, 25)),
-    *(f"sealed/case-{n:02d}" for n in range(1, 31)),
+    *(f"labelled/work-{n:02d}" for n in range(1, 25, 3)),
+    *(f"sealed/case-{n:02d}" for n in range(2, 31, 6)),
 ]
 
 
