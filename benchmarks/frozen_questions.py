@@ -99,16 +99,17 @@ _PROGRESS = re.compile(r"^flexlink: (?:\d+ s: |compiling, once).*\n", re.MULTILI
 
 
 def flexlink(*words: object, folder: Path | None = None) -> tuple[int, str, list[str]]:
-    """Exit code, standard output, and the lines on standard error, the folder's name left out."""
+    """Exit code, standard output, and the lines on standard error, names of folders left out."""
     from workflow.cli import main
 
     out, error = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
         code = main([str(word) for word in words])
-    lines = _PROGRESS.sub("", error.getvalue())
+    said = [out.getvalue(), _PROGRESS.sub("", error.getvalue())]
     for place in filter(None, (folder, DATA, GAP, MACHINES, ROOT)):
-        lines = lines.replace(f"{place}/", "").replace(f"{os.path.relpath(place, folder)}/", "")
-    return code, out.getvalue(), lines.splitlines()
+        for name in (f"{place}/", f"{os.path.relpath(place)}/"):
+            said = [text.replace(name, "") for text in said]
+    return code, said[0], said[1].splitlines()
 
 
 # Of the numbers of `run --json` and `identify --json`.
@@ -253,7 +254,56 @@ def two_joints(case: str) -> Answer:
     return kept.answer
 
 
+def joints_run() -> Answer:
+    """A whole run for two simulated joints, as small as tests have it."""
+    from tests.workflow.test_joints import _JOINTS, _REST, _SOURCE
+    from workflow.config.joints_config import load_joints
+    from workflow.tasks.pipeline import run_pipeline
+
+    with scratch() as folder:
+        (folder / "two.toml").write_text(_SOURCE + _JOINTS + _REST)
+        summary = run_pipeline(load_joints(folder / "two.toml")[0], folder / "run")
+    kept = Kept()
+    kept("said", certified=summary.certified)
+    kept("lines", verdict=summary.verdict)
+    for path, value in _flat(summary.to_document()["numbers"]):
+        if isinstance(value, bool | int | str):
+            kept("said", **{".".join(path): value})
+        elif isinstance(value, float):
+            kept("margins", **{".".join(path): value})
+    return kept.answer
+
+
 # ---- models from logs
+
+
+def simulated_effects() -> Answer:
+    """What each effect adds to the outputs of the paper's link, rms."""
+    from plant import parse_effect, simulate
+    from tests.plant.test_effects import EXAMPLES, RIG, VOLTAGE
+
+    still, kept = simulate(RIG, VOLTAGE, ()).output, Kept()
+    for name, size in EXAMPLES.items():
+        added = simulate(RIG, VOLTAGE, [parse_effect({"name": name, **size})]).output - still
+        hub, tip = np.sqrt(np.mean(added**2, axis=0)).tolist()
+        kept("model", **{f"{name} hub": hub, f"{name} tip": tip})
+    return kept.answer
+
+
+def planned() -> Answer:
+    """`flexlink excite` for the paper's link: what the plan states."""
+    limits = "--band 0.5 40 --dt-s 0.005 --duration 60 --voltage 10 --rig paper_link --angle 30"
+    with scratch() as folder:
+        code, _, lines = flexlink("excite", "--out", folder / "plan", *limits.split(), folder=folder)
+        plan, kept = json.loads((folder / "plan" / "plan.json").read_text("utf-8")), Kept()
+    kept("said", exit=code)
+    kept("lines", error=" | ".join(lines))
+    for record in plan["records"]:
+        kept(
+            "model",
+            **{f"{record['file']} {key}": record[key] for key in ("peak_V", "rms_V", "peak_angle_deg")},
+        )
+    return kept.answer
 
 
 def identified(**options: Any) -> Answer:
@@ -407,6 +457,41 @@ def own_case(*effects: Mapping[str, Any], rig: str | None = None) -> Answer:
         return diagnosed(case, [str(e["name"]) for e in effects])
 
 
+def diagnosed_by_command() -> Answer:
+    """`flexlink diagnose` of four short records: what its document says beside the answer itself."""
+    from tests.workflow.diagnosis_examples import write_case
+
+    with scratch() as folder:
+        case = write_case(folder / "case", dict(_FRICTION))
+        words = case, "--out", folder / "out", "--json", "--quiet"
+        code, out, lines = flexlink("diagnose", *words, folder=folder)
+    kept = Kept()
+    kept("said", exit=code)
+    kept("lines", error=" | ".join(lines))
+    kept.picked(json.loads(out)["cases"][0] if out else {}, _DOCUMENT)
+    return kept.answer
+
+
+_DOCUMENT = (
+    (r"verdict|detail_verdict|decided", "said"),
+    (r"(where|controller|completeness)\..*(verdict|place|kind|name|certified)", "said"),
+    (r"next_experiment\.(kind|advice)", "said"),
+    (r"next_experiment\.(amplitude_V|duration_s|parameters\..*)", "sizes"),
+    (r"gap_.*", "gaps"),
+)
+
+
+def checked(case: Path) -> Answer:
+    """`flexlink check`: what logs can tell of a model."""
+    code, out, lines = flexlink("check", case, "--json", folder=case.parent)
+    kept = Kept()
+    kept("said", exit=code)
+    kept("lines", error=" | ".join(lines), **({"verdict": json.loads(out)["verdict"]} if out else {}))
+    for row in json.loads(out)["table"] if out else ():
+        kept("lines", **{f"{row['section']} {row['label']}": row["value"]})
+    return kept.answer
+
+
 def mujoco_case(number: int, seed: int = 7352) -> Answer:
     from benchmarks.mujoco_cases import case_of
 
@@ -531,7 +616,7 @@ def looked_at(log: Path) -> Answer:
     kept("lines", error=" | ".join(lines))
     if out:
         document = json.loads(out)
-        kept("lines", verdict=document["verdict"].replace(f"{log.parent}/", ""))
+        kept("lines", verdict=document["verdict"])
         kept.picked(document["numbers"], _LOOK)
     return kept.answer
 
@@ -567,12 +652,15 @@ def _questions() -> Iterator[tuple[str, Question]]:
     yield "margins default_arm", Question(partial(example, "default_arm"))
     for name, slow in (("daisy_robot_arm", False), ("slfr_krauss_2009", True)):
         yield f"margins {name}", Question(partial(example, name), (DATA / name,), slow)
-    for seed in (0, 2, 3, 7, 9, 13, 20, 25, 145):
+    for seed in (0, 2, 3, 7, 9, 13, 20, 25, 32, 49, 145):
         yield f"random design {seed}", Question(partial(random_design, seed))
     for scenario in "ABC":
         yield f"flexible link {scenario}", Question(partial(flexible_link, scenario))
-    for case, slow in (("T, full", False), ("T, decentralised", False), ("T, ball x 3", True), ("D", True)):
+    for case, slow in (("T, full", False), ("T, decentralised", True), ("T, ball x 3", True), ("D", True)):
         yield f"two joints {case}", Question(partial(two_joints, case), slow=slow)
+    yield "two joints, a whole run", Question(joints_run)
+    yield "simulated effects", Question(simulated_effects)
+    yield "planned experiment", Question(planned)
     for name, options in (
         ("orders given", {"seed": 0, "n_real": 1, "n_pairs": 2}),
         ("band 10 600", {"seed": 1, "band_rad_s": (10.0, 600.0)}),
@@ -593,6 +681,9 @@ def _questions() -> Iterator[tuple[str, Question]]:
         yield f"exact {place}", Question(partial(shared_case, place), (GAP / place.partition(":")[0],), slow)
     for name, effects in (("friction", (_FRICTION,)), ("payload", (_PAYLOAD,)), ("nothing", ())):
         yield f"exact, four short records: {name}", Question(partial(own_case, *effects))
+    yield "diagnose command", Question(diagnosed_by_command)
+    for name in ("gap_case", "mujoco_arm/arm.toml"):
+        yield f"check {name}", Question(partial(checked, ROOT / "examples" / name))
     for place, slow in _WORKSHOP.items():
         folder = GAP / "workshop" / place
         yield f"workshop {place}", Question(partial(shared_case, f"workshop/{place}"), (folder,), slow)
