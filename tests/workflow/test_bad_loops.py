@@ -237,28 +237,16 @@ def before_lag(signal, a):
 TWO, THREE = (0.2, 0.15), (0.2, 0.1, 0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "said", "levels"),
     [
-        pytest.param(
-            lambda one, k: {"y": behind_lag(one["y"], 0.9)}, UNEXPLAINED, THREE, marks=pytest.mark.slow
-        ),
+        (lambda one, k: {"y": behind_lag(one["y"], 0.9)}, UNEXPLAINED, THREE),
         # The drive lags: what turns the motor is the command behind a filter.
-        pytest.param(
-            lambda one, k: {"u": before_lag(one["u"], 0.7)}, UNEXPLAINED, TWO, marks=pytest.mark.slow
-        ),
-        pytest.param(lambda one, k: {"u": log(10 + k)["u"]}, "'enc_rad'", TWO, marks=pytest.mark.slow),
-        pytest.param(
-            lambda one, k: {"u": np.concatenate([np.full(5, one["u"][0]), one["u"][:-5]])},
-            "logged late",
-            TWO,
-            marks=pytest.mark.slow,
-        ),
-        (
-            lambda one, k: log(k, machine=plant(load=3 * LOAD)) if k == 1 else {},
-            "explains these logs",
-            THREE,
-        ),
+        (lambda one, k: {"u": before_lag(one["u"], 0.7)}, UNEXPLAINED, TWO),
+        (lambda one, k: {"u": log(10 + k)["u"]}, "'enc_rad'", TWO),
+        (lambda one, k: {"u": np.concatenate([np.full(5, one["u"][0]), one["u"][:-5]])}, "logged late", TWO),
+        (lambda one, k: log(k, machine=plant(load=3 * LOAD)) if k == 1 else {}, "explains these logs", THREE),
     ],
     ids=["filtered position", "lagging drive", "command of another axis", "late command", "another load"],
 )
