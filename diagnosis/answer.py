@@ -241,18 +241,14 @@ class Diagnosis:
     @property
     def instead(self) -> tuple[str, ...]:
         """Answers that the records cannot rule out in place of the first."""
-        others = {*self.beside, *self.perhaps}
-        return tuple(name for name in self.ambiguous_with if name not in others)
+        return tuple(name for name in self.ambiguous_with if name not in (*self.beside, *self.perhaps))
 
     @property
     def perhaps(self) -> tuple[str, ...]:
         """Of `ambiguous_with`, effects that are likely beside the answer alone: one of another output cannot
         take its place."""
-        answer = set(self.combination)
-        if not answer:
-            return ()
-        named = [name for name in self.ambiguous_with if name not in self.beside]
-        whole = {key: p for key, p in self.sets.items() if answer <= {*key}}
+        named = [name for name in self.ambiguous_with if self.combination and name not in self.beside]
+        whole = {key: p for key, p in self.sets.items() if set(self.combination) <= {*key}}
         beside = {name: sum(p for key, p in whole.items() if name in key) for name in named}
         return tuple(n for n, p in beside.items() if p >= POSSIBLE > self.presence(n) - p)
 

@@ -113,7 +113,8 @@ def _answered(
         progress(_FIRST_SEARCH + (1 - _FIRST_SEARCH) * done, what)
 
     if isinstance(case, PlantCase) and not weighing.stated and reaches_noise(found):
-        exact = without_error(case.without_model_error(), again, rng, deadline_s)
+        as_sensors = replace(case, plant=replace(case.plant, model_error=0.0))
+        exact = without_error(as_sensors, again, rng, deadline_s)
         if exact.verdict != "unknown":
             return exact
     return looked_at_again(found, beside_imperfections(found, rng), again, deadline_s, rng)

@@ -41,19 +41,15 @@ def octaves_of(samples: int) -> npt.NDArray[np.int64]:
     return octave
 
 
-def octave_energies(signals: Real) -> Real:
-    """(T, Y) -> (octaves, Y)"""
-    octave = octaves_of(len(signals))
-    return np.array([np.bincount(octave, c * c) for c in dct(signals, axis=0, norm="ortho").T]).T
-
-
 def quietest(signals: Sequence[Real]) -> Real:
     """(Y,) white noise that no signal (T, Y) has more of: at most the RMS of its quietest octave."""
     rms = []
     for signal in signals:
-        samples = np.bincount(octaves_of(len(signal)))
+        octave = octaves_of(len(signal))
+        samples = np.bincount(octave)
         many = samples >= min(_MOST, float(np.max(samples)))
-        rms.append(np.sqrt(np.min(octave_energies(signal)[many] / samples[many, None], axis=0)))
+        energies = np.array([np.bincount(octave, c * c) for c in dct(signal, axis=0, norm="ortho").T])
+        rms.append(np.sqrt(np.min(energies[:, many] / samples[many], axis=1)))
     return np.asarray(np.max(rms, axis=0))
 
 

@@ -141,7 +141,11 @@ class RecordsToFit:
         outputs = self.case.noise.size
         responses = self.nominal.at(deviations).unknown_start.responses
         if responses is None or touching:
-            states = self._differences(deviations, effects, start)
+            of_each = self.of_each(deviations, effects, start.zeros)
+            states = [
+                quotients(partial(of_each, r), state, of_each(r, state), self.state_steps)
+                for r, state in enumerate(start.states)
+            ]
         else:
             whole = responses(effects, longest)
             states = [
@@ -157,13 +161,6 @@ class RecordsToFit:
             constant = [self.likelihood.changed(np.broadcast_to(shape, (T, outputs))) for shape in shapes]
             zeros.append(-np.array(constant).reshape(-1, T * outputs).T)
         return StartColumns.of(np.concatenate(zeros), states, self.case.machine.unknown_start.state_per_zero)
-
-    def _differences(self, deviations: Real, effects: Sequence[Any], start: Start) -> list[Real]:
-        of_each = self.of_each(deviations, effects, start.zeros)
-        return [
-            quotients(partial(of_each, r), state, of_each(r, state), self.state_steps)
-            for r, state in enumerate(start.states)
-        ]
 
     def with_true_angles(
         self, columns: StartColumns, deviations: Real, effects: Sequence[Any], start: Start, e: Real

@@ -57,7 +57,8 @@ def looked_at_again(
     holding = [e for e in first.found if named <= set(e.names)]
     if holding:
         named_alone = first.by_these(answer.combination, max(holding, key=lambda e: e.evidence))
-        left = search.left_by(named_alone)
+        # The same effects in windows, descended on from where the free run ended.
+        left = np.sqrt(search.explained(named_alone.end.on(search.records)).mean_squares)
         if max(np.max(left), np.max(named_alone.shares)) < answer.case.machine.weighing.model_error:
             return answer
     search.run_in_time()

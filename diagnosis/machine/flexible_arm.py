@@ -87,14 +87,11 @@ class FlexibleArm:
             np.array([_ZERO[self.outputs[k]] for k in moved]),
             np.eye(len(self.outputs))[moved],
             per_zero,
-            self._first_sample,
+            lambda record: np.array([record.output[0, 0], *[0.0] * (1 + 2 * _MODES)]),
             self._responses,
             zero_seen=_TIP in self.outputs,
             tried=np.outer(_DRIFTS_RAD_S, np.eye(len(spread))[1]),
         )
-
-    def _first_sample(self, record: RecordOfMachine) -> Real:
-        return np.array([record.output[0, 0], *[0.0] * (1 + 2 * _MODES)])
 
     def _responses(self, effects: Sequence[Effect], samples: int) -> list[Real]:
         linear = [effect for effect in effects if make_machine(self.rig, [effect]).linear]
@@ -134,9 +131,18 @@ class FlexibleArm:
 
     def candidates(self, experiments: Sequence[RecordOfMachine]) -> tuple[Candidate, ...]:
         """Every effect of the registry that a fit can find; signed ones twice. Of a sensor of the link that
-        is not tip_m only its gain is one."""
-        scales = scales_of(self.rig, experiments)
-        scales = replace(scales, any_direction=self.model_error > 0 and _TIP in self.outputs)
+        is not tip_m only its gain is one. Magnitudes: of the largest motion, speeds means of ten samples."""
+        angles = [e.output[:, 0] for e in experiments]
+        k, dt = _SPEED_SAMPLES, self.rig.sampling.dt_s
+        scales = Scales(
+            self.rig,
+            voltage_V=max(float(np.max(np.abs(e.input))) for e in experiments),
+            angle_rad=max(float(np.max(np.abs(angle))) for angle in angles),
+            swing_rad=max(float(np.ptp(angle)) for angle in angles),
+            speed_rad_s=max(float(np.max(np.abs(angle[k:] - angle[:-k]))) / k for angle in angles) / dt,
+            duration_s=max(len(e.input) for e in experiments) * dt,
+            any_direction=self.model_error > 0 and _TIP in self.outputs,
+        )
         gain = ("sensor_gain",) if set(self.outputs) - {"hub_angle_rad", "hub_speed_rad_s"} else ()
         seen = [
             effect
@@ -144,17 +150,3 @@ class FlexibleArm:
             if effect.group != "sensor" or _TIP in self.outputs or effect.id in gain
         ]
         return tuple(found for effect in seen for found in effect.candidates(scales))
-
-
-def scales_of(rig: Rig, experiments: Sequence[RecordOfMachine]) -> Scales:
-    """Magnitudes of the largest motion in the records; speeds are means over ten samples."""
-    angles = [e.output[:, 0] for e in experiments]
-    k, dt = _SPEED_SAMPLES, rig.sampling.dt_s
-    return Scales(
-        rig,
-        voltage_V=max(float(np.max(np.abs(e.input))) for e in experiments),
-        angle_rad=max(float(np.max(np.abs(angle))) for angle in angles),
-        swing_rad=max(float(np.ptp(angle)) for angle in angles),
-        speed_rad_s=max(float(np.max(np.abs(angle[k:] - angle[:-k]))) / k for angle in angles) / dt,
-        duration_s=max(len(e.input) for e in experiments) * dt,
-    )

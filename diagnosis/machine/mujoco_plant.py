@@ -174,10 +174,9 @@ class MujocoArm(MujocoModel):
             for name, one in there.items()
             if not one.by_name or any(fnmatchcase(name, pattern) for pattern in named)
         }
-        # Stated, and taken as exact: the damping of the joint does the same.
-        exact = [f"wrong_{name}" for name in there if name.endswith(".kv") and name not in every]
         stated = {name: one.value for name, one in every.items() if one.value != 0.0}
-        tolerances = {name: self.number(f"tolerance.{name}", _usual_tolerance(name)) for name in stated}
+        usual = {name: TOLERANCES.get(name.rpartition(".")[2], _ELSE) for name in stated}
+        tolerances = {name: self.number(f"tolerance.{name}", usual[name]) for name in stated}
         simulation = Simulation(self, every, noise)
         share = model_error * simulation.commanded(stated, experiments)
         records = experiments[:_LOOKED_AT]
@@ -209,7 +208,8 @@ class MujocoArm(MujocoModel):
             self.dt_s,
             inactive={
                 **self._untried(every),
-                **dict.fromkeys(exact, "its name in candidates"),
+                # Stated, and taken as exact: the damping of the joint does the same.
+                **{f"wrong_{n}": "its name in candidates" for n in {*there} - {*every} if n.endswith(".kv")},
                 **dict.fromkeys(silent, "records in which it shows"),
             },
             settled=simulation.settled,
@@ -226,7 +226,3 @@ class MujocoArm(MujocoModel):
             needs[f"{one.name}.gain"] = "an actuator whose gain is fixed, affine or a muscle's"
             needs[f"{one.name}.lag"] = "an actuator without dynamics or with those of a filter"
         return {name: need for name, need in sorted(needs.items()) if name not in every}
-
-
-def _usual_tolerance(name: str) -> float:
-    return TOLERANCES.get(name.rpartition(".")[2], _ELSE)

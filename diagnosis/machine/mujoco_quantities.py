@@ -153,20 +153,16 @@ class Quantities:
             yield Quantity(f"{one.name}.forcerange", 1.0, partial(put_forcerange, one.name, limits))
         elif (force := max(-least, largest)) > 0:
             put = partial(put_limit, one.name, limits)
-            name = self._limit_name(one)
+            # The kind of a joint says the unit of the force.
+            on_joint = one.trntype in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+            kind = self.model.spec.joint(one.target).type if on_joint else None
+            name = f"limit_{_UNITS[kind][0]}" if kind in _UNITS else "limit"
             limit = of(f"{one.name}.forcerange", 0.0, put, name, force, (0.05, 1.0), (0.1, 0.98))
             yield replace(limit, grows=False)
         if one.dyntype in LAGS:
             yield late(f"{one.name}.lag", lag, partial(put_lag, one.name), "time_constant_s")
         put = partial(put_delay, "actuator", one.name, self.model.spec.option.timestep)
         yield late(f"{one.name}.delay", float(one.delay), put, "delay_s")
-
-    def _limit_name(self, actuator: Any) -> str:
-        """Of a joint's actuator with the unit of its force, which the joint's kind says."""
-        if actuator.trntype not in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
-            return "limit"
-        kind = self.model.spec.joint(actuator.target).type
-        return f"limit_{_UNITS[kind][0]}" if kind in _UNITS else "limit"
 
     def _of_link(self, body: Any) -> Iterator[Quantity]:
         model = self.model.nominal

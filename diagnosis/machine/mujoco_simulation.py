@@ -391,9 +391,8 @@ def _remembered(
 
 def start_filters(model: Any, data: Any, commands: Real) -> None:
     """As if the commands had been held for long; what integrates them starts at zero."""
-    integrates = int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
-    for u in range(len(commands)):
-        if model.actuator_actadr[u] >= 0 and model.actuator_dyntype[u] != integrates:
+    for u, late in enumerate(model.actuator_actadr[: len(commands)] >= 0):
+        if late and model.actuator_dyntype[u] != int(mujoco.mjtDyn.mjDYN_INTEGRATOR):
             data.act[model.actuator_actadr[u]] = commands[u]
 
 

@@ -277,8 +277,7 @@ class PlantExperiment:
 
     def __post_init__(self) -> None:
         lock(self, "input", "output")
-        for key in ("input", "output"):
-            signal = getattr(self, key)
+        for key, signal in (("input", self.input), ("output", self.output)):
             object.__setattr__(self, key, signal[:, None] if signal.ndim == 1 else signal)
         check_record(self)
 
@@ -329,10 +328,6 @@ class PlantCase(RecordedCase[PlantExperiment]):
     @property
     def units(self) -> Mapping[str, str]:
         return self.plant.units
-
-    def without_model_error(self) -> PlantCase:
-        """The same with a simulation that is stated to be as good as the sensors."""
-        return replace(self, plant=replace(self.plant, model_error=0.0))
 
     def with_noise(self, noise: Real) -> PlantCase:
         """The same with other noise of the outputs (Y,)."""

@@ -18,9 +18,6 @@ _BENT = 0.5
 _RECORDS = 5
 # From this correlation on an output follows the simulation closely enough to compare how far both move.
 _FOLLOWED = 0.8
-# Steps of the simulation that may be one sample, or samples that may be one step: of fewer, an inertia a few
-# times as large would do as much. Samples compared at least.
-_STEPS, _COMPARED = (5, 10, 20, 50, 100), 100
 _FACTORS = {180 / np.pi: "degrees", 1e3: "thousandths", 100.0: "hundredths", 30 / np.pi: "rpm"}
 
 
@@ -98,36 +95,29 @@ def doubtful_columns(case: PlantCase) -> tuple[str, ...]:
             near = min(_FACTORS, key=lambda factor: abs(np.log(times / factor)))
             unit = f"in {_FACTORS[near]}" if 0.5 < times / near < 2 else "in another unit"
             found.append(f"{name} moves {times:.3g} times as far as in the simulation: is its column {unit}?")
-    return (*found, *_other_step(case))
+    # What the best sizes would leave of the motion is no question of steps.
+    sized = np.sqrt(np.mean(1 - np.diagonal(alike[0]) ** 2))
+    return (*found, *([] if case.plant.untracked else _other_step(case, float(sized))))
 
 
-def _other_step(case: PlantCase) -> list[str]:
+def _other_step(case: PlantCase, sized: float) -> list[str]:
     """On a simulation whose step seems not to be the sampling period: where a sample is several of its steps,
-    or a step several samples, it follows the first record far better, whatever the sizes. MuJoCo is told."""
-    plant, e = case.plant, case.estimation[0]
-    run = plant.replayed(())
+    or a step several samples, it follows the first record far better than with any sizes (sized)."""
+    e, run = case.estimation[0], case.plant.replayed(())
+    least, ratios = 100, (5, 10, 20, 50, 100)  # of less than five an inertia would do as much
 
-    def left(steps: int, samples: int, *, scaled: bool = False) -> float:
-        """Share of the motion, in as many samples as take no longer than the record, at least `_COMPARED`."""
-        part = slice(0, max(len(e.input) // steps, _COMPARED), samples)
-        x = run(np.repeat(e.input[part], steps, axis=0))[::steps]
-        own, y = x - np.mean(x, axis=0), e.output[part] - np.mean(e.output[part], axis=0)
-        energy = np.sum(own**2, axis=0)
-        gain = np.divide(np.sum(own * y, axis=0), energy, out=np.ones_like(energy), where=energy > 0)
-        rest = y - np.where(scaled, gain, 1.0) * own
-        return float(np.sqrt(np.mean(np.sum(rest**2, axis=0) / np.sum(y**2, axis=0))))
+    def left(steps: int, samples: int) -> float:
+        """Share of the motion, of as many samples as take no longer than the record, at least so many."""
+        part = slice(0, max(len(e.input) // steps, least), samples)
+        missed = e.output[part] - run(np.repeat(e.input[part], steps, axis=0))[::steps]
+        return float(np.sqrt(np.mean(np.var(missed, axis=0) / np.var(e.output[part], axis=0))))
 
-    if plant.untracked is not None or left(1, 1) < 0.5:
-        return []
-    tried = [(n, 1) for n in _STEPS] + [(1, n) for n in _STEPS if len(e.input) >= n * _COMPARED]
-    best, (n, samples) = min((left(*one), one) for one in tried)
-    if best > 0.5 * min(left(1, 1, scaled=True), 1.0):
+    tried = [(n, 1) for n in ratios] + [(1, n) for n in ratios if len(e.input) >= n * least]
+    best, (n, samples) = min((left(*one), one) for one in tried) if left(1, 1) > 0.5 else (1.0, (1, 1))
+    if best > 0.5 * sized:
         return []
     what = f"a sample is {n} of its steps" if n > 1 else f"its step is {samples} samples"
-    period = f" ({plant.dt_s:g} s)" if plant.dt_s > 0 else ""
-    return [
-        f"the simulation follows {e.name} far better where {what}: is its step the sampling period{period}?"
-    ]
+    return [f"the simulation follows {e.name} far better where {what}: is its step the sampling period?"]
 
 
 def _of_value(plant: Plant, key: str, tolerance: float, inputs: list[Real], stated: list[Real]) -> list[str]:

@@ -6,7 +6,7 @@ plant = with_effects(plant, "all", experiments, dt_s=0.01, motion="position_m")
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -134,7 +134,8 @@ def with_effects(
         places["input"] = None
     found = list(plant.effects)
     own = {effect.name for effect in plant.effects}
-    chosen = [n for n in _applying(plant, places) if prefix + n not in own] if names == "all" else names
+    every = [n for n in _of_all(plant) if places[WHERE[n]] is not None and prefix + n not in own]
+    chosen = every if names == "all" else names
     for name in chosen:
         where = WHERE[name]
         place = places[where]
@@ -163,10 +164,6 @@ def with_effects(
 def _of_all(plant: Plant) -> list[str]:
     left_out = _BY_NAME_ONLY if len(plant.output_names) > 1 else (*_BY_NAME_ONLY, *_TWINS)
     return [name for name in KINDS if name not in left_out]
-
-
-def _applying(plant: Plant, places: Mapping[Where, object]) -> list[str]:
-    return [name for name in _of_all(plant) if places[WHERE[name]] is not None]
 
 
 def _column(plant: Plant, output: str) -> int:

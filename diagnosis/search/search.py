@@ -13,7 +13,7 @@ from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL
 from diagnosis.fit.records import Records, Start, mean_square_left
 from diagnosis.fit.starts import Point, beside
 from diagnosis.fit.windows import Windows
-from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+from diagnosis.machine.machine_protocol import CaseOfMachine
 from diagnosis.search.explanation import Explanation
 from diagnosis.search.loop import MANY, NEAREST, SEVERAL, Progress, SearchLoop
 from diagnosis.search.moves import (
@@ -164,11 +164,6 @@ class Search(SearchLoop[Explanation]):
         weights = self.records.levels.weights(e)
         moved = replace(end, deviations=stated, start=start, left=e, weights=weights, loss=loss, prior=prior)
         return self.explained(moved)
-
-    def left_by(self, other: Explanation) -> Real:
-        """(2, Y) shares of the motion here that the same effects leave, descended on from where another
-        search ended."""
-        return np.sqrt(self.explained(other.end.on(self.records)).mean_squares)
 
     def explained(self, end: Descent) -> Explanation:
         """With what it predicts of the held-out records, their starts fitted (`settled`)."""

@@ -61,7 +61,7 @@ def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> P
     banded = [(low, high, chosen) for low, high, chosen in banded if np.count_nonzero(chosen) >= _LEAST_LINES]
     sensors = sensors_of(case)
     tests = len(sensors) * (len(groups) + len(banded))
-    bands, shown, unrepeated = [], [], []
+    bands, shown = [], []
     for s, sensor in enumerate(sensors):
         mean, rest = _split(spectra[:, :, s])
         for low, high, chosen in banded:
@@ -94,12 +94,7 @@ def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> P
                     bool(p_value < level / tests),
                 )
             )
-        freedom = 2 * lines.size * (count - 1)
-        unrepeated.append(float(np.sqrt(2 * np.sum(rest) / freedom)))
-    low, high = (float(np.sqrt(chi2.ppf(q, freedom) / freedom)) for q in (0.025, 0.975))
-    return PeriodicFinding(
-        x.name, period, count, tuple(bands), tuple(shown), tuple(unrepeated), (low, high), separable
-    )
+    return PeriodicFinding(x.name, period, count, tuple(bands), tuple(shown), separable)
 
 
 def _without_trend(e: Real) -> Real:

@@ -256,19 +256,13 @@ class LineGroup:
 
 @dataclass(frozen=True)
 class PeriodicFinding:
-    """What a record with repeated periods says.
-
-    unrepeated: per sensor, rms over the lines of what changes from period to period over what noise alone
-    gives (1), with its 95 % interval under noise.
-    """
+    """What a record with repeated periods says."""
 
     experiment: str
     period_samples: int
     periods: int
     bands: tuple[FrequencyResponseBand, ...]
     groups: tuple[LineGroup, ...]
-    unrepeated: tuple[float, ...]
-    unrepeated_interval: Interval
     even_odd_separable: bool
 
     @property

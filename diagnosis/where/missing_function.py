@@ -86,9 +86,11 @@ def missing_functions(
             if p_value < level / tests and share >= _LEAST_SHARE:
                 shares = np.zeros(_SHIFTS)
                 for k in range(_SHIFTS):
+                    # A slow function is hardly another one less than a tenth of a record later.
                     moved_on = {
-                        name: np.roll(f, _shift(f.shape[0], rng), axis=0)
+                        name: np.roll(f, rng.integers(tenth, len(f) - tenth), axis=0)
                         for name, f in basis.functions.items()
+                        for tenth in [max(len(f) // 10, 1)]
                     }
                     again = _solve(*_normal_equations(at, moved_on, residuals, torque, case.noise))
                     shares[k] = (again[0] - again[1]) / gap
@@ -111,12 +113,6 @@ def missing_functions(
                 )
             )
     return tuple(found)
-
-
-def _shift(n_samples: int, rng: np.random.Generator) -> int:
-    """At least a tenth of the record, for a slow function is hardly another one a few samples later."""
-    least = max(n_samples // 10, 1)
-    return int(rng.integers(least, n_samples - least))
 
 
 def _basis(axis: str, moved: Mapping[str, Motion]) -> _Basis | None:

@@ -42,17 +42,15 @@ class Column(Section):
         return values * (usual if self.scale is None else self.scale) + self.offset
 
 
-def _column(value: object) -> object:
-    return {"column": value} if isinstance(value, str) else value
-
-
 def _moves(column: Column) -> Column:
     if column.scale == 0:
         raise ValueError("scale must not be 0")
     return column
 
 
-ColumnChoice = Annotated[Column, BeforeValidator(_column), AfterValidator(_moves)]
+ColumnChoice = Annotated[
+    Column, BeforeValidator(lambda v: {"column": v} if isinstance(v, str) else v), AfterValidator(_moves)
+]
 
 
 class Columns(Section):

@@ -108,7 +108,8 @@ def _rendered(
         shown=shown(found),
         moved=moved(found, found.deviations),
         moved_refit=moved(found, found.deviations_refit),
-        partial=partial_answers(found),
+        # Effects that close a part of the held-out gap by themselves, with that share, most first.
+        partial=tuple(one for one in (found.shares.closes if found.shares else ()) if one[1] > 0)[:5],
         left=left(found),
         effects=EFFECTS,
         checks=checks(found),
@@ -175,9 +176,3 @@ def moved(found: Diagnosis, deviations: Mapping[str, float]) -> Mapping[str, flo
     """
     stated = found.case.machine.description
     return {key: d * copysign(1.0, stated.value(key)) for key, d in deviations.items()}
-
-
-def partial_answers(found: Diagnosis, most: int = 5) -> tuple[tuple[tuple[str, ...], float], ...]:
-    """Effects that close a part of the held-out gap by themselves, with that share, most first."""
-    closes = () if found.shares is None else found.shares.closes
-    return tuple(one for one in closes if one[1] > 0)[:most]

@@ -388,8 +388,7 @@ def _fmu(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s
 
 
 def _python(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s: float) -> Any:
-    if (folder := str(model.resolve().parent)) not in sys.path:
-        sys.path.append(folder)  # for what it imports from beside it
+    sys.path += {str(model.resolve().parent)} - {*sys.path}  # for what it imports from beside it
     try:
         there = runpy.run_path(str(model))
     except (Exception, SystemExit) as error:
