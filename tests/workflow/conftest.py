@@ -1,22 +1,63 @@
-"""A small fast run, made once."""
+"""What is computed once and looked at by many tests; of all workers the first one computes it."""
 
 from __future__ import annotations
 
+import fcntl
+import os
+import pickle
+import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.workflow.command import FAST_ARM, draw_nothing
+from tests.workflow.study_examples import write_study
 from workflow.text.templates import RunSummary
+
+MakeOnce = Callable[[str, Callable[[Path], Any]], tuple[Path, Any]]
 
 
 @pytest.fixture(scope="session")
-def fast_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunSummary]:
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> MakeOnce:
+    """make(directory) is called by the first worker that asks for the name; every worker gets a copy of the
+    directory of its own, and the value that came back."""
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def once(name: str, make: Callable[[Path], Any]) -> tuple[Path, Any]:
+        (kept := base / f"once-{name}").mkdir(exist_ok=True)
+        with open(kept / "lock", "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (kept / "value").exists():
+                value = make(kept / "out")
+                (kept / "value").write_bytes(pickle.dumps(value))
+        out = tmp_path_factory.mktemp(name) / "out"
+        shutil.copytree(kept / "out", out, symlinks=True)
+        return out, pickle.loads((kept / "value").read_bytes())  # noqa: S301
+
+    return once
+
+
+@pytest.fixture(scope="session")
+def fast_run(made_once: MakeOnce) -> tuple[Path, RunSummary]:
     """Directory and summary of the fast arm's run."""
     from workflow.commands.run import run_from_files
 
-    out = tmp_path_factory.mktemp("fast") / "run"
-    return out, run_from_files(FAST_ARM, out)
+    return made_once("fast", lambda out: run_from_files(FAST_ARM, out))
+
+
+@pytest.fixture(scope="session")
+def small_study(made_once: MakeOnce) -> tuple[Path, RunSummary]:
+    """Directory and summary of the small study, computed on two processes."""
+    from workflow.study.settings import load_study
+    from workflow.study.work import run_study
+
+    def make(out: Path) -> RunSummary:
+        return run_study(load_study(write_study(out.parent)), out, jobs=2)
+
+    return made_once("study", make)
 
 
 @pytest.fixture

@@ -409,6 +409,13 @@ def test_short_help_is_the_long_one(flexlink, command):
     assert "-h, --help" in short.out
 
 
+@pytest.fixture
+def called_flexlink(monkeypatch):
+    """This process has the name that a shell knows the command by."""
+    monkeypatch.setattr(sys, "argv", ["flexlink"])
+    monkeypatch.setattr(sys.modules["__main__"], "__package__", None)
+
+
 @pytest.mark.parametrize(
     ("shell", "typed", "offered"),
     [
@@ -419,37 +426,23 @@ def test_short_help_is_the_long_one(flexlink, command):
         ("fish", "flexlink re", {"report"}),
     ],
 )
-def test_a_shell_completes_commands_and_options(shell, typed, offered):
+@pytest.mark.usefixtures("called_flexlink")
+def test_a_shell_completes_commands_and_options(shell, typed, offered, monkeypatch, capsys):
     env = {"_FLEXLINK_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_ARGS": typed}
-    env |= {
-        "COMP_WORDS": typed,
-        "COMP_CWORD": str(typed.count(" ")),
-        "_TYPER_COMPLETE_FISH_ACTION": "get-args",
-    }
-    code = "import sys; sys.argv[0] = 'flexlink'; from workflow.cli import app, main; sys.exit(main())"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | env,
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert set(re.findall(r"(?:--)?[a-z-]+(?=\n|\t|\"|$)", done.stdout)) >= offered, done.stdout + done.stderr
+    env |= {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+    for name, value in {**env, "_TYPER_COMPLETE_FISH_ACTION": "get-args"}.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(SystemExit):
+        main([])
+    assert set(re.findall(r"(?:--)?[a-z-]+(?=\n|\t|\"|$)", capsys.readouterr().out)) >= offered
 
 
-def test_completion_is_installed_for_the_shell_that_runs(tmp_path):
-    code = "import sys; sys.argv[0] = 'flexlink'; from workflow.cli import app, main; sys.exit(main())"
-    home = {"HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", code, "--install-completion", "bash"],
-        env=os.environ | home,
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "bash completion installed" in done.stdout
+def test_completion_is_installed_for_the_shell_that_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
+    with pytest.raises(SystemExit, match=r"^0$"):
+        get_command(app).main(["--install-completion", "bash"], prog_name="flexlink")
+    assert "bash completion installed" in capsys.readouterr().out
     script = next((tmp_path / ".bash_completions").iterdir())
     assert "_FLEXLINK_COMPLETE=complete_bash" in script.read_text()
 
@@ -485,18 +478,16 @@ def test_terminal_codes_in_names_are_shown_as_text(refused, tmp_path):
     assert "control characters" in refused("identify", log, "--input", "u", "--output", "y", "--time", "t")
 
 
-@pytest.mark.parametrize("given", [{}, {"OMP_NUM_THREADS": "2"}])
-def test_numpy_is_loaded_after_its_threads_are_settled(given):
+def test_numpy_is_loaded_after_its_threads_are_settled():
     code = (
         "import os, sys, workflow.cli; loaded = 'numpy' in sys.modules; "
         "sys.argv = ['flexlink', '--version']; workflow.cli.main(); "
-        "print(loaded, os.environ.get('OMP_NUM_THREADS'), "
-        "os.environ.get('OPENBLAS_NUM_THREADS'))"
+        "print(loaded, *map(os.environ.get, ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS')))"
     )
     kept = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
-    answer = subprocess.run(
-        [sys.executable, "-c", code], env=kept | given, cwd=ROOT, check=True, capture_output=True, text=True
-    )
+    environment = kept | {"OMP_NUM_THREADS": "2"}
+    command = [sys.executable, "-c", code]
+    answer = subprocess.run(command, env=environment, cwd=ROOT, check=True, capture_output=True, text=True)
     # One thread whatever was asked for: results are the same to the last byte (docs/limits.md).
     assert answer.stdout.splitlines()[-1] == "False 1 1"
 

@@ -145,8 +145,8 @@ STREAMS = {
 def test_any_kind_of_output_will_do(kind, more, tmp_path):
     (tmp_path / "l°g.csv").write_text(PRINTS_A_TABLE)
     set_, streams = STREAMS[kind]
-    # Drawing is slow: a page where nothing else shows that the end was reached, and in the C locale.
-    page = f"--out {tmp_path}/page.html" if streams or "C" in kind else ""
+    # Drawing is slow: a page where a file's own characters meet the locale.
+    page = f"--out {tmp_path}/page.html" if "C" in kind and not more else ""
     command = f"{sys.executable} -m workflow look {tmp_path}/*.csv {more} {page} {streams}"
     shell = ["bash", "-o", "pipefail", "-c", command]
     done = subprocess.run(shell, cwd=ROOT, env={**os.environ, **set_}, capture_output=True, check=False)

@@ -26,15 +26,6 @@ from workflow.study.settings import load_study
 from workflow.study.work import run_study
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.results import RunResults
-from workflow.text.templates import RunSummary
-
-
-@pytest.fixture(scope="module")
-def small_study(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunSummary]:
-    """Directory and summary of the small study, computed on two processes."""
-    folder = tmp_path_factory.mktemp("study")
-    out = folder / "out"
-    return out, run_study(load_study(write_study(folder)), out, jobs=2)
 
 
 def rows_of(out: Path) -> list[dict[str, str]]:
@@ -75,6 +66,7 @@ def test_numbers_are_those_of_the_certificate(small_study):
         assert float(row["peak_command"]) == max(one.peak_command for one in achieved)
 
 
+@pytest.mark.slow
 def test_a_point_is_what_flexlink_run_makes_of_its_configuration(small_study, tmp_path):
     # Independent of the study: the ordinary pipeline, from the records on, on the point's own TOML, in a
     # process as fresh as the study's own (this one has other compiled variants of the kernels in memory).

@@ -82,14 +82,6 @@ def far_study(folder: Path, address: str) -> tuple[Path, tuple[object, ...]]:
     return study, ("study", "--config", study, "--out", folder / "out", "--scheduler", address)
 
 
-@pytest.fixture(scope="module")
-def near(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same study computed here."""
-    folder = tmp_path_factory.mktemp("near")
-    run_study(load_study(write_study(folder)), folder / "near", jobs=2)
-    return folder / "near"
-
-
 def finished_points(out: Path) -> int:
     # Not through the links that have the points' numbers.
     folders = [point for point in out.glob("points/*") if not point.is_symlink()]
@@ -97,7 +89,7 @@ def finished_points(out: Path) -> int:
 
 
 @pytest.mark.slow
-def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, near, tmp_path):
+def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, small_study, tmp_path):
     cluster.add_worker()
     study, call = far_study(tmp_path, cluster.address)
     process = start_flexlink(*call)
@@ -112,7 +104,7 @@ def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, nea
     assert 1 <= done < 6
     run_study(load_study(study), tmp_path / "out", resume=True, jobs=2)
     assert finished_points(tmp_path / "out") == 6
-    assert_same_study(near, tmp_path / "out")
+    assert_same_study(small_study[0], tmp_path / "out")
 
 
 @dataclass(frozen=True)
