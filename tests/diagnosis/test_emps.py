@@ -31,17 +31,6 @@ def test_coulomb_friction_and_an_offset_are_named_with_the_published_values(flex
 
 
 @pytest.mark.slow
-def test_what_slow_strokes_say_of_fast_ones_is_named_and_not_sure(flexlink_data):
-    found = diagnose(emps_axis.case(flexlink_data, "fast"))
-    # Fitted below 0.083 m/s, the two leave nearly twice what does not interest of motions up to 0.125 m/s.
-    assert set(found.combination) == {"coulomb_friction", "constant_offset"}
-    assert found.gap_closed > 0.8
-    assert found.presence("coulomb_friction") > 0.9
-    assert found.completeness.probability < 0.1
-    assert found.probability < 0.7
-
-
-@pytest.mark.slow
 def test_with_friction_by_direction_listed_it_explains_more_than_an_offset(flexlink_data):
     # Not in the published model: half the sum of forces at plus and minus one speed grows with the speed.
     found = diagnose(emps_axis.case(flexlink_data, "passes", refined=True))

@@ -229,19 +229,6 @@ def test_dry_friction_of_the_background_is_inside_the_interval_of_the_friction_f
     assert all(low < value <= high for value, low, high in found.shares.carried.values())
 
 
-@pytest.mark.slow
-def test_a_cause_beyond_the_list_that_explains_the_records_is_told():
-    found = diagnose(_simulated({"name": "ground_spring", "stiffness_Nm_rad": 1.0}))
-    assert (found.verdict, found.combination) == ("unknown", ())
-    (spring,) = [effect for effect in found.unlisted if effect.id == "ground_spring"]
-    assert spring.stiffness_Nm_rad == pytest.approx(1.0, rel=0.05)
-    # What it looks like is in the repaired model, for any program that reads effects.
-    assert (found.combination, found.partial_model) == ((), ("ground_spring",))
-    assert [parse_effect(effect.to_dict()) for effect in found.repair] == [spring]
-    assert found.gap_closed > 0.99
-    assert found.gap_after < 0.1 * found.gap_refit
-
-
 def test_a_time_limit_says_what_was_not_tried(gap_cases):
     case = load_case(gap_cases / "workshop" / "labelled" / "work-05").case
     found = diagnose(case, time_limit_s=0.0)

@@ -101,11 +101,7 @@ def test_dry_friction_around_a_simulation_is_the_one_inside_it(name, motion):
 
 @pytest.mark.parametrize(
     ("straight", "tolerance", "most"),
-    [
-        (False, 1e-6, 3e-3),
-        pytest.param(False, 1e-8, 2e-4, marks=pytest.mark.slow),
-        (True, 1e-6, 0.03),
-    ],
+    [(False, 1e-6, 3e-3), pytest.param(False, 1e-8, 2e-4, marks=pytest.mark.slow), (True, 1e-6, 0.03)],
 )
 def test_a_simulation_with_steps_of_its_own_settles(straight, tolerance, most):
     """Its noise ends the rounds: measured 2.2e-3 where that noise alone is 2.4e-3 of what friction changes,

@@ -1,5 +1,4 @@
-"""Spring to ground, drag and a body held to the hub, which are not on the list, and gravity, viscous friction
-and hub inertia, which are; made by an independent simulator."""
+"""A spring to ground, which is not on the list, and gravity, which is; made by an independent simulator."""
 
 from __future__ import annotations
 
@@ -67,37 +66,3 @@ def test_a_spring_to_ground_is_nothing_of_the_list(tmp_path):
     true = _as_gravity_would(tmp_path, 0.4)
     assert spring.id == true["name"]
     assert spring.stiffness_Nm_rad == pytest.approx(true["stiffness_Nm_rad"], rel=0.02)
-
-
-@pytest.mark.slow
-def test_a_drag_with_the_square_of_the_speed_is_nothing_of_the_list(tmp_path):
-    cause = {"name": "gear_drag", "coefficient_Nms2": 0.05}
-    found = diagnose(_case(tmp_path, cause, 1.0))
-    assert found.verdict == "unknown"
-    assert found.probabilities["unknown"] > 0.98
-    sizes = [effect.coefficient_Nms2 for effect in found.unlisted if effect.id == "quadratic_drag"]
-    assert sizes == [pytest.approx(0.05, rel=0.01)]
-
-
-@pytest.mark.slow
-def test_viscous_friction_is_no_drag(tmp_path):
-    found = diagnose(_case(tmp_path, {"name": "viscous_friction", "coefficient_Nms": 0.02}, 1.0))
-    assert found.combination == ("viscous_friction",)
-    assert found.probabilities["viscous_friction"] > 0.98
-
-
-@pytest.mark.slow
-def test_a_body_that_a_spring_holds_to_the_hub_is_nothing_of_the_list(tmp_path):
-    held = {"inertia_kg_m2": 0.02, "stiffness_Nm_rad": 20.0, "damping_Nms": 0.05}
-    found = diagnose(_case(tmp_path, {"name": "attachment", **held}, 1.0))
-    assert found.verdict == "unknown"
-    assert found.probabilities["unknown"] > 0.98
-    (body,) = [effect for effect in found.unlisted if effect.id == "attached_body"]
-    assert body.parameters() == pytest.approx(held, rel=0.05)
-
-
-@pytest.mark.slow
-def test_hub_inertia_is_no_body_that_a_spring_holds(tmp_path):
-    found = diagnose(_case(tmp_path, {"name": "hub_inertia", "ratio": 1.3}, 1.0))
-    assert found.combination == ("hub_inertia",)
-    assert found.probabilities["hub_inertia"] > 0.98

@@ -149,11 +149,9 @@ def in_motion(xml: str, noise: float, seed: int, servo: bool = False) -> PlantEx
 
 @pytest.mark.parametrize(
     ("integrator", "kind", "tracking_rad_s"),
-    [  # any two of them together
-        ("Euler", "motor", 9.0), ("Euler", "cart", 20.0), ("Euler", "servo", 9.0), ("RK4", "motor", 20.0),
-        ("RK4", "cart", 9.0), ("RK4", "servo", 20.0), ("implicit", "motor", 9.0), ("implicit", "cart", 20.0),
-        ("implicit", "servo", 9.0), ("implicitfast", "motor", 20.0), ("implicitfast", "cart", 9.0),
-        ("implicitfast", "servo", 20.0),
+    [
+        ("Euler", "motor", 9.0), ("Euler", "cart", 20.0), ("RK4", "servo", 20.0), ("RK4", "cart", 9.0),
+        ("implicit", "motor", 20.0), ("implicitfast", "servo", 9.0),
     ],
 )  # fmt: skip
 def test_the_true_model_leaves_the_noise_of_a_log_that_begins_in_motion(integrator, kind, tracking_rad_s):
@@ -254,7 +252,7 @@ def test_a_stiff_servo_that_saturates_under_steps_is_followed(load_kg):
     assert not load_kg or np.any(left() > interests)
 
 
-@pytest.mark.parametrize("kind", ["motor", "cart", "lag"])
+@pytest.mark.parametrize("kind", ["cart", "lag"])
 def test_steps_that_are_coarser_than_the_machine_leave_little_of_it(kind):
     """The machine at a twentieth of the model's steps: classical Runge-Kutta leaves nothing."""
     logs = [in_motion(two_links("RK4", 0.00025, kind), 0.0, seed) for seed in range(2)]
@@ -354,7 +352,7 @@ def test_the_repaired_file_does_in_mujoco_what_the_diagnosis_simulated():
 def test_the_equations_of_the_benchmark_are_those_of_mujoco():
     """Both truths of the same two-joint arm under the same torques; they share no line."""
     masses, damping, armature = np.array([1.2, 0.8]), np.array([0.25, 0.12]), np.array([0.03, 0.015])
-    for effect, flat in (("payload", False), ("tilt", True), ("stiffness", False)):
+    for effect, flat in (("payload", False), ("tilt", True)):
         truth = cases.Truth(2, masses, damping, armature, effect, 1, 0.2, flat)
         one, other = cases.InMujoco(truth), cases.ByEquations(truth)
         for k in range(100):

@@ -16,7 +16,6 @@ import pytest
 from numba import njit
 from scipy.signal import lfilter
 
-from benchmarks import emps_axis
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
 from diagnosis.fit.descent import descend
 from diagnosis.imperfect.answered import beside_imperfections, searched
@@ -152,8 +151,7 @@ def _case(name, seed=0, **off):
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(one, marks=[] if one == "backlash" else [pytest.mark.slow]) for one in CASES],
+    "name", [pytest.param(one, marks=[] if one == "backlash" else [pytest.mark.slow]) for one in CASES]
 )
 def test_the_effect_is_found_among_all_that_are_listed(name):
     case = _case(name)
@@ -329,81 +327,6 @@ def test_larger_sets_are_sought_while_the_last_size_was_worth_it(gained, sizes, 
         monkeypatch.setattr(later, "proposed", lambda search, *sets: [])
     search.run()
     assert tried[1:] == sizes
-
-
-@njit
-def _circuit(volts, mass, damper, spring, cubic, dt_s, steps, quadratic=0.0, lag_s=0.0):
-    """Position (T, 1) of an electronic oscillator: Runge-Kutta steps of the truth with its imperfections; the
-    user's model (no lag) by semi-implicit Euler steps."""
-    h, found, x, v, u = dt_s / steps, np.zeros((volts.size, 1)), 0.0, 0.0, 0.0
-    for k in range(volts.size):
-        found[k] = x
-        for _ in range(steps):
-            if lag_s == 0.0:
-                v += h * (volts[k] - damper * v - spring * x - cubic * x**3) / mass
-                x += h * v
-                continue
-            u += (volts[k] - u) * (1 - np.exp(-h / lag_s))
-            y, w, slope_x, slope_v, moved_x, moved_v = x, v, 0.0, 0.0, 0.0, 0.0
-            for part, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
-                y, w = x + part * h * slope_x, v + part * h * slope_v
-                slope_x = w
-                slope_v = (u - damper * w - spring * y - quadratic * y * y - cubic * y**3) / mass
-                moved_x, moved_v = moved_x + weight * slope_x, moved_v + weight * slope_v
-            x, v = x + h / 6 * moved_x, v + h / 6 * moved_v
-    return found
-
-
-@pytest.mark.slow
-def test_a_listed_spring_is_found_at_nine_samples_per_period():
-    # As the well-known circuit: 68 Hz, sampled with 610, multisines up to 200 Hz; held out is one that grows.
-    rng, dt_s, n = np.random.default_rng(5), 1 / 610.35, 2048
-    true = {"mass": 1 / (2 * np.pi * 68) ** 2, "damper": 0.09 / (2 * np.pi * 68), "spring": 1.0}
-    records = []
-    for name, role, size in (
-        ("small", "estimation", 0.03),
-        ("large", "estimation", 0.06),
-        ("growing", "held_out", 0.07 * np.linspace(0, 1, n)),
-    ):
-        f = np.fft.rfftfreq(n, dt_s)
-        tones = np.where((f > 0) & (f < 200), np.exp(2j * np.pi * rng.random(f.size)), 0.0)
-        volts = np.fft.irfft(tones, n)
-        volts *= size / np.std(volts)
-        moved = _circuit(volts, *true.values(), 3.9, dt_s, 50, quadratic=0.03, lag_s=6e-5)
-        moved += 4e-4 * rng.standard_normal(moved.shape)
-        records.append(PlantExperiment(name, role, volts[:, None], moved))
-    plant = Plant(
-        lambda p, effects, u: _circuit(u[:, 0].copy(), *p.values(), 0.0, dt_s, 20),
-        {"mass": 0.96 * true["mass"], "damper": 1.15 * true["damper"], "spring": 1.04},
-        {"mass": 0.05, "damper": 0.2, "spring": 0.05},
-        ("position_V",),
-        np.array([5e-4]),
-        model_error=0.05,
-    )
-    plant = with_effects(plant, "all", records, dt_s=dt_s, motion="position_V")
-    began = time.process_time()
-    found = diagnose(PlantCase("circuit", plant, tuple(records)))
-    assert time.process_time() - began < 60
-    # Measured .99, 3.87 and .9998; with forces held over each sample .76, 4.14 and .998.
-    assert found.combination == ("hardening_spring",)
-    assert found.sets[("hardening_spring",)] > 0.9
-    (spring,) = [e for e in found.effects if e.name == "hardening_spring"]
-    assert abs(spring.parameters["cubic"] / 3.9 - 1) < 0.03
-    assert found.gap_closed > 0.999
-
-
-@pytest.mark.slow
-def test_emps_by_names_alone_gives_the_published_values(flexlink_data):
-    case = emps_axis.case(flexlink_data, "passes")
-    bare = replace(case.plant, effects=())
-    plant = with_effects(bare, "all", case.experiments, dt_s=emps_axis.DT_S, measured_motion=(0, 1))
-    found = diagnose(replace(case, plant=plant))
-    assert found.combination == ("coulomb_friction", "output_offset")
-    values = {change.id: change.values for change in found.repair}
-    published = emps_axis.PUBLISHED
-    assert values["coulomb_friction"]["force"] == pytest.approx(published["coulomb_N"], rel=0.05)
-    assert values["output_offset"]["offset"] == pytest.approx(published["offset_N"], rel=0.05)
-    assert found.gap_closed > 0.9
 
 
 def _carriage_records(dry_N):

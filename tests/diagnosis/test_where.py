@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -145,6 +146,7 @@ def test_a_drift_is_found_with_its_rate():
     assert (curve.route, curve.axis) == ("tip", "time")
 
 
+@cache
 def _of_effect(*effects):
     """Residuals of noisy records of a rig with effects against the nominal rig."""
     rng = np.random.default_rng(8)

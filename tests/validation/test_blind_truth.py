@@ -117,10 +117,6 @@ def test_what_looks_like_an_effect_agrees_with_the_plants(name, effect):
     assert np.all(np.sqrt(np.mean((record - plant) ** 2, axis=0)) < 0.05 * ours.noise)
 
 
-def test_no_effect_agrees_with_the_plant():
-    assert np.all(_noise_deviations(Truth(RIG), [], _voltage()) < 0.05)
-
-
 def test_quantisation_agrees_but_for_values_at_an_edge():
     effects = [{"name": "quantisation", **EFFECTS_HERE["quantisation"]}]
     ours = Truth(RIG, effects).record(_voltage()).measured(np.zeros((500, 2)))[:, 1]
@@ -161,14 +157,6 @@ def test_every_cause_beyond_the_list_changes_the_record(name, parameters):
     assert name in UNLISTED
 
 
-def test_even_levels_of_asymmetric_friction_are_coulomb_friction():
-    voltage = _voltage()
-    uneven = {"name": "asymmetric_friction", "torque_positive_Nm": 0.02, "torque_negative_Nm": 0.02}
-    even = {"name": "coulomb_friction", "torque_Nm": 0.02}
-    a, b = (Truth(RIG, [effect]).record(voltage) for effect in (uneven, even))
-    np.testing.assert_array_equal(a.tip_m, b.tip_m)
-
-
 def test_friction_holds_a_voltage_below_its_level():
     # 0.2 V make 0.05 Nm; the hub may give way by the ten microradian of pre-sliding, no more.
     voltage = np.full(400, 0.2)
@@ -197,17 +185,7 @@ def test_bad_effects_are_refused_in_one_line():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        "none",
-        "gravity",
-        "input_delay",
-        "joint_compliance",
-        "periodic_disturbance",
-        "coulomb_friction_and_tip_payload",
-    ],
-)
+@pytest.mark.parametrize("name", ["gravity", "periodic_disturbance", "coulomb_friction_and_tip_payload"])
 def test_recorded_cases_are_explained_to_the_noise(gap_cases, name):
     # Records of a third rig, by others: driven by the logged voltage, slew under control included.
     folder = gap_cases / "labelled" / name

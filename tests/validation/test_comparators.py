@@ -51,13 +51,7 @@ def test_white_output_noise_biases_arx_and_not_oe():
     assert np.max(np.abs(arx(record, 2, 2).a - A)) > 0.05
 
 
-def test_arx_noise_is_no_trouble_for_arx():
-    model = arx(data(20_000, noise_std=0.5, noise=(ONE, A)), 2, 2)
-    np.testing.assert_allclose(model.a, A, atol=0.015)  # 4 sd, 0.5 / sqrt(N) / (spread of y, about 1)
-    np.testing.assert_allclose(model.b, B, atol=0.015)
-
-
-@pytest.mark.parametrize("output_error_start", [True, False])
+@pytest.mark.parametrize("output_error_start", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_armax_finds_the_noise_filter(output_error_start):
     record = data(20_000, noise_std=0.5, noise=(C, A))
     model = armax(record, 2, 2, 2, output_error_start=output_error_start)
@@ -151,11 +145,10 @@ def test_unusable_input_is_refused_in_one_line():
 def test_oe_on_p1_finds_the_mode():
     """Measured over 50 seeds: median 0.033, 90th percentile 0.079 (published peer: 0.049 and 0.120)."""
     omega = np.geomspace(1, 100, 200)
-    for seed in range(3):
-        truth = p1(seed)
-        model = oe(truth.record, 4, 4)
-        error = model.frequency_response(omega) / truth.response(omega) - 1
-        assert np.sqrt(np.mean(np.abs(error) ** 2)) < 0.15
-        poles = model.poles[model.poles.imag > 0]
-        assert np.any(np.abs(np.abs(np.log(poles)) / 0.005 - 15) < 0.5)
-        assert np.all(np.abs(model.poles) < 1)
+    truth = p1(0)
+    model = oe(truth.record, 4, 4)
+    error = model.frequency_response(omega) / truth.response(omega) - 1
+    assert np.sqrt(np.mean(np.abs(error) ** 2)) < 0.15
+    poles = model.poles[model.poles.imag > 0]
+    assert np.any(np.abs(np.abs(np.log(poles)) / 0.005 - 15) < 0.5)
+    assert np.all(np.abs(model.poles) < 1)

@@ -69,11 +69,6 @@ def test_the_preset_is_stable_but_for_its_two_angles():
     assert system.output_labels == ["shoulder_angle_rad", "elbow_angle_rad", "tip_m"]
 
 
-def test_the_operating_point_matters():
-    straight, bent = (two_link_operating_point(angle)(1j * 3.0) for angle in (0.0, np.pi / 2))
-    assert np.max(np.abs(straight - bent)) > 0.05 * np.max(np.abs(bent))
-
-
 def test_bad_arms_are_refused():
     with pytest.raises(ValueError, match="radii must be zero"):
         two_link_matrices((RIG.link, RIG.link), (paper_link().hub, HUBS[1]), 0.1, 0.1, 0.0, 2)

@@ -14,7 +14,7 @@ from plant.effects import EFFECTS, Effect, in_words, parse_effects
 from plant.effects.base import NotNegative, register, with_torque
 from plant.effects.search_space import Sought
 from plant.machine import QUADRATIC, SmoothTorque
-from tests.workflow.diagnosis_examples import KnownAnswer, write_case
+from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from workflow.diagnose.case_files import load_case
 from workflow.diagnose.outputs import Work
 
@@ -48,13 +48,12 @@ def _page(folder, engine):
     return files, re.sub("<[^>]*>", "", files["arm.html"].decode())
 
 
-@pytest.mark.parametrize("model_error", [0.0, 0.05])
 @pytest.mark.parametrize(
-    "engine",
+    ("engine", "model_error"),
     [
-        KnownAnswer((WIND,), ambiguous=("coulomb_friction",)),
-        KnownAnswer(({"name": "coulomb_friction", "torque_Nm": 0.05},), ambiguous=("wind_drag", "unknown")),
-        KnownAnswer((WIND,), "unknown", "unknown"),
+        (KnownAnswer((WIND,), ambiguous=("coulomb_friction",)), 0.05),
+        (KnownAnswer((FRICTION,), ambiguous=("wind_drag", "unknown")), 0.0),
+        (KnownAnswer((WIND,), "unknown", "unknown"), 0.05),
     ],
     ids=["named", "possible", "in part"],
 )

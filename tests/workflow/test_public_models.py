@@ -34,17 +34,6 @@ MODELS = {
         ("slider", "hinge_1"),
         0.02,
     ),
-    "acrobot": (
-        """<mujoco model="acrobot"><default><joint damping=".05"/><geom type="capsule" mass="1"/></default>
-        <option timestep="0.01" integrator="RK4"/><worldbody><body name="upper_arm" pos="0 0 2">
-        <joint name="shoulder" type="hinge" axis="0 1 0"/><geom fromto="0 0 0 0 0 1" size="0.05"/>
-        <body name="lower_arm" pos="0 0 1"><joint name="elbow" type="hinge" axis="0 1 0"/>
-        <geom fromto="0 0 0 0 0 1" size="0.049"/><site name="tip" pos="0 0 1"/></body></body></worldbody>
-        <actuator><motor name="elbow" joint="elbow" gear="2" ctrllimited="true" ctrlrange="-1 1"/>
-        </actuator></mujoco>""",
-        ("shoulder", "elbow"),
-        0.02,
-    ),
     "inverted pendulum": (
         """<mujoco model="inverted pendulum"><compiler inertiafromgeom="true"/><default>
         <joint armature="0" damping="1" limited="true"/><geom contype="0" friction="1 0.1 0.1"/>
