@@ -72,7 +72,7 @@ CASES = [("motor", 14, 2000.0), ("motor", 3, -5000.0), ("mode", 14, 2000.0), ("i
 @pytest.mark.parametrize(("kind", "delay", "offset"), CASES)
 def test_ellipses_hold_the_truth_wherever_the_log_begins(kind, delay, offset):
     hits = []
-    for seed in range(5):
+    for seed in range(2):
         found, posterior = ellipses(kind, delay, measured(kind, delay, offset, seed))
         hits.append(posterior.at(OMEGA).contains(truth(kind, delay)).mean())
         assert found.model.order == {"motor": 1, "mode": 2, "integrator": 2}[kind]
@@ -80,7 +80,7 @@ def test_ellipses_hold_the_truth_wherever_the_log_begins(kind, delay, offset):
     assert np.mean(hits) > 0.85
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("noise_pole", [0.0, 0.8])
 @pytest.mark.parametrize(("kind", "delay", "offset"), CASES)
 def test_coverage_of_delayed_records(kind, delay, offset, noise_pole):

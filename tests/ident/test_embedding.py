@@ -40,15 +40,16 @@ def coverage(estimator, runs, options=None, noise_pole=0.0):
 
 
 def test_tangent_covers_and_classical_does_not():
-    tangent_hits, classical_hits = coverage(tangent, 12), coverage(classical, 12)
-    # Whole responses are strongly correlated over frequency, so 12 runs decide coverage to a few per cent
-    # only: 98 and 75 % were measured. The Monte Carlo below is the tight test.
+    tangent_hits, classical_hits = coverage(tangent, 4), coverage(classical, 4)
+    # Whole responses are strongly correlated over frequency, so 4 runs decide coverage roughly: 94 and 36 %
+    # were measured. The Monte Carlo below is the tight test.
     assert tangent_hits.mean() > 0.9
     assert classical_hits.mean() < 0.85
     # What the classical recipe misses is where the data are best: the first band and the modes.
     assert per_band(classical_hits).min() < 0.6
 
 
+@pytest.mark.slow
 def test_a_damped_mode_that_nobody_asked_for_is_inside():
     """Too weak to be seen: 20 noise variances of energy, of 32 that an order selection asks for. The last one
     stands near the Nyquist frequency, where a slow kernel has least."""
@@ -76,8 +77,8 @@ def test_a_damped_mode_that_nobody_asked_for_is_inside():
 
 
 def test_coloured_noise_needs_the_noise_model():
-    white = coverage(tangent, 6, noise_pole=0.9)
-    coloured = coverage(tangent, 6, EmbeddingOptions(coloured_noise=True), noise_pole=0.9)
+    white = coverage(tangent, 2, noise_pole=0.9)
+    coloured = coverage(tangent, 2, EmbeddingOptions(coloured_noise=True), noise_pole=0.9)
     assert white.mean() < 0.6  # 35 % measured
     assert coloured.mean() > 0.85
 
@@ -231,9 +232,10 @@ def test_autoregression_is_stable_even_for_a_growing_signal():
     assert np.all(np.abs(np.roots(whitening)) < 1)
 
 
-@pytest.mark.slow
-def test_coverage_with_poles_from_the_same_data():
-    runs = 64
+@pytest.mark.parametrize(
+    "runs", [pytest.param(8, marks=pytest.mark.slow), pytest.param(64, marks=pytest.mark.long)]
+)
+def test_coverage_with_poles_from_the_same_data(runs):
     hits, classical_hits = [], []
     for seed in range(runs):
         arm = random_arm(np.random.default_rng([2024, seed]))
@@ -241,7 +243,8 @@ def test_coverage_with_poles_from_the_same_data():
         hits.append(tangent([arm.record], model).at(OMEGA).contains(arm.truth))
         classical_hits.append(classical([arm.record], model).at(OMEGA).contains(arm.truth))
     bands = per_band(np.array(hits))
-    # Over the bands one run counts once or little more: sd sqrt(0.95 * 0.05 / 64) = 2.7 %; 3 of those below.
-    assert np.array(hits).mean() == pytest.approx(0.95, abs=0.03)  # all bands together: about a third of that
-    assert np.all(bands > 0.87), dict(zip(BANDS, bands, strict=True))
+    # Over a band one run counts once or little more: 3 sd below. All bands together: about a third of that.
+    sd = np.sqrt(0.95 * 0.05 / runs)
+    assert np.array(hits).mean() == pytest.approx(0.95, abs=1.1 * sd)
+    assert np.all(bands > 0.95 - 3 * sd), dict(zip(BANDS, bands, strict=True))
     assert per_band(np.array(classical_hits)).min() < 0.6

@@ -60,7 +60,7 @@ def test_p1_without_prior_knowledge():
     assert np.median(errors) < 0.06
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_p1_monte_carlo():
     errors, validation = [], []
     fresh = max_length_sequence(77, 1000)

@@ -69,10 +69,12 @@ def test_intervals_of_p2_hold_the_truth_and_say_which_mode_is_known_best():
     assert relative.argmax() == 2  # the third mode is the weakest
 
 
-@pytest.mark.slow
-def test_intervals_hold_the_truth_as_often_as_they_say():
+@pytest.mark.parametrize(
+    "runs", [pytest.param(6, marks=pytest.mark.slow), pytest.param(34, marks=pytest.mark.long)]
+)
+def test_intervals_hold_the_truth_as_often_as_they_say(runs):
     hits = []
-    for seed in range(34):
+    for seed in range(runs):
         arm = random_arm(np.random.default_rng([5, seed]))
         model = identify([arm.record], IdentOptions(n_real=2, n_pairs=3)).model
         found = pole_intervals(tangent([arm.record], model), model.poles)
@@ -82,9 +84,10 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
         ends = (found.omega_rad_s, found.zeta, found.decay_per_s)
         for value, (low, high) in zip(np.concatenate(wanted), np.concatenate(ends), strict=True):
             hits.append(low <= value <= high)
-    # 34 runs of 8 numbers; within a run they are nearly independent: 3 sd of a binomial is 4 %. First
-    # order leaves a little out (weak third modes), so the lower side has 2 % more.
-    assert 0.89 <= np.mean(hits) <= 0.99
+    # 8 numbers a run, nearly independent: 3 sd of a binomial. First order leaves a little out (weak third
+    # modes), so the lower side has 2 % more.
+    off = 3 * np.sqrt(0.95 * 0.05 / (8 * runs))
+    assert 0.93 - off <= np.mean(hits) <= min(0.95 + off, 1)
 
 
 def test_what_the_records_do_not_tell_is_open():

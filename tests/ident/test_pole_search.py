@@ -143,14 +143,16 @@ def test_no_poles_to_search_means_the_fixed_ones():
     np.testing.assert_array_equal(end.poles.values, [0.9, 0.8 + 0.1j, 0.8 - 0.1j])
 
 
-@pytest.mark.slow
-def test_search_succeeds_for_at_least_96_percent_of_seeds():
+@pytest.mark.parametrize(
+    "runs", [pytest.param(3, marks=pytest.mark.slow), pytest.param(50, marks=pytest.mark.long)]
+)
+def test_search_succeeds_for_at_least_96_percent_of_seeds(runs):
     """P2, n = 4, box from the data alone: within 0.2 % of the best known cost, at most 2000 evaluations.
 
     Best known: the same search with six times the evaluations and 20 starts. Measured 50/50.
     """
     hits, most = 0, 0
-    for seed in range(50):
+    for seed in range(runs):
         options = IdentOptions(estimate_offset=False, estimate_initial_state=False)
         data = prepare([p2(seed).record], options.structure())
         search = PoleSearch(data, options)
@@ -159,5 +161,5 @@ def test_search_succeeds_for_at_least_96_percent_of_seeds():
         best = min(found.rss, thorough.rescan(thorough.joint(2, 1)).rss)
         hits += found.rss <= 1.002 * best
         most = max(most, search.evaluations)
-    assert hits >= 48
+    assert hits >= 0.96 * runs
     assert most <= 2000

@@ -202,15 +202,20 @@ def test_impossible_settings_are_refused(options, message):
         IdentOptions(**options)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("colour", [0.0, 0.9])
-def test_error_rates_of_the_verdicts(colour):
+@pytest.mark.parametrize(
+    ("colour", "runs"),
+    [
+        pytest.param(0.9, 2, marks=pytest.mark.slow),
+        *(pytest.param(c, 10, marks=pytest.mark.long) for c in (0.0, 0.9)),
+    ],
+)
+def test_error_rates_of_the_verdicts(colour, runs):
     """True priors pass in 95 % of the records at least, wrong ones never; white and AR(1) noise of equal
     power.
 
     Measured over 40 seeds: one of 80 records with a true prior refused in white noise, two in AR(1) 0.9.
     """
-    seeds = range(10)
+    seeds = range(runs)
 
     def record(truth, seed):
         white = np.random.default_rng(1000 + seed).normal(size=truth.clean.size + 500)

@@ -347,8 +347,9 @@ def test_two_link_example(tmp_path):
     assert picture.stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_balls_cover_the_truth():
+    """`test_several_outputs.py` has 14 records day by day."""
     seeds, omega = 100, np.geomspace(0.5, 150.0, 20)
     truth = response(sampled(), omega)[:, None]
     hits = np.zeros(omega.size)
