@@ -1,6 +1,6 @@
 """Dry friction identified with the linear arm: the response behind it, and what it makes of it."""
 
-from ident.friction.amplitude import EquivalentFriction, at_amplitudes, equivalent_friction, refuse_unrecorded
+from ident.friction.amplitude import EquivalentFriction, at_amplitude, equivalent_friction
 from ident.friction.arm import FrictionLaw
 from ident.friction.fit import fit_friction, refuse_unseen_shaft
 from ident.friction.gauss_newton import FrictionFit
@@ -12,14 +12,13 @@ __all__ = [
     "EquivalentFriction",
     "FrictionFit",
     "FrictionLaw",
-    "at_amplitudes",
+    "at_amplitude",
     "equivalent_friction",
     "fit_friction",
     "identify_behind",
     "other_output_without_friction",
     "precedes_command",
     "recorded_in_loop",
-    "refuse_unrecorded",
     "refuse_unseen_shaft",
     "without_friction",
 ]

@@ -1,4 +1,4 @@
-"""The arm with its friction as a linear response: what it is at one amplitude, and over a range of them.
+"""The arm with its friction as a linear response, as it is at one amplitude.
 
 A nonlinear arm answers a random-phase multisine with its best linear approximation (BLA) and a rest that is
 uncorrelated with the input (Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd
@@ -9,8 +9,8 @@ linearisation):
     N(j omega) = n_0 + n_1 j omega + n_2 (j omega)^2 + n_3 (j omega)^3 + n_4 j omega / (j omega + corner),
 
 the last where the shaft has a corner, below which the input moves it at a speed. N comes from simulations of
-the identified arm at the amplitudes asked for, G and the level of the friction from their common posterior. N
-at each line is that of a weak one, times `more_at_a_strong_line`; a quarter of the largest of these stays
+the identified arm at the rms of the records, G and the friction's level from their common posterior. N at
+each line is that of a weak one, times `more_at_a_strong_line`; a quarter of the largest of these stays
 uncertain, in size and in phase.
 
 Neglected: every other nonlinearity, and how N depends on the arm's coefficients.
@@ -18,14 +18,12 @@ Neglected: every other nonlinearity, and how N depends on the arm's coefficients
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import expm, logm
-from scipy.optimize import brentq
 from scipy.special import ive
 
 from ident.basis.functions import basis_response
@@ -41,36 +39,16 @@ from ident.friction.gauss_newton import FrictionFit
 from ident.friction.posterior import BehindFriction
 
 _TERMS = 4  # N is a cubic in j omega, see above
-_REALISATIONS, _AMPLITUDES, _DRAWS = 128, 5, 400
+_REALISATIONS, _DRAWS = 128, 400
 # The first period dies out from rest, the second is in steady state.
 _PERIODS = 2
 _CHANGE_OF_LEVEL = 0.02  # for a derivative between runs of equal phases: small, and far above rounding
-# An amplitude this close to the end of what was recorded counts as recorded.
-_SAME = 1e-3
-# Largest multiple of the scatter between amplitudes that ellipses are made of.
-_MOST = 3.0
-# What the number of draws leaves open of a share of them.
-_OF_DRAWS = 0.01
-# Every so many draws are counted when the ellipses are made large enough.
-_THINNED = 5
 # A line of the spectrum counts as excited above this share of the largest.
 _EXCITED = 1e-3
 _N_GRID = 300  # frequencies: over five decades 30 in every half decade that is counted
 # Of how much larger N is at the strongest line, what stays open of N at every line, in size and in phase.
 _UNEVEN = 0.25
 _HALF_WIDTHS = np.array([-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0])
-
-
-def refuse_unrecorded(records: Sequence[Record], amplitudes: tuple[float, float] | None) -> None:
-    """Raises ValueError for a range of the input's rms that is not inside that of the records."""
-    rms = _input_rms(records)
-    smallest, largest = float(rms.min()), float(rms.max())
-    low, high = amplitudes or (smallest, largest)
-    if not smallest * (1 - _SAME) <= low <= high <= largest * (1 + _SAME):
-        raise ValueError(
-            f"amplitudes from {low:.4g} to {high:.4g} cannot be described: the inputs of the records have an "
-            f"rms from {smallest:.4g} to {largest:.4g}"
-        )
 
 
 def _input_rms(records: Sequence[Record]) -> RealArray:
@@ -80,15 +58,15 @@ def _input_rms(records: Sequence[Record]) -> RealArray:
 
 @dataclass(frozen=True, eq=False)
 class EquivalentFriction:
-    """The viscous friction that acts like the dry one, on average, at amplitudes of the input.
+    """The viscous friction that acts like the dry one, on average, at an amplitude of the input.
 
-    friction: what it was simulated from. rms (A,), ascending: of the input. omega_rad_s (F,): excited lines;
-    stronger (A, F): how much larger N is there than at a weak line. mean, by_level (A, M): coefficients of N
-    there (`_terms`), and their derivative by the level; factor (A, M, M): what the simulations leave open.
+    friction: what it was simulated from. rms: of the input. omega_rad_s (F,): excited lines; stronger (F,):
+    how much larger N is there than at a weak line. mean, by_level (M,): coefficients of N there (`_terms`),
+    and their derivative by the level; factor (M, M): what the simulations leave open.
     """
 
     friction: FrictionFit
-    rms: RealArray
+    rms: float
     omega_rad_s: RealArray
     stronger: RealArray
     mean: RealArray
@@ -96,53 +74,40 @@ class EquivalentFriction:
     factor: RealArray
 
     @property
-    def damping(self) -> RealArray:
-        """(A,) N at low frequency, in units of the input per (unit of position / s)."""
-        return np.maximum(self.mean[:, 0], 0.0)
+    def damping(self) -> float:
+        """N at low frequency, in units of the input per (unit of position / s)."""
+        return max(float(self.mean[0]), 0.0)
 
     def drawn(self, change: RealArray, omega: RealArray, rng: np.random.Generator) -> ComplexArray:
-        """(A, K, W) values of N at omega (W,) for changes (K,) of the friction's level."""
-        normals = rng.standard_normal((len(self.rms), change.size, self.factor.shape[2]))
-        uneven = rng.standard_normal((len(self.rms), change.size, 2)) @ (1, 1j)
-        left_open = normals @ self.factor.transpose(0, 2, 1)
-        values = self.mean[:, None] + change[:, None] * self.by_level[:, None] + left_open
+        """(K, W) values of N at omega (W,) for changes (K,) of the friction's level."""
+        normals = rng.standard_normal((change.size, self.factor.shape[1]))
+        uneven = rng.standard_normal((change.size, 2)) @ (1, 1j)
+        values = self.mean + change[:, None] * self.by_level + normals @ self.factor.T
         # No line says how N goes on beyond the last.
         inside = np.minimum(omega, self.omega_rad_s[-1])
         smooth = values @ _terms(inside, self.omega_rad_s[-1], _corner(self.friction.arm)).T
-        stronger = [np.interp(omega, self.omega_rad_s, own) for own in self.stronger]
-        few = _UNEVEN * self.stronger.max(axis=1)
-        return np.asarray(smooth * (1 + np.array(stronger)[:, None] + (few[:, None] * uneven)[..., None]))
+        stronger = np.interp(omega, self.omega_rad_s, self.stronger)
+        few = _UNEVEN * self.stronger.max()
+        return np.asarray(smooth * (1 + stronger + (few * uneven)[:, None]))
 
 
 def equivalent_friction(
     friction: FrictionFit,
     records: Sequence[Record],
     rng: np.random.Generator,
-    amplitudes: tuple[float, float] | None = None,
 ) -> EquivalentFriction:
-    """For random-phase multisines with the records' power spectrum. amplitudes: smallest and largest rms of
-    the input, with five logarithmic steps; default: that of the records together. Raises ValueError as
-    `refuse_unrecorded`."""
-    refuse_unrecorded(records, amplitudes)
-    if amplitudes is None:
-        rms = np.array([np.sqrt(np.mean(_input_rms(records) ** 2))])
-    else:
-        rms = np.geomspace(*amplitudes, _AMPLITUDES)
+    """For random-phase multisines with the records' power spectrum, and the rms of them together."""
+    rms = float(np.sqrt(np.mean(_input_rms(records) ** 2)))
     spectrum = _power_spectrum(records)
     lines = np.flatnonzero(spectrum > _EXCITED * spectrum.max())
-    found = [_at_amplitude(friction, spectrum, lines, float(a), rng) for a in rms]
     omega = lines.astype(np.float64) * (np.pi / ((spectrum.size - 1) * friction.arm.dt_s))
-    return EquivalentFriction(friction, rms, omega, *(np.stack(part) for part in zip(*found, strict=True)))
+    return EquivalentFriction(friction, rms, omega, *_simulated(friction, spectrum, lines, rms, rng))
 
 
-def at_amplitudes(
-    behind: BehindFriction, equivalent: EquivalentFriction, rng: np.random.Generator, level: float = 0.95
+def at_amplitude(
+    behind: BehindFriction, equivalent: EquivalentFriction, rng: np.random.Generator
 ) -> tuple[ResponsePosterior, Poles]:
-    """Posterior of the best linear approximation, and poles of a model of it.
-
-    Over a range of amplitudes the centre lies halfway between its ends, and the ellipses hold the response
-    with probability `level` in every half decade, averaged over the amplitudes.
-    """
+    """Posterior of the best linear approximation, and poles of a model of it."""
     friction, arm = behind.friction, behind.friction.arm
     spaced = np.geomspace(0.5 * equivalent.omega_rad_s[0], np.pi / arm.dt_s, _N_GRID)
     omega = _around_pairs(spaced, behind.response.poles, arm.dt_s)
@@ -156,50 +121,11 @@ def at_amplitudes(
     linear = behind.response.response_of(coefficients, omega)
     responses = linear / (1 + speed * equivalent.drawn(change, omega, rng))
 
-    damping = equivalent.damping
-    ends = [damped_poles(friction.model, float(one)) for one in (damping.max(), damping.min())]
-    form, draws = _on_poles(behind.response, ends, coefficients, responses, omega)
-    centres = draws.mean(axis=1)
-    middle = 0.5 * (centres[0] + centres[-1])
-    spread = (draws - centres[:, None]).reshape(-1, middle.size) / np.sqrt(draws.shape[0] * (_DRAWS - 1))
-    own = np.asarray(np.linalg.qr(spread, mode="r")).T
-    between = (centres - middle).T / np.sqrt(len(centres))
-
-    def posterior(share: float) -> ResponsePosterior:
-        return replace(form, mean=middle, covariance_factor=np.hstack([own, share * between]))
-
-    share = 0.0
-    if len(centres) > 1:
-        share = _share_of_scatter(posterior, responses[..., np.isin(omega, spaced)], spaced, level)
-    return posterior(share), damped_poles(friction.model, float(np.sqrt(damping[0] * damping[-1])))
-
-
-def _share_of_scatter(
-    posterior: Callable[[float], ResponsePosterior], drawn: ComplexArray, omega: RealArray, level: float
-) -> float:
-    """How much of the scatter between amplitudes (0 to _MOST) the ellipses, posterior(share), need to hold
-    the drawn responses (A, K, F) on omega (F,), evenly spaced in its logarithm, with probability `level` in
-    every half decade."""
-    half_decade = int(0.5 * omega.size / np.log10(omega[-1] / omega[0]))
-
-    def inside(share: float, these: ComplexArray) -> RealArray:
-        """Share of responses (A, K, F) within the ellipses, in every window of half a decade."""
-        ellipses, flat = posterior(share).at(omega, level), these.reshape(-1, omega.size)[::_THINNED]
-        held = np.mean([ellipses.contains(one) for one in flat], axis=0)
-        return np.asarray(sliding_window_view(held, half_decade).mean(axis=1))
-
-    together = drawn - drawn.mean(axis=1, keepdims=True) + posterior(0.0).at(omega, level).centre
-    # Not more than one amplitude alone has: no scatter between them makes up for heavy tails of each.
-    wanted = np.minimum(level, inside(0.0, together)) - _OF_DRAWS
-    wanted[inside(_MOST, drawn) < wanted] = 0.0
-
-    def missing(share: float) -> float:
-        return float(np.max(wanted - inside(share, drawn)))
-
-    # Where the amplitudes differ by less than is known of each, nothing has to be added.
-    if missing(0.0) <= 0:
-        return 0.0
-    return brentq(missing, 0.0, _MOST, xtol=0.01) if missing(_MOST) < 0 else _MOST
+    damped = damped_poles(friction.model, equivalent.damping)
+    form, draws = _on_poles(behind.response, damped, coefficients, responses, omega)
+    centre = draws.mean(axis=0)
+    factor = np.asarray(np.linalg.qr((draws - centre) / np.sqrt(_DRAWS - 1), mode="r")).T
+    return replace(form, mean=centre, covariance_factor=factor), damped
 
 
 def _corner(arm: SteppedArm) -> float:
@@ -240,7 +166,7 @@ def damped_poles(model: GobfModel, damping: float) -> Poles:
     return Poles(np.sort(poles[plain].real), poles[poles.imag >= 1e-9].astype(np.complex128))
 
 
-def _at_amplitude(
+def _simulated(
     friction: FrictionFit,
     spectrum: RealArray,
     lines: npt.NDArray[np.intp],
@@ -317,15 +243,15 @@ def _around_pairs(omega: RealArray, poles: Poles, dt_s: float) -> RealArray:
 
 def _on_poles(
     response: ResponsePosterior,
-    ends: Sequence[Poles],
+    damped: Poles,
     coefficients: RealArray,
     responses: ComplexArray,
     omega: RealArray,
 ) -> tuple[ResponsePosterior, RealArray]:
-    """Responses (A, K, F) as coefficients (A, K, P), and the form they stand in: on the poles of both ends of
-    the range and those of the arm as often as they stand there; taps are those of the draws (K, .)."""
+    """Responses (K, F) as coefficients (K, P), and the form they stand in: on the damped poles, twice since N
+    depends on frequency, and those of the arm as often as they stand there; taps are those of the draws."""
     own = response.poles
-    parts = (*ends, own)
+    parts = (damped, damped, own)
     poles = Poles(
         np.concatenate([part.real for part in parts]), np.concatenate([part.pairs for part in parts])
     )
@@ -333,9 +259,8 @@ def _on_poles(
     form = replace(response, poles=poles, mean=np.zeros(size), covariance_factor=np.zeros((size, 1)))
     rows, taps = form.frequency_rows(omega), coefficients[:, own.order :]
     # No stable poles follow N at strong lines: what they leave has to be small beside what is not known.
-    scale = 1 / np.std(responses, axis=1).mean(axis=0)
-    targets = ((responses - taps @ rows[:, poles.order :].T) * scale).reshape(-1, omega.size).T
+    scale = 1 / np.std(responses, axis=0)
+    targets = ((responses - taps @ rows[:, poles.order :].T) * scale).T
     columns = scale[:, None] * rows[:, : poles.order]
     solved = np.linalg.lstsq(real_rows(columns), real_rows(targets), rcond=1e-10)[0]
-    on_poles = solved.T.reshape(*responses.shape[:2], -1)
-    return form, np.concatenate([on_poles, np.broadcast_to(taps, (len(responses), *taps.shape))], axis=2)
+    return form, np.hstack([solved.T, taps])

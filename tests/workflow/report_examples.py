@@ -34,7 +34,6 @@ from workflow.tasks.identification import as_fitted, residual_tests
 from workflow.tasks.loop_conditions import condition_run
 from workflow.tasks.results import (
     AchievablePerformance,
-    AmplitudeCost,
     CertifyResult,
     ClosedLoopResult,
     ConditionRun,
@@ -287,7 +286,6 @@ def _save_design(run: RunDirectory, settings: RunConfig, gain: float, impossible
         run.save_stage("design", DesignResult(None, met=False, reason=reason), "00")
         run.save_stage("achievable_performance", AchievablePerformance(), "00")
         run.save_stage("certify", CertifyResult(None, certified=False, reason=reason), "00")
-        run.save_stage("amplitude_cost", AmplitudeCost(), "00")
         run.save_stage("reference_filter", ReferenceFilterResult(), "00")
         run.save_stage("closed_loop", ClosedLoopResult(skipped=reason), "00")
         return
@@ -307,7 +305,6 @@ def _save_design(run: RunDirectory, settings: RunConfig, gain: float, impossible
     )
     run.save_stage("design", DesignResult(result, met, said("outcome", result)), "00")
     run.save_stage("achievable_performance", achievable(), "00")
-    run.save_stage("amplitude_cost", AmplitudeCost(), "00")
     run.save_stage("reference_filter", ReferenceFilterResult(), "00")
     reason = "; ".join(said("requirement", item) for item in certificate.items if not item.met) or "met"
     sampled = sampled_responses(certificate.gamma)

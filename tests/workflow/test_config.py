@@ -133,8 +133,7 @@ def test_every_excitation_gives_its_samples_and_its_size(table):
         ("uncertainty = {{ {0} }}\nincrements = true", "records as measured"),
         ("uncertainty = {{ {0} }}\nband_rad_s = [1.0, 20.0]", "records as measured"),
         ("uncertainty = {{ {0} }}\nidentification = {{ integrators = 2 }}", "at most one integrator"),
-        ("uncertainty = {{ response = 'amplitudes from 8 to 2' }}", "must be positive and smaller"),
-        ("uncertainty = {{ response = 'amplitudes 2..8' }}", "response"),
+        ("uncertainty = {{ response = 'amplitude 2' }}", "response"),
     ],
 )
 def test_a_response_that_cannot_be_described_is_refused(tmp_path, channel, complaint):
@@ -143,17 +142,10 @@ def test_a_response_that_cannot_be_described_is_refused(tmp_path, channel, compl
         minimal(tmp_path, MINIMAL.replace("[[channels]]", f"[[channels]]\n{asked}"))
 
 
-def test_a_specification_over_amplitudes_is_the_response_of_every_channel(tmp_path):
-    asked = MINIMAL.replace("[specification]", "[specification]\namplitudes = [0.5, 8.0]")
-    tip = '[[channels]]\ninput = "voltage_V"\noutput = "tip_m"\n%s\n[specification]'
-    config = minimal(tmp_path, asked.replace("[specification]", tip % ""))
-    assert [channel.uncertainty.amplitudes for channel in config.channels] == [(0.5, 8.0)] * 2
-    assert RunConfig.from_document(config.to_document(), source="document") == config
-    other = tip % "uncertainty = { response = 'without friction' }"
-    with pytest.raises(InputError, match=r"0.5, 8\], but channel 'tip_m' says response = 'without friction'"):
-        minimal(tmp_path, asked.replace("[specification]", other))
-    # Without a range in the specification the channels still have to agree on the one there is.
+def test_channels_are_about_the_same_amplitude(tmp_path):
     described = MINIMAL.replace("[[channels]]", "[[channels]]\nuncertainty = { response = 'this amplitude' }")
+    tip = '[[channels]]\ninput = "voltage_V"\noutput = "tip_m"\n%s\n[specification]'
+    other = tip % "uncertainty = { response = 'without friction' }"
     with pytest.raises(InputError, match="describe 'this amplitude' and 'without friction'"):
         minimal(tmp_path, described.replace("[specification]", other))
 

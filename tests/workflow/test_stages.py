@@ -27,12 +27,11 @@ from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.identification import as_bounded, as_fitted
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.records import make_records, read_record, with_common_sampling_time
-from workflow.tasks.results import IdentifiedPlant, RunRecord, RunResults, UncertaintyResult
+from workflow.tasks.results import RunRecord, RunResults
 from workflow.tasks.simulated_rig import encoded_arm, rig_of
 from workflow.tasks.stage import StageInput
-from workflow.tasks.stages import STAGES, design_filter, find_amplitude_cost
+from workflow.tasks.stages import STAGES, design_filter
 from workflow.tasks.uncertainty import posterior_of
-from workflow.text.templates import said
 
 _IN_OUT = "voltage_V", "hub_angle_rad"
 
@@ -124,32 +123,6 @@ def test_every_design_is_compared_with_any_order_and_sampled_whole(run):
     assert joint is not None
     assert joint.draws == 2000
     assert joint.stable_share > 0.999
-
-
-def test_amplitudes_cost_what_the_design_for_the_arm_behind_its_friction_gains(run, tmp_path):
-    config, found = config_of(run.run), run.uncertainty.channels[0]
-    options = found_options(config, response="this amplitude")
-    shutil.copytree(run.run.path, tmp_path / "run")
-
-    def cost(posterior):
-        copy = RunResults(RunDirectory(tmp_path / "run"))
-        behind = IdentifiedPlant(found.nominal, posterior, found.level)
-        copy.read["uncertainty"] = UncertaintyResult((replace(found, behind_friction=behind),))
-        return find_amplitude_cost(StageInput(options, copy, Progress()))
-
-    assert find_amplitude_cost(StageInput(config, run, Progress())).design is None
-    nothing = cost(found.posterior)
-    assert nothing.design.gamma == run.design.gamma
-    assert nothing.behind == nothing.carried_over == run.certify.certificate
-    assert nothing.left_by_unit[0] == nothing.left_by_unit[1]
-    assert "by 10 %" in said("amplitude_cost", nothing, 1.1 * run.design.gamma)
-    # An arm of which less is known leaves less to gain; its controller is looked at on both.
-    larger = cost(
-        replace(found.posterior, covariance_factor=40 * np.asarray(found.posterior.covariance_factor))
-    )
-    assert larger.design.gamma > 1.01 * run.design.gamma
-    assert larger.behind.gamma > 1.01 * larger.carried_over.gamma
-    assert "does not raise" in said("amplitude_cost", larger, run.design.gamma)
 
 
 def found_options(config, **uncertainty):

@@ -122,8 +122,6 @@ def read_design_file(path: Path) -> DesignFile:
         wishes = {key: document.pop(key) for key in document.keys() - known}
         document["specification"] = wishes
     elif "channels" in document:
-        # Which amplitudes the ellipses are about is up to whoever made them.
-        document["specification"].pop("amplitudes", None)
         document = {key: value for key, value in document.items() if key in known}
     found = check(DesignFile, document, source=str(path), context={"base": path.absolute().parent})
     found._name = str(path)

@@ -9,7 +9,6 @@ from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-import numpy as np
 import tomlkit
 from pydantic import AfterValidator, Field, model_validator
 
@@ -265,29 +264,6 @@ class Channel(Section):
     def label(self) -> str:
         return self.name or self.output
 
-    def over_amplitudes(self, low: float, high: float) -> Channel:
-        """The same over a range of amplitudes. Raises ValueError where it states another response."""
-        options = self.uncertainty
-        if "response" in options.model_fields_set and options.amplitudes != (low, high):
-            raise ValueError(
-                f"specification.amplitudes = [{low:g}, {high:g}], but channel {self.label!r} says response = "
-                f"{options.response!r}: leave that out"
-            )
-        ends = [np.format_float_positional(end, trim="-") for end in (low, high)]
-        described = {**dict(options), "response": f"amplitudes from {ends[0]} to {ends[1]}"}
-        return Channel(**{**dict(self), "uncertainty": UncertaintyOptions(**described)})
-
-
-class RunSpecification(Specification):
-    """[specification] of a run: requirements, and the amplitudes over which they hold."""
-
-    amplitudes: tuple[float, float] | None = Field(
-        None,
-        description="smallest and largest rms of the input, in its unit: the specification holds "
-        "between them, for the arm with friction. Sets `response` of every "
-        "channel; default: as in the channels",
-    )
-
 
 class StatedController(Section):
     """u = K (r - y) of the loop the logs were made in."""
@@ -412,7 +388,7 @@ class RunConfig(Section):
     source: Source
     channels: tuple[Channel, ...] = Field(min_length=1)
     closed_loop_data: ClosedLoopData = Field(default_factory=ClosedLoopData)
-    specification: RunSpecification
+    specification: Specification
     synthesis: SynthesisOptions = Field(default_factory=SynthesisOptions)
     certificate: CertificateOptions = Field(default_factory=CertificateOptions)
     achievable_performance: AchievableOptions = Field(default_factory=AchievableOptions)
@@ -423,16 +399,12 @@ class RunConfig(Section):
     notes: Notes = Field(default_factory=Notes)
 
     @model_validator(mode="after")
-    def _specified_over_amplitudes(self) -> Self:
-        asked = self.specification.amplitudes
-        if asked is not None:
-            channels = tuple(channel.over_amplitudes(*asked) for channel in self.channels)
-            object.__setattr__(self, "channels", channels)
-        described = [channel.uncertainty for channel in self.channels]
-        if any(one.about_amplitudes for one in described) and len({one.response for one in described}) > 1:
+    def _describes_one_arm(self) -> Self:
+        described = dict.fromkeys(channel.uncertainty.response for channel in self.channels)
+        if "this amplitude" in described and len(described) > 1:
             raise ValueError(
-                "a certificate holds at one amplitude or over one range: the channels describe "
-                + " and ".join(dict.fromkeys(repr(one.response) for one in described))
+                "a certificate holds at one amplitude: the channels describe "
+                + " and ".join(map(repr, described))
             )
         return self
 

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from ident.basis.options import EmbeddingOptions, IdentOptions
-
-_NUMBER = r"(\d+(?:\.\d+)?)"
-_RANGE = rf"amplitudes from {_NUMBER} to {_NUMBER}"
 
 
 class FitOptions(IdentOptions):
@@ -37,14 +33,13 @@ class UncertaintyOptions(EmbeddingOptions):
         "between records of different condition",
     )
     level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse taken alone")
-    response: str = Field(
+    response: Literal["as recorded", "without friction", "this amplitude"] = Field(
         "as recorded",
         description="which response the ellipses describe. as recorded: linear dynamics, everything else "
         "counts as noise. The others identify dry friction as well: the output (of the control "
         "channel) must be the shaft's position. without friction: linear dynamics "
         "without friction; this amplitude: best linear approximation with friction, at "
-        "the rms of the recorded inputs; amplitudes from 2 to 8: the same at any rms of "
-        "the input between these, in its unit",
+        "the rms of the recorded inputs",
     )
 
     @model_validator(mode="before")
@@ -54,40 +49,15 @@ class UncertaintyOptions(EmbeddingOptions):
             return {"coloured_noise": True, **stated}
         return stated
 
-    @field_validator("response")
-    @classmethod
-    def _known(cls, response: str) -> str:
-        if not re.fullmatch(f"as recorded|without friction|this amplitude|{_RANGE}", response):
-            raise ValueError(
-                "expected 'as recorded', 'without friction', 'this amplitude' or 'amplitudes from 2 to 8', "
-                f"got {response!r}"
-            )
-        return response
-
     @property
     def friction_identified(self) -> bool:
         """The dry friction of the shaft is identified with the arm."""
         return self.response != "as recorded"
-
-    @property
-    def about_amplitudes(self) -> bool:
-        """The ellipses hold at an amplitude, or over a range of them."""
-        return self.response not in ("as recorded", "without friction")
-
-    @property
-    def amplitudes(self) -> tuple[float, float] | None:
-        """Smallest and largest rms of the input, where a range is described."""
-        ends = re.fullmatch(_RANGE, self.response)
-        return None if ends is None else (float(ends[1]), float(ends[2]))
 
     @model_validator(mode="after")
     def _friction_by_tangent(self) -> Self:
         if self.friction_identified and self.method != "tangent":
             raise ValueError(
                 f"response = {self.response!r} goes with method = 'tangent', not {self.method!r}"
-            )
-        if self.amplitudes is not None and not 0 < self.amplitudes[0] < self.amplitudes[1]:
-            raise ValueError(
-                f"response = {self.response!r}: the first amplitude must be positive and smaller"
             )
         return self

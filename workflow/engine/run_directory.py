@@ -33,7 +33,7 @@ from workflow.engine import codec, documents, storage
 from workflow.engine.errors import InputError, naming, shortened
 from workflow.engine.store import Store
 
-LAYOUT_VERSION = 7  # 7: the reference step with friction
+LAYOUT_VERSION = 8  # 8: no design beside it that holds over amplitudes
 T = TypeVar("T")
 _INPUT_HASH, _DIGEST = "_input_hash", "_sha256"
 _RESULT = "result"

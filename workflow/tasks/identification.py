@@ -25,7 +25,6 @@ from ident.friction import (
     fit_friction,
     identify_behind,
     recorded_in_loop,
-    refuse_unrecorded,
     refuse_unseen_shaft,
 )
 from ident.one_input import identify
@@ -90,9 +89,8 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
     friction, shaft = None, config.control_channel
     if config.friction_identified:
         with naming(f"channel {shaft.label!r}"):
-            ranges = [channel.uncertainty.amplitudes for channel in config.channels]
             progress = partial(stage.progress.update, "identify", 0.0)
-            friction = shaft_friction(records.fitted(shaft), shaft, ranges, lambda done, what: progress(what))
+            friction = shaft_friction(records.fitted(shaft), shaft, lambda done, what: progress(what))
     in_loop = isinstance(config.source, FileSource) and (
         config.closed_loop_data.stated or made_in_loop(records.fitted(shaft))
     )
@@ -127,13 +125,9 @@ def made_in_loop(measured: Sequence[Record]) -> bool:
 def shaft_friction(
     measured: Sequence[Record],
     channel: Channel,
-    amplitudes: Sequence[tuple[float, float] | None],
     report: Report,
 ) -> FrictionFit:
-    """Coulomb friction of the shaft whose position a channel measures. amplitudes: that responses are asked
-    for at."""
-    for wanted in amplitudes:
-        refuse_unrecorded(measured, wanted)
+    """Coulomb friction of the shaft whose position a channel measures."""
     found = fit_friction(measured, channel.identification, progress=report)
     refuse_unseen_shaft(found, measured)
     return found

@@ -30,7 +30,7 @@ class LogIdentification:
     to look at. The stabilisation plot is None where nobody asked for it. `true_modes`: beside each mode of
     `about` the true one, known of simulated logs. `described`: what the ellipses are about; friction:
     identified, where that asks for it; equivalent: the viscous friction that acts like it, where it asks for
-    amplitudes. input_limit: that the amplifier gives, where it was stated.
+    an amplitude. input_limit: that the amplifier gives, where it was stated.
     """
 
     measured: tuple[Record, ...]
@@ -81,7 +81,7 @@ def identify_records(
         except ValidationError as error:
             raise ValueError(str(error.errors()[0]["ctx"]["error"])) from error
         if described.friction_identified:
-            friction = shaft_friction(measured, channel, [described.amplitudes], update)
+            friction = shaft_friction(measured, channel, update)
         about = identify_channel(
             channel,
             measured,

@@ -245,9 +245,8 @@ class UncertainChannel:
 
     nominal: model on the identified poles that is nearest to the posterior; frequency: ellipses on the
     display grid; empirical: response without a model, where the records allow one; tests: whiteness and
-    independence of the residuals on the estimation records; advice: where they fail; behind_friction: the
-    linear arm, where the ellipses are about amplitudes; repeat_scatter: None without repeats; intervals: None
-    where the method has none.
+    independence of the residuals on the estimation records; advice: where they fail; repeat_scatter: None
+    without repeats; intervals: None where the method has none.
     """
 
     name: str
@@ -260,7 +259,6 @@ class UncertainChannel:
     bands: tuple[Band, ...]
     tests: Tests
     agreement: NominalAgreement
-    behind_friction: IdentifiedPlant | None = None
     intervals: Intervals | None = None
     repeat_scatter: tuple[ScatterRow, ...] | None = None
     advice: tuple[Finding, ...] = ()
@@ -271,15 +269,13 @@ class UncertainChannel:
         report = self.posterior.report
         return 0 if report is None else len(report.ar_coefficients)
 
-    def in_plant(self, behind_friction: bool) -> PlantChannel:
-        behind = self.behind_friction if behind_friction else None
-        model = self.nominal if behind is None else behind.model
-        return PlantChannel(model.to_control(), (behind or self).posterior, self.level)
+    def in_plant(self) -> PlantChannel:
+        return PlantChannel(self.nominal.to_control(), self.posterior, self.level)
 
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyResult:
-    """equivalent: viscous friction that acts like the dry one, where ellipses are about amplitudes."""
+    """equivalent: viscous friction that acts like the dry one, where ellipses are about an amplitude."""
 
     channels: tuple[UncertainChannel, ...]
     equivalent: EquivalentFriction | None = None
@@ -291,23 +287,22 @@ class UncertaintyResult:
             [found for k in used if k is not None for found in conditions_of(self.channels[k].advice)]
         )
 
-    def plant(self, config: RunConfig, *, behind_friction: bool = False) -> UncertainPlant:
-        """What the controller is designed for: control channel and first performance channel; or the
-        friction-free dynamics, where the ellipses are about amplitudes."""
-        key = config.control_index, config.performance_index, behind_friction
+    def plant(self, config: RunConfig) -> UncertainPlant:
+        """What the controller is designed for: control channel and first performance channel."""
+        key = config.control_index, config.performance_index
         if key not in self._plants:
-            control = self.channels[key[0]].in_plant(behind_friction)
+            control = self.channels[key[0]].in_plant()
             self._plants[key] = UncertainPlant(
                 name=config.control_channel.label,
                 nominal=control.nominal,
                 uncertainty=control.uncertainty,
-                performance=None if key[1] is None else self.channels[key[1]].in_plant(behind_friction),
+                performance=None if key[1] is None else self.channels[key[1]].in_plant(),
                 level=control.level,
             )
         return self._plants[key]
 
     @cached_property
-    def _plants(self) -> dict[tuple[int, int | None, bool], UncertainPlant]:
+    def _plants(self) -> dict[tuple[int, int | None], UncertainPlant]:
         return {}
 
 
@@ -379,21 +374,6 @@ class CertifyResult:
     certified: bool
     reason: str
     sampled: SampledResponses = SampledResponses()
-
-
-@dataclass(frozen=True, eq=False)
-class AmplitudeCost:
-    """The same specification for the friction-free dynamics; empty where no amplitudes are described.
-
-    design, behind: controller and certificate for that arm; carried_over: certificate of the same controller
-    over the amplitudes. left_by_unit: output that a unit of constant disturbance at the plant's input leaves,
-    with the run's own controller and with this one.
-    """
-
-    design: DesignResult | None = None
-    behind: Certificate | None = None
-    carried_over: Certificate | None = None
-    left_by_unit: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -651,6 +631,5 @@ class RunResults(StageResults):
     design = StageResult(DesignResult)
     achievable_performance = StageResult(AchievablePerformance)
     certify = StageResult(CertifyResult)
-    amplitude_cost = StageResult(AmplitudeCost)
     reference_filter = StageResult(ReferenceFilterResult)
     closed_loop = StageResult(ClosedLoopResult)

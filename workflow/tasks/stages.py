@@ -8,11 +8,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
-
-from control_design.analysis.certificate import certify
-from control_design.controllers.controller import Controller
-from control_design.plants.plant_set import UncertainPlant
 from workflow.engine.errors import naming
 from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.design import UNKNOWN_TO_BRACKET, certify_asked, find_bracket, find_design, find_filter
@@ -21,7 +16,6 @@ from workflow.tasks.identification import identify_channels
 from workflow.tasks.records import make_records
 from workflow.tasks.results import (
     AchievablePerformance,
-    AmplitudeCost,
     CertifyResult,
     DesignResult,
     ReferenceFilterResult,
@@ -76,32 +70,6 @@ def design_filter(stage: StageInput) -> ReferenceFilterResult:
     return found
 
 
-def find_amplitude_cost(stage: StageInput) -> AmplitudeCost:
-    """A design for the friction-free dynamics, certified there and over the amplitudes; empty where none are
-    described, or the run itself has no controller."""
-    config, own = stage.config, stage.results.design.controller
-    if not config.control_channel.uncertainty.about_amplitudes or own is None:
-        return AmplitudeCost()
-    asked, tell = stage.specification, partial(stage.progress.update, "amplitude_cost")
-    linear = stage.results.uncertainty.plant(config, behind_friction=True)
-    with naming("amplitude cost"):
-        # From the starts of the run's own design: what differs is the plant.
-        design = find_design([linear], asked, config.synthesis, config.certificate, stage.rng("design"), tell)
-        law = design.controller
-        if law is None:
-            return AmplitudeCost(design)
-        behind, carried_over = (certify(law, [plant], asked) for plant in (linear, stage.plant))
-    left = _left_by_unit(own, stage.plant), _left_by_unit(law, linear)
-    return AmplitudeCost(design, behind, carried_over, left)
-
-
-def _left_by_unit(law: Controller, plant: UncertainPlant) -> float:
-    """Output that a unit of constant disturbance at the nominal plant's input leaves, |G / (1 + G K)|."""
-    # A millionth of the Nyquist frequency: there an integrator is as good as infinite.
-    omega = np.array([1e-6 * plant.nyquist_rad_s])
-    return float(1 / np.abs(law.response(omega) + 1 / plant.channel.nominal_response(omega))[0])
-
-
 _PLANT = ("identify", "uncertainty")
 _PURPOSES = {"channels": {"__all__": {"purpose"}}}
 
@@ -141,13 +109,6 @@ STAGES: tuple[Stage, ...] = (
         except_for={"specification": set(UNKNOWN_TO_BRACKET)},
     ),
     Stage("certify", (*_PLANT, "design"), certify_controller, 1.0, uses={"certificate": True}),
-    Stage(
-        "amplitude_cost",
-        (*_PLANT, "design", "certify"),
-        find_amplitude_cost,
-        0.1,
-        uses={"specification": True, "synthesis": True, "certificate": {"calibrate"}},
-    ),
     Stage(
         "reference_filter",
         (*_PLANT, "design", "certify"),

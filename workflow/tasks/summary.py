@@ -18,7 +18,6 @@ from workflow.tasks.exports import Logged
 from workflow.tasks.joints import JointsResults
 from workflow.tasks.results import (
     AchievablePerformance,
-    AmplitudeCost,
     CertifyResult,
     ClosedLoopResult,
     DesignResult,
@@ -52,7 +51,6 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
             "certificate_conditions": [words(doubt) for doubt in conditions],
             "achievable_performance": bracket_numbers(achievable, design.gamma),
             "sampled_responses": shares,
-            "amplitude_cost": cost_numbers(results.amplitude_cost),
             "reference_filter": codec.plain(results.reference_filter.filter),
             "closed_loop": loop_numbers(loop),
         },
@@ -174,7 +172,7 @@ def way_numbers(found: Finding | None) -> dict[str, Any] | None:
 def uncertainty_numbers(spread: UncertainChannel) -> dict[str, Any]:
     """The same of its ellipses, arrays left out."""
     found: dict[str, Any] = codec.plain(spread, arrays=False)
-    for unwanted in ("posterior", "nominal", "frequency", "empirical", "behind_friction"):
+    for unwanted in ("posterior", "nominal", "frequency", "empirical"):
         found.pop(unwanted)
     if spread.intervals is not None:
         for row, known in zip(found["intervals"]["modes"], spread.intervals.modes, strict=True):
@@ -204,11 +202,6 @@ def design_numbers(design: DesignResult) -> dict[str, Any]:
         "outcome": "IMPOSSIBLE" if found is None else found.outcome.name,
         "blocking": [] if found is None else codec.plain(found.blocking),
     }
-
-
-def cost_numbers(cost: AmplitudeCost) -> dict[str, Any] | None:
-    """What holding over amplitudes costs, without the controller."""
-    return None if cost.design is None else {**codec.plain(cost), "design": design_numbers(cost.design)}
 
 
 def loop_numbers(loop: ClosedLoopResult) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from ident.friction import (
     BehindFriction,
     EquivalentFriction,
     FrictionFit,
-    at_amplitudes,
+    at_amplitude,
     equivalent_friction,
     other_output_without_friction,
     precedes_command,
@@ -46,7 +46,6 @@ from workflow.tasks.identification import as_bounded, residual_tests
 from workflow.tasks.results import (
     Band,
     IdentifiedChannel,
-    IdentifiedPlant,
     Intervals,
     ModeInterval,
     NominalAgreement,
@@ -118,7 +117,7 @@ def uncertainty_of(
     records: Sequence[RunRecord] = (),
 ) -> tuple[UncertainChannel, EquivalentFriction | None]:
     """Ellipses of one channel, as `flexlink run` and `flexlink identify` have them, and the viscous friction
-    that acts like the dry one where they are about amplitudes.
+    that acts like the dry one where they are about an amplitude.
 
     measured: SISO estimation records as recorded; friction: of the shaft, whose position the channel's output
     is where at_shaft; equivalent: where it is known from the shaft; records: with their conditions. Raises
@@ -223,16 +222,16 @@ def described_response(
     equivalent: EquivalentFriction | None = None,
 ) -> tuple[ResponsePosterior, Poles, EquivalentFriction | None]:
     """What the ellipses of an arm with friction are about, and the poles of its nominal: the response behind
-    the friction with the model's poles, or the one at amplitudes, and what stands for the friction there.
+    the friction with the model's poles, or the one at an amplitude, and what stands for the friction there.
 
     friction: as it was fitted to the measured records, from which equivalent follows where it is not known of
     another output.
     """
-    if not described.about_amplitudes:
+    if described.response != "this amplitude":
         return behind.response, poles, equivalent
     if equivalent is None:
-        equivalent = equivalent_friction(friction, measured, rng, described.amplitudes)
-    return (*at_amplitudes(behind, equivalent, rng, described.level), equivalent)
+        equivalent = equivalent_friction(friction, measured, rng)
+    return (*at_amplitude(behind, equivalent, rng), equivalent)
 
 
 def uncertain_channel(
@@ -249,10 +248,7 @@ def uncertain_channel(
     """Everything said about a posterior. omega (F,): shown, and where the nominal has to be right; tests: of
     the residuals; poles: of the nominal, where they are not the model's; linear: posterior of the model,
     where that is another one."""
-    model, behind = result.model, None
-    if linear is not None and linear is not posterior:
-        behind = IdentifiedPlant(nominal_of(linear, model.poles, omega), linear, level)
-    linear = linear or posterior
+    model, linear = result.model, linear or posterior
     refuse_unanswered(result, linear, omega)
     frequency = posterior.at(omega, level)
     nominal = nominal_of(posterior, poles or model.poles, omega)
@@ -272,7 +268,6 @@ def uncertain_channel(
         bands=tuple(band_row(frequency, low, high) for low, high in bands_of(omega)),
         tests=tests,
         agreement=agreement_of(frequency, nominal.frequency_response),
-        behind_friction=behind,
         intervals=intervals_of(linear, model.stable_poles, level),
     )
 
