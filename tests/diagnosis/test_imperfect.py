@@ -238,6 +238,7 @@ def test_a_time_limit_says_what_was_not_tried(gap_cases):
     assert found.probabilities["unknown"] < 0.2
 
 
+@pytest.mark.slow
 def test_what_the_held_out_records_contradict_is_no_answer():
     # The estimation record has a spring to ground that the held-out one has not: nothing holds for both.
     rng = np.random.default_rng(6)
@@ -608,7 +609,7 @@ def test_every_likely_set_of_an_effect_and_the_effect_alone_are_also_fitted_with
         assert tuple(sorted({"ground_spring", *names} - {"gravity"})) in fitted
 
 
-@pytest.mark.parametrize("seed", [3, 5, 7])
+@pytest.mark.parametrize("seed", [3, *(pytest.param(k, marks=pytest.mark.slow) for k in (5, 7))])
 def test_a_record_that_begins_in_free_play_is_followed_from_there(seed):
     # Cut out of a run: until the hub touches, it goes on as it went, which no linear arm does.
     rng = np.random.default_rng(seed)
@@ -688,6 +689,7 @@ def test_one_window_is_the_free_run_and_states_of_each_act_in_it_alone():
     assert np.flatnonzero(difference)[[0, -1]] // 100 == pytest.approx([3, 3])
 
 
+@pytest.mark.slow
 def test_far_values_are_scanned_where_contacts_switch():
     joint = {"name": "joint_compliance", "stiffness_Nm_rad": 40.0, "damping_Nms": 0.01}
     search, kinds = _hub_only(1, joint, {"name": "backlash", "gap_rad": 0.1})
@@ -897,6 +899,7 @@ def test_a_simpler_effect_is_also_sought_where_the_one_that_contains_it_ended():
     assert best.evidence > poor.evidence + 10
 
 
+@pytest.mark.slow
 def test_gain_and_zeros_of_a_strain_gauge_and_a_tachometer():
     # Records of an independent simulator, read by sensors whose zeros and gain nobody knows.
     rng = np.random.default_rng(8)

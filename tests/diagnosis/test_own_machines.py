@@ -166,15 +166,6 @@ def test_the_effect_is_found_among_all_that_are_listed(name):
     assert found.gap_closed > 0.95
 
 
-def test_noise_stated_far_too_large_hides_no_effect():
-    case = _case("input_delay")
-    with pytest.warns(UserWarning, match=r"less noise than stated, which counts: y 0\.\d+, stated 5$"):
-        found = diagnose(case.with_noise(100 * case.noise))
-    assert (found.verdict, found.combination) == ("effect", ("input_delay",))
-    assert case.noise < found.case.noise < 5 * case.noise
-    assert found.noise_below_stated == (("y", found.case.noise[0], 100 * case.noise[0]),)
-
-
 @pytest.mark.slow
 def test_noise_stated_too_large_makes_no_effect():
     case = _case("backlash", mass_kg=0.5)
@@ -228,6 +219,7 @@ def _turning(parameters, effects, inputs):
     return np.concatenate([[0.0], np.cumsum(gain * inputs[:-1, 0] * DT_S - T * np.diff(speed))])[:, None]
 
 
+@pytest.mark.slow
 def test_what_is_wrong_is_named_beside_a_bias_that_drifts():
     """A bias of a hundredth of the voltage leaves most of the gap of an angle that nobody holds."""
     rng = np.random.default_rng(5)
@@ -390,6 +382,18 @@ def test_noise_is_no_model_error_in_where_and_what_remains():
     assert not where_in_records(found.case, found.residuals_after, DT_S).is_gap
     assert where_in_records(found.case, found.residuals_refit, DT_S).is_gap
     assert found.completeness.most == 0.0
+
+
+def test_noise_stated_far_too_large_hides_no_effect():
+    plant, records = _noisy_motor()
+    case = PlantCase("loud", with_effects(plant, ("output_offset",), records, dt_s=DT_S), tuple(records))
+    with pytest.warns(
+        UserWarning, match=r"less noise than stated, which counts: speed_rad_s .*, stated 150$"
+    ):
+        found = diagnose(case.with_noise(100 * case.noise))
+    assert (found.verdict, found.combination) == ("effect", ("output_offset",))
+    assert 0.5 * case.noise < found.case.noise < 5 * case.noise
+    assert found.noise_below_stated == (("speed_rad_s", found.case.noise[0], 100 * case.noise[0]),)
 
 
 def test_effects_of_a_body_are_not_ruled_out_where_no_motion_is_stated():

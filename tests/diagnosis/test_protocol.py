@@ -87,7 +87,7 @@ def test_what_no_listed_effect_describes_is_unknown():
         (150.0, 0.0, 0.05, "none"),
         pytest.param(0.0, 0.0, None, "none", marks=pytest.mark.slow),
         # Something small is always missing: that must not hide what is large.
-        (4e3, 0.6, None, "effect"),
+        pytest.param(4e3, 0.6, None, "effect", marks=pytest.mark.slow),
         pytest.param(4e3, 0.6, 0.0, "unknown", marks=pytest.mark.slow),
         # A tone alone, small beside what is stated that the simulation may miss.
         pytest.param(0.0, 0.1, 0.05, "none", marks=pytest.mark.slow),
