@@ -121,7 +121,7 @@ def _in_sections(above: npt.NDArray[Any], below: npt.NDArray[Any], dt_s: float) 
     return found
 
 
-def _factors(roots: npt.NDArray[Any]) -> list[npt.NDArray[np.float64]]:
+def _factors(roots: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
     """Factors of second order and, of an odd number of roots, one of first order."""
     real = np.sort(roots[roots.imag == 0].real)[::-1]
     pairs = [np.poly([root, root.conj()]).real for root in roots[roots.imag > 0]]

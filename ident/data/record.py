@@ -339,8 +339,10 @@ def reading_notes(
             found.append(finding(FindingKind.WRAPS, record=record, name=name, period=period))
         elif (spikes := spikes_in(columns[name])).size:
             value, place = float(columns[name][spikes[0]]), table.place(int(spikes[0]), name)
-            told = {"name": name, "value": value, "place": place, "rows": spikes.size}
-            found.append(finding(FindingKind.SPIKES, record=record, **told))
+            rows = spikes.size
+            found.append(
+                finding(FindingKind.SPIKES, record=record, name=name, value=value, place=place, rows=rows)
+            )
     return tuple(found)
 
 
