@@ -7,11 +7,12 @@ import io
 import os
 import subprocess
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ident.data import foreign_files, record_files
+from ident.data import child_reader, foreign_files, record_files
 from ident.data.record_files import read_table
 from tests.ident.mutations import Tally, mutated, tally
 from tests.ident.test_forty_logs import LOGS
@@ -116,8 +117,17 @@ ENDLESS = {
 }
 
 
+@pytest.mark.parametrize("smaller", [50, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("last", "row"), ENDLESS.values(), ids=ENDLESS)
-def test_a_sheet_without_end_is_refused_within_seconds(tmp_path, last, row):
+def test_a_sheet_without_end_is_refused_within_seconds(tmp_path, monkeypatch, last, row, smaller):
+    """smaller: by how much the limits and the sheets are."""
+    child = Path(child_reader.__file__).read_text()
+    for limit in ("_MOST_CELLS = 20_000_000", "_EMPTY_CELLS = 500_000"):
+        assert limit in child
+        child = child.replace(limit, f"{limit} // {smaller}")
+    monkeypatch.setattr(foreign_files, "_SCRIPT", tmp_path / "child.py")
+    foreign_files._SCRIPT.write_text(child)
+    last = 100 + last // smaller
     source, long = LOGS["a spreadsheet"].content, io.BytesIO()
     rows = b"".join(b'<row r="%d">%b</row>' % (k, row(k)) for k in range(100, last))
     with zipfile.ZipFile(io.BytesIO(source)) as old, zipfile.ZipFile(long, "w", zipfile.ZIP_DEFLATED) as new:

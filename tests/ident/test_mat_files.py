@@ -75,11 +75,10 @@ def opaque(name):
 
 
 def test_objects_of_matlab_do_not_hide_the_vectors_beside_them():
-    for count in range(4):
-        content = written({"t": np.arange(4.0)}) + b"".join(opaque(f"s{k}".encode()) for k in range(count))
-        found = mat_variables(content, "f")
-        np.testing.assert_array_equal(found.pop("t"), [[0, 1, 2, 3]])
-        assert all("a MATLAB object" in other.why for other in found.values())
+    content = written({"t": np.arange(4.0)}) + opaque(b"s1") + opaque(b"s2") + opaque(b"s3")
+    found = mat_variables(content, "f")
+    np.testing.assert_array_equal(found.pop("t"), [[0, 1, 2, 3]])
+    assert all("a MATLAB object" in other.why for other in found.values())
 
 
 def test_a_reader_keeps_to_limits_that_are_there():

@@ -296,6 +296,7 @@ def test_order_and_modes_of_a_published_frequency_response(flexlink_data):
     assert four.dispersion > 5
 
 
+@pytest.mark.slow
 def test_numbers_that_are_given_are_fitted_as_well_as_the_same_numbers_chosen(flexlink_data):
     """Grown to given numbers without a test in between, it once ended at four times the chi-square."""
     plant = kyoto_plant(flexlink_data)
