@@ -67,12 +67,17 @@ def _written(folder: Path, text: str, name: str = "arm.toml") -> Path:
     return path
 
 
+def _run(config: Path) -> int:
+    return main(["run", "--config", str(config), "--out", str(config.parent / "run"), "--quiet"])
+
+
 @pytest.fixture(scope="module")
-def run_of_the_arm(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("joints")
-    config = _written(folder, _SOURCE + _JOINTS + _REST)
-    assert main(["run", "--config", str(config), "--out", str(folder / "run"), "--quiet"]) == 0
-    return folder / "run"
+def run_of_the_arm(made_once) -> Path:
+    def make(out: Path) -> None:
+        config = _written(out.parent, _SOURCE + _JOINTS + _REST)
+        assert main(["run", "--config", str(config), "--out", str(out), "--quiet"]) == 0
+
+    return made_once("joints", make)[0]
 
 
 def test_a_run_ends_with_a_certified_controller_and_a_page(run_of_the_arm):
@@ -167,6 +172,7 @@ def test_logs_give_the_same_model_as_the_arm(logs, run_of_the_arm, tmp_path, cap
     assert found["closed_loop"]["machine"] == "identified"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_inputs_that_are_one_signal_in_a_band_are_named_with_the_band(logs, tmp_path, capfd):
     table = pd.read_csv(logs)
     lines = np.fft.rfft(table[["shoulder_V", "elbow_V"]].to_numpy(), axis=0)
@@ -178,7 +184,7 @@ def test_inputs_that_are_one_signal_in_a_band_are_named_with_the_band(logs, tmp_
     config = _from_log(tmp_path, tmp_path / "log.csv")
     text = config.read_text().replace("controller_order = 4", "controller_order = 0")
     config.write_text(text, encoding="utf-8")  # the loop is not what is tested
-    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) != 2
+    assert _run(config) != 2
     said = " ".join(capfd.readouterr().out.replace("│", " ").split())
     assert "the inputs ['shoulder_V', 'elbow_V'] are not independent from" in said
     page = (tmp_path / "run" / "report.html").read_text()
@@ -186,36 +192,20 @@ def test_inputs_that_are_one_signal_in_a_band_are_named_with_the_band(logs, tmp_
     assert "(rank 1 of 2)" in page
 
 
-def _twice(table):
-    return table.assign(elbow_rad=table["shoulder_rad"])
-
-
-def _never_moved(table):
-    return table.assign(elbow_V=0.0)
-
-
-def _one_signal(table):
-    return table.assign(elbow_V=2 * table["shoulder_V"])
-
-
-def _short(table):
-    return table.head(20)
-
-
 @pytest.mark.parametrize(
     ("spoilt", "words"),
     [
-        (_twice, "same sensor twice"),
-        (_never_moved, "elbow_V"),
-        (_one_signal, "linearly dependent"),
-        (_short, "samples"),
+        (lambda table: table.assign(elbow_rad=table["shoulder_rad"]), "same sensor twice"),
+        (lambda table: table.assign(elbow_V=0.0), "elbow_V"),
+        (lambda table: table.assign(elbow_V=2 * table["shoulder_V"]), "linearly dependent"),
+        (lambda table: table.head(20), "samples"),
     ],
 )
 def test_logs_that_tell_too_little_are_refused_in_one_line(spoilt, words, logs, tmp_path, capfd):
     log = tmp_path / "log.csv"
     spoilt(pd.read_csv(logs)).to_csv(log, index=False)
     config = _from_log(tmp_path, log)
-    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert _run(config) == 2
     said = capfd.readouterr().err.strip()
     assert words in said
     assert "\n" not in said
@@ -232,16 +222,16 @@ def test_logs_that_tell_too_little_are_refused_in_one_line(spoilt, words, logs, 
 )
 def test_logs_that_are_not_taken_say_why(source, words, logs, tmp_path, capfd):
     config = _from_log(tmp_path, logs, source)
-    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert _run(config) == 2
     assert words in capfd.readouterr().err
     text = config.read_text().replace('condition = "bent"', 'condition = "bent", role = "validation"')
     config.write_text(text.replace(source, 'time = "time_s"'), encoding="utf-8")
-    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert _run(config) == 2
     assert "each record is fitted" in capfd.readouterr().err
     _from_log(tmp_path, logs)
     with config.open("a", encoding="utf-8") as file:
         file.write("\n[closed_loop]\ncoulomb_Nm = [0.1, 0.1]\n")
-    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert _run(config) == 2
     assert "simulated arm only" in capfd.readouterr().err
 
 
@@ -254,7 +244,7 @@ def test_logs_of_different_sampling_are_refused(logs, tmp_path, capfd):
     )
     text = f'[source]\nkind = "files"\ntime = "time_s"\nrecords = [{records}]\n' + _JOINTS + _REST
     config = _written(tmp_path, text)
-    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert _run(config) == 2
     assert "differ in sampling time" in capfd.readouterr().err
 
 
@@ -274,7 +264,7 @@ def test_configurations_that_do_not_fit_are_refused(old, new, words, tmp_path, c
     text = _SOURCE + _JOINTS + _REST
     assert old in text
     config = _written(tmp_path, text.replace(old, new))
-    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert _run(config) == 2
     said = capfd.readouterr().err.strip()
     assert words in said
     assert "\n" not in said
@@ -290,16 +280,17 @@ def test_a_joint_may_rest_while_another_moves(run_of_the_arm):
     assert not _judged("bent", "by hand", output + 0.02, np.zeros((100, 2)), step, law).settled
 
 
-def test_what_cannot_be_met_is_a_result_with_exit_code_one(tmp_path, capfd):
+@pytest.mark.usefixtures("undrawn")
+def test_what_cannot_be_met_is_a_result(tmp_path, capfd):
     text = (_SOURCE + _JOINTS + _REST).replace("effort_limit = 100.0", "effort_limit = 0.5")
     config = _written(tmp_path, text.replace("controller_order = 4", "controller_order = 0"))
-    code = main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"])
-    assert code not in (0, 2)
+    assert _run(config) == 3
     assert "not certified" in capfd.readouterr().err
     assert "Not certified" in (tmp_path / "run" / "report.html").read_text()
     assert np.isfinite(Controller.from_json((tmp_path / "run" / "controller.json").read_text()).D).all()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_study_varies_what_a_joint_is_asked(run_of_the_arm, tmp_path):
     """From the run's models: its own point is designed as in the run, and a faster one has a larger worst
     case; the table says what the certificate and the loops of each point say."""
@@ -353,7 +344,7 @@ def test_each_input_may_have_its_own_dead_time(logs, run_of_the_arm, tmp_path):
     text = _from_log(tmp_path, moved).read_text()
     text = text.replace("n_real = 3", f"input_delay_samples = {list(late)}\nn_real = 3")
     config = _written(tmp_path, text)
-    assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    assert _run(config) == 0
     (found,) = JointsResults(RunDirectory(tmp_path / "run")).identify.points
     (own,) = JointsResults(RunDirectory(run_of_the_arm)).identify.points
     assert found.model.order == own.model.order
