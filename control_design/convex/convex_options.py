@@ -11,6 +11,9 @@ class YoulaOptions(GridOptions):
     """Size of the basis and of the grids; the defaults take about two seconds a plant."""
 
     real_poles: int = Field(default=32, ge=2, le=200, description="real poles of the basis of Q")
+    mirrored_poles: int = Field(
+        default=6, ge=0, le=50, description="real poles of the basis of Q at negative z, next to Nyquist"
+    )
     pairs_per_mode: int = Field(
         default=12, ge=1, le=50, description="pole pairs of the basis at every mode and light zero"
     )

@@ -25,7 +25,9 @@ _ROUND_REACH = 1e-4  # denominators are about one: off by at most 1e-4, at the k
 _ROUND_FEASIBILITY = 1e-2  # while denominators are being made positive: their maximum may sit on the kink
 _EXCESS = 5e-4  # relative; accepted of the dense check over the programme
 _MOST_STEPS = 200  # of the interior point in one round; 5 to 40 are usual
-_KEPT = 1e-10  # singular values of the scaled basis below this fraction are no directions of the search
+# Singular values of the basis below this fraction are no directions of the search: rounding. The best Q of an
+# unstable plant with a resonance has a part at 1e-13.
+_KEPT = 1e-14
 
 
 @dataclass(frozen=True, eq=False)

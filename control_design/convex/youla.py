@@ -44,7 +44,8 @@ Region = Literal["inscribed", "ellipse", "enclosing"]
 
 @dataclass(frozen=True)
 class PlantBracket:
-    """Values for one plant, each the largest on the dense grid; inf where nothing was found to be robustly
+    """Values for one plant, each the largest on the dense grid, by a Q of the basis: a longer one may lie a
+    little lower, by a per cent at most on the plants tried; inf where nothing was found to be robustly
     stable. Of unstable plants whose ellipses are not about the nominal response `inscribed` is a local
     optimum."""
 
@@ -75,7 +76,7 @@ class YoulaBracket:
 
     @property
     def floor(self) -> float:
-        """The best lower bound, that of the inscribed discs."""
+        """The best lower bound, that of the inscribed discs; but for basis and grid: see `PlantBracket`."""
         return self.inscribed
 
 
@@ -121,8 +122,10 @@ class BracketProblem:
         self.factors: Factors | None = None
         if np.any(np.abs(plant.poles) >= 1.0 - 1e-9):
             self.factors = coprime_factors(delayed(plant.nominal, specification.computational_delay_samples))
-        self.poles = chosen_poles(plant, self.grids.scale_rad_s, options.real_poles, options.pairs_per_mode)
         self.dense = self.grids.dense[0]
+        if np.any(self.dense.largest(LoopFunction.EFFORT) > 0):  # then Q does not invert up to Nyquist
+            options = options.model_copy(update={"mirrored_poles": 0})
+        self.poles = chosen_poles(plant, self.grids.scale_rad_s, options)
         self.dense_loop = self._loop(self.dense)
         self.dense_basis = self._basis(self.dense)
 

@@ -8,10 +8,13 @@ import control
 import numpy as np
 import scipy.linalg
 
+from control_design.convex.convex_options import YoulaOptions
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import UncertainPlant, matrix_response, modes_of
 from ident.basis.functions import basis_response
 from ident.basis.poles import Poles
+
+_NEAREST = 3e-3  # of Nyquist: zeros of sampling lie as far as the plant turns in a sample, and farther
 
 
 def with_constant(poles: Poles, omega_rad_s: Real, dt_s: float) -> Complex:
@@ -20,15 +23,18 @@ def with_constant(poles: Poles, omega_rad_s: Real, dt_s: float) -> Complex:
     return np.hstack([np.ones((z.size, 1), np.complex128), basis_response(poles, z)])
 
 
-def chosen_poles(plant: UncertainPlant, scale_rad_s: float, real_poles: int, pairs: int) -> Poles:
+def chosen_poles(plant: UncertainPlant, scale_rad_s: float, options: YoulaOptions) -> Poles:
     """Poles of the basis of Q: real ones spread logarithmically from the slowest corner of the plant to
-    Nyquist; pairs at every mode and lightly damped zero (where Q inverts the plant), damping from their own
-    to 0.7. pairs: for each; more than three of them share three times as many."""
+    Nyquist; mirrored ones next to Nyquist, where sampling puts zeros; pairs at every mode and lightly damped
+    zero (where Q inverts the plant), damping from their own to 0.7: as many as for three where there are
+    more."""
     dt = plant.dt_s
     decay = np.abs(np.log(np.maximum(np.abs(plant.poles), 1e-6))) / dt
     slow = decay[(decay > 1e-3 * scale_rad_s)]
     lowest = min(float(np.min(slow, initial=np.inf)), 0.02 * scale_rad_s)
-    real, found = np.exp(-dt * np.geomspace(lowest, 0.95 * plant.nyquist_rad_s, real_poles)), []
+    fastest, pairs, found = 0.95 * plant.nyquist_rad_s, options.pairs_per_mode, []
+    real = np.exp(-dt * np.geomspace(lowest, fastest, options.real_poles))
+    mirrored = -np.exp(-dt * np.geomspace(_NEAREST * fastest, fastest, options.mirrored_poles))
     resonances = [*plant.modes, *modes_of(plant.zeros, dt)]
     resonances = [each for each in resonances if each.omega_rad_s < plant.nyquist_rad_s]
     count = max(2, min(pairs, 3 * pairs // max(len(resonances), 1)))
@@ -36,7 +42,7 @@ def chosen_poles(plant: UncertainPlant, scale_rad_s: float, real_poles: int, pai
         least = np.clip(1.3 * abs(each.zeta), 0.005, 0.3)
         zeta = np.geomspace(least, 0.7, count)
         found.append(np.exp(dt * each.omega_rad_s * (-zeta + 1j * np.sqrt(1 - zeta**2))))
-    return Poles(real, np.concatenate(found) if found else np.zeros(0, complex))
+    return Poles(np.append(real, mirrored), np.concatenate(found) if found else np.zeros(0, complex))
 
 
 @dataclass(frozen=True, eq=False)
