@@ -96,7 +96,7 @@ def doubtful_columns(case: PlantCase) -> tuple[str, ...]:
             unit = f"in {_FACTORS[near]}" if 0.5 < times / near < 2 else "in another unit"
             found.append(f"{name} moves {times:.3g} times as far as in the simulation: is its column {unit}?")
     # What the best sizes would leave of the motion is no question of steps.
-    sized = np.sqrt(np.mean(1 - np.diagonal(alike[0]) ** 2))
+    sized = np.sqrt(np.mean(np.maximum(1 - np.diagonal(alike[0]) ** 2, 0)))
     return (*found, *([] if case.plant.untracked else _other_step(case, float(sized))))
 
 
@@ -105,12 +105,16 @@ def _other_step(case: PlantCase, sized: float) -> list[str]:
     or a step several samples, it follows the first record far better than with any sizes (sized)."""
     e, run = case.estimation[0], case.plant.replayed(())
     least, ratios = 100, (5, 10, 20, 50, 100)  # of less than five an inertia would do as much
+    rests, moves = int(np.argmax(np.any(e.input != e.input[0], axis=1))), np.var(e.output, axis=0)
+    if np.any(np.var(e.output[: rests + 1], axis=0) > 1e-3 * moves):
+        rests = 0
 
     def left(steps: int, samples: int) -> float:
         """Share of the motion, of as many samples as take no longer than the record, at least so many."""
-        part = slice(0, max(len(e.input) // steps, least), samples)
-        missed = e.output[part] - run(np.repeat(e.input[part], steps, axis=0))[::steps]
-        return float(np.sqrt(np.mean(np.var(missed, axis=0) / np.var(e.output[part], axis=0))))
+        part = slice(rests, rests + max(len(e.input) // steps, least), samples)
+        missed = np.var(e.output[part] - run(np.repeat(e.input[part], steps, axis=0))[::steps], axis=0)
+        moved = np.var(e.output[part], axis=0)
+        return float(np.sqrt(np.mean(missed / moved))) if np.all(moved > 0.01 * moves) else 1.0
 
     tried = [(n, 1) for n in ratios] + [(1, n) for n in ratios if len(e.input) >= n * least]
     best, (n, samples) = min((left(*one), one) for one in tried) if left(1, 1) > 0.5 else (1.0, (1, 1))

@@ -53,6 +53,7 @@ def _payload(mass_kg):
     return [{"name": "tip_payload", "mass_kg": mass_kg}]
 
 
+@pytest.mark.slow
 def test_a_fluke_of_the_estimation_records_is_no_effect(tmp_path):
     # A payload in the estimation records alone, as a fluke of their noise would look.
     found = diagnose(_case(tmp_path, _payload(1.5e-4), held_out=[], held_out_V=0.4))

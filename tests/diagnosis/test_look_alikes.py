@@ -33,7 +33,8 @@ def _found(folder, cause, acceleration_m_s2, amplitude_V):
     return diagnose(case)
 
 
-@pytest.mark.parametrize("cause", [pytest.param("gravity", marks=pytest.mark.slow), "spring"])
+@pytest.mark.slow
+@pytest.mark.parametrize("cause", ["gravity", "spring"])
 def test_what_the_records_cannot_tell_apart_is_gravity_or_unknown(tmp_path, cause):
     # 0.04 rad of motion, a gap of a tenth of the noise.
     found = _found(tmp_path, cause, 0.1, 0.05)

@@ -222,6 +222,7 @@ def _swings(step_s):
     [
         (_swings(0.001), _swings(0.01), "where a sample is 10 of its steps: is its step the sampling period"),
         (_swings(0.002), _swings(0.01), "where a sample is 5 of its steps"),
+        (_swings(1e-4), _swings(0.01), "where a sample is 100 of its steps"),
         (_swings(0.05), _swings(0.01), "where its step is 5 samples"),
         # With something missing as well.
         (_swings(0.001), lambda u: _swings(0.01)(u) + 0.15 * np.abs(u), "where a sample is 10 of its steps"),
@@ -234,6 +235,7 @@ def _swings(step_s):
 )
 def test_a_step_that_is_not_that_of_the_log_is_doubted(simulated, recorded, said):
     u = np.random.default_rng(3).uniform(-1, 1, 60).repeat(15)[:, None]
+    u[:150] = 0.0
     record = PlantExperiment("log", "estimation", u, recorded(u))
     plant = replace(PLANT, simulation=lambda p, e, u: simulated(u), dt_s=0.01)
     found = doubtful_columns(SimpleNamespace(plant=plant, estimation=[record], outputs=("y",)))
@@ -256,7 +258,7 @@ def test_one_output_is_a_column_in_whatever_form(given):
 
 def test_exchanged_columns_are_doubted():
     moves = np.cumsum(np.random.default_rng(4).standard_normal((400, 2)), axis=0)
-    plant = SimpleNamespace(replayed=lambda effects: lambda u: moves, untracked=0)
+    plant = SimpleNamespace(replayed=lambda effects: lambda u: np.resize(moves, (len(u), 2)), untracked=0)
 
     def doubts(measured):
         record = SimpleNamespace(input=moves, output=measured)

@@ -21,7 +21,7 @@ from benchmarks.fleet import write_fleet
 from diagnosis.fit.residual import pooled_rms
 from plant import EFFECTS, Rig, parse_effects, simulate
 from plant.effects.joint import GroundSpring
-from tests.workflow.command import ROOT, finish, kill, start_flexlink, wait_until
+from tests.workflow.command import ROOT, build_nothing, finish, kill, start_flexlink, wait_until
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from tests.workflow.page_shape import shape_faults
 from workflow.config.run_config import SimulatedSource
@@ -41,6 +41,12 @@ QUESTIONS = (
     "What it means for the controller",
     "What was not checked",
 )
+
+
+@pytest.fixture
+def undrawn(undrawn, monkeypatch):
+    """Nor built: the page of `files` is drawn."""
+    build_nothing(monkeypatch)
 
 
 def made(folder, engine, *, rig=None, controller=False):
