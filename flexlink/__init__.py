@@ -26,6 +26,7 @@ Tables      `table`
 """
 
 import sys
+from types import FunctionType
 
 if sys.argv[0] == "-m" and "flexlink" in sys.orig_argv:
     del sys.path[0]  # of the current folder: no csv.py in it is taken for Python's own
@@ -35,4 +36,13 @@ import lazy_loader
 from flexlink.own_packages import find_own_first
 
 find_own_first()
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    from flexlink.shown import one_line
+
+    found = _attribute(name)
+    if isinstance(found, FunctionType):
+        found = globals()[name] = one_line(found)
+    return found

@@ -26,7 +26,7 @@ from control_design.specification.multivariable import MultivariableSpecificatio
 from control_design.synthesis import joint_synthesis, multivariable, synthesis, synthesis_result
 from control_design.synthesis.synthesis_options import MultivariableOptions, SynthesisOptions
 from flexlink.models import Uncertainty, nominal_outside, warned
-from flexlink.shown import Shown, dressed
+from flexlink.shown import Shown, dressed, one_line
 from ident.checks.residual_tests import conditions_of
 from ident.data.finding import Finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
@@ -178,6 +178,7 @@ class UncertainPlant(Shown, plant_set.UncertainPlant):
     flexlink.design.WrongSystemError: plant 'motor' is in continuous time, flexlink works in discrete ...
     """
 
+    @one_line
     def __init__(
         self,
         plant: Any = None,

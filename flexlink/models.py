@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from flexlink.shown import Shown, dressed
+from flexlink.shown import Shown, dressed, one_line
 from ident import several_outputs
 from ident.basis import posterior
 from ident.basis.functions import basis_response, regressor
@@ -100,6 +100,7 @@ class Record(Shown, PlainRecord):
     ValueError: u has 1 samples of 4 signals; expected one row per sample
     """
 
+    @one_line
     def __init__(
         self,
         u: Any = None,
@@ -141,12 +142,14 @@ class Record(Shown, PlainRecord):
         refuse_step(self.label, self.dt_s, self.output, self.time_column)
 
     @classmethod
+    @one_line
     def from_file(cls, path: Any, inputs: Any, outputs: Any, *, references: Any = (), **more: Any) -> Self:
         """Columns of a log file, as `ident.Record.from_file`; a single name may stand by itself."""
         named = _listed(inputs), _listed(outputs)
         return super().from_file(path, *named, references=_listed(references), **more)
 
     @classmethod
+    @one_line
     def from_table(
         cls,
         table: Any,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import inspect
 import os
 import re
 import subprocess
@@ -409,6 +410,21 @@ def test_another_sampling_time_is_refused_with_what_to_do():
         flexlink.simulate_loop(slow, example_plant(), [1.0] * 3)
 
 
+def test_every_function_refuses_an_unknown_keyword_in_one_line():
+    functions = [
+        each for each in (getattr(flexlink, name) for name in flexlink.__all__) if inspect.isfunction(each)
+    ]
+    assert len(functions) > 25
+    for each in functions:
+        if not hasattr(each, "registry") and not any(
+            one.kind is one.VAR_KEYWORD for one in inspect.signature(each).parameters.values()
+        ):
+            with pytest.raises(
+                ValueError, match=f"^{each.__name__}: unknown keyword quite_unheard_of [(].*[)]$"
+            ):
+                each(quite_unheard_of=1)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -417,6 +433,16 @@ def test_another_sampling_time_is_refused_with_what_to_do():
         (lambda: flexlink.Record(u=[1.0, 2.0], y=[1.0], dt_s=0.1), "equally long"),
         (lambda: flexlink.identify(example_record(), pairs=1), "pairs"),
         (lambda: flexlink.identify(example_record(), flexlink.IdentOptions(), n_pairs=1), "not both"),
+        (
+            lambda: flexlink.synthesise(TF, None, starts=1),
+            r"field of flexlink\.SynthesisOptions\(starts=\.\.\.\)",
+        ),
+        (
+            lambda: flexlink.certify(None, TF, flexlink.Specification(), ndense=9),
+            r"help\(flexlink\.certify\)",
+        ),
+        (lambda: flexlink.Record([1.0], [1.0], 0.1, unit="V"), "Record: unknown keyword unit"),
+        (lambda: flexlink.prbs(8, 4, 6.0, 500, sed=1), "did you mean seed|known keywords"),
         (lambda: flexlink.effect("magic"), "unknown effect 'magic'"),
         (lambda: flexlink.effect("viscous_friction", c=1.0), "known: coefficient_Nms"),
         (lambda: flexlink.Specification(bandwith_rad_s=1.0), "did you mean bandwidth_rad_s"),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from string import Template
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -94,7 +94,8 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
     Dialect(prefix, number)
     controller = law_in(number, controller)
     assert controller.anti_windup_gain is not None
-    kind, suffix = (np.float32, "f") if number == "float" else (np.float64, "")
+    kind: type[np.floating[Any]] = np.float32 if number == "float" else np.float64
+    suffix = "f" if number == "float" else ""
 
     def literal(value: float) -> str:
         # The shortest decimal that reads back as the same number.
@@ -104,7 +105,7 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
 
     def constant(what: str, value: float) -> str:
         with np.errstate(over="ignore", under="ignore"):
-            if value and not 0 < abs(kind(value)) < np.inf:
+            if value and not 0 < abs(float(kind(value))) < np.inf:
                 raise ValueError(f"{what} = {value:.6g} does not fit in a C {number}; use number = 'double'")
         return literal(value)
 
@@ -113,7 +114,7 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
 
     values = {"f": suffix}
     if (given := controller.feedforward) is not None:
-        own = {
+        own: dict[str, float] = {
             "level": given.level,
             "turn": given.turn(controller.dt_s),
             "share": given.share(controller.dt_s),
@@ -152,6 +153,7 @@ def law_in(number: Number, controller: Controller) -> Controller:
     change what it does by rounding its own. Raises ValueError where it does in both."""
     if number == "double" or controller.order == 0:
         return controller
+    assert controller.anti_windup_gain is not None
     own, there, back = in_sections(controller.A)
     sections = replace(
         controller,
@@ -163,15 +165,15 @@ def law_in(number: Number, controller: Controller) -> Controller:
     omega = np.geomspace(1e-4, 1.0, 400) * np.pi / controller.dt_s
     exact = controller.response(omega).reshape(omega.size, -1)
     size = _ROUNDED * np.linalg.norm(exact, axis=1)
-    radius = max(1.0, *_radii(controller)) * (1 + np.finfo(np.float32).eps)
+    radius = max(1.0, _radius(controller)) * (1 + np.finfo(np.float32).eps)
     for form in (controller, sections):
-        rounded = {
+        rounded: dict[str, Any] = {
             name: np.clip(getattr(form, name), -_NO_LIMIT, _NO_LIMIT).astype(np.float32)
             for name in ("A", "B", "C", "D", "anti_windup_gain")
         }
         law = replace(controller, **rounded, input_limit=None, rate_limit=None)
         off = np.linalg.norm(law.response(omega).reshape(exact.shape) - exact, axis=1)
-        if np.all(off <= size) and max(_radii(law)) <= radius:
+        if np.all(off <= size) and _radius(law) <= radius:
             return form
     raise ValueError(
         f"single precision changes the response of {controller.name!r} by more than {_ROUNDED:.0%}: use "
@@ -179,11 +181,11 @@ def law_in(number: Number, controller: Controller) -> Controller:
     )
 
 
-def _radii(law: Controller) -> tuple[float, float]:
-    """Of the poles, and of those while a limit is active."""
-    return tuple(
-        float(np.max(np.abs(np.linalg.eigvals(a)))) for a in (law.A, law.A - law.anti_windup_gain @ law.C)
-    )
+def _radius(law: Controller) -> float:
+    """Of the poles, with a limit active or not."""
+    assert law.anti_windup_gain is not None
+    held = law.A - law.anti_windup_gain @ law.C
+    return float(np.max(np.abs(np.linalg.eigvals([law.A, held]))))
 
 
 def _filled(template: str, controller: Controller, **values: object) -> str:
