@@ -257,7 +257,7 @@ class Record:
                 )
         notes = (*doubtful, *reading_notes(table, columns, inputs, outputs))
         step = dt_s if stamps is None else float(np.median(np.diff(stamps))) if stamps.size > 1 else None
-        if step is not None and step > 0:
+        if step is not None and 0 < step < np.inf:
             moved = np.column_stack([columns[item] for item in outputs])
             refuse_step(str(table.path), step, moved, time_column)
         grid: TimeGrid | CoarseGrid | None = None

@@ -77,6 +77,7 @@ def test_feedback_of_coloured_noise_biases_a_direct_fit_and_not_two_stages():
     assert staged < 0.7 * direct
 
 
+@pytest.mark.slow
 def test_balls_hold_the_response_in_a_loop_but_not_around_a_direct_fit():
     """Of three records, whatever the colour of the noise."""
     assert bias(3, 0.3, 0.9, 1)[2] < 0.05

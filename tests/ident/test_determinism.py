@@ -101,6 +101,7 @@ def fresh():
     return in_a_fresh_process(os.environ.get("NUMBA_CACHE_DIR", ""), code)
 
 
+@pytest.mark.slow
 def test_a_fit_in_a_used_process_is_that_of_a_fresh_one(fresh):
     """There they came first."""
     everything_else()
@@ -129,6 +130,7 @@ def compiled():
     return found
 
 
+@pytest.mark.slow
 def test_kernels_are_compiled_once_for_one_kind_of_array(fresh):
     """No locked array reaches compiled code: it would be another type there, and another compilation."""
     found = fresh[1]

@@ -84,6 +84,7 @@ def test_level_is_found_with_its_standard_deviation(torque_Nm: float) -> None:
     assert found.level_std < 0.02 * found.level
 
 
+@pytest.mark.slow
 def test_a_pair_that_does_not_swing_takes_no_mode_from_the_arm() -> None:
     """Records of the default arm whose start has two overdamped pairs: their fit had a level 2 % too low, a
     Stribeck excess that is not there, and no mode at 33 Hz."""
@@ -242,6 +243,7 @@ def test_more_viscous_friction_moves_the_poles_where_the_equations_of_motion_say
     assert np.max(np.abs(there - np.sort_complex(moving))) > 1e-3
 
 
+@pytest.mark.slow
 def test_friction_is_viscous_on_average_at_an_amplitude_that_was_not_recorded() -> None:
     """Ellipses at the rms of all records hold the mean of many fresh experiments there; half were made at 2 V
     and half at 6 V."""
@@ -400,9 +402,6 @@ def test_a_shaft_that_the_records_do_not_show_is_refused() -> None:
     ]
     with pytest.raises(ValueError, match="is lost in its noise"):
         refuse_unseen_shaft(fit_friction(stuck, OPTIONS), stuck)
-    for elsewhere in (
-        recorded(0.1, 5, output=1),
-        [replace(record, output=-record.output) for record in records],
-    ):
-        with pytest.raises(ValueError, match=r"'y' is no position of the driven shaft, or .* degrees"):
-            refuse_unseen_shaft(fit_friction(elsewhere, OPTIONS), elsewhere)
+    tip = recorded(0.1, 5, output=1)
+    with pytest.raises(ValueError, match=r"'y' is no position of the driven shaft, or .* degrees"):
+        refuse_unseen_shaft(fit_friction(tip, OPTIONS), tip)

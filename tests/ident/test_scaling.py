@@ -48,10 +48,14 @@ def plain(name, delay):
     return answer(name, (1.0, 1.0, 1.0), delay)
 
 
+ALL = (1e-6, 1e6, 1e-3)
+ONE = [(1e6, 1.0, 1.0), (1.0, 1e-6, 1.0), (1.0, 1.0, 1e6), (1.0, 1.0, 1e-6)]
+
+
 @pytest.mark.parametrize(
-    "scales", [(1e6, 1.0, 1.0), (1.0, 1e-6, 1.0), (1.0, 1.0, 1e6), (1.0, 1.0, 1e-6), (1e-6, 1e6, 1e-3)]
+    ("name", "delay", "scales"),
+    [*((name, 0, ALL) for name in OPTIONS), ("white", 12, ALL), *(("white", 0, scales) for scales in ONE)],
 )
-@pytest.mark.parametrize(("name", "delay"), [*((name, 0) for name in OPTIONS), ("white", 12)])
 def test_units_change_nothing(name, delay, scales):
     found, ellipses = plain(name, delay)
     there, scaled = answer(name, scales, delay)

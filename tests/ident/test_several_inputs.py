@@ -331,6 +331,7 @@ def test_independent_inputs_are_not_called_alike(seed):
     assert not _bands(one * [1.0, 0.0], one * [0.0, 1.0])
 
 
+@pytest.mark.slow
 def test_two_link_example(tmp_path):
     from examples import two_link_arm  # here: it draws
 

@@ -217,14 +217,16 @@ LOOPS = {
 }
 
 
+@pytest.mark.parametrize("runs", [3, pytest.param(10, marks=pytest.mark.long)])
 @pytest.mark.parametrize("case", LOOPS)
-def test_the_pendulum_s_pole_is_found(case):
-    found = [find_unstable([pendulum(seed, **LOOPS[case])]) for seed in range(10)]
-    assert [poles.counts for poles in found] == [(1, 0)] * 10
+def test_the_pendulum_s_pole_is_found(case, runs):
+    found = [find_unstable([pendulum(seed, **LOOPS[case])]) for seed in range(runs)]
+    assert [poles.counts for poles in found] == [(1, 0)] * runs
     growths = np.array([-np.log(poles.real[0]) for poles in found]) / np.log(OUTSIDE)
     assert np.max(np.abs(growths - 1)) < 0.05
 
 
+@pytest.mark.parametrize("runs", [1, pytest.param(5, marks=pytest.mark.long)])
 @pytest.mark.parametrize("case", [name for name in LOOPS if name != "limited"])
 @pytest.mark.parametrize(
     "plant",
@@ -236,16 +238,16 @@ def test_the_pendulum_s_pole_is_found(case):
         pytest.param(sampled([40.0 * 900], np.polymul([1.0, 1.5, 0.3], [1, 1.2, 900])), id="slow and a mode"),
     ],
 )
-def test_stable_plants_have_none(plant, case):
+def test_stable_plants_have_none(plant, case, runs):
     gains = (0.3, 0.02) if len(plant[1]) > 3 else (1.2, 0.08)
-    for seed in range(5):
+    for seed in range(runs):
         assert find_unstable([looped(plant, seed, gains=gains, **LOOPS[case])]).order == 0
 
 
 def test_an_oscillation_that_grows_is_a_pair():
     """Negative damping; two records, each with its own start."""
     plant = sampled([40.0], [1.0, -0.8, 16.0])
-    for seed in range(5):
+    for seed in range(2):
         found = find_unstable([looped(plant, [seed, k], n=2000) for k in range(2)])
         assert found.counts == (0, 1)
         s = np.log(1 / found.pairs[0].conj()) / DT
@@ -253,9 +255,10 @@ def test_an_oscillation_that_grows_is_a_pair():
         assert abs(s - expected[expected.imag > 0][0]) < 0.02 * abs(s)
 
 
-def test_its_interval_and_the_ellipses_hold_the_truth():
+@pytest.mark.parametrize("runs", [12, pytest.param(60, marks=pytest.mark.long)])
+def test_its_interval_and_the_ellipses_hold_the_truth(runs):
     held, inside, bounds = [], [], EmbeddingOptions(fir_length=20, prior_missed_mode=0.0)
-    for seed in range(60):
+    for seed in range(runs):
         record = pendulum(400 + seed, n=1500)
         asked = IdentOptions(n_real=1, n_pairs=0).with_unstable(find_unstable([record]))
         posterior = tangent([record], identify([record], asked).model, bounds)
@@ -264,9 +267,9 @@ def test_its_interval_and_the_ellipses_hold_the_truth():
             [low < np.log(OUTSIDE) / DT < high for low, high in growth_intervals(posterior)] == [True]
         )
         held.append(posterior.at(OMEGA).contains(TRUTH))
-    # Binomial, 60 runs of a true 95 %: 52 or more in 99.7 %.
-    assert np.sum(inside) >= 52
-    assert 0.91 <= np.mean(held) <= 0.99
+    # Binomial of a true 95 %, three standard deviations: 52 or more of 60. Responses of a run move together.
+    assert np.sum(inside) >= 0.95 * runs - 3 * np.sqrt(0.95 * 0.05 * runs)
+    assert abs(np.mean(held) - 0.95) <= 0.04 * np.sqrt(60 / runs)
 
 
 def test_repeats_are_combined_with_their_unstable_pole():
