@@ -9,12 +9,13 @@ from diagnosis import diagnose
 from tests.diagnosis.recorded import answer, recorded_case
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "rig"),
     [
         ("tip_payload", "rig.toml"),
         # Backlash, gravity, two effects, none and one beyond the list: `make frozen`.
-        pytest.param("link_stiffness", "rig_uncertain.toml", marks=pytest.mark.slow),
+        ("link_stiffness", "rig_uncertain.toml"),
     ],
 )
 def test_one_effect_is_named_sized_and_closes_the_gap(gap_cases, name, rig):
