@@ -141,6 +141,15 @@ def test_stored_then_asked_again_then_moved(asking, tmp_path):
     assert "make frozen STORE=1" in said
 
 
+def test_it_stops_at_the_first_that_moved(asking):
+    asking({"one": ANSWER, "two": ANSWER}, "--store")
+    other = {"said": {"x": 1}}
+    code, said = asking({"one": other, "two": other}, "--stop")
+    assert code == 1
+    assert "1 of 2 questions" in said
+    assert "not as stored 1: one\n" in said
+
+
 def test_storing_a_part_leaves_the_rest(asking, tmp_path):
     other = {"said": {"x": 1}}
     asking({"one": ANSWER, "two": other}, "--store")
@@ -152,7 +161,7 @@ def test_what_needs_absent_data_is_skipped_and_counted(asking, tmp_path):
     code, said = asking({"one": ANSWER}, needs=(tmp_path / "nowhere",))
     assert code == 0
     assert f"skipped, {tmp_path / 'nowhere'} is not here: one" in said
-    assert "0 questions" in said
+    assert "0 of 0 questions" in said
     assert "skipped 1;" in said
 
 
