@@ -337,9 +337,10 @@ def run(
     if within:
         share, line = max(within)
         out(f"{len(within)} values moved within their tolerance, the furthest by {share:.0%} of it: {line}")
+    minutes = (time.monotonic() - begin) / 60
     out(
-        f"{count} of {len(ready)} questions, {spent_s:.0f} s CPU in {(time.monotonic() - begin) / 60:.1f} min; "
-        f"skipped {len(skipped)}; {'stored, of them moved' if store else 'not as stored'} {len(wrong)}"
+        f"{count} of {len(ready)} questions, {spent_s:.0f} s CPU in {minutes:.1f} min; skipped "
+        f"{len(skipped)}; {'stored, of them moved' if store else 'not as stored'} {len(wrong)}"
         + (f": {', '.join(wrong)}" if wrong else "")
     )
     if wrong and not store:
