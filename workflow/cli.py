@@ -476,7 +476,9 @@ def identify(
     as_json: Json = False,
 ) -> None:
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
-    given = locals() | {"relative_degree": _degree(relative_degree)}
+    # A number where one was given, so that the settings' own complaint names what is allowed.
+    number = int(relative_degree) if relative_degree and relative_degree.isdigit() else relative_degree
+    given = locals() | {"relative_degree": number}
     need(*log, *(validation or []))
     from workflow.commands.logs import are_responses, read_logs
     from workflow.config.run_config import ClosedLoopData
@@ -891,11 +893,6 @@ def _settings(model: type[ModelT], given: Mapping[str, Any]) -> ModelT:
         ) from error
 
 
-def _degree(text: str | None) -> int | str | None:
-    """A number where one was given, so that the settings' own complaint names what is allowed."""
-    return int(text) if text is not None and text.isdigit() else text
-
-
 def print_json(document: Mapping[str, Any]) -> None:
     """A document, and nothing else, on standard output; in ASCII where that is not UTF-8."""
     from workflow.engine.codec import plain_text
@@ -959,19 +956,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         if interrupts.came():  # this is what a library has made of it
             return _interrupted(arguments)
         if isinstance(error, OSError) and error.filename is None:
-            _no_more_output()
+            with suppress(OSError):  # standard output goes nowhere, at the last flush neither
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if debug:
             traceback.print_exc()
         message, code = _explain(error)
         return _complain(cut_inside(one_line(message)), code)
     finally:
         interrupts.no_limit()
-
-
-def _no_more_output() -> None:
-    """Standard output goes nowhere, at the last flush neither."""
-    with suppress(OSError):  # no file at all
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _commands() -> dict[str, Callable[..., Any]]:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from ident.basis.model_files import ModelFile
 from ident.basis.options import IdentOptions
-from ident.data.record import Record
 from workflow.commands.logs import Logs
 from workflow.config.run_config import ClosedLoopData
 from workflow.config.uncertainty_options import UncertaintyOptions
@@ -95,7 +93,17 @@ def _summary(
         numbers={
             **model_numbers(about),
             "warnings": [words(item) for item in result.careful],
-            "logs": [_log_numbers(record) for record in (*result.measured, *result.fresh_records)],
+            "logs": [
+                {
+                    "name": record.name,
+                    "dt_s": record.dt_s,
+                    "time_column": codec.plain(record.time_column),
+                    "input_unit": "".join(record.input_units),
+                    "output_unit": "".join(record.output_units),
+                    "input_cut_samples": record.cut,
+                }
+                for record in (*result.measured, *result.fresh_records)
+            ],
             "uncertainty": uncertainty_numbers(spread),
             "file": None if out is None else str(out),
             "model_file": None if export is None else str(export),
@@ -103,14 +111,3 @@ def _summary(
         verdict=count(len(result.careful), "warning"),
         report_path=None if report is None else str(report),
     )
-
-
-def _log_numbers(record: Record) -> dict[str, Any]:
-    return {
-        "name": record.name,
-        "dt_s": record.dt_s,
-        "time_column": codec.plain(record.time_column),
-        "input_unit": "".join(record.input_units),
-        "output_unit": "".join(record.output_units),
-        "input_cut_samples": record.cut,
-    }

@@ -190,7 +190,7 @@ def configuration(found: Found, records: Sequence[Entry]) -> str:
     """The TOML text."""
     filters = (
         ("toml", _toml),
-        ("toml_key", _toml_key),
+        ("toml_key", lambda name: tomlkit.key(name).as_string()),
         ("three", lambda value: _toml(float(f"{value:.3g}"))),
     )
     template = environment(*filters).get_template("init.toml.j2")
@@ -200,10 +200,6 @@ def configuration(found: Found, records: Sequence[Entry]) -> str:
 def _toml(value: Any) -> str:
     plain = value.item() if isinstance(value, np.generic) else value
     return tomlkit.item(plain).as_string()
-
-
-def _toml_key(name: str) -> str:
-    return tomlkit.key(name).as_string()
 
 
 def _stamps(table: Table, roles: Roles, time_unit: str | None) -> str:

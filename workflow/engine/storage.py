@@ -220,7 +220,8 @@ def locked(directory: Path, what: str, *below: Path) -> Iterator[None]:
     for place in below:
         if place.is_symlink():  # files of others must not be written or deleted through it
             raise InputError(f"{place}: a link; a {what} keeps its files in its own directory")
-    with open(directory / "lock", "w", opener=_no_link) as stream:
+    no_link = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW
+    with os.fdopen(os.open(directory / "lock", no_link, 0o666), "w") as stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -228,10 +229,6 @@ def locked(directory: Path, what: str, *below: Path) -> Iterator[None]:
         for place in (directory, *below):
             remove_leftovers(place)
         yield
-
-
-def _no_link(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
 def _flush_directory(directory: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from diagnosis.where.findings import SENSORS, BandGap, RegimeBin, Where
+from diagnosis.where.findings import SENSORS, BandGap, Where
 from workflow.figures import gap_style, style
 from workflow.figures.bands import Real
 from workflow.text.formats import portion
@@ -113,7 +113,12 @@ def draw_regimes(where: Where, model_error: float = 0.0) -> Figure | None:
         axes.bar(at, high - low, bottom=low, width=0.8, color="#dddddd", label=chance)
         name, colour = _LOOKS[finding.sensor]
         axes.plot(at, [one.energy for one in finding.bins], "o", ms=6, color=colour, label=name)
-        axes.set_xticks(at, [_bin_words(one, count) for one in finding.bins], fontsize=8)
+        # The label where there is room for words, else the range on two lines.
+        named = [
+            style.plain(one.label, 24) if count <= _FEW_BINS else f"{one.low:.2g}\nto {one.high:.2g}"
+            for one in finding.bins
+        ]
+        axes.set_xticks(at, named, fontsize=8)
         axes.axhline(1.0, **gap_style.floor_of(model_error))
         axes.set_ylim(bottom=0)
         axes.grid(visible=False, axis="x")
@@ -140,11 +145,6 @@ def draw_curves(where: Where) -> Figure | None:
         axes.set_ylabel(_with_unit(_ROUTES[curve.route], curve.value_unit))
         axes.set_title(f"{portion(curve.share)} of the gap energy", fontsize=9.5, fontweight="normal")
     return figure
-
-
-def _bin_words(one: RegimeBin, count: int) -> str:
-    """The label where there is room for words, else the range on two lines."""
-    return style.plain(one.label, 24) if count <= _FEW_BINS else f"{one.low:.2g}\nto {one.high:.2g}"
 
 
 def _with_unit(words: str, unit: str) -> str:

@@ -60,7 +60,13 @@ def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str 
         seen = searched[np.all((searched >= low) & (searched <= high), axis=1)]
         if seen.size:
             left.plot(seen[:, 0], seen[:, 1], **_DOTS, label=f"{seen.shape[0]} points the search tried")
-    others = [(i, j) for i, j in surface.local_minima() if _is_another(surface, i, j)]
+    # Inside the picture, and not the pair's own (which is no grid point).
+    others = [
+        (i, j)
+        for i, j in surface.local_minima()
+        if 0 < i < surface.first.size - 1 and 0 < j < surface.second.size - 1
+        if abs(np.log(surface.first[i] / surface.pole[0])) > 0.2
+    ]
     if others:
         i, j = np.array(others[:8]).T
         left.plot(first[i], second[j], **_HOLLOW, label="other local minima")
@@ -116,12 +122,6 @@ def searched_pairs(stages: Sequence[SearchStage], omega_rad_s: float) -> Real:
                 away = abs(float(np.log(best / omega_rad_s)))
                 nearest = min(nearest, (away, points), key=lambda entry: entry[0])
     return nearest[1]
-
-
-def _is_another(surface: ErrorSurface, i: int, j: int) -> bool:
-    """Whether a grid minimum lies inside the picture and is not the pair's own (which is no grid point)."""
-    inside = 0 < i < surface.first.size - 1 and 0 < j < surface.second.size - 1
-    return bool(inside and abs(np.log(surface.first[i] / surface.pole[0])) > 0.2)
 
 
 def _round_ticks(bar: Colorbar, levels: Real) -> None:

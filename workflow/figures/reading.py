@@ -33,7 +33,8 @@ def marked(figure: Figure, reaches: list[tuple[float, float]]) -> dict[str, Any]
     words = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     entries = {word: place for place, word in enumerate(words)}
     looks: dict[tuple[Any, ...], int | None] = {}
-    shown = [axes for axes in _all_axes(figure) if axes.get_visible()]
+    every: list[Any] = [one for axes in figure.axes for one in (axes, *axes.child_axes)]
+    shown = [axes for axes in every if axes.get_visible()]
     for axes in filter(shown.__contains__, figure.axes):
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             looks.setdefault(_look(handle), entries.get(str(label)))
@@ -103,11 +104,6 @@ def draw_minor_ticks(figure: Figure) -> None:
             gid=f"{'xy'[not x]}tick_minor",
         )
         axes.add_artist(line)
-
-
-def _all_axes(figure: Figure) -> Iterator[Any]:
-    for axes in figure.axes:
-        yield from (axes, *axes.child_axes)
 
 
 def _look(artist: Artist) -> tuple[Any, ...]:

@@ -204,7 +204,11 @@ class PointMaker:
                 document = with_values(self._base.document, {axis.key: value})
                 type(self._base.config).model_validate(document, context=self._base.context)
             except ValidationError as error:
-                if all(_only_a_contradiction(detail, axis.key) for detail in error.errors()):
+                # Only what sections say about values that are each right by themselves.
+                if all(
+                    detail["type"] == "value_error" and last_name(axis.key) not in detail["loc"]
+                    for detail in error.errors()
+                ):
                     continue
             except ValueError:
                 pass
@@ -228,9 +232,3 @@ def short(value: Any) -> str:
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key} = {short(item)}" for key, item in value.items()) + "}"
     return str(value)
-
-
-def _only_a_contradiction(detail: Any, key: str) -> bool:
-    """True for what sections say about values that are each right by themselves."""
-    named = last_name(key) in detail["loc"]
-    return detail["type"] == "value_error" and not named

@@ -81,7 +81,9 @@ def draft_of(records: Sequence[Record], *, position: bool, limit: float | None =
     if limit is None and at_limit is None:
         unseen = unseen_limit(look, position=position)
     if unseen is not None:
-        unseen = _of_a_data_sheet(unseen)
+        # As on a data sheet: with as few digits as the logs allow.
+        rounded = [float(f"{unseen:.{digits}g}") for digits in (1, 2, 3)]
+        unseen = next((value for value in rounded if abs(value / unseen - 1) < _SAME_DIGITS), unseen)
         look = first_look([record.limited(unseen) for record in fitted], position=position)
     reached = limit or at_limit or unseen or highest
     spread = _moved(fitted, look)
@@ -130,12 +132,6 @@ def _limit(records: Sequence[Record]) -> float | None:
         return None
     low, high = min(float(u.min()) for u in clipped), max(float(u.max()) for u in clipped)
     return high if abs(high + low) <= _SAME_LIMIT * high else None
-
-
-def _of_a_data_sheet(limit: float) -> float:
-    """The same with as few digits as the logs allow."""
-    rounded = [float(f"{limit:.{digits}g}") for digits in (1, 2, 3)]
-    return next((value for value in rounded if abs(value / limit - 1) < _SAME_DIGITS), limit)
 
 
 def _split(record: Record) -> int | None:

@@ -134,7 +134,7 @@ def untold_below_rad_s(found: FrequencyUncertainty) -> float:
 
 def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
     """What was found in one channel, for programs."""
-    model, identification = found.model, found.identification
+    model, identification, way = found.model, found.identification, found.closed_loop
     return {
         "name": found.name,
         "input": found.input,
@@ -153,7 +153,8 @@ def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
         **{f"fit_{role}_percent": fits for role, fits in found.fit_percent.items()},
         "warnings": [words(item) for item in identification.warnings],
         "verdicts": [words(item) for item in identification.verdicts],
-        "closed_loop": way_numbers(found.closed_loop),
+        # How logs made in a loop were used, and why.
+        "closed_loop": None if way is None else {"method": way.kind.name.lower(), "reason": words(way)},
         "modes": [
             {"frequency_Hz": mode.frequency_Hz, **codec.plain(mode), "is_mode": found.is_mode(mode)}
             for mode in found.modes
@@ -162,11 +163,6 @@ def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
         "tangent_optimality": identification.tangent_optimality,
         "search_evaluations": identification.search.evaluations,
     }
-
-
-def way_numbers(found: Finding | None) -> dict[str, Any] | None:
-    """How logs made in a loop were used, and why; None for others."""
-    return None if found is None else {"method": found.kind.name.lower(), "reason": words(found)}
 
 
 def uncertainty_numbers(spread: UncertainChannel) -> dict[str, Any]:

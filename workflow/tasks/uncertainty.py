@@ -62,7 +62,7 @@ _FEWEST_FREQUENCIES = 100  # over a band of the data, some decade: a nominal mod
 _SHARE_INSIDE = 0.9  # of the ellipses: below it a nominal is no member of the set it stands for
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 _NOISE_ORDERS = (8, 32)
-# A model of a loop's logs outside most of its own ellipses explains nothing: machines whose certificates held
+# A model outside most of its own ellipses explains nothing: machines whose certificates held
 # had 87 % or more of them around their model, wrong ones 46 % or less (benchmarks.closed_loop_machines).
 _MOST = 50.0
 # So does one whose best fit to a log is below this, where the sensor's noise leaves a third of the rest at
@@ -166,14 +166,17 @@ def uncertainty_of(
         linear=linear,
         tests=tests,
     )
-    if observer or (result.closed_loop is not None and result.closed_loop.kind is not FindingKind.DIRECT):
-        late = (
-            friction is not None
-            and FindingKind.ANSWERS_AT_ONCE in {warning.kind for warning in result.identification.warnings}
-            and precedes_command(friction, measured, channel.identification)
-        )
-        rms = np.sqrt(np.mean(np.concatenate([record.input for record in measured]) ** 2))
-        refuse_unexplained(result, found.agreement, friction, rms_input=float(rms), late=late)
+    in_loop = observer or (
+        result.closed_loop is not None and result.closed_loop.kind is not FindingKind.DIRECT
+    )
+    late = (
+        in_loop
+        and friction is not None
+        and FindingKind.ANSWERS_AT_ONCE in {warning.kind for warning in result.identification.warnings}
+        and precedes_command(friction, measured, channel.identification)
+    )
+    rms = np.sqrt(np.mean(np.concatenate([record.input for record in measured]) ** 2))
+    refuse_unexplained(result, found.agreement, friction, rms_input=float(rms), in_loop=in_loop, late=late)
     # In a loop friction biases damping and poles, also where a noise model leaves white residuals.
     rubs = friction is None and result.closed_loop is not None and not white
     advice = residual_advice(
@@ -184,7 +187,7 @@ def uncertainty_of(
     )
     if rubs:
         advice.append(finding(FindingKind.UNTRIED_FRICTION, output=result.output))
-    return replace(found, advice=(*advice, *nominal_doubt(found.agreement))), equivalent
+    return replace(found, advice=tuple(advice)), equivalent
 
 
 def _with_noise_model(
@@ -251,6 +254,7 @@ def uncertain_channel(
     model, linear = result.model, linear or posterior
     refuse_unanswered(result, linear, omega)
     frequency = posterior.at(omega, level)
+    bands = pairwise(np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist())  # of equal ratio
     nominal = nominal_of(posterior, poles or model.poles, omega)
     return UncertainChannel(
         name=result.name,
@@ -265,7 +269,7 @@ def uncertain_channel(
             level=level,
             band_rad_s=result.data_band_rad_s,
         ),
-        bands=tuple(band_row(frequency, low, high) for low, high in bands_of(omega)),
+        bands=tuple(band_row(frequency, low, high) for low, high in bands),
         tests=tests,
         agreement=agreement_of(frequency, nominal.frequency_response),
         intervals=intervals_of(linear, model.stable_poles, level),
@@ -295,17 +299,20 @@ def refuse_unexplained(
     friction: FrictionFit | None,
     *,
     rms_input: float,
+    in_loop: bool = True,
     late: bool = False,
 ) -> None:
-    """Raises ValueError, one line, where the model of logs made in a loop explains nothing, so that no number
-    of it means anything. friction: of the fit, None where none was identified; rms_input: of the
-    commands; late: the motion comes before its command."""
+    """Raises ValueError, one line, where the model explains nothing, so that no number of it means anything:
+    one outside its own ellipses anywhere, others where the logs were made in a loop. friction: of the fit,
+    None where none was identified; rms_input: of the commands; late: the motion comes before its command."""
     found = result.identification
     best = max(*found.fit_percent.tolist(), *(fit.fit_percent for fit in result.fresh), 0.0)
     why = ""
     if agreement.share_inside_percent < _MOST:
         outside, at = 100 - agreement.share_inside_percent, agreement.at_rad_s
         why = f"it lies outside {outside:.0f} % of its own ellipses, most near {at:.3g} rad/s"
+    elif not in_loop:
+        return
     elif friction is not None and best < _EXPLAINED and found.noise_std > _BEYOND_NOISE * friction.noise_std:
         times = found.noise_std / friction.noise_std
         why = f"its best fit to one is {best:.0f} %, and it leaves {times:.0f} times the sensor's noise"
@@ -319,7 +326,7 @@ def refuse_unexplained(
         )
         why = f"its friction cannot be told from slow poles ({known}), as behind a filter"
     if why:
-        raise ValueError(said("unexplained_logs", result.output, why, friction is not None))
+        raise ValueError(said("unexplained_logs", result.output, why, friction is not None, in_loop))
 
 
 def posterior_of(
@@ -377,12 +384,6 @@ def display_grid(model: GobfModel, records: Sequence[Record]) -> Real:
     ]
     low, high = 2 * np.pi / longest_s, np.pi / model.dt_s
     return frequency_grid(high, modes, omega_min_rad_s=low, n_log=300, n_mode=41 * len(modes))
-
-
-def bands_of(omega: Real) -> list[tuple[float, float]]:
-    """`N_BANDS` bands of equal ratio over the grid."""
-    edges = np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist()
-    return list(pairwise(edges))
 
 
 def band_row(frequency: FrequencyUncertainty, low: float, high: float) -> Band:
