@@ -86,6 +86,7 @@ def test_balls_hold_the_response_in_a_loop_but_not_around_a_direct_fit():
     assert 0.85 < held <= 1.0
 
 
+@pytest.mark.slow
 def test_records_of_the_open_loop_stay_as_they_are():
     item = log(0, 0.03, 0.0)
     free = Record("free", item.input, item.output, DT_S, *NAMES)

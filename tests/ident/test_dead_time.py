@@ -51,7 +51,11 @@ def measured(plant, delay, kind, seed, *, n=2000, noise=0.02, noise_pole=0.0, ra
     ("plant", "delay", "noise_pole"),
     [
         *[("first", 3, 0.0), ("second", 14, 0.0), ("mode", 40, 0.0)],
-        *[("first", 40, 0.8), ("second", 3, 0.8), ("mode", 14, 0.8)],
+        ("mode", 14, 0.8),
+        *[
+            pytest.param(plant, delay, 0.8, marks=pytest.mark.slow)
+            for plant, delay in (("first", 40), ("second", 3))
+        ],
     ],
 )
 def test_a_delay_is_found_with_the_order_behind_it(plant, delay, noise_pole):
@@ -72,8 +76,8 @@ def test_a_delay_is_found_with_the_order_behind_it(plant, delay, noise_pole):
     [
         ("first", "step", 40),
         ("second", "multisine", 14),
-        ("two modes", "step", 14),
         ("two modes", "multisine", 40),
+        pytest.param("two modes", "step", 14, marks=pytest.mark.slow),
     ],
 )
 def test_a_delay_is_found_with_other_inputs(plant, kind, delay):
@@ -102,6 +106,7 @@ def test_no_delay_is_found_where_there_is_none(plant, kind, seeds):
     assert wrong <= (2 if plant == "second" and kind == "step" else 0)
 
 
+@pytest.mark.slow
 def test_a_delay_longer_than_the_long_model_is_found():
     found = identify([measured("first", 700, "prbs", 3, n=3000)])
     assert (found.model.input_delay_samples, found.model.order) == (700, 1)

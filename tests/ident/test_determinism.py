@@ -108,7 +108,7 @@ def test_a_fit_in_a_used_process_is_that_of_a_fresh_one(fresh):
     assert_same(the_fits(), fresh[0], "this process against a fresh one")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_fits_do_not_depend_on_who_compiled(fresh, tmp_path):
     """The fresh process does these fits first and finds everything compiled; here everything is compiled
     anew, for other fits before them."""

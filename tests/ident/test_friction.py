@@ -389,6 +389,7 @@ def test_a_stuck_shaft_and_an_output_that_is_no_position_are_refused() -> None:
         fit_friction([record], OPTIONS.model_copy(update={"integrators": 2}))
 
 
+@pytest.mark.slow
 def test_a_shaft_that_the_records_do_not_show_is_refused() -> None:
     records, found = rubbing()
     refuse_unseen_shaft(found, records)

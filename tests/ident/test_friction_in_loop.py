@@ -139,7 +139,7 @@ def test_an_arm_without_a_constant_force_gets_none() -> None:
     assert found.level == pytest.approx(levels_of(one), rel=0.03)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_fit_decides_that_a_weight_throws_the_arm_over() -> None:
     one = machine("pendulum", 1)
     log = logged(one, 0)

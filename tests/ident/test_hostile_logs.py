@@ -117,7 +117,7 @@ ENDLESS = {
 }
 
 
-@pytest.mark.parametrize("smaller", [50, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("smaller", [50, pytest.param(1, marks=pytest.mark.long)])
 @pytest.mark.parametrize(("last", "row"), ENDLESS.values(), ids=ENDLESS)
 def test_a_sheet_without_end_is_refused_within_seconds(tmp_path, monkeypatch, last, row, smaller):
     """smaller: by how much the limits and the sheets are."""

@@ -111,7 +111,9 @@ def test_other_numbers_of_parquet(tmp_path):
 
 
 def test_columns_of_one_name_are_told_apart(tmp_path):
-    path = as_parquet(tmp_path / "a.parquet", ["t_s", "u_V", "y_rad", "y_rad"], 0.01 * K, U, Y, -Y)
+    path = read_table(
+        as_parquet(tmp_path / "a.parquet", ["t_s", "u_V", "y_rad", "y_rad"], 0.01 * K, U, Y, -Y)
+    )
     with pytest.raises(ValueError, match=r"several columns 'y_rad'; the file has #1 y_rad, #2 y_rad"):
         record(path)
     np.testing.assert_array_equal(record(path, y="#2 y_rad").output[:, 0], -Y)
