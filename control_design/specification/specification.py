@@ -242,6 +242,7 @@ class Specification(Settings):
                 "with one period"
             )
         for plant in plants:
+            plant.refuse_foreign()
             _refuse_frequencies(self, plant)
             _refuse_zeros(self, plant)
             _refuse_effort(self, plant)

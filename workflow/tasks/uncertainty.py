@@ -62,8 +62,8 @@ _FEWEST_FREQUENCIES = 100  # over a band of the data, some decade: a nominal mod
 _SHARE_INSIDE = 0.9  # of the ellipses: below it a nominal is no member of the set it stands for
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 _NOISE_ORDERS = (8, 32)
-# A model outside most of its own ellipses explains nothing: machines whose certificates held
-# had 87 % or more of them around their model, wrong ones 46 % or less (benchmarks.closed_loop_machines).
+# A model outside most of its own ellipses explains nothing: machines whose certificates held had 87 % or more
+# of them around their model, wrong ones 46 % or less (benchmarks.closed_loop_machines).
 _MOST = 50.0
 # So does one whose best fit to a log is below this, where the sensor's noise leaves a third of the rest at
 # most (right ones had 90 % and more, wrong ones 75 % and less).
@@ -99,6 +99,8 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
                 equivalent=equivalent,
                 records=records.records,
             )
+            # No margins and no certificate of such a one; `identify`, which shows none, warns of it.
+            refuse_unexplained(result, found.agreement, friction, in_loop=False)
             bands = [(band.from_rad_s, band.to_rad_s) for band in found.bands]
             scatter = scatter_of(channel, result, records.records, bands, friction)
             channels[k] = replace(found, repeat_scatter=scatter)
@@ -166,17 +168,14 @@ def uncertainty_of(
         linear=linear,
         tests=tests,
     )
-    in_loop = observer or (
-        result.closed_loop is not None and result.closed_loop.kind is not FindingKind.DIRECT
-    )
-    late = (
-        in_loop
-        and friction is not None
-        and FindingKind.ANSWERS_AT_ONCE in {warning.kind for warning in result.identification.warnings}
-        and precedes_command(friction, measured, channel.identification)
-    )
-    rms = np.sqrt(np.mean(np.concatenate([record.input for record in measured]) ** 2))
-    refuse_unexplained(result, found.agreement, friction, rms_input=float(rms), in_loop=in_loop, late=late)
+    if observer or (result.closed_loop is not None and result.closed_loop.kind is not FindingKind.DIRECT):
+        late = (
+            friction is not None
+            and FindingKind.ANSWERS_AT_ONCE in {warning.kind for warning in result.identification.warnings}
+            and precedes_command(friction, measured, channel.identification)
+        )
+        rms = np.sqrt(np.mean(np.concatenate([record.input for record in measured]) ** 2))
+        refuse_unexplained(result, found.agreement, friction, rms_input=float(rms), late=late)
     # In a loop friction biases damping and poles, also where a noise model leaves white residuals.
     rubs = friction is None and result.closed_loop is not None and not white
     advice = residual_advice(
@@ -187,7 +186,7 @@ def uncertainty_of(
     )
     if rubs:
         advice.append(finding(FindingKind.UNTRIED_FRICTION, output=result.output))
-    return replace(found, advice=tuple(advice)), equivalent
+    return replace(found, advice=(*advice, *nominal_doubt(found.agreement))), equivalent
 
 
 def _with_noise_model(
@@ -298,13 +297,13 @@ def refuse_unexplained(
     agreement: NominalAgreement,
     friction: FrictionFit | None,
     *,
-    rms_input: float,
-    in_loop: bool = True,
+    rms_input: float = 0.0,
     late: bool = False,
+    in_loop: bool = True,
 ) -> None:
     """Raises ValueError, one line, where the model explains nothing, so that no number of it means anything:
-    one outside its own ellipses anywhere, others where the logs were made in a loop. friction: of the fit,
-    None where none was identified; rms_input: of the commands; late: the motion comes before its command."""
+    of logs that were not made in a loop one outside its own ellipses. friction: of the fit, None where none
+    was identified; rms_input: of the commands; late: the motion comes before its command."""
     found = result.identification
     best = max(*found.fit_percent.tolist(), *(fit.fit_percent for fit in result.fresh), 0.0)
     why = ""
