@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # Share of its ellipses. Machines whose certificates held had their model outside 13 % of them or less, wrong
 # ones outside 54 % or more (benchmarks.closed_loop_machines).
-_OUTSIDE = 0.5
+OUTSIDE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,7 +329,7 @@ class UncertainPlant:
             distance = np.hypot(off.real / np.maximum(ellipses.semi_major, least), off.imag / minor)
             distance = np.where(ellipses.semi_major > least, distance, 0.0)
             outside = distance > 1
-            if np.sum(outside) > _OUTSIDE * np.sum(ellipses.semi_major > least):
+            if np.sum(outside) > OUTSIDE * np.sum(ellipses.semi_major > least):
                 share, at = 100 * np.mean(outside), omega[np.argmax(distance)]
                 raise ValueError(
                     f"plant {self.name!r}: the nominal model lies outside {share:.0f} % of its own ellipses, "

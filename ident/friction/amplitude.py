@@ -38,7 +38,6 @@ from ident.friction.arm import FASTEST_POLE, SteppedArm
 from ident.friction.gauss_newton import FrictionFit
 from ident.friction.posterior import BehindFriction
 
-_TERMS = 4  # N is a cubic in j omega, see above
 _REALISATIONS, _DRAWS = 128, 400
 # The first period dies out from rest, the second is in steady state.
 _PERIODS = 2
@@ -136,7 +135,7 @@ def _corner(arm: SteppedArm) -> float:
 
 def _terms(omega: RealArray, last: float, corner: float) -> ComplexArray:
     """(F, M) what N is a sum of: powers of j omega, and a step at the corner of the shaft's speed."""
-    powers = (1j * omega / last)[:, None] ** np.arange(_TERMS)
+    powers = (1j * omega / last)[:, None] ** np.arange(4)  # a cubic, see above
     if not np.isfinite(corner):
         return np.asarray(powers)
     return np.column_stack([powers, 1j * omega / (1j * omega + corner)])

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from control_design.plants.frequency_grid import frequency_grid
-from control_design.plants.plant_set import Mode
+from control_design.plants.plant_set import OUTSIDE, Mode
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.checks.answer import zero_is_inside
@@ -62,11 +62,9 @@ _FEWEST_FREQUENCIES = 100  # over a band of the data, some decade: a nominal mod
 _SHARE_INSIDE = 0.9  # of the ellipses: below it a nominal is no member of the set it stands for
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 _NOISE_ORDERS = (8, 32)
-# A model outside most of its own ellipses explains nothing: machines whose certificates held had 87 % or more
-# of them around their model, wrong ones 46 % or less (benchmarks.closed_loop_machines).
-_MOST = 50.0
-# So does one whose best fit to a log is below this, where the sensor's noise leaves a third of the rest at
-# most (right ones had 90 % and more, wrong ones 75 % and less).
+# A model outside most of its own ellipses explains nothing, and so does one whose best fit to a log is below
+# this, where the sensor's noise leaves a third of the rest at most (right ones had 90 % and more, wrong ones
+# 75 % and less).
 _EXPLAINED, _BEYOND_NOISE = 80.0, 3.0
 # So does one whose friction has a standard deviation above both of these shares, of its level and of the rms
 # command: wrong levels, and logs behind a filter, whose ellipses missed the machine (docs/decisions.md).
@@ -307,7 +305,7 @@ def refuse_unexplained(
     found = result.identification
     best = max(*found.fit_percent.tolist(), *(fit.fit_percent for fit in result.fresh), 0.0)
     why = ""
-    if agreement.share_inside_percent < _MOST:
+    if agreement.share_inside_percent < 100 * OUTSIDE:
         outside, at = 100 - agreement.share_inside_percent, agreement.at_rad_s
         why = f"it lies outside {outside:.0f} % of its own ellipses, most near {at:.3g} rad/s"
     elif not in_loop:
@@ -407,7 +405,7 @@ def agreement_of(
 
 def nominal_doubt(found: NominalAgreement) -> list[Finding]:
     """What to say of a nominal that lies outside most of its ellipses; empty for others."""
-    if found.share_inside_percent >= _MOST:
+    if found.share_inside_percent >= 100 * OUTSIDE:
         return []
     told = {"outside_percent": 100 - found.share_inside_percent, "times": found.largest_distance}
     return [finding(FindingKind.NOMINAL_OUTSIDE, **told, at_rad_s=found.at_rad_s)]
