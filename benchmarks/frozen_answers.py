@@ -317,8 +317,8 @@ def run(
             state, told = "not stored", [] if store else [f"it is stored by: {_storing(name, against)}"]
         else:
             within += [(one.share, f"{name}: {one}") for one in off if one.share <= 1]
-        if place and (told or before is None):
-            told.append(f"{answer['lines']['raises']} (raised in {place})")
+        if place and (told or before is None):  # in place of a line for each value that vanished
+            told = [f"raises, in {place}: {answer['lines']['raises']}"]
         wrong += [name] if told else []
         rest = left_s * (time.monotonic() - begin) / max(all_s - left_s, 1.0)
         out(
