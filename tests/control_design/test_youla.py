@@ -49,7 +49,8 @@ def test_one_unstable_zero_gives_the_weight_at_the_zero():
     zero = 1.2
     s = 2 / _DT_S * (zero - 1) / (zero + 1)
     truth = abs(_WEIGHT.at(np.array([s + 0j]))[0])
-    bracket = youla_bracket(_plant([1.0, -zero], [1.0, -0.5]), _spec(), _SMALL)
+    bracket = youla_bracket([_plant([1.0, -zero], [1.0, -0.5])] * 2, _spec(), _SMALL)
+    assert len(bracket.plants) == 2
     # The optimal S is reached by a Q of order two in the limit; 0.3 % is left to the basis.
     assert truth * (1 - 1e-4) <= bracket.inscribed <= truth * 1.003
     assert bracket.enclosing == pytest.approx(bracket.inscribed, rel=1e-3)  # no uncertainty: all agree
@@ -102,8 +103,7 @@ def test_integrating_plant_with_delay_is_ordered_and_finite():
     plant = hub_arm()
     arm = UncertainPlant("hub", plant, RelativeDisc(plant, 0.02, 30.0))
     spec = Specification(bandwidth_rad_s=3.0, effort_limit=20.0, modulus_margin=0.4)
-    bracket = youla_bracket([arm, arm], spec, _SMALL)
-    assert len(bracket.plants) == 2
+    bracket = youla_bracket(arm, spec, _SMALL.model_copy(update={"real_poles": 10, "grid_points": 80}))
     assert bracket.inscribed <= bracket.ellipse <= bracket.enclosing < 2.0
     # Isotropic discs: the three regions are the same.
     assert bracket.enclosing == pytest.approx(bracket.inscribed, rel=2e-3)
@@ -114,7 +114,6 @@ def test_integrating_plant_with_delay_is_ordered_and_finite():
     [
         pytest.param([8.0], [1, 1, -30], 0.01, (6.0, 0.4), 0.5756, id="pendulum"),
         pytest.param([-2000.0], [1, 60, -900, -54000], 0.002, (20.0, 0.3), 0.4889, id="levitation"),
-        pytest.param([20.0], [1, -1.6, 1.0], 0.01, (4.0, 0.3), 0.3783, id="two poles"),
         pytest.param(
             [8100.0], np.polymul([1, 0, -9], [1, 1.2, 900]), 0.01, (2.0, 0.2), 0.2713, id="resonance"
         ),
