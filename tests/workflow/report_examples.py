@@ -312,7 +312,7 @@ def _save_design(run: RunDirectory, settings: RunConfig, gain: float, impossible
     run.save_stage("closed_loop", ClosedLoopResult(check=loop_check(settings, settled)), "00")
 
 
-def achievable(reached: float = 0.8) -> AchievablePerformance:
+def achievable(reached: float = 0.79) -> AchievablePerformance:
     """What a controller of any order reaches, made up."""
     return AchievablePerformance(
         YoulaBracket((PlantBracket("hub", reached - 0.002, reached, reached + 0.002),))

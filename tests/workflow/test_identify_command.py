@@ -314,17 +314,15 @@ def test_a_log_in_milliseconds_gives_the_poles_of_the_same_log_in_seconds(flexli
     assert told["stated"]["stated"] == "time column 't': milliseconds as given, sampled every 5 ms, 3 s"
 
 
-def test_integers_called_seconds_are_doubted(flexlink, tmp_path):
+def test_integers_called_seconds_are_doubted(refused, tmp_path):
     record = p2(5, 600).record
     rows = enumerate(zip(record.input[:, 0], record.output[:, 0], strict=True))
     lines = ["t,u,y", *(f"{5 * k},{a:.12g},{b:.12g}" for k, (a, b) in rows)]
     (tmp_path / "log.csv").write_text("\n".join(lines))
     command = ("identify", tmp_path / "log.csv", "--input", "u", "--output", "y", "--time", "t")
-    command = (*command, "--real", 2, "--pairs", 3, "--json")
-    document = flexlink(*command).document()
-    assert "--time-unit ms" in document["numbers"]["warnings"][0]
-    (said,) = [row["value"] for row in document["table"] if row["label"] == "log"]
-    assert said == "time column 't': seconds (no unit given), sampled every 5 s, 3000 s"
+    said = refused(*command, "--real", 2, "--pairs", 3, "--json")
+    assert "time column 't' has steps of 5 s, no unit is stated" in said
+    assert "state --time-unit ms, or --time-unit s if it is right" in said
 
 
 @pytest.mark.parametrize(
@@ -337,10 +335,10 @@ def test_integers_called_seconds_are_doubted(flexlink, tmp_path):
         (("--report", "{log}"), "that is a source already"),
         (("--report", "{out}/a", "--out", "{out}/a"), "that is --out already"),
         (("--reference", "r"), "no column 'r'"),
-        (("--input-limit", "0"), "log.csv: the limit of the input must be positive; got 0"),
+        (("--input-limit", "0"), "the limit of the input must be positive; got 0"),
         (("--level", "0.2"), "flexlink: --level: input should be greater than 0.5"),
         (("--pairs", "13"), "flexlink: --pairs: input should be less than or equal to 12, got 13"),
-        (("--response", "amplitude 2"), "expected 'as recorded', 'without friction', 'this amplitude' or"),
+        (("--response", "amplitude 2"), "should be 'as recorded', 'without friction' or 'this amplitude'"),
         (("--response", "this amplitude", "--band", "10", "20"), "takes records as measured: no increments"),
         (("--band", "50", "20"), "a band needs 0 < low < high in rad/s; got 50, 20"),
         (("--band", "50", "2000"), "the band must lie in (0, 628"),

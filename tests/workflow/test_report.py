@@ -374,8 +374,8 @@ def test_page_tells_of_any_order_whole_responses_and_reference_filter(tmp_path, 
     gamma = RunResults(run).design.gamma
     # Made up: the bound for any order, and a worst case of the ellipses that holds for 990 of 1000 draws.
     assert f"Order 1 reaches γ = {at_most(gamma)} (needed: 1 or less); a higher order" in text
-    assert "(lower bound for any order: 0.798)" in text
-    assert "any order 0.8 such a controller was found" in text
+    assert "(lower bound for any order: 0.788)" in text
+    assert "any order 0.79 such a controller was found" in text
     assert "Of 1000 models drawn from the posterior, 99 % stay within the worst case" in text
     assert "99 % (98.17 % to 99.46 %)" in text
     assert "All frequencies together: checked on models drawn from the posterior" in text
