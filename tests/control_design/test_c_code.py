@@ -153,7 +153,7 @@ class _Running:
 
 
 def _finite(commands):
-    """NaN for infinities too: which of them follows a reading that is not finite hangs on the order of sums."""
+    """NaN for infinities too: which of them follows a reading that is not finite depends on how sums go."""
     return np.where(np.isfinite(commands), commands, np.nan)
 
 
