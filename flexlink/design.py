@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import control
@@ -25,7 +25,7 @@ from control_design.specification import Specification
 from control_design.specification.multivariable import MultivariableSpecification
 from control_design.synthesis import joint_synthesis, multivariable, synthesis, synthesis_result
 from control_design.synthesis.synthesis_options import MultivariableOptions, SynthesisOptions
-from flexlink.models import Uncertainty, warned
+from flexlink.models import Uncertainty, nominal_outside, warned
 from flexlink.shown import Shown, dressed, one_line
 from ident.checks.residual_tests import conditions_of
 from ident.data.finding import Finding
@@ -235,6 +235,9 @@ class Certificate(Shown, certificate.Certificate):
         found: list[Finding] = []
         for plant in self.uncertain_plants:
             found += conditions_of(getattr(plant.uncertainty, "advice", ()))
+            if isinstance(plant.uncertainty, Uncertainty):
+                response = partial(plant_set.frequency_response, plant.nominal)
+                found += nominal_outside(plant.uncertainty, response, plant.dt_s, plant.level)
         return warned(*found)
 
     @property

@@ -318,6 +318,13 @@ def warned(*findings: Finding) -> tuple[Finding, ...]:
     return tuple(told.values())
 
 
+def nominal_outside(uncertainty: Any, response: Any, dt_s: float, level: float = 0.95) -> list[Finding]:
+    """The doubt about a nominal response, rad/s (F,) to G (F,), outside most ellipses of an uncertainty."""
+    from workflow.tasks.uncertainty import agreement_of, nominal_doubt
+
+    return nominal_doubt(agreement_of(uncertainty.at(_nominal_grid(dt_s), level), response))
+
+
 def _nominal_grid(dt_s: float) -> npt.NDArray[np.float64]:
     nyquist = np.pi / dt_s
     return np.geomspace(1e-3 * nyquist, nyquist, _NOMINAL_POINTS)
@@ -382,10 +389,7 @@ class Uncertainty(Shown, posterior.ResponsePosterior):
     @cached_property
     def warnings(self) -> tuple[Finding, ...]:
         """What to look at before trusting the ellipses: residuals, and a nominal outside most of them."""
-        from workflow.tasks.uncertainty import agreement_of, nominal_doubt
-
-        response = self.nominal().frequency_response
-        return warned(*self.advice, *nominal_doubt(agreement_of(self.at(_nominal_grid(self.dt_s)), response)))
+        return warned(*self.advice, *nominal_outside(self, self.nominal().frequency_response, self.dt_s))
 
     @property
     def missed_mode_suspected(self) -> bool:

@@ -8,7 +8,6 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -133,7 +132,7 @@ def test_a_diagnosis_credits_everything_that_the_repaired_model_holds(tmp_path):
     assert delayed["main_cause"] == answer.probabilities["input_delay"]
 
 
-def test_ellipses_that_miss_the_model_are_in_doubt_and_have_no_certificate():
+def test_ellipses_that_miss_the_model_are_in_doubt_and_so_is_their_certificate():
     """Four real poles cannot be this mode, whose response no ellipse around them has then to hold."""
     system = control.tf([10 / 15 / 100], [1 / 15, 1]) * control.tf([1.6, 1.6, 1600], [1, 1.6, 1600])
     plant = control.sample_system(control.ss(system), 0.01, "zoh")
@@ -146,19 +145,18 @@ def test_ellipses_that_miss_the_model_are_in_doubt_and_have_no_certificate():
     for how, doubted in ((poles, True), ({"n_real": 1, "n_pairs": 1}, False)):
         found = flexlink.identify(record, integrators=0, **how)
         spread = flexlink.uncertainty(found)
-        assert bool(spread.warnings) == ("! the nominal model lies outside" in repr(spread)) == doubted
-        for ask in (flexlink.certify, flexlink.synthesise) if doubted else ():
-            with pytest.raises(ValueError, match=r"lies outside \d+ % of its own ellipses"):
-                ask(*[law] * (ask is flexlink.certify), spread, asked)
-        if not doubted:
-            assert flexlink.certify(law, spread, asked).certified
+        certificate = flexlink.certify(law, spread, asked)
+        first = repr(certificate).splitlines()[0]
+        assert certificate.certified
+        assert ("the ellipses are in doubt" in first) == doubted
+        for said in (spread, certificate):
+            assert bool(said.warnings) == ("! the nominal model lies outside" in repr(said)) == doubted
     noisy = lfilter([1.0], [1.0, -1.9, 0.95], rng.standard_normal(2000))  # a line that order 1 cannot whiten
-    found = flexlink.identify(flexlink.Record(u, y + 0.002 * noisy, 0.01), integrators=0, n_real=1, n_pairs=1)
-    doubtful = flexlink.uncertainty(found, coloured_noise=True, max_ar_order=1)
-    assert "the ellipses, and what is certified for them, may be too small" in repr(doubtful)
-    certificate = flexlink.certify(law, replace(spread, advice=doubtful.advice), asked)
-    assert "the ellipses are in doubt" in repr(certificate).splitlines()[0]
-    assert "may be too small" in repr(certificate)
+    record = flexlink.Record(u, y + 0.002 * noisy, 0.01)
+    found = flexlink.identify(record, integrators=0, n_real=1, n_pairs=1)
+    spread = flexlink.uncertainty(found, coloured_noise=True, max_ar_order=1)
+    assert "the ellipses, and what is certified for them, may be too small" in repr(spread)
+    assert "may be too small" in repr(flexlink.certify(law, spread, asked))
 
 
 def test_every_name_is_there_and_shown_in_an_example():

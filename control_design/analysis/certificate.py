@@ -139,8 +139,6 @@ def certify(
             f"the controller has {controller.computational_delay_samples} samples of computational delay, "
             f"the specification {specification.computational_delay_samples}"
         )
-    for plant in plants:
-        plant.refuse_foreign()
     joint = None
     if joint_coverage is not None:
         if rng is None:

@@ -14,10 +14,6 @@ from control_design.plants.ellipses import Complex, Ellipses, EvaluableUncertain
 if TYPE_CHECKING:
     import control
 
-# Share of its ellipses. Machines whose certificates held had their model outside 13 % of them or less, wrong
-# ones outside 54 % or more (benchmarks.closed_loop_machines).
-OUTSIDE = 0.5
-
 
 @dataclass(frozen=True, eq=False)
 class Channel:
@@ -314,25 +310,3 @@ class UncertainPlant:
     def at(self, omega_rad_s: Real) -> Ellipses:
         """Ellipses of input -> measured output at omega (F,)."""
         return self.channel.at(omega_rad_s)
-
-    def refuse_foreign(self) -> None:
-        """Raises ValueError, one line, where a nominal lies outside most of its own ellipses: its poles are
-        not those of the responses that margins are taken of. Ellipses of no size say nothing."""
-        for channel in dict.fromkeys((self.channel, self.damped)):
-            own = channel.own_grid
-            omega = np.geomspace(1e-3, 1.0, 400) * self.nyquist_rad_s if own is None else own[own > 0]
-            ellipses, nominal = channel.at(omega), channel.nominal_response(omega)
-            # Axes that are rounding of the response are none.
-            least = 1e-9 * (np.abs(ellipses.centre) + np.abs(nominal))
-            off = (nominal - ellipses.centre) * np.conj(ellipses.direction)
-            minor = np.maximum(ellipses.semi_minor, least)
-            distance = np.hypot(off.real / np.maximum(ellipses.semi_major, least), off.imag / minor)
-            distance = np.where(ellipses.semi_major > least, distance, 0.0)
-            outside = distance > 1
-            if np.sum(outside) > OUTSIDE * np.sum(ellipses.semi_major > least):
-                share, at = 100 * np.mean(outside), omega[np.argmax(distance)]
-                raise ValueError(
-                    f"plant {self.name!r}: the nominal model lies outside {share:.0f} % of its own ellipses, "
-                    f"most near {at:.3g} rad/s: margins would be those of another machine; allow more poles, "
-                    "or give the ellipses of this model"
-                )

@@ -242,7 +242,6 @@ class Specification(Settings):
                 "with one period"
             )
         for plant in plants:
-            plant.refuse_foreign()
             _refuse_frequencies(self, plant)
             _refuse_zeros(self, plant)
             _refuse_effort(self, plant)

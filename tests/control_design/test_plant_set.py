@@ -6,15 +6,7 @@ import control
 import numpy as np
 import pytest
 
-from control_design import (
-    Channel,
-    Controller,
-    Specification,
-    UncertainPlant,
-    certify,
-    synthesise,
-    youla_bracket,
-)
+from control_design import Channel, UncertainPlant
 from control_design.plants.plant_set import count_integrators, frequency_response, modes_of
 from validation.example_plants import LinkUncertainty, ResponseRecord, flexible_link
 
@@ -76,45 +68,6 @@ def test_uncertainty_on_its_own_grid_is_refused_elsewhere_and_nominal_outside():
     assert np.all(plant.at(np.array([0.5, 10.0])).semi_major == 0)
     with pytest.raises(ValueError, match=r"own grid only; 3 rad/s is not on it"):
         plant.at(np.array([1.0, 3.0]))
-
-
-_FOREIGN = control.c2d(control.ss(control.tf([50 * 1.1], [1, 8, 0])), 0.005, "zoh")  # without the mode
-
-
-@pytest.mark.parametrize(
-    "plant",
-    [
-        UncertainPlant("arm", _FOREIGN, RelativeDisc(hub_arm(), 0.02, 60.0)),
-        UncertainPlant(
-            "arm", _FOREIGN, RelativeDisc(hub_arm(), 0.02, 60.0).at(np.geomspace(0.1, 600, 90), 0.95)
-        ),
-        UncertainPlant("arm", hub_arm(), performance=Channel(_FOREIGN, RelativeDisc(hub_arm(), 0.02, 60.0))),
-        UncertainPlant("arm", 1.5 * hub_arm(), RelativeDisc(hub_arm(), 0.02, 1e9)),
-    ],
-    ids=["any frequency", "own grid", "performance", "gain"],
-)
-def test_no_margins_of_a_model_outside_its_own_ellipses(plant):
-    """Not by certificate, synthesis or bound; one at the edge of its ellipses, or an exact one, has them."""
-    k, spec = Controller.proportional(0.1, plant.dt_s), Specification(modulus_margin=0.2)
-    for call in (
-        lambda: certify(k, [plant], spec),
-        lambda: synthesise([plant], spec, rng=np.random.default_rng(0)),
-        lambda: youla_bracket(plant, spec),
-    ):
-        with pytest.raises(
-            ValueError, match=r"'arm': the nominal model lies outside \d+ % of its own ellipses"
-        ) as told:
-            call()
-        assert "\n" not in str(told.value)
-    edge = np.sqrt(-2 * np.log(0.05)) * 0.02  # of the relative disc at 95 %
-    for factor, taken in ((1 + 0.9 * edge, True), (1 - 0.9 * edge, True), (1 + 1.1 * edge, False)):
-        near = UncertainPlant("arm", factor * hub_arm(), RelativeDisc(hub_arm(), 0.02, 1e9))
-        if taken:
-            near.refuse_foreign()
-        else:
-            with pytest.raises(ValueError, match="outside 100 %"):
-                near.refuse_foreign()
-    UncertainPlant("exact", hub_arm(), RelativeDisc(_FOREIGN, 0.0, 60.0)).refuse_foreign()
 
 
 @pytest.mark.parametrize(
