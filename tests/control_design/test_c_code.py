@@ -147,14 +147,9 @@ class _Running:
         x = np.zeros(self.x.size, kind)
         for matrix, values in parts:
             for column, value in zip(matrix.T, values, strict=True):
-                x = x + column * value
+                x = x + (column * value + (value - value) if matrix is self.b else column * value)
         self.x, self.last = x, command
         return command
-
-
-def _finite(commands):
-    """NaN for infinities too: which of them follows a reading that is not finite depends on how sums go."""
-    return np.where(np.isfinite(commands), commands, np.nan)
 
 
 @cache
@@ -233,8 +228,7 @@ def test_the_code_of_any_controller_is_its_stepper(tmp_path, count):
     code, limited = compiled(_in_one_file(sources), tmp_path), 0
     for k, (law, errors, reference) in enumerate(drawn):
         found, flags = _run_code(code, f"d{k}", law, "double", errors, reference)
-        documented = _run(_Running(law, np.float64), errors, reference)
-        np.testing.assert_array_equal(_finite(found), _finite(documented), str(k))
+        np.testing.assert_array_equal(found, _run(_Running(law, np.float64), errors, reference), str(k))
         stepper = _run(running := _Stepper(law), errors, reference)
         exact = _run(_Running(law, np.longdouble), errors, reference)
         finite = np.isfinite(exact)
@@ -250,7 +244,7 @@ def test_the_code_of_any_controller_is_its_stepper(tmp_path, count):
             rounded = law_in("float", law)
             single, _ = _run_code(code, f"f{k}", law, "float", errors, reference)
             documented = _run(_Running(rounded, np.float32), errors, reference)
-            np.testing.assert_array_equal(_finite(single), _finite(documented), str(k))
+            np.testing.assert_array_equal(single, documented, str(k))
     assert limited > 10 * count, "the runs must saturate to mean anything"
 
 
