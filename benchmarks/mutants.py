@@ -403,6 +403,11 @@ def run(
     frozen: bool = True,
 ) -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # or the copies would stay in /tmp
+    if tests_of and not Path(tests_of, "tests").is_dir():
+        print(
+            f"--tests-of {tests_of}: no tests/ there; expected a checkout of this repository", file=sys.stderr
+        )
+        sys.exit(2)
     mutants = drawn(ROOT, seed, per_room, rooms)
     if list_only:
         for mutant in mutants:

@@ -67,9 +67,8 @@ def test_the_other_program_that_counts_finds_the_same():
     other = concepts.ROOT.parent / "shared" / "tools" / "concepts.py"
     if not other.is_file():
         pytest.skip(f"{other.name} is not beside the project")
-    if subprocess.run(
-        ["git", "status", "--porcelain"], cwd=concepts.ROOT, capture_output=True, check=True
-    ).stdout:
+    status = ["git", "status", "--porcelain"]
+    if subprocess.run(status, cwd=concepts.ROOT, capture_output=True, check=True).stdout:
         pytest.skip("files are not committed, which the other program does not see")
     done = subprocess.run(
         [sys.executable, str(other), "--json"], cwd=concepts.ROOT, capture_output=True, check=True

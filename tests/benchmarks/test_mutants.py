@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.mutants import ROOMS, ROOT, Copy, Judge, changed, drawn, files_of, mutants_of, placed
+from benchmarks.mutants import ROOMS, ROOT, Copy, Judge, changed, drawn, files_of, mutants_of, placed, run
 
 SOURCE = b'''"""Docs with 3 * 4."""
 from dataclasses import dataclass
@@ -221,6 +221,13 @@ def test_a_statement_is_found_in_another_checkout_where_it_is_there_once(checkou
         (other / f"plant/{name}.py").write_text(CODE)
     with pytest.raises(ValueError, match="its statement is in 2 files"):
         placed(mutant, other)
+
+
+def test_tests_of_a_checkout_that_is_none_are_refused_in_one_line(tmp_path, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        run(print, tests_of=str(tmp_path))
+    said, expected = capsys.readouterr().err, "no tests/ there; expected a checkout of this repository\n"
+    assert said == f"--tests-of {tmp_path}: {expected}"
 
 
 def test_an_end_by_signal_leaves_nothing(checkout, tmp_path):
