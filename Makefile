@@ -14,6 +14,8 @@ VERSION := $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export NO_MKDOCS_2_WARNING := 1
+# Without bytecode every process that a test starts compiles a thousand modules again, which takes five seconds.
+unexport PYTHONDONTWRITEBYTECODE
 # A process a core, from two to four: each takes .8 GB.
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$((n < 2 ? 2 : n > 4 ? 4 : n)))
 # Times of all tests are kept: `python -m benchmarks.durations` tells where they go.
