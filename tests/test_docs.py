@@ -89,7 +89,7 @@ def run_command(command: str, flexlink: Callable[..., Answer]) -> str:
 @pytest.mark.parametrize(
     "name",
     # The margins of the same run are held by test_margins.py.
-    [pytest.param(n, marks=pytest.mark.slow) if n == "margins_in_ci.md" else n for n in CONSOLE],
+    [pytest.param(n, marks=pytest.mark.long) if n == "margins_in_ci.md" else n for n in CONSOLE],
 )
 @pytest.mark.usefixtures("examples_alone")
 def test_commands_of_a_page_print_what_it_says(name, flexlink):
@@ -150,8 +150,14 @@ def test_every_key_of_a_configuration_has_a_meaning():
     assert "| **`amplitude_V`** | V |  | largest voltage |" in text
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NOTEBOOKS)
+# Two of four readers every day: the others run the same commands on more logs.
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in ("student", "lecturer") else pytest.mark.long)
+        for name in NOTEBOOKS
+    ],
+)
 def test_tutorial_runs_and_shows_what_it_finds(name, tmp_path, monkeypatch):
     pytest.importorskip("mkdocs")
     from mkdocs.structure.files import Files

@@ -77,7 +77,9 @@ def test_examples_run(module, monkeypatch):
     assert result.failed == 0
 
 
-@pytest.mark.parametrize("path", [GUIDE, ROOT / "README.md"], ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path", [pytest.param(GUIDE, marks=pytest.mark.slow), ROOT / "README.md"], ids=lambda path: path.name
+)
 def test_documents_run(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = doctest.testfile(str(path), module_relative=False, optionflags=FLAGS)

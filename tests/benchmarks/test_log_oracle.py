@@ -8,7 +8,7 @@ from tests.ident.generated_logs import generated
 
 @pytest.mark.parametrize("text_share", [1.0, 0.0], ids=["text", "others"])
 def test_no_log_is_misread_in_silence_and_every_hint_helps(tmp_path, text_share):
-    count = 40 if text_share else 4  # which take a process each
+    count = 20 if text_share else 2  # which take a process each
     logs = [generated(4711, number, text_share) for number in range(count)]
     found = [(log.kind, *log_oracle.outcome(log, tmp_path)) for log in logs]
     assert [one for one in found if one[1] not in (*log_oracle.GOOD, log_oracle.HINT)] == []

@@ -52,7 +52,7 @@ def test_unstable_draws_are_those_whose_poles_say_so():
     assert 0 < np.mean(found.stable) < 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("scenario", ["A", "B", "C"])
 def test_link_holds_in_95_percent_of_fresh_draws(scenario):
     plant, spec = flexible_link(scenario), flexible_link_specification(1)

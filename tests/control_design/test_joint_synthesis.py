@@ -123,7 +123,7 @@ def test_bad_input_is_refused():
         Guard(0, np.array([2.0, 1.0]), np.array([1.0 + 0j, 1.0]))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_link_b_is_stable_for_999_of_1000_parameter_draws():
     """Mode frequency three standard deviations high leaves every ellipse; plain designs lose 0.15 %."""
     plant, specification = flexible_link("B"), flexible_link_specification(5)

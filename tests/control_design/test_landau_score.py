@@ -103,6 +103,7 @@ def test_fast_margins_agree_with_the_score(s_length):
             assert f == pytest.approx(s, abs=tolerance), item
 
 
+@pytest.mark.slow
 def test_short_search_reaches_the_full_score():
     start = np.array([0.2, -0.55, 0.4, -0.05, -0.3, -0.2])
     x = search(start, 4, np.random.default_rng(0), generations=60, population=40)

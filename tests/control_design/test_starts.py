@@ -150,7 +150,7 @@ def test_a_cancelling_section_does_not_change_the_controller():
         with_cancelling_section(lower, x, lower, rng)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_active_damping_agrees_between_seeds_and_gains_with_order():
     """Orders 2 and 4 from two seeds with a short search; both beat doing nothing (1/0.3) by far."""
     gammas: dict[int, list[float]] = {2: [], 4: []}

@@ -9,7 +9,7 @@ import pytest
 from examples import two_joints
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_logs_of_two_joints_become_a_certified_controller(tmp_path, capsys):
     two_joints.run(tmp_path)
     said = capsys.readouterr().out

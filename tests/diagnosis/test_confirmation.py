@@ -30,7 +30,7 @@ def _estimation_gap(found):
 _FIT, _HELD_OUT = 3 / np.sqrt(2 * 2800), 3 / np.sqrt(2 * 1400)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_only_large_motions_show_is_unknown(tmp_path):
     # Air drag grows with the square of the speed: a tenth of the torque at a third of it.
     found = diagnose(_case(tmp_path, [{"name": "air_drag", "coefficient_Ns2_m3": 0.01}]))
@@ -53,7 +53,7 @@ def _payload(mass_kg):
     return [{"name": "tip_payload", "mass_kg": mass_kg}]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_fluke_of_the_estimation_records_is_no_effect(tmp_path):
     # A payload in the estimation records alone, as a fluke of their noise would look.
     found = diagnose(_case(tmp_path, _payload(1.5e-4), held_out=[], held_out_V=0.4))
@@ -62,13 +62,14 @@ def test_a_fluke_of_the_estimation_records_is_no_effect(tmp_path):
     assert found.probabilities["none"] > 0.9
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_same_where_the_held_out_records_show_it_too_is_one(tmp_path):
     found = diagnose(_case(tmp_path, _payload(1.5e-4), held_out_V=0.4))
     assert not found.held_out_decided
     assert found.combination == ("tip_payload",)
 
 
+@pytest.mark.slow
 def test_what_only_the_held_out_records_make_likely_is_an_effect(tmp_path):
     found = diagnose(_case(tmp_path, _payload(1.2e-4), held_out_V=0.4))
     assert found.held_out_decided

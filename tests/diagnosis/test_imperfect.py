@@ -215,6 +215,7 @@ def _simulated(effect, seed=15):
     return Case("simulated", RIG, tuple(records), 0.05)
 
 
+@pytest.mark.slow
 def test_dry_friction_of_the_background_is_inside_the_interval_of_the_friction_found():
     # A part of what rubs is no listed effect: what is found is both together.
     found = diagnose(_simulated({"name": "coulomb_friction", "torque_Nm": 0.1}))
@@ -609,7 +610,8 @@ def test_every_likely_set_of_an_effect_and_the_effect_alone_are_also_fitted_with
         assert tuple(sorted({"ground_spring", *names} - {"gravity"})) in fitted
 
 
-@pytest.mark.parametrize("seed", [3, *(pytest.param(k, marks=pytest.mark.slow) for k in (5, 7))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [3, 5, 7])
 def test_a_record_that_begins_in_free_play_is_followed_from_there(seed):
     # Cut out of a run: until the hub touches, it goes on as it went, which no linear arm does.
     rng = np.random.default_rng(seed)
@@ -689,7 +691,7 @@ def test_one_window_is_the_free_run_and_states_of_each_act_in_it_alone():
     assert np.flatnonzero(difference)[[0, -1]] // 100 == pytest.approx([3, 3])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_far_values_are_scanned_where_contacts_switch():
     joint = {"name": "joint_compliance", "stiffness_Nm_rad": 40.0, "damping_Nms": 0.01}
     search, kinds = _hub_only(1, joint, {"name": "backlash", "gap_rad": 0.1})

@@ -79,7 +79,11 @@ def _missed(found, truth, free):
 
 
 @pytest.mark.parametrize(
-    ("name", "motion"), [("mass", "x"), ("on a spring", "x"), ("on a spring", "v"), ("pendulum", "v")]
+    ("name", "motion"),
+    [
+        pytest.param("mass", "x", marks=pytest.mark.slow),
+        *[("on a spring", "x"), ("on a spring", "v"), ("pendulum", "v")],
+    ],
 )
 def test_dry_friction_around_a_simulation_is_the_one_inside_it(name, motion):
     errors = []

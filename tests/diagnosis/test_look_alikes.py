@@ -33,7 +33,7 @@ def _found(folder, cause, acceleration_m_s2, amplitude_V):
     return diagnose(case)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("cause", ["gravity", "spring"])
 def test_what_the_records_cannot_tell_apart_is_gravity_or_unknown(tmp_path, cause):
     # 0.04 rad of motion, a gap of a tenth of the noise.
@@ -50,7 +50,7 @@ def test_what_the_records_cannot_tell_apart_is_gravity_or_unknown(tmp_path, caus
     assert found.probabilities["gravity"] == pytest.approx(0.78, abs=0.06)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_gravity_that_also_bends_the_link_is_gravity(tmp_path):
     found = _found(tmp_path, "gravity", 0.4, 0.15)
     assert found.combination == ("gravity",)

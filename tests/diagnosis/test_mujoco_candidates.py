@@ -136,18 +136,13 @@ CASES: dict[str, tuple[Machine, str, str, str, float]] = {
 }
 
 
-# One of what the repaired file can only note, one each of the values, forces and shapes; all take as long.
-FAST, SLOW = ("dead zone",), ("kp", "a limit", "stretch")
+# One of what the repaired file can only note, one of the values; all take as long.
+SLOW = ("dead zone", "kp")
 
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(
-            name, marks=[] if name in FAST else getattr(pytest.mark, "slow" if name in SLOW else "long")
-        )
-        for name in CASES
-    ],
+    [pytest.param(name, marks=pytest.mark.slow if name in SLOW else pytest.mark.long) for name in CASES],
 )
 def test_it_is_named_with_its_size_and_the_repaired_model_moves_as_the_machine(tmp_path, name):
     machine, stated, candidates, effect, size = CASES[name]

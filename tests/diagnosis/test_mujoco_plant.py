@@ -56,7 +56,7 @@ def test_a_stick_figure_stands_where_its_joint_says():
     np.testing.assert_allclose(lines[:, -1, 0], 0 * tips, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_force_limit_that_is_stated_wrong_is_named():
     limit, stated = 0.7, 0.35
     text = ROD.replace(

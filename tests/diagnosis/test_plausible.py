@@ -145,6 +145,7 @@ def test_effects_that_change_the_motion_most_are_no_fault():
         refuse_implausible(case)
 
 
+@pytest.mark.slow
 def test_no_recorded_case_is_refused_and_its_faults_are(gap_cases):
     """The workshop's cases are loaded one by one in tests/workflow/test_diagnose_case_files.py."""
     for folder in sorted((gap_cases / "labelled").iterdir()):

@@ -104,6 +104,7 @@ def test_without_a_stated_model_error_the_records_say_whether_there_is_one(
     assert found.doubts == ()
 
 
+@pytest.mark.slow
 def test_the_example_runs_and_finds_what_it_lacks(capsys, monkeypatch):
     found = own_plant.run(seed=1)
     monkeypatch.setattr(own_plant, "run", lambda: found)

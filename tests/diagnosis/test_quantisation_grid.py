@@ -86,7 +86,7 @@ def _rounded(case, step):
     return Case(case.name, case.rig, tuple(experiments))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rounded_records_name_quantisation_beside_the_rest(gap_cases):
     step = 2e-3
     found = diagnose(_rounded(recorded_case(gap_cases / "labelled" / "tip_payload"), step))

@@ -9,7 +9,7 @@ from diagnosis import diagnose
 from tests.diagnosis.recorded import answer, recorded_case
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "rig"),
     [

@@ -28,8 +28,14 @@ def _near_the_truth(folder, effect, values, *, seed, off=1.0):
 
 
 # Of eight rigs those whose contacts amplify most.
-@pytest.mark.parametrize("seed", [0, 1, 6, 7])
-@pytest.mark.parametrize("off", [0.999, 1.001])
+@pytest.mark.parametrize(
+    ("seed", "off"),
+    [
+        *[(0, 0.999), (7, 1.001)],
+        *[pytest.param(0, 1.001, marks=pytest.mark.slow), pytest.param(7, 0.999, marks=pytest.mark.slow)],
+        *[pytest.param(seed, off, marks=pytest.mark.long) for seed in (1, 6) for off in (0.999, 1.001)],
+    ],
+)
 def test_a_machine_that_is_off_by_a_hair_leaves_no_more(tmp_path, seed, off):
     model, end = _near_the_truth(tmp_path, "backlash", {"gap_rad": 0.03}, seed=seed, off=off)
     spread = solver_spread(model, end, model.case.experiments)

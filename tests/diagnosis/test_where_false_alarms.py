@@ -30,7 +30,7 @@ def _alarms(found):
 REACHED = ("sensors", "experiments", "bands", "regimes", "drift")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_axis_keeps_its_level():
     count: dict[str, int] = {}
     for seed in range(SEEDS):

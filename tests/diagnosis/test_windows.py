@@ -103,7 +103,7 @@ def _bar(bias_V):
     return Case("bar", RIG, tuple(records), 0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_drift_alone_makes_no_effect():
     found = diagnose(_bar(0.1))
     assert found.verdict == "unknown"

@@ -123,6 +123,7 @@ PLANTS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "runs", [pytest.param(4, marks=pytest.mark.slow), pytest.param(30, marks=pytest.mark.long)]
 )

@@ -243,7 +243,7 @@ def test_more_viscous_friction_moves_the_poles_where_the_equations_of_motion_say
     assert np.max(np.abs(there - np.sort_complex(moving))) > 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_friction_is_viscous_on_average_at_an_amplitude_that_was_not_recorded() -> None:
     """Ellipses at the rms of all records hold the mean of many fresh experiments there; half were made at 2 V
     and half at 6 V."""
@@ -331,7 +331,7 @@ def test_a_strong_line_meets_more_friction_in_the_response_too() -> None:
     assert 1.7 < values[strong] / np.mean(values[[strong - 1, strong + 1]]) < 1.95
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_no_poles_follow_of_strong_lines_is_small_beside_the_ellipses() -> None:
     """N that falls with frequency and has no phase: the formula of the best linear approximation itself, on
     the centre of the arm. Of several records: what modes may be missed is drawn and differs with rounding."""

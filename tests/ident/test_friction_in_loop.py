@@ -129,7 +129,7 @@ def test_friction_at_the_load_of_a_wheel_is_found_with_its_share() -> None:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xfail(reason="the fit ends in one of two minima, by the rounding of the machine", strict=False)
 def test_an_arm_without_a_constant_force_gets_none() -> None:
     """A bias that the errors' variance alone decided was 2 % of the command here, the friction 10 % off."""

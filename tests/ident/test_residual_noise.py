@@ -174,7 +174,7 @@ def test_first_rows_are_dropped_where_their_covariance_is_nearly_singular():
     np.testing.assert_array_equal(pair.first, 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_noise_model_is_not_biased_by_the_fit():
     """A pole of the plant (0.88) beside that of the noise (0.9), offset and initial state estimated."""
     found = []

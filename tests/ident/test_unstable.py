@@ -257,7 +257,7 @@ def test_an_oscillation_that_grows_is_a_pair():
         assert abs(s - expected[expected.imag > 0][0]) < 0.02 * abs(s)
 
 
-@pytest.mark.parametrize("runs", [12, pytest.param(60, marks=pytest.mark.long)])
+@pytest.mark.parametrize("runs", [6, pytest.param(60, marks=pytest.mark.long)])
 def test_its_interval_and_the_ellipses_hold_the_truth(runs):
     held, inside, bounds = [], [], EmbeddingOptions(fir_length=20, prior_missed_mode=0.0)
     for seed in range(runs):

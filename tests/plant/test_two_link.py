@@ -27,6 +27,7 @@ def _without_losses(**changes) -> TwoLinkArm:
     return TwoLinkArm(links, hubs, (free, free), 0.25, 0.1, **changes)
 
 
+@pytest.mark.slow
 def test_without_losses_the_shoulder_keeps_its_angular_momentum():
     """No torque acts about the shoulder's axis, whatever link 2 and the bending do: dL/dt = 0, with L the
     derivative of the kinetic energy by a common turn. A point-mass sum over both links stands for L."""

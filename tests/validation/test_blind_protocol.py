@@ -100,7 +100,7 @@ def test_rigs_are_arms_and_what_is_stated_is_off_by_tolerances():
     assert abs(np.std(off) - 0.88) < 0.16
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_generated_cases_hold_what_their_answers_say(tmp_path):
     # Five cases: one of every sort.
     answers = generate(5, 5, tmp_path, open_cases=True)

@@ -146,7 +146,7 @@ def test_a_schedule_has_the_shares_and_no_effect_its_sensors_cannot_show():
     assert not [p for p in plans if p.first_effect in TIP_ONLY and p.sensor != "tip"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_generated_cases_load_and_hold_what_their_answers_say(tmp_path):
     # One of each verdict: the pair and the second single effect take twenty seconds each.
     left_out = {name: {"case": name} for name in ("case_0002", "case_0005")}

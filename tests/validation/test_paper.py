@@ -25,6 +25,8 @@ from validation.paper.table import csv_text, rows_of
 from workflow.engine.progress import Progress
 from workflow.figures import style
 
+pytestmark = pytest.mark.slow
+
 # Everything once, and the searches long enough to find something.
 SMALL = PaperSettings(seed=7, repeats=2, searches=1, evaluations=200, surface_points=21, grids=(11, 21))
 
@@ -114,7 +116,7 @@ def test_verdicts_follow_the_numbers(results, pictures):
     assert any(row.ours == "runs away" for row in rows_of(away))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_numbers(results):
     again = run_experiments(SMALL, Progress())
     assert csv_text(rows_of(again)) == csv_text(rows_of(results))

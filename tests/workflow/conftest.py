@@ -3,39 +3,42 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
-import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.workflow.command import FAST_ARM, draw_nothing
+from tests.workflow.command import FAST_ARM, build_nothing, draw_nothing
 from tests.workflow.study_examples import write_study
-from workflow.text.templates import RunSummary
+from workflow.text.templates import Row, RunSummary, Section
 
-MakeOnce = Callable[[str, Callable[[Path], Any]], tuple[Path, Any]]
+MakeOnce = Callable[[str, Callable[[Path], RunSummary | None]], tuple[Path, RunSummary | None]]
 
 
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> MakeOnce:
     """make(directory) is called by the first worker that asks for the name; every worker gets a copy of the
-    directory of its own, and the value that came back."""
+    directory of its own, and the summary that came back."""
     base = tmp_path_factory.getbasetemp()
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
-    def once(name: str, make: Callable[[Path], Any]) -> tuple[Path, Any]:
+    def once(name: str, make: Callable[[Path], RunSummary | None]) -> tuple[Path, RunSummary | None]:
         (kept := base / f"once-{name}").mkdir(exist_ok=True)
         with open(kept / "lock", "w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not (kept / "value").exists():
                 value = make(kept / "out")
-                (kept / "value").write_bytes(pickle.dumps(value))
+                (kept / "value").write_text(json.dumps(None if value is None else vars(value)))
         out = tmp_path_factory.mktemp(name) / "out"
         shutil.copytree(kept / "out", out, symlinks=True)
-        return out, pickle.loads((kept / "value").read_bytes())  # noqa: S301
+        value = json.loads((kept / "value").read_text())
+        if value is None:
+            return out, None
+        tables = [Section(title, [Row(*row) for row in rows]) for title, rows in value.pop("sections")]
+        return out, RunSummary(sections=tables, **value)
 
     return once
 
@@ -63,3 +66,9 @@ def small_study(made_once: MakeOnce) -> tuple[Path, RunSummary]:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     draw_nothing(monkeypatch)
+
+
+@pytest.fixture
+def unbuilt(undrawn: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For sentences of a page."""
+    build_nothing(monkeypatch)

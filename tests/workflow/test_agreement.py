@@ -60,6 +60,7 @@ CASES = {
         FindingKind.DIRECT_WITH_FRICTION,
     ),
 }
+TIERS = {"open loop": pytest.mark.slow, "friction": pytest.mark.long}
 
 
 def by_run(
@@ -88,7 +89,8 @@ def by_run(
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(name, marks=[pytest.mark.slow] * (name == "friction")) for name in CASES]
+    "case",
+    [pytest.param(name, marks=TIERS.get(name, ())) for name in CASES],
 )
 def test_the_same_numbers_by_identify_and_by_run(case, tmp_path):
     signals, reference, settings, way = CASES[case]

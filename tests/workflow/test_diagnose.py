@@ -474,7 +474,7 @@ def test_a_process_that_dies_is_that_cases_failure(cases, tmp_path):
     assert "died" in found.failures[0][1].reason
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_killed_and_resumed_ends_with_the_same_bytes(tmp_path):
     short = {"records": 2, "samples": 160}
     cases = *write_fleet(tmp_path / "fleet", 1, samples=90), write_case(tmp_path / "arm", FRICTION, **short)
@@ -492,7 +492,7 @@ def test_killed_and_resumed_ends_with_the_same_bytes(tmp_path):
     assert everything(killed) == everything(quiet)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_recorded_case_from_files_to_files(gap_cases, tmp_path, flexlink):
     """The labelled case with a payload: named, sized, closed, and its files for whoever comes next."""
     truth = tomllib.loads((gap_cases / "labelled/tip_payload/answer.toml").read_text())

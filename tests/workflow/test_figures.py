@@ -114,7 +114,9 @@ def test_pictures_of_a_planned_experiment():
         is_whole(figure)
 
 
-@pytest.mark.parametrize("names", [(), (HOSTILE, HOSTILE)], ids=["plain", "hostile"])
+@pytest.mark.parametrize(
+    "names", [pytest.param((), marks=pytest.mark.slow), (HOSTILE, HOSTILE)], ids=["plain", "hostile"]
+)
 def test_titles_units_and_a_legend_nothing_cut_off_and_nothing_overlapping(names):
     for figure in pictures(*names).values():
         has_titles_units_and_a_legend(figure)

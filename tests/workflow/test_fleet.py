@@ -149,7 +149,7 @@ def test_answers_are_written_one_after_another():
             assert answers.read == k + 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_worker_killed_midway_changes_no_byte(cluster, tmp_path):  # noqa: F811
     call = ("diagnose", *write_fleet(tmp_path / "cases", 3, samples=90))
     finish(start_flexlink(*call, "--out", tmp_path / "near", "--jobs", "2"))

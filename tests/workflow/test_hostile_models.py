@@ -68,7 +68,7 @@ def damaged(name, folder, count) -> Tally:
 
 
 # A process of its own reads a .mat; benchmarks/damaged_files.py has 600 read.
-@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", WHOLE)
 def test_damaged_bytes(name, many, tmp_path):
     few, often = (2, 15) if name == "hub.mat" else (150, 3000)

@@ -220,6 +220,7 @@ def test_logs_of_a_closed_loop_in_two_stages(flexlink, undrawn, tmp_path):
     assert "The reference explains" in Page((tmp_path / "page.html").read_text(encoding="utf-8")).text
 
 
+@pytest.mark.slow
 def test_repeats_that_differ_between_amplitudes_are_warned_of(flexlink, undrawn, tmp_path):
     """Gain 5 % higher at twice the input, and the same records of an arm that keeps its gain."""
     rng = np.random.default_rng(7)

@@ -106,7 +106,7 @@ def _check_the_ball(run: Path):
     return point, a
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_logs_of_a_closed_loop_give_a_certified_controller(run_of_the_arm, tmp_path, capsys):
     law = Controller.from_json((run_of_the_arm / "controller.json").read_text())
     config = load_joints(run_of_the_arm / "config.toml")[0]
@@ -160,6 +160,7 @@ def _from_log(folder: Path, log: Path, source: str = 'time = "time_s"') -> Path:
     return _written(folder, head + _JOINTS + _REST)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_logs_give_the_same_model_as_the_arm(logs, run_of_the_arm, tmp_path, capsys):
     config = _from_log(tmp_path, logs)
@@ -172,6 +173,7 @@ def test_logs_give_the_same_model_as_the_arm(logs, run_of_the_arm, tmp_path, cap
     assert found["closed_loop"]["machine"] == "identified"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_inputs_that_are_one_signal_in_a_band_are_named_with_the_band(logs, tmp_path, capfd):
     table = pd.read_csv(logs)
@@ -290,6 +292,7 @@ def test_what_cannot_be_met_is_a_result(tmp_path, capfd):
     assert np.isfinite(Controller.from_json((tmp_path / "run" / "controller.json").read_text()).D).all()
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("undrawn")
 def test_a_study_varies_what_a_joint_is_asked(run_of_the_arm, tmp_path):
     """From the run's models: its own point is designed as in the run, and a faster one has a larger worst
@@ -331,6 +334,7 @@ def test_commands_for_one_loop_say_what_to_use(command, run_of_the_arm, capfd):
     assert "flexlink study" in told
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_each_input_may_have_its_own_dead_time(logs, run_of_the_arm, tmp_path):
     """The log's commands are moved ahead of what they do: with the dead times stated, model and ball are

@@ -96,7 +96,7 @@ def test_a_study_goes_on(tmp_path, monkeypatch, continued):
     assert "certified" in (out / "table.csv").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("undrawn")
 def test_a_diagnosis_goes_on(tmp_path, monkeypatch, continued):
     monkeypatch.setattr(workflow.diagnose.command, "diagnose", KnownAnswer((FRICTION,)))
@@ -146,6 +146,7 @@ def test_files_of_a_design_are_all_there_or_none(tmp_path, monkeypatch, refused)
     assert not list((tmp_path / "out").iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_a_page_for_which_there_is_no_room_leaves_the_one_before(
     fast_run, tmp_path, monkeypatch, flexlink, refused

@@ -42,7 +42,7 @@ def measured(tmp_path_factory, request) -> Iterator[Example]:
         os.environ["FLEXLINK_DATA"] = before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("example", margins.EXAMPLES[1:])
 def test_certified_margins_of_the_example_stay_where_they_were(example, measured):
     """Of the default arm: tests/workflow/test_readme.py, which runs it."""

@@ -384,6 +384,7 @@ def replayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Output
         return outputs_replayed(tmp_path_factory.mktemp("outputs"), patch), LocalProcesses.run
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_tampered_studies_and_diagnoses(replayed, tmp_path, monkeypatch, few):
     outputs, replay = replayed

@@ -158,7 +158,7 @@ def test_make_run_gives_the_numbers_of_the_readme(flexlink):
     assert Path("runs/default/figures/overview.pdf").read_bytes().startswith(b"%PDF")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_study_of_the_readme(call, flexlink):
     points = call("study")["numbers"]["points"]
     certified = [point for point in points if point["state"] == "certified"]
@@ -170,7 +170,7 @@ def test_the_study_of_the_readme(call, flexlink):
     assert "certified" in flexlink(*command.split()).out
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_blind_cases_of_the_readme(call):
     call("blind")
     scores = json.loads(Path("runs/blind/scores.json").read_text(encoding="utf-8"))
@@ -184,7 +184,7 @@ def test_the_blind_cases_of_the_readme(call):
         assert sum(effect["probability"] for effect in one["effects"]) == pytest.approx(1.0, abs=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_paper_of_the_readme(call):
     call("paper")
     with open("runs/paper/table.csv", newline="") as stream:

@@ -167,7 +167,7 @@ def test_a_certified_run_says_so_and_why(drawn):
     assert any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
 
 
-def test_an_uncertified_run_says_what_is_missed(undrawn, tmp_path):
+def test_an_uncertified_run_says_what_is_missed(unbuilt, tmp_path):
     page = page_for(tmp_path, example.config(), gain=4.0)
     assert "Not certified: 2 of 2 requirements missed" in page.text
     assert re.search(
@@ -178,7 +178,7 @@ def test_an_uncertified_run_says_what_is_missed(undrawn, tmp_path):
     assert not any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
 
 
-def test_an_unstable_loop_has_no_margins_and_a_line_of_its_own_for_what_is_not_proved(undrawn, tmp_path):
+def test_an_unstable_loop_has_no_margins_and_a_line_of_its_own_for_what_is_not_proved(unbuilt, tmp_path):
     run = example.build_run(tmp_path / "run", example.config(), gain=400.0)
     text = text_of(run, example.config())
     assert "gain may rise by" not in text
@@ -188,14 +188,14 @@ def test_an_unstable_loop_has_no_margins_and_a_line_of_its_own_for_what_is_not_p
     assert opened[0].endswith("not proved: the loop is not robustly stable on the dense grid")
 
 
-def test_a_certificate_does_not_hide_a_loop_that_does_not_settle(undrawn, tmp_path):
+def test_a_certificate_does_not_hide_a_loop_that_does_not_settle(unbuilt, tmp_path):
     page = page_for(tmp_path, example.config(), settled=1)
     assert "Certified, but the simulated loop does not settle" in page.text
     assert "2 of 3 runs on the simulated arm did not settle" in page.text
     assert not any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
 
 
-def test_without_a_controller_the_page_still_tells_the_rest(undrawn, tmp_path):
+def test_without_a_controller_the_page_still_tells_the_rest(unbuilt, tmp_path):
     page = page_for(tmp_path, example.config(), impossible=True)
     assert "Not certified: there is no controller" in page.text
     assert "lies beyond the Nyquist frequency" in page.text
@@ -206,7 +206,7 @@ def test_without_a_controller_the_page_still_tells_the_rest(undrawn, tmp_path):
     assert list(run.figures_path.glob("bode*"))
 
 
-def test_without_validation_data_the_page_warns(undrawn, tmp_path):
+def test_without_validation_data_the_page_warns(unbuilt, tmp_path):
     page = page_for(tmp_path, example.config(validation=False), scatter=False)
     assert "There is no validation record: the model was not tested on new data." in page.text
     assert "; on validation data:" not in page.text
@@ -222,7 +222,7 @@ def test_without_validation_data_the_page_warns(undrawn, tmp_path):
         ({"n_real": 1, "n_pairs": 2}, "n_real = 1 and n_pairs = 2 were specified; the criterion"),
     ],
 )
-def test_the_page_says_who_chose_the_order(undrawn, tmp_path, chosen, words):
+def test_the_page_says_who_chose_the_order(unbuilt, tmp_path, chosen, words):
     settings = example.config(channels=1)
     options = settings.channels[0].identification.model_copy(update=chosen)
     channel = settings.channels[0].model_copy(update={"identification": options})
@@ -235,7 +235,7 @@ def change_loop(run, **changes):
     run.save_stage("closed_loop", ClosedLoopResult(check=replace(loop, **changes)), "x")
 
 
-def test_a_command_beyond_the_records_and_an_error_that_stays_are_told(undrawn, tmp_path):
+def test_a_command_beyond_the_records_and_an_error_that_stays_are_told(unbuilt, tmp_path):
     settings = example.config()
     run = example.build_run(tmp_path / "run", settings)
     records = RunResults(run).records.of_role("estimation")
@@ -250,7 +250,7 @@ def test_a_command_beyond_the_records_and_an_error_that_stays_are_told(undrawn, 
         assert ("integrator = true" in text) == told
 
 
-def test_a_design_that_takes_damping_from_a_mode_says_so(undrawn, tmp_path):
+def test_a_design_that_takes_damping_from_a_mode_says_so(unbuilt, tmp_path):
     settings = example.config()
     run = example.build_run(tmp_path / "run", settings)
     results = RunResults(run)
@@ -300,13 +300,13 @@ def test_a_mode_of_several_plants_is_named_once_where_it_loses_most(tmp_path):
     assert "load 1: the mode at 12.6 Hz loses damping: 0.02 in open loop, 0.004 in closed loop" in said_of
 
 
-def test_one_channel_alone(undrawn, tmp_path):
+def test_one_channel_alone(unbuilt, tmp_path):
     page = page_for(tmp_path, example.config(channels=1))
     assert "Channel hub" not in page.text
     assert not list((tmp_path / "run" / "figures").glob("*-2-*"))
 
 
-def test_a_real_arm_is_not_said_to_have_run(undrawn, tmp_path):
+def test_a_real_arm_is_not_said_to_have_run(unbuilt, tmp_path):
     page = page_for(tmp_path, example.config(machine="identified"))
     assert "Nothing was run on the real machine here." in page.text
     assert "The controller has not run on the real machine." in page.text
@@ -340,7 +340,7 @@ def test_hostile_names_are_escaped(tmp_path):
         assert re.fullmatch(r"[a-z0-9-]+\.(svg|png)", path.name)
 
 
-def test_sensitivity_on_the_arm_is_compared_and_friction_named(tmp_path, undrawn):
+def test_sensitivity_on_the_arm_is_compared_and_friction_named(tmp_path, unbuilt):
     """A smaller peak at small excitation is put down to friction, and predicted where that was identified; a
     large gap is a warning."""
     page = page_for(tmp_path, example.config())
@@ -367,7 +367,7 @@ def test_sensitivity_on_the_arm_is_compared_and_friction_named(tmp_path, undrawn
     assert "The loop does not settle with: payload 200 % and push at the tip." in text
 
 
-def test_page_tells_of_any_order_whole_responses_and_reference_filter(tmp_path, undrawn):
+def test_page_tells_of_any_order_whole_responses_and_reference_filter(tmp_path, unbuilt):
     settings = example.config()
     run = example.build_run(tmp_path / "run", settings)
     text = text_of(run, settings)

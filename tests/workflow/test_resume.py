@@ -206,7 +206,7 @@ def test_c_code_stays_as_it_was_asked_for(fast_run, tmp_path):
         written()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_stopped_again_and_again_it_ends_with_the_same_files(tmp_path):
     """A kill and an interrupt at random moments, continued as the line says: benchmarks/interruptions.py
     makes many, of studies and diagnoses too."""

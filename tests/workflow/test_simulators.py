@@ -52,6 +52,7 @@ def write_log(path: Path, seed: int, friction: float, gain: float = 1.0) -> None
     np.savetxt(path, rows, delimiter=",", header="time_s,motor,hinge", comments="")
 
 
+@pytest.mark.slow
 def test_a_mujoco_model_is_diagnosed_and_comes_back_repaired(tmp_path, flexlink, monkeypatch):
     mujoco = pytest.importorskip("mujoco")
     scaled = '<custom><numeric name="hinge.gain" data="1.1"/></custom><actuator>'
@@ -137,10 +138,13 @@ def write_pendulum_log(path: Path, seed: int, load_kg: float, friction_Nm: float
     np.savetxt(path, rows, delimiter=",", header="time_s,torque,angle", comments="")
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
-    ("integrator", "load_kg", "friction_Nm"), [("implicitfast", 0.15, 0.12), ("implicit", 0.0, 0.1)]
+    ("integrator", "load_kg", "friction_Nm"),
+    [
+        pytest.param("implicitfast", 0.15, 0.12, marks=pytest.mark.slow),
+        pytest.param("implicit", 0.0, 0.1, marks=pytest.mark.long),
+    ],
 )
 def test_a_load_and_friction_of_a_pendulum_without_a_site_are_found(
     tmp_path, flexlink, integrator, load_kg, friction_Nm

@@ -267,6 +267,7 @@ def test_channel_filters_are_what_the_settings_say():
         Channel(input="u", output="y", band_rad_s=(3.0, 2.0))
 
 
+@pytest.mark.slow
 def test_scatter_between_records_needs_four_and_widens_the_ellipses():
     """Records of arms that differ by 20 % in gain: noise alone would never tell."""
     rng = np.random.default_rng(6)
@@ -330,6 +331,7 @@ def test_slice_and_mirror(tmp_path, flexlink_data):
     assert np.corrcoef(first.output[:, 0], second.output[:, 0])[0, 1] == pytest.approx(0.998, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_the_default_arm_is_identified_behind_its_friction(tmp_path):
     """The level of the configuration, intervals for both channels, and no warning that the binary input is
     clipped; all read back from the run's files.

@@ -118,7 +118,7 @@ class Sleep:
         return self.seconds
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("who", "words"),
     [("scheduler", "has not answered for 4 s"), ("worker", "no worker that answers for 4 s")],
@@ -142,7 +142,7 @@ def test_a_network_that_stalls(cluster, monkeypatch, who, words):
     assert time.monotonic() - began_s < 4 + 20
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_another_version_on_the_worker(cluster, tmp_path, flexlink):
     other = tmp_path / "other"
     for room in ("plant", "ident", "control_design", "workflow", "flexlink"):

@@ -324,7 +324,7 @@ def test_ctrl_c_ends_it(folder):
     assert err == b""
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_demo_is_the_built_in_arm(tmp_path):
     process = start_flexlink("tune", "--demo", "--no-browser", "--quiet", "--out", tmp_path / "saved")
     assert process.stdout is not None
