@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.landau_score import ITEMS, LOADS, TS_S, Law, all_values, margins, points, score, values
-from benchmarks.landau_transmission import batch_margins, law_of, search
+from benchmarks.landau_transmission import batch_margins, law_of
 
 _NEAR = np.array(
     [0.4768552, -1.317387, 1.1759111, -0.3086128, -0.0343734, -0.5180146]
@@ -101,10 +101,3 @@ def test_fast_margins_agree_with_the_score(s_length):
                 continue
             tolerance = {"rise_s": 2 * TS_S, "attenuation_Hz": 0.06}.get(item, 0.01)
             assert f == pytest.approx(s, abs=tolerance), item
-
-
-@pytest.mark.slow
-def test_short_search_reaches_the_full_score():
-    start = np.array([0.2, -0.55, 0.4, -0.05, -0.3, -0.2])
-    x = search(start, 4, np.random.default_rng(0), generations=60, population=40)
-    assert score(law_of(x, 4)) > 99.0

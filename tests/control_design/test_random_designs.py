@@ -40,17 +40,6 @@ def test_sampled_plants_of_a_proved_loop_are_stable_and_of_a_bad_one_are_not():
     assert not certify(wild, [plant], Specification(modulus_margin=0.2), n_dense=1500).certified
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("seed", [0, 1])
-def test_returned_designs_are_proved_and_their_sampled_plants_stable(seed):
-    plant, posterior, specification = random_case(seed)
-    result = synthesise([plant], specification, LOW_EFFORT, rng=np.random.default_rng(seed))
-    certificate = certify(result.controller, [plant], specification)
-    assert certificate.plants[0].all_frequencies.proved
-    assert certificate.gamma <= certificate.gamma_bound <= 1.005 * certificate.gamma
-    assert unstable_samples(result.controller, posterior, np.random.default_rng(seed)) == 0
-
-
 @pytest.mark.parametrize("seed", [pytest.param(107, marks=pytest.mark.slow), 155])
 def test_a_step_below_the_grids_is_seen(seed):
     """Both lack an integrator and ask for rejection down to zero frequency: a slow pole below every grid

@@ -51,19 +51,6 @@ def test_link_scenario_a_at_order_5_reaches_the_published_worst_case():
     assert fractions[-1] == 1.0
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("scenario", "limit"), [("B", 1.09), ("C", 1.34)])
-def test_link_scenarios_at_order_5_with_the_default_search(scenario, limit):
-    plant, specification = flexible_link(scenario), flexible_link_specification(5)
-    result = synthesise([plant], specification, rng=np.random.default_rng(1))
-    certificate = certify(result.controller, [plant], specification)
-    assert result.outcome is Outcome.NOT_MET
-    assert not certificate.certified
-    assert certificate.plants[0].stable
-    assert certificate.plants[0].nyquist.matches
-    assert certificate.gamma <= limit
-
-
 def test_same_seed_same_controller():
     specification = Specification(bandwidth_rad_s=2.0, effort_limit=60.0, controller_order=3)
     results = [

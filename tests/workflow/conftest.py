@@ -70,5 +70,4 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def unbuilt(undrawn: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """For sentences of a page."""
     build_nothing(monkeypatch)

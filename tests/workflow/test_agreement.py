@@ -60,7 +60,6 @@ CASES = {
         FindingKind.DIRECT_WITH_FRICTION,
     ),
 }
-TIERS = {"open loop": pytest.mark.slow, "friction": pytest.mark.long}
 
 
 def by_run(
@@ -90,7 +89,7 @@ def by_run(
 
 @pytest.mark.parametrize(
     "case",
-    [pytest.param(name, marks=TIERS.get(name, ())) for name in CASES],
+    ["in a band", "reference", *(pytest.param(k, marks=pytest.mark.slow) for k in ("open loop", "friction"))],
 )
 def test_the_same_numbers_by_identify_and_by_run(case, tmp_path):
     signals, reference, settings, way = CASES[case]

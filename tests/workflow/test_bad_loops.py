@@ -234,6 +234,14 @@ def before_lag(signal, a):
     return lfilter([1, -a], [1 - a], signal)
 
 
+def behind(signal, samples):
+    return np.concatenate([np.full(samples, signal[0]), signal[:-samples]])
+
+
+def other_load(one, k):
+    return log(k, machine=plant(load=3 * LOAD)) if k == 1 else {}
+
+
 TWO, THREE = (0.2, 0.15), (0.2, 0.1, 0.15)
 
 # The fit ends in one of two minima, decided by rounding: lags of .5 and .85 are refused, .8 is taken.
@@ -247,25 +255,10 @@ LAGGING = [pytest.mark.slow, pytest.mark.xfail(reason="two minima of the fit", s
             lambda one, k: {"y": behind_lag(one["y"], 0.9)}, UNEXPLAINED, THREE, marks=pytest.mark.long
         ),
         # The drive lags: what turns the motor is the command behind a filter.
-        pytest.param(
-            lambda one, k: {"u": before_lag(one["u"], 0.7)},
-            UNEXPLAINED,
-            TWO,
-            marks=LAGGING,
-        ),
+        pytest.param(lambda one, k: {"u": before_lag(one["u"], 0.7)}, UNEXPLAINED, TWO, marks=LAGGING),
         pytest.param(lambda one, k: {"u": log(10 + k)["u"]}, "'enc_rad'", TWO, marks=pytest.mark.slow),
-        pytest.param(
-            lambda one, k: {"u": np.concatenate([np.full(5, one["u"][0]), one["u"][:-5]])},
-            "logged late",
-            TWO,
-            marks=pytest.mark.long,
-        ),
-        pytest.param(
-            lambda one, k: log(k, machine=plant(load=3 * LOAD)) if k == 1 else {},
-            "explains these logs",
-            THREE,
-            marks=pytest.mark.long,
-        ),
+        pytest.param(lambda one, k: {"u": behind(one["u"], 5)}, "logged late", TWO, marks=pytest.mark.long),
+        pytest.param(other_load, "explains these logs", THREE, marks=pytest.mark.long),
     ],
     ids=["filtered position", "lagging drive", "command of another axis", "late command", "another load"],
 )

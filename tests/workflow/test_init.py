@@ -329,12 +329,6 @@ def test_the_reported_log_becomes_a_controller_without_an_edit(flexlink, tmp_pat
     assert mode.damping[0] - 5e-5 < 0.0496 < mode.damping[1] + 5e-5
 
 
-def try_few_loops(config):
-    """Two closed loops instead of twenty, no other conditions."""
-    few = "[closed_loop]\ndraws = 2\nconditions = false\n"
-    config.write_text(config.read_text().replace("[closed_loop]\n", few))
-
-
 @pytest.mark.long
 @pytest.mark.usefixtures("undrawn")
 def test_the_axis_of_emps_becomes_a_controller(refused, flexlink, tmp_path, flexlink_data):
@@ -342,7 +336,8 @@ def test_the_axis_of_emps_becomes_a_controller(refused, flexlink, tmp_path, flex
     out = tmp_path / "my.toml"
     line = refused("init", flexlink_data / "emps" / "emps_train.csv", "--out", out)
     assert flexlink(*shlex.split(line.split("type: flexlink ")[1]), "--out", out).code == 0
-    try_few_loops(out)
+    few = "[closed_loop]\ndraws = 2\nconditions = false\n"
+    out.write_text(out.read_text().replace("[closed_loop]\n", few))
     answer = flexlink("run", "--config", out, "--out", tmp_path / "out", "--json")
     assert answer.document()["certified"]
     results = RunResults(RunDirectory.open(tmp_path / "out"))
@@ -368,31 +363,6 @@ def test_the_notch_of_the_ruler_robot(flexlink, tmp_path, flexlink_data):
     assert seen["notch_rad_s"] / (2 * np.pi) == pytest.approx(2.52, rel=0.03)
     wanted = load_config(tmp_path / "my.toml")[0].specification
     assert wanted.bandwidth_rad_s < seen["notch_rad_s"] / 2.5
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("undrawn")
-def test_one_move_of_two_coupled_links_asks_for_another_experiment(
-    refused, flexlink, tmp_path, flexlink_data
-):
-    """20 s of smoothed steps, of which the response shows up to 1.2 Hz: the first mode is at 2.7 Hz."""
-    log, out = flexlink_data / "quanser_2dsfl" / "lqr_run.csv", tmp_path / "my.toml"
-    line = refused("init", log, "--out", out)
-    assert flexlink(*shlex.split(line.split("type: flexlink ")[1]), "--out", out).code == 0
-    try_few_loops(out)
-    # At which of a dozen poles the fit with friction ends is up to last digits; what was asked is never met.
-    answer = flexlink("run", "--config", out, "--out", tmp_path / "out")
-    if answer.code == 2:
-        refusal = r"flexlink excite --closed-loop LOG|check columns, wiring and unit"
-        assert re.search(refusal, answer.err.splitlines()[-1])
-    else:
-        assert answer.code == 3 or "not for the specified" in answer.out
-    text = re.sub("lowest_bandwidth_rad_s.*", "", out.read_text())
-    text = text.replace('"without friction"', '"as recorded"')
-    out.write_text(text + '\n[closed_loop_data]\nmethod = "two_stage"\n')
-    answer = flexlink("run", "--config", out, "--out", tmp_path / "recorded")
-    assert answer.code in (2, 3)
-    assert "flexlink excite" in answer.err.splitlines()[-1]
 
 
 def test_a_reference_planned_for_the_loop_keeps_its_limits_on_the_machine(flexlink, tmp_path, signals):

@@ -1,63 +1,30 @@
-"""Regression test on closed-loop margins: the examples, end to end, against `tests/golden/margins.toml`."""
+"""Regression test on closed-loop margins: an example, end to end, against `tests/golden/margins.toml`."""
 
 from __future__ import annotations
-
-import os
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from tests.golden import margins
-from tests.workflow.command import draw_nothing
 from workflow.config.run_config import load_config
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.results import RunResults
 
-Example = Callable[[str], tuple[dict[str, Any], Path]]
-
-
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory, request) -> Iterator[Example]:
-    """Certified margins and run directory of an example, run once."""
-    done: dict[str, tuple[dict[str, Any], Path]] = {}
-
-    def run(example: str) -> tuple[dict[str, Any], Path]:
-        if example not in done:
-            os.environ["FLEXLINK_DATA"] = str(request.getfixturevalue("flexlink_data"))
-            out = tmp_path_factory.mktemp("margins") / example
-            with pytest.MonkeyPatch.context() as patch:
-                draw_nothing(patch)
-                done[example] = margins.measure(example, out), out
-        return done[example]
-
-    before = os.environ.get("FLEXLINK_DATA")
-    yield run
-    if before is None:
-        os.environ.pop("FLEXLINK_DATA", None)
-    else:
-        os.environ["FLEXLINK_DATA"] = before
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("example", margins.EXAMPLES[1:])
-def test_certified_margins_of_the_example_stay_where_they_were(example, measured):
-    """Of the default arm: tests/workflow/test_readme.py, which runs it."""
-    off = margins.moved(example, measured(example)[0])
-    assert not off, f"measured against golden: {off}; if meant, rerun python -m tests.golden.margins"
-
 
 @pytest.mark.slow
-def test_zeros_of_the_hub_are_the_modes_of_the_arm_with_the_hub_held(measured, flexlink_data):
+@pytest.mark.usefixtures("undrawn")
+def test_margins_stay_and_zeros_of_the_hub_are_the_modes_of_the_arm_with_the_hub_held(
+    tmp_path, monkeypatch, flexlink_data
+):
     """Physics that the identification has not seen: drive and angle of one shaft are collocated, so the
     response has its zeros where the arm swings with the shaft held, and the free decays were recorded like
-    that."""
-    _, out = measured("slfr_krauss_2009")
+    that. Margins of the other examples: `make frozen`."""
+    monkeypatch.setenv("FLEXLINK_DATA", str(flexlink_data))
+    off = margins.moved("slfr_krauss_2009", margins.measure("slfr_krauss_2009", tmp_path / "out"))
+    assert not off, f"measured against golden: {off}; if meant, rerun python -m tests.golden.margins"
     config, _ = load_config(margins.ROOT / "examples" / "slfr_krauss_2009.toml")
-    plant = RunResults(RunDirectory.open(out)).uncertainty.plant(config)
+    plant = RunResults(RunDirectory.open(tmp_path / "out")).uncertainty.plant(config)
     zeros = np.log(plant.zeros[np.abs(plant.zeros) > 0.5].astype(complex)) / plant.dt_s
     found_Hz = np.abs(zeros[zeros.imag > 1.0]) / (2 * np.pi)
     decay = pd.read_csv(flexlink_data / "slfr_krauss_2009" / "free_decay_hub_held_rep1.csv")
