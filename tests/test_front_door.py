@@ -134,6 +134,7 @@ def test_a_diagnosis_credits_everything_that_the_repaired_model_holds(tmp_path):
     assert delayed["main_cause"] == answer.probabilities["input_delay"]
 
 
+@pytest.mark.slow
 def test_ellipses_that_miss_the_model_are_in_doubt_and_so_is_their_certificate():
     """Four real poles cannot be this mode, whose response no ellipse around them has then to hold."""
     system = control.tf([10 / 15 / 100], [1 / 15, 1]) * control.tf([1.6, 1.6, 1600], [1, 1.6, 1600])

@@ -108,6 +108,7 @@ def test_new_blocks_change_rows_as_said_and_the_list_is_in_order(structure):
     np.testing.assert_allclose(said, change, rtol=1e-2, atol=1e-2 * np.max(np.abs(change)))
 
 
+@pytest.mark.slow
 def test_the_same_design_every_time():
     first, second = designed(), synthesise_multivariable(plant_t(), specification_t(4), QUICK)
     assert first.gamma == second.gamma

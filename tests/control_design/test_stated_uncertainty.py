@@ -58,6 +58,7 @@ def test_expansion_holds_on_its_interval(kind):
         assert np.max(np.abs(size - scale * linear)) <= scale * generators.remainder[k] + 1e-12
 
 
+@pytest.mark.slow
 def test_certificate_covers_members_of_the_set_for_all_frequencies():
     """Gains, delays and lags inside the discs: each is stable and has its peak of S below the certified."""
     plant = UncertainPlant("arm", arm(), StatedDiscs(arm(), WEIGHT))

@@ -47,6 +47,7 @@ def ends(compliant):
     return [fitted_to(model, (space,), s.coordinates, s.deviations) for s in starts]
 
 
+@pytest.mark.slow
 def test_most_starts_end_in_one_minimum_although_it_lies_in_a_flat_valley(ends):
     best = min(ends, key=lambda end: end.cost)
     # A descent ends where less than half a unit of the cost is to be gained.

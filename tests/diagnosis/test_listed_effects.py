@@ -81,8 +81,8 @@ def _missed(found, truth, free):
 @pytest.mark.parametrize(
     ("name", "motion"),
     [
-        pytest.param("mass", "x", marks=pytest.mark.slow),
-        *[("on a spring", "x"), ("on a spring", "v"), ("pendulum", "v")],
+        *(pytest.param(name, "x", marks=pytest.mark.slow) for name in ("mass", "on a spring")),
+        *[("on a spring", "v"), ("pendulum", "v")],
     ],
 )
 def test_dry_friction_around_a_simulation_is_the_one_inside_it(name, motion):

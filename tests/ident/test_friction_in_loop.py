@@ -52,6 +52,7 @@ def belt() -> tuple[Machine, list[Record], FrictionFit]:
     return one, records, fit_friction(records, IdentOptions(integrators=1))
 
 
+@pytest.mark.slow
 def test_level_and_dead_time_of_a_belt_are_found(belt: tuple[Machine, list[Record], FrictionFit]) -> None:
     one, _, found = belt
     assert found.in_loop

@@ -89,7 +89,7 @@ def by_run(
 
 @pytest.mark.parametrize(
     "case",
-    ["in a band", "reference", *(pytest.param(k, marks=pytest.mark.slow) for k in ("open loop", "friction"))],
+    ["in a band", *(pytest.param(k, marks=pytest.mark.slow) for k in CASES if k != "in a band")],
 )
 def test_the_same_numbers_by_identify_and_by_run(case, tmp_path):
     signals, reference, settings, way = CASES[case]
@@ -154,6 +154,7 @@ def test_noise_in_a_loop_without_reference_is_refused(flexlink, noisy_logs):
     assert "as asked for: what the loop feeds back moves the response" in told["reason"]
 
 
+@pytest.mark.slow
 def test_a_stated_controller_opens_the_loop(tmp_path):
     law = Controller.proportional(GAIN, 0.01, computational_delay_samples=0)
     matrices = {"A": [[0.5]], "B": [[0.0]], "C": [[1.0]], "D": [[GAIN]], "dt_s": 0.01}

@@ -247,6 +247,7 @@ def test_calibration_is_designed_for(monkeypatch):
     assert asked == ["plain", "jointly", "plain", "plain"]
 
 
+@pytest.mark.slow
 def test_a_missed_specification_says_what_would_meet_it():
     """A modulus margin near one leaves no bandwidth: the reason names a smaller one, and it is met."""
     asked = {"effort_limit": 1.5, "modulus_margin": 0.95, "controller_order": 3}

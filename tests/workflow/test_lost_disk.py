@@ -62,6 +62,7 @@ def continued(flexlink):
     return call
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_a_run_goes_on_after_every_file_for_which_there_was_no_room(
     fast_run, tmp_path, monkeypatch, continued

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from workflow.diagnose.pages import write_plant_page
 
@@ -34,6 +35,7 @@ def _motor():
     return {"levels": levels, "measured": measured}
 
 
+@pytest.mark.slow
 def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path, faults_seen):
     given = {"DT_S": DT_S, "folder": tmp_path, **_motor()}
     test = doctest.DocTestParser().get_doctest(GUIDE.read_text(), given, GUIDE.name, str(GUIDE), 0)
