@@ -39,6 +39,5 @@ from .synthesis.synthesis_options import (
 )
 from .synthesis.synthesis_result import (
     Outcome as Outcome,
-    SynthesisError as SynthesisError,
     SynthesisResult as SynthesisResult,
 )

@@ -16,19 +16,6 @@ class Outcome(Enum):
     NOT_CONVERGED = "not converged"  # no start led to a stable loop; the controller means nothing
 
 
-class SynthesisError(Exception):
-    """The synthesis did not meet the specification; `result` holds the best point found, which the message
-    tells: gamma, and the active constraint."""
-
-    def __init__(self, message: str, result: SynthesisResult) -> None:
-        worst = "".join(
-            f"; active constraint: {b.weight} of {b.plant!r} at {b.omega_rad_s:.4g} rad/s"
-            for b in result.blocking[:1]
-        )
-        super().__init__(f"{message} (gamma {result.gamma:.4g}){worst}")
-        self.result = result
-
-
 @dataclass(frozen=True)
 class BlockingPoint:
     """A frequency at which a requirement keeps gamma from getting smaller.
@@ -84,17 +71,3 @@ class SynthesisResult:
     starts: tuple[StartReport, ...]
     gamma_history: tuple[float, ...]
     grid_points: int
-
-    def controller_or_raise(self) -> Controller:
-        """The controller if the specification is met on the grid.
-
-        Raises SynthesisError otherwise, with this result attached.
-        """
-        if self.outcome is not Outcome.MET_ON_GRID:
-            raise SynthesisError(
-                "no start led to a stable loop; the controller means nothing"
-                if self.outcome is Outcome.NOT_CONVERGED
-                else "the solver converged to a stable loop, but some requirement is exceeded",
-                self,
-            )
-        return self.controller

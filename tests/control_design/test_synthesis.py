@@ -13,7 +13,6 @@ from control_design import (
     Outcome,
     Specification,
     SpecificationError,
-    SynthesisError,
     SynthesisOptions,
     UncertainPlant,
     certify,
@@ -39,7 +38,7 @@ def test_link_scenario_a_at_order_5_reaches_the_published_worst_case():
         rng=np.random.default_rng(1),
         progress=lambda fraction, message: messages.append((fraction, message)),
     )
-    certificate = certify(result.controller_or_raise(), [plant], specification)
+    certificate = certify(result.controller, [plant], specification)
     assert result.outcome is Outcome.MET_ON_GRID
     assert certificate.certified
     assert 0.931 <= certificate.gamma <= 0.94
@@ -71,7 +70,7 @@ def integrating_arm(integrators):
     )  # fmt: skip
     options = SynthesisOptions(starts=12, exchange_rounds=2, sufficient_gamma=0.97)
     result = synthesise([plant], specification, options, rng=np.random.default_rng(2))
-    return plant, result, certify(result.controller_or_raise(), [plant], specification)
+    return plant, result, certify(result.controller, [plant], specification)
 
 
 @pytest.mark.parametrize("integrators", [1, 2])
@@ -104,7 +103,7 @@ def test_active_damping_through_the_tip_without_tracking():
     result = synthesise(
         [plant], specification, SynthesisOptions(sufficient_gamma=0.97), rng=np.random.default_rng(1)
     )
-    certificate = certify(result.controller_or_raise(), [plant], specification)
+    certificate = certify(result.controller, [plant], specification)
     assert certificate.certified
     near = [m for m in certificate.plants[0].closed_loop_modes if 12 < m.omega_rad_s < 20]
     assert near
@@ -116,7 +115,7 @@ def test_two_plants_are_met_by_one_controller():
     plants = [uncertain_hub(0.03), UncertainPlant("heavy", heavy, RelativeDisc(heavy, 0.03, 60.0))]
     specification = Specification(bandwidth_rad_s=2.0, effort_limit=60.0, controller_order=3)
     result = synthesise(plants, specification, _QUICK, rng=np.random.default_rng(4))
-    certificate = certify(result.controller_or_raise(), plants, specification)
+    certificate = certify(result.controller, plants, specification)
     assert certificate.certified
     assert [v.plant for v in certificate.plants] == ["hub", "heavy"]
 
@@ -140,9 +139,7 @@ def test_a_requirement_out_of_reach_names_how_far_and_where():
     assert worst.weight in ("tracking", "modulus")
     assert worst.value == pytest.approx(result.gamma)
     assert 0.1 < worst.omega_rad_s < 60
-    with pytest.raises(SynthesisError, match=r"active constraint: .* rad/s") as caught:
-        result.controller_or_raise()
-    assert caught.value.result is result
+    assert result.outcome is Outcome.NOT_MET
     assert not certify(result.controller, [plant], specification).certified
 
 
@@ -160,8 +157,6 @@ def test_without_a_stable_design_the_unstable_pole_is_named():
     first = result.blocking[0]
     assert (first.plant, first.weight) == ("unruly", "stability of the nominal loop")
     assert 0 < first.omega_rad_s <= np.pi / 0.01
-    with pytest.raises(SynthesisError, match="no start led to a stable loop"):
-        result.controller_or_raise()
 
 
 def test_contradictions_are_refused_before_any_optimisation():
@@ -182,7 +177,7 @@ def test_damping_of_the_measured_output_over_ellipses():
     plant = flexible_link("A")
     specification = flexible_link_specification(6).model_copy(update={"mode_peak_ratio": 0.5})
     result = synthesise([plant], specification, rng=np.random.default_rng(0))
-    certificate = certify(result.controller_or_raise(), [plant], specification)
+    certificate = certify(result.controller, [plant], specification)
     assert certificate.certified
     assert certificate.gamma < 0.97
     mode = min(certificate.plants[0].closed_loop_modes, key=lambda m: abs(m.omega_rad_s - 15))
