@@ -149,10 +149,11 @@ class _Loop:
         """Upper bounds and the values at the middles of |W S| or |W K S|, times |Gp| of an independent
         channel."""
         own, i_plant, weight = self.controller.integrators, self.plant.n_integrators, each.weight
-        if each.requirement.function.of_controller:
-            numerator = weight.expand(intervals, i_plant).times(self.controller.expand(intervals, own))
-        else:
-            numerator = weight.expand(intervals, own + i_plant)
+        numerator = (
+            weight.expand(intervals, i_plant).times(self.controller.expand(intervals, own))
+            if each.requirement.function.of_controller
+            else weight.expand(intervals, own + i_plant)
+        )
         upper, middle = _quotient(numerator, ends), quotient(np.abs(numerator.value), at_middle, np.inf)
         if each.channel is not None:
             channel = each.channel(intervals, 0)
@@ -297,9 +298,11 @@ def _model_error(loop: _Loop, controller: Controller, omega: Real) -> float:
     ellipses the dense check uses (centre by its size, shape by its trace and the centre)."""
     largest = _difference(loop.controller.at(omega), frequency_response(controller.to_control(), omega))
     sets = [(loop.members, loop.plant.channel)]
-    for each in loop.asked:
-        if each.channel is not None and each.requirement.channel is not None:
-            sets.append((each.channel, each.requirement.channel))
+    sets += [
+        (each.channel, each.requirement.channel)
+        for each in loop.asked
+        if each.channel is not None and each.requirement.channel is not None
+    ]
     for members, channel in sets:
         if channel.own_grid is not None:
             continue

@@ -194,8 +194,7 @@ def _check_plant(
     light = [Mode(m.omega_rad_s, max(abs(m.zeta), 1e-5)) for m in near if abs(m.zeta) < 0.4]
     # Whatever is narrow: poles and zeros of the loop next to the circle, before and after it is closed.
     roots = np.concatenate([plant.poles, plant.zeros, controller.poles, _zeros(controller), poles])
-    narrow = near_the_circle(roots, plant.dt_s)
-    grid = checked_grid(plant, light, n_dense, 120, roots=roots, extra=narrow)
+    grid = checked_grid(plant, light, n_dense, 120, roots=roots, extra=near_the_circle(roots, plant.dt_s))
     assumed_linear = plant.own_grid is not None and between_own_points == "linear"
     own_points = with_own_grid(plant, grid)
     seen = with_straight_between(plant) if assumed_linear else plant
@@ -287,6 +286,5 @@ def _check_plant(
 
 def _zeros(controller: Controller) -> Complex:
     """Finite zeros of the controller in z."""
-    system = controller.to_control()
-    zeros = np.asarray(system.zeros() if controller.order else [], dtype=np.complex128)
+    zeros = np.asarray(controller.to_control().zeros() if controller.order else [], dtype=np.complex128)
     return np.asarray(zeros[np.isfinite(zeros)], dtype=np.complex128)

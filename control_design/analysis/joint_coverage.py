@@ -166,8 +166,7 @@ class SampledLoop:
 
     def worst(self, radius: float) -> float:
         """Largest weighted worst case over ellipses of a radius in standard deviations."""
-        plant = at_level(self.plant, _level(radius))
-        data = PlantData.build(plant, self.specification, self.omega_rad_s)
+        data = PlantData.build(at_level(self.plant, _level(radius)), self.specification, self.omega_rad_s)
         return float(np.max(worst_of(data.weighted(self.loop))))
 
     def gamma_of(self, members: Complex, performance: Responses | None) -> Real:

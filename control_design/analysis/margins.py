@@ -200,12 +200,10 @@ def ellipse_margins(
         low, high = float(centre.real[0] - reach[0]), float(centre.real[0] + reach[0])
         up = min(up, -1 / low) if -1 < low < 0 else up
         down = min(down, -high) if high < -1 else down
-        nearest = max(low + 1.0, -1.0 - high, 0.0)
-        modulus = min(modulus, nearest)
+        modulus = min(modulus, max(low + 1.0, -1.0 - high, 0.0))
     if modulus <= 0:
         return Margins(1.0, 1.0, 0.0, 0.0, 0.0)
-    known = between is None
-    less = 1.0 if known else 1.0 - _ROUNDED
+    less = 1.0 if between is None else 1.0 - _ROUNDED
     return Margins(
         max(1.0, up * less), min(1.0, 1 / (down * less)) if np.isfinite(down) else 0.0, phase * less,
         delay * less, modulus,

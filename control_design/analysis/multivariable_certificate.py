@@ -175,11 +175,8 @@ def _verdict(
 
     def turned(w: Real) -> Complex:
         k = controller.response(w, with_delay=False).reshape(w.size, plant.inputs, plant.outputs)
-        loop = np.eye(plant.outputs) + plant.blocks(w, delay)[0] @ k if plant.own_grid is None else None
-        if loop is None:
-            index = np.searchsorted(omega, w)
-            loop = np.eye(plant.outputs) + G[index] @ k
-        return np.asarray(np.linalg.det(loop) - 1.0)
+        own = plant.blocks(w, delay)[0] if plant.own_grid is None else G[np.searchsorted(omega, w)]
+        return np.asarray(np.linalg.det(np.eye(plant.outputs) + own @ k) - 1.0)
 
     winding = nyquist_count(
         turned, omega, integrators=sum(at_one), unstable_poles=outside, refinable=plant.own_grid is None
@@ -304,10 +301,8 @@ def _scaled_loop(
     """Closed loop in s from (w of every block, d) to (z of every block, e); sizes (z, w) of the blocks in the
     order of `MultivariablePlant.blocks`."""
     dt, u, y = plant.dt_s, plant.inputs, plant.outputs
-    system = plant.delayed(controller.computational_delay_samples)
-    G = _in_s(system, dt)
-    K = _in_s(controller, dt)
-    parts = [G, K, _weights(weights)]
+    G = _in_s(plant.delayed(controller.computational_delay_samples), dt)
+    parts = [G, _in_s(controller, dt), _weights(weights)]
     sizes: list[tuple[int, int]] = []
     if plant.ball is not None:
         li = plant.ball.Li
@@ -402,9 +397,7 @@ def _covered(
 
     covered, stride, pieces = start, 16, 0
     while pieces < _PIECES:
-        first = int(np.searchsorted(size_s, covered))
-        if first >= size_s.size:
-            first = size_s.size - 1
+        first = min(int(np.searchsorted(size_s, covered)), size_s.size - 1)
         trials = [size_s[min(first + each, size_s.size - 1)] for each in (stride, stride // 4, 0)]
         trials += [covered + share * (size_s[first] - covered) for share in (0.3, 0.1, 0.03, 0.01)]
         for number, here in enumerate(trials):

@@ -219,5 +219,4 @@ def _filled(template: str, controller: Controller, **values: object) -> str:
 
 @cache
 def _template(name: str) -> tuple[str, ...]:
-    text = (files("control_design.controllers") / name).read_text("ascii")
-    return tuple(text.splitlines(keepends=True))
+    return tuple((files("control_design.controllers") / name).read_text("ascii").splitlines(keepends=True))

@@ -63,8 +63,7 @@ class PlaneRows:
 
     def ratio(self, y: Real) -> Real:
         """Numerator over denominator for y (F, 2): (R,); infinite where the denominator is not positive."""
-        below = self.denominator(y)
-        return np.asarray(quotient(self.numerator(y), below, np.inf))
+        return np.asarray(quotient(self.numerator(y), self.denominator(y), np.inf))
 
 
 def plane(value: Complex) -> Real:

@@ -184,8 +184,7 @@ class BracketProblem:
         point = MinimaxPoint(np.zeros(basis.shape[1]), np.inf)
         for _ in range(_ELLIPSE_ROUNDS):
             angles = None if start is None else _best_angles(loop, data, basis @ start)
-            rows = self._rows(data, "ellipse", loop, angles)
-            new = self._smallest(basis, rows, start)
+            new = self._smallest(basis, self._rows(data, "ellipse", loop, angles), start)
             before = point.gamma
             if new.gamma < before:
                 point, start = new, new.x

@@ -113,9 +113,11 @@ def programme_grid(
     dense: bool = False,
 ) -> Real:
     """Frequencies of a programme, to begin with, or of its dense check."""
-    points = options.grid_points, options.mode_points
-    if dense:
-        points = int(0.7 * options.dense_points), int(0.3 * options.dense_points)
+    points = (
+        (int(0.7 * options.dense_points), int(0.3 * options.dense_points))
+        if dense
+        else (options.grid_points, options.mode_points)
+    )
     low = options.omega_min_rad_s or lowest_rad_s(plant.dt_s, plant.poles)
     grid = frequency_grid(
         plant.nyquist_rad_s, modes, omega_min_rad_s=low, n_log=points[0], n_mode=points[1], extra=extra
@@ -131,9 +133,7 @@ def _outside(own: Real, wanted: Real) -> Real:
 def with_own_grid(plant: UncertainPlant, wanted: Real) -> Real:
     """`wanted`; of an uncertainty with its own frequencies all of these, and `wanted` outside their range."""
     own = plant.own_grid
-    if own is None:
-        return wanted
-    return np.union1d(own[own > 0], _outside(own, wanted))
+    return wanted if own is None else np.union1d(own[own > 0], _outside(own, wanted))
 
 
 def plant_grid(plant: UncertainPlant, wanted: Real) -> Real:

@@ -195,8 +195,7 @@ def modes_of(poles_z: Complex, dt_s: float, *, zeta_below: float = 0.4) -> tuple
     """Oscillatory pole pairs of z-plane poles as s = ln(z)/dt, ascending in frequency; zeta < 0: unstable."""
     poles = np.asarray(poles_z, dtype=np.complex128)
     upper = poles[(np.imag(poles) > 1e-9) & (np.abs(poles) > 1e-6)]
-    s = np.log(upper) / dt_s
-    modes = [Mode(float(abs(value)), float(-value.real / abs(value))) for value in s]
+    modes = [Mode(float(abs(value)), float(-value.real / abs(value))) for value in np.log(upper) / dt_s]
     return tuple(sorted((m for m in modes if m.zeta < zeta_below), key=lambda m: m.omega_rad_s))
 
 

@@ -117,14 +117,12 @@ def scaled_bound(
     log_t (R, N): where to begin; None: from the sizes of the blocks. within: rows whose log gamma^2 stays by
     more than this below the largest keep a bound that is not the smallest. Neglected: rounding.
     """
-    outputs = K.shape[2]
-    S = np.linalg.inv(np.eye(outputs) + rows.G @ K)
+    S = np.linalg.inv(np.eye(K.shape[2]) + rows.G @ K)
     KS = K @ S
     seen = conjugate(KS)[:, None] @ rows.seen @ KS[:, None]  # (R, N, Y, Y)
     own = conjugate(KS) @ rows.V_u @ KS + conjugate(S) @ rows.V_y @ S
     problem = _Problem(rows, S, seen, own)
-    n = seen.shape[1]
-    if n == 0:
+    if seen.shape[1] == 0:
         t = np.zeros((K.shape[0], 0))
         point = problem.at(t)
     else:
@@ -326,8 +324,7 @@ class _Problem:
             size, vectors = np.linalg.eigh(inside)
             good = size[:, 0] > 1e-12
             root = half @ (vectors / np.sqrt(np.where(good[:, None], size, 1.0))[:, None, :])
-            R = root @ conjugate(root)
-            size, vectors = np.linalg.eigh(R)
+            size, vectors = np.linalg.eigh(root @ conjugate(root))
             top = np.maximum(size[:, -1], 1e-300)
             u = vectors[:, :, -1]
             p = top[:, None] * u

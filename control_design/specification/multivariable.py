@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from control_design.plants.ellipses import Boolean, Complex, Real
 from control_design.plants.weights import RationalWeight
+from control_design.specification.requirement import constant_weight
 from control_design.specification.specification import Specification, SpecificationError
 from ident.data.settings import Settings
 
@@ -79,7 +80,7 @@ class MultivariableSpecification(Settings):
         found: dict[str, tuple[str, tuple[RationalWeight | None, ...]]] = {
             "tracking": ("y", tuple(joint.tracking_weight() for joint in joints[:outputs])),
             "effort": ("u", tuple(joint.limit_weight() for joint in joints[:inputs])),
-            "modulus": ("y", tuple(_constant(joint.modulus_margin) for joint in joints[:outputs])),
+            "modulus": ("y", tuple(constant_weight(joint.modulus_margin) for joint in joints[:outputs])),
         }
         return {name: each for name, each in found.items() if any(w is not None for w in each[1])}
 
@@ -87,10 +88,6 @@ class MultivariableSpecification(Settings):
         """Input and rate limit of every actuator."""
         used = self.joints[:inputs]
         return tuple(joint.input_limit for joint in used), tuple(joint.rate_limit for joint in used)
-
-
-def _constant(value: float) -> RationalWeight:
-    return RationalWeight(numerator=(value,), denominator=(1.0,))
 
 
 def gram(weights: tuple[RationalWeight | None, ...], s: Complex) -> Real:

@@ -197,8 +197,7 @@ class MatrixDescent:
         log = 2 * np.log(bound.gamma)
         index = np.flatnonzero(log > np.max(log) - _FAR_BELOW)
         rows, s = self.stack.rows.part(index), self.stack.s[index]
-        K = self.form.response(x[None], s)[0]
-        found = expansion(rows, K, bound.log_t[index])
+        found = expansion(rows, self.form.response(x[None], s)[0], bound.log_t[index])
         sizes, vectors = np.linalg.eigh(found.H)
         sizes, basis, top = sizes[:, ::-1], vectors[:, :, ::-1], sizes[:, -1]
         width = sizes.shape[1]

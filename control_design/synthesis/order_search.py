@@ -71,7 +71,10 @@ class OrderSearch:
 
     def run(self) -> OrderResult:
         """Starts, descent from each, exchange with hops."""
-        found = [self._as_given(x) for x in self.given[:1]]
+        found = [
+            Candidate(x, self._descent().value(x), self.problem.gamma(self.cascade, x))
+            for x in self.given[:1]
+        ]
         if self._enough(found):
             return OrderResult(found[0], (), (found[0].gamma,))
         tasks = self._starts()
@@ -117,8 +120,7 @@ class OrderSearch:
                 break
             self.tell(0.1 * turn, f"start {turn + 1} of {_WEIGHTED + 2}, from controllers of any order")
             starts = self._fits(free, turn) if turn <= _WEIGHTED else self._others()
-            raced = self._raced(starts)
-            found, turn = found + raced, turn + 1
+            found, turn = found + self._raced(starts), turn + 1
         ends = self._retrieved(self._checked(found))
         if not ends:
             return OrderResult(None, tuple(self.reports), (), self._nearest(found) if found else None), False
@@ -200,16 +202,14 @@ class OrderSearch:
         kept = [c for c in found if np.isfinite(c.gamma)]
         lost = [c for c in found if np.isfinite(c.gamma_grid) and not np.isfinite(c.gamma)]
         for _ in range(_RETRIEVALS):
-            best = min((c.gamma for c in kept), default=np.inf)
-            limit = best * (1 - EXCHANGE_TOLERANCE)
+            limit = min((c.gamma for c in kept), default=np.inf) * (1 - EXCHANGE_TOLERANCE)
             lost = different([c for c in lost if c.gamma_grid < limit], _CARRIED, on_grid=True)
             if not lost or self._enough(kept):
                 break
             for c in lost:
                 self.problem.add_violated(self.cascade, c.parameters, c.gamma_grid)
             retreats = [self._retreat(c.parameters) for c in lost]
-            tasks = [self._task(x) for x in retreats if x is not None]
-            lost = list(self._done(tasks))
+            lost = list(self._done([self._task(x) for x in retreats if x is not None]))
             kept += [c for c in lost if np.isfinite(c.gamma)]
             lost = [c for c in lost if np.isfinite(c.gamma_grid) and not np.isfinite(c.gamma)]
         return sorted(kept, key=lambda c: c.gamma)
@@ -229,8 +229,7 @@ class OrderSearch:
         return agreeing >= (enough or self.options.agreeing_starts)
 
     def _enough(self, found: Sequence[Candidate]) -> bool:
-        best = min((c.gamma for c in found), default=np.inf)
-        return best <= self.options.sufficient_gamma
+        return min((c.gamma for c in found), default=np.inf) <= self.options.sufficient_gamma
 
     def _task(self, parameters: Real, *, eased: bool = False, steps: int | None = None) -> StartTask:
         """steps: without the dense check."""
@@ -242,11 +241,6 @@ class OrderSearch:
         for end in map(self.workshop.do, tasks):
             self.reports += end.reports
             yield end
-
-    def _as_given(self, parameters: Real) -> Candidate:
-        return Candidate(
-            parameters, self._descent().value(parameters), self.problem.gamma(self.cascade, parameters)
-        )
 
     def _descent(self) -> MinimaxDescent:
         return self.workshop.descent(self.cascade, tuple(self.problem.grids))

@@ -109,7 +109,9 @@ class Problem(Grids):
             below = np.geomspace(
                 begin, low, int(np.ceil(_PER_DECADE * np.log10(low / begin))), endpoint=False
             )
-            points = np.unique(np.concatenate([below, *(_around(mode) for mode in light)]))
+            # A pole or zero of either side of the circle.
+            modes = (Mode(mode.omega_rad_s, abs(mode.zeta)) for mode in light)
+            points = np.unique(np.concatenate([below, *(mode_points(mode, 25) for mode in modes)]))
             points = points[(points >= begin) & (points < plant.nyquist_rad_s)]
             if points.size:
                 found.append((number, PlantData.build(plant, self.spec, points)))
@@ -235,8 +237,3 @@ class Problem(Grids):
 def _modulus(value: float, ellipses: Ellipses) -> tuple[tuple[LoopFunction, Real], ...]:
     """Nothing but a distance from -1 asked for."""
     return ((LoopFunction.SENSITIVITY, np.full(ellipses.omega_rad_s.size, value)),)
-
-
-def _around(mode: Mode) -> Real:
-    """Points around a pole or zero of either side of the circle."""
-    return mode_points(Mode(mode.omega_rad_s, abs(mode.zeta)), 25)

@@ -259,7 +259,7 @@ class StartMaker:
             if kind == "first_order" and "second_order" not in self.cascade.sections:
                 x[at : at + 3] = [1.0, low[0], np.log(slow)]
                 return x
-            at += _numbers(kind)
+            at += Cascade((kind,), 1.0, 1.0).parameters
         return x
 
     def _random_sections(self) -> Real:
@@ -329,11 +329,6 @@ def _simplex(cost: Callable[[Real], float], start: Real, evaluations: int) -> Re
 
     options: Any = {"maxfev": evaluations, "initial_simplex": start, "adaptive": True, "fatol": 1e-4}
     return np.asarray(minimize(cost, start[0], method="Nelder-Mead", options=options).x, dtype=np.float64)
-
-
-def _numbers(kind: SectionKind) -> int:
-    """Parameters of one section."""
-    return Cascade((kind,), 1.0, 1.0).parameters
 
 
 def with_gain(cascade: Cascade, parameters: Real, factor: float) -> Real:

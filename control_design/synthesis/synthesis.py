@@ -90,8 +90,7 @@ def synthesise(
     reports += search.reports
     if thorough and not settled:
         problem.grids[:] = grids  # what the fits violated may be of no concern to other starts
-        rest = part_of(tell, 1, 2)
-        found = _climbed(workshop, ladder, root, own_damping, result.best, rest, reports)
+        found = _climbed(workshop, ladder, root, own_damping, result.best, part_of(tell, 1, 2), reports)
         worse = result.best is None or (found.best and found.best.gamma <= result.best.gamma)
         result = found if worse else result
     return _told(problem, cascade, result, tuple(reports), tell)
@@ -176,8 +175,7 @@ def synthesise_near(
     cascade, workshop = Cascade(problem.spec.sections(), problem.dt_s, problem.scale_rad_s), Workshop(problem)
     omega = problem.grids[0]
     known = FreeController(omega, controller.response(omega, with_delay=False))
-    search = OrderSearch(workshop, cascade, rng, tell)
-    result = search.fits_only(FreeControllers((known,), np.inf), np.inf)
+    result = OrderSearch(workshop, cascade, rng, tell).fits_only(FreeControllers((known,), np.inf), np.inf)
     return _told(problem, cascade, result, result.reports, tell)
 
 
@@ -295,8 +293,7 @@ def what_destabilises(problem: Problem, cascade: Cascade, parameters: Real) -> t
     rings too much by its own least damped pair.
     """
     found: list[tuple[int, float, BlockingPoint]] = []
-    loops = problem.closed_loop_poles(cascade, parameters)
-    for plant, z in zip(problem.plants, loops, strict=True):
+    for plant, z in zip(problem.plants, problem.closed_loop_poles(cascade, parameters), strict=True):
         for pole in z[(np.abs(z) >= 1.0) & (z.imag >= 0) & np.isfinite(z)]:
             frequency = float(np.abs(np.log(pole))) / problem.dt_s
             found.append((0, -float(np.abs(pole)), BlockingPoint(plant.name, NOMINAL, frequency, np.inf)))
