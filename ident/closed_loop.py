@@ -196,19 +196,14 @@ def _opened(records: Sequence[Record], rests: Sequence[RealArray], plant: GobfMo
     return opened
 
 
-def _reference(record: Record) -> RealArray:
+def _reference_to_input(record: Record) -> Record:
     if record.reference is None or record.reference.shape[1] != 1:
         raise ValueError(f"{record.label}: closed-loop identification needs exactly one reference column")
     if record.input.shape[1] != 1:
         raise ValueError(f"{record.label}: need one input; got {list(record.input_names)}")
-    return record.reference[:, 0]
-
-
-def _reference_to_input(record: Record) -> Record:
-    reference = _reference(record)
     return Record(
         name=record.name,
-        input=reference[:, None],
+        input=record.reference[:, 0][:, None],
         output=record.input,
         dt_s=record.dt_s,
         input_names=record.reference_names,

@@ -79,7 +79,8 @@ def long_arx_filter(records: Sequence[Record], options: IdentOptions) -> RealArr
         return best
     longest = orders[-1]
     blocks, targets = [], []
-    sizes = [max(float(np.std(signal)) for signal in signals) for signals in _signals(part)]
+    signals = [record.input for record in part], [record.output for record in part]
+    sizes = [max(float(np.std(signal)) for signal in each) for each in signals]
     for record in part:
         # In units of their own: a rank is told from how large the columns are.
         u, y = record.input[:, 0] / sizes[0], (record.output[:, 0] - record.output[:, 0].mean()) / sizes[1]
@@ -102,10 +103,6 @@ def long_arx_filter(records: Sequence[Record], options: IdentOptions) -> RealArr
         if criterion < least:
             best, least = np.concatenate([[1.0], theta[:order]]), criterion
     return best
-
-
-def _signals(records: Sequence[Record]) -> tuple[list[RealArray], list[RealArray]]:
-    return [record.input for record in records], [record.output for record in records]
 
 
 def _on_records(records: Sequence[Record], behind: Identification, noise_filter: RealArray) -> Identification:

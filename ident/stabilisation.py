@@ -107,9 +107,7 @@ def stabilisation(
     options = options or IdentOptions()
     records = [prewhitened(record, found.noise_filter) for record in records]
     part, in_mid_record = thinned(records, min(options.search_samples, _MOST_SAMPLES))
-    structure = found.structure
-    if in_mid_record:
-        structure = replace(structure, estimate_initial_state=True)
+    structure = replace(found.structure, estimate_initial_state=True) if in_mid_record else found.structure
     data = prepare(part, structure)
     search = PoleSearch(data, options)
     fixed_real, fixed_pairs = search.fixed.counts

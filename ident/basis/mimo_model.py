@@ -167,8 +167,7 @@ def residue_columns(poles: Poles) -> tuple[ComplexArray, ComplexArray]:
     apart = np.abs(values[:, None] - values[None, :]) + np.eye(values.size)
     if np.min(apart, initial=1.0) < 1e-9:
         raise ValueError("poles repeat: they have no residue each")
-    weights = np.linalg.solve(vectors, basis.B[:, 0])
-    return values, np.asarray(vectors * weights)
+    return values, np.asarray(vectors * np.linalg.solve(vectors, basis.B[:, 0]))
 
 
 def _mode(pole: complex, c: ComplexArray, b: ComplexArray) -> tuple[RealArray, RealArray, RealArray]:

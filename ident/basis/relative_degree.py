@@ -48,8 +48,7 @@ def conditions(poles: Poles, integrators: int, relative_degree: int) -> RealArra
 
     Raises ValueError if a pole has no continuous-time counterpart, or there are fewer than r poles in all.
     """
-    nothing = np.zeros(poles.order)
-    return conditions_with_sensitivities(poles, integrators, relative_degree, nothing, ())[0]
+    return conditions_with_sensitivities(poles, integrators, relative_degree, np.zeros(poles.order), ())[0]
 
 
 def conditions_with_sensitivities(
@@ -108,8 +107,7 @@ def conditions_with_sensitivities(
 def _schur_vectors(block: RealArray, pole: complex) -> ComplexArray:
     """Unitary (2, 2) U with U^* block U lower triangular; block is [[., .], [b, c]] with b != 0."""
     x, y = pole.conjugate() - block[1, 1], block[1, 0]
-    vectors = np.array([[y, x], [-np.conj(x), y]]) / np.hypot(abs(x), y)
-    return np.asarray(vectors, dtype=np.complex128)
+    return np.asarray(np.array([[y, x], [-np.conj(x), y]]) / np.hypot(abs(x), y), dtype=np.complex128)
 
 
 @numba.njit(**COMPILED)

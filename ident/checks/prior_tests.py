@@ -81,10 +81,8 @@ def fixed_poles_test(
     ends = [small.descend(poles, "fixed poles freed", ROUGH), OrderSelection(small).run()]
     n_real = poles.real.size - k
     if n_real > 1:  # no number of real poles makes a mode: two of them may be a pair
-        n_pairs = min(poles.pairs.size + n_real // 2, options.max_pairs)
-        turned = {"n_real": n_real % 2, "n_pairs": n_pairs}
-        paired = PoleSearch(small.data, options.model_copy(update=turned))
-        ends.append(OrderSelection(paired).run())
+        turned = {"n_real": n_real % 2, "n_pairs": min(poles.pairs.size + n_real // 2, options.max_pairs)}
+        ends.append(OrderSelection(PoleSearch(small.data, options.model_copy(update=turned))).run())
     best = min(ends, key=lambda end: end.rss)
     search = PoleSearch(given.data, options)
     freed = Fitted(search, search.descend(best.poles, "fixed poles freed"))
@@ -288,9 +286,7 @@ def _spare_integrators(records: Sequence[Record], given: Fitted) -> tuple[int, f
         if value > (k - fewer) * one:
             break
         found = fewer, value, (k - fewer) * one
-    if found is not None and _other_pole_to_spare(given, one):
-        return None
-    return found
+    return None if found is not None and _other_pole_to_spare(given, one) else found
 
 
 def _other_pole_to_spare(given: Fitted, price: float) -> bool:
@@ -345,8 +341,7 @@ def clearly_left_out(name: str, without: Fitted, with_it: Regression) -> Nuisanc
     and compare. The statistic shown counts what the residual without it is worth."""
     poles, search = without.poles, without.search
     here = with_it.linearise(*poles.writable())
-    share = free_optimality(here, poles, search.bounds, search.fixed)
-    promised = here.rss * (1 - share**2)
+    promised = here.rss * (1 - free_optimality(here, poles, search.bounds, search.fixed) ** 2)
     gain = float(np.log(max(without.end.rss, 1e-300) / max(promised, 1e-300)))
     test = NuisanceTest(name, _columns(without, with_it), without.worth() * gain)
     return test if with_it.n_samples * gain < _CLEARLY_BELOW * test.limit else None

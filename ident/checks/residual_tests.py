@@ -114,9 +114,8 @@ def independence_test(
     # Bartlett taper keeps the sum of sample correlations positive.
     taper = 1 - np.abs(np.arange(-longest, longest + 1)) / (longest + 1)
     deviation = np.sqrt(max(float(np.sum(taper * memory)), 1.0 / n) / n)
-    causal = np.abs(correlation[max_lag:])
     # 2 Phi(-x), all of max_lag + 1 lags below x with probability (1 - that)^(max_lag + 1).
-    single = 2 * norm.sf(causal / deviation)
+    single = 2 * norm.sf(np.abs(correlation[max_lag:]) / deviation)
     probability = float(-np.expm1((max_lag + 1) * np.log1p(-min(float(single.min()), 1 - 1e-16))))
     passed = probability >= 1 - level
     band = np.full(correlation.size, norm.ppf(0.5 + level / 2) * deviation)
@@ -150,8 +149,7 @@ def residual_advice(
     if not independence.passed:
         found.append(finding(FindingKind.NOT_INDEPENDENT, lag=independence.largest[0]))
     if not whiteness.passed:
-        independent = independence.passed
-        told = {"noise_order": noise_order, "independent": independent, "friction": friction}
+        told = {"noise_order": noise_order, "independent": independence.passed, "friction": friction}
         share = whiteness.predictable_share
         found.append(finding(FindingKind.NOT_WHITE, **told, observer=observer, predictable_share=share))
     return found

@@ -167,8 +167,7 @@ def period_of(signal: RealArray) -> int | None:
     """Samples after which a signal (T,) repeats, at least once in full; None where it does not."""
     n = signal.size
     x = signal - signal.mean()
-    spectrum = np.fft.rfft(x, 2 * n)
-    correlation = np.fft.irfft(np.abs(spectrum) ** 2, 2 * n)[: n // 2 + 1]
+    correlation = np.fft.irfft(np.abs(np.fft.rfft(x, 2 * n)) ** 2, 2 * n)[: n // 2 + 1]
     energy = np.concatenate([[0.0], np.cumsum(x**2)])
     lags = np.arange(n // 2 + 1)
     both = (energy[n] - energy[lags]) + energy[n - lags]
@@ -276,8 +275,7 @@ def _levels(group: Sequence[_Steady]) -> Distortion:
     outputs = [np.vstack([steady.output for steady in same]) for same in realisations]
     inputs = np.stack([same[0].input for same in realisations])
     periods = min(output.shape[0] for output in outputs)
-    n_lines = inputs.shape[1]
-    harmonics = np.arange(1, n_lines + 1)
+    harmonics = np.arange(1, inputs.shape[1] + 1)
     omega = 2 * np.pi * harmonics / (first.period * first.record.dt_s)
     means = np.stack([output.mean(axis=0) for output in outputs])
     # Noise of one period, smoothed over neighbouring harmonics, and its share in the mean of the periods.

@@ -73,8 +73,7 @@ class FrequencyUncertainty:
             omega,
             "the covariance is not positive semidefinite",
         )
-        off_diagonal = 0.5 * (covariance[:, 0, 1] + covariance[:, 1, 0])
-        covariance[:, 0, 1] = covariance[:, 1, 0] = off_diagonal
+        covariance[:, 0, 1] = covariance[:, 1, 0] = 0.5 * (covariance[:, 0, 1] + covariance[:, 1, 0])
         object.__setattr__(self, "dt_s", float(self.dt_s))
         object.__setattr__(self, "level", float(self.level))
         object.__setattr__(self, "covariance", readonly(covariance))

@@ -18,8 +18,7 @@ def json_columns(text: str, *, in_lines: bool) -> dict[str, Any]:
     """Arrays, text or `Unread` by name, nested as log.signals[0].values; what a row lacks is NaN. Raises
     ValueError, beginning with ':' or ', line 3:': no JSON, or a name twice in one object."""
     if in_lines:
-        lines = enumerate(text.split("\n"), 1)
-        document: Any = [_parsed(line, k) for k, line in lines if line.strip()]
+        document: Any = [_parsed(line, k) for k, line in enumerate(text.split("\n"), 1) if line.strip()]
     else:
         document = _parsed(text, 0)
     if isinstance(document, list):

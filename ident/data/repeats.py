@@ -152,8 +152,7 @@ def repeats_of(records: Sequence[Record]) -> tuple[Repeats, ...]:
 
 def _course(record: Record) -> RealArray:
     signal = record.input if record.reference is None else record.reference
-    course = signal[:, 0] - signal[:, 0].mean()
-    return np.asarray(course)
+    return np.asarray(signal[:, 0] - signal[:, 0].mean())
 
 
 def _alike(one: tuple[Record, RealArray], another: tuple[Record, RealArray]) -> bool:

@@ -210,8 +210,7 @@ def _conversion(table: Table, role: str, name: str, found: Mapping[str, Sequence
     unit = _unit(name, _stated(table, name))
     if unit in units:
         return units[unit]
-    words = _words(name)
-    if role == "frequency" and not unit and words & {"omega", "ω"}:
+    if role == "frequency" and not unit and _words(name) & {"omega", "ω"}:
         return units["rad/s"]
     # The table of our own documentation: gain beside phase_rad is a factor.
     if name == "gain" and not unit and "phase_rad" in found["phase"]:
@@ -241,8 +240,7 @@ def _role(name: str, unit: str) -> str | None:
     if re.match(r"\s*\|.*\|", plain):
         return "gain"
     hits = [role for role in ("real", "imag", "phase", "gain", "frequency") if words & _WORDS[role]]
-    spoken = [role for role in hits if words & _WORDS[role] - _SHORT]
-    hits = spoken or hits
+    hits = [role for role in hits if words & _WORDS[role] - _SHORT] or hits
     if len(hits) > 1:
         # 'Trace 1: Gain: Phase (°)': what the unit is of.
         hits = [role for role in hits if _unit(name, unit) in _UNITS[role]] or hits[:1]

@@ -214,8 +214,7 @@ def project(data: Regression, shared: Poles, local: Poles | None = None) -> Proj
         rows = np.vstack([rows, data.u])
     local_q, residual = data.polynomials_q, data.y_clear.copy()
     if local.order > 0 and data.structure.estimate_initial_state:
-        n_polynomials = data.polynomials.shape[0]
-        local_q = np.zeros((n_polynomials + local.order, data.n_samples))
+        local_q = np.zeros((data.polynomials.shape[0] + local.order, data.n_samples))
         for here in data.segments:
             free = free_response(local, here.stop - here.start)
             q, _ = np.linalg.qr(np.column_stack([data.polynomials[:, here].T, free]))
@@ -257,9 +256,11 @@ def block_states(data: Regression, poles: Poles, signal: RealArray) -> RealArray
 def fitted_output(data: Regression, projection: Projection) -> RealArray:
     """The part of the output that the poles make, (N,)."""
     # A polynomial part stays in the span of free responses; without them it has to be left out.
-    if data.structure.estimate_initial_state:
-        return np.asarray(data.y - projection.residual)
-    return np.asarray(projection.coefficients(data.y) @ projection.shared)
+    return np.asarray(
+        data.y - projection.residual
+        if data.structure.estimate_initial_state
+        else projection.coefficients(data.y) @ projection.shared
+    )
 
 
 def pole_sensitivities(data: Regression, poles: Poles, projection: Projection) -> RealArray:

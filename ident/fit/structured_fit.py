@@ -44,8 +44,7 @@ def structured_fit(data: Regression, poles: Poles, relative_degree: int) -> Line
     """
     solved = _solve(data, poles, relative_degree)
     residual = solved.residual
-    coefficients = solved.coefficients[np.newaxis]
-    return LinearFit(coefficients, np.zeros(1), residual, float(residual @ residual))
+    return LinearFit(solved.coefficients[np.newaxis], np.zeros(1), residual, float(residual @ residual))
 
 
 def _solve(data: Regression, poles: Poles, relative_degree: int) -> _Constrained:
@@ -58,8 +57,7 @@ def _solve(data: Regression, poles: Poles, relative_degree: int) -> _Constrained
     projection = project(data, poles)
     basis, inverse = null_space(rows, np.linalg.norm(projection.triangle, axis=0))
     target = projection.shared_q @ data.y
-    columns = projection.triangle @ basis
-    left, values, right = np.linalg.svd(columns, full_matrices=False)
+    left, values, right = np.linalg.svd(projection.triangle @ basis, full_matrices=False)
     kept = values > _RANK_TOLERANCE * values[0]
     reachable = left[:, kept]
     along = reachable.T @ target
@@ -122,11 +120,9 @@ class UnderRelativeDegree:
 
     def refine(self, poles: Poles, bounds: Bounds, tolerance: float = 1e-9) -> Refined:
         """`ident.fit.refinement.refine` under the relative degree; real poles are kept at or above 0.01."""
-        held = self.bounded(bounds)
-        return refine(self, poles, held, self.fixed, max_iterations=100, tolerance=tolerance)
+        return refine(self, poles, self.bounded(bounds), self.fixed, max_iterations=100, tolerance=tolerance)
 
     def optimality(self, poles: Poles, bounds: Bounds) -> float:
         """|P r|/|r| over the tangent directions of the constrained models that no bound holds; 0: an
         optimum."""
-        here = self.linearise(*poles.writable())
-        return free_optimality(here, poles, self.bounded(bounds), self.fixed)
+        return free_optimality(self.linearise(*poles.writable()), poles, self.bounded(bounds), self.fixed)

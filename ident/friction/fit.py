@@ -97,8 +97,7 @@ def _swinging(options: IdentOptions) -> IdentOptions:
     it."""
     if (options.zeta_min or 0.0) >= LARGEST_DAMPING:
         return options
-    largest = min(options.zeta_max or LARGEST_DAMPING, LARGEST_DAMPING)
-    return options.model_copy(update={"zeta_max": largest})
+    return options.model_copy(update={"zeta_max": min(options.zeta_max or LARGEST_DAMPING, LARGEST_DAMPING)})
 
 
 def moved_to(found: FrictionFit, records: Sequence[Record], model: GobfModel) -> FrictionFit:

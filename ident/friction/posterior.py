@@ -73,8 +73,7 @@ def without_friction(
         # Known beforehand, to one: logarithms in the law, and how far this record's level is off.
         plain, logs = local.by_law[:, ::2], STD_LOG * local.by_law[:, 1::2]
         own = np.outer(found.between * plain[:, 0], np.arange(len(records)) == k)
-        columns = np.hstack([plain, logs, own])
-        beside.append(Beside(local.by_coefficients, columns))
+        beside.append(Beside(local.by_coefficients, np.hstack([plain, logs, own])))
     n_known = logs.shape[1] + len(records)
     response, change, factor = tangent_beside(corrected, found.model, beside, options, n_known=n_known)
     return BehindFriction(response, response, found.level + float(change[0]), factor[0], found)
