@@ -89,5 +89,4 @@ def simulate(
     """
     given = (effects,) if isinstance(effects, Effect) else effects
     noise = None if rng is None else np.random.default_rng(rng)
-    result = simulation.simulate(rig, voltage_V, given, rng=noise, **settings)
-    return dressed(Simulation, result)
+    return dressed(Simulation, simulation.simulate(rig, voltage_V, given, rng=noise, **settings))

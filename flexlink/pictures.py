@@ -117,8 +117,7 @@ def _record(record: Record) -> Figure:
     from workflow.figures.records import draw_records
     from workflow.tasks.results import RunRecord
 
-    shown = RunRecord(record, "estimation", None, "")
-    return draw_records([shown], record.input_names, record.output_names)
+    return draw_records([RunRecord(record, "estimation", None, "")], record.input_names, record.output_names)
 
 
 @plot.register(Simulation)
@@ -196,8 +195,7 @@ def _loop(plant: UncertainPlant, controller: Controller, specification: Specific
 
     own = plant.own_grid
     omega = _grid(plant.dt_s) if own is None else own[own > 0]
-    curves = sensitivity_curves(plant, controller, specification, omega)
-    return draw_sensitivities(curves, level=plant.level)
+    return draw_sensitivities(sensitivity_curves(plant, controller, specification, omega), level=plant.level)
 
 
 def _grid(dt_s: float) -> npt.NDArray[np.float64]:

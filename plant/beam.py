@@ -143,5 +143,4 @@ def _root(k: int, mu: float) -> float:
 
     from scipy.optimize import brentq  # here: every command would wait for it
 
-    root = brentq(characteristic, max(k * np.pi, 1e-6), (k + 1) * np.pi, xtol=1e-14, rtol=1e-14)
-    return float(root)
+    return float(brentq(characteristic, max(k * np.pi, 1e-6), (k + 1) * np.pi, xtol=1e-14, rtol=1e-14))

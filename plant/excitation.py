@@ -158,8 +158,7 @@ def log_chirp(start_Hz: float, stop_Hz: float, amplitude_V: float, n_samples: in
             f"need different frequencies between 0 and {0.5 / dt_s} Hz (Nyquist); "
             f"got {start_Hz} and {stop_Hz}"
         )
-    duration = n_samples * dt_s
-    rate = np.log(stop_Hz / start_Hz) / duration
+    rate = np.log(stop_Hz / start_Hz) / (n_samples * dt_s)
     time = np.arange(n_samples) * dt_s
     return np.asarray(amplitude_V * np.sin(2 * np.pi * start_Hz * np.expm1(rate * time) / rate))
 

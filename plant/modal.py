@@ -102,8 +102,7 @@ def default_n_modes(rig: Rig) -> int:
     n = 4
     while n < 40 and link_modes(rig, n).omega_rad_s[-1] < nyquist:
         n += 1
-    below = link_modes(rig, n).omega_rad_s < nyquist
-    return min(max(int(np.sum(below)), 3), 39)
+    return min(max(int(np.sum(link_modes(rig, n).omega_rad_s < nyquist)), 3), 39)
 
 
 def link_modes(rig: Rig, n_modes: int) -> BeamModes:

@@ -256,10 +256,11 @@ class _Builder:
         """Columns of what is constant over a step: voltage before and after it changes in it, hub torque, tip
         force, one force per element. The first is filled in where it does (`_change_inside`)."""
         eq = self.equations
-        if self.voltage_state >= 0:
-            voltage = np.eye(self.n)[self.voltage_state] / self.machine.voltage.lag_s
-        else:
-            voltage = self._motor_column()
+        voltage = (
+            np.eye(self.n)[self.voltage_state] / self.machine.voltage.lag_s
+            if self.voltage_state >= 0
+            else self._motor_column()
+        )
         before, forces = np.zeros(self.n), self._element_columns()
         return np.column_stack([before, voltage, self._column(eq.hub), self._column(eq.tip), forces])
 
@@ -375,9 +376,8 @@ class _Builder:
         turned[: eq.first_mode] = 1.0
         if self.machine.joint.base is not None:
             turned[1] = 0.0
-        modes = np.eye(n)[:, eq.first_mode :]
-        if self.machine.joint.compliance is not None:
-            modes = self._modes_with_root()
+        stiff = self.machine.joint.compliance is None
+        modes = np.eye(n)[:, eq.first_mode :] if stiff else self._modes_with_root()
         columns = np.zeros((self.n, 3 + 2 * modes.shape[1]))
         columns[:n, 0] = columns[n : 2 * n, 1] = turned
         columns[:n, 3 : 3 + modes.shape[1]] = columns[n : 2 * n, 3 + modes.shape[1] :] = modes
