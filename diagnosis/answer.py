@@ -405,8 +405,7 @@ def share_closed(
     """Share of the explainable held-out energy that is gone, with a block bootstrap."""
     pairs = []
     for experiment in case.held_out:
-        T = len(experiment.output)
-        for start in range(0, T, BLOCK):
+        for start in range(0, len(experiment.output), BLOCK):
             part = slice(start, start + BLOCK)
             a, b = before[experiment.name][part], after[experiment.name][part]
             pairs.append((float(np.sum(a**2)), float(np.sum(b**2)), a.size))

@@ -26,8 +26,7 @@ def confronted(
 ) -> list[Hypothesis] | None:
     """The hypotheses with the log density of the held-out records added to their weights, and to an unknown
     rest what that gains; None if the records confirm the leading one and it is an answer, no look-alike."""
-    case = model.case
-    if not case.held_out:
+    if not model.case.held_out:
         return None
     first = _prediction(model, leading.end)
     confirmed = leading.is_answer and first.unknown_gain < SUBSTANTIAL

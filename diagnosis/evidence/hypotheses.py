@@ -68,10 +68,9 @@ class Hypothesis(Weighed):
         listed: tuple[str, ...] = tuple(EFFECTS),
     ) -> Hypothesis:
         """left: what the fit leaves over, of residuals without the drift of correct solvers."""
-        beside = len(fit.names) - 1
         # Where contacts switch, what two correct solvers disagree about is not white, and further effects can
         # follow some of it.
-        allowed = DECISIVE * beside if fit.non_smooth else 0.0
+        allowed = DECISIVE * (len(fit.names) - 1) if fit.non_smooth else 0.0
         further = sum(len(candidate.axes) - 1 for candidate in fit.candidates)
         # The evidence charges only for parameters that the records determine: an effect that contains another
         # (Stribeck and Coulomb friction) costs nothing where it looks like it; the simpler name is better.

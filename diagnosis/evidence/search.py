@@ -94,9 +94,7 @@ class WhiteSearch(SearchLoop[Hypothesis]):
     def looked_for(self, candidate: Candidate, points: list[Point]) -> tuple[Candidate, list[Point]]:
         """From the size on at which it changes a record."""
         smallest = smallest_size(candidate, points, _SMALLEST)
-        if smallest is None:
-            return candidate, []
-        return candidate.from_size(smallest), points
+        return (candidate, []) if smallest is None else (candidate.from_size(smallest), points)
 
     def looked_at_beside(
         self, parent: Descent, candidate: Candidate, points: Sequence[Point]
@@ -111,8 +109,7 @@ class WhiteSearch(SearchLoop[Hypothesis]):
         """Finished where it may matter: among faint effects alone a few units of loss decide, and stated
         values that a gap has pulled far off need more than rough steps to come back."""
         best = min(h.end.loss for h in self.found)
-        smooth = all(c.dependence == "smooth" for c in end.candidates)
-        faint = smooth and not around.candidates
+        faint = all(c.dependence == "smooth" for c in end.candidates) and not around.candidates
         close = end.loss < best + DECISIVE and (faint or end.loss < around.loss - WORTH_IT)
         # A backlash that only looks like something else takes as long as everything besides.
         if not (close or rank == 0) or (rank > 0 and end.non_smooth and not self._near(end)):

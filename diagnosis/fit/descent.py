@@ -111,8 +111,7 @@ class Descent:
     def precision(self, records: RecordsToFit) -> Real:
         """(P + A, P + A) of deviations and coordinates, whatever the starts and zeros are."""
         H, n = self.normal(records).hessian, self.jacobian.shape[1]
-        rest = np.linalg.pinv(H[n:, n:], hermitian=True)
-        return np.asarray(H[:n, :n] - H[:n, n:] @ rest @ H[n:, :n])
+        return np.asarray(H[:n, :n] - H[:n, n:] @ np.linalg.pinv(H[n:, n:], hermitian=True) @ H[n:, :n])
 
 
 @dataclass(frozen=True, eq=False)

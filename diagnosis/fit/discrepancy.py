@@ -85,8 +85,7 @@ def _band(frequency: Real) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
 
 def _log_factor(n: float, S: float) -> float:
     """log of the mean over log s of the likelihood of variance 1 + s over that of variance 1, chi-square."""
-    low = _VISIBLE * np.sqrt(2 / n)
-    s = np.geomspace(low, _LARGEST, _GRID)
+    s = np.geomspace(_VISIBLE * np.sqrt(2 / n), _LARGEST, _GRID)
     gain = -0.5 * n * np.log1p(s) + 0.5 * S * s / (1 + s)
     top = float(np.max(gain))
     return top + float(np.log(np.mean(np.exp(gain - top))))

@@ -124,8 +124,7 @@ class RecordsToFit:
 
     def size_of(self, change: Real) -> float:
         """Largest RMS, over records and outputs, of a change of the coefficients (N,)."""
-        squares = np.square(change).reshape(-1, self.case.noise.size)
-        energies = np.add.reduceat(squares, self._firsts)
+        energies = np.add.reduceat(np.square(change).reshape(-1, self.case.noise.size), self._firsts)
         return float(np.sqrt(np.max(energies / self._lengths)))
 
     def residuals_of(self, e: Real) -> tuple[Real, ...]:

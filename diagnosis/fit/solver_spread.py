@@ -77,8 +77,7 @@ def without_drift(residuals: Real, spread: Real) -> tuple[Real, Drift]:
     """
     variance = 1.0 + spread
     e = residuals / np.sqrt(variance)
-    drifted = spread / variance
-    counted = 1.0 - drifted * (1.0 - 1.0 / _WINDOW)
+    counted = 1.0 - spread / variance * (1.0 - 1.0 / _WINDOW)
     cost = float(np.sum(counted * (e**2 + np.log(variance)) + 1.0 - counted))
     gain = 0.5 * (float(residuals @ residuals) - cost)
     if not gain > 0 or float(np.mean(e**2)) > 1.0 + _MOST_LEFT**2:

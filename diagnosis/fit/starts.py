@@ -82,8 +82,7 @@ def beside(
 def point_at(
     records: RecordsToFit, around: Descent, candidate: Candidate, x: Real, start: Start
 ) -> Point | None:
-    effects = (*around.effects, candidate.effect_at(x))
-    e = records.coefficients(around.deviations, effects, start)
+    e = records.coefficients(around.deviations, (*around.effects, candidate.effect_at(x)), start)
     if not np.all(np.isfinite(e)):
         return None
     loss, deviations = follow(records, around, e, start)
@@ -147,8 +146,7 @@ def _harmonic(records: RecordsToFit, around: Descent, candidate: Candidate) -> l
         return np.asarray(irfft(rfft(torque, size)[..., None] * transfer, size, axis=2))
 
     def columns_of(moved: Real) -> Real:
-        columns = records.likelihood.changed(moved).reshape(2 * len(moved), -1)
-        return -columns.T.astype(np.float64)
+        return -records.likelihood.changed(moved).reshape(2 * len(moved), -1).T.astype(np.float64)
 
     found = []
     lines = lines[(lines >= low) & (lines <= high)]

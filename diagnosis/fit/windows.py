@@ -137,5 +137,4 @@ def _slowest_samples(responses: Real) -> int:
     rates = np.abs(np.log(modes[np.abs(modes) > 0]))
     turns = np.abs(np.angle(modes[np.abs(modes) > 0]))
     times = np.where(turns > 0, 2 * np.pi / np.maximum(turns, 1e-12), 1 / np.maximum(rates, 1e-12))
-    within = times[_TIMES * times <= L]
-    return int(np.ceil(_TIMES * np.max(within, initial=1.0)))
+    return int(np.ceil(_TIMES * np.max(times[_TIMES * times <= L], initial=1.0)))

@@ -97,8 +97,7 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
     if accepted.names:
         # Values are re-estimated beside effects too only where that leaves less of the held-out records.
         accepted = min(accepted, search.stated(accepted), key=lambda e: e.pooled_held_out(case.noise))
-    names = found.accepted or partial
-    shares = shares_of(search, names, accepted, refit, rng)
+    shares = shares_of(search, found.accepted or partial, accepted, refit, rng)
 
     def model(of: Explanation) -> Model:
         return Model(of.end.deviations, _whitened(case, of))

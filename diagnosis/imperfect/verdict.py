@@ -166,8 +166,7 @@ def judged(search: Search) -> Verdict:
             search.simpler(one)
         if len(search.found) == known:
             break
-    weights = _weights(sets)
-    sets = tuple(replace(one, weight=float(w)) for one, w in zip(sets, weights, strict=True))
+    sets = tuple(replace(one, weight=float(w)) for one, w in zip(sets, _weights(sets), strict=True))
     sets = tuple(sorted(sets, key=lambda one: -one.weight))
     weighing = search.case.machine.weighing
     # What effects too small to interest carry together is measured as each of them is; held-out records have
@@ -189,8 +188,7 @@ def judged(search: Search) -> Verdict:
     )
     answer = probabilities.counting_as_unknown(untried).answer
     accepted = _accepted(probabilities, answer, sets, beside)
-    rounded = rounding if beside else None
-    return Verdict(probabilities, sets, answer, accepted, nominal, untried, rounded)
+    return Verdict(probabilities, sets, answer, accepted, nominal, untried, rounding if beside else None)
 
 
 def late(search: Search) -> bool:

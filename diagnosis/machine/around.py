@@ -197,8 +197,7 @@ def _fixed(changed: Callable[[Real], Real], beyond: Real, response: Real, start:
         x = x + step
         if len(steps) > 1:
             moves, turns = np.diff(points, axis=0).T, np.diff(steps, axis=0).T
-            mixed = np.linalg.lstsq(turns, step, rcond=1e-12)[0]
-            x = x - (moves + turns) @ mixed
+            x = x - (moves + turns) @ np.linalg.lstsq(turns, step, rcond=1e-12)[0]
     return x, np.asarray(beyond + scipy.signal.fftconvolve(response, x)[: x.size])
 
 

@@ -234,8 +234,7 @@ def put_spring(name: str, load: float, spec: Any, stiffness: float, damping_rati
 
 def put_stribeck(name: str, spec: Any, level: float, share: float, velocity: float) -> None:
     """Dry friction of level at rest, a share of it at speed; MJCF has no word for the difference."""
-    joint = spec.joint(name)
-    joint.frictionloss += share * level
+    spec.joint(name).frictionloss += share * level
     put_number(f"{name}.{STRIBECK}", spec, (1 - share) * level, velocity)
 
 

@@ -244,8 +244,7 @@ class Simulation:
                 guess, spread = np.append(guess, inputs[0, u]), np.append(spread, np.std(inputs[:, u]) or 1.0)
             model = self._model({})
             first = self._run(model, inputs, guess)
-            moved = guess + np.diag(spread)
-            runs = [self._run(model, inputs, state) for state in moved]
+            runs = [self._run(model, inputs, state) for state in guess + np.diag(spread)]
             slopes = [(run - first) / size for run, size in zip(runs, spread, strict=True)]
             start = _Start(guess, guess, spread, np.array(slopes).reshape(-1, *first.shape), self.noise)
             return replace(start, state=guess + start.shift(inputs[:, U:] - first))

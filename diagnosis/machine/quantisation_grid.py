@@ -56,9 +56,7 @@ def grid_step(signals: Sequence[Real], noise: float) -> float:
         reach *= 2
     off = np.abs(values - step * np.round(values / step))
     # The step carries an error of its own, which grows with the count.
-    if np.any(off > 2 * coarse) or step / np.sqrt(12) < _NOTICEABLE * noise:
-        return 0.0
-    return step
+    return 0.0 if np.any(off > 2 * coarse) or step / np.sqrt(12) < _NOTICEABLE * noise else step
 
 
 def cell_residual(measured: Real, model: Real, step: float, noise: float) -> Real:

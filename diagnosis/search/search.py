@@ -132,9 +132,7 @@ class Search(SearchLoop[Explanation]):
             return end
         start, e = settled(self.records, end.deviations, end.effects, end.start)
         loss, _ = loss_at(self.records, e, end.deviations, start)
-        if loss > end.loss - SUBSTANTIAL:
-            return end
-        return end.on(self.records, start)
+        return end if loss > end.loss - SUBSTANTIAL else end.on(self.records, start)
 
     def acts_on_held_out(self, explanation: Explanation, k: int) -> float:
         """Share of the motion that the k-th effect changes of held-out records, all else as it is; of the

@@ -107,9 +107,9 @@ class _RecordStart:
         and by parts of such steps."""
         records, parts = self.records, _PARTS if columns is None else (1.0,)
         for _ in range(_STEPS):
-            own = columns
-            if own is None:
-                own = quotients(self.left, self.state, self.e, records.state_steps)
+            own = (
+                quotients(self.left, self.state, self.e, records.state_steps) if columns is None else columns
+            )
             before, move = self.loss, best_move(self.levels, records.state_spread, own, self.e, self.state)
             if not any(self.better(self.state + part * move) for part in parts) or self.loss > before - _GAIN:
                 return

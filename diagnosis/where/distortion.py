@@ -48,12 +48,12 @@ def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> P
     separable = bool(np.all(lines[excited] % 2 == 1))
     # Distortion of a low order ends at a few times the highest excited line.
     near = lines <= 3 * lines[excited].max()
-    groups = {
-        "not excited, odd": ~excited & near & (lines % 2 == 1),
-        "not excited, even": ~excited & near & (lines % 2 == 0),
-    }
-    if not separable:
-        groups = {"not excited": ~excited & near}
+    silent = ~excited & near
+    groups = (
+        {"not excited, odd": silent & (lines % 2 == 1), "not excited, even": silent & (lines % 2 == 0)}
+        if separable
+        else {"not excited": silent}
+    )
     groups = {name: chosen for name, chosen in groups.items() if np.count_nonzero(chosen) >= _LEAST_LINES}
     edges = band_edges_Hz(period * dt, dt)
     frequency = lines / (period * dt)
@@ -63,7 +63,9 @@ def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> P
     tests = len(sensors) * (len(groups) + len(banded))
     bands, shown = [], []
     for s, sensor in enumerate(sensors):
-        mean, rest = _split(spectra[:, :, s])
+        # Mean over the periods (L,) and summed squares of what is left (L,).
+        mean = spectra[:, :, s].mean(axis=0)
+        rest = np.sum(np.abs(spectra[:, :, s] - mean) ** 2, axis=0)
         for low, high, chosen in banded:
             p_value = _p_value(mean, rest, chosen, count)
             error = float(np.sqrt(np.sum(np.abs(mean[chosen]) ** 2)))
@@ -108,12 +110,6 @@ def _lines(signal: Real, period: int, count: int, lines: npt.NDArray[np.int64]) 
     """(M, L, Y) orthonormal spectra of the last whole periods of a signal (T, Y)."""
     last = signal[signal.shape[0] - count * period :].reshape(count, period, -1)
     return np.asarray(np.fft.rfft(last, axis=1)[:, lines] / np.sqrt(period))
-
-
-def _split(spectra: ComplexArray) -> tuple[ComplexArray, Real]:
-    """Mean over the periods (L,) and summed squares of what is left (L,)."""
-    mean = spectra.mean(axis=0)
-    return mean, np.sum(np.abs(spectra - mean) ** 2, axis=0)
 
 
 def _p_value(mean: ComplexArray, rest: Real, chosen: npt.NDArray[np.bool_], count: int) -> float:

@@ -145,8 +145,7 @@ def _basis(axis: str, moved: Mapping[str, Motion]) -> _Basis | None:
 
 def _hats(values: Real, nodes: Real) -> Real:
     """Piecewise linear interpolation weights (T, K) of values within the nodes (K,)."""
-    identity = np.eye(nodes.size)
-    return np.column_stack([np.interp(values, nodes, row) for row in identity])
+    return np.column_stack([np.interp(values, nodes, row) for row in np.eye(nodes.size)])
 
 
 def _normal_equations(

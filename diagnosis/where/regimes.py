@@ -187,8 +187,7 @@ def regime_findings(
     found = []
     for axis in axes:
         sums, counts = _shifted_energy(residuals, axis, rng)
-        for s, sensor in enumerate(sensors):
-            found.append(_finding(axis, sensor, sums[:, s], counts, each))
+        found += [_finding(axis, sensor, sums[:, s], counts, each) for s, sensor in enumerate(sensors)]
     return tuple(found)
 
 

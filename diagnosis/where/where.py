@@ -116,8 +116,7 @@ def over_levels(
     if not isinstance(case, Case):
         return case, weighed
     keys = [f"sensors.{NOISE[output]}" for output in case.outputs]
-    seen = replace(case, rig=case.rig.perturbed(dict(zip(keys, levels, strict=True))))
-    return seen, weighed
+    return replace(case, rig=case.rig.perturbed(dict(zip(keys, levels, strict=True)))), weighed
 
 
 def subsystem_mass(probabilities: Mapping[str, float]) -> dict[str, float]:

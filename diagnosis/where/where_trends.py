@@ -234,8 +234,7 @@ def linear_correction(case: Case, residuals: Mapping[str, Real]) -> LinearCorrec
 
 
 def _poles(case: Case) -> Poles:
-    dt = case.rig.sampling.dt_s
-    z = np.exp(linear_arm(case.rig).poles() * dt)
+    z = np.exp(linear_arm(case.rig).poles() * case.rig.sampling.dt_s)
     # The integrator of the hub enters as summed input: a pole inside the circle cannot stand for it.
     inside = z[np.abs(z) < 1 - 1e-7]
     real = inside.real[np.abs(inside.imag) < 1e-12]
