@@ -16,7 +16,7 @@ from workflow.engine.run_directory import RunDirectory
 from workflow.text.templates import RunSummary, rows_of
 
 if TYPE_CHECKING:
-    from workflow.tasks.experiment import Limits, PlannedExperiment
+    from workflow.tasks.experiment import Limits
 
 PLAN_FILE, PAGE_FILE = "plan.json", "plan.html"
 
@@ -42,22 +42,20 @@ def write_experiment(
         record.file: storage.csv_text({"time_s": time, INPUT_NAME: voltage})
         for record, voltage in zip(found.records, signals, strict=True)
     }
-    texts[PLAN_FILE] = codec.plain_text(_document(found))
+    texts[PLAN_FILE] = codec.plain_text(
+        {
+            "plan": found.plan,
+            "seed": found.seed,
+            "dt_s": found.limits.dt_s,
+            "duration_s": found.duration_s,
+            "lines_Hz": found.lines_Hz,
+            "detection_lines_Hz": found.detection_Hz,
+            "expected_radius_rad_per_V": found.radii,
+            "records": found.records,
+        }
+    )
     texts[PAGE_FILE] = render_page("experiment.html.j2", title="Planned experiment", found=found).html
     return storage.write_new_directory(out, texts)
-
-
-def _document(found: PlannedExperiment) -> dict[str, object]:
-    return {
-        "plan": found.plan,
-        "seed": found.seed,
-        "dt_s": found.limits.dt_s,
-        "duration_s": found.duration_s,
-        "lines_Hz": found.lines_Hz,
-        "detection_lines_Hz": found.detection_Hz,
-        "expected_radius_rad_per_V": found.radii,
-        "records": found.records,
-    }
 
 
 def write_reference(

@@ -62,8 +62,7 @@ def identify_logs(
             with_plot=report is not None,
             progress=progress,
         )
-    matched = beside(result.about, true_modes)
-    result = replace(result, true_modes=matched, input_limit=logs.input_limit)
+    result = replace(result, true_modes=beside(result.about, true_modes), input_limit=logs.input_limit)
     written: dict[Path, bytes] = {}
     if report is not None:
         from workflow.report.pages import identify_page  # only a page needs what draws

@@ -10,7 +10,7 @@ import numpy as np
 from ident.basis.model_files import ModelFile
 from ident.basis.options import IdentOptions
 from ident.data.frf_records import FrfRepeats, measured_response
-from ident.frequency_fit import FrfIdentification, identify_frf
+from ident.frequency_fit import identify_frf
 from ident.uncertainty.nominal import nominal_near
 from workflow.engine import codec, interrupts, storage
 from workflow.engine.errors import InputError, naming
@@ -74,28 +74,24 @@ def identify_response(
             written[export] = model_bytes(export, ModelFile(found.model, found.posterior.at(omega, level)))
     interrupts.check()
     storage.write_together(written)
+    poles, dt_s = found.model.poles, found.model.dt_s
     return RunSummary(
         title=f"frequency response {paths[0].name}",
         sections=rows_of("summary/response.j2", found=found, response=response),
-        numbers=_numbers(found, out, export),
+        numbers={
+            "order": found.model.order,
+            "dt_s": dt_s,
+            "real_poles_per_s": codec.plain(poles.decay_per_s(dt_s)),
+            "modes": [
+                {"omega_rad_s": omega, "frequency_Hz": omega / (2 * np.pi), "damping": zeta}
+                for omega, zeta in zip(poles.omega_rad_s(dt_s).tolist(), poles.zeta().tolist(), strict=True)
+            ],
+            "chi_square": found.rss,
+            "degrees_of_freedom": found.degrees_of_freedom,
+            "verdicts": [words(item) for item in found.verdicts],
+            "warnings": [words(item) for item in found.warnings],
+            "file": None if out is None else str(out),
+            "model_file": None if export is None else str(export),
+        },
         verdict=count(len(found.warnings), "warning"),
     )
-
-
-def _numbers(found: FrfIdentification, out: Path | None, export: Path | None) -> dict[str, object]:
-    poles, dt_s = found.model.poles, found.model.dt_s
-    return {
-        "order": found.model.order,
-        "dt_s": dt_s,
-        "real_poles_per_s": codec.plain(poles.decay_per_s(dt_s)),
-        "modes": [
-            {"omega_rad_s": omega, "frequency_Hz": omega / (2 * np.pi), "damping": zeta}
-            for omega, zeta in zip(poles.omega_rad_s(dt_s).tolist(), poles.zeta().tolist(), strict=True)
-        ],
-        "chi_square": found.rss,
-        "degrees_of_freedom": found.degrees_of_freedom,
-        "verdicts": [words(item) for item in found.verdicts],
-        "warnings": [words(item) for item in found.warnings],
-        "file": None if out is None else str(out),
-        "model_file": None if export is None else str(export),
-    }

@@ -110,10 +110,24 @@ def init(
     text = configuration(found, _entries(logs, out, draft))
     config = check(RunConfig, tomllib.loads(text), source=str(out), context={"base": out.absolute().parent})
     storage.write_text(out, text)
+    look = draft.look
     return RunSummary(
         title=str(out),
         sections=rows_of("summary/init.j2", found=found, config=config),
-        numbers={"configuration": config.to_document(), "seen": _numbers(found)},
+        numbers={
+            "configuration": config.to_document(),
+            "seen": {
+                "roles": codec.plain(read.roles),
+                "told_rad_s": codec.plain(look.told_rad_s),
+                "first_mode": codec.plain(look.mode),
+                "notch_rad_s": look.notch,
+                "motion": codec.plain(look.motion),
+                "delay_samples": look.delay,
+                "turned": look.turned,
+                "friction": draft.friction,
+                "unstable_per_s": draft.unstable_per_s,
+            },
+        },
         verdict=f"flexlink run --config {shlex.quote(str(out))}",
     )
 
@@ -241,18 +255,3 @@ def _entries(logs: Sequence[Path], out: Path, draft: Draft) -> list[Entry]:
         Entry(path, k == len(paths) - 1, f"{k + 1}: {logs[k].stem}" if alike else "")
         for k, path in enumerate(paths)
     ]
-
-
-def _numbers(found: Found) -> dict[str, Any]:
-    draft, look = found.draft, found.draft.look
-    return {
-        "roles": codec.plain(found.read.roles),
-        "told_rad_s": codec.plain(look.told_rad_s),
-        "first_mode": codec.plain(look.mode),
-        "notch_rad_s": look.notch,
-        "motion": codec.plain(look.motion),
-        "delay_samples": look.delay,
-        "turned": look.turned,
-        "friction": draft.friction,
-        "unstable_per_s": draft.unstable_per_s,
-    }

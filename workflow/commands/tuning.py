@@ -181,8 +181,7 @@ class TuningSession:
                 numbers |= _of_synthesis(found.synthesis)
             if law is None:
                 return {**_finite(numbers), "plants": []}
-            between = asked.plant.between_points
-            certificate = certify(law, plants, used, between_own_points=between)
+            certificate = certify(law, plants, used, between_own_points=asked.plant.between_points)
             still()
             self._last = law
         return {**_finite(numbers | _of(certificate)), "plants": self._curves(law, plants, used)}
@@ -254,9 +253,11 @@ class TuningSession:
     def _drawn(self, plant: UncertainPlant, n: int) -> Complex:
         """Responses (D, n/2 + 1) drawn from the posterior, the same at every call; none where none can be."""
         number = next(k for k, known in enumerate(self._plants) if known.name == plant.name)
-        if not self.drawable:
-            return np.empty((0, n // 2 + 1), dtype=np.complex128)
-        return _samples(self._plants[number], n, self.seed)
+        return (
+            _samples(self._plants[number], n, self.seed)
+            if self.drawable
+            else np.empty((0, n // 2 + 1), dtype=np.complex128)
+        )
 
 
 @lru_cache(maxsize=8)
