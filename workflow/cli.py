@@ -356,8 +356,7 @@ def excite(
         rig=None if rig is None else rig_called(rig),
         noise_std_rad=noise_std,
     )
-    files = write_experiment(limits, out, seed=seed, lead_in_s=lead_in, **given)
-    _show_files(files, as_json)
+    _show_files(write_experiment(limits, out, seed=seed, lead_in_s=lead_in, **given), as_json)
 
 
 @app.command(cls=_OfSettings, short_help="What a log holds: columns, units, sampling, ranges.")

@@ -119,8 +119,7 @@ def read_design_file(path: Path) -> DesignFile:
     _, document = read_toml(path)
     known = DesignFile.model_fields.keys()
     if "specification" not in document:
-        wishes = {key: document.pop(key) for key in document.keys() - known}
-        document["specification"] = wishes
+        document["specification"] = {key: document.pop(key) for key in document.keys() - known}
     elif "channels" in document:
         document = {key: value for key, value in document.items() if key in known}
     found = check(DesignFile, document, source=str(path), context={"base": path.absolute().parent})

@@ -208,9 +208,8 @@ def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dic
         units["S"] = unit(inputs[acts.on] if acts.where == "input" else names[acts.on])
     found = {}
     for parameter in (one.name for one in effect.parameters):
-        size = _SIZES.get(parameter, "")
-        if effect.name.endswith("quadratic_drag"):
-            size = "{F}s2_{x}2"
+        drag = effect.name.endswith("quadratic_drag")
+        size = "{F}s2_{x}2" if drag else _SIZES.get(parameter, "")
         if size and all(units.get(key) for key in re.findall(r"{(\w)}", size)):
             # A rate of a speed is per second squared.
             found[parameter] = f"{parameter.removesuffix('_per_s')}_{size.format(**units)}".replace(
@@ -360,9 +359,8 @@ def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_
         doubts.append(f"no column measures {listing(loose)}: simulated from where the model rests")
 
     def finish(experiments: Sequence[PlantExperiment], noise: Real) -> Any:
-        tracking = settings.tracking_rad_s
-        if tracking is None:
-            tracking = arm.tracking(experiments)
+        stated = settings.tracking_rad_s
+        tracking = arm.tracking(experiments) if stated is None else stated
         # A pattern for all of a place ("elbow.*") is no name.
         named = [one for one in settings.candidates if one.rpartition(".")[2] != "*" and "." in one]
         plant = replace(arm, tracking_rad_s=tracking).plant(
@@ -525,10 +523,11 @@ def _sampling(tables: Sequence[Table], settings: SimulatorSettings) -> float:
                 found.append(sampling_time(table, None, None, settings.dt_s))
                 continue
             stamps = table.seconds(name, table.columns([name])[name], unit)[0]
-            if settings.repair:
-                found.append(TimeGrid.of(table, name, stamps).dt_s)
-            else:
-                found.append(sampling_time(table, stamps, name, None))
+            found.append(
+                TimeGrid.of(table, name, stamps).dt_s
+                if settings.repair
+                else sampling_time(table, stamps, name, None)
+            )
     if max(found) > 1.001 * min(found):
         raise InputError(
             f"{tables[0].path}: logs are sampled every {min(found):.6g} to {max(found):.6g} s; put all on "

@@ -40,9 +40,7 @@ def cut_inside(text: str, most: int = LONGEST_LINE) -> str:
     """The text, cut where it is longer: at its end, but for the command to type there."""
     at = text.find("type: flexlink ")
     tail = text[at:] if at >= 0 and len(text) - at < most - 5 else ""
-    if len(text) <= most or not tail:
-        return cut(text, most)
-    return f"{text[: most - 5 - len(tail)]} ... {tail}"
+    return cut(text, most) if len(text) <= most or not tail else f"{text[: most - 5 - len(tail)]} ... {tail}"
 
 
 class InputError(ValueError):

@@ -12,6 +12,5 @@ def stage_rng(seed: int, *names: str) -> np.random.Generator:
 
     The names enter as the eight 32-bit words of their SHA-256: the order of asking does not matter.
     """
-    digest = hashlib.sha256("\0".join(names).encode("utf-8")).digest()
-    words = np.frombuffer(digest, dtype="<u4")
+    words = np.frombuffer(hashlib.sha256("\0".join(names).encode("utf-8")).digest(), dtype="<u4")
     return np.random.default_rng(np.random.SeedSequence([seed, *(int(word) for word in words)]))

@@ -211,9 +211,7 @@ def two_lines(name: object, unit: str) -> str:
 
 def ratio_unit(output_unit: str, input_unit: str) -> str:
     """Unit of a gain."""
-    if not output_unit and not input_unit:
-        return "as logged"
-    return f"{output_unit or '?'} / {input_unit or '?'}"
+    return f"{output_unit or '?'} / {input_unit or '?'}" if output_unit or input_unit else "as logged"
 
 
 def finish(figure: Figure) -> None:
@@ -273,8 +271,7 @@ def drawing(name: str) -> Callable[[D], D]:
 @cache
 def drawings() -> Mapping[str, Drawing]:
     """Every drawing of every module of this package, so that a new one is named in its own file only."""
-    package = importlib.import_module("workflow.figures")
-    for module in pkgutil.iter_modules(package.__path__):
+    for module in pkgutil.iter_modules(importlib.import_module("workflow.figures").__path__):
         importlib.import_module(f"workflow.figures.{module.name}")
     return _DRAWINGS
 

@@ -298,9 +298,7 @@ class RunView:
     def lasting_error_share(self) -> float:
         """Of the reference step that a constant disturbance leaves as error; 0 without tracking."""
         loop = self.loop
-        if loop is None or not loop.tracking:
-            return 0.0
-        return self.lasting_error / loop.reference_step
+        return 0.0 if loop is None or not loop.tracking else self.lasting_error / loop.reference_step
 
     @property
     def damped_mode(self) -> ModeChange | None:

@@ -44,8 +44,7 @@ def inline(
         _minor_ticks_together(group, marks)
     size = picture.plot["width"], picture.plot["height"]
     root.attrib = {"viewBox": f"0 0 {size[0]} {size[1]}", "role": "img", "aria-label": label}
-    legend = list(zip(samples, picture.plot["legend"], strict=True))
-    return Markup(_text(root)), legend
+    return Markup(_text(root)), list(zip(samples, picture.plot["legend"], strict=True))
 
 
 def _clean(root: ET.Element, number: int, styles: dict[str, str], ids: dict[str, str]) -> None:
@@ -88,8 +87,7 @@ def _named(group: ET.Element) -> None:
     elif re.match(r"(a\d+$|[kdtu]\d*-)", name):
         group.set("class", name.partition("-")[0])
     if name[:1] in "kd" and "-" in name:
-        clips = [child.attrib.pop("clip-path", "") for child in group.iter()]
-        clip = next(filter(None, clips), "")
+        clip = next(filter(None, [child.attrib.pop("clip-path", "") for child in group.iter()]), "")
         moving = ET.Element("g", {"class": "m"})
         moving.extend(list(group))
         for child in list(group):

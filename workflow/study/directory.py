@@ -58,8 +58,10 @@ class StudyDirectory(Store):
             "inputs": dict(base.inputs),
             "stages_taken_over": base.digests,
         }
-        if replace:
-            study._refuse_own_base(base)
+        if replace and base.run is not None and study.path.resolve() in base.run.path.resolve().parents:
+            raise InputError(
+                f"{study.path}: --replace would delete the base, {base.run.path}; choose another --out"
+            )
         if study.prepare(resume=resume, replace=replace):
             changed = first_difference(storage.read_json(study.manifest_path), document)
             if changed:
@@ -74,12 +76,6 @@ class StudyDirectory(Store):
             }
         )
         return study
-
-    def _refuse_own_base(self, base: Base) -> None:
-        if base.run is not None and self.path.resolve() in base.run.path.resolve().parents:
-            raise InputError(
-                f"{self.path}: --replace would delete the base, {base.run.path}; choose another --out"
-            )
 
     def discard_if_empty(self) -> None:
         """Take back what `begin` wrote if neither a plant nor a point is there: a corrected base may come."""

@@ -95,9 +95,7 @@ class Axis(Section):
             return tuple(range(int(self.from_), int(self.to) + 1))
         spread = np.geomspace if self.log else np.linspace
         numbers = [tidy(float(value)) for value in spread(self.from_, self.to, self.points)]
-        if self.whole:
-            return tuple(dict.fromkeys(round(number) for number in numbers))
-        return tuple(numbers)
+        return tuple(dict.fromkeys(round(number) for number in numbers)) if self.whole else tuple(numbers)
 
 
 def tidy(value: float) -> float:

@@ -168,14 +168,16 @@ def _specification(look: FirstLook, effort: float, limit: float, unstable: float
         "effort_limit": _rounded(effort),
         # Above what the logs tell the command falls off.
         "effort_rolloff_rad_s": _rounded(min(max(highest, _PART * bandwidth), 0.5 * np.pi / dt_s)),
-        **({"mode_peak_ratio": 1.0} if look.mode else {}),
-        **({"mode_band_rad_s": _band(look.mode[0], dt_s)} if look.mode else {}),
+        **(
+            {
+                "mode_peak_ratio": 1.0,
+                "mode_band_rad_s": [_rounded(base / 1.5), _rounded(min(1.5 * base, 0.95 * np.pi / dt_s))],
+            }
+            if look.mode
+            else {}
+        ),
         "controller_damping": 0.3,
         "integrator": True,
         "input_limit": limit,
         "controller_order": _ORDER,
     }
-
-
-def _band(mode_rad_s: float, dt_s: float) -> list[float]:
-    return [_rounded(mode_rad_s / 1.5), _rounded(min(1.5 * mode_rad_s, 0.95 * np.pi / dt_s))]

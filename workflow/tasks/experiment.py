@@ -90,8 +90,7 @@ class PlannedExperiment:
         """|hub angle / voltage| (H,) in rad/V, None without a rig or a gain."""
         omega = 2 * np.pi * self.lines_Hz
         if self.limits.rig is not None:
-            arm = linear_arm(self.limits.rig)
-            return np.asarray(np.abs(arm(1j * omega)[0, 0]))
+            return np.asarray(np.abs(linear_arm(self.limits.rig)(1j * omega)[0, 0]))
         return None if self.limits.gain_rad_per_Vs is None else self.limits.gain_rad_per_Vs / omega
 
     @cached_property

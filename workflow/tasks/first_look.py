@@ -353,8 +353,7 @@ def _rigid(
     tried = [rigid_motion(records, _RIGID * float(end), told[1], position=position) for end in ends]
     motions = [motion for motion in tried if motion is not None]
     explaining = [motion for motion in motions if motion.explained > _EXPLAINED]
-    agreeing = [motion for motion in explaining or motions[::-1] if motion.agrees(response)]
-    return next(iter(agreeing), None)
+    return next((motion for motion in explaining or motions[::-1] if motion.agrees(response)), None)
 
 
 def rigid_motion(

@@ -116,8 +116,7 @@ class FrictionLoop:
         # While the shaft stands, the command is the controller's answer to a constant error.
         law = self.controller
         answer = control.step_response(law.to_control(), np.arange(samples) * law.dt_s).outputs
-        reach = float(np.max(np.abs(answer)))
-        size = self.friction.breakaway / reach
+        size = self.friction.breakaway / float(np.max(np.abs(answer)))
         low, high = size / _APART, size * _APART
         if not (size > 0 and sticks(low)):
             return 0.0
@@ -295,10 +294,11 @@ def slow_sine(stage: StageInput, controller: Controller, amplitude: float, *, on
     for feedforward in (None, forward):
         law = replace(controller, feedforward=feedforward)
         noise = stage.rng("closed_loop", "slow sine")
-        if on_arm:
-            run = simulate(law, reference=reference, **loop_of_arm(stage.config, noise))
-        else:
-            run = FrictionLoop.of(law, found).run(reference, noise)
+        run = (
+            simulate(law, reference=reference, **loop_of_arm(stage.config, noise))
+            if on_arm
+            else FrictionLoop.of(law, found).run(reference, noise)
+        )
         errors.append((run.reference - run.measured)[period // 4 :])
     linear = FrictionLoop(controller, found, found.coefficients, FrictionLaw(0.0)).run(reference)
     rest = (linear.reference - linear.measured)[period // 4 :]

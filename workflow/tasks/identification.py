@@ -58,9 +58,11 @@ def as_fitted(record: Record, channel: Channel, friction: FrictionFit | None = N
 
 def as_bounded(record: Record, channel: Channel, friction: FrictionFit | None = None) -> Record:
     """The channel's columns as the ellipses see them; the same unless a wider band is given for them."""
-    if channel.bounds_band_rad_s is None:
-        return as_fitted(record, channel, friction)
-    return _inside(record.siso(channel.input, channel.output), channel, channel.bounds_band_rad_s)
+    return (
+        as_fitted(record, channel, friction)
+        if channel.bounds_band_rad_s is None
+        else _inside(record.siso(channel.input, channel.output), channel, channel.bounds_band_rad_s)
+    )
 
 
 def _inside(record: Record, channel: Channel, band_rad_s: tuple[float, float]) -> Record:
@@ -305,8 +307,7 @@ def identified_channel(
 
     if friction is not None and in_loop:
         found = identify_behind(friction, used, options, part)
-        known = found.model.input_delay_samples
-        options = options.model_copy(update={"input_delay_samples": known})
+        options = options.model_copy(update={"input_delay_samples": found.model.input_delay_samples})
     else:
         found = identify(used, options, progress=part)
     again = fit_in_windows if in_loop else fit_on_fresh_data

@@ -341,9 +341,9 @@ def certify_joints(stage: StageInput) -> JointsCertificate:
     """Checked independently of the synthesis, for all frequencies."""
     config, results = _of(stage)
     law = results.design.controller
-    if law is None:
-        return JointsCertificate(None)
-    return JointsCertificate(certify_multivariable(law, _plants(config, results), config.specification()))
+    return JointsCertificate(
+        None if law is None else certify_multivariable(law, _plants(config, results), config.specification())
+    )
 
 
 def run_loops(stage: StageInput) -> JointsLoopResult:

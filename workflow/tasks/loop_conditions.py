@@ -203,8 +203,7 @@ class ConditionBench:
         measurement = (
             4 * max(self.source.encoder_step_rad, self.options.measurement_step) or 0.004 * self.step
         )
-        unit = UNITS[OUTPUT_NAMES[self.measured]]
-        words = said("coarse_steps", command, measurement, unit)
+        words = said("coarse_steps", command, measurement, UNITS[OUTPUT_NAMES[self.measured]])
         return self._run("coarse", words, steps=(measurement, command))
 
     def overdriven(self) -> list[ConditionRun]:

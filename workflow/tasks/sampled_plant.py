@@ -97,10 +97,8 @@ def simulate_draw(
         measurement_step=measurement_step,
         command_step=command_step,
     )
-    if not direct:
-        return run
-    # The machine acted on each command one sample after it was handed over.
-    return replace(run, command=np.concatenate([[0.0], run.command[:-1]]))
+    # With a direct term the machine acted on each command one sample after it was handed over.
+    return replace(run, command=np.concatenate([[0.0], run.command[:-1]])) if direct else run
 
 
 class ClippedMachine:

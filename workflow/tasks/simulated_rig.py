@@ -50,8 +50,7 @@ def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) 
     voltage = entry.excitation.signal(dt_s, stage_rng(seed, "records", entry.name, "excitation"))
     reference = None
     if source.loop is None:
-        effects = parse_effects(source.effects)
-        output = simulate(rig, voltage, effects, rng=rng, n_modes=source.modes).output
+        output = simulate(rig, voltage, parse_effects(source.effects), rng=rng, n_modes=source.modes).output
         output = quantised(output, source.encoder_step_rad)
     else:
         slope = source.loop.derivative_Vs_per_rad / dt_s

@@ -144,9 +144,11 @@ def uncertainty_of(
 
         def arm_behind(asked: UncertaintyOptions) -> tuple[BehindFriction, Tests]:
             found = find(measured, friction, result.model, asked)
-            if not at_shaft:
-                return found, residual_tests(found.response, result.bounded)
-            return found, residual_tests(found.response, measured, found.friction)
+            return (
+                (found, residual_tests(found.response, measured, found.friction))
+                if at_shaft
+                else (found, residual_tests(found.response, result.bounded))
+            )
 
         (behind, tests), _ = _with_noise_model(options, white, arm_behind)
         linear = behind.response
