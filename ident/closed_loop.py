@@ -203,7 +203,7 @@ def _reference_to_input(record: Record) -> Record:
         raise ValueError(f"{record.label}: need one input; got {list(record.input_names)}")
     return Record(
         name=record.name,
-        input=record.reference[:, 0][:, None],
+        input=record.reference,
         output=record.input,
         dt_s=record.dt_s,
         input_names=record.reference_names,

@@ -218,11 +218,10 @@ def fitted_on_all(records: Sequence[Record], outcome: Outcome) -> tuple[Fitted, 
         # With integrators the polynomials that they leave free contain the offset.
         if needed == here.data.n_parameters(here.poles.order) or not other.n_samples > needed:
             continue
-        there = (
-            Fitted(PoleSearch(other, options), outcome.free)
-            if again and outcome.free
-            else _moved(outcome, other, here.poles)
-        )
+        if again and outcome.free:
+            there = Fitted(PoleSearch(other, options), outcome.free)
+        else:
+            there = _moved(outcome, other, here.poles)
         with_it, without = (here, there) if present else (there, here)
         test = nuisance_test(name, without, with_it)
         verdicts.append(test.finding)

@@ -256,11 +256,10 @@ class _Builder:
         """Columns of what is constant over a step: voltage before and after it changes in it, hub torque, tip
         force, one force per element. The first is filled in where it does (`_change_inside`)."""
         eq = self.equations
-        voltage = (
-            np.eye(self.n)[self.voltage_state] / self.machine.voltage.lag_s
-            if self.voltage_state >= 0
-            else self._motor_column()
-        )
+        if self.voltage_state >= 0:
+            voltage = np.eye(self.n)[self.voltage_state] / self.machine.voltage.lag_s
+        else:
+            voltage = self._motor_column()
         before, forces = np.zeros(self.n), self._element_columns()
         return np.column_stack([before, voltage, self._column(eq.hub), self._column(eq.tip), forces])
 

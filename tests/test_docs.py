@@ -150,7 +150,7 @@ def test_every_key_of_a_configuration_has_a_meaning():
     assert "| **`amplitude_V`** | V |  | largest voltage |" in text
 
 
-# Two of four readers every day: the others run the same commands on more logs.
+# In CI two of four readers: the others run the same commands on more logs.
 @pytest.mark.parametrize(
     "name",
     [

@@ -149,11 +149,10 @@ class _Loop:
         """Upper bounds and the values at the middles of |W S| or |W K S|, times |Gp| of an independent
         channel."""
         own, i_plant, weight = self.controller.integrators, self.plant.n_integrators, each.weight
-        numerator = (
-            weight.expand(intervals, i_plant).times(self.controller.expand(intervals, own))
-            if each.requirement.function.of_controller
-            else weight.expand(intervals, own + i_plant)
-        )
+        if each.requirement.function.of_controller:
+            numerator = weight.expand(intervals, i_plant).times(self.controller.expand(intervals, own))
+        else:
+            numerator = weight.expand(intervals, own + i_plant)
         upper, middle = _quotient(numerator, ends), quotient(np.abs(numerator.value), at_middle, np.inf)
         if each.channel is not None:
             channel = each.channel(intervals, 0)

@@ -113,11 +113,9 @@ def programme_grid(
     dense: bool = False,
 ) -> Real:
     """Frequencies of a programme, to begin with, or of its dense check."""
-    points = (
-        (int(0.7 * options.dense_points), int(0.3 * options.dense_points))
-        if dense
-        else (options.grid_points, options.mode_points)
-    )
+    points = options.grid_points, options.mode_points
+    if dense:
+        points = int(0.7 * options.dense_points), int(0.3 * options.dense_points)
     low = options.omega_min_rad_s or lowest_rad_s(plant.dt_s, plant.poles)
     grid = frequency_grid(
         plant.nyquist_rad_s, modes, omega_min_rad_s=low, n_log=points[0], n_mode=points[1], extra=extra

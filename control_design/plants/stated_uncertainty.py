@@ -80,10 +80,9 @@ class StatedDiscs:
         """
         nominal, weight = self._rational
         centre = nominal.expand(intervals, cleared)
-        disc = (
-            weight.expand(intervals).times(centre)
-            if self.kind == "multiplicative"
-            else weight.expand(intervals, cleared)
-        )
+        if self.kind == "multiplicative":
+            disc = weight.expand(intervals).times(centre)
+        else:
+            disc = weight.expand(intervals, cleared)
         disc = disc.scaled(1.0 / radius_of(self.level))
         return centre, stacked([disc, disc.scaled(1j)])

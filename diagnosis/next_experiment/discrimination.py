@@ -41,11 +41,9 @@ _SURVIVES = 0.01
 
 def simulated(machine: Any, effects: Sequence[Any], inputs: Real) -> Real:
     """(T, Y) of a Rig for a voltage (T,), of a Plant for inputs (T, U)."""
-    return (
-        simulate(machine, inputs, effects).output
-        if isinstance(machine, Rig)
-        else np.asarray(machine.simulator(effects)(inputs))
-    )
+    if isinstance(machine, Rig):
+        return simulate(machine, inputs, effects).output
+    return np.asarray(machine.simulator(effects)(inputs))
 
 
 @dataclass(frozen=True, eq=False)

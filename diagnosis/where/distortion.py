@@ -48,12 +48,12 @@ def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> P
     separable = bool(np.all(lines[excited] % 2 == 1))
     # Distortion of a low order ends at a few times the highest excited line.
     near = lines <= 3 * lines[excited].max()
-    silent = ~excited & near
-    groups = (
-        {"not excited, odd": silent & (lines % 2 == 1), "not excited, even": silent & (lines % 2 == 0)}
-        if separable
-        else {"not excited": silent}
-    )
+    groups = {
+        "not excited, odd": ~excited & near & (lines % 2 == 1),
+        "not excited, even": ~excited & near & (lines % 2 == 0),
+    }
+    if not separable:
+        groups = {"not excited": ~excited & near}
     groups = {name: chosen for name, chosen in groups.items() if np.count_nonzero(chosen) >= _LEAST_LINES}
     edges = band_edges_Hz(period * dt, dt)
     frequency = lines / (period * dt)

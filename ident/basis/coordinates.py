@@ -96,11 +96,10 @@ class SearchSpace:
     def levels(self, poles: Poles) -> RealArray:
         """Where poles lie in the box, 0 to 1: (R + P,) by their first coordinate, those beyond on its
         side."""
-        first = (
-            np.concatenate([poles.real, 2 * poles.pairs.real / (1 + np.abs(poles.pairs) ** 2)])
-            if self.raw
-            else np.log10(np.concatenate([1 - poles.real, np.abs(np.log(poles.pairs))]))
-        )
+        if self.raw:
+            first = np.concatenate([poles.real, 2 * poles.pairs.real / (1 + np.abs(poles.pairs) ** 2)])
+        else:
+            first = np.log10(np.concatenate([1 - poles.real, np.abs(np.log(poles.pairs))]))
         low = np.repeat(self.low[:2], poles.counts)
         high = np.repeat(self.high[:2], poles.counts)
         return np.asarray(np.clip((first - low) / (high - low), 0, 1))

@@ -256,11 +256,9 @@ def block_states(data: Regression, poles: Poles, signal: RealArray) -> RealArray
 def fitted_output(data: Regression, projection: Projection) -> RealArray:
     """The part of the output that the poles make, (N,)."""
     # A polynomial part stays in the span of free responses; without them it has to be left out.
-    return np.asarray(
-        data.y - projection.residual
-        if data.structure.estimate_initial_state
-        else projection.coefficients(data.y) @ projection.shared
-    )
+    if data.structure.estimate_initial_state:
+        return np.asarray(data.y - projection.residual)
+    return np.asarray(projection.coefficients(data.y) @ projection.shared)
 
 
 def pole_sensitivities(data: Regression, poles: Poles, projection: Projection) -> RealArray:

@@ -139,7 +139,6 @@ def test_a_requirement_out_of_reach_names_how_far_and_where():
     assert worst.weight in ("tracking", "modulus")
     assert worst.value == pytest.approx(result.gamma)
     assert 0.1 < worst.omega_rad_s < 60
-    assert result.outcome is Outcome.NOT_MET
     assert not certify(result.controller, [plant], specification).certified
 
 

@@ -253,11 +253,9 @@ class TuningSession:
     def _drawn(self, plant: UncertainPlant, n: int) -> Complex:
         """Responses (D, n/2 + 1) drawn from the posterior, the same at every call; none where none can be."""
         number = next(k for k, known in enumerate(self._plants) if known.name == plant.name)
-        return (
-            _samples(self._plants[number], n, self.seed)
-            if self.drawable
-            else np.empty((0, n // 2 + 1), dtype=np.complex128)
-        )
+        if not self.drawable:
+            return np.empty((0, n // 2 + 1), dtype=np.complex128)
+        return _samples(self._plants[number], n, self.seed)
 
 
 @lru_cache(maxsize=8)

@@ -538,11 +538,9 @@ def load_config(path: Path) -> tuple[RunConfig, str]:
 def load_simulation(path: Path) -> RunConfig | SimulationConfig:
     """A whole configuration, or one of [run] and [source] alone. Raises InputError as `load_config`."""
     _, document = read_toml(path)
-    return (
-        check(SimulationConfig, document, source=str(path), context={"base": path.absolute().parent})
-        if document.keys() <= SimulationConfig.model_fields.keys()
-        else load_config(path)[0]
-    )
+    if document.keys() <= SimulationConfig.model_fields.keys():
+        return check(SimulationConfig, document, source=str(path), context={"base": path.absolute().parent})
+    return load_config(path)[0]
 
 
 def built_in_config() -> tuple[RunConfig, str]:

@@ -164,11 +164,9 @@ def left(found: Diagnosis) -> list[tuple[str, list[tuple[float, float]], float]]
 
 def remains_of(found: Diagnosis) -> Where:
     """Where the rest lies that the repaired model leaves."""
-    return (
-        where_in_records(found.case, found.residuals_after, found.case.dt_s)
-        if isinstance(found.case, PlantCase)
-        else where(found.case, found.residuals_after)
-    )
+    if isinstance(found.case, PlantCase):
+        return where_in_records(found.case, found.residuals_after, found.case.dt_s)
+    return where(found.case, found.residuals_after)
 
 
 def moved(found: Diagnosis, deviations: Mapping[str, float]) -> Mapping[str, float]:

@@ -523,11 +523,10 @@ def _sampling(tables: Sequence[Table], settings: SimulatorSettings) -> float:
                 found.append(sampling_time(table, None, None, settings.dt_s))
                 continue
             stamps = table.seconds(name, table.columns([name])[name], unit)[0]
-            found.append(
-                TimeGrid.of(table, name, stamps).dt_s
-                if settings.repair
-                else sampling_time(table, stamps, name, None)
-            )
+            if settings.repair:
+                found.append(TimeGrid.of(table, name, stamps).dt_s)
+            else:
+                found.append(sampling_time(table, stamps, name, None))
     if max(found) > 1.001 * min(found):
         raise InputError(
             f"{tables[0].path}: logs are sampled every {min(found):.6g} to {max(found):.6g} s; put all on "

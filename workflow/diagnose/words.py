@@ -32,11 +32,9 @@ def key_words(key: str) -> str:
 def setting_words(name: str, value: float | int | str) -> str:
     """up_to_Hz 35.0 as "up to 35 Hz"."""
     what, _, unit = name.rpartition("_")
-    return (
-        f"{name.replace('_', ' ')} {value}"
-        if not what or isinstance(value, str)
-        else f"{what.replace('_', ' ')} {si(value, unit)}"
-    )
+    if not what or isinstance(value, str):
+        return f"{name.replace('_', ' ')} {value}"
+    return f"{what.replace('_', ' ')} {si(value, unit)}"
 
 
 def probability_words(p: float) -> str:

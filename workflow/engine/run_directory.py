@@ -211,11 +211,9 @@ class RunDirectory(Store):
         path = self._finished(name)
         _, content = _stage_content(path)
         with naming(str(path)):
-            return (
-                codec.from_arrays(kind, content)
-                if path.suffix == ".npz"
-                else codec.unpack(kind, content[_RESULT], {})
-            )
+            if path.suffix == ".npz":
+                return codec.from_arrays(kind, content)
+            return codec.unpack(kind, content[_RESULT], {})
 
     # -- manifest --------------------------------------------------------------------------------------------
 

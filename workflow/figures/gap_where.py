@@ -29,11 +29,9 @@ _ROUTES = {"hub_torque": "torque on the hub", "hub_angle": "hub angle reading", 
 
 def _size(model_error: float) -> tuple[float, str]:
     """Factor and words of a gap that `where` found: over the noise, or in per cent of the motion."""
-    return (
-        (100 * model_error, "model error [% of the motion]")
-        if model_error > 0
-        else (1.0, "model error over noise, RMS [1]")
-    )
+    if model_error > 0:
+        return 100 * model_error, "model error [% of the motion]"
+    return 1.0, "model error over noise, RMS [1]"
 
 
 def _of_band(where: Where, band: BandGap, model_error: float) -> tuple[float, Real]:

@@ -59,11 +59,9 @@ class Base:
 
     def inputs_of(self, config: AnyConfig) -> Mapping[str, str]:
         """SHA-256 of the input files, those of the run where one was given."""
-        return (
-            self.inputs
-            if self.run is not None
-            else {str(path): storage.sha256_of_file(path) for path in config.input_files}
-        )
+        if self.run is not None:
+            return self.inputs
+        return {str(path): storage.sha256_of_file(path) for path in config.input_files}
 
     @property
     def digests(self) -> dict[str, str]:

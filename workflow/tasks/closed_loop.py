@@ -89,8 +89,9 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
         else:
             # Control and performance channel are drawn independently.
             own = posterior.sample(stage.rng("closed_loop", "control"), options.draws)
-            rng = stage.rng("closed_loop", "performance")
-            shown = None if tip is None else (tip, tip.sample(rng, options.draws))
+            shown = None
+            if tip is not None:
+                shown = tip, tip.sample(stage.rng("closed_loop", "performance"), options.draws)
             achieved = run_on_draws(controller, (posterior, own), shown, trial, **converter_steps(options))
         if options.sensitivity and results.identify.friction is not None:
             stage.progress.update("closed_loop", 0.95, "friction")
@@ -139,17 +140,13 @@ def make_trial(
     used = stage.results.records.fitted(config.control_channel)
     # A plant that was drawn is linear, and cheap: at a high sampling rate a slow pole takes many samples.
     longest = _LONGEST if config.machine == "simulated" else _LONGEST_DRAWN
-    samples = (
-        settling_samples(pole_radius, _SHORTEST, longest)
-        if options.duration_s is None
-        else min(max(round(options.duration_s / dt_s), _SHORTEST), longest)
-    )
+    samples = settling_samples(pole_radius, _SHORTEST, longest)
+    if options.duration_s is not None:
+        samples = min(max(round(options.duration_s / dt_s), _SHORTEST), longest)
     step = options.reference_step or 0.5 * rms_of([record.output for record in used])
-    disturbance = (
-        0.1 * rms_of([record.input for record in used])
-        if options.disturbance is None
-        else options.disturbance
-    )
+    disturbance = options.disturbance
+    if disturbance is None:
+        disturbance = 0.1 * rms_of([record.input for record in used])
     k = np.arange(samples)
     half = samples // 2
     reference = np.where(k >= round(_LEAD_IN * samples), step, 0.0)

@@ -161,6 +161,10 @@ def _specification(look: FirstLook, effort: float, limit: float, unstable: float
     highest = look.told_rad_s[1] if look.told_rad_s else 0.05 * np.pi / dt_s
     base = look.mode[0] if look.mode else look.notch or highest
     bandwidth = max(base / _PART, _BEYOND_UNSTABLE * unstable)
+    band = {
+        "mode_peak_ratio": 1.0,
+        "mode_band_rad_s": [_rounded(base / 1.5), _rounded(min(1.5 * base, 0.95 * np.pi / dt_s))],
+    }
     return {
         "bandwidth_rad_s": _rounded(bandwidth),
         "lowest_bandwidth_rad_s": _rounded(max(base / _LEAST_PART, unstable)),
@@ -168,14 +172,7 @@ def _specification(look: FirstLook, effort: float, limit: float, unstable: float
         "effort_limit": _rounded(effort),
         # Above what the logs tell the command falls off.
         "effort_rolloff_rad_s": _rounded(min(max(highest, _PART * bandwidth), 0.5 * np.pi / dt_s)),
-        **(
-            {
-                "mode_peak_ratio": 1.0,
-                "mode_band_rad_s": [_rounded(base / 1.5), _rounded(min(1.5 * base, 0.95 * np.pi / dt_s))],
-            }
-            if look.mode
-            else {}
-        ),
+        **(band if look.mode else {}),
         "controller_damping": 0.3,
         "integrator": True,
         "input_limit": limit,

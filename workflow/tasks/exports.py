@@ -127,8 +127,6 @@ def model_bytes(path: Path, file: ModelFile) -> bytes:
 def read_model(path: Path) -> ModelFile:
     """The model in a file of `model_bytes`. Raises InputError: one line that names the file."""
     with naming(str(path)):
-        return (
-            ModelFile.from_mat(content_of(path), str(path))
-            if path.suffix.lower() == ".mat"
-            else ModelFile.from_json(documents.read_text(path), str(path))
-        )
+        if path.suffix.lower() == ".mat":
+            return ModelFile.from_mat(content_of(path), str(path))
+        return ModelFile.from_json(documents.read_text(path), str(path))

@@ -294,11 +294,10 @@ def slow_sine(stage: StageInput, controller: Controller, amplitude: float, *, on
     for feedforward in (None, forward):
         law = replace(controller, feedforward=feedforward)
         noise = stage.rng("closed_loop", "slow sine")
-        run = (
-            simulate(law, reference=reference, **loop_of_arm(stage.config, noise))
-            if on_arm
-            else FrictionLoop.of(law, found).run(reference, noise)
-        )
+        if on_arm:
+            run = simulate(law, reference=reference, **loop_of_arm(stage.config, noise))
+        else:
+            run = FrictionLoop.of(law, found).run(reference, noise)
         errors.append((run.reference - run.measured)[period // 4 :])
     linear = FrictionLoop(controller, found, found.coefficients, FrictionLaw(0.0)).run(reference)
     rest = (linear.reference - linear.measured)[period // 4 :]

@@ -58,11 +58,9 @@ def as_fitted(record: Record, channel: Channel, friction: FrictionFit | None = N
 
 def as_bounded(record: Record, channel: Channel, friction: FrictionFit | None = None) -> Record:
     """The channel's columns as the ellipses see them; the same unless a wider band is given for them."""
-    return (
-        as_fitted(record, channel, friction)
-        if channel.bounds_band_rad_s is None
-        else _inside(record.siso(channel.input, channel.output), channel, channel.bounds_band_rad_s)
-    )
+    if channel.bounds_band_rad_s is None:
+        return as_fitted(record, channel, friction)
+    return _inside(record.siso(channel.input, channel.output), channel, channel.bounds_band_rad_s)
 
 
 def _inside(record: Record, channel: Channel, band_rad_s: tuple[float, float]) -> Record:

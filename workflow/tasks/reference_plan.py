@@ -110,13 +110,13 @@ def plan_reference(
     to_command, to_motion = (
         np.full(omega.size, np.nan) if one is None else _at(one, omega) for one in answers
     )
-    shape = (
-        np.ones(omega.size)
-        if None in answers
-        else 1 / (np.abs(to_command) / command_limit + np.abs(to_motion) / motion_limit)
-    )
+    if None in answers:
+        shape = np.ones(omega.size)
+    else:
+        shape = 1 / (np.abs(to_command) / command_limit + np.abs(to_motion) / motion_limit)
     rng = np.random.default_rng(seed)
-    spectra = np.stack([_drawn(plan, lines, shape, to_command, rng) for _ in range(plan.realisations)])
+    drawn = [_drawn(plan, lines, shape, to_command, rng) for _ in range(plan.realisations)]
+    spectra = np.stack(drawn)
 
     def peaks(gain: ComplexArray | RealArray) -> RealArray:
         return np.asarray(np.max(np.abs(_signal(plan, lines, gain * spectra)), axis=-1))

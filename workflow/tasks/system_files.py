@@ -77,11 +77,10 @@ def read_controller(path: Path, dt_s: float) -> tuple[list[float], list[float]]:
     and dt_s. Raises InputError, also for another sampling time."""
     document = read_document(path)
     with naming(str(path)):
-        law = (
-            Controller.from_dict(document).to_control(include_delay=True)
-            if document.get("format") == Controller.format_name()
-            else read_state_space(path, document)
-        )
+        if document.get("format") == Controller.format_name():
+            law = Controller.from_dict(document).to_control(include_delay=True)
+        else:
+            law = read_state_space(path, document)
         if not abs(law.dt - dt_s) <= _SAME_CLOCK * dt_s:
             raise ValueError(f"is sampled every {law.dt:g} s, the logs every {dt_s:g} s")
         if not law.nstates:

@@ -144,11 +144,9 @@ def uncertainty_of(
 
         def arm_behind(asked: UncertaintyOptions) -> tuple[BehindFriction, Tests]:
             found = find(measured, friction, result.model, asked)
-            return (
-                (found, residual_tests(found.response, measured, found.friction))
-                if at_shaft
-                else (found, residual_tests(found.response, result.bounded))
-            )
+            if not at_shaft:
+                return found, residual_tests(found.response, result.bounded)
+            return found, residual_tests(found.response, measured, found.friction)
 
         (behind, tests), _ = _with_noise_model(options, white, arm_behind)
         linear = behind.response
