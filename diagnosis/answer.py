@@ -13,6 +13,7 @@ from diagnosis.fit.residual import pooled_rms
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.machine.rounding import rounding_effect
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
+from ident.data.shown import Shown
 from plant.effects.search_space import Candidate
 
 Verdict = Literal["none", "effect", "unknown"]
@@ -124,8 +125,8 @@ class Shares:
         return min(1 - after / before, 1.0) if before > 0 else float("nan")
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosis(Shown):
     """What is wrong with a model, as far as its records tell.
 
     verdict, detail_verdict : str
@@ -166,6 +167,8 @@ class Diagnosis:
     white : (Y,) or None. What sensors have in the unit of the residuals of a page, taken off their sizes;
         None: sizes are over noise, which is one of them.
     """
+
+    table_in_notebook = True
 
     case: Any
     verdict: Verdict

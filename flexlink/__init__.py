@@ -40,8 +40,10 @@ _attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> object:
-    from flexlink.shown import one_line
+    from flexlink.keywords import one_line
+    from flexlink.shown import put_in_front
 
+    put_in_front()
     found = _attribute(name)
     if isinstance(found, FunctionType):
         found = globals()[name] = one_line(found)

@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from diagnosis import answer, diagnosis as chain
+from diagnosis import diagnosis as chain
+from diagnosis.answer import Diagnosis
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.own_plant import PlantCase
-from flexlink.shown import Shown, dressed
 
 __all__ = ["Case", "Diagnosis", "Experiment", "diagnose", "load_case"]
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Diagnosis(Shown, answer.Diagnosis):
-    """Result of `diagnose`; fields as in `diagnosis.Diagnosis`."""
-
-    table_in_notebook = True
 
 
 def diagnose(case: Any, **more: Any) -> Diagnosis:
@@ -45,7 +37,7 @@ def diagnose(case: Any, **more: Any) -> Diagnosis:
     ('effect', 'coulomb_friction')
     """
     with threadpool_limits(1):
-        return dressed(Diagnosis, chain.diagnose(case, **more))
+        return chain.diagnose(case, **more)
 
 
 def load_case(place: str | os.PathLike[str], rig: str | None = None) -> Case | PlantCase:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, partial
 from typing import Any
 
 import control
@@ -13,7 +11,14 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from control_design.analysis import certificate, closed_loop, multivariable_certificate
-from control_design.analysis.closed_loop import LinearMachine, SampledMachine, step_metrics
+from control_design.analysis.certificate import Certificate
+from control_design.analysis.closed_loop import (
+    ClosedLoopTrajectory as LoopRun,
+    LinearMachine,
+    SampledMachine,
+    step_metrics,
+)
+from control_design.analysis.multivariable_certificate import MultivariableCertificate
 from control_design.controllers import c_code
 from control_design.controllers.controller import Controller
 from control_design.convex import youla
@@ -23,13 +28,13 @@ from control_design.plants.multivariable import MultivariablePlant, ResponseBall
 from control_design.plants.weights import RationalWeight
 from control_design.specification import Specification
 from control_design.specification.multivariable import MultivariableSpecification
-from control_design.synthesis import joint_synthesis, multivariable, synthesis, synthesis_result
+from control_design.synthesis import joint_synthesis, multivariable, synthesis
+from control_design.synthesis.multivariable import MultivariableResult
 from control_design.synthesis.synthesis_options import MultivariableOptions, SynthesisOptions
-from flexlink.models import Uncertainty, nominal_outside, warned
-from flexlink.shown import Shown, dressed, one_line
-from ident.checks.residual_tests import conditions_of
-from ident.data.finding import Finding
+from control_design.synthesis.synthesis_result import SynthesisResult
+from flexlink.keywords import one_line
 from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.response_uncertainty import Uncertainty
 from ident.uncertainty.matrix_response import MatrixPosterior
 
 __all__ = [
@@ -159,7 +164,7 @@ def _checked(system: Any, what: str, *, several: bool = False) -> None:
         )
 
 
-class UncertainPlant(Shown, plant_set.UncertainPlant):
+class UncertainPlant(plant_set.UncertainPlant):
     """A nominal state space and the ellipses around its response, for which a controller is designed.
 
     plant : Uncertainty, or a discrete system of python-control (ss, tf), or a model with `to_control()`
@@ -203,85 +208,6 @@ class UncertainPlant(Shown, plant_set.UncertainPlant):
         )
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class SynthesisResult(Shown, synthesis_result.SynthesisResult):
-    """Result of `synthesise`, with plants and specification."""
-
-    plants: tuple[plant_set.UncertainPlant, ...] = ()
-    specification: Specification = field(default_factory=Specification)
-
-    def to_control(self) -> control.StateSpace:
-        """The controller as `control.StateSpace`, without its computational delay and limits."""
-        return self.controller.to_control()
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Certificate(Shown, certificate.Certificate):
-    """Result of `certify`, with controller, plants and specification.
-
-    certified, gamma, items: the verdict, the largest weighted gain, every requirement with what was achieved.
-    plants: per plant its `worst_margins` and `nominal_margins` (`gain_up`, `gain_down`, `phase_rad`,
-    `delay_s`, `modulus`), `bandwidth_rad_s`, `stable`, `pole_radius`; nan where the loop is not stable.
-    """
-
-    table_in_notebook = True
-    controller: Controller | None = None
-    uncertain_plants: tuple[plant_set.UncertainPlant, ...] = ()
-    specification: Specification = field(default_factory=Specification)
-
-    @cached_property
-    def warnings(self) -> tuple[Finding, ...]:
-        """What the certificate stands or falls with: doubts about the ellipses of its plants."""
-        found: list[Finding] = []
-        for plant in self.uncertain_plants:
-            found += conditions_of(getattr(plant.uncertainty, "advice", ()))
-            if isinstance(plant.uncertainty, Uncertainty):
-                response = partial(plant_set.frequency_response, plant.nominal)
-                found += nominal_outside(plant.uncertainty, response, plant.dt_s, plant.level)
-        return warned(*found)
-
-    @property
-    def nominal_only(self) -> bool:
-        """No plant had an uncertainty: the worst case is the nominal plant."""
-        return not any(plant.stated for plant in self.plants)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class YoulaBracket(Shown, youla.YoulaBracket):
-    """Result of `youla_bracket`, from worst cases over three regions at every frequency.
-
-    inscribed: with the disc inside each ellipse, which no controller of any order falls below (`floor`).
-    ellipse: what some controller reaches over the ellipses (a local optimum). enclosing: the same over the
-    disc around each. `plants` has the three of each plant; inf where none was found to be robustly stable.
-    """
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class MultivariableResult(Shown, multivariable.MultivariableResult):
-    """Result of `synthesise_multivariable`: `controller`, `gamma`, `worst` by requirement."""
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class MultivariableCertificate(Shown, multivariable_certificate.MultivariableCertificate):
-    """Result of `certify_multivariable`: `met`, `gamma`, and `verdicts` by plant."""
-
-    table_in_notebook = True
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class LoopRun(Shown, closed_loop.ClosedLoopTrajectory):
-    """Closed-loop simulation, the result of `simulate_loop`."""
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class JointDesign(joint_synthesis.JointDesign):
-    """Result of `synthesise_jointly`; its `result` is a `SynthesisResult`."""
-
-    def __repr__(self) -> str:
-        """The result, and how many sampled responses are unstable with it."""
-        return f"{self.result!r}\n  unstable of {self.draws} sampled responses: {self.unstable[-1:] or '-'}"
-
-
 def synthesise(
     plants: Any,
     specification: Specification,
@@ -306,8 +232,7 @@ def synthesise(
     chosen = _several(plants)
     generator = np.random.default_rng(rng)
     with threadpool_limits(1):
-        result = synthesis.synthesise(chosen, specification, options, rng=generator, **more)
-    return dressed(SynthesisResult, result, plants=chosen, specification=specification)
+        return synthesis.synthesise(chosen, specification, options, rng=generator, **more)
 
 
 def synthesise_jointly(
@@ -317,7 +242,7 @@ def synthesise_jointly(
     *,
     rng: np.random.Generator | int = 0,
     **more: Any,
-) -> JointDesign:
+) -> joint_synthesis.JointDesign:
     """As `synthesise`, until the stated share of sampled responses is stable (Monte Carlo, not a bound).
 
     Arguments as `control_design.synthesise_jointly` (`stable_share`, `draws`, `rounds`); `rng` as in
@@ -334,16 +259,14 @@ def synthesise_jointly(
     """
     chosen = _several(plants)
     with threadpool_limits(1):
-        found = joint_synthesis.synthesise_jointly(
+        return joint_synthesis.synthesise_jointly(
             chosen, specification, options, rng=np.random.default_rng(rng), **more
         )
-    result = dressed(SynthesisResult, found.result, plants=chosen, specification=specification)
-    return dressed(JointDesign, found, result=result)
 
 
 def youla_bracket(
     plants: Any, specification: Specification, options: YoulaOptions | None = None
-) -> YoulaBracket:
+) -> youla.YoulaBracket:
     """What no controller of any order can fall below (`floor`); `control_design.youla_bracket`.
 
     Examples
@@ -354,7 +277,7 @@ def youla_bracket(
     True
     """
     with threadpool_limits(1):
-        return YoulaBracket(youla.youla_bracket(_several(plants), specification, options).plants)
+        return youla.youla_bracket(_several(plants), specification, options)
 
 
 def certify(
@@ -392,10 +315,7 @@ def certify(
     if "joint_coverage" in more:
         more["rng"] = np.random.default_rng(more.get("rng", 0))
     with threadpool_limits(1):
-        found = certificate.certify(controller, chosen, specification, **more)
-    return dressed(
-        Certificate, found, controller=controller, uncertain_plants=chosen, specification=specification
-    )
+        return certificate.certify(controller, chosen, specification, **more)
 
 
 def synthesise_multivariable(
@@ -405,8 +325,7 @@ def synthesise_multivariable(
 ) -> MultivariableResult:
     """Design one controller of all sensors and actuators; `control_design.synthesise_multivariable`."""
     with threadpool_limits(1):
-        found = multivariable.synthesise_multivariable(plants, specification, options)
-    return dressed(MultivariableResult, found)
+        return multivariable.synthesise_multivariable(plants, specification, options)
 
 
 def certify_multivariable(
@@ -425,10 +344,9 @@ def certify_multivariable(
     if not isinstance(law, Controller):
         law = _as_controller(law, specification.computational_delay_samples, several=True)
     with threadpool_limits(1):
-        found = multivariable_certificate.certify_multivariable(
+        return multivariable_certificate.certify_multivariable(
             law, plants, specification, dense_points=dense_points
         )
-    return MultivariableCertificate(found.verdicts)
 
 
 def c_source(controller: Any, prefix: str = "controller", number: c_code.Number = "double") -> str:
@@ -471,7 +389,7 @@ def simulate_loop(controller: Any, machine: Any, reference: npt.ArrayLike, **mor
     chosen: SampledMachine = machine
     if not isinstance(controller, Controller):
         controller = _as_controller(controller, 1)
-    return dressed(LoopRun, closed_loop.simulate(controller, chosen, reference, **more))
+    return closed_loop.simulate(controller, chosen, reference, **more)
 
 
 def _as_controller(system: Any, delay_samples: int, *, several: bool = False) -> Controller:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexlink.models import Record
-from flexlink.shown import Shown, dressed
+from ident.data.shown import Shown
 from plant import simulation
 from plant.effects import Effect, parse_effect
 from plant.excitation import multisine, prbs
@@ -89,4 +89,5 @@ def simulate(
     """
     given = (effects,) if isinstance(effects, Effect) else effects
     noise = None if rng is None else np.random.default_rng(rng)
-    return dressed(Simulation, simulation.simulate(rig, voltage_V, given, rng=noise, **settings))
+    found = simulation.simulate(rig, voltage_V, given, rng=noise, **settings)
+    return Simulation(**{each.name: getattr(found, each.name) for each in fields(found)})

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -12,16 +11,12 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from flexlink.shown import Shown, dressed, one_line
-from ident import several_outputs
-from ident.basis import posterior
+from flexlink.keywords import one_line
+from ident import response_uncertainty, several_outputs
 from ident.basis.functions import basis_response, regressor
-from ident.basis.model import GobfModel as PlainModel
-from ident.basis.model_files import ModelFile
+from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.poles import Poles
-from ident.checks.residual_tests import residual_advice
-from ident.data.finding import Finding
 from ident.data.foreign_files import distinct
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
@@ -32,12 +27,11 @@ from ident.data.signal_filter import band_limited
 from ident.data.table import Table
 from ident.data.units import refuse_step
 from ident.frequency_fit import identify_frf
-from ident.identification import Identification as Identified, MimoIdentification as MimoIdentified
+from ident.identification import Identification, MimoIdentification
 from ident.one_input import identify as identify_records
-from ident.search.error_surface import ErrorSurface as PlainSurface, error_surface as surface_of
+from ident.response_uncertainty import Uncertainty
+from ident.search.error_surface import ErrorSurface, error_surface as surface_of
 from ident.uncertainty import matrix_response
-from ident.uncertainty.embedding import tangent
-from ident.uncertainty.nominal import nominal_near
 from ident.uncertainty.pole_intervals import pole_intervals
 
 __all__ = [
@@ -64,13 +58,9 @@ __all__ = [
 ]
 
 Options = TypeVar("Options", bound=Settings)
-# Frequencies over which a low-order nominal model is fitted to a posterior.
-_NOMINAL_POINTS = 400
-# Factor on the odds: Bayes factor of "positive" evidence (Kass and Raftery, 1995).
-_POSITIVE = 3.0
 
 
-class Record(Shown, PlainRecord):
+class Record(PlainRecord):
     """One uniformly sampled experiment, from arrays, pandas columns or (with `from_file`) a file.
 
     u, y : (T,) or (T, n), or a pandas column or table
@@ -185,32 +175,6 @@ class Record(Shown, PlainRecord):
         return cls.from_file(Table(Path("table"), columns), input, output, time=time, **more)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class GobfModel(Shown, PlainModel):
-    """Poles and coefficients of a model on generalised orthonormal basis functions.
-
-    Fields as in `ident.basis.model.GobfModel`.
-
-    Examples
-    --------
-    >>> poles = flexlink.Poles.from_continuous(omega_rad_s=[20.0], zeta=[0.05], dt_s=0.01)
-    >>> flexlink.GobfModel(poles, [0.1, 0.2], dt_s=0.01)
-    GobfModel of order 2, u -> y, dt = 0.01 s
-      mode at 20 rad/s (3.18 Hz), damping ratio 0.05
-    """
-
-    table_in_notebook = True
-
-    def save(self, path: str | Path) -> None:
-        """Write poles, coefficients and state space to a .json or .mat file, as `identify --export` does."""
-        from workflow.engine.storage import write_bytes
-        from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
-
-        if Path(path).suffix.lower() not in MODEL_SUFFIXES:
-            raise ValueError(f"{path}: expected a file name that ends in {' or '.join(MODEL_SUFFIXES)}")
-        write_bytes(Path(path), model_bytes(Path(path), ModelFile(self)))
-
-
 def _listed(names: str | Sequence[str]) -> tuple[str, ...]:
     """One name or several."""
     return (names,) if isinstance(names, str) else tuple(names)
@@ -291,135 +255,6 @@ def _refuse_other_rows(*signals: Any) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Sentence(Finding):
-    """A warning that prints as its sentence."""
-
-    def __str__(self) -> str:
-        from workflow.text.templates import words
-
-        return words(self)
-
-    __repr__ = __str__
-
-
-class _Warned:
-    """Put before the class of a fit: its warnings as `_Sentence`."""
-
-    @cached_property
-    def warnings(self) -> tuple[Finding, ...]:
-        """What to look at before trusting the model."""
-        return warned(*super().warnings)  # type: ignore[misc]
-
-
-def warned(*findings: Finding) -> tuple[Finding, ...]:
-    """Findings that print as their sentences, each once."""
-    told = {str(each): each for each in (_Sentence(found.kind, found.values) for found in findings)}
-    return tuple(told.values())
-
-
-def nominal_outside(uncertainty: Any, response: Any, dt_s: float, level: float = 0.95) -> list[Finding]:
-    """The doubt about a nominal response, rad/s (F,) to G (F,), outside most ellipses of an uncertainty."""
-    from workflow.tasks.uncertainty import agreement_of, nominal_doubt
-
-    return nominal_doubt(agreement_of(uncertainty.at(_nominal_grid(dt_s), level), response))
-
-
-def _nominal_grid(dt_s: float) -> npt.NDArray[np.float64]:
-    nyquist = np.pi / dt_s
-    return np.geomspace(1e-3 * nyquist, nyquist, _NOMINAL_POINTS)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Identification(_Warned, Shown, Identified):
-    """Result of `identify`: the fields of `ident.Identification`, and the records.
-
-    Examples
-    --------
-    >>> found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
-    >>> found.model.poles.omega_rad_s(found.model.dt_s).round(1)
-    array([20.])
-    """
-
-    table_in_notebook = True
-    records: tuple[PlainRecord, ...] = ()
-    order_given: bool = False
-
-    def to_control(self) -> Any:
-        """The model as `control.StateSpace`."""
-        return self.model.to_control()
-
-    def save(self, path: str | Path) -> None:
-        """Write the model as `GobfModel.save`."""
-        GobfModel.save(self.model, path)  # type: ignore[arg-type]
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class MimoIdentification(_Warned, Shown, MimoIdentified):
-    """Result of `identify_mimo`: the fields of `ident.MimoIdentification`, and the records."""
-
-    table_in_notebook = True
-    records: tuple[PlainRecord, ...] = ()
-
-    def to_control(self) -> Any:
-        """The model as `control.StateSpace`."""
-        return self.model.to_control()
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class MatrixPosterior(Shown, matrix_response.MatrixPosterior):
-    """Result of `matrix_posterior`: balls around a matrix response at any frequency (`at`)."""
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Uncertainty(Shown, posterior.ResponsePosterior):
-    """Response with ellipses at any frequency (`at`); `joint_level` gives the level for a whole curve.
-
-    Examples
-    --------
-    >>> spread = flexlink.uncertainty(flexlink.identify(example_record(), n_pairs=1, n_real=0))
-    >>> spread.at([5.0, 20.0]).ellipse(0.95).semi_major.shape
-    (2,)
-    """
-
-    nominal_poles: Poles = Poles()  # noqa: RUF009 (frozen)
-    prior_missed_mode: float = 0.0
-    advice: tuple[Finding, ...] = ()
-
-    @cached_property
-    def warnings(self) -> tuple[Finding, ...]:
-        """What to look at before trusting the ellipses: residuals, and a nominal outside most of them."""
-        return warned(*self.advice, *nominal_outside(self, self.nominal().frequency_response, self.dt_s))
-
-    @property
-    def missed_mode_suspected(self) -> bool:
-        """The data themselves raise the odds that a mode is missing."""
-        now, before = getattr(self.report, "probability_missed_mode", 0.0), self.prior_missed_mode
-        return now * (1 - before) >= _POSITIVE * (1 - now) * before > 0
-
-    def nominal(self) -> GobfModel:
-        """Model on the identified poles, nearest to the centre in units of the ellipses."""
-        return dressed(GobfModel, nominal_near(self, self.nominal_poles, _nominal_grid(self.dt_s)))
-
-    def at_modes(self) -> list[tuple[float, float]]:
-        """(frequency [rad/s], major semi-axis of the 95 % ellipse over gain) at every mode."""
-        omega = np.unique(self.nominal_poles.omega_rad_s(self.dt_s))
-        here = self.at(omega[omega < np.pi / self.dt_s]) if omega.size else None
-        if here is None:
-            return []
-        share = here.ellipse(0.95).semi_major / np.abs(here.centre)
-        return list(zip(here.omega_rad_s.tolist(), share.tolist(), strict=True))
-
-    def to_control(self) -> Any:
-        """`nominal` as `control.StateSpace`, without the ellipses."""
-        return self.nominal().to_control()
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class ErrorSurface(Shown, PlainSurface):
-    """Result of `error_surface`: `mean_square` (A, B) over `first` (A,) and `second` (B,), called `names`."""
-
-
 def identify(
     records: PlainRecord | Sequence[PlainRecord], options: IdentOptions | None = None, **settings: Any
 ) -> Identification:
@@ -437,9 +272,7 @@ def identify(
     chosen, used = _options(IdentOptions, options, settings), _records(records)
     with threadpool_limits(1):
         found = identify_records(used, chosen)
-    given = chosen is not None and chosen.n_pairs is not None
-    model = dressed(GobfModel, found.model)
-    return dressed(Identification, found, model=model, records=used, order_given=given)
+    return replace(found, records=used, order_given=chosen is not None and chosen.n_pairs is not None)
 
 
 def identify_mimo(
@@ -459,20 +292,19 @@ def identify_mimo(
     chosen, used = _options(IdentOptions, options, settings), _records(records)
     with threadpool_limits(1):
         found = several_outputs.identify_mimo(used, chosen, free_shapes=free_shapes, start=start)
-    return dressed(MimoIdentification, found, records=used)
+    return replace(found, records=used)
 
 
 def matrix_posterior(
-    records: PlainRecord | Sequence[PlainRecord], identification: MimoIdentified, *, level: float = 0.95
-) -> MatrixPosterior:
+    records: PlainRecord | Sequence[PlainRecord], identification: MimoIdentification, *, level: float = 0.95
+) -> matrix_response.MatrixPosterior:
     """Uncertainty of a matrix response: balls that hold it with probability `level` at every frequency."""
     with threadpool_limits(1):
-        found = matrix_response.matrix_posterior(_records(records), identification, level=level)
-    return dressed(MatrixPosterior, found)
+        return matrix_response.matrix_posterior(_records(records), identification, level=level)
 
 
 def uncertainty(
-    identification: Identified,
+    identification: Identification,
     records: PlainRecord | Sequence[PlainRecord] | EmbeddingOptions | None = None,
     options: EmbeddingOptions | None = None,
     **settings: Any,
@@ -503,30 +335,13 @@ def uncertainty(
         chosen = chosen.model_copy(update={"order_given": getattr(identification, "order_given", False)})
     used = _records_of(identification, records)
     with threadpool_limits(1):
-        found = tangent(used, identification.model, chosen)
-        advice = _advice(found, used)
-    return dressed(
-        Uncertainty,
-        found,
-        advice=advice,
-        nominal_poles=identification.model.poles,
-        prior_missed_mode=chosen.prior_missed_mode,
-    )
-
-
-def _advice(found: posterior.ResponsePosterior, records: Sequence[PlainRecord]) -> tuple[Finding, ...]:
-    """What the residuals say about the ellipses, as `flexlink run` says it."""
-    from workflow.tasks.identification import residual_tests
-
-    order = 0 if found.report is None else len(found.report.ar_coefficients)
-    try:
-        return tuple(residual_advice(*residual_tests(found, records), noise_order=order))
-    except ValueError:  # records too short for a test, or nothing left to test
-        return ()
+        return response_uncertainty.uncertainty(used, identification, chosen)
 
 
 def error_surface(
-    identification: Identified, records: PlainRecord | Sequence[PlainRecord] | None = None, **settings: Any
+    identification: Identification,
+    records: PlainRecord | Sequence[PlainRecord] | None = None,
+    **settings: Any,
 ) -> ErrorSurface:
     """Mean square residual with one pole pair of an identified model moved over a grid, its others frozen.
 
@@ -547,8 +362,7 @@ def error_surface(
     for name in {"first", "second"} & set(settings):
         settings[name] = np.asarray(settings[name], dtype=np.float64)
     with threadpool_limits(1):
-        found = surface_of(used, identification.model, identification.structure, **settings)
-    return dressed(ErrorSurface, found)
+        return surface_of(used, identification.model, identification.structure, **settings)
 
 
 _ELSEWHERE = {
@@ -571,9 +385,9 @@ def _records(records: Any) -> tuple[PlainRecord, ...]:
 def _records_of(identification: Any, records: Any) -> tuple[PlainRecord, ...]:
     """These records or those of the identification, of one input and one output."""
     model = getattr(identification, "model", None)
-    if isinstance(identification, MimoIdentified):
+    if isinstance(identification, MimoIdentification):
         raise ValueError("several inputs or outputs: use flexlink.matrix_posterior(records, identification)")
-    if not isinstance(model, PlainModel):
+    if not isinstance(model, GobfModel):
         raise ValueError(f"expected the result of flexlink.identify, got {type(identification).__name__}")
     used = _records(getattr(identification, "records", ()) if records is None else records)
     if not used:

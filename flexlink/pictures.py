@@ -10,11 +10,14 @@ import control
 import numpy as np
 import numpy.typing as npt
 
+from control_design.analysis.certificate import Certificate
+from control_design.analysis.closed_loop import ClosedLoopTrajectory
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant, frequency_response
 from control_design.specification import Specification
+from control_design.synthesis.synthesis_result import SynthesisResult
 from diagnosis.answer import Diagnosis
-from flexlink.design import Certificate, LoopRun, SynthesisResult, measured_response, state_space
+from flexlink.design import measured_response, state_space
 from flexlink.machines import Simulation
 from ident.basis.model import GobfModel
 from ident.data.frequency_uncertainty import FrequencyUncertainty
@@ -166,8 +169,8 @@ def _synthesis(result: SynthesisResult) -> Figure:
     return _loop(result.plants[0], result.controller, result.specification)
 
 
-@plot.register(LoopRun)
-def _run(run: LoopRun) -> Figure:
+@plot.register(ClosedLoopTrajectory)
+def _run(run: ClosedLoopTrajectory) -> Figure:
     from workflow.figures.closed_loop import draw_closed_loop
     from workflow.tasks.results import LoopRuns
 
@@ -190,9 +193,10 @@ def _causes(found: Diagnosis) -> Figure:
     return draw_probabilities(found)
 
 
-def _loop(plant: UncertainPlant, controller: Controller, specification: Specification) -> Figure:
+def _loop(plant: UncertainPlant, controller: Controller, specification: Specification | None) -> Figure:
     from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
 
+    assert specification is not None
     own = plant.own_grid
     omega = _grid(plant.dt_s) if own is None else own[own > 0]
     return draw_sensitivities(sensitivity_curves(plant, controller, specification, omega), level=plant.level)

@@ -3,94 +3,64 @@
 from __future__ import annotations
 
 import html
-import inspect
-import re
 import sys
-from collections.abc import Callable
-from dataclasses import fields
-from functools import cache, wraps
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from ident.data.settings import Settings, meant
+from ident.basis.model import GobfModel
+from ident.basis.model_files import ModelFile
+from ident.data.shown import Shown
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-T = TypeVar("T")
-F = TypeVar("F", bound=Callable[..., Any])
+
+def text(result: object) -> str:
+    """The sentences of a result: the macro in results.j2 that has the name of its class."""
+    return "\n".join(_lines(result))
 
 
-class UnknownKeywordError(ValueError, TypeError):
-    """A keyword that a function does not take; one line that says what was meant, or where it belongs."""
+def html_text(result: Shown) -> str:
+    """The same for a notebook, with a table where the class has a short one."""
+    first, *others = (html.escape(line.strip()) for line in _lines(result))
+    said = f"<p>{'<br>'.join([f'<b>{first}</b>', *others])}</p>"
+    if not result.table_in_notebook:
+        return said
+    return said + table(result).to_html(index=False, na_rep="", float_format="{:.4g}".format, border=0)
 
 
-class Shown:
-    """Put before the class of a result: the sentences are the macro of the same name in results.j2."""
+def plot(result: object) -> Figure:
+    from flexlink.pictures import plot as draw
 
-    table_in_notebook: ClassVar[bool] = False  # where it is short, and says more than the sentences
-
-    def __repr__(self) -> str:
-        return "\n".join(_lines(self))
-
-    def _repr_html_(self) -> str:
-        first, *others = (html.escape(line.strip()) for line in _lines(self))
-        said = f"<p>{'<br>'.join([f'<b>{first}</b>', *others])}</p>"
-        if not self.table_in_notebook:
-            return said
-        return said + self.table().to_html(index=False, na_rep="", float_format="{:.4g}".format, border=0)
-
-    def plot(self) -> Figure:
-        """Draw the result; see `flexlink.plot`."""
-        from flexlink import plot
-
-        return plot(self)
-
-    def table(self) -> pd.DataFrame:
-        """Return the result as a table; see `flexlink.table`."""
-        from flexlink import table
-
-        return table(self)
+    return draw(result)
 
 
-def dressed(kind: type[T], value: Any, **more: Any) -> T:
-    """A numerical result as the class of the front door that shows itself; the fields are the same."""
-    return kind(**{field.name: getattr(value, field.name) for field in fields(value)} | more)
+def table(result: object) -> pd.DataFrame:
+    from flexlink.tables import table as tabulate
+
+    return tabulate(result)
 
 
-def one_line(function: F) -> F:
-    """The function, which refuses a keyword that nobody knows as settings refuse a key."""
+def save(model: GobfModel, path: Path) -> None:
+    from workflow.engine.storage import write_bytes
+    from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
 
-    @wraps(function)
-    def called(*arguments: Any, **named: Any) -> Any:
-        try:
-            return function(*arguments, **named)
-        except TypeError as error:
-            unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
-            if unknown is None or unknown[1] not in named:
-                raise
-            name, of = unknown[1], function.__qualname__.removesuffix(".__init__")
-        own = inspect.signature(function).parameters.values()
-        known = [
-            each.name
-            for each in own
-            if each.kind is not each.VAR_KEYWORD and each.name not in ("self", "cls")
-        ]
-        where = meant(name, known, "keywords")
-        if len(known) < len(own) and "did you mean" not in where:
-            where += f", more in help(flexlink.{of})"
-        hints = " ".join(str(each.annotation) for each in own)
-        for kind in vars(sys.modules[function.__module__]).values():
-            settings = inspect.isclass(kind) and issubclass(kind, Settings) and kind.__name__ in hints
-            if settings and name in kind.model_fields:
-                where = f"a field of flexlink.{kind.__name__}({name}=...)"
-        raise UnknownKeywordError(f"{of}: unknown keyword {name} ({where})")
+    if path.suffix.lower() not in MODEL_SUFFIXES:
+        raise ValueError(f"{path}: expected a file name that ends in {' or '.join(MODEL_SUFFIXES)}")
+    write_bytes(path, model_bytes(path, ModelFile(model)))
 
-    return called  # type: ignore[return-value]
+
+def put_in_front() -> None:
+    """Results say from now on what was found."""
+    Shown.front = sys.modules[__name__]
 
 
 def _lines(result: object) -> list[str]:
-    text = str(getattr(_macros(), type(result).__name__)(result))
+    macros = _macros()
+    name = next(kind.__name__ for kind in type(result).__mro__ if hasattr(macros, kind.__name__))
+    text = str(getattr(macros, name)(result))
     return [line.rstrip() for line in text.splitlines() if line.strip()]
 
 

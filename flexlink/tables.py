@@ -7,19 +7,20 @@ from functools import singledispatch
 import numpy as np
 import pandas as pd
 
+from control_design.analysis.certificate import Certificate
+from control_design.analysis.closed_loop import ClosedLoopTrajectory
 from control_design.analysis.multivariable_certificate import MultivariableCertificate
 from control_design.convex.youla import YoulaBracket
+from control_design.synthesis.synthesis_result import SynthesisResult
 from diagnosis.answer import Diagnosis
-from flexlink.design import Certificate, LoopRun, SynthesisResult
 from flexlink.machines import Simulation
-from flexlink.models import MimoIdentification
 from flexlink.pictures import as_response, unknown
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.data.arrays import ComplexArray
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
-from ident.identification import Identification
+from ident.identification import Identification, MimoIdentification
 from ident.search.error_surface import ErrorSurface
 from ident.uncertainty import ResponsePosterior
 from workflow.figures.bands import response_band
@@ -68,8 +69,8 @@ def _simulation(simulation: Simulation) -> pd.DataFrame:
     return pd.DataFrame(vars(simulation))
 
 
-@table.register(LoopRun)
-def _run(run: LoopRun) -> pd.DataFrame:
+@table.register(ClosedLoopTrajectory)
+def _run(run: ClosedLoopTrajectory) -> pd.DataFrame:
     names = ("time_s", "reference", "measured", "command", "limited")
     return pd.DataFrame({name: getattr(run, name) for name in names})
 

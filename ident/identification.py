@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,12 +15,14 @@ from ident.basis.model import GobfModel
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray, lock, readonly
 from ident.data.finding import Finding, PriorTest, distinct
+from ident.data.record import Record
+from ident.data.shown import NOT_STORED, Shown
 from ident.search.order_selection import OrderStep
 from ident.search.pole_search import SearchTrace
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FittedRecords:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class FittedRecords(Shown):
     """How well a model with poles fits the K records it was made from.
 
     structure: around the basis, after the data decided what was left to them. residuals: (T - delay,) each,
@@ -27,8 +31,11 @@ class FittedRecords:
     free poles, 0 at an optimum. order_table: every structure tried. n_fixed: real poles and pairs that were
     given (integrators counted), first of each type. verdicts: on each question left to the data and each
     prior. noise_filter: A(q) behind which everything was fitted, [1.0] for white noise. advise: further
-    warnings, looked for when they are first asked for.
+    warnings, looked for when they are first asked for. records: what it was made from; order_given: nobody
+    left it to the data; neither is stored.
     """
+
+    table_in_notebook = True
 
     structure: Structure
     record_names: tuple[str, ...]
@@ -44,6 +51,8 @@ class FittedRecords:
     prior_tests: tuple[PriorTest, ...] = ()
     noise_filter: RealArray = field(default_factory=lambda: np.ones(1))
     advise: Callable[[], Sequence[Finding]] = field(default=tuple)
+    records: tuple[Record, ...] = field(default=(), compare=False, metadata=NOT_STORED)
+    order_given: bool = field(default=False, compare=False, metadata=NOT_STORED)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "residuals", tuple(readonly(item) for item in self.residuals))
@@ -62,14 +71,29 @@ class FittedRecords:
         return distinct((*self.search.warnings, *self.advise()))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Identification(FittedRecords):
-    """A fitted model of one input, and how well it fits."""
+    """A fitted model of one input, and how well it fits.
+
+    Examples
+    --------
+    >>> found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
+    >>> found.model.poles.omega_rad_s(found.model.dt_s).round(1)
+    array([20.])
+    """
 
     model: GobfModel
 
+    def to_control(self) -> Any:
+        """The model as `control.StateSpace`."""
+        return self.model.to_control()
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+    def save(self, path: str | Path) -> None:
+        """Write the model as `GobfModel.save`."""
+        self.model.save(path)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class MimoIdentification(FittedRecords):
     """A fitted model of several inputs and outputs with shared poles, and how well it fits.
 
@@ -84,3 +108,7 @@ class MimoIdentification(FittedRecords):
     output_fit_percent: RealArray
     rank_one: tuple[bool, ...] = ()
     rank_one_test: float = 1.0
+
+    def to_control(self) -> Any:
+        """The model as `control.StateSpace`."""
+        return self.model.to_control()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from functools import partial
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -24,10 +24,12 @@ from control_design.analysis.worst_case import worst_case
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Ellipses, Real
 from control_design.plants.frequency_grid import checked_grid, near_the_circle, with_own_grid
-from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
+from control_design.plants.plant_set import Mode, UncertainPlant, frequency_response, modes_of
 from control_design.plants.set_expansion import with_straight_between
 from control_design.specification import Specification
 from control_design.specification.requirement import Findings, SpecificationItem
+from ident.data.finding import Finding, distinct
+from ident.data.shown import NOT_STORED, Shown
 
 
 @dataclass(frozen=True)
@@ -73,8 +75,8 @@ class Resonance:
     gain: float
 
 
-@dataclass(frozen=True)
-class Certificate:
+@dataclass(frozen=True, repr=False)
+class Certificate(Shown):
     """Verdict on a controller for a set of uncertain plants.
 
     certified: every nominal closed loop is stable by its poles and by the Nyquist count, no ellipse reaches
@@ -83,8 +85,14 @@ class Certificate:
     weighted worst case on the dense grid (<= 1 met). gamma_bound: upper bound of it for all frequencies, or
     None where some plant allows no proof. joint: calibration of the ellipses to posterior samples, where
     specified; the ellipses checked are then those of the calibrated level where it is above the given one.
-    resonances: pole pairs of the controller with a damping ratio below `LIGHT_CONTROLLER_POLES`.
+    resonances: pole pairs of the controller with a damping ratio below `LIGHT_CONTROLLER_POLES`. controller,
+    uncertain_plants, specification: what it is about; not stored.
+
+    plants: per plant its `worst_margins` and `nominal_margins` (`gain_up`, `gain_down`, `phase_rad`,
+    `delay_s`, `modulus`), `bandwidth_rad_s`, `stable`, `pole_radius`; nan where the loop is not stable.
     """
+
+    table_in_notebook = True
 
     certified: bool
     gamma: float
@@ -93,6 +101,23 @@ class Certificate:
     gamma_bound: float | None = None
     joint: JointCoverage | None = None
     resonances: tuple[Resonance, ...] = ()
+    controller: Controller | None = field(default=None, compare=False, metadata=NOT_STORED)
+    uncertain_plants: tuple[UncertainPlant, ...] = field(default=(), compare=False, metadata=NOT_STORED)
+    specification: Specification | None = field(default=None, compare=False, metadata=NOT_STORED)
+
+    @cached_property
+    def warnings(self) -> tuple[Finding, ...]:
+        """What the certificate stands or falls with: doubts about the ellipses of its plants."""
+        found: list[Finding] = []
+        for plant in self.uncertain_plants:
+            if (conditions := getattr(plant.uncertainty, "conditions", None)) is not None:
+                found += conditions(partial(frequency_response, plant.nominal), plant.level)
+        return distinct(found)
+
+    @property
+    def nominal_only(self) -> bool:
+        """No plant had an uncertainty: the worst case is the nominal plant."""
+        return not any(plant.stated for plant in self.plants)
 
 
 LIGHT_CONTROLLER_POLES = 1e-3
@@ -139,7 +164,7 @@ def certify(
             f"the controller has {controller.computational_delay_samples} samples of computational delay, "
             f"the specification {specification.computational_delay_samples}"
         )
-    joint = None
+    joint, asked = None, tuple(plants)
     if joint_coverage is not None:
         if rng is None:
             raise ValueError("joint_coverage needs rng, a numpy.random.Generator to draw responses with")
@@ -176,6 +201,9 @@ def certify(
             for mode in modes_of(controller.poles, controller.dt_s, zeta_below=LIGHT_CONTROLLER_POLES)
             if mode.omega_rad_s < np.pi / controller.dt_s
         ),
+        controller=controller,
+        uncertain_plants=asked,
+        specification=specification,
     )
 
 

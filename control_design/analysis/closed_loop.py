@@ -14,6 +14,7 @@ import numpy.typing as npt
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Boolean, Complex, Real
 from ident.data.arrays import lock
+from ident.data.shown import Shown
 
 
 class SampledMachine(Protocol):
@@ -73,8 +74,8 @@ class LinearMachine:
             self._x = self._a @ self._x + self._b @ np.array([u, hub_torque_Nm])
 
 
-@dataclass(frozen=True, eq=False)
-class ClosedLoopTrajectory:
+@dataclass(frozen=True, eq=False, repr=False)
+class ClosedLoopTrajectory(Shown):
     """What happened: time_s (T,), reference (T,), output (T, Y) as measured, command (T,) as applied during
     [t_k, t_{k+1}), limited (T,) whether a limit was active when the command at t_k was computed; dt_s,
     measured_index of the controlled output."""

@@ -30,6 +30,7 @@ from control_design.plants.scaled_bound import (
 )
 from control_design.plants.weights import RationalWeight
 from control_design.specification.multivariable import MultivariableSpecification, gram
+from ident.data.shown import Shown
 
 _EXCESS = 0.002  # of a bound for all frequencies over the dense maximum
 _PIECES = 3000  # at most, of one requirement
@@ -98,9 +99,11 @@ class MultivariableVerdict:
         return self.proved and max(self.bounds.values()) <= 1.0
 
 
-@dataclass(frozen=True)
-class MultivariableCertificate:
+@dataclass(frozen=True, repr=False)
+class MultivariableCertificate(Shown):
     """Verdicts by plant; gamma: largest worst case on the grids; met: for every one."""
+
+    table_in_notebook = True
 
     verdicts: tuple[MultivariableVerdict, ...]
     gamma: float = field(init=False)

@@ -37,6 +37,7 @@ from control_design.plants.plant_set import UncertainPlant, delayed
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction
 from ident.data.arrays import factor_matrices
+from ident.data.shown import Shown
 
 _ELLIPSE_ROUNDS = 20  # turns of angles and Q
 Region = Literal["inscribed", "ellipse", "enclosing"]
@@ -55,8 +56,8 @@ class PlantBracket:
     enclosing: float
 
 
-@dataclass(frozen=True)
-class YoulaBracket:
+@dataclass(frozen=True, repr=False)
+class YoulaBracket(Shown):
     """What any controller could reach, the worst over the plants; each may need a Q of its own, so that with
     several these are lower bounds of what one controller can do."""
 

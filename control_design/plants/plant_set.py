@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from control_design.plants.ellipses import Complex, Ellipses, EvaluableUncertainty, Real, ResponseSet
+from ident.data.shown import Shown
 
 if TYPE_CHECKING:
     import control
@@ -199,8 +200,8 @@ def modes_of(poles_z: Complex, dt_s: float, *, zeta_below: float = 0.4) -> tuple
     return tuple(sorted((m for m in modes if m.zeta < zeta_below), key=lambda m: m.omega_rad_s))
 
 
-@dataclass(frozen=True, eq=False)
-class UncertainPlant:
+@dataclass(frozen=True, eq=False, repr=False)
+class UncertainPlant(Shown):
     """Input -> measured output with ellipses (`Channel`), one plant per load or operating point.
 
     integrators: poles at z = 1, None = counted; a number that contradicts the nominal is refused.

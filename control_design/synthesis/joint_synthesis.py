@@ -21,12 +21,13 @@ from control_design.specification import Specification
 from control_design.synthesis.synthesis import Progress, part_of, synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
+from ident.data.shown import Shown
 
 _MOST_GUARDS = 6  # of each plant and round: each is one more set of rows
 
 
-@dataclass(frozen=True, eq=False)
-class JointDesign:
+@dataclass(frozen=True, eq=False, repr=False)
+class JointDesign(Shown):
     """A design whose sampled responses are stable as often as asked, or the best found.
 
     guards: responses it had to keep stable. unstable: unstable draws of `draws` for the first design and each

@@ -28,6 +28,7 @@ from control_design.synthesis.next_block import best_blocks
 from control_design.synthesis.synthesis import part_of
 from control_design.synthesis.synthesis_options import MultivariableOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome
+from ident.data.shown import Shown
 
 _LIGHT = 0.3  # poles of loop and controller damped less have frequencies of their own in every check
 _AROUND = np.array([-3, -1.5, -0.7, -0.3, 0, 0.3, 0.7, 1.5, 3])  # in half-widths of such a pole
@@ -38,8 +39,8 @@ _SAME = 1e-3  # relative difference of worst cases below which two static gains 
 _MOST = 15  # violated frequencies added in a round
 
 
-@dataclass(frozen=True)
-class MultivariableResult:
+@dataclass(frozen=True, repr=False)
+class MultivariableResult(Shown):
     """gamma: largest worst case over plants, requirements and the dense grid (at most 1: met). worst: by
     name of the requirement. blocking: where gamma is reached, worst first. steps of the descents in all.
     Certify with `certify_multivariable` before use."""

@@ -4,6 +4,7 @@ the asked one first; and why a controller is no design at all."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -73,11 +74,12 @@ def synthesise(
     """
     options = options or SynthesisOptions()
     specification.check_against(plants)
-    specification = _seen_by_the_data(specification, plants)
+    asked, specification = specification, _seen_by_the_data(specification, plants)
     tell = progress or (lambda fraction, message: None)
     problem = Problem(tuple(plants), specification, options, tuple(guards))
     if specification.controller_order == "auto":
-        return _of_lowest_order(problem, int(rng.integers(2**63)), tell)
+        found = _of_lowest_order(problem, int(rng.integers(2**63)), tell)
+        return replace(found, plants=problem.plants, specification=asked)
     own_damping = max(0.8, 1.01 * (specification.controller_damping or 0.0))
     root = int(rng.integers(2**63))
     cascade = Cascade(specification.sections(), problem.dt_s, problem.scale_rad_s)
@@ -90,10 +92,11 @@ def synthesise(
     reports += search.reports
     if thorough and not settled:
         problem.grids[:] = grids  # what the fits violated may be of no concern to other starts
-        found = _climbed(workshop, ladder, root, own_damping, result.best, part_of(tell, 1, 2), reports)
-        worse = result.best is None or (found.best and found.best.gamma <= result.best.gamma)
-        result = found if worse else result
-    return _told(problem, cascade, result, tuple(reports), tell)
+        climbed = _climbed(workshop, ladder, root, own_damping, result.best, part_of(tell, 1, 2), reports)
+        worse = result.best is None or (climbed.best and climbed.best.gamma <= result.best.gamma)
+        result = climbed if worse else result
+    found = _told(problem, cascade, result, tuple(reports), tell)
+    return replace(found, plants=problem.plants, specification=asked)
 
 
 def _of_lowest_order(problem: Problem, root: int, tell: Progress) -> SynthesisResult:

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any
 
 from control_design.controllers.controller import Controller
+from control_design.plants.plant_set import UncertainPlant
+from control_design.specification import Specification
+from ident.data.shown import NOT_STORED, Shown
 
 
 class Outcome(Enum):
@@ -54,14 +58,15 @@ class StartReport:
         return self.gamma_dense is not None or (self.status == "descent" and self.gamma_grid < LARGEST_GAMMA)
 
 
-@dataclass(frozen=True)
-class SynthesisResult:
+@dataclass(frozen=True, repr=False)
+class SynthesisResult(Shown):
     """Best controller found and how good it is.
 
     gamma: largest weighted worst case over plants, ellipses and the dense grid (<= 1: met; 1.2: requirements
     exceeded by 20 %). blocking: where and which weight, worst first. gamma_history: dense gamma of the best
     point after the starts and each exchange round. grid_points: final size of the programme's grids. outcome
-    says what gamma means; certify with `certificate.certify` before use.
+    says what gamma means; certify with `certificate.certify` before use. plants, specification: what it is
+    for; not stored.
     """
 
     outcome: Outcome
@@ -71,3 +76,9 @@ class SynthesisResult:
     starts: tuple[StartReport, ...]
     gamma_history: tuple[float, ...]
     grid_points: int
+    plants: tuple[UncertainPlant, ...] = field(default=(), compare=False, metadata=NOT_STORED)
+    specification: Specification | None = field(default=None, compare=False, metadata=NOT_STORED)
+
+    def to_control(self) -> Any:
+        """The controller as `control.StateSpace`, without its computational delay and limits."""
+        return self.controller.to_control()

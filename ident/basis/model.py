@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from math import comb
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,20 +20,30 @@ from ident.basis.functions import (
 from ident.basis.poles import NO_POLES, Poles
 from ident.basis.structure import filter_input
 from ident.data.arrays import ComplexArray, RealArray, lock
+from ident.data.shown import Shown
 
 # Each is a state; a file that says more is damaged, and would fill the memory.
 _MOST_STAGES = 1000
 
 
-@dataclass(frozen=True, eq=False)
-class GobfModel:
+@dataclass(frozen=True, eq=False, repr=False)
+class GobfModel(Shown):
     """G(z) = [sum_i c_i L_i(z) + feedthrough] (z/(z-1))^integrators z^-input_delay_samples, paper (3) and
     (5).
 
     coefficients (B,): one per basis function, real poles first, then two per pair. unstable: mirror images 1
     / conj(p) of poles p outside the circle, each among the poles: G is the above divided by their all-pass
     B(z). Raises ValueError if the shapes do not fit, a number is not finite or dt_s is not positive.
+
+    Examples
+    --------
+    >>> poles = flexlink.Poles.from_continuous(omega_rad_s=[20.0], zeta=[0.05], dt_s=0.01)
+    >>> flexlink.GobfModel(poles, [0.1, 0.2], dt_s=0.01)
+    GobfModel of order 2, u -> y, dt = 0.01 s
+      mode at 20 rad/s (3.18 Hz), damping ratio 0.05
     """
+
+    table_in_notebook = True
 
     poles: Poles
     coefficients: RealArray
@@ -143,6 +154,10 @@ class GobfModel:
     def to_control(self) -> Any:
         """The same model as a `control.StateSpace` with dt = dt_s."""
         return _as_control(self, [self.input_name])
+
+    def save(self, path: str | Path) -> None:
+        """Write poles, coefficients and state space to a .json or .mat file, as `identify --export` does."""
+        self.front.save(self, Path(path))
 
     def simulate(self, u: RealArray) -> RealArray:
         """Output (T,) for the input u (T,) or (T, 1), from rest. Raises ValueError for an unstable model."""

@@ -16,6 +16,7 @@ from ident.basis.structure import filter_input, front_response
 from ident.data.arrays import ComplexArray, RealArray, lock
 from ident.data.ellipses import ellipse_distance, spread_covariance
 from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.shown import Shown
 
 # Responses times frequencies that are drawn at once for simultaneous bands.
 _LARGEST_BATCH = 1_000_000
@@ -68,8 +69,8 @@ def _delays(z: ComplexArray, most: int) -> ComplexArray:
     return powers
 
 
-@dataclass(frozen=True, eq=False)
-class ResponsePosterior:
+@dataclass(frozen=True, eq=False, repr=False)
+class ResponsePosterior(Shown):
     """Gaussian coefficients of G(z) = [sum a_i L_i(z) + d + sum h_k z^-k] (z / (z - 1))^integrators z^-delay.
 
     poles: of the L_i (doubled ones for the tangent method); has_feedthrough: whether d is among the

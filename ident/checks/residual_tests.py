@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
-from scipy.signal import correlate
+from scipy.signal import correlate, lfilter
 from scipy.stats import chi2, norm
 
 from ident.basis.posterior import ResponsePosterior
@@ -218,3 +219,35 @@ def _pooled_correlation(e: Sequence[RealArray], u: Sequence[RealArray], max_lag:
         total += correlate(a, b, mode="full", method="fft")[middle - max_lag : middle + max_lag + 1]
     scale = np.sqrt(sum(float(a @ a) for a in e) * sum(float(b @ b) for b in u))
     return np.asarray(total / scale)
+
+
+class Simulated(Protocol):
+    """A machine that simulates its records: `ident.friction.FrictionFit`."""
+
+    @property
+    def in_loop(self) -> bool: ...
+
+    def residual(self, record: Record) -> RealArray: ...
+
+
+def residual_tests(
+    posterior: ResponsePosterior, records: Sequence[Record], friction: Simulated | None = None
+) -> tuple[ResidualTest, ResidualTest]:
+    """Whiteness and independence of what the posterior's own mean leaves of the records behind the ellipses.
+
+    friction: records of the shaft's position as measured are held against its simulation instead, which has
+    the friction between the samples, too. Where the bounds have a noise model, whiteness is that of the
+    residuals behind it: they rest on those.
+    """
+    # Prediction errors of an observer are white as they are.
+    in_loop = friction is not None and friction.in_loop
+    colour = () if posterior.report is None or in_loop else posterior.report.ar_coefficients
+    filter_of_noise = np.array([1.0, *colour])
+    residuals = [
+        fit_on_fresh_data(posterior, record).residual if friction is None else friction.residual(record)
+        for record in records
+    ]
+    whitened = [lfilter(filter_of_noise, np.ones(1), residual)[len(colour) :] for residual in residuals]
+    delay = posterior.input_delay_samples
+    inputs = [record.input[: record.n_samples - delay, 0] for record in records]
+    return whiteness_test(whitened), independence_test(inputs, residuals)

@@ -8,6 +8,8 @@ from enum import Enum, auto
 
 import numpy as np
 
+from ident.data.shown import Shown
+
 Value = float | bool | int | str  # what a sentence is made with
 
 # Level of the tests of what is stated as known.
@@ -96,8 +98,8 @@ class FindingKind(Enum):
     AMPLITUDE_HIDDEN = auto()
 
 
-@dataclass(frozen=True)
-class Finding:
+@dataclass(frozen=True, repr=False)
+class Finding(Shown):
     """A kind, and the numbers and names that belong to it (units in their names)."""
 
     kind: FindingKind

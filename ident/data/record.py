@@ -13,6 +13,7 @@ from ident.data.arrays import RealArray, readonly
 from ident.data.finding import Finding, FindingKind, Value, finding
 from ident.data.foreign_files import shown
 from ident.data.record_files import read_table
+from ident.data.shown import Shown
 from ident.data.table import LARGEST, Table
 from ident.data.time_grid import CoarseGrid, Repair, TimeGrid, clock_doubts, sampling_time
 from ident.data.units import TimeColumn, contradicted_by_loop, per, refuse_step
@@ -24,8 +25,8 @@ T = TypeVar("T")
 _SAME_CLOCK = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class Record:
+@dataclass(frozen=True, eq=False, repr=False)
+class Record(Shown):
     """One uniformly sampled experiment.
 
     input (T, U), output (T, Y), reference (T, R) or None, with distinct names each; units are free text,

@@ -14,11 +14,12 @@ from ident.basis.model import GobfModel
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray, lock
 from ident.data.record import Record
+from ident.data.shown import Shown
 from ident.fit.regression import prepare
 
 
-@dataclass(frozen=True, eq=False)
-class ErrorSurface:
+@dataclass(frozen=True, eq=False, repr=False)
+class ErrorSurface(Shown):
     """Mean square residual J/N (20) over two coordinates of one pair, coefficients fitted at every point.
 
     first (A,), second (B,): values of (beta, gamma) of (29), or (omega [rad/s], zeta), called `names`;

@@ -20,6 +20,7 @@ from ident.basis.mimo_model import MimoModel
 from ident.basis.structure import front_response
 from ident.data.arrays import ComplexArray, RealArray, lock
 from ident.data.record import Record
+from ident.data.shown import Shown
 from ident.fit.several_outputs import prepare_outputs, whitened
 from ident.identification import MimoIdentification
 from ident.mode_shapes import ModalFit, modes_of
@@ -67,8 +68,8 @@ class MatrixUncertainty:
         return np.asarray(self.distance(response) <= 1)
 
 
-@dataclass(frozen=True, eq=False)
-class MatrixPosterior:
+@dataclass(frozen=True, eq=False, repr=False)
+class MatrixPosterior(Shown):
     """What records say of a matrix response, at any frequency: `at`.
 
     model; output_factor Lo (Y, Y); modes, on outputs made white by it; covariance_factor of their numbers;

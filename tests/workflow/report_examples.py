@@ -19,6 +19,7 @@ from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.checks.prior_tests import NuisanceTest
+from ident.checks.residual_tests import residual_tests
 from ident.checks.validation import ScatterRow, fit_on_fresh_data
 from ident.data.finding import FindingKind, finding
 from ident.data.record import Record
@@ -30,7 +31,7 @@ from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import RunConfig
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks import closed_loop as closed_loop_stage, uncertainty as uncertainty_stage
-from workflow.tasks.identification import as_fitted, residual_tests
+from workflow.tasks.identification import as_fitted
 from workflow.tasks.loop_conditions import condition_run
 from workflow.tasks.results import (
     AchievablePerformance,

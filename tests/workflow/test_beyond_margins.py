@@ -25,6 +25,7 @@ from control_design.synthesis.synthesis_result import Outcome
 from ident.checks.residual_tests import conditions_of
 from ident.data.finding import FindingKind, finding
 from ident.uncertainty import FrequencyUncertainty
+from ident.uncertainty.nominal import NominalAgreement
 from tests.compiler import compiled, needs_compiler
 from tests.control_design.plants import uncertain_hub
 from tests.workflow.report_examples import (
@@ -54,12 +55,10 @@ from workflow.tasks.results import (
     CertifyResult,
     ClosedLoopResult,
     DesignResult,
-    NominalAgreement,
     ReferenceFilterResult,
     SampledResponses,
 )
 from workflow.tasks.summary import bandwidth_numbers, untold_below_rad_s, verdict_of
-from workflow.tasks.uncertainty import nominal_doubt
 from workflow.text.templates import environment, said
 
 
@@ -162,7 +161,7 @@ def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_h
     white = {"noise_order": 8, "independent": True, "friction": False, "predictable_share": 0.3}
     small, widened = (finding(FindingKind.NOT_WHITE, **white, observer=known) for known in (False, True))
     lag = finding(FindingKind.NOT_INDEPENDENT, lag=3)
-    outside = [nominal_doubt(NominalAgreement(share, 7.0, 12.0)) for share in (49.0, 51.0)]
+    outside = [NominalAgreement(share, 7.0, 12.0).doubt for share in (49.0, 51.0)]
     assert conditions_of([lag, small, *outside[0], widened, *outside[1]]) == [small, *outside[0]]
     words = verdict_of(design, certify, SimpleNamespace(check=check), conditions=[small, *outside[0]])
     assert words.startswith(verdict() + ". But the residuals are not white, even after a noise model of")

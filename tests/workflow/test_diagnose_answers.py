@@ -22,8 +22,7 @@ from diagnosis.machine.plant_effect import Change, EffectParameter, PlantEffect
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from diagnosis.next_experiment.next_experiment import Considered, NextExperiment, Separation
 from diagnosis.next_experiment.repeat import Change as Changed, Repeat
-from flexlink.causes import Diagnosis as Printed
-from flexlink.shown import dressed
+from flexlink import shown
 from plant.effects.joint import GroundSpring
 from tests.workflow.command import build_nothing
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
@@ -206,7 +205,7 @@ def drawn(loaded, found, coming, monkeypatch):
     assert several.sections
     command._overview([Machine.of(document)] * 2, {"other": "no such luck"})
     rows = [(row.label, row.value) for section in one.sections for row in section.rows]
-    assert str(dressed(Printed, found))
+    assert shown.text(found)
     return document, " ".join(page.split()), rows
 
 

@@ -1,8 +1,9 @@
 """One codec for every result: frozen dataclasses to JSON and named arrays, and back by their annotations.
 
 A dataclass becomes an object of its fields, an enum its name, an array a reference into the archive beside
-the document; non-finite and complex numbers are tagged. Fields that are functions are left out and come back
-as their defaults. A field that is missing or unknown, or of another kind, is refused in one line.
+the document; non-finite and complex numbers are tagged. Fields that are functions, or not to be stored
+(`ident.data.shown.NOT_STORED`), are left out and come back as their defaults. A field that is missing or
+unknown, or of another kind, is refused in one line.
 """
 
 from __future__ import annotations
@@ -133,7 +134,8 @@ def _written_out(kind: Any, meant: Mapping[Any, Any]) -> Any:
 def stored_fields(kind: type) -> dict[str, Any]:
     """Name and annotation of the fields of a dataclass that are data."""
     hints = get_type_hints(kind, include_extras=True)
-    known = {f.name: bare(hints[f.name]) for f in dataclasses.fields(kind) if f.init}
+    stored = [f for f in dataclasses.fields(kind) if f.init and f.metadata.get("stored", True)]
+    known = {f.name: bare(hints[f.name]) for f in stored}
     return {name: k for name, k in known.items() if get_origin(k) is not collections.abc.Callable}
 
 

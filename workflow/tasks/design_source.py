@@ -27,6 +27,7 @@ from ident.data.record_files import READERS, read_table
 from ident.data.response_columns import has_response
 from ident.frequency_fit import identify_frf
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
+from ident.uncertainty.nominal import NominalAgreement
 from workflow.config.design_file import DesignFile
 from workflow.config.run_config import RunConfig
 from workflow.engine import codec
@@ -36,7 +37,6 @@ from workflow.tasks.exports import Logged, read_model
 from workflow.tasks.pipeline import certified_for, config_of
 from workflow.tasks.results import IdentifiedPlant, RunResults
 from workflow.tasks.system_files import DOCUMENTS, read_document, read_state_space
-from workflow.tasks.uncertainty import agreement_of
 from workflow.text.templates import said, words
 
 
@@ -246,5 +246,5 @@ def _inside(own: FrequencyUncertainty, nominal: control.StateSpace) -> tuple[str
     at = FrequencyUncertainty(
         own.omega_rad_s[inside], own.centre[inside], own.covariance[inside], own.dt_s, own.level, own.method
     )
-    found = agreement_of(at, lambda omega: frequency_response(nominal, omega))
+    found = NominalAgreement.of(at, lambda omega: frequency_response(nominal, omega))
     return (said("nominal_inside", found, own.omega_rad_s.size),)

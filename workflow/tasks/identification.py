@@ -7,14 +7,12 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from scipy.signal import lfilter
 
 from ident.basis.options import EmbeddingOptions, IdentOptions
-from ident.basis.posterior import ResponsePosterior
 from ident.checks.distortion_findings import amplitude_effects
 from ident.checks.input_checks import clipped
 from ident.checks.plausible_modes import pairs_outside
-from ident.checks.residual_tests import fed_back, independence_test, whiteness_test
+from ident.checks.residual_tests import fed_back, independence_test
 from ident.checks.validation import fit_in_windows, fit_on_fresh_data
 from ident.closed_loop import TwoStage, two_stage, with_controller
 from ident.data.finding import Finding, FindingKind, distinct, finding
@@ -32,7 +30,7 @@ from ident.stabilisation import stabilisation
 from ident.uncertainty.embedding import tangent
 from workflow.config.run_config import Channel, ClosedLoopData, FileSource, Role
 from workflow.engine.errors import naming
-from workflow.tasks.results import IdentifiedChannel, IdentifyResult, Tests
+from workflow.tasks.results import IdentifiedChannel, IdentifyResult
 from workflow.tasks.stage import StageInput
 from workflow.text.templates import said
 
@@ -258,29 +256,6 @@ def clipped_as_measured(found: IdentifiedChannel, measured: Sequence[Record]) ->
     warnings = found.identification.search.warnings
     others = [warning for warning in warnings if warning.kind is not FindingKind.CLIPPED]
     return with_warnings(found, [*others, *clipped(measured)])
-
-
-def residual_tests(
-    posterior: ResponsePosterior, records: Sequence[Record], friction: FrictionFit | None = None
-) -> Tests:
-    """Whiteness and independence of what the posterior's own mean leaves of the records behind the ellipses.
-
-    friction: records of the shaft's position as measured are held against its simulation instead, which has
-    the friction between the samples, too. Where the bounds have a noise model, whiteness is that of the
-    residuals behind it: they rest on those.
-    """
-    # Prediction errors of an observer are white as they are.
-    in_loop = friction is not None and friction.in_loop
-    colour = () if posterior.report is None or in_loop else posterior.report.ar_coefficients
-    filter_of_noise = np.array([1.0, *colour])
-    residuals = [
-        fit_on_fresh_data(posterior, record).residual if friction is None else friction.residual(record)
-        for record in records
-    ]
-    whitened = [lfilter(filter_of_noise, np.ones(1), residual)[len(colour) :] for residual in residuals]
-    delay = posterior.input_delay_samples
-    inputs = [record.input[: record.n_samples - delay, 0] for record in records]
-    return whiteness_test(whitened), independence_test(inputs, residuals)
 
 
 def identified_channel(

@@ -33,6 +33,7 @@ from ident.friction import EquivalentFriction, FrictionFit
 from ident.identification import Identification
 from ident.stabilisation import Stabilisation
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
+from ident.uncertainty.nominal import NominalAgreement
 from workflow.config.run_config import Channel, Role, RunConfig
 from workflow.engine.run_directory import RunDirectory
 
@@ -228,15 +229,6 @@ class Intervals:
     modes: tuple[ModeInterval, ...]
     real_poles_per_s: tuple[Interval, ...]
     growth_per_s: tuple[Interval, ...] = field(default=(), metadata={"since": 2})
-
-
-@dataclass(frozen=True)
-class NominalAgreement:
-    """How far the nominal model of the design is from the ellipses' centres, in ellipses."""
-
-    share_inside_percent: float
-    largest_distance: float
-    at_rad_s: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,17 +10,16 @@ from operator import itemgetter
 from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import Mode
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.checks.answer import zero_is_inside
-from ident.checks.residual_tests import residual_advice, whiteness_test
+from ident.checks.residual_tests import residual_advice, residual_tests, whiteness_test
 from ident.checks.validation import ScatterRow, repeat_scatter
 from ident.data.distortion import distortion_of
-from ident.data.finding import Finding, FindingKind, distinct, finding
+from ident.data.finding import FindingKind, distinct, finding
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
 from ident.data.signal_filter import increments
@@ -37,18 +36,17 @@ from ident.friction import (
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.conditions import combine_posteriors, group_posteriors, repeat_posteriors
 from ident.uncertainty.embedding import tangent
-from ident.uncertainty.nominal import nominal_near
+from ident.uncertainty.nominal import MOST_INSIDE_PERCENT, NominalAgreement, nominal_near
 from ident.uncertainty.pole_intervals import growth_intervals, pole_intervals
 from workflow.config.run_config import Channel
 from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.engine.errors import naming
-from workflow.tasks.identification import as_bounded, residual_tests
+from workflow.tasks.identification import as_bounded
 from workflow.tasks.results import (
     Band,
     IdentifiedChannel,
     Intervals,
     ModeInterval,
-    NominalAgreement,
     Real,
     RunRecord,
     Tests,
@@ -62,11 +60,8 @@ _FEWEST_FREQUENCIES = 100  # over a band of the data, some decade: a nominal mod
 _SHARE_INSIDE = 0.9  # of the ellipses: below it a nominal is no member of the set it stands for
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 _NOISE_ORDERS = (8, 32)
-# A model of a loop's logs outside most of its own ellipses explains nothing: machines whose certificates held
-# had 87 % or more of them around their model, wrong ones 46 % or less (benchmarks.closed_loop_machines).
-_MOST = 50.0
-# So does one whose best fit to a log is below this, where the sensor's noise leaves a third of the rest at
-# most (right ones had 90 % and more, wrong ones 75 % and less).
+# A model explains nothing whose best fit to a log is below this, where the sensor's noise leaves a third of
+# the rest at most (right ones had 90 % and more, wrong ones 75 % and less).
 _EXPLAINED, _BEYOND_NOISE = 80.0, 3.0
 # So does one whose friction has a standard deviation above both of these shares, of its level and of the rms
 # command: wrong levels, and logs behind a filter, whose ellipses missed the machine (docs/decisions.md).
@@ -184,7 +179,7 @@ def uncertainty_of(
     )
     if rubs:
         advice.append(finding(FindingKind.UNTRIED_FRICTION, output=result.output))
-    return replace(found, advice=(*advice, *nominal_doubt(found.agreement))), equivalent
+    return replace(found, advice=(*advice, *found.agreement.doubt)), equivalent
 
 
 def _with_noise_model(
@@ -268,7 +263,7 @@ def uncertain_channel(
         ),
         bands=tuple(band_row(frequency, low, high) for low, high in bands),
         tests=tests,
-        agreement=agreement_of(frequency, nominal.frequency_response),
+        agreement=NominalAgreement.of(frequency, nominal.frequency_response),
         intervals=intervals_of(linear, model.stable_poles, level),
     )
 
@@ -304,7 +299,7 @@ def refuse_unexplained(
     found = result.identification
     best = max(*found.fit_percent.tolist(), *(fit.fit_percent for fit in result.fresh), 0.0)
     why = ""
-    if agreement.share_inside_percent < _MOST:
+    if agreement.share_inside_percent < MOST_INSIDE_PERCENT:
         outside, at = 100 - agreement.share_inside_percent, agreement.at_rad_s
         why = f"it lies outside {outside:.0f} % of its own ellipses, most near {at:.3g} rad/s"
     elif friction is not None and best < _EXPLAINED and found.noise_std > _BEYOND_NOISE * friction.noise_std:
@@ -385,27 +380,6 @@ def band_row(frequency: FrequencyUncertainty, low: float, high: float) -> Band:
     inside = (frequency.omega_rad_s >= low) & (frequency.omega_rad_s < high)
     relative = 100 * frequency.ellipse().semi_major[inside] / np.abs(frequency.centre[inside])
     return Band(low, high, float(np.median(relative)), float(np.max(relative)))
-
-
-def agreement_of(
-    frequency: FrequencyUncertainty, nominal: Callable[[Real], npt.NDArray[np.complex128]]
-) -> NominalAgreement:
-    """How far a nominal response, rad/s (F,) to G (F,), is from the ellipses' centres, in ellipses."""
-    distance = frequency.normalised_distance(nominal(frequency.omega_rad_s))
-    worst = int(np.argmax(distance))
-    return NominalAgreement(
-        share_inside_percent=100 * float(np.mean(distance <= 1)),
-        largest_distance=float(distance[worst]),
-        at_rad_s=float(frequency.omega_rad_s[worst]),
-    )
-
-
-def nominal_doubt(found: NominalAgreement) -> list[Finding]:
-    """What to say of a nominal that lies outside most of its ellipses; empty for others."""
-    if found.share_inside_percent >= _MOST:
-        return []
-    told = {"outside_percent": 100 - found.share_inside_percent, "times": found.largest_distance}
-    return [finding(FindingKind.NOMINAL_OUTSIDE, **told, at_rad_s=found.at_rad_s)]
 
 
 def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> Intervals | None:
