@@ -22,7 +22,7 @@ from .convex.youla import youla_bracket as youla_bracket
 from .plants.ellipses import Ellipses as Ellipses
 from .plants.guards import Guard as Guard
 from .plants.multivariable import MultivariablePlant as MultivariablePlant, ResponseBall as ResponseBall
-from .plants.plant_set import Channel as Channel, UncertainPlant as UncertainPlant
+from .plants.plant_set import PlantChannel as PlantChannel, UncertainPlant as UncertainPlant
 from .plants.weights import RationalWeight as RationalWeight
 from .specification import Specification as Specification, SpecificationError as SpecificationError
 from .specification.multivariable import MultivariableSpecification as MultivariableSpecification

@@ -31,7 +31,7 @@ from plant.effects.search_space import Candidate
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FittedEffect:
     """An effect where it is fitted best: coordinates (A,), 95 % intervals; gap_after, explains as in
     `NamedEffect`, of the set that it is in; widened_by: the nominal value it is widest by."""
 
@@ -108,7 +108,7 @@ def assembled(
     case: CaseOfMachine,
     nominal: NominalParameters,
     found: Judgement,
-    fitted: Callable[[str], Fitted | None],
+    fitted: Callable[[str], FittedEffect | None],
     rng: np.random.Generator,
     **more: Any,
 ) -> Diagnosis:
@@ -153,7 +153,7 @@ def assembled(
 
 
 def _entry(
-    name: str, found: Judgement, fitted: Fitted | None, case: CaseOfMachine, keys: tuple[str, ...]
+    name: str, found: Judgement, fitted: FittedEffect | None, case: CaseOfMachine, keys: tuple[str, ...]
 ) -> NamedEffect:
     weighed, rounding = found.probabilities, found.rounding
     entry = NamedEffect(name, weighed.cause[name], weighed.presence[name], {}, {}, float("nan"))

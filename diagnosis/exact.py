@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from diagnosis.answer import NOISE_FLOOR, POSSIBLE, Diagnosis, held_out_gap
-from diagnosis.assembled import Fitted, Judgement, Model, assembled
+from diagnosis.assembled import FittedEffect, Judgement, Model, assembled
 from diagnosis.evidence.confirmation import confronted
 from diagnosis.evidence.hypotheses import DISAGREEMENT, Hypothesis, Probabilities, probabilities
 from diagnosis.evidence.search import WhiteSearch
@@ -143,7 +143,7 @@ def _fitted(
     floor: float,
     gap_refit: float,
     rng: np.random.Generator,
-) -> Callable[[str], Fitted | None]:
+) -> Callable[[str], FittedEffect | None]:
     """floor, gap_refit : of validation records over noise: what noise and rounding leave, and the nominal."""
     case = model.case
     samples = float(np.mean([len(record.output) for record in case.estimation]))
@@ -151,7 +151,7 @@ def _fitted(
     def gap_of(end: Descent) -> float:
         return held_out_gap(case, model.by_experiment(end.deviations, end.effects, case.held_out))
 
-    def fitted(name: str) -> Fitted | None:
+    def fitted(name: str) -> FittedEffect | None:
         holding = [h for h in hypotheses if name in h.names]
         if not holding:
             return None
@@ -164,7 +164,7 @@ def _fitted(
         wider = max(1.0, end.rms**2) * _solver_variance(end, samples)
         inverse = wider * np.asarray(np.linalg.pinv(end.hessian, hermitian=True), dtype=np.float64)
         rows = end.rows_of(k)
-        return Fitted(
+        return FittedEffect(
             end.candidates[k],
             end.coordinates_of(k),
             parameter_intervals(end.candidates[k], end.coordinates_of(k), inverse[rows, rows], rng),

@@ -46,7 +46,7 @@ class Shaped:
 
 
 @dataclass(frozen=True, eq=False)
-class Mode:
+class ShapedMode:
     """A pole (the upper one of a pair) and its residue (Y, U); whether it moves, and has a residue of rank
     one."""
 
@@ -105,7 +105,7 @@ def one_shape_each(
 
 def modes_of(
     poles: Poles, coefficients: RealArray, n_fixed: tuple[int, int], rank_one: Sequence[bool] | None = None
-) -> list[Mode]:
+) -> list[ShapedMode]:
     """Modes of coefficients (Y, U, B), those at zero left out; rank_one: of each, default all. Raises
     ValueError where poles repeat."""
     values, columns = residue_columns(poles)
@@ -113,7 +113,7 @@ def modes_of(
     given = [*poles.real[: n_fixed[0]], *poles.pairs[: n_fixed[1]]]
     listed = [pole for pole in (*poles.real, *poles.pairs) if pole != 0]
     return [
-        Mode(complex(pole), residues[int(np.argmin(np.abs(values - pole)))], pole not in given, one)
+        ShapedMode(complex(pole), residues[int(np.argmin(np.abs(values - pole)))], pole not in given, one)
         for pole, one in zip(listed, rank_one or [True] * len(listed), strict=True)
     ]
 
@@ -122,7 +122,7 @@ class ModalFit:
     """Output error over poles, shapes and free residues from modes as given; what is linear is projected
     out."""
 
-    def __init__(self, data: OutputRegressions, modes: Sequence[Mode]) -> None:
+    def __init__(self, data: OutputRegressions, modes: Sequence[ShapedMode]) -> None:
         self.data, self.modes = data, modes
         first = data.each[0]
         self.u, self.segments, self.structure = first.u, first.segments, data.structure
@@ -165,7 +165,7 @@ class ModalFit:
         found = least_squares(residual, self.x, jacobian, ftol=_ENOUGH, xtol=_ENOUGH, **given)
         self._set(found.x)
 
-    def sizes(self, mode: Mode) -> RealArray:
+    def sizes(self, mode: ShapedMode) -> RealArray:
         """How much each input drives a mode, (U,): by that a residue's columns are weighed."""
         return np.asarray(np.linalg.norm(self._filtered(mode.pole, self.u), axis=1))
 
@@ -298,7 +298,7 @@ class ModalFit:
                     columns.append(column)
         return np.asarray(block_diag(*blocks)), np.array(drive)[:, None], np.array(columns)
 
-    def _unpacked(self) -> Iterator[tuple[Mode, tuple[complex, ComplexArray], list[ComplexArray]]]:
+    def _unpacked(self) -> Iterator[tuple[ShapedMode, tuple[complex, ComplexArray], list[ComplexArray]]]:
         at = 0
         for mode in self.modes:
             pole, residue, slopes = _unpacked(mode, self.x[at : at + _count(mode)])
@@ -309,7 +309,7 @@ class ModalFit:
         """Pole and residue (Y, U) of every mode."""
         return [both for _, both, _ in self._unpacked()]
 
-    def modes_found(self) -> list[Mode]:
+    def modes_found(self) -> list[ShapedMode]:
         """The modes as they are now."""
         return [replace(mode, pole=pole, residue=residue) for mode, (pole, residue), _ in self._unpacked()]
 
@@ -360,19 +360,19 @@ def _inverse_factor(columns: RealArray) -> RealArray:
     return np.asarray(np.linalg.pinv(triangle, rcond=1e-12) / scale[:, None])
 
 
-def _shown(rows: RealArray | ComplexArray, mode: Mode) -> RealArray:
+def _shown(rows: RealArray | ComplexArray, mode: ShapedMode) -> RealArray:
     """What a mode adds to the outputs: with its conjugate where it is a pair."""
     return 2 * np.real(rows) if mode.is_pair else np.real(rows)
 
 
-def _count(mode: Mode) -> int:
+def _count(mode: ShapedMode) -> int:
     """Free numbers: those of the pole, and of a residue with or without one shape."""
     outputs, inputs = mode.residue.shape
     numbers = outputs + inputs - 1 if mode.rank_one else outputs * inputs
     return int((1 + mode.is_pair) * (numbers + mode.moves))
 
 
-def _start(mode: Mode, sizes: RealArray) -> RealArray:
+def _start(mode: ShapedMode, sizes: RealArray) -> RealArray:
     """Free numbers of a mode: log decay (and logistic angle), then c, and b without its largest, which is
     one."""
     pole, residue = mode.pole, mode.residue
@@ -389,12 +389,12 @@ def _start(mode: Mode, sizes: RealArray) -> RealArray:
     return np.concatenate([head, *parts])
 
 
-def _largest(mode: Mode) -> int:
+def _largest(mode: ShapedMode) -> int:
     """The input that drives a mode most: its share of the shape is one."""
     return int(np.argmax(np.linalg.norm(mode.residue, axis=0)))
 
 
-def _unpacked(mode: Mode, x: RealArray) -> tuple[complex, ComplexArray, list[ComplexArray]]:
+def _unpacked(mode: ShapedMode, x: RealArray) -> tuple[complex, ComplexArray, list[ComplexArray]]:
     """Pole, residue (Y, U), and the residue's change with each of its free numbers."""
     pole = mode.pole
     if mode.moves:
@@ -422,7 +422,7 @@ def _unpacked(mode: Mode, x: RealArray) -> tuple[complex, ComplexArray, list[Com
     return complex(pole), np.asarray(np.outer(c, b)), slopes
 
 
-def _pole_steps(mode: Mode, pole: complex) -> list[complex]:
+def _pole_steps(mode: ShapedMode, pole: complex) -> list[complex]:
     """Change of the pole with its log decay, and with the logistic number of its angle."""
     decay = pole * np.log(abs(pole)) if pole else 0j
     angle = np.angle(pole)

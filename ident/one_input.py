@@ -112,7 +112,7 @@ def least_order(options: IdentOptions) -> int:
 
 def searched(
     records: Sequence[Record], data: Regression, options: IdentOptions, report: Progress
-) -> tuple[Outcome, Sequence[Record]]:
+) -> tuple[SearchOutcome, Sequence[Record]]:
     """Poles from a search on the records, or a part of long ones, and that part; initial states are estimated
     where the data ask for it. `data` are the records made ready for a fit from rest."""
     part, in_mid_record = thinned(records, options.search_samples)
@@ -128,7 +128,9 @@ def searched(
     return outcome, part
 
 
-def _behind_dead_time(records: Sequence[Record], plain: Outcome, report: Progress) -> tuple[Outcome, bool]:
+def _behind_dead_time(
+    records: Sequence[Record], plain: SearchOutcome, report: Progress
+) -> tuple[SearchOutcome, bool]:
     """The search behind a delay that the data show, where nobody stated one; and whether the output answers
     in the very sample of the input. Not where a reference was recorded: noise that comes back looks like dead
     time."""
@@ -144,11 +146,11 @@ def _behind_dead_time(records: Sequence[Record], plain: Outcome, report: Progres
     search.minima = [*plain.search.minima, *search.minima]
     search.stages = [*plain.search.stages, *search.stages]
     search.evaluations += plain.search.evaluations
-    return Outcome(search, found.fitted.end, found.selection, dead_time=found.finding), False
+    return SearchOutcome(search, found.fitted.end, found.selection, dead_time=found.finding), False
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome(Fitted):
+class SearchOutcome(Fitted):
     """A search at its end on one structure. from_rest: the test that left initial states out; free: the end
     of a descent with them, where it took one; dead_time: the delay that was found."""
 
@@ -160,13 +162,15 @@ class Outcome(Fitted):
 
 def _searched(
     data: Regression, options: IdentOptions, report: Progress, start: Refined | None = None
-) -> Outcome:
+) -> SearchOutcome:
     search = PoleSearch(data, options)
     selection = OrderSelection(search, report)
-    return Outcome(search, selection.run(start), selection)
+    return SearchOutcome(search, selection.run(start), selection)
 
 
-def _searched_with_initial_state(records: Sequence[Record], outcome: Outcome, report: Progress) -> Outcome:
+def _searched_with_initial_state(
+    records: Sequence[Record], outcome: SearchOutcome, report: Progress
+) -> SearchOutcome:
     """Search again with unknown initial states if the fit from rest is improbably worse than one with
     them."""
     data, options = outcome.data, outcome.search.options
@@ -194,7 +198,7 @@ def _searched_with_initial_state(records: Sequence[Record], outcome: Outcome, re
     return _searched(free, options, lambda fraction, message: report(0.45 + 0.4 * fraction, message), start)
 
 
-def fitted_on_all(records: Sequence[Record], outcome: Outcome) -> tuple[Fitted, tuple[Finding, ...]]:
+def fitted_on_all(records: Sequence[Record], outcome: SearchOutcome) -> tuple[Fitted, tuple[Finding, ...]]:
     """Refine on all samples and decide what was left to the data: initial state first, then the offset."""
     options, structure = outcome.search.options, outcome.data.structure
     here: Fitted = outcome
@@ -230,7 +234,7 @@ def fitted_on_all(records: Sequence[Record], outcome: Outcome) -> tuple[Fitted, 
 
 
 def _priors_judged(
-    records: Sequence[Record], part: Sequence[Record], outcome: Outcome, fitted: Fitted
+    records: Sequence[Record], part: Sequence[Record], outcome: SearchOutcome, fitted: Fitted
 ) -> tuple[Fitted, tuple[PriorTest, ...]]:
     """Test what the options state as known, and impose the relative degree. Each test starts from a model
     that the data have not refused: with integrators refused, relative degree is judged with slow poles in
@@ -289,7 +293,7 @@ def in_order(poles: Poles, fixed: Poles) -> Poles:
     )
 
 
-def _moved(outcome: Outcome, data: Regression, poles: Poles) -> Fitted:
+def _moved(outcome: SearchOutcome, data: Regression, poles: Poles) -> Fitted:
     """The poles polished on other rows or columns; noted in the trace of the search."""
     search = PoleSearch(data, outcome.search.options)
     end = search.descend(poles, "final polish")
@@ -299,7 +303,7 @@ def _moved(outcome: Outcome, data: Regression, poles: Poles) -> Fitted:
 
 
 def description(
-    records: Sequence[Record], outcome: Outcome, fitted: Fitted
+    records: Sequence[Record], outcome: SearchOutcome, fitted: Fitted
 ) -> tuple[GobfModel, dict[str, Any]]:
     """The model, and the fields of `ident.identification.FittedRecords` that are read from fit and search."""
     data, search, options = fitted.data, outcome.search, outcome.search.options

@@ -16,7 +16,7 @@ import control
 import numpy as np
 
 from control_design.plants.ellipses import Complex, Real
-from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
+from control_design.plants.first_order import FirstOrder, FrequencyIntervals, RationalResponse
 from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.set_expansion import stacked
 from control_design.plants.weights import RationalWeight
@@ -76,7 +76,7 @@ class LinkUncertainty:
         covariance += isotropic[:, None, None] ** 2 * np.eye(2)
         return ResponseRecord(omega, centre, covariance, level)
 
-    def first_order(self, intervals: Intervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
+    def first_order(self, intervals: FrequencyIntervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
         """Centre (F,) and generators (F, 9) of the covariance of `at`, for bounds between frequencies.
 
         dG/dtheta = G (gain'/gain + sum p'/(z - p) - sum q'/(z - q)) with the roots' derivatives by the same

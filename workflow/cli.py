@@ -343,9 +343,9 @@ def excite(
         )
     from workflow.commands.excite import write_experiment
     from workflow.config.rig_settings import rig_called
-    from workflow.tasks.experiment import Limits
+    from workflow.tasks.experiment import ExperimentLimits
 
-    limits = Limits(
+    limits = ExperimentLimits(
         band_Hz=band,
         dt_s=dt_s,
         duration_s=duration,

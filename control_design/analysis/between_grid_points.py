@@ -31,7 +31,7 @@ from control_design.plants.ellipses import (
     quotient,
     secular_root,
 )
-from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
+from control_design.plants.first_order import FirstOrder, FrequencyIntervals, RationalResponse
 from control_design.plants.frequency_grid import starting_edges
 from control_design.plants.plant_set import Mode, UncertainPlant, frequency_response
 from control_design.plants.set_expansion import Expand, SetExpansion, expandable
@@ -116,7 +116,7 @@ class _Loop:
     members: Expand
     asked: tuple[_Asked, ...]
 
-    def bounds(self, intervals: Intervals) -> _Bounds:
+    def bounds(self, intervals: FrequencyIntervals) -> _Bounds:
         """Upper bounds on every interval."""
         own, i_plant = self.controller.integrators, self.plant.n_integrators
         delay = self.specification.computational_delay_samples
@@ -144,7 +144,7 @@ class _Loop:
         return _Bounds(intervals.centre, upper, middle, distance, loop.centre.end(-1), loop.centre.end(1))
 
     def _alone(
-        self, each: _Asked, intervals: Intervals, ends: dict[int, Real], at_middle: Real
+        self, each: _Asked, intervals: FrequencyIntervals, ends: dict[int, Real], at_middle: Real
     ) -> tuple[Real, Real]:
         """Upper bounds and the values at the middles of |W S| or |W K S|, times |Gp| of an independent
         channel."""
@@ -166,7 +166,7 @@ class _Loop:
         return upper, middle
 
     def _with_member(
-        self, each: _Asked, intervals: Intervals, ends: dict[int, Real], at_middle: Real
+        self, each: _Asked, intervals: FrequencyIntervals, ends: dict[int, Real], at_middle: Real
     ) -> tuple[Real, Real]:
         """The same of |W G S| and |W T|, G the member; for a weight that is finite at zero frequency.
 
@@ -306,7 +306,7 @@ def _model_error(loop: _Loop, controller: Controller, omega: Real) -> float:
         if channel.own_grid is not None:
             continue
         given = channel.at(omega)
-        expansion = members(Intervals(omega, np.zeros(omega.size), loop.plant.dt_s), 0)
+        expansion = members(FrequencyIntervals(omega, np.zeros(omega.size), loop.plant.dt_s), 0)
         largest = max(largest, _difference(expansion.centre.value, given.centre))
         major, minor = given.direction * given.semi_major, 1j * given.direction * given.semi_minor
         rows = np.stack([[major.real, minor.real], [major.imag, minor.imag]]).transpose(2, 0, 1)
@@ -323,7 +323,7 @@ def _difference(form: Complex, value: Complex) -> float:
 
 
 def _bisect(
-    evaluate: Callable[[Intervals], _Bounds], edges: Real, dt_s: float, targets: Real
+    evaluate: Callable[[FrequencyIntervals], _Bounds], edges: Real, dt_s: float, targets: Real
 ) -> tuple[_Bounds, int]:
     """Refine until every interval is under every target (K,) or the budget is spent; the accepted pieces in
     ascending order, and how many were looked at. A middle above its target shows that the dense check missed
@@ -332,7 +332,7 @@ def _bisect(
     accepted: list[_Bounds] = []
     used = 0
     while low.size:
-        found = evaluate(Intervals(0.5 * (low + high), 0.5 * (high - low), dt_s))
+        found = evaluate(FrequencyIntervals(0.5 * (low + high), 0.5 * (high - low), dt_s))
         used += low.size
         seen = np.max(found.middle, axis=1, initial=0.0, where=np.isfinite(found.middle))
         targets = np.maximum(targets, (1.0 + _EXCESS) * seen)

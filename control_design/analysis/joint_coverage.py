@@ -20,10 +20,10 @@ from control_design.analysis.stability import closed_loop_poles, loop_integrator
 from control_design.analysis.worst_case import PlantData, worst_of
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Boolean, Complex, Real, radius_of
-from control_design.plants.first_order import Intervals
+from control_design.plants.first_order import FrequencyIntervals
 from control_design.plants.frequency_grid import checked_grid
 from control_design.plants.guards import Guard, different_responses
-from control_design.plants.plant_set import Channel, Mode, UncertainPlant, modes_of
+from control_design.plants.plant_set import Mode, PlantChannel, UncertainPlant, modes_of
 from control_design.plants.set_expansion import FirstOrderUncertainty
 from control_design.specification import Specification
 from ident.uncertainty import ResponsePosterior
@@ -261,7 +261,7 @@ def _chunks(draws: int) -> Iterator[tuple[slice, int]]:
         yield slice(start, start + count), count
 
 
-def drawn(channel: Channel) -> Draw:
+def drawn(channel: PlantChannel) -> Draw:
     """How posterior samples of a channel are drawn; ValueError where they cannot be."""
     uncertainty: Any = channel.uncertainty
     if uncertainty is None:
@@ -287,7 +287,7 @@ def _linear_responses(
     kept: list[Real] = []
 
     def at(omega: Real) -> Complex:
-        centre, generators = uncertainty.first_order(Intervals(omega, np.zeros(omega.size), dt_s), 0)
+        centre, generators = uncertainty.first_order(FrequencyIntervals(omega, np.zeros(omega.size), dt_s), 0)
         if not kept:
             kept.append(rng.standard_normal((draws, generators.value.shape[1])))
         return np.asarray(centre.value + kept[0] @ generators.value.T, dtype=np.complex128)

@@ -22,7 +22,7 @@ from control_design.plants.frequency_grid import frequency_grid, lowest_rad_s, n
 from control_design.plants.multivariable import MultivariablePlant, tustin_s
 from control_design.plants.plant_set import Mode, modes_of
 from control_design.plants.scaled_bound import (
-    Rows,
+    BoundRows,
     largest_channel,
     scaled_bound,
     stability_bound,
@@ -157,11 +157,11 @@ def _verdict(
     G, seen, entering = plant.blocks(omega, delay)
     K = controller.response(omega, with_delay=False).reshape(omega.size, plant.inputs, plant.outputs)
 
-    def rows(of: str, each: tuple[RationalWeight | None, ...]) -> Rows:
+    def rows(of: str, each: tuple[RationalWeight | None, ...]) -> BoundRows:
         size = gram(each, s)
         none_y, none_u = (np.zeros((omega.size, n, n)) for n in (plant.outputs, plant.inputs))
         on_y, on_u = (size, none_u) if of == "y" else (none_y, size)
-        return Rows(G, seen, entering, on_y, on_u, False)
+        return BoundRows(G, seen, entering, on_y, on_u, False)
 
     worst, worst_at, worst_joint, scalings = {}, {}, {}, {}
     for name, (of, each) in weights.items():

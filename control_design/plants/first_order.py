@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Intervals:
+class FrequencyIntervals:
     """Frequency intervals centre_k +- half_width_k [rad/s], (F,) each, at dt_s; also below 0 or above
     pi/dt."""
 
@@ -45,7 +45,7 @@ class Intervals:
         beyond = np.maximum(np.abs(offset) - self.half_width * self.dt_s, 0.0)
         return np.asarray(np.hypot(inward, 2.0 * np.sqrt(size) * np.sin(beyond / 2)), dtype=np.float64)
 
-    def part(self, index: Boolean) -> Intervals:
+    def part(self, index: Boolean) -> FrequencyIntervals:
         """Some of them."""
         return replace(self, centre=self.centre[index], half_width=self.half_width[index])
 
@@ -216,7 +216,7 @@ class RationalResponse:
         """Times z^-samples."""
         return replace(self, delay_samples=self.delay_samples + samples)
 
-    def expand(self, intervals: Intervals, cleared: int = 0) -> FirstOrder:
+    def expand(self, intervals: FrequencyIntervals, cleared: int = 0) -> FirstOrder:
         """(z - 1)^cleared times the response, to first order on the intervals."""
         result = intervals.constant(self.gain)
         zeros = self.zeros_minus_1[np.argsort(np.abs(self.zeros_minus_1), kind="stable")]
@@ -236,7 +236,7 @@ class RationalResponse:
     def at(self, omega_rad_s: Real) -> Complex:
         """Values at omega (F,)."""
         omega = np.asarray(omega_rad_s, dtype=np.float64)
-        return self.expand(Intervals(omega, np.zeros(omega.size), self.dt_s)).value
+        return self.expand(FrequencyIntervals(omega, np.zeros(omega.size), self.dt_s)).value
 
 
 def _eigenvalues(matrix: npt.NDArray[np.float64]) -> Complex:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Channel:
+class PlantChannel:
     """One response with its uncertainty. nominal: SISO discrete `control.StateSpace`. uncertainty: an object
     with `at(omega, level)` (any frequency), a record with omega_rad_s, centre, covariance, level (its own
     frequencies only), or None (the nominal response is exact)."""
@@ -202,7 +202,7 @@ def modes_of(poles_z: Complex, dt_s: float, *, zeta_below: float = 0.4) -> tuple
 
 @dataclass(frozen=True, eq=False, repr=False)
 class UncertainPlant(Shown):
-    """Input -> measured output with ellipses (`Channel`), one plant per load or operating point.
+    """Input -> measured output with ellipses (`PlantChannel`), one plant per load or operating point.
 
     integrators: poles at z = 1, None = counted; a number that contradicts the nominal is refused.
     performance: the channel whose |Gp S| the damping weight bounds; None = the measured output itself.
@@ -212,7 +212,7 @@ class UncertainPlant(Shown):
     nominal: control.StateSpace
     uncertainty: EvaluableUncertainty | ResponseSet | None = None
     integrators: int | None = None
-    performance: Channel | None = None
+    performance: PlantChannel | None = None
     level: float = 0.95
 
     def __post_init__(self) -> None:
@@ -242,9 +242,9 @@ class UncertainPlant(Shown):
             )
 
     @cached_property
-    def channel(self) -> Channel:
+    def channel(self) -> PlantChannel:
         """Input -> measured output."""
-        return Channel(self.nominal, self.uncertainty, self.level)
+        return PlantChannel(self.nominal, self.uncertainty, self.level)
 
     @property
     def dt_s(self) -> float:
@@ -255,7 +255,7 @@ class UncertainPlant(Shown):
         return float(np.pi / self.dt_s)
 
     @property
-    def damped(self) -> Channel:
+    def damped(self) -> PlantChannel:
         """The channel whose |Gp S| the damping requirement bounds."""
         return self.channel if self.performance is None else self.performance
 

@@ -38,7 +38,7 @@ def apply(matrix: Array, vector: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class BoundRows:
     """R weighted requirements at one frequency each: nominal response G (R, Y, U); seen (R, N, U, U) =
     L_i^H L_i and entering (R, N, Y, Y) = B_i B_i^H of N blocks; V_y (R, Y, Y) and V_u (R, U, U), Gram
     matrices of the weights on S and K S. together: the blocks grow with 1/gamma as the performance does (mu)
@@ -52,10 +52,10 @@ class Rows:
     together: bool
     base: Array | None = None  # (R, Y, Y): Gram matrix of how the performance input enters, None = identity
 
-    def part(self, index: Integer | Boolean) -> Rows:
+    def part(self, index: Integer | Boolean) -> BoundRows:
         """Some of them."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Rows(**{k: v if k == "together" or v is None else v[index] for k, v in values.items()})
+        return BoundRows(**{k: v if k == "together" or v is None else v[index] for k, v in values.items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +69,12 @@ class Bound:
     right: Array
 
 
-def stability_bound(rows: Rows, K: Array) -> Array:
+def stability_bound(rows: BoundRows, K: Array) -> Array:
     """mu of the blocks alone (R,): the loop is stable for all blocks of size one where it stays below 1, and
     tolerates them enlarged by its inverse. The last block stands for the performance."""
     last = rows.entering[:, -1]
     jitter = 1e-12 * np.trace(last, axis1=1, axis2=2).real[:, None, None] * np.eye(last.shape[1])
-    alone = Rows(
+    alone = BoundRows(
         rows.G, rows.seen[:, :-1], rows.entering[:, :-1], 0 * rows.V_y, rows.seen[:, -1], True, last + jitter
     )  # fmt: skip
     return scaled_bound(alone, K).gamma
@@ -86,7 +86,7 @@ def structured_norm(M: Array) -> Array:
     each = np.broadcast_to(np.eye(n)[:, :, None] * np.eye(n)[:, None, :], (count, n, n, n)).astype(
         np.complex128
     )
-    rows = Rows(np.zeros_like(M), each, each, np.zeros((count, n, n)), np.zeros((count, n, n)), True)
+    rows = BoundRows(np.zeros_like(M), each, each, np.zeros((count, n, n)), np.zeros((count, n, n)), True)
     return stability_bound(rows, M)
 
 
@@ -110,7 +110,7 @@ class _Point(NamedTuple):
 
 
 def scaled_bound(
-    rows: Rows, K: Array, log_t: Array | None = None, *, accuracy: float = 1e-9, within: float = np.inf
+    rows: BoundRows, K: Array, log_t: Array | None = None, *, accuracy: float = 1e-9, within: float = np.inf
 ) -> Bound:
     """Smallest bound over the scalings for controller values K (R, U, Y), to a relative accuracy of gamma.
 
@@ -155,7 +155,7 @@ def scaled_bound(
     return Bound(gamma, t, np.where(np.isfinite(left), left, 0.0), x)
 
 
-def largest_channel(rows: Rows, K: Array, right: Array) -> Integer:
+def largest_channel(rows: BoundRows, K: Array, right: Array) -> Integer:
     """Output (weight on S) or actuator (weight on K S) that carries most of each worst case (R,); right: of
     its `Bound`."""
     shares = [
@@ -178,7 +178,7 @@ class Expansion:
     in_t: Array
 
 
-def expansion(rows: Rows, K: Array, log_t: Array) -> Expansion:
+def expansion(rows: BoundRows, K: Array, log_t: Array) -> Expansion:
     """Around controller values K (R, U, Y) and scalings log_t (R, N); worst-case gain only."""
     eye = np.eye(K.shape[2])
     S = np.linalg.inv(eye + rows.G @ K)
@@ -197,7 +197,7 @@ def expansion(rows: Rows, K: Array, log_t: Array) -> Expansion:
 
 
 class _Problem:
-    def __init__(self, rows: Rows, S: Array, seen: Array, own: Array) -> None:
+    def __init__(self, rows: BoundRows, S: Array, seen: Array, own: Array) -> None:
         self.rows, self.S, self.seen, self.own = rows, S, seen, own
         self.eye = np.eye(own.shape[-1])
 

@@ -16,8 +16,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from control_design.plants.ellipses import Complex, Real, quotient, radius_of
-from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
-from control_design.plants.plant_set import Channel, UncertainPlant
+from control_design.plants.first_order import FirstOrder, FrequencyIntervals, RationalResponse
+from control_design.plants.plant_set import PlantChannel, UncertainPlant
 from ident.basis.functions import block_parameters
 from ident.basis.poles import Poles
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
@@ -59,7 +59,7 @@ class SetExpansion:
         return total
 
 
-Expand = Callable[[Intervals, int], SetExpansion]
+Expand = Callable[[FrequencyIntervals, int], SetExpansion]
 """Ellipses bounded between frequencies: their expansion times (z - 1)^cleared on intervals."""
 
 
@@ -70,12 +70,12 @@ class FirstOrderUncertainty(Protocol):
     generators: columns whose Gram matrix of real and imaginary parts is the covariance that `at` gives.
     """
 
-    def first_order(self, intervals: Intervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
+    def first_order(self, intervals: FrequencyIntervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
         """(centre (F,), generators (F, Q)), both times (z - 1)^cleared."""
         ...
 
 
-def expandable(channel: Channel, integrators: int, between_own_points: str) -> Expand | None:
+def expandable(channel: PlantChannel, integrators: int, between_own_points: str) -> Expand | None:
     """How the channel's ellipses expand, or None if nothing can be said between frequencies."""
     uncertainty = channel.uncertainty
     if channel.own_grid is not None and between_own_points != "linear":
@@ -85,7 +85,7 @@ def expandable(channel: Channel, integrators: int, between_own_points: str) -> E
         if uncertainty is None:
             return lambda intervals, cleared: SetExpansion(nominal.expand(intervals, cleared), ())
         return partial(own_grid_set, channel, nominal)
-    first_order: Callable[[Intervals, int], tuple[FirstOrder, FirstOrder]]
+    first_order: Callable[[FrequencyIntervals, int], tuple[FirstOrder, FirstOrder]]
     if isinstance(uncertainty, ResponsePosterior):
         first_order = partial(posterior_expansion, uncertainty)
     elif isinstance(uncertainty, FirstOrderUncertainty):
@@ -93,7 +93,7 @@ def expandable(channel: Channel, integrators: int, between_own_points: str) -> E
     else:
         return None
 
-    def expand(intervals: Intervals, cleared: int) -> SetExpansion:
+    def expand(intervals: FrequencyIntervals, cleared: int) -> SetExpansion:
         centre, generators = first_order(intervals, cleared)
         return SetExpansion(centre, (generators.scaled(radius_of(channel.level)),))
 
@@ -101,7 +101,7 @@ def expandable(channel: Channel, integrators: int, between_own_points: str) -> E
 
 
 def posterior_expansion(
-    posterior: ResponsePosterior, intervals: Intervals, cleared: int
+    posterior: ResponsePosterior, intervals: FrequencyIntervals, cleared: int
 ) -> tuple[FirstOrder, FirstOrder]:
     """`FirstOrderUncertainty.first_order` of a Gaussian over coefficients of basis functions and impulse
     response: every column is rational."""
@@ -121,7 +121,7 @@ def posterior_expansion(
     return common.times(centre), common.times(spread)
 
 
-def _columns(posterior: ResponsePosterior, intervals: Intervals) -> tuple[Complex, Complex, Real]:
+def _columns(posterior: ResponsePosterior, intervals: FrequencyIntervals) -> tuple[Complex, Complex, Real]:
     """Value, slope and remainder (F, P) of the columns of `ResponsePosterior.frequency_rows`, without
     integrators, delay and all-pass."""
     columns: list[FirstOrder] = []
@@ -153,7 +153,7 @@ def _columns(posterior: ResponsePosterior, intervals: Intervals) -> tuple[Comple
     )
 
 
-def _log_all_pass_slopes(unstable: Poles, intervals: Intervals) -> list[FirstOrder]:
+def _log_all_pass_slopes(unstable: Poles, intervals: FrequencyIntervals) -> list[FirstOrder]:
     """`ident.basis.functions.log_all_pass_slopes` as expansions."""
 
     def slope(p: complex) -> FirstOrder:
@@ -168,7 +168,7 @@ def _log_all_pass_slopes(unstable: Poles, intervals: Intervals) -> list[FirstOrd
     return found
 
 
-def _reflected_zero(p: complex, intervals: Intervals) -> FirstOrder:
+def _reflected_zero(p: complex, intervals: FrequencyIntervals) -> FirstOrder:
     """1 - conj(p) z."""
     q = p.conjugate()
     factor = intervals.zero(0.0).scaled(-q)
@@ -176,7 +176,7 @@ def _reflected_zero(p: complex, intervals: Intervals) -> FirstOrder:
 
 
 def own_grid_set(
-    channel: Channel, nominal: RationalResponse, intervals: Intervals, cleared: int
+    channel: PlantChannel, nominal: RationalResponse, intervals: FrequencyIntervals, cleared: int
 ) -> SetExpansion:
     """Ellipses on a user's own frequencies. Assumed: at fraction x of the way between neighbours the response
     lies in (1 - x) E_k + x E_{k+1} (Minkowski sum). Outside the range the nominal response stands alone."""
@@ -215,7 +215,7 @@ class StraightBetween:
     p^2 = tr P, q^2 = tr Q it is (p + q)(P/p + Q/q), exact where one of them vanishes or both are alike.
     """
 
-    channel: Channel
+    channel: PlantChannel
 
     def at(self, omega_rad_s: Real, level: float) -> FrequencyUncertainty:
         """Centre and covariances at omega (F,), so that ellipses of `level` enclose those of the record."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from control_design.plants.ellipses import Real, radius_of
-from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
+from control_design.plants.first_order import FirstOrder, FrequencyIntervals, RationalResponse
 from control_design.plants.plant_set import count_integrators, frequency_response
 from control_design.plants.set_expansion import stacked
 from control_design.plants.weights import RationalWeight
@@ -72,7 +72,7 @@ class StatedDiscs:
             method=f"{self.kind} discs as stated",
         )
 
-    def first_order(self, intervals: Intervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
+    def first_order(self, intervals: FrequencyIntervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
         """Centre (F,) and two generators (F, 2), both times (z - 1)^cleared.
 
         A disc of radius |f| is {x f + y j f : x^2 + y^2 <= 1} whatever the phase of f, so f = W G_nom (or W)

@@ -22,7 +22,7 @@ import numpy as np
 from control_design.controllers.biquads import imaginary_axis
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Real
-from control_design.plants.plant_set import Channel, Mode
+from control_design.plants.plant_set import Mode, PlantChannel
 from control_design.plants.weights import RationalWeight
 
 _PROOF_SLACK = 2e-5  # relative: what the bounds may exceed a limit the dense maximum meets
@@ -127,7 +127,7 @@ class WeightedRequirement(Requirement):
     weight: RationalWeight
     band: tuple[float, float] | None = None
     above: float = 0.0
-    channel: Channel | None = None
+    channel: PlantChannel | None = None
 
     @property
     def of_member(self) -> LoopFunction:

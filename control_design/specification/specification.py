@@ -23,7 +23,7 @@ from pydantic import Field, model_validator
 from control_design.controllers.biquads import SOLVER_SLACK, SectionKind
 from control_design.plants.ellipses import Real
 from control_design.plants.frequency_grid import lowest_rad_s
-from control_design.plants.plant_set import Channel, UncertainPlant, count_integrators
+from control_design.plants.plant_set import PlantChannel, UncertainPlant, count_integrators
 from control_design.plants.weights import (
     RationalWeight,
     bandwidth_weight,
@@ -315,7 +315,7 @@ class ModePeak(WeightedRequirement):
 
 
 @lru_cache(maxsize=32)  # every grid of a synthesis asks for the requirements of its plant
-def _nominal_peak(channel: Channel, low_rad_s: float, high_rad_s: float) -> float:
+def _nominal_peak(channel: PlantChannel, low_rad_s: float, high_rad_s: float) -> float:
     """Largest nominal gain in a band, refined around the modes."""
     omega = np.geomspace(low_rad_s, high_rad_s, 2000)
     for mode in channel.modes:

@@ -17,7 +17,7 @@ import numpy as np
 from control_design.analysis.stability import NominalLoop
 from control_design.plants.ellipses import Complex, Integer, Real
 from control_design.plants.multivariable import MultivariablePlant, tustin_s
-from control_design.plants.scaled_bound import Bound, Rows, conjugate, expansion, scaled_bound
+from control_design.plants.scaled_bound import Bound, BoundRows, conjugate, expansion, scaled_bound
 from control_design.specification.multivariable import MultivariableSpecification, gram
 from control_design.synthesis.minimax_step import minimax_step
 from control_design.synthesis.modal_controller import ModalForm
@@ -39,7 +39,7 @@ _ACTIVE = 1e-4  # share of the largest multiplier below which a row bends nothin
 class StackedRows:
     """Rows of all plants and requirements: s (R,), omega (R,), plant and requirement number (R,)."""
 
-    rows: Rows
+    rows: BoundRows
     s: Complex
     omega_rad_s: Real
     plant: Real
@@ -74,11 +74,11 @@ def stacked_rows(
     G, seen, entering, on_y, on_u, s, omega, plant_of, which_of = (
         np.concatenate([part[i] for part in parts]) for i in range(9)
     )
-    return StackedRows(Rows(G, seen, entering, on_y, on_u, together), s, omega, plant_of, which_of)
+    return StackedRows(BoundRows(G, seen, entering, on_y, on_u, together), s, omega, plant_of, which_of)
 
 
 @dataclass(frozen=True, eq=False)
-class _Local:
+class _NearWorst:
     """Rows near the worst at a point, each the Hermitian matrix of log H in its eigenvectors, w = Y of them,
     largest first, as real numbers (`_entries`): value (r, w^2), slope (r, w^2, n), in_t (r, w^2, N). basis
     (r, Y, w), top (r,)."""
@@ -137,7 +137,7 @@ class MatrixDescent:
             return x, float("inf"), 0
         box, taken, weights = _FIRST_BOX, 0, None
         best = 2 * float(np.log(np.max(bound.gamma)))
-        local: _Local | None = None
+        local: _NearWorst | None = None
         while taken < steps and box > _SMALLEST_BOX:
             if local is None:
                 local = self._local(x, bound)
@@ -193,7 +193,7 @@ class MatrixDescent:
         near = local.value[:, 0] > np.max(local.value[:, 0]) - _NEAR
         return Pull(s[near], on_K[near], left[near, :, 0], right[near, :, 0])
 
-    def _local(self, x: Real, bound: Bound) -> _Local:
+    def _local(self, x: Real, bound: Bound) -> _NearWorst:
         log = 2 * np.log(bound.gamma)
         index = np.flatnonzero(log > np.max(log) - _FAR_BELOW)
         rows, s = self.stack.rows.part(index), self.stack.s[index]
@@ -215,9 +215,9 @@ class MatrixDescent:
         value = np.zeros((index.size, width**2))
         value[:, :width] = log[index][:, None] + sizes / top[:, None] - 1.0
         in_t = np.moveaxis(_entries(turned), 1, 2)
-        return _Local(index, value, np.stack(slope, axis=1) / top[:, None, None], in_t, basis, top)
+        return _NearWorst(index, value, np.stack(slope, axis=1) / top[:, None, None], in_t, basis, top)
 
-    def _bent(self, local: _Local, change: Real, after: Bound, box: float) -> _Local:
+    def _bent(self, local: _NearWorst, change: Real, after: Bound, box: float) -> _NearWorst:
         """The rows with what they missed at x + change added: a second-order correction, with which the next
         step from the same point follows a curved edge between rows."""
         width = local.basis.shape[2]
@@ -226,7 +226,9 @@ class MatrixDescent:
         value[:, :width] += (2 * np.log(after.gamma[local.index]) - said)[:, None]
         return replace(local, value=value)
 
-    def _curvature(self, x: Real, bound: Bound, local: _Local, weights: Complex | None, unit: Real) -> Real:
+    def _curvature(
+        self, x: Real, bound: Bound, local: _NearWorst, weights: Complex | None, unit: Real
+    ) -> Real:
         """Of the blocks' sum weighted by the multipliers of the step before, in natural units (n, n)."""
         n = x.size
         if weights is None:
@@ -258,7 +260,7 @@ class MatrixDescent:
         return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
 
     def _step(
-        self, x: Real, local: _Local, curvature: Real, unit: Real, box: float
+        self, x: Real, local: _NearWorst, curvature: Real, unit: Real, box: float
     ) -> tuple[Real, float, Complex] | None:
         """Step (n,) in natural units, predicted fall of log gamma^2, multipliers (r, w, w); None where it
         fails. Rows are u^H M u for directions u of every matrix; the worst are added in rounds."""

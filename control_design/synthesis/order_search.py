@@ -14,7 +14,7 @@ from control_design.synthesis.descent import MinimaxDescent, natural_units
 from control_design.synthesis.problem import EXCHANGE_TOLERANCE
 from control_design.synthesis.starts import StartMaker, with_gain
 from control_design.synthesis.synthesis_result import StartReport
-from control_design.synthesis.workshop import STEPS, Candidate, StartTask, Workshop
+from control_design.synthesis.workshop import STEPS, StartTask, TriedController, Workshop
 from control_design.synthesis.youla_starts import FreeControllers, fitted
 
 Told = Callable[[float, str], None]
@@ -47,7 +47,7 @@ class OrderResult:
     nearest: without a best, the parameters of the end that came nearest to a robustly stable loop.
     """
 
-    best: Candidate | None
+    best: TriedController | None
     reports: tuple[StartReport, ...]
     history: tuple[float, ...]
     nearest: Real | None = None
@@ -72,7 +72,7 @@ class OrderSearch:
     def run(self) -> OrderResult:
         """Starts, descent from each, exchange with hops."""
         found = [
-            Candidate(x, self._descent().value(x), self.problem.gamma(self.cascade, x))
+            TriedController(x, self._descent().value(x), self.problem.gamma(self.cascade, x))
             for x in self.given[:1]
         ]
         if self._enough(found):
@@ -80,7 +80,7 @@ class OrderSearch:
         tasks = self._starts()
         drawn = len(tasks) - len(self.given)
         least = len(self.given) + max((drawn + 1) // 2, min(drawn, 3))
-        ends: list[Candidate] = []
+        ends: list[TriedController] = []
         for number, end in enumerate(self._done(tasks)):
             self.tell(0.5 * (number + 1) / len(tasks), f"start {number + 1} of {len(tasks)}")
             ends.append(end)
@@ -104,7 +104,7 @@ class OrderSearch:
         specification gets all fits, as another valley may meet it. Agreement before the last starts
         counts within `_FAIR` only.
         """
-        found: list[Candidate] = []
+        found: list[TriedController] = []
 
         def near(gamma: float) -> bool:
             return free.gamma / _FINER <= gamma <= _NEAR * free.gamma < np.inf
@@ -140,7 +140,7 @@ class OrderSearch:
         ends = self._retrieved(found)
         return self._exchange(ends, hops=False) if ends else OrderResult(None, tuple(self.reports), ())
 
-    def _raced(self, starts: Sequence[Real]) -> list[Candidate]:
+    def _raced(self, starts: Sequence[Real]) -> list[TriedController]:
         """Where `_TRIAL` steps lead from each start, the best first and from there to its end; not checked
         between the points of the grid unless it may be enough."""
         tried = list(self._done([self._task(x, steps=_TRIAL) for x in starts]))
@@ -152,10 +152,10 @@ class OrderSearch:
                 tried[:1] = self._checked(tried[:1])
         return tried
 
-    def _checked(self, found: Sequence[Candidate]) -> list[Candidate]:
+    def _checked(self, found: Sequence[TriedController]) -> list[TriedController]:
         """Those of different optima, best first, with their worst cases on the dense grid, until as many as
         are carried are stable there."""
-        checked: list[Candidate] = []
+        checked: list[TriedController] = []
         for c in different(found, len(found), on_grid=True):
             if np.isfinite(c.gamma_grid):
                 checked.append(replace(c, gamma=self.problem.gamma(self.cascade, c.parameters)))
@@ -182,7 +182,7 @@ class OrderSearch:
     def _stabilised(self, parameters: Real) -> Real | None:
         return parameters if np.isfinite(self._descent().value(parameters)) else self._retreat(parameters)
 
-    def _nearest(self, ends: Sequence[Candidate]) -> Real:
+    def _nearest(self, ends: Sequence[TriedController]) -> Real:
         """Parameters that are stable on the grid, the smallest worst case first; else nearest to the
         circle."""
         key = [(c.gamma_grid, self._radius(c.parameters)) for c in ends]
@@ -193,7 +193,7 @@ class OrderSearch:
         poles = self.problem.closed_loop_poles(self.cascade, parameters)
         return max(float(np.max(np.abs(z), initial=0.0)) for z in poles)
 
-    def _retrieved(self, found: Sequence[Candidate]) -> list[Candidate]:
+    def _retrieved(self, found: Sequence[TriedController]) -> list[TriedController]:
         """What is stable on the dense grid, best first, enlarged by what can be saved of the rest.
 
         An end that is better on the grid than the best, and reaches -1 between its points, has found a valley
@@ -222,13 +222,13 @@ class OrderSearch:
                 return trial
         return None
 
-    def _agree(self, found: Sequence[Candidate], enough: int | None = None) -> bool:
+    def _agree(self, found: Sequence[TriedController], enough: int | None = None) -> bool:
         """Enough descents ended at the best value: more of them would hardly find another."""
         stable = [c.gamma_grid for c in found if np.isfinite(c.gamma_grid)]
         agreeing = sum(g <= min(stable) * _AGREE for g in stable)
         return agreeing >= (enough or self.options.agreeing_starts)
 
-    def _enough(self, found: Sequence[Candidate]) -> bool:
+    def _enough(self, found: Sequence[TriedController]) -> bool:
         return min((c.gamma for c in found), default=np.inf) <= self.options.sufficient_gamma
 
     def _task(self, parameters: Real, *, eased: bool = False, steps: int | None = None) -> StartTask:
@@ -236,7 +236,7 @@ class OrderSearch:
         grids = tuple(self.problem.grids)
         return StartTask(self.cascade, parameters, grids, eased, steps or STEPS, checked=steps is None)
 
-    def _done(self, tasks: Sequence[StartTask]) -> Iterator[Candidate]:
+    def _done(self, tasks: Sequence[StartTask]) -> Iterator[TriedController]:
         """Where they ended, one after the other; what was run is noted."""
         for end in map(self.workshop.do, tasks):
             self.reports += end.reports
@@ -275,14 +275,14 @@ class OrderSearch:
         mixed = [start for pair in zip_longest(shaped, random) for start in pair if start is not None]
         return [*given, *mixed]
 
-    def _exchange(self, found: list[Candidate], *, hops: bool = True) -> OrderResult:
+    def _exchange(self, found: list[TriedController], *, hops: bool = True) -> OrderResult:
         """Add violated frequencies of the best candidates, improve them on the finer grid, and again.
 
         Several are carried along at first: the best on a coarse grid is often not the best on a finer one.
         In between, hops from the best look for a better valley.
         """
         history, tolerance = [found[0].gamma], EXCHANGE_TOLERANCE
-        pool, fresh = different(found, _CARRIED), list[Candidate]()
+        pool, fresh = different(found, _CARRIED), list[TriedController]()
         for number in range(self.options.exchange_rounds):
             self.tell(0.5 + 0.5 * number / self.options.exchange_rounds, f"exchange {number + 1}")
             if self._enough(pool):
@@ -317,7 +317,7 @@ class OrderSearch:
             history.append(best.gamma)
         return OrderResult(best, tuple(self.reports), tuple(history))
 
-    def _finished(self, best: Candidate) -> Candidate:
+    def _finished(self, best: TriedController) -> TriedController:
         """The best alone, violated frequencies added and improved until dense check and grid agree."""
         current = best
         for _ in range(_FINISHING):
@@ -343,14 +343,16 @@ class OrderSearch:
         return np.asarray(parameters + size * direction, dtype=np.float64)
 
 
-def different(candidates: Sequence[Candidate], most: int, *, on_grid: bool = False) -> list[Candidate]:
+def different(
+    candidates: Sequence[TriedController], most: int, *, on_grid: bool = False
+) -> list[TriedController]:
     """Best candidates that differ in gamma (on_grid: of their lean grid) by more than 0.1 %: the same optimum
     twice teaches nothing."""
 
-    def gamma(candidate: Candidate) -> float:
+    def gamma(candidate: TriedController) -> float:
         return candidate.gamma_grid if on_grid else candidate.gamma
 
-    kept: list[Candidate] = []
+    kept: list[TriedController] = []
     for candidate in sorted(candidates, key=gamma):
         if all(abs(gamma(candidate) / gamma(other) - 1) > _AGREE - 1 for other in kept):
             kept.append(candidate)

@@ -21,7 +21,7 @@ from control_design.synthesis.problem import Problem
 from control_design.synthesis.starts import with_cancelling_section
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
-from control_design.synthesis.workshop import Candidate, Workshop
+from control_design.synthesis.workshop import TriedController, Workshop
 from control_design.synthesis.youla_starts import FreeController, FreeControllers, free_controllers
 
 Progress = Callable[[float, str], None]
@@ -206,7 +206,7 @@ def _climbed(
     ladder: Sequence[tuple[SectionKind, ...]],
     root: int,
     own_damping: float,
-    fitted: Candidate | None,
+    fitted: TriedController | None,
     tell: Progress,
     reports: list[StartReport],
 ) -> OrderResult:
@@ -261,7 +261,7 @@ def _nothing_stable(
     problem: Problem,
     cascade: Cascade,
     nearest: Real | None,
-    edge: Candidate | None,
+    edge: TriedController | None,
     reports: tuple[StartReport, ...],
 ) -> SynthesisResult:
     """No controller, and where the search came nearest to one: which requirement fails there."""
@@ -274,7 +274,7 @@ def _nothing_stable(
     return SynthesisResult(Outcome.NOT_CONVERGED, nothing, float("inf"), blocking, reports, (), points)
 
 
-def _blocking(problem: Problem, cascade: Cascade, best: Candidate) -> tuple[BlockingPoint, ...]:
+def _blocking(problem: Problem, cascade: Cascade, best: TriedController) -> tuple[BlockingPoint, ...]:
     points = []
     for _, data in problem.checks(cascade, best.parameters):
         omega = data.ellipses.omega_rad_s

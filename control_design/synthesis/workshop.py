@@ -34,7 +34,7 @@ class StartTask:
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class TriedController:
     """Where a start ended: parameters, worst case on the lean grid it came from and on the dense grid (inf:
     unstable, or not checked), what was run."""
 
@@ -66,7 +66,7 @@ class Workshop:
             )
         return self._descent
 
-    def do(self, task: StartTask) -> Candidate:
+    def do(self, task: StartTask) -> TriedController:
         """Improve one start."""
         descent = self.descent(task.cascade, task.grids)
         start, reports = task.parameters, []
@@ -81,7 +81,7 @@ class Workshop:
         dense = self.problem.gamma(task.cascade, end) if checked else float("inf")
         seen = min(gamma, LARGEST_GAMMA), dense if np.isfinite(dense) else None
         reports.append(StartReport("descent", steps, *seen))
-        return Candidate(end, gamma, dense, tuple(reports))
+        return TriedController(end, gamma, dense, tuple(reports))
 
     def _eased_program(self, task: StartTask) -> AngleProgram:
         if self._program is None:

@@ -17,10 +17,10 @@ from diagnosis.fit.discrepancy import discrepancy
 from diagnosis.fit.likelihood import DECISIVE, WORTH_IT
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
-from diagnosis.fit.starts import Point, beside, superposed
+from diagnosis.fit.starts import StartPoint, beside, superposed
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.search.loop import NEAREST, SEVERAL, Progress, SearchLoop
-from diagnosis.search.moves import Alone, Beside, Enlarge, FromPoints, InPlaceOf, LookAlike
+from diagnosis.search.moves import Alone, BesideSet, Enlarge, FromPoints, InPlaceOf, LookAlike
 from plant.effects.search_space import Candidate
 
 # An effect that changes no record by more than this many noise deviations (RMS) is not looked for: alone, and
@@ -64,7 +64,7 @@ class WhiteSearch(SearchLoop[Hypothesis]):
         self.tried(Enlarge.proposed(self, self.found), 0.5)
         self.tried(InPlaceOf.proposed(self, self.base.end), 0.55)
         for count in range(2, self.case.machine.weighing.most_effects + 1):
-            moves = Beside.proposed(self, count)
+            moves = BesideSet.proposed(self, count)
             if not moves or (count > 2 and self._hopeless(moves[0].parent)):
                 break
             pulled = [m for move in moves for m in InPlaceOf.proposed(self, move.parent)]
@@ -91,14 +91,16 @@ class WhiteSearch(SearchLoop[Hypothesis]):
         e, drift = without_drift(parent.left, solver_spread(self.records, parent))
         return float(np.mean(e**2)) - 1.0 < max(DISAGREEMENT["non-smooth"], drift.size) ** 2
 
-    def looked_for(self, candidate: Candidate, points: list[Point]) -> tuple[Candidate, list[Point]]:
+    def looked_for(
+        self, candidate: Candidate, points: list[StartPoint]
+    ) -> tuple[Candidate, list[StartPoint]]:
         """From the size on at which it changes a record."""
         smallest = smallest_size(candidate, points, _SMALLEST)
         return (candidate, []) if smallest is None else (candidate.from_size(smallest), points)
 
     def looked_at_beside(
-        self, parent: Descent, candidate: Candidate, points: Sequence[Point]
-    ) -> tuple[Candidate, list[Point]]:
+        self, parent: Descent, candidate: Candidate, points: Sequence[StartPoint]
+    ) -> tuple[Candidate, list[StartPoint]]:
         smallest = smallest_size(candidate, points, _SMALLEST_BESIDE)
         if smallest is not None:
             candidate = candidate.from_size(smallest)
@@ -139,7 +141,7 @@ def _beyond_noise(end: Descent) -> float:
     return max(end.rms**2 - 1.0, 0.0)
 
 
-def smallest_size(candidate: Candidate, starts: Sequence[Point], ratio: float) -> float | None:
+def smallest_size(candidate: Candidate, starts: Sequence[StartPoint], ratio: float) -> float | None:
     """Coordinate of the size at which the effect changes the model by `ratio` noise deviations.
 
     From the grid: interpolated between points in log-log, extrapolated in proportion; over several points of

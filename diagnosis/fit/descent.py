@@ -17,7 +17,7 @@ import numpy as np
 from diagnosis.fit.coordinates import box, effects_at, non_smooth, quotients, solved
 from diagnosis.fit.likelihood import WORTH_IT
 from diagnosis.fit.nominal import prior_cost, prior_curvature, prior_slope
-from diagnosis.fit.records import RecordsToFit, Start, StartColumns
+from diagnosis.fit.records import FittedStart, RecordsToFit, StartColumns
 from diagnosis.machine.machine_protocol import Real
 from plant.effects.search_space import Candidate
 
@@ -50,7 +50,7 @@ class Descent:
     candidates: tuple[Candidate, ...]
     deviations: Real
     coordinates: Real
-    start: Start
+    start: FittedStart
     left: Real
     weights: Real
     jacobian: Real
@@ -103,7 +103,7 @@ class Descent:
         """Of its linearisation."""
         return _normal_at(self, records)
 
-    def on(self, records: RecordsToFit, start: Start | None = None, **settings: Any) -> Descent:
+    def on(self, records: RecordsToFit, start: FittedStart | None = None, **settings: Any) -> Descent:
         """Descended on, from another start where one is given."""
         start = self.start if start is None else start
         return descend(records, self.candidates, self.deviations, self.coordinates, start, **settings)
@@ -147,7 +147,7 @@ class NormalEquations:
         H[zeros, zeros] += 1 / records.zero_spread**2
         return cls(records, deviations, (weighted, tuple(of_states)), H)
 
-    def gradient(self, start: Start, e: Real) -> Real:
+    def gradient(self, start: FittedStart, e: Real) -> Real:
         """(M,) where coefficients e (N,) are left from a start."""
         weighted, of_states = self.weighted
         shared, Z = weighted.T @ e, start.zeros.size
@@ -166,7 +166,7 @@ def _normal_at(end: Descent, records: RecordsToFit) -> NormalEquations:
     return NormalEquations.of(records, end.weights, end.jacobian, end.columns, end.deviations)
 
 
-def loss_at(records: RecordsToFit, e: Real, deviations: Real, start: Start) -> tuple[float, float]:
+def loss_at(records: RecordsToFit, e: Real, deviations: Real, start: FittedStart) -> tuple[float, float]:
     """-log posterior density of a point, and the part of it that the prior of deviations and start is."""
     prior = 0.5 * (prior_cost(deviations) + records.prior_cost(start))
     return records.likelihood.loss(e) + prior, prior
@@ -177,7 +177,7 @@ def descend(
     candidates: Sequence[Candidate],
     deviations: Real,
     coordinates: Real,
-    start: Start,
+    start: FittedStart,
     *,
     nominal_jacobian: Real | None = None,
     columns: StartColumns | None = None,
@@ -192,7 +192,7 @@ def descend(
     d, x = deviations.copy(), np.clip(coordinates, low, high)
     deviation_step, steps = steps_of(candidates)
 
-    def left(d: Real, x: Real, start: Start) -> Real:
+    def left(d: Real, x: Real, start: FittedStart) -> Real:
         return records.coefficients(d, effects_at(candidates, x), start)
 
     e = left(d, x, start)
@@ -322,7 +322,7 @@ def best_following(
     return min(followed, key=lambda trial: trial[0])
 
 
-def follow(records: RecordsToFit, around: Descent, e: Real, start: Start) -> tuple[float, Real]:
+def follow(records: RecordsToFit, around: Descent, e: Real, start: FittedStart) -> tuple[float, Real]:
     """What the loss of coefficients e (N,) becomes, and where the deviations go, once everything that
     `around` holds has followed linearly."""
     P = around.deviations.size

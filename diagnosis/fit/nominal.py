@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from diagnosis.machine.machine_protocol import Machine, Real
+from diagnosis.machine.machine_protocol import Real, SimulatedMachine
 
 # Up to so many tolerances the prior is Gaussian. Beyond them it falls faster: a value that far off gets
 # noticed before it gets stated.
@@ -40,7 +40,7 @@ class NominalParameters:
     true (1 + t d), so the true value is stated / (1 + t d).
     """
 
-    stated: Machine
+    stated: SimulatedMachine
     # A value that would have to be wrong by more tolerances than this is not believed.
     farthest: ClassVar[float] = 8.0
 
@@ -52,7 +52,7 @@ class NominalParameters:
     def count(self) -> int:
         return len(self.stated.tolerances)
 
-    def at(self, deviations: Real) -> Machine:
+    def at(self, deviations: Real) -> SimulatedMachine:
         """The machine whose nominal parameters are off by these deviations (P,)."""
         if not self.count:
             return self.stated
@@ -63,7 +63,7 @@ class NominalParameters:
         return self._last[key]
 
     @cached_property
-    def _last(self) -> dict[bytes, Machine]:
+    def _last(self) -> dict[bytes, SimulatedMachine]:
         return {}
 
     def factors(self, deviations: Real) -> dict[str, float]:

@@ -23,21 +23,21 @@ _STATE_STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class FittedStart:
     """What is fitted beside parameters: states (R, S) at the start of every record, zeros (Z,) of sensors."""
 
     states: Real
     zeros: Real
 
-    def with_zeros(self, zeros: Real, columns: Real) -> Start:
+    def with_zeros(self, zeros: Real, columns: Real) -> FittedStart:
         """The same measured start with other zeros; columns (S, Z): states per unit of a zero."""
-        return Start(self.states + (zeros - self.zeros) @ columns.T, zeros)
+        return FittedStart(self.states + (zeros - self.zeros) @ columns.T, zeros)
 
 
 @dataclass(frozen=True, eq=False)
 class StartColumns:
-    """Derivatives of the coefficients by a `Start`: zeros (N, Z), states of every record (T Y, S) each. A
-    zero takes the measured start along, per_zero (S, Z) as `Start.with_zeros`: apart, steps go nowhere."""
+    """Derivatives of the coefficients by a `FittedStart`: zeros (N, Z), states of every record (T Y, S) each.
+    A zero takes the measured start along, per_zero (S, Z) as in `with_zeros`: apart, steps go nowhere."""
 
     zeros: Real
     states: tuple[Real, ...]
@@ -48,11 +48,11 @@ class StartColumns:
         """fixed (N, Z): derivatives by the zeros with the states held."""
         return cls(fixed + np.concatenate([own @ per_zero for own in states]), tuple(states), per_zero)
 
-    def moved(self, start: Start, step: Real) -> Start:
+    def moved(self, start: FittedStart, step: Real) -> FittedStart:
         """step: (Z + R S,)."""
         Z = start.zeros.size
         turned = start.with_zeros(start.zeros + step[:Z], self.per_zero)
-        return Start(turned.states + step[Z:].reshape(start.states.shape), turned.zeros)
+        return FittedStart(turned.states + step[Z:].reshape(start.states.shape), turned.zeros)
 
 
 class RecordsToFit:
@@ -89,12 +89,12 @@ class RecordsToFit:
         known = np.isfinite(self.state_spread)
         self.state_steps = np.where(known, _STATE_STEP * self.state_spread, _ANGLE_STEP_RAD)
 
-    def at_rest(self) -> Start:
+    def at_rest(self) -> FittedStart:
         """Starts as the first samples say, sensors at their zeros."""
         guess = self.case.machine.unknown_start.guess
-        return Start(np.array([guess(e) for e in self.experiments]), np.zeros(self.zero_spread.size))
+        return FittedStart(np.array([guess(e) for e in self.experiments]), np.zeros(self.zero_spread.size))
 
-    def residuals(self, deviations: Real, effects: Sequence[Any], start: Start) -> list[Real]:
+    def residuals(self, deviations: Real, effects: Sequence[Any], start: FittedStart) -> list[Real]:
         """measured - model (T, Y) of every record, in the outputs' units."""
         simulate = self.nominal.at(deviations).simulator(effects)
         return [self._left(simulate, r, state, start.zeros) for r, state in enumerate(start.states)]
@@ -119,7 +119,7 @@ class RecordsToFit:
         simulate = self.nominal.at(deviations).simulator(effects)
         return lambda r, state: self.likelihood.seen(self._left(simulate, r, state, zeros))
 
-    def coefficients(self, deviations: Real, effects: Sequence[Any], start: Start) -> Real:
+    def coefficients(self, deviations: Real, effects: Sequence[Any], start: FittedStart) -> Real:
         return np.concatenate([self.likelihood.seen(e) for e in self.residuals(deviations, effects, start)])
 
     def size_of(self, change: Real) -> float:
@@ -132,7 +132,7 @@ class RecordsToFit:
         return tuple(self.likelihood.unseen(e[part], self.case.noise.size) for part in self.parts)
 
     def start_columns(
-        self, deviations: Real, effects: Sequence[Any], start: Start, *, touching: bool = False
+        self, deviations: Real, effects: Sequence[Any], start: FittedStart, *, touching: bool = False
     ) -> StartColumns:
         """Of the linear part of the machine; where nobody knows that, and where contacts are to be felt
         (touching), difference quotients."""
@@ -162,13 +162,13 @@ class RecordsToFit:
         return StartColumns.of(np.concatenate(zeros), states, self.case.machine.unknown_start.state_per_zero)
 
     def with_true_angles(
-        self, columns: StartColumns, deviations: Real, effects: Sequence[Any], start: Start, e: Real
+        self, columns: StartColumns, deviations: Real, effects: Sequence[Any], start: FittedStart, e: Real
     ) -> StartColumns:
         """The columns with those by the first state (the true hub angle) as difference quotients: what an
         effect does with that angle is in them. e (N,): coefficients at the point."""
         shift = np.zeros_like(start.states)
         shift[:, 0] = _ANGLE_STEP_RAD
-        moved = self.coefficients(deviations, effects, Start(start.states + shift, start.zeros)) - e
+        moved = self.coefficients(deviations, effects, FittedStart(start.states + shift, start.zeros)) - e
         states = tuple(
             np.column_stack([moved[part] / _ANGLE_STEP_RAD, own[:, 1:]])
             for part, own in zip(self.parts, columns.states, strict=True)
@@ -176,7 +176,7 @@ class RecordsToFit:
         before = np.concatenate([own @ columns.per_zero for own in columns.states])
         return StartColumns.of(columns.zeros - before, states, columns.per_zero)
 
-    def prior_cost(self, start: Start) -> float:
+    def prior_cost(self, start: FittedStart) -> float:
         """-2 log prior density of a start."""
         return float(
             np.sum((start.states / self.state_spread) ** 2) + np.sum((start.zeros / self.zero_spread) ** 2)

@@ -12,7 +12,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.signal import czt
 
 from diagnosis.fit.descent import Descent, follow
-from diagnosis.fit.records import RecordsToFit, Start
+from diagnosis.fit.records import FittedStart, RecordsToFit
 from diagnosis.machine.machine_protocol import Real
 from plant.effects.search_space import Candidate
 
@@ -27,7 +27,7 @@ MOST_LINES, BEST_LINES, SLOW_LINES = 6000, 1000, 200
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class StartPoint:
     """To descend from beside a fit: loss once all else has followed, coordinates, deviations, start.
 
     size: largest RMS, over records and outputs, of what the effect changes of their coefficients;
@@ -37,21 +37,23 @@ class Point:
     loss: float
     coordinates: Real
     deviations: Real
-    start: Start
+    start: FittedStart
     size: float = 0.0
     change: npt.NDArray[np.float32] | None = None
 
-    def far_from(self, other: Point) -> bool:
+    def far_from(self, other: StartPoint) -> bool:
         moved = np.max(np.abs(self.coordinates - other.coordinates))
         turned = np.max(np.abs(self.start.zeros - other.start.zeros), initial=0.0)
         return bool(moved > _APART or turned > _APART)
 
 
-def point_of(end: Descent) -> Point:
-    return Point(end.loss, end.coordinates, end.deviations, end.start)
+def point_of(end: Descent) -> StartPoint:
+    return StartPoint(end.loss, end.coordinates, end.deviations, end.start)
 
 
-def points_of(records: RecordsToFit, around: Descent, candidate: Candidate, every: int = 1) -> list[Point]:
+def points_of(
+    records: RecordsToFit, around: Descent, candidate: Candidate, every: int = 1
+) -> list[StartPoint]:
     """Every start of a candidate beside a fit, or one in several of its grid, best first."""
     found = _harmonic(records, around, candidate) if candidate.kind.harmonic else []
     if not found:
@@ -65,8 +67,8 @@ def points_of(records: RecordsToFit, around: Descent, candidate: Candidate, ever
 
 
 def beside(
-    records: RecordsToFit, around: Descent, candidate: Candidate, points: Sequence[Point]
-) -> list[Point]:
+    records: RecordsToFit, around: Descent, candidate: Candidate, points: Sequence[StartPoint]
+) -> list[StartPoint]:
     """The same points beside the effects of another fit, best first."""
     found = []
     for point in points:
@@ -80,17 +82,17 @@ def beside(
 
 
 def point_at(
-    records: RecordsToFit, around: Descent, candidate: Candidate, x: Real, start: Start
-) -> Point | None:
+    records: RecordsToFit, around: Descent, candidate: Candidate, x: Real, start: FittedStart
+) -> StartPoint | None:
     e = records.coefficients(around.deviations, (*around.effects, candidate.effect_at(x)), start)
     if not np.all(np.isfinite(e)):
         return None
     loss, deviations = follow(records, around, e, start)
     change = e - around.left
-    return Point(loss, x, deviations, start, records.size_of(change), change.astype(np.float32))
+    return StartPoint(loss, x, deviations, start, records.size_of(change), change.astype(np.float32))
 
 
-def superposed(records: RecordsToFit, parent: Descent, points: Sequence[Point]) -> list[Point]:
+def superposed(records: RecordsToFit, parent: Descent, points: Sequence[StartPoint]) -> list[StartPoint]:
     """The same points beside the effects of another fit, changes simply added, best first: no simulation. A
     second effect large enough for superposition to fail shows all the same."""
     found = []
@@ -101,7 +103,7 @@ def superposed(records: RecordsToFit, parent: Descent, points: Sequence[Point]) 
     return sorted(found, key=lambda point: point.loss)
 
 
-def _turned(records: RecordsToFit, start: Start, candidate: Candidate) -> list[Start]:
+def _turned(records: RecordsToFit, start: FittedStart, candidate: Candidate) -> list[FittedStart]:
     if records.case.machine.unknown_start.zero_seen or not candidate.kind.absolute_angle:
         return [start]
     turns = np.arange(_ZEROS_AROUND) * 2 * np.pi / _ZEROS_AROUND - np.pi
@@ -109,11 +111,11 @@ def _turned(records: RecordsToFit, start: Start, candidate: Candidate) -> list[S
     return [_with_zeros(records, start, start.zeros + turn * first) for turn in turns]
 
 
-def _with_zeros(records: RecordsToFit, start: Start, zeros: Real) -> Start:
+def _with_zeros(records: RecordsToFit, start: FittedStart, zeros: Real) -> FittedStart:
     return start.with_zeros(zeros, records.case.machine.unknown_start.state_per_zero)
 
 
-def _harmonic(records: RecordsToFit, around: Descent, candidate: Candidate) -> list[Point]:
+def _harmonic(records: RecordsToFit, around: Descent, candidate: Candidate) -> list[StartPoint]:
     """Amplitude and phase by linear least squares at each frequency: the torque acts on a linear arm."""
     machine = records.nominal.at(around.deviations)
     periodic = candidate.kind.harmonic == "time"
@@ -178,7 +180,7 @@ def _harmonic(records: RecordsToFit, around: Descent, candidate: Candidate) -> l
         losses = around.loss + 0.5 * np.sum(slopes * ab, axis=1)
         changes = np.einsum("nlk,lk->ln", columns.reshape(len(columns), -1, 2), ab)
         for loss, x, change in zip(losses, coordinates, changes, strict=True):
-            found.append(Point(float(loss), x, around.deviations, around.start, records.size_of(change)))
+            found.append(StartPoint(float(loss), x, around.deviations, around.start, records.size_of(change)))
     return found
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 import numpy as np
 
 from diagnosis.answer import Diagnosis, held_out_gap
-from diagnosis.assembled import Fitted, Judgement, Model, assembled
+from diagnosis.assembled import FittedEffect, Judgement, Model, assembled
 from diagnosis.fit.coordinates import parameter_intervals, widened_by
 from diagnosis.fit.descent import Descent
 from diagnosis.imperfect import verdict as judging
@@ -205,11 +205,11 @@ def _fitted(
     accepted: Explanation,
     carried: Mapping[str, tuple[float, float, float]],
     rng: np.random.Generator,
-) -> Callable[[str], Fitted | None]:
+) -> Callable[[str], FittedEffect | None]:
     sets = best_of_sets(search.found)
     likeliest = [accepted, *(one.explanation for one in found.judged), *sets.values()]
 
-    def fitted(name: str) -> Fitted | None:
+    def fitted(name: str) -> FittedEffect | None:
         best = next((e for e in likeliest if name in e.names), None)
         if best is None:
             return None
@@ -220,7 +220,7 @@ def _fitted(
         rows = end.rows_of(k)
         covariance = inverse[rows, rows] + _taken_for(search, best, k)
         explains = closed_by(search, best, found.nominal) - closed_by(search, rest, found.nominal)
-        return Fitted(
+        return FittedEffect(
             end.candidates[k],
             end.coordinates_of(k),
             parameter_intervals(end.candidates[k], end.coordinates_of(k), covariance, rng),

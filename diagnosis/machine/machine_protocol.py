@@ -79,14 +79,14 @@ KNOWN_START = UnknownStart(
 )
 
 
-class Machine(Protocol):
+class SimulatedMachine(Protocol):
     """A machine that can be simulated, as its makers know it; stated parameters may be off."""
 
     @property
     def tolerances(self) -> Mapping[str, float]:
         """Parameter -> relative standard deviation of its nominal parameter."""
 
-    def scaled(self, factors: Mapping[str, float]) -> Machine:
+    def scaled(self, factors: Mapping[str, float]) -> SimulatedMachine:
         """The same with these parameters multiplied."""
 
     @property
@@ -171,7 +171,7 @@ class RecordedCase(ABC, Generic[Record]):
 
     @property
     @abstractmethod
-    def machine(self) -> Machine:
+    def machine(self) -> SimulatedMachine:
         """The machine in the form that fits and evidence ask for."""
 
     @property

@@ -28,7 +28,7 @@ from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.mujoco_edits import DEAD_ZONE, STRIBECK, Quantity
 from diagnosis.machine.mujoco_model import MujocoModel
 from diagnosis.machine.mujoco_quantities import Quantities
-from diagnosis.machine.mujoco_simulation import Simulation
+from diagnosis.machine.mujoco_simulation import MujocoSimulation
 from diagnosis.machine.own_plant import Plant, PlantExperiment
 from diagnosis.machine.plant_effect import Change
 
@@ -103,7 +103,7 @@ class MujocoArm(MujocoModel):
         for change in effects:
             size, name = tuple(change.values.values()), change.id.removeprefix("wrong_")
             values[name] = values[name] * size[0] if name in values else size
-        assert isinstance(plant.simulation, Simulation)
+        assert isinstance(plant.simulation, MujocoSimulation)
         changed = {k: v for k, v in values.items() if v != plant.parameters.get(k)}
         spec = plant.simulation.edited(changed, self.spec)
         poses = [np.array(key.qpos) for key in spec.keys]
@@ -177,7 +177,7 @@ class MujocoArm(MujocoModel):
         stated = {name: one.value for name, one in every.items() if one.value != 0.0}
         usual = {name: TOLERANCES.get(name.rpartition(".")[2], _ELSE) for name in stated}
         tolerances = {name: self.number(f"tolerance.{name}", usual[name]) for name in stated}
-        simulation = Simulation(self, every, noise)
+        simulation = MujocoSimulation(self, every, noise)
         share = model_error * simulation.commanded(stated, experiments)
         records = experiments[:_LOOKED_AT]
         as_stated = [simulation(stated, {}, e.input) for e in records]
@@ -213,7 +213,7 @@ class MujocoArm(MujocoModel):
                 **dict.fromkeys(silent, "records in which it shows"),
             },
             settled=simulation.settled,
-            untracked=Simulation(
+            untracked=MujocoSimulation(
                 replace(self, tracking_rad_s=0.0), every, noise, False, _starts=simulation._starts
             ),
             units=self.units,

@@ -49,7 +49,7 @@ _MET = {
 
 
 @dataclass(frozen=True, eq=False)
-class Simulation:
+class MujocoSimulation:
     """parameters, effects, inputs (T, U + Y) -> outputs (T, Y). settles : they are meant for `settled`;
     else every record starts as its first samples say."""
 

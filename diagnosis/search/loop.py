@@ -12,7 +12,7 @@ import numpy as np
 from diagnosis.fit.descent import Descent, best_following, descend
 from diagnosis.fit.likelihood import DECISIVE
 from diagnosis.fit.records import RecordsToFit
-from diagnosis.fit.starts import Point, point_of
+from diagnosis.fit.starts import StartPoint, point_of
 from diagnosis.machine.machine_protocol import CaseOfMachine
 from diagnosis.search.explanation import E, best_of_sets
 from plant.effects.search_space import Candidate
@@ -57,8 +57,8 @@ class SearchLoop(ABC, Generic[E]):
         self.case, self.progress, self.deadline_s = case, progress, deadline_s
         self.found: list[E] = []
         self.left_out: list[str] = []
-        self.points: list[tuple[Candidate, list[Point]]] = []
-        self.rough: list[tuple[Descent, list[Point]]] = []
+        self.points: list[tuple[Candidate, list[StartPoint]]] = []
+        self.rough: list[tuple[Descent, list[StartPoint]]] = []
         # Whether starts of records that are only predicted feel contacts.
         self.touching = False
         # Already tried: sets without one of their effects, with a simpler one, with another in its place.
@@ -124,13 +124,15 @@ class SearchLoop(ABC, Generic[E]):
         """An end with what it leaves, weighed."""
 
     @abstractmethod
-    def looked_for(self, candidate: Candidate, points: list[Point]) -> tuple[Candidate, list[Point]]:
+    def looked_for(
+        self, candidate: Candidate, points: list[StartPoint]
+    ) -> tuple[Candidate, list[StartPoint]]:
         """A candidate and its points beside the nominal as they are tried from then on."""
 
     @abstractmethod
     def looked_at_beside(
-        self, parent: Descent, candidate: Candidate, points: Sequence[Point]
-    ) -> tuple[Candidate, list[Point]]:
+        self, parent: Descent, candidate: Candidate, points: Sequence[StartPoint]
+    ) -> tuple[Candidate, list[StartPoint]]:
         """A candidate and some of its points beside a set, simulated, best first."""
 
     @abstractmethod

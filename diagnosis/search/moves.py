@@ -15,8 +15,8 @@ from scipy.signal import find_peaks
 from diagnosis.fit.descent import Descent, best_following, descend, refined, scanned
 from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL, WORTH_IT
 from diagnosis.fit.nominal import EDGE
-from diagnosis.fit.records import Records, Start
-from diagnosis.fit.starts import Point, beside, point_of, points_of, superposed
+from diagnosis.fit.records import FittedStart, Records
+from diagnosis.fit.starts import StartPoint, beside, point_of, points_of, superposed
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.search.explanation import Weighed, best_of_sets
@@ -62,7 +62,7 @@ class FromPoints(Move):
     """An effect alone, from the best of its starts."""
 
     candidate: Candidate
-    points: list[Point]
+    points: list[StartPoint]
 
     @property
     def what(self) -> str:
@@ -80,7 +80,11 @@ class FromPoints(Move):
 
 
 def descended(
-    search: SearchLoop[Any], around: Descent, candidate: Candidate, points: Sequence[Point], nominal: Real
+    search: SearchLoop[Any],
+    around: Descent,
+    candidate: Candidate,
+    points: Sequence[StartPoint],
+    nominal: Real,
 ) -> Descent:
     """The best end of a candidate beside a fit, from its best points that are apart."""
     chosen, most = [points[0]], SEVERAL if _turned(search, candidate) else NEAREST
@@ -103,7 +107,7 @@ def _from(
     search: SearchLoop[Any],
     around: Descent,
     candidate: Candidate,
-    point: Point,
+    point: StartPoint,
     nominal: Real,
 ) -> Descent:
     return descend(
@@ -165,7 +169,7 @@ class Enlarge(Move):
 
 
 @dataclass(frozen=True, eq=False)
-class Beside(Move):
+class BesideSet(Move):
     """The most promising effects beside a set."""
 
     parent: Descent
@@ -176,7 +180,7 @@ class Beside(Move):
         return f"further effects beside {' and '.join(self.parent.names)}"
 
     @classmethod
-    def proposed(cls, search: SearchLoop[Any], count: int) -> list[Beside]:
+    def proposed(cls, search: SearchLoop[Any], count: int) -> list[BesideSet]:
         """Sets of so many effects, from the likeliest of one fewer. Several of these while something that
         interests is left, for what is left says little about which member of the true set has been found;
         then those as likely as the likeliest of all sets: a small effect beside one of two that look alike
@@ -191,7 +195,7 @@ class Beside(Move):
         parent = self.parent
         trials = sorted(self._trials(search), key=lambda trial: trial[1].loss)
         most_pulled = NEAREST * self.most if len(search.points) > _DESCENDED else len(trials)
-        chosen: dict[tuple[str, float], tuple[Candidate, Point]] = {}
+        chosen: dict[tuple[str, float], tuple[Candidate, StartPoint]] = {}
         for candidate, point in trials:
             pulled = candidate.kind.multiplies is not None and np.any(np.abs(parent.deviations) > EDGE)
             if len(chosen) < self.most or (pulled and len(chosen) < most_pulled):
@@ -210,13 +214,13 @@ class Beside(Move):
         for k, end in enumerate(sorted(ends, key=lambda end: end.loss)):
             search.add(search.polished(end, k, parent))
 
-    def _trials(self, search: SearchLoop[Any]) -> Iterator[tuple[Candidate, Point]]:
+    def _trials(self, search: SearchLoop[Any]) -> Iterator[tuple[Candidate, StartPoint]]:
         """The best point of every candidate beside the parent."""
         held = {name for c in self.parent.candidates for name in (c.effect, c.kind.contains)} - {None}
         listed = [(c, p) for c, p in search.points if not {c.effect, c.kind.contains} & held]
         if len(search.points) > _DESCENDED:
 
-            def left(one: tuple[Candidate, list[Point]]) -> float:
+            def left(one: tuple[Candidate, list[StartPoint]]) -> float:
                 return min((p.loss for p in superposed(search.records, self.parent, one[1])), default=-np.inf)
 
             listed = sorted(listed, key=left)[:_SIMULATED]
@@ -258,7 +262,7 @@ class InPlaceOf(Move):
                 yield cls(parent, *found, np.where(np.arange(nominal.count) == k, 0.0, parent.deviations))
 
     def apply(self, search: SearchLoop[Any]) -> None:
-        point = Point(self.parent.loss, self.coordinates, self.deviations, self.parent.start)
+        point = StartPoint(self.parent.loss, self.coordinates, self.deviations, self.parent.start)
         nominal = self.parent.jacobian[:, : self.deviations.size]
         end = _from(search, self.parent, self.candidate, point, nominal)
         search.add(search.polished(end, 0, self.parent))
@@ -305,11 +309,11 @@ class InWindows(Move):
         if best.loss > around.loss - DECISIVE:
             return
         if not search.late(self.what):
-            Beside(best, SEVERAL).apply(windows)
+            BesideSet(best, SEVERAL).apply(windows)
         for count in (1, 2):
             of_count = [e.end for e in windows.found if len(e.names) == count]
             for end in sorted(of_count, key=lambda end: end.loss)[:NEAREST]:
-                start = Start(end.start.states[:, :states], end.start.zeros)
+                start = FittedStart(end.start.states[:, :states], end.start.zeros)
                 search.add(refined(search.records, end.on(search.records, start)))
 
 
@@ -409,7 +413,7 @@ class LookAlike(Move):
         search.add(descend(search.records, candidates, d, x, end.start))
 
 
-def _local_minima(points: Sequence[Point]) -> list[Point]:
+def _local_minima(points: Sequence[StartPoint]) -> list[StartPoint]:
     """Of a grid of one value, best first; of several values none is sought."""
     if points[0].coordinates.size != 1:
         return []

@@ -10,15 +10,15 @@ import numpy as np
 
 from diagnosis.fit.descent import FINE, Descent, descend, loss_at, occam, refined
 from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL
-from diagnosis.fit.records import Records, Start, mean_square_left
-from diagnosis.fit.starts import Point, beside
+from diagnosis.fit.records import FittedStart, Records, mean_square_left
+from diagnosis.fit.starts import StartPoint, beside
 from diagnosis.fit.windows import Windows
 from diagnosis.machine.machine_protocol import CaseOfMachine
 from diagnosis.search.explanation import Explanation
 from diagnosis.search.loop import MANY, NEAREST, SEVERAL, Progress, SearchLoop
 from diagnosis.search.moves import (
     Alone,
-    Beside,
+    BesideSet,
     Enlarge,
     FromContacts,
     FromPoints,
@@ -85,7 +85,7 @@ class Search(SearchLoop[Explanation]):
         for count in range(2, self.case.machine.weighing.most_effects + 1):
             if count > 3 and not (self.unexplained and self._worth(count - 1)):
                 break
-            self.tried(Beside.proposed(self, count), min(0.45 + 0.25 * (count - 2), 0.9), 0.1)
+            self.tried(BesideSet.proposed(self, count), min(0.45 + 0.25 * (count - 2), 0.9), 0.1)
         if self.unexplained:
             self.tried(InWindows.proposed(self), 0.95)
             self.tried(Scan.proposed(self), 0.97)
@@ -105,12 +105,14 @@ class Search(SearchLoop[Explanation]):
         )
         return largest > smaller + DECISIVE
 
-    def looked_for(self, candidate: Candidate, points: list[Point]) -> tuple[Candidate, list[Point]]:
+    def looked_for(
+        self, candidate: Candidate, points: list[StartPoint]
+    ) -> tuple[Candidate, list[StartPoint]]:
         return candidate, points
 
     def looked_at_beside(
-        self, parent: Descent, candidate: Candidate, points: Sequence[Point]
-    ) -> tuple[Candidate, list[Point]]:
+        self, parent: Descent, candidate: Candidate, points: Sequence[StartPoint]
+    ) -> tuple[Candidate, list[StartPoint]]:
         """The best and, because beside another effect any size may be right, some of the rest."""
         rest = points[SEVERAL:]
         some = [*points[:SEVERAL], *rest[:: max(1, len(rest) // SEVERAL)]]
@@ -187,7 +189,7 @@ class Search(SearchLoop[Explanation]):
             ),
         )
 
-    def _beginning(self, held: Records, fitted: Start) -> Start:
+    def _beginning(self, held: Records, fitted: FittedStart) -> FittedStart:
         """Starts of records as their first samples say, sensors at the zeros that others have."""
         start = held.at_rest()
         if not start.zeros.size:

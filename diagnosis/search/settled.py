@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 
 from diagnosis.fit.coordinates import quotients, solved
 from diagnosis.fit.levels import Levels
-from diagnosis.fit.records import Records, Start, later
+from diagnosis.fit.records import FittedStart, Records, later
 from diagnosis.machine.machine_protocol import Real
 
 _ITERATIONS, _STILL = 30, 1e-7
@@ -30,8 +30,8 @@ _BEGINNINGS, _FEWEST, _STEP, _CALLS, _LITTLE = (16, 4), 20, 0.02, 15, 1e-3
 
 
 def settled(
-    records: Records, d: Real, effects: Sequence[Any], start: Start, *, touching: bool = False
-) -> tuple[Start, Real]:
+    records: Records, d: Real, effects: Sequence[Any], start: FittedStart, *, touching: bool = False
+) -> tuple[FittedStart, Real]:
     """The start from which the records fit best, and their coefficients (N,) there.
 
     touching : from where the steps of the linear arm end and from the guess, states some way off are tried
@@ -48,7 +48,7 @@ def settled(
         best.descend(columns[r])
         more = unknown.responses is None and best.loss > best.levels.loss_of(best.levels.floor)
         # More is left than does not interest, and nobody knows a linear part.
-        if more and best.better(_begun(records, r, d, effects, Start(state, start.zeros))):
+        if more and best.better(_begun(records, r, d, effects, FittedStart(state, start.zeros))):
             best.descend()
         for near in (best.state, rest.states[r]) if touching else ():
             one = _RecordStart(records, r, left, near)
@@ -58,10 +58,10 @@ def settled(
             best = min(best, one, key=lambda one: one.loss)
         found.append(best)
     e = np.concatenate([one.e for one in found])
-    return Start(np.array([one.state for one in found]), start.zeros), e
+    return FittedStart(np.array([one.state for one in found]), start.zeros), e
 
 
-def _begun(records: Records, r: int, d: Real, effects: Sequence[Any], start: Start) -> Real:
+def _begun(records: Records, r: int, d: Real, effects: Sequence[Any], start: FittedStart) -> Real:
     """States (S,) that fit the beginnings of the r-th record best, from states (S,)."""
     record, spread = records.experiments[r], records.state_spread
     simulate, scale = records.nominal.at(d).simulator(effects), np.std(record.output, axis=0)

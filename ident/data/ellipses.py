@@ -17,7 +17,7 @@ _ROUNDING = 16 * np.finfo(np.float64).eps
 
 
 @dataclass(frozen=True, eq=False)
-class Ellipses:
+class EllipseAxes:
     """{centre + s1 d1 u1 + s2 d2 (j u1), d1^2 + d2^2 <= 1}, one ellipse per frequency: semi_major s1 >=
     semi_minor s2 >= 0 (F,) in units of the response, direction u1 (F,) of modulus 1, up to its sign."""
 
@@ -88,7 +88,7 @@ def relative_deficit(covariance: RealArray) -> RealArray:
     return np.asarray(np.divide(-smallest, size, out=np.zeros_like(size), where=size > 0))
 
 
-def ellipse_distance(offset: ComplexArray, ellipses: Ellipses, magnitude: RealArray) -> RealArray:
+def ellipse_distance(offset: ComplexArray, ellipses: EllipseAxes, magnitude: RealArray) -> RealArray:
     """Length of an offset (F,) in units of the ellipse: 0 at the centre, 1 on the boundary. Axes below the
     rounding of numbers of size magnitude (F,) count as that rounding."""
     aligned = offset * np.conj(ellipses.direction)

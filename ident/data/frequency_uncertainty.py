@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ident.data.arrays import BoolArray, ComplexArray, RealArray, lock, readonly
-from ident.data.ellipses import Ellipses, chi2_radius, ellipse_distance, relative_deficit, standard_axes
+from ident.data.ellipses import EllipseAxes, chi2_radius, ellipse_distance, relative_deficit, standard_axes
 from ident.data.record_files import read_table
 from ident.data.response_columns import read_response
 
@@ -78,11 +78,11 @@ class FrequencyUncertainty:
         object.__setattr__(self, "level", float(self.level))
         object.__setattr__(self, "covariance", readonly(covariance))
 
-    def ellipse(self, level: float | None = None) -> Ellipses:
+    def ellipse(self, level: float | None = None) -> EllipseAxes:
         """Axes of the ellipses that hold the response with probability `level` (default: the record's)."""
         s1, s2, u1 = standard_axes(self.covariance)
         radius = chi2_radius(self.level if level is None else level)
-        return Ellipses(semi_major=radius * s1, semi_minor=radius * s2, direction=u1)
+        return EllipseAxes(semi_major=radius * s1, semi_minor=radius * s2, direction=u1)
 
     def normalised_distance(self, response: npt.ArrayLike) -> RealArray:
         """Distance (F,) of a response (F,) from the centre in units of the ellipse: 1 on its boundary."""

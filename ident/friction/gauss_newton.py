@@ -155,7 +155,7 @@ class FrictionFit:
 
 
 @dataclass(frozen=True, eq=False)
-class Linearised:
+class LinearisedRecord:
     """The simulation of one record to first order: position, friction (T,); by_coefficients (T, P), by_law
     (T, Q) derivatives of the position, friction_by (T, P + Q) those of the friction."""
 
@@ -179,7 +179,7 @@ def law_of(parameters: RealArray) -> FrictionLaw:
     return replace(law, excess=max(falling[0], 0.0), fall=float(np.exp(falling[1]))) if falling else law
 
 
-def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray) -> Linearised:
+def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray) -> LinearisedRecord:
     """Differences of the simulation with input u (T,): the friction follows every change."""
     if u.size > _LONGEST_KEPT:
         return _linearised(arm, coefficients, law, u)
@@ -187,12 +187,12 @@ def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: Re
 
 
 @lru_cache(maxsize=32)
-def _kept(arm: SteppedArm, coefficients: bytes, law: FrictionLaw, u: bytes) -> Linearised:
+def _kept(arm: SteppedArm, coefficients: bytes, law: FrictionLaw, u: bytes) -> LinearisedRecord:
     # Where one descent ends the next begins, and so does what is said of the friction-free arm.
     return _linearised(arm, np.frombuffer(coefficients), law, np.frombuffer(u))
 
 
-def _linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray) -> Linearised:
+def _linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray) -> LinearisedRecord:
     position, friction = arm.run(coefficients, u, law)
     structure = arm.structure
     effort = filter_input(u, 0, structure.input_delay_samples) - friction
@@ -216,7 +216,7 @@ def _linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: R
         # An excess has no size of its own before it is known, and cannot be negative.
         change[k] = _CHANGE if k % 2 else _CHANGE * law.level
         differentiate(n + k, change[k], coefficients, law_of(parameters + change))
-    return Linearised(position, friction, by[:, :n], by[:, n:], friction_by)
+    return LinearisedRecord(position, friction, by[:, :n], by[:, n:], friction_by)
 
 
 def equations(found: FrictionFit, records: Sequence[Record]) -> tuple[list[RealArray], list[RealArray]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ident.basis.posterior import EmbeddingReport, ResponsePosterior
-from ident.data.ellipses import Ellipses
+from ident.data.ellipses import EllipseAxes
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 
-__all__ = ["Ellipses", "EmbeddingReport", "FrequencyUncertainty", "ResponsePosterior"]
+__all__ = ["EllipseAxes", "EmbeddingReport", "FrequencyUncertainty", "ResponsePosterior"]

@@ -28,7 +28,7 @@ _NUISANCE_RANK = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class RecordRows:
     """The rows of one record that answer to its input: nuisance (T,n), regressors F (T,p), output y (T,),
     whitened.
 
@@ -76,7 +76,7 @@ class EmbeddingRows:
         """Columns beside the basis functions."""
         return self.beside[0].columns.shape[1] if self.beside else 0
 
-    def __iter__(self) -> Iterator[Rows]:
+    def __iter__(self) -> Iterator[RecordRows]:
         for k, record in enumerate(self.records):
             yield self._rows(record, self.beside[k] if self.beside else None)
 
@@ -102,13 +102,13 @@ class EmbeddingRows:
             known[:, -q:] = self.known_std * np.eye(q)
             yield RegressionBlock(np.zeros((q, 0)), known, np.zeros((q, self.fir_length)), np.zeros(q))
 
-    def pair_blocks(self) -> Iterator[Rows]:
+    def pair_blocks(self) -> Iterator[RecordRows]:
         """Rows with the signal that drives one more pair after all the poles in place of the input."""
         for rows in self:
             signal, head = (all_pass_signal(self.poles, part) for part in (rows.input, rows.head))
             yield replace(rows, input=signal, head=head)
 
-    def _rows(self, record: Record, beside: Beside | None) -> Rows:
+    def _rows(self, record: Record, beside: Beside | None) -> RecordRows:
         """Matrices of one record, every column whitened. Columns driven by the input from rest commute with
         A(q): for them the input is filtered, but for the first rows."""
         structure, whitening = self.structure, self.whitening
@@ -130,7 +130,7 @@ class EmbeddingRows:
         known = nuisance_columns(
             self.poles, plain.size, structure.n_polynomials, structure.estimate_initial_state
         )
-        return Rows(
+        return RecordRows(
             nuisance=whitened(known, whitening),
             regressors=regressors,
             output=whitened(answered(stabilised(record.output[:, 0], structure.unstable), delay), whitening),

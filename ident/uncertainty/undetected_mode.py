@@ -30,7 +30,7 @@ from ident.uncertainty.embedding_algebra import (
     remainder_energies,
     symmetric_factor,
 )
-from ident.uncertainty.embedding_rows import Rows
+from ident.uncertainty.embedding_rows import RecordRows
 
 # Lightly damped: half way (in ratio) between two, or at 0.005, a mode loses a tenth of its energy.
 _ZETA = (0.01, 0.03)
@@ -126,7 +126,7 @@ def candidate_pairs(n_samples: int) -> CandidatePairs:
 
 
 def pair_statistics(
-    blocks: Iterable[Rows], reduced: ReducedRegression, poles: ComplexArray
+    blocks: Iterable[RecordRows], reduced: ReducedRegression, poles: ComplexArray
 ) -> PairStatistics:
     """One pass over the records; time O(N J (p + n)), memory that of a few hundred rows of all pairs. blocks:
     `EmbeddingRows.pair_blocks`."""
@@ -298,7 +298,9 @@ def _worth_keeping(poles: ComplexArray, probability: RealArray) -> npt.NDArray[n
     return np.sort(likeliest)
 
 
-def refined_pair(blocks: Callable[[], Iterable[Rows]], reduced: ReducedRegression, pair: complex) -> complex:
+def refined_pair(
+    blocks: Callable[[], Iterable[RecordRows]], reduced: ReducedRegression, pair: complex
+) -> complex:
     """The pair near this grid point that explains most. Six rounds of 5 x 5 that shrink end within a
     hundredth of a half bandwidth; the tangent columns cover the rest."""
     rate = np.log(pair)

@@ -9,7 +9,7 @@ import pytest
 from control_design import Channel, Controller, Specification, UncertainPlant, certify
 from control_design.analysis.between_grid_points import Obstacle
 from control_design.analysis.worst_case import worst_case
-from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
+from control_design.plants.first_order import FirstOrder, FrequencyIntervals, RationalResponse
 from control_design.plants.plant_set import frequency_response
 from control_design.plants.set_expansion import stacked
 from ident import Poles
@@ -33,7 +33,7 @@ class RationalDisc:
         std = np.abs(centre) * self.relative_std * (1 + (omega_rad_s / self.corner) ** 2)
         return ResponseRecord(omega_rad_s, centre, std[:, None, None] ** 2 * np.eye(2), level)
 
-    def first_order(self, intervals: Intervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
+    def first_order(self, intervals: FrequencyIntervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
         centre = self.form.expand(intervals, cleared)
         x, h = 1 + 1j * intervals.centre / self.corner, intervals.half_width
         squared = FirstOrder(x**2, 2j * x / self.corner, (h / self.corner) ** 2, h)
@@ -160,18 +160,18 @@ def test_a_resonance_the_grid_does_not_know_is_found_by_the_bounds():
     class Needle(RationalDisc):
         def at(self, omega_rad_s: np.ndarray, level: float) -> ResponseRecord:
             record = super().at(omega_rad_s, level)
-            _, needle = self._needle(Intervals(omega_rad_s, np.zeros(omega_rad_s.size), _DT))
+            _, needle = self._needle(FrequencyIntervals(omega_rad_s, np.zeros(omega_rad_s.size), _DT))
             size = np.abs(needle.value) ** 2
             return ResponseRecord(
                 omega_rad_s, record.centre, record.covariance + size[:, None, None] * np.eye(2), level
             )
 
-        def _needle(self, intervals: Intervals) -> tuple[FirstOrder, FirstOrder]:
+        def _needle(self, intervals: FrequencyIntervals) -> tuple[FirstOrder, FirstOrder]:
             pole = np.exp(_DT * 33.3333333 * (-1e-7 + 1j))
             form = RationalResponse(2e-5 * _DT, np.zeros(0, complex), np.array([pole - 1]), 0, _DT)
             return form.expand(intervals, 0), form.expand(intervals, 0)
 
-        def first_order(self, intervals: Intervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
+        def first_order(self, intervals: FrequencyIntervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
             centre, disc = super().first_order(intervals, cleared)
             needle = intervals.cleared(cleared).times(self._needle(intervals)[0])
             columns = [
@@ -216,7 +216,7 @@ def test_what_cannot_be_bounded_says_so_and_stands_on_the_grid():
 
 def test_generators_that_are_not_those_of_the_ellipses_are_refused():
     class Wrong(RationalDisc):
-        def first_order(self, intervals: Intervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
+        def first_order(self, intervals: FrequencyIntervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
             centre, generators = super().first_order(intervals, cleared)
             return centre, generators.scaled(0.9)
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from control_design import Channel, LoopFunction, RationalWeight, Specification, UncertainPlant
-from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
+from control_design.plants.first_order import FirstOrder, FrequencyIntervals, RationalResponse
 from control_design.plants.plant_set import frequency_response
 from control_design.plants.set_expansion import SetExpansion, own_grid_set, posterior_expansion
 from ident import Poles
@@ -21,9 +21,9 @@ _DT = 0.005
 _INSIDE = np.linspace(-1.0, 1.0, 401)
 
 
-def _intervals(rng: np.random.Generator, count: int = 25) -> Intervals:
+def _intervals(rng: np.random.Generator, count: int = 25) -> FrequencyIntervals:
     centre = np.sort(10 ** rng.uniform(-1, np.log10(0.9 * np.pi / _DT), count))
-    return Intervals(centre, centre * 10 ** rng.uniform(-4, -1, count), _DT)
+    return FrequencyIntervals(centre, centre * 10 ** rng.uniform(-4, -1, count), _DT)
 
 
 def _excess(expansion: FirstOrder, truth: np.ndarray, offsets: np.ndarray) -> float:
@@ -38,7 +38,7 @@ def _excess(expansion: FirstOrder, truth: np.ndarray, offsets: np.ndarray) -> fl
     return float(np.max(rest / (expansion.remainder + 1e-12 * size + 1e-300)))
 
 
-def _frequencies(intervals: Intervals) -> tuple[np.ndarray, np.ndarray]:
+def _frequencies(intervals: FrequencyIntervals) -> tuple[np.ndarray, np.ndarray]:
     offsets = _INSIDE[:, None] * intervals.half_width
     return intervals.centre + offsets, offsets
 
@@ -51,7 +51,7 @@ def _frequencies(intervals: Intervals) -> tuple[np.ndarray, np.ndarray]:
 )
 def test_factors_hold_over_their_interval_and_the_distance_is_the_smallest(radius, angle, theta, width):
     root = radius * np.exp(1j * angle)
-    intervals = Intervals(np.array([theta / _DT]), np.array([width / _DT]), _DT)
+    intervals = FrequencyIntervals(np.array([theta / _DT]), np.array([width / _DT]), _DT)
     omega, offsets = _frequencies(intervals)
     z = np.exp(1j * omega * _DT)
     assert _excess(intervals.zero(root - 1), z - root, offsets) <= 1
@@ -67,7 +67,7 @@ def test_remainder_of_a_product_is_of_second_order_and_close_to_the_truth():
     root, intervals = 0.98 * np.exp(0.1j), None
     used = []
     for width in (0.1, 0.05, 0.025):
-        intervals = Intervals(np.array([20.0]), np.array([width]), _DT)
+        intervals = FrequencyIntervals(np.array([20.0]), np.array([width]), _DT)
         omega, offsets = _frequencies(intervals)
         z = np.exp(1j * omega * _DT)
         product = intervals.pole(root - 1).times(intervals.zero(-0.5))
@@ -109,7 +109,7 @@ def test_relative_degree_and_integrators_are_exact():
         form = RationalResponse.from_state_space(arm, count)
         assert form.integrators == count
         np.testing.assert_allclose(form.at(omega), frequency_response(arm, omega), rtol=1e-8)
-        down_to_zero = Intervals(np.array([0.005]), np.array([0.005]), _DT)
+        down_to_zero = FrequencyIntervals(np.array([0.005]), np.array([0.005]), _DT)
         cleared = form.expand(down_to_zero, count)
         at = np.linspace(1e-4, 0.01, 100)
         factor = (2j * np.sin(at * _DT / 2) * np.exp(0.5j * at * _DT)) ** count
@@ -199,7 +199,7 @@ def test_link_generators_have_the_links_covariance_and_hold(scenario):
     np.testing.assert_allclose(rows @ np.swapaxes(rows, 1, 2) / scale, record.covariance / scale, atol=2e-8)
     omega, offsets = _frequencies(intervals)
     none = np.zeros(intervals.centre.size)
-    samples = [link.first_order(Intervals(row, none, _DT), 0) for row in omega]
+    samples = [link.first_order(FrequencyIntervals(row, none, _DT), 0) for row in omega]
     assert _excess(centre, np.array([c.value for c, _ in samples]), offsets) <= 1
     assert _excess(generators, np.array([g.value for _, g in samples]), offsets) <= 1
 
@@ -219,7 +219,7 @@ def test_own_grid_with_the_straight_line_assumption_is_the_sum_of_neighbours():
     for share in (0.0, 0.3, 1.0):
         omega = own[2:3] + share * (own[3] - own[2])
         middle = 0.5 * (own[2:3] + own[3:4])
-        intervals = Intervals(middle, 0.5 * (own[3:4] - own[2:3]), _DT)
+        intervals = FrequencyIntervals(middle, 0.5 * (own[3:4] - own[2:3]), _DT)
         expansion = own_grid_set(channel, nominal, intervals, 0)
         x = omega - middle
         centre = expansion.centre.value + expansion.centre.slope * x

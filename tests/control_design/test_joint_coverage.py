@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 from control_design import Channel, Controller, Specification, UncertainPlant, certify
 from control_design.analysis.joint_coverage import SampledLoop, joint_coverage
-from control_design.plants.first_order import FirstOrder, Intervals, RationalResponse
+from control_design.plants.first_order import FirstOrder, FrequencyIntervals, RationalResponse
 from control_design.plants.set_expansion import stacked
 from validation.example_plants import ResponseRecord, flexible_link, flexible_link_specification
 
@@ -116,7 +116,7 @@ class GaussianGain:
         row = np.stack([centre.real, centre.imag], axis=1) * self.std
         return ResponseRecord(omega_rad_s, centre, row[:, :, None] * row[:, None, :], level)
 
-    def first_order(self, intervals: Intervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
+    def first_order(self, intervals: FrequencyIntervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
         centre = self.form.expand(intervals, cleared)
         return centre, stacked([centre.scaled(self.std)])
 

@@ -13,7 +13,13 @@ from benchmarks.mimo_designs import DT_D, TS, plant_d, plant_t, specification_d,
 from control_design import Controller, MultivariablePlant, ResponseBall, certify_multivariable
 from control_design.plants.ellipses import Ellipses, distance_to_minus_one
 from control_design.plants.multivariable import tustin_s
-from control_design.plants.scaled_bound import Rows, expansion, scaled_bound, stability_bound, structured_norm
+from control_design.plants.scaled_bound import (
+    BoundRows,
+    expansion,
+    scaled_bound,
+    stability_bound,
+    structured_norm,
+)
 from control_design.specification.multivariable import gram
 
 
@@ -56,17 +62,19 @@ def test_several_blocks_agree_with_the_judge_of_the_column():
     G, seen, entering = plant.blocks(omega)
     K = problems.inverse_d(s)
     size = gram(specification.weights(2, 2)["tracking"][1], s)
-    found = scaled_bound(Rows(G, seen, entering, size, 0 * size, True), K)
+    found = scaled_bound(BoundRows(G, seen, entering, size, 0 * size, True), K)
     assert np.max(found.gamma) == pytest.approx(5.782, abs=2e-3)
 
 
-def random_rows(rng: np.random.Generator, count: int, u: int, y: int, blocks: int) -> tuple[Rows, np.ndarray]:
+def random_rows(
+    rng: np.random.Generator, count: int, u: int, y: int, blocks: int
+) -> tuple[BoundRows, np.ndarray]:
     def draw(*shape: int) -> np.ndarray:
         return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
 
     li, lo = 0.24 / u * draw(count, blocks, u, u), 0.24 / y * draw(count, blocks, y, y)
     weight = draw(count, y, y)
-    rows = Rows(
+    rows = BoundRows(
         draw(count, y, u), np.conj(np.swapaxes(li, -1, -2)) @ li, lo @ np.conj(np.swapaxes(lo, -1, -2)),
         np.conj(np.swapaxes(weight, -1, -2)) @ weight, np.zeros((count, u, u)), False,
     )  # fmt: skip
@@ -93,7 +101,7 @@ def test_slopes_are_those_of_differences(u, y, blocks):
 def test_no_sample_of_the_ball_exceeds_the_bound_and_ascent_reaches_it(u, y):
     rng = np.random.default_rng(11)
     rows, K = random_rows(rng, 1, u, y, 1)
-    rows = Rows(rows.G, rows.seen, rows.entering, rows.V_y, rows.V_u, False)
+    rows = BoundRows(rows.G, rows.seen, rows.entering, rows.V_y, rows.V_u, False)
     bound = float(scaled_bound(rows, K).gamma[0])
     li, lo = np.linalg.cholesky(rows.seen[0, 0]).conj().T, np.linalg.cholesky(rows.entering[0, 0])
     weight = np.linalg.cholesky(rows.V_y[0]).conj().T
@@ -129,7 +137,7 @@ def test_one_loop_is_that_of_circular_ellipses():
     ellipses = Ellipses(np.arange(1.0, count + 1), G, radius, radius, np.ones(count, complex))
     distance = distance_to_minus_one(K, ellipses)
     one = np.ones((count, 1, 1))
-    rows = Rows(
+    rows = BoundRows(
         G[:, None, None], radius[:, None, None, None] ** 2 * one[:, None], one[:, None] + 0j, one, 0 * one,
         False,
     )  # fmt: skip

@@ -8,7 +8,7 @@ import pytest
 
 from control_design.analysis.certificate import certify
 from control_design.controllers.controller import Controller
-from control_design.plants.first_order import Intervals
+from control_design.plants.first_order import FrequencyIntervals
 from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.stated_uncertainty import StatedDiscs
 from control_design.plants.weights import RationalWeight
@@ -45,7 +45,7 @@ def test_ellipses_are_discs_of_the_stated_radius(kind):
 @pytest.mark.parametrize("kind", ["multiplicative", "additive"])
 def test_expansion_holds_on_its_interval(kind):
     discs = StatedDiscs(arm(), WEIGHT, kind)
-    intervals = Intervals(np.array([0.3, 3.0, 12.0]), np.array([0.01, 0.1, 0.2]), DT_S)
+    intervals = FrequencyIntervals(np.array([0.3, 3.0, 12.0]), np.array([0.01, 0.1, 0.2]), DT_S)
     centre, generators = discs.first_order(intervals, 0)
     scale = np.sqrt(-2 * np.log(0.05))
     for k, (middle, half) in enumerate(zip(intervals.centre, intervals.half_width, strict=True)):

@@ -9,7 +9,7 @@ import numpy as np
 from diagnosis import Case, Experiment
 from diagnosis.fit.descent import Descent
 from diagnosis.fit.nominal import prior_cost
-from diagnosis.fit.records import Start, StartColumns
+from diagnosis.fit.records import FittedStart, StartColumns
 from plant import Rig, prbs
 from validation.blind.rigs import rig_toml
 from validation.blind.truth import Truth
@@ -52,7 +52,7 @@ def end_of_fit(candidates, coordinates, left, jacobian, deviations=()):
     """Under white noise, made by hand: what is left (N,), its derivatives (N, P + A)."""
     d = np.array(deviations, dtype=float)
     loss, prior = 0.5 * float(left @ left + prior_cost(d)), 0.5 * float(prior_cost(d))
-    start, weights = Start(np.zeros((1, 0)), np.zeros(0)), np.ones(left.size)
+    start, weights = FittedStart(np.zeros((1, 0)), np.zeros(0)), np.ones(left.size)
     columns = StartColumns(np.zeros((left.size, 0)), (), np.zeros((0, 0)))
     x = np.concatenate([np.zeros(0), *coordinates])
     return Descent(tuple(candidates), d, x, start, left, weights, jacobian, columns, loss, prior, True)

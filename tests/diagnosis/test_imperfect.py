@@ -22,15 +22,15 @@ from diagnosis import (
 )
 from diagnosis.fit.descent import Descent, descend, occam, refined, scanned
 from diagnosis.fit.levels import Levels, quietest
-from diagnosis.fit.records import Records, Start, StartColumns
-from diagnosis.fit.starts import Point, points_of
+from diagnosis.fit.records import FittedStart, Records, StartColumns
+from diagnosis.fit.starts import StartPoint, points_of
 from diagnosis.imperfect.answered import _in_part
 from diagnosis.imperfect.carried import shares_of
 from diagnosis.imperfect.verdict import TEMPER, _enough, _weights, is_silent, judged
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Weighing
 from diagnosis.search.explanation import Explanation
-from diagnosis.search.moves import Beside, InWindows, LookAlike, descended
+from diagnosis.search.moves import BesideSet, InWindows, LookAlike, descended
 from diagnosis.search.search import Search
 from diagnosis.search.settled import best_move, settled
 from diagnosis.search.windows import in_windows
@@ -170,7 +170,7 @@ def test_a_drift_stays_in_the_lowest_octaves():
 def test_an_encoder_zero_is_no_motion_of_a_linear_arm():
     case = _case(np.random.default_rng(4))
     records = Records(case, case.estimation)
-    start = Start(np.array([[0.4, 0.2, 0.01, 0.0, 0.1, 0.0]]), np.zeros(1))
+    start = FittedStart(np.array([[0.4, 0.2, 0.01, 0.0, 0.1, 0.0]]), np.zeros(1))
     turned = start.with_zeros(np.array([0.3]), case.machine.unknown_start.state_per_zero)
     here = records.residuals(np.zeros(0), (), start)[0]
     there = records.residuals(np.zeros(0), (), turned)[0]
@@ -526,10 +526,10 @@ def test_of_generated_cases_that_were_once_missed_the_effects_are_found(tmp_path
 def test_a_fit_alone_also_begins_at_a_local_minimum_of_its_grid(losses, begun, monkeypatch):
     def points(values):
         start = SimpleNamespace(zeros=np.zeros(0))
-        grid = [Point(loss, np.full(values, float(k)), None, start) for k, loss in enumerate(losses)]
+        grid = [StartPoint(loss, np.full(values, float(k)), None, start) for k, loss in enumerate(losses)]
         return sorted(grid, key=lambda point: point.loss)
 
-    tried: list[Point] = []
+    tried: list[StartPoint] = []
     nominal = SimpleNamespace(end=SimpleNamespace(loss=0.5))
     search = SimpleNamespace(base=nominal)
     monkeypatch.setattr("diagnosis.search.moves._turned", lambda search, candidate: False)
@@ -570,12 +570,12 @@ def test_beside_others_a_frequency_is_tried_as_simulated_not_as_a_linear_arm_wou
     nothing, ripple = np.zeros(search.records.nominal.count), kinds["torque_ripple"]
     base = search.add(descend(search.records, (), nothing, np.zeros(0), search.records.at_rest())).end
     right, wrong = (
-        Point(loss, np.array([np.log(0.03), cycles, 1.0]), nothing, base.start)
+        StartPoint(loss, np.array([np.log(0.03), cycles, 1.0]), nothing, base.start)
         for loss, cycles in ((2 * base.loss, 9.0), (base.loss, 50.0))
     )
     search.points = [(ripple, [wrong])]
     monkeypatch.setattr("diagnosis.search.moves.points_of", lambda *told, **more: [right])
-    Beside(base, 2).apply(search)
+    BesideSet(base, 2).apply(search)
     end = search.found[-1].end
     assert end.loss < 0.1 * base.loss
     found = ripple.parameters(end.coordinates)
@@ -736,7 +736,7 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
             [middle.get(axis.scale, lambda axis: np.mean(axis.box))(axis) for c in chosen for axis in c.axes]
         )
         start, columns = (
-            Start(np.zeros((1, 0)), nothing),
+            FittedStart(np.zeros((1, 0)), nothing),
             StartColumns(np.zeros((0, 0)), (), np.zeros((0, 0))),
         )
         end = Descent(

@@ -19,7 +19,7 @@ from scipy.signal import lfilter
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
 from diagnosis.fit.descent import descend
 from diagnosis.imperfect.answered import beside_imperfections, searched
-from diagnosis.search.moves import Alone, Beside, Enlarge, FromContacts, Scan
+from diagnosis.search.moves import Alone, BesideSet, Enlarge, FromContacts, Scan
 from diagnosis.search.search import Search
 from diagnosis.where.where import where_in_records
 from examples import own_plant
@@ -314,7 +314,7 @@ def test_larger_sets_are_sought_while_the_last_size_was_worth_it(gained, sizes, 
         return [SimpleNamespace(what="", apply=lambda search: together(search, count))]
 
     monkeypatch.setattr(Alone, "proposed", lambda search: moved(1))
-    monkeypatch.setattr(Beside, "proposed", lambda search, count: moved(count))
+    monkeypatch.setattr(BesideSet, "proposed", lambda search, count: moved(count))
     for later in (Enlarge, Scan, FromContacts):
         monkeypatch.setattr(later, "proposed", lambda search, *sets: [])
     search.run()

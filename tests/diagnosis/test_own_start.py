@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose
 from diagnosis.fit.descent import descend
-from diagnosis.fit.records import Records, Start
+from diagnosis.fit.records import FittedStart, Records
 from diagnosis.search.search import Search
 from diagnosis.search.settled import settled
 
@@ -130,7 +130,7 @@ def test_a_set_is_descended_on_from_starts_sought_with_its_effects():
     )
     search = Search(PlantCase("rubs", plant, records), lambda share, words: None)
     dry = search.case.machine.candidates(records)[0]
-    held = Start(np.array([[0.05, 0.0], [-0.6, -4.0]]), np.zeros(0))
+    held = FittedStart(np.array([[0.05, 0.0], [-0.6, -4.0]]), np.zeros(0))
     stuck = descend(search.records, (dry,), np.zeros(0), np.log([0.1]), held, iterations=3)
     assert abs(stuck.start.states[0, 0] - 1.1) > 0.5
     again = search.begun(stuck)

@@ -13,7 +13,7 @@ import pytest
 
 from tests.workflow.command import FAST_ARM, build_nothing, draw_nothing
 from tests.workflow.study_examples import write_study
-from workflow.text.templates import Row, RunSummary, Section
+from workflow.text.templates import Row, RunSummary, TableSection
 
 MakeOnce = Callable[[str, Callable[[Path], RunSummary | None]], tuple[Path, RunSummary | None]]
 
@@ -37,7 +37,7 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> MakeOnce:
         value = json.loads((kept / "value").read_text())
         if value is None:
             return out, None
-        tables = [Section(title, [Row(*row) for row in rows]) for title, rows in value.pop("sections")]
+        tables = [TableSection(title, [Row(*row) for row in rows]) for title, rows in value.pop("sections")]
         return out, RunSummary(sections=tables, **value)
 
     return once

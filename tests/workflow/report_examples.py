@@ -12,7 +12,7 @@ from control_design.analysis.closed_loop import ClosedLoopTrajectory as LoopTraj
 from control_design.analysis.joint_coverage import JointCoverage
 from control_design.controllers.controller import Controller
 from control_design.convex.youla import PlantBracket, YoulaBracket
-from control_design.plants.plant_set import Channel, UncertainPlant
+from control_design.plants.plant_set import PlantChannel, UncertainPlant
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
 from ident.basis.functions import basis_response
 from ident.basis.model import GobfModel
@@ -153,7 +153,7 @@ def plant(*, performance: bool = True) -> UncertainPlant:
         "hub",
         hub.to_control(),
         posterior(hub),
-        performance=Channel(tip.to_control(), posterior(tip)) if performance else None,
+        performance=PlantChannel(tip.to_control(), posterior(tip)) if performance else None,
     )
 
 

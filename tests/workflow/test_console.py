@@ -15,7 +15,7 @@ import pytest
 
 from tests.workflow.command import ROOT
 from workflow import console
-from workflow.text.templates import Row, RunSummary, Section
+from workflow.text.templates import Row, RunSummary, TableSection
 
 
 @pytest.fixture
@@ -121,7 +121,7 @@ def test_tables_in_a_pipe_are_as_wide_as_asked(asked, width, capsys, monkeypatch
     monkeypatch.delenv("COLUMNS", raising=False)
     if asked is not None:
         monkeypatch.setenv("COLUMNS", asked)
-    console.print_summary(RunSummary("arm", [Section("model", [Row("modes", "7.6 Hz " * 40)])]))
+    console.print_summary(RunSummary("arm", [TableSection("model", [Row("modes", "7.6 Hz " * 40)])]))
     assert max(map(len, capsys.readouterr().out.splitlines())) == width
 
 

@@ -28,7 +28,7 @@ from tests.workflow.command import build_nothing
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from workflow.diagnose import command, outputs, pages
 from workflow.diagnose.case_files import load_case
-from workflow.diagnose.fleet import Machine
+from workflow.diagnose.fleet import FleetMachine
 from workflow.diagnose.following import Following
 from workflow.diagnose.outputs import Work
 from workflow.diagnose.simulator_case import SimulatorCase
@@ -199,11 +199,13 @@ def drawn(loaded, found, coming, monkeypatch):
     document = json.loads(files[f"{loaded.case.name}.json"])
     page = re.sub(r"<script.*?</script>|<[^>]*>", " ", files[f"{loaded.case.name}.html"].decode(), flags=re.S)
     one, several = (
-        command._summary([document] * count, [Machine.of(document)] * count, [], outputs.Path("found/a.html"))
+        command._summary(
+            [document] * count, [FleetMachine.of(document)] * count, [], outputs.Path("found/a.html")
+        )
         for count in (1, 2)
     )
     assert several.sections
-    command._overview([Machine.of(document)] * 2, {"other": "no such luck"})
+    command._overview([FleetMachine.of(document)] * 2, {"other": "no such luck"})
     rows = [(row.label, row.value) for section in one.sections for row in section.rows]
     assert shown.text(found)
     return document, " ".join(page.split()), rows

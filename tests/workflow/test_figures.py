@@ -35,7 +35,7 @@ from workflow.figures.subjects import RunView
 from workflow.figures.validation import draw_repeat_scatter
 from workflow.report import rendering
 from workflow.report.inline import relative
-from workflow.tasks.experiment import Limits, plan_experiment
+from workflow.tasks.experiment import ExperimentLimits, plan_experiment
 from workflow.tasks.results import LoopCheck, LoopRuns, RunRecord, RunResults
 from workflow.tasks.summary import summarise
 
@@ -105,7 +105,7 @@ def same_row(one, other) -> bool:
 
 
 def test_pictures_of_a_planned_experiment():
-    limits = Limits((0.5, 90.0), 0.005, 40.0, 24.0, rig=paper_link(), noise_std_rad=1e-3)
+    limits = ExperimentLimits((0.5, 90.0), 0.005, 40.0, 24.0, rig=paper_link(), noise_std_rad=1e-3)
     plan = plan_experiment(limits, seed=1, realisations=2)
     steady = np.tile(plan.voltages_V, 2)  # a gain of one, as it stands
     records = [Record(str(k), u[:, None], u[:, None], 0.005, ("u",), ("y",)) for k, u in enumerate(steady[0])]

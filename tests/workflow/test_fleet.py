@@ -20,7 +20,7 @@ from workflow.engine.executor import Failure
 from workflow.text.templates import RunSummary
 
 
-def machine(name: str, level: float | None = None, value: float = 1.0, **more) -> fleet.Machine:
+def machine(name: str, level: float | None = None, value: float = 1.0, **more) -> fleet.FleetMachine:
     sizes = {} if level is None else {("elbow.frictionloss", "level_Nm"): (level, 0.9 * level, 1.1 * level)}
     stated = {
         "verdict": "none" if level is None else "effect",
@@ -31,7 +31,7 @@ def machine(name: str, level: float | None = None, value: float = 1.0, **more) -
         "numbers": dict.fromkeys(fleet._NUMBERS, 1.0),
         "values": {"elbow.damping": (1.0, value)},
     }
-    return fleet.Machine(name, sizes=sizes, **{**stated, **more})
+    return fleet.FleetMachine(name, sizes=sizes, **{**stated, **more})
 
 
 @pytest.mark.parametrize(

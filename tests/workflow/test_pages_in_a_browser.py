@@ -21,7 +21,7 @@ from workflow.figures.poles import draw_poles
 from workflow.report import rendering
 from workflow.report.pages import write_report
 from workflow.report.rendering import render_page
-from workflow.tasks.experiment import Limits, plan_experiment
+from workflow.tasks.experiment import ExperimentLimits, plan_experiment
 from workflow.tasks.results import RunResults
 from workflow.text.templates import environment
 
@@ -205,7 +205,7 @@ def test_the_shape_of_a_page_is_measured(browser, tmp_path):
 
 
 def test_page_of_a_planned_experiment(faults_seen, tmp_path):
-    limits = Limits((0.5, 90.0), 0.005, 40.0, 24.0, rig=paper_link(), noise_std_rad=1e-3)
+    limits = ExperimentLimits((0.5, 90.0), 0.005, 40.0, 24.0, rig=paper_link(), noise_std_rad=1e-3)
     plan = plan_experiment(limits, seed=1, realisations=2)
     path = tmp_path / "plan.html"
     path.write_text(render_page("experiment.html.j2", title="Planned experiment", found=plan).html)

@@ -37,8 +37,8 @@ from workflow.report.rendering import render_page
 from workflow.study.columns import COLUMNS, numbers_of
 from workflow.study.page import PointRow, StudyView, draw_pareto, pareto_front, row_of, study_summary
 from workflow.study.points import Point, PointMaker, load_base, short
-from workflow.study.settings import Axis, ParetoPlot, last_name, load_study, parse_key, tidy, with_values
-from workflow.study.task import Task
+from workflow.study.settings import ParetoPlot, StudyAxis, last_name, load_study, parse_key, tidy, with_values
+from workflow.study.task import PointTask
 from workflow.tasks.results import (
     AchievablePerformance,
     CertifyResult,
@@ -81,8 +81,8 @@ def test_configurations_come_back_from_toml(name):
     assert check(RunConfig, document, source="again", context={"may_be_gone": True}) == config
 
 
-def _axis(**keys) -> Axis:
-    return Axis.model_validate({"key": "specification.bandwidth_rad_s", **keys})
+def _axis(**keys) -> StudyAxis:
+    return StudyAxis.model_validate({"key": "specification.bandwidth_rad_s", **keys})
 
 
 def test_ranges():
@@ -254,7 +254,9 @@ def test_a_point_at_a_lower_bandwidth_is_marked_everywhere():
     why = "the specified 9 rad/s was not met; the requirements are those of a design for 4 rad/s"
     lower = PointRow(1, "a", {}, "certified at a lower bandwidth", why, numbers)
     whole = replace(lower, number=2, state="certified", why="certified")
-    axes = Axis.model_validate({"key": "specification.modulus_margin", "label": "asked", "values": [0.5]})
+    axes = StudyAxis.model_validate(
+        {"key": "specification.modulus_margin", "label": "asked", "values": [0.5]}
+    )
     for rows, config_axes, judged in (
         ([lower, whole], (), False),
         ([whole, whole], (), True),
@@ -284,7 +286,7 @@ NO_POINT = Point(1, "p", {}, cast(Any, None), {}, "", "", ())
 
 
 def test_other_code_on_the_worker_is_refused():
-    task = Task((NO_POINT,), {}, ("design",), "0" * 64)
+    task = PointTask((NO_POINT,), {}, ("design",), "0" * 64)
     with pytest.raises(StageError, match="code of the worker is not that of the study"):
         task.run(lambda fraction, message: None)
 
@@ -297,8 +299,8 @@ class Deadly:
 
 
 def test_a_task_that_kills_its_process_fails_alone():
-    harmless = Task((NO_POINT,), {}, ("design",), "0" * 64)
-    deadly = Task((NO_POINT,), {"bomb": Deadly()}, ("design",), "0" * 64)
+    harmless = PointTask((NO_POINT,), {}, ("design",), "0" * 64)
+    deadly = PointTask((NO_POINT,), {"bomb": Deadly()}, ("design",), "0" * 64)
     before = os.environ.get("OMP_NUM_THREADS")
     with closing(LocalProcesses(2, preload=["workflow.study.task"])) as processes:
         found = dict(processes.run([harmless, deadly, harmless, harmless]))
@@ -312,7 +314,7 @@ def test_a_task_that_kills_its_process_fails_alone():
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are forked off another one on Linux only")
 def test_the_process_that_others_are_forked_off_may_die_too(monkeypatch):
     """A task, another one when that process has just been killed, and one whose start meets a dead one."""
-    task = Task((NO_POINT,), {}, ("design",), "0" * 64)
+    task = PointTask((NO_POINT,), {}, ("design",), "0" * 64)
     with closing(LocalProcesses(1, preload=["workflow.study.task"])) as processes:
         found = processes.run([task] * 3)
         assert "code of the worker" in next(found)[1].reason
@@ -369,7 +371,9 @@ def test_an_interrupt_while_a_process_begins_is_no_traceback(tmp_path):
 
 
 def test_tables_show_what_was_asked_for_and_no_empty_column():
-    axis = Axis.model_validate({"key": "specification.bandwidth_rad_s", "label": "asked", "values": [1.0]})
+    axis = StudyAxis.model_validate(
+        {"key": "specification.bandwidth_rad_s", "label": "asked", "values": [1.0]}
+    )
     numbers = dict.fromkeys(COLUMNS) | {
         "worst_gamma": 0.9, "any_order_gamma": 0.8, "predicted_peak_sensitivity": 1.4,
         "measured_peak_sensitivity": 1.42, "settled_draws": 1, "draws": 2,

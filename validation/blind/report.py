@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from validation.blind.truth import LISTED
 from workflow.figures import style
-from workflow.text.templates import Row, RunSummary, Section, environment
+from workflow.text.templates import Row, RunSummary, TableSection, environment
 
 _SLICES = ("all", "exact", "uncertain")
 _CPU = "CPU per case [s]"
@@ -70,7 +70,7 @@ def summary(document: Mapping[str, Any], out: Path) -> RunSummary:
             if numbers["count"] and (part == "all" or name != _CPU)
         )
         if rows:
-            sections.append(Section(part if part == "all" else f"{part} nominal", rows))
+            sections.append(TableSection(part if part == "all" else f"{part} nominal", rows))
     right = found["table"]["all"]["verdict and set right, every case"]
     return RunSummary(
         title="Blind protocol",

@@ -34,7 +34,7 @@ from workflow.engine.run_directory import package_versions
 from workflow.engine.store import Store
 from workflow.figures.style import Picture, render
 from workflow.report.rendering import embedded
-from workflow.text.templates import Row, RunSummary, Section, environment
+from workflow.text.templates import Row, RunSummary, TableSection, environment
 
 PAGE = "paper.html"
 TABLE_CSV, TABLE_JSON = "table.csv", "table.json"
@@ -167,7 +167,7 @@ def _summary(out: Path, document: Mapping[str, Any]) -> RunSummary:
     return RunSummary(
         title="Ziaei & Wang 2006, redrawn",
         sections=tuple(
-            Section(f"Fig. {item['figure']}", (Row(verdicts[item["agrees"]], item["found"]),))
+            TableSection(f"Fig. {item['figure']}", (Row(verdicts[item["agrees"]], item["found"]),))
             for item in figures
         ),
         numbers=document,

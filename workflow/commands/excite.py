@@ -16,13 +16,13 @@ from workflow.engine.run_directory import RunDirectory
 from workflow.text.templates import RunSummary, rows_of
 
 if TYPE_CHECKING:
-    from workflow.tasks.experiment import Limits
+    from workflow.tasks.experiment import ExperimentLimits
 
 PLAN_FILE, PAGE_FILE = "plan.json", "plan.html"
 
 
 def write_experiment(
-    limits: Limits, out: Path, *, seed: int, lead_in_s: float, **settings: object
+    limits: ExperimentLimits, out: Path, *, seed: int, lead_in_s: float, **settings: object
 ) -> list[Path]:
     """Plan an experiment within limits; one CSV (time_s, voltage_V) per record, the plan and its page.
 

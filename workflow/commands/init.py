@@ -54,7 +54,7 @@ class Found:
     logs: tuple[Path, ...]
     file_name: str
     stated: Reading
-    read: Channel
+    read: ReadChannel
     scale: Mapping[str, float]
     units: Mapping[str, str]
     draft: Draft
@@ -133,7 +133,7 @@ def init(
 
 
 @dataclass(frozen=True, eq=False)
-class Channel:
+class ReadChannel:
     """One channel of logs as read. how: with what was found; unit_of: input and output; repeats: rows of the
     logs that are alike, one after the other, 1 where each is its own."""
 
@@ -144,7 +144,7 @@ class Channel:
     repeats: int
 
 
-def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> Channel:
+def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> ReadChannel:
     """Columns as names and units tell them, a reference among them, repaired and unwrapped where they need
     it. command: what a complaint says to type again. Raises InputError."""
     tables = list[Table]()
@@ -188,7 +188,7 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> Channel
         name: stated.units.get(name, "" if name in stated.scale else tables[0].unit(name))
         for name in (roles.input, roles.output)
     }
-    return Channel(roles, how, unit_of, with_common_sampling_time(records), repeats if not steps else 1)
+    return ReadChannel(roles, how, unit_of, with_common_sampling_time(records), repeats if not steps else 1)
 
 
 def _repeats(record: Record) -> int:

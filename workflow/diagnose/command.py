@@ -16,7 +16,7 @@ from workflow.config.settings import repeated
 from workflow.diagnose.case_files import LoadedCase, load_case
 from workflow.diagnose.case_settings import CASE_FILE, case_document
 from workflow.diagnose.directory import DiagnosisDirectory
-from workflow.diagnose.fleet import Machine, csv_text, groups, trends
+from workflow.diagnose.fleet import FleetMachine, csv_text, groups, trends
 from workflow.diagnose.outputs import Work
 from workflow.diagnose.simulator_case import (
     SimulatorCase,
@@ -248,9 +248,9 @@ def load_any_case(
 
 def _compute(
     directory: DiagnosisDirectory, work: Sequence[PlacedCase], executor: Executor, progress: Progress
-) -> tuple[list[Machine], list[_Failed]]:
+) -> tuple[list[FleetMachine], list[_Failed]]:
     there = {one.name: directory.finished(one.name, one.made_from) for one in work}
-    answers = {name: Machine.of(known) for name, known in there.items() if known is not None}
+    answers = {name: FleetMachine.of(known) for name, known in there.items() if known is not None}
     todo = {one.name: one for one in work if one.name not in answers}
     names, several, width = list(todo), len(work) > 1, executor.width
     progress.plan(
@@ -275,7 +275,7 @@ def _compute(
                 files, cpu_s = found
                 timings[name] = {"cpu_s": round(cpu_s, 3)}
                 directory.save(name, {**files, "timings.json": codec.plain_text(timings).encode()})
-                answers[name] = Machine.of(json.loads(files[f"{name}.json"]))
+                answers[name] = FleetMachine.of(json.loads(files[f"{name}.json"]))
             watch(index, 1.0, "done")
     return (
         [answers[one.name] for one in work if one.name in answers],
@@ -283,7 +283,7 @@ def _compute(
     )
 
 
-def _overview(machines: Sequence[Machine], failed: Mapping[str, str]) -> str:
+def _overview(machines: Sequence[FleetMachine], failed: Mapping[str, str]) -> str:
     """The page of several cases: groups of one cause, trends, a picture, a table with links, what failed."""
     return render_page(
         "diagnosis/overview.html.j2",
@@ -298,7 +298,7 @@ def _overview(machines: Sequence[Machine], failed: Mapping[str, str]) -> str:
 
 
 def _summary(
-    documents: Answers, machines: Sequence[Machine], failures: Sequence[_Failed], page: Path
+    documents: Answers, machines: Sequence[FleetMachine], failures: Sequence[_Failed], page: Path
 ) -> RunSummary:
     count, several = len(documents), len(documents) > 1
     return RunSummary(

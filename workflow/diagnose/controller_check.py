@@ -22,7 +22,7 @@ from control_design.analysis.certificate import certify
 from control_design.analysis.closed_loop import LinearMachine, SampledMachine, measure_sensitivity, simulate
 from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller
-from control_design.plants.plant_set import Channel, UncertainPlant, modes_of
+from control_design.plants.plant_set import PlantChannel, UncertainPlant, modes_of
 from control_design.specification import Specification, SpecificationError
 from control_design.synthesis.synthesis import synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
@@ -72,7 +72,7 @@ class ControllerCheck:
     """Four runs on one trial: design on the stated rig predicted and achieved, design on the repaired one
     likewise."""
 
-    trial: Trial
+    trial: ControllerTrial
     specification: Specification
     certified: tuple[bool, bool]
     runs: tuple[Run, Run, Run, Run]
@@ -108,7 +108,7 @@ def check_controller(case: Case, rig: Rig, effects: tuple[Effect, ...]) -> Contr
     specification = _specification(case, plants[0])
     designs = [_designed(plant, specification) for plant in plants]
     certificates = [certify(k, [p.uncertain], specification) for k, p in zip(designs, plants, strict=True)]
-    trial = Trial.of(case, designs[0], plants[0])
+    trial = ControllerTrial.of(case, designs[0], plants[0])
     arm = _WatchedArm(rig, effects)
     runs = []
     for controller, plant, certificate in zip(designs, plants, certificates, strict=True):
@@ -136,7 +136,7 @@ def _plant(name: str, rig: Rig, effects: tuple[Effect, ...]) -> _Plant:
     both = sampled_linear_machine(rig, effects)
     hub, tip = (control.ss(both.A, both.B, both.C[i : i + 1], np.zeros((1, 1)), both.dt) for i in (0, 1))
     try:
-        return _Plant(both, UncertainPlant(name, hub, None, performance=Channel(tip)))
+        return _Plant(both, UncertainPlant(name, hub, None, performance=PlantChannel(tip)))
     except ValueError as error:
         raise NoControllerError(str(error)) from error
 
@@ -177,7 +177,7 @@ def _designed(plant: _Plant, specification: Specification) -> Controller:
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class ControllerTrial:
     """A step after a lead-in, half-way a short push by the voltage as well; arrays (T,)."""
 
     time_s: Real
@@ -186,7 +186,7 @@ class Trial:
     arm_m: float
 
     @classmethod
-    def of(cls, case: Case, controller: Controller, plant: _Plant) -> Trial:
+    def of(cls, case: Case, controller: Controller, plant: _Plant) -> ControllerTrial:
         dt = case.rig.sampling.dt_s
         radius = float(np.max(np.abs(closed_loop_poles(controller, plant.uncertain))))
         k = np.arange(settling_samples(radius, _SHORTEST, _LONGEST))
@@ -238,7 +238,7 @@ class _WatchedArm(SampledArm):
 
 
 def _measured_margin(
-    controller: Controller, plant: _Plant, arm: SampledArm, case: Case, trial: Trial
+    controller: Controller, plant: _Plant, arm: SampledArm, case: Case, trial: ControllerTrial
 ) -> float:
     """One over the largest |S| measured on the arm."""
     input_rms = rms_of([e.voltage_V for e in case.estimation])

@@ -25,7 +25,7 @@ _NUMBERS = ("probability", "gap_before", "gap_refit", "gap_after", "noise_floor"
 
 
 @dataclass(frozen=True, eq=False)
-class Machine:
+class FleetMachine:
     """What an overview keeps of an answer: numbers (`_NUMBERS`), sizes of the effects that are present, with
     95 % intervals, under (effect, parameter), and stated and repaired values by name."""
 
@@ -45,7 +45,7 @@ class Machine:
         return listing([in_words(name) for name in self.effects]) if self.effects else self.answer
 
     @classmethod
-    def of(cls, document: Mapping[str, Any]) -> Machine:
+    def of(cls, document: Mapping[str, Any]) -> FleetMachine:
         """Of a JSON answer."""
         present = {
             name: effect
@@ -76,7 +76,7 @@ class Group:
     sets them apart from others of this cause."""
 
     cause: str
-    machines: tuple[Machine, ...]
+    machines: tuple[FleetMachine, ...]
     apart: tuple[str, str] | None = None
 
     @property
@@ -103,9 +103,9 @@ class Trend:
     machines: int
 
 
-def groups(machines: Iterable[Machine]) -> list[Group]:
+def groups(machines: Iterable[FleetMachine]) -> list[Group]:
     """By cause, the most frequent first, and by size where there is a gap."""
-    found: dict[str, list[Machine]] = {}
+    found: dict[str, list[FleetMachine]] = {}
     for one in machines:
         found.setdefault(one.cause, []).append(one)
     ordered = sorted(found.items(), key=lambda item: (-len(item[1]), item[0]))
@@ -115,8 +115,8 @@ def groups(machines: Iterable[Machine]) -> list[Group]:
 
 
 def _by_size(
-    members: list[Machine], apart: tuple[str, str] | None = None
-) -> list[tuple[list[Machine], tuple[str, str] | None]]:
+    members: list[FleetMachine], apart: tuple[str, str] | None = None
+) -> list[tuple[list[FleetMachine], tuple[str, str] | None]]:
     """Parts that are farther from each other than any two of one part, by the size with the surest gap.
 
     Beyond that, sizes spread evenly over the whole range (on a log scale) would seldom leave such a gap: the
@@ -153,7 +153,7 @@ def serial_numbers(names: Sequence[str]) -> dict[str, int]:
     return {name: values[best] for name, values in numbers.items()} if len(set(columns[best])) > 1 else {}
 
 
-def trends(machines: Sequence[Machine]) -> list[Trend]:
+def trends(machines: Sequence[FleetMachine]) -> list[Trend]:
     """Sizes and values that rise or fall with the number in the names, the surest first.
 
     Kendall's rank test over the machines whose cause is decided; an effect that a machine lacks has the size
@@ -181,7 +181,7 @@ def trends(machines: Sequence[Machine]) -> list[Trend]:
     return sorted(found, key=lambda one: one.p)
 
 
-def csv_text(machines: Sequence[Machine], failures: Mapping[str, str]) -> str:
+def csv_text(machines: Sequence[FleetMachine], failures: Mapping[str, str]) -> str:
     """One row per machine with answer, numbers, sizes with intervals and values; then what failed."""
     numbers = serial_numbers([one.name for one in machines])
     rows: list[dict[str, Any]] = []

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from control_design.plants.multivariable import tustin_s
-from control_design.plants.scaled_bound import Rows, scaled_bound
+from control_design.plants.scaled_bound import BoundRows, scaled_bound
 from control_design.specification.multivariable import gram
 from workflow.config.joints_config import JointsConfig
 from workflow.figures import style
@@ -56,7 +56,7 @@ class JointsView:
                 size = gram(weights, s)
                 none = np.zeros_like(size)
                 on_y, on_u = (size, none) if of == "y" else (none, size)
-                gamma = scaled_bound(Rows(G, seen, entering, on_y, on_u, False), K).gamma
+                gamma = scaled_bound(BoundRows(G, seen, entering, on_y, on_u, False), K).gamma
                 found[name] = np.maximum(found.get(name, np.zeros(omega.size)), gamma)
         return omega, found
 

@@ -16,7 +16,7 @@ Number = float | int | None
 
 
 @dataclass(frozen=True)
-class Column:
+class StudyColumn:
     """A number of the table. `better` None: it is stated, not judged."""
 
     name: str
@@ -31,38 +31,38 @@ class Column:
 
 # Margins without further word are the worst over the ellipses, as the certificate states them.
 _ALL = (
-    Column("worst_gamma", "worst-case gamma", "", "smaller"),
-    Column("modulus_margin", "modulus margin", "", "larger"),
-    Column("gain_margin_dB", "gain margin", "dB", "larger"),
-    Column("phase_margin_deg", "phase margin", "deg", "larger"),
-    Column("delay_margin_ms", "delay margin", "ms", "larger"),
-    Column("disk_margin", "nominal disk margin, all joints at once", "", "larger"),
-    Column("bandwidth_rad_s", "bandwidth", "rad/s", "larger"),
-    Column("design_bandwidth_rad_s", "bandwidth of the design", "rad/s"),
-    Column("mode_damping", "mode damping", "", "larger"),
-    Column("mode_omega_rad_s", "of the mode at", "rad/s"),
-    Column("settling_time_s", "settling time", "s", "smaller"),
-    Column("rise_time_s", "rise time", "s", "smaller"),
-    Column("overshoot_percent", "overshoot", "%", "smaller"),
-    Column("peak_command", "peak command", "", "smaller"),
-    Column("disturbance_peak", "disturbance peak", "", "smaller"),
-    Column("settled_draws", "runs that stop moving"),
-    Column("draws", "runs"),
-    Column("design_gamma", "gamma of the design", "", "smaller"),
-    Column("any_order_gamma", "gamma of any order", "", "smaller"),
-    Column("above_any_order_percent", "above any order", "%", "smaller"),
-    Column("whole_held_percent", "sampled responses within gamma", "%", "larger"),
-    Column("whole_stable_percent", "sampled responses stable", "%", "larger"),
-    Column("matching_error", "model-matching error", "", "smaller"),
-    Column("matching_error_unfiltered", "model-matching error without reference filter", "", "smaller"),
-    Column("predicted_peak_sensitivity", "peak of S, predicted", "", "smaller"),
-    Column("measured_peak_sensitivity", "peak of S, measured", "", "smaller"),
-    Column("nominal_modulus_margin", "modulus margin, nominal", "", "larger"),
-    Column("nominal_gain_margin_dB", "gain margin, nominal", "dB", "larger"),
-    Column("nominal_phase_margin_deg", "phase margin, nominal", "deg", "larger"),
-    Column("nominal_delay_margin_ms", "delay margin, nominal", "ms", "larger"),
+    StudyColumn("worst_gamma", "worst-case gamma", "", "smaller"),
+    StudyColumn("modulus_margin", "modulus margin", "", "larger"),
+    StudyColumn("gain_margin_dB", "gain margin", "dB", "larger"),
+    StudyColumn("phase_margin_deg", "phase margin", "deg", "larger"),
+    StudyColumn("delay_margin_ms", "delay margin", "ms", "larger"),
+    StudyColumn("disk_margin", "nominal disk margin, all joints at once", "", "larger"),
+    StudyColumn("bandwidth_rad_s", "bandwidth", "rad/s", "larger"),
+    StudyColumn("design_bandwidth_rad_s", "bandwidth of the design", "rad/s"),
+    StudyColumn("mode_damping", "mode damping", "", "larger"),
+    StudyColumn("mode_omega_rad_s", "of the mode at", "rad/s"),
+    StudyColumn("settling_time_s", "settling time", "s", "smaller"),
+    StudyColumn("rise_time_s", "rise time", "s", "smaller"),
+    StudyColumn("overshoot_percent", "overshoot", "%", "smaller"),
+    StudyColumn("peak_command", "peak command", "", "smaller"),
+    StudyColumn("disturbance_peak", "disturbance peak", "", "smaller"),
+    StudyColumn("settled_draws", "runs that stop moving"),
+    StudyColumn("draws", "runs"),
+    StudyColumn("design_gamma", "gamma of the design", "", "smaller"),
+    StudyColumn("any_order_gamma", "gamma of any order", "", "smaller"),
+    StudyColumn("above_any_order_percent", "above any order", "%", "smaller"),
+    StudyColumn("whole_held_percent", "sampled responses within gamma", "%", "larger"),
+    StudyColumn("whole_stable_percent", "sampled responses stable", "%", "larger"),
+    StudyColumn("matching_error", "model-matching error", "", "smaller"),
+    StudyColumn("matching_error_unfiltered", "model-matching error without reference filter", "", "smaller"),
+    StudyColumn("predicted_peak_sensitivity", "peak of S, predicted", "", "smaller"),
+    StudyColumn("measured_peak_sensitivity", "peak of S, measured", "", "smaller"),
+    StudyColumn("nominal_modulus_margin", "modulus margin, nominal", "", "larger"),
+    StudyColumn("nominal_gain_margin_dB", "gain margin, nominal", "dB", "larger"),
+    StudyColumn("nominal_phase_margin_deg", "phase margin, nominal", "deg", "larger"),
+    StudyColumn("nominal_delay_margin_ms", "delay margin, nominal", "ms", "larger"),
 )
-COLUMNS: Mapping[str, Column] = {column.name: column for column in _ALL}
+COLUMNS: Mapping[str, StudyColumn] = {column.name: column for column in _ALL}
 
 
 def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None) -> dict[str, Number]:

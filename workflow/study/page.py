@@ -18,9 +18,9 @@ from workflow.config.joints_config import JointsConfig
 from workflow.engine import codec
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures import style
-from workflow.study.columns import COLUMNS, Column, Number, numbers_of, numbers_of_joints
+from workflow.study.columns import COLUMNS, Number, StudyColumn, numbers_of, numbers_of_joints
 from workflow.study.points import Combination, Point, short
-from workflow.study.settings import Axis, ParetoPlot, StudyConfig
+from workflow.study.settings import ParetoPlot, StudyAxis, StudyConfig
 from workflow.tasks.joints import JointsResults
 from workflow.tasks.results import RunResults
 from workflow.tasks.summary import summarise_joints, verdict_of
@@ -110,7 +110,7 @@ def row_without_run(point: Combination, state: State, why: str) -> PointRow:
     return PointRow(point.number, point.name, point.values, state, why, dict.fromkeys(COLUMNS))
 
 
-def csv_text(axes: Sequence[Axis], rows: Sequence[PointRow], front: Sequence[Sequence[int]]) -> str:
+def csv_text(axes: Sequence[StudyAxis], rows: Sequence[PointRow], front: Sequence[Sequence[int]]) -> str:
     """The table; numbers with every digit, nothing where there is none.
 
     front: numbers of the points on each Pareto front; a column each.
@@ -181,7 +181,7 @@ class StudyView:
     def counts(self) -> Mapping[State, int]:
         return Counter(row.state for row in self.rows)
 
-    def column(self, name: str) -> Column:
+    def column(self, name: str) -> StudyColumn:
         return COLUMNS[name]
 
     def unit(self, name: str) -> str:
@@ -196,7 +196,7 @@ class StudyView:
         return [name for name in names if any(row.numbers[name] is not None for row in self.rows)]
 
     @property
-    def best(self) -> list[tuple[Column, PointRow]]:
+    def best(self) -> list[tuple[StudyColumn, PointRow]]:
         """The best certified point by each of the columns one asks for first."""
         found = []
         # Where requirements differ, so does what a gamma of 1 means.

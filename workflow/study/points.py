@@ -18,7 +18,7 @@ from workflow.config.settings import check
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory, hash_of
-from workflow.study.settings import Axis, StudyConfig, last_name, with_values
+from workflow.study.settings import StudyAxis, StudyConfig, last_name, with_values
 from workflow.tasks.pipeline import Kind, any_config_of, kind_of
 
 
@@ -194,7 +194,7 @@ class PointMaker:
         readable = re.sub(r"[^A-Za-z0-9_.-]+", "_", "_".join(words))[:90]
         return f"{readable or 'base'}_{digest[:10]}"
 
-    def _refuse_bad_values(self, index: int, axis: Axis) -> None:
+    def _refuse_bad_values(self, index: int, axis: StudyAxis) -> None:
         """A value no combination can make right is an error of the study, named with file and key."""
         ends: dict[str, Any] = {"from": axis.from_, "to": axis.to}
         if axis.values is not None:

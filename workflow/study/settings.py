@@ -41,7 +41,7 @@ DottedKey = Annotated[str, AfterValidator(_key)]
 Judged = Annotated[str, AfterValidator(_judged)]
 
 
-class Axis(Section):
+class StudyAxis(Section):
     """One key and the values it takes."""
 
     key: DottedKey = Field(
@@ -148,7 +148,7 @@ class StudyConfig(Section):
     changes: Mapping[DottedKey, Any] = Field(
         default_factory=dict, description="dotted keys of the base with other values for every point"
     )
-    axes: tuple[Axis, ...] = Field(min_length=1, max_length=12)
+    axes: tuple[StudyAxis, ...] = Field(min_length=1, max_length=12)
     pareto: tuple[ParetoPlot, ...] = Field(_DEFAULT_PLOTS, min_length=1, max_length=4)
 
     @model_validator(mode="after")

@@ -35,7 +35,7 @@ class Done:
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class PointTask:
     """Points for one worker, one after the other: a result two of them share is computed once.
 
     given: stage files (name to content) that every point starts from. stages: names of those to compute.

@@ -27,7 +27,7 @@ from workflow.study.points import (
     shared_stages,
 )
 from workflow.study.settings import JOINTS_PLOTS, StudyFile
-from workflow.study.task import Done, Task
+from workflow.study.task import Done, PointTask
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage
 from workflow.text.templates import RunSummary
@@ -182,12 +182,12 @@ class _Work:
         self.progress.update("points", min(share, 1.0), message)
 
 
-def _task(points: Sequence[Point], given: Mapping[str, bytes], stages: Sequence[Stage]) -> Task:
-    return Task(tuple(points), given, tuple(stage.name for stage in stages), code_digest())
+def _task(points: Sequence[Point], given: Mapping[str, bytes], stages: Sequence[Stage]) -> PointTask:
+    return PointTask(tuple(points), given, tuple(stage.name for stage in stages), code_digest())
 
 
 def _done(
-    executor: Executor, groups: Sequence[Sequence[Point]], tasks: Sequence[Task]
+    executor: Executor, groups: Sequence[Sequence[Point]], tasks: Sequence[PointTask]
 ) -> Iterator[list[tuple[Point, Done | Failure]]]:
     """What became of the points of each task, as they finish."""
     for index, found in executor.run(tasks):

@@ -19,7 +19,7 @@ Real = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Limits:
+class ExperimentLimits:
     """What an experiment may do; angles are those of the hub, None where nobody stated one.
 
     rms_V: the ladder, or none for half of the highest that the limits allow, and that. gain_rad_per_Vs: speed
@@ -53,7 +53,7 @@ class PlannedRecord:
 class PlannedExperiment:
     """voltages_V (A, M, T) over amplitudes, realisations and samples."""
 
-    limits: Limits
+    limits: ExperimentLimits
     plan: ExperimentPlan
     seed: int
     voltages_V: Real
@@ -102,7 +102,7 @@ class PlannedExperiment:
         return tuple(self.plan.radius(rms, self.limits.dt_s, noise) for rms in self.plan.rms_V)
 
 
-def motion_of(limits: Limits) -> Callable[[Real], Real] | None:
+def motion_of(limits: ExperimentLimits) -> Callable[[Real], Real] | None:
     """Hub angle (T,) [rad] from rest under a voltage (T,): that of the linear rig, or of an integrator."""
     rig, gain = limits.rig, limits.gain_rad_per_Vs
     if rig is not None:
@@ -116,7 +116,7 @@ def motion_of(limits: Limits) -> Callable[[Real], Real] | None:
 
 
 def plan_experiment(
-    limits: Limits, *, seed: int, lead_in_s: float = 1.0, **settings: object
+    limits: ExperimentLimits, *, seed: int, lead_in_s: float = 1.0, **settings: object
 ) -> PlannedExperiment:
     """The longest periods and largest voltages that the limits allow; settings: fields of the plan by name.
 

@@ -19,7 +19,7 @@ from control_design.analysis.joint_coverage import JointCoverage
 from control_design.controllers.controller import Controller, FrictionFeedforward
 from control_design.convex.reference_filter import ReferenceFilter
 from control_design.convex.youla import YoulaBracket
-from control_design.plants.plant_set import Channel as PlantChannel, UncertainPlant
+from control_design.plants.plant_set import PlantChannel as PlantChannel, UncertainPlant
 from control_design.specification import Specification
 from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
 from ident.basis.model import GobfModel

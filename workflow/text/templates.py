@@ -83,7 +83,7 @@ class Row(NamedTuple):
     value: str
 
 
-class Section(NamedTuple):
+class TableSection(NamedTuple):
     title: str
     rows: Sequence[Row]
 
@@ -97,7 +97,7 @@ class RunSummary:
     """
 
     title: str
-    sections: Sequence[Section]
+    sections: Sequence[TableSection]
     numbers: Mapping[str, Any] = field(default_factory=dict)
     certified: bool | None = None
     verdict: str = ""
@@ -121,7 +121,7 @@ class RunSummary:
 
 def rows_of(
     template: str, filters: Iterable[tuple[str, Callable[..., Any]]] = (), **values: Any
-) -> list[Section]:
+) -> list[TableSection]:
     """A table by template: plain text on one line each.
 
     The template calls part("title") and {% call line("label") %}value{% endcall %}; an empty value is no row,
@@ -140,7 +140,7 @@ def rows_of(
         return ""
 
     environment(*filters).get_template(template).render(part=part, line=line, **values)
-    return [Section(title, rows) for title, rows in parts if rows]
+    return [TableSection(title, rows) for title, rows in parts if rows]
 
 
 def _plain(text: str) -> str:
