@@ -15,15 +15,14 @@ import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import fields
 from enum import StrEnum
+from functools import cache
 from importlib import metadata
 from pathlib import Path
-from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperGroup
 
 from workflow.engine import interrupts
 from workflow.engine.errors import (
@@ -41,19 +40,37 @@ from workflow.engine.errors import (
     one_line,
 )
 from workflow.engine.threads import one_thread
+from workflow.field_options import completed, option_name, with_fields
 
 if TYPE_CHECKING:
-    from pydantic.fields import FieldInfo
-
     from workflow.commands.logs import Reading
     from workflow.config.settings import ModelT
     from workflow.console import TerminalProgress
     from workflow.text.templates import RunSummary
 
+_SIMULATOR = ("mjcf", "fmu", "python", "motion", "log", "dt_s", "repair", "resample_s")
 _MANIFESTS = ("manifest.json", "study.json", "diagnose.json", "blind.json")  # of what can be continued
+
+
+class _Commands(TyperGroup):
+    """Options for fields of settings are made when their command is called."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name, found, rest = super().resolve_command(ctx, args)
+        known = _commands().get(name or "")
+        return name, _completed(known) if hasattr(known, "of_fields") else found, rest
+
+
+@cache
+def _completed(command: Callable[..., Any]) -> Any:
+    alone = typer.Typer(add_completion=False, rich_markup_mode=None)
+    alone.command()(completed(command))
+    return typer.main.get_command(alone)
+
 
 app = typer.Typer(
     name="flexlink",
+    cls=_Commands,
     help="From a flexible-link arm and its logs to a robust controller with a certificate.",
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
@@ -63,35 +80,6 @@ app = typer.Typer(
     "SIGTERM, SIGHUP. Example: flexlink run --out "
     "runs/first",
 )
-
-# Settings whose fields are set by options; such an option has one of these in place of its help.
-_IDENT = "workflow.config.uncertainty_options:FitOptions"
-_ELLIPSES = "workflow.config.uncertainty_options:UncertaintyOptions"
-_LOGS, _CHANNEL = "workflow.config.run_config:FileSource", "workflow.config.run_config:Channel"
-_PLAN = "plant.experiment_plan:ExperimentPlan"
-_LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
-
-
-class _OfSettings(TyperCommand):
-    """Options say what the fields they set say. For the help alone: settings are slow to load."""
-
-    def format_options(self, ctx: Any, formatter: Any) -> None:
-        for option in self.params:
-            if (place := getattr(option, "help", None)) in (_IDENT, _ELLIPSES, _LOGS, _CHANNEL, _PLAN):
-                field = resolve_name(place).model_fields[option.name]
-                option.help = _described(field, option.default)  # type: ignore[attr-defined]
-        super().format_options(ctx, formatter)
-
-
-def _described(field: FieldInfo, own_default: object) -> str:
-    """Description, choices, range and, where the option has none of its own, default of a field."""
-    said = str(field.description)
-    choices = [get_args(kind) for kind in (field.annotation, *get_args(field.annotation))]
-    more = [", ".join(some) for some in choices if len(some) > 1 and isinstance(some[0], str)]
-    more += [f"{_LIMITS[k]} {getattr(m, k):g}" for m in field.metadata for k in _LIMITS if hasattr(m, k)]
-    if own_default is None and field.default is not None and "default:" not in said:
-        more.append(f"default: {field.default}")
-    return said[0].upper() + said[1:] + (f" [{'; '.join(more)}]" if more else ".")
 
 
 Jobs = Annotated[
@@ -140,42 +128,36 @@ CFloat = Annotated[
 ]
 
 
-InputName = Annotated[
-    str | None, typer.Option("--input", help="Name of the input column [default: as names and units say]")
+Logs = Annotated[
+    list[Path], typer.Argument(help="CSV or other tables, npz, MAT, ... (docs/logs.md); used together.")
 ]
-OutputName = Annotated[str | None, typer.Option("--output", help="Name of the output column.")]
-Time = Annotated[str | None, typer.Option(help="Name of the time column [default: what looks like it]")]
-Reference = Annotated[
-    str | None,
-    typer.Option(help="Reference column of logs made in closed loop [default: what looks like one]"),
+Config = Annotated[
+    Path | None, typer.Option(help="TOML file (see examples/ and README); without it the built-in arm.")
 ]
-Scale = Annotated[
-    list[str] | None,
-    typer.Option(help="COLUMN=FACTOR: quantity = factor * column + offset (repeatable).", metavar="TEXT"),
-]
-Unit = Annotated[list[str] | None, typer.Option(help="COLUMN=UNIT of the scaled quantity (repeatable).")]
-Unwrap = Annotated[
-    list[str] | None,
-    typer.Option(help="COLUMN=PERIOD of a column that wraps: encoder=4096, angle_deg=360 (repeatable)."),
-]
-Mjcf = Annotated[str | None, typer.Option(help="MuJoCo model of the machine, in place of a case.")]
-Fmu = Annotated[
-    str | None,
-    typer.Option(help="FMU (FMI 2.0, co-simulation), in place of a case; runs its native code."),
-]
-Python = Annotated[str | None, typer.Option(help="Python file with a simulation, in place of a case.")]
-Motion = Annotated[
-    str | None,
-    typer.Option(
-        help="Of an FMU or Python file: the first output is the position or speed of the body that the "
-        "first input drives. [default: by its unit]"
+NewDirectory = Annotated[Path, typer.Option(help="Directory for what is written; new or empty.")]
+Source = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="Run directory; npz of `flexlink identify --out`; JSON or MAT of its --export, or with A, B, C, "
+        "D, dt_s of your own model; CSV with a measured frequency response. Several: one controller for all."
     ),
 ]
-MachineLog = Annotated[
-    list[str] | None,
-    typer.Option(help="Log of that machine; of several the last one judges, of one its last third."),
+DesignFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--spec",
+        "--specification",
+        help="TOML with the keys of [specification], and [plant], [uncertainty], [synthesis], [certificate], "
+        "[achievable_performance], [reference_filter] where needed; for a run directory its own if left out.",
+    ),
 ]
-MachineDt = Annotated[float | None, typer.Option(help="Sampling period [s] of its logs without time.")]
+Cases = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="Case folder with case.toml, rig.toml and logs, or a TOML file like case.toml with a column map "
+        "beside logs of your own, or one that names a simulator's model; several give an overview as well."
+    ),
+]
 Seed = Annotated[int, typer.Option(min=0, help="Root of the random starts.")]
 
 
@@ -204,10 +186,7 @@ def _root(
 
 @app.command(short_help="Everything, from records to report.html.")
 def run(
-    config: Annotated[
-        Path | None,
-        typer.Option(help="TOML file (see examples/ and README); without it the built-in default arm."),
-    ] = None,
+    config: Config = None,
     out: Annotated[
         Path | None, typer.Option(help="Run directory, new or empty [default: runs/<name>-<date>-<time>]")
     ] = None,
@@ -238,11 +217,8 @@ def run(
 
 @app.command(short_help="Simulate experiments and write them as CSV.")
 def simulate(
-    out: Annotated[Path, typer.Option(help="Directory for one CSV file per record; new or empty.")],
-    config: Annotated[
-        Path | None,
-        typer.Option(help="TOML file with [source] kind = 'simulated'; without it the default arm."),
-    ] = None,
+    out: NewDirectory,
+    config: Config = None,
     time_limit: TimeLimit = None,
     as_json: Json = False,
 ) -> None:
@@ -253,182 +229,161 @@ def simulate(
     _show_files(simulate_to_csv(config, out), as_json)
 
 
-@app.command(cls=_OfSettings, short_help="Plan an experiment: voltages as CSV, plan, page.")
+@app.command(short_help="Plan an experiment: voltages as CSV, plan, page.")
+@with_fields(
+    limits=(
+        "band_Hz",
+        "duration_s",
+        "dt_s",
+        "peak_V",
+        "motion",
+        "rms_V",
+        "angle_deg",
+        "rig",
+        "gain_rad_per_Vs",
+        "noise_std_rad",
+        "lead_in_s",
+    ),
+    reading=("input_name", "output_name", "reference"),
+    plan=("realisations", "periods"),
+)
 def excite(
-    out: Annotated[Path, typer.Option(help="Directory for the files; new or empty.")],
-    band: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            help="Frequencies to excite [Hz], low and high [default with --closed-loop: two decades up to "
-            "twice the first mode, or the highest that the logs tell]"
-        ),
-    ] = None,
-    duration: Annotated[
-        float | None,
-        typer.Option(
-            help="Time allowed for all records together [s] [default with --closed-loop: what the band needs]"
-        ),
-    ] = None,
+    out: NewDirectory,
     log: Annotated[
         list[Path] | None, typer.Argument(help="With --closed-loop: logs of the loop that is there.")
     ] = None,
     closed_loop: Annotated[
         bool, typer.Option("--closed-loop", help="Plan a reference for the loop that made the logs.")
     ] = False,
-    dt_s: Annotated[float | None, typer.Option(help="Sampling period [s]; of logs their own.")] = None,
-    voltage: Annotated[
-        float | None,
-        typer.Option(
-            help="Largest voltage allowed [V]; with --closed-loop the largest command, in its unit [default "
-            "there: 80 % of the logs' largest]"
-        ),
-    ] = None,
-    motion: Annotated[
-        float | None,
-        typer.Option(
-            help="With --closed-loop: largest motion, in the output's unit [default: the logs' largest]"
-        ),
-    ] = None,
-    input_name: InputName = None,
-    output_name: OutputName = None,
-    reference: Reference = None,
-    rms: Annotated[
-        list[float] | None,
-        typer.Option(help="Root mean square [V] (repeatable) [default: the highest allowed, and half of it]"),
-    ] = None,
-    angle: Annotated[
-        float | None, typer.Option(help="Largest hub angle allowed [degrees]; needs --rig or --gain.")
-    ] = None,
-    rig: Annotated[
-        str | None, typer.Option(help="Rig file or 'paper_link': predicts motion and response.")
-    ] = None,
-    gain: Annotated[
-        float | None, typer.Option(help="Rough speed of the hub per volt [rad/s per V], without a rig.")
-    ] = None,
-    noise_std: Annotated[
-        float | None, typer.Option(help="Sensor noise of the hub angle [rad]: predicts radii.")
-    ] = None,
-    realisations: Annotated[int | None, typer.Option(help=_PLAN)] = None,
-    periods: Annotated[int | None, typer.Option(help=_PLAN)] = None,
-    lead_in: Annotated[float, typer.Option(min=0, help="From rest to steady state [s].")] = 1.0,
-    seed: Annotated[int, typer.Option(min=0, help="Root of the random phases and lines.")] = 2006,
+    seed: Seed = 2006,
     time_limit: TimeLimit = None,
     as_json: Json = False,
+    **of_fields: Any,
 ) -> None:
     """Plan random-phase multisines that tell response, noise and nonlinear distortion apart."""
-    named = locals()
-    given = _stated({"realisations": realisations, "periods": periods})
+    stated = _stated(of_fields)
+    given: dict[str, Any] = {name: stated.pop(name) for name in ("realisations", "periods") if name in stated}
     if closed_loop != bool(log):
         raise InputError("--closed-loop goes with logs of the loop: flexlink excite --closed-loop LOG... ...")
     if log:
         need(*log)
         from workflow.commands.excite import write_reference
 
-        given |= {"band_Hz": band, "duration_s": duration, "seed": seed, "lead_in_s": lead_in}
+        given |= {name: stated[name] for name in ("band_Hz", "duration_s", "lead_in_s") if name in stated}
         summary = write_reference(
             log,
             out,
-            _reading(named),
-            largest_command=voltage,
-            largest_motion=motion,
-            rms=rms[0] if rms else None,
+            _reading({name: of_fields[name] for name in ("input_name", "output_name", "reference")}),
+            largest_command=stated.get("peak_V"),
+            largest_motion=stated.get("motion"),
+            rms=next(iter(stated.get("rms_V", ())), None),
+            seed=seed,
             **given,
         )
         _show(summary, as_json)
         return
-    if dt_s is None or voltage is None or band is None or duration is None:
+    if not {"dt_s", "peak_V", "band_Hz", "duration_s"} <= stated.keys():
         raise InputError(
             "an experiment in open loop needs --dt-s SECONDS, --voltage LARGEST, --band LOW HIGH "
             "and --duration SECONDS"
         )
+    if "motion" in stated:
+        raise InputError("--motion goes with --closed-loop; in open loop --angle bounds the motion")
     from workflow.commands.excite import write_experiment
     from workflow.config.rig_settings import rig_called
     from workflow.tasks.experiment import ExperimentLimits
 
-    limits = ExperimentLimits(
-        band_Hz=band,
-        dt_s=dt_s,
-        duration_s=duration,
-        peak_V=voltage,
-        rms_V=tuple(rms or ()),
-        angle_deg=angle,
-        gain_rad_per_Vs=gain,
-        rig=None if rig is None else rig_called(rig),
-        noise_std_rad=noise_std,
-    )
-    _show_files(write_experiment(limits, out, seed=seed, lead_in_s=lead_in, **given), as_json)
+    rig = stated.pop("rig", None)
+    limits = _settings(ExperimentLimits, stated)
+    if rig is not None:
+        limits = limits.model_copy(update={"rig": rig_called(rig)})
+    _show_files(write_experiment(limits, out, seed=seed, **given), as_json)
 
 
-@app.command(cls=_OfSettings, short_help="What a log holds: columns, units, sampling, ranges.")
+@app.command(short_help="What a log holds: columns, units, sampling, ranges.")
+@with_fields(reading=("time", "time_unit", "decimal"))
 def look(
     log: Annotated[Path, typer.Argument(help="CSV or other tables, npz, MAT, ... (docs/logs.md).")],
-    time: Time = None,
-    time_unit: Annotated[str | None, typer.Option(help=_LOGS)] = None,
-    decimal: Annotated[str | None, typer.Option(help=_LOGS)] = None,
     out: Annotated[Path | None, typer.Option(help="Write a page here (HTML, one file).")] = None,
     time_limit: TimeLimit = None,
     as_json: Json = False,
+    **of_fields: Any,
 ) -> None:
     """Columns, units, sampling (period, jitter, missing rows), ranges, clipping and quantisation of a log."""
     need(log)
     from workflow.commands.look import look as look_at_log
 
-    _show(look_at_log(log, time=time, time_unit=time_unit, decimal=decimal, out=out), as_json)
+    _show(look_at_log(log, out=out, **of_fields), as_json)
 
 
-@app.command(cls=_OfSettings, short_help="Write a configuration that runs, from logs.")
+@app.command(short_help="Write a configuration that runs, from logs.")
+@with_fields(
+    reading=(
+        "input_name",
+        "output_name",
+        "reference",
+        "time",
+        "time_unit",
+        "dt_s",
+        "scale",
+        "units",
+        "unwrap",
+        "decimal",
+        "input_limit",
+    )
+)
 def init(
-    log: Annotated[
-        list[Path],
-        typer.Argument(help="CSV or other tables, npz, MAT, ... (docs/logs.md); the last one validates."),
-    ],
+    log: Logs,
     out: Annotated[Path, typer.Option(help="Write the configuration here (TOML), for `flexlink run`.")],
-    input_name: InputName = None,
-    output_name: OutputName = None,
-    reference: Reference = None,
-    time: Time = None,
-    time_unit: Annotated[str | None, typer.Option(help=_LOGS)] = None,
-    dt_s: Annotated[float | None, typer.Option(help="Sampling period [s], without a time column.")] = None,
-    scale: Scale = None,
-    unit: Unit = None,
-    unwrap: Unwrap = None,
-    decimal: Annotated[str | None, typer.Option(help=_LOGS)] = None,
-    input_limit: Annotated[float | None, typer.Option(help=_LOGS)] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Write over what is at --out.")] = False,
     time_limit: TimeLimit = None,
     as_json: Json = False,
+    **of_fields: Any,
 ) -> None:
     """Look at logs and write a configuration that runs: columns, roles, structure and a specification."""
-    given = locals()
     need(*log)
     from workflow.commands.init import init as write_configuration
 
-    _show(write_configuration(log, out, _reading(given), replace_file=replace), as_json)
+    _show(write_configuration(log, out, _reading(of_fields), replace_file=replace), as_json)
 
 
-@app.command(cls=_OfSettings, short_help="Identify one channel from log files; one-page report.")
+@app.command(short_help="Identify one channel from log files; one-page report.")
+@with_fields(
+    reading=(
+        "input_name",
+        "output_name",
+        "reference",
+        "time",
+        "time_unit",
+        "dt_s",
+        "scale",
+        "offset",
+        "units",
+        "repair",
+        "resample_s",
+        "unwrap",
+        "decimal",
+        "input_limit",
+    ),
+    loop=("closed_loop_data.method",),
+    fit=(
+        "n_pairs",
+        "n_real",
+        "integrators",
+        "input_delay_samples",
+        "feedthrough",
+        "relative_degree",
+        "noise",
+        "omega_min_rad_s",
+        "omega_max_rad_s",
+        "zeta_min",
+        "zeta_max",
+    ),
+    channel=("band_rad_s",),
+    ellipses=("level", "response", "max_ar_order"),
+)
 def identify(
-    log: Annotated[
-        list[Path],
-        typer.Argument(
-            help="CSV or other tables, npz, MAT, ... (docs/logs.md); several files are fitted together."
-        ),
-    ],
-    input_name: InputName = None,
-    output_name: OutputName = None,
-    time: Time = None,
-    time_unit: Annotated[str | None, typer.Option(help=_LOGS)] = None,
-    dt_s: Annotated[
-        float | None,
-        typer.Option(help="Sampling period [s], if there is no --time; beside it, the exact one within 1 %."),
-    ] = None,
-    scale: Scale = None,
-    offset: Annotated[list[str] | None, typer.Option(help="COLUMN=VALUE, added after scaling.")] = None,
-    unit: Unit = None,
-    repair: Annotated[bool, typer.Option("--repair", help=_LOGS)] = False,
-    resample_s: Annotated[float | None, typer.Option(help=_LOGS)] = None,
-    unwrap: Unwrap = None,
-    decimal: Annotated[str | None, typer.Option(help=_LOGS)] = None,
+    log: Logs,
     report_page: Annotated[
         Path | None,
         typer.Option(
@@ -439,27 +394,6 @@ def identify(
     validation: Annotated[
         list[Path] | None, typer.Option(help="Log kept for validation (repeatable).")
     ] = None,
-    reference: Reference = None,
-    loop_method: Annotated[
-        str | None,
-        typer.Option(help="Of logs made in closed loop: auto, direct or two_stage [default: auto]."),
-    ] = None,
-    input_limit: Annotated[float | None, typer.Option(help=_LOGS)] = None,
-    n_pairs: Annotated[int | None, typer.Option("--pairs", help=_IDENT)] = None,
-    n_real: Annotated[int | None, typer.Option("--real", help=_IDENT)] = None,
-    integrators: Annotated[int | None, typer.Option(help=_IDENT)] = None,
-    input_delay_samples: Annotated[int | None, typer.Option("--delay", help=_IDENT)] = None,
-    feedthrough: Annotated[bool, typer.Option("--feedthrough", help=_IDENT)] = False,
-    relative_degree: Annotated[str | None, typer.Option(help=_IDENT)] = None,
-    level: Annotated[float | None, typer.Option(help=_ELLIPSES)] = None,
-    response: Annotated[str | None, typer.Option(help=_ELLIPSES)] = None,
-    band_rad_s: Annotated[tuple[float, float] | None, typer.Option("--band", help=_CHANNEL)] = None,
-    noise: Annotated[str | None, typer.Option(help=_IDENT)] = None,
-    max_ar_order: Annotated[int | None, typer.Option("--noise-order", help=_ELLIPSES)] = None,
-    omega_min_rad_s: Annotated[float | None, typer.Option("--omega-min", help=_IDENT)] = None,
-    omega_max_rad_s: Annotated[float | None, typer.Option("--omega-max", help=_IDENT)] = None,
-    zeta_min: Annotated[float | None, typer.Option(help=_IDENT)] = None,
-    zeta_max: Annotated[float | None, typer.Option(help=_IDENT)] = None,
     export: Annotated[
         Path | None,
         typer.Option(
@@ -473,11 +407,12 @@ def identify(
     time_limit: TimeLimit = None,
     quiet: Quiet = False,
     as_json: Json = False,
+    **of_fields: Any,
 ) -> None:
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
-    # A number where one was given, so that the settings' own complaint names what is allowed.
-    number = int(relative_degree) if relative_degree and relative_degree.isdigit() else relative_degree
-    given = locals() | {"relative_degree": number}
+    given, degree = of_fields, of_fields["relative_degree"]
+    if degree and degree.isdigit():  # so that the settings' own complaint names what is allowed
+        given["relative_degree"] = int(degree)
     need(*log, *(validation or []))
     from workflow.commands.logs import are_responses, read_logs
     from workflow.config.run_config import ClosedLoopData
@@ -487,22 +422,19 @@ def identify(
     options = _settings(FitOptions, given)
     with _watched(quiet) as progress:
         described = _settings(UncertaintyOptions, given)
-        loop = _settings(ClosedLoopData, {"method": loop_method})
+        loop = _settings(ClosedLoopData, {"method": given["closed_loop_data_method"]})
         written = [("--out", out), ("--report", report_page), ("--export", export)]
         # A log given twice would count its noise twice as well known, or validate what it was fitted to.
         refuse_in_the_way([*log, *(validation or [])], [(name, path) for name, path in written if path])
-        if (input_name, output_name, time) == (None, None, None) and are_responses(log):
+        columns = (given[name] for name in ("input_name", "output_name", "time"))
+        if not any(columns) and are_responses(log):
             from workflow.commands.identify_response import identify_response
 
-            of_logs = {
-                "--report": report_page, "--validation": validation, "--reference": reference,
-                "--band": band_rad_s, "--input-limit": input_limit, "--noise-order": max_ar_order,
-                "--time-unit": time_unit, "--scale": scale, "--offset": offset, "--unit": unit,
-                "--repair": repair, "--loop-method": loop_method,
-            }  # fmt: skip
+            of_logs = {option_name(key): given[key.replace(".", "_")] for key in _OF_LOGS}
+            of_logs |= {"--report": report_page, "--validation": validation}
             summary = identify_response(
                 log,
-                dt_s,
+                given["dt_s"],
                 level=described.level,
                 options=options,
                 out=out,
@@ -520,7 +452,7 @@ def identify(
             logs,
             options=options,
             described=described,
-            band_rad_s=band_rad_s,
+            band_rad_s=given["band_rad_s"],
             loop=loop,
             out=out,
             report=report_page,
@@ -528,6 +460,21 @@ def identify(
             progress=progress,
         )
     _identified(summary, as_json, export, out)
+
+
+# Options of `identify` that a measured response has no use for.
+_OF_LOGS = (
+    "reference",
+    "band_rad_s",
+    "input_limit",
+    "max_ar_order",
+    "time_unit",
+    "scale",
+    "offset",
+    "units",
+    "repair",
+    "closed_loop_data.method",
+)
 
 
 def _identified(summary: RunSummary, as_json: bool, export: Path | None, out: Path | None) -> None:
@@ -543,24 +490,8 @@ def _identified(summary: RunSummary, as_json: bool, export: Path | None, out: Pa
 
 @app.command()
 def design(
-    source: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Run directory; npz of `flexlink identify --out`; JSON or MAT of its --export, or with A, "
-            "B, C, D, dt_s of your own model; CSV with a measured frequency response. Several: one "
-            "controller for all of them."
-        ),
-    ],
-    specification: Annotated[
-        Path | None,
-        typer.Option(
-            "--spec",
-            "--specification",
-            help="TOML with the keys of [specification], and [plant], [uncertainty], [synthesis], "
-            "[certificate], [achievable_performance], [reference_filter] where needed; for a run directory "
-            "its own if left out.",
-        ),
-    ] = None,
+    source: Source = None,
+    specification: DesignFile = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -577,6 +508,8 @@ def design(
     as_json: Json = False,
 ) -> None:
     """Design and certify one controller for one or several plants, identified here or brought along."""
+    if not source:
+        raise InputError("flexlink design needs a source: a run directory, a model or a measured response")
     need(*source, specification)
     with _watched(quiet) as progress:
         from control_design.controllers.c_code import Dialect
@@ -594,16 +527,8 @@ def design(
 
 @app.command(short_help="A page with sliders: designs as you move them.")
 def tune(
-    source: Annotated[
-        list[Path] | None,
-        typer.Argument(help="As of `flexlink design`: a finished run directory, or another description."),
-    ] = None,
-    specification: Annotated[
-        Path | None,
-        typer.Option(
-            "--spec", "--specification", help="Design file to begin with; for a run directory its own."
-        ),
-    ] = None,
+    source: Source = None,
+    specification: DesignFile = None,
     demo: Annotated[bool, typer.Option("--demo", help="Tune the built-in arm, identified first.")] = False,
     out: Annotated[Path, typer.Option(help="Saved designs go below this directory.")] = Path("runs/tuned"),
     seed: Seed = 2006,
@@ -652,7 +577,7 @@ def report(
 @app.command(short_help="Many designs for one plant: table, Pareto plot.")
 def study(
     config: Annotated[Path, typer.Option(help="TOML file of the study (see examples/study.toml).")],
-    out: Annotated[Path, typer.Option(help="Directory of the study, new or empty.")],
+    out: NewDirectory,
     jobs: Jobs = None,
     scheduler: Scheduler = None,
     resume: Resume = False,
@@ -678,53 +603,30 @@ def study(
     _leave(summary)
 
 
-@app.command(cls=_OfSettings, short_help="What logs can tell of a simulator's model, in seconds.")
+@app.command(short_help="What logs can tell of a simulator's model, in seconds.")
+@with_fields(simulator=_SIMULATOR)
 def check(
-    case: Annotated[
-        list[Path] | None, typer.Argument(help="TOML file that names a simulator's model and its logs.")
-    ] = None,
-    mjcf: Mjcf = None,
-    fmu: Fmu = None,
-    python: Python = None,
-    motion: Motion = None,
-    log: MachineLog = None,
-    dt_s: MachineDt = None,
-    repair: Annotated[bool, typer.Option("--repair", help=_LOGS)] = False,
-    resample_s: Annotated[float | None, typer.Option(help=_LOGS)] = None,
+    case: Cases = None,
     time_limit: TimeLimit = None,
     as_json: Json = False,
+    **of_fields: Any,
 ) -> None:
     """Quality of logs, smallest sizes that show, candidates that act alike, what a next record needs."""
-    of_logs = {"motion": motion, "dt_s": dt_s, "repair": repair or None, "resample_s": resample_s}
-    stated = _of_simulator("check", case or [], mjcf, fmu, python, log, of_logs)
+    stated = _of_simulator("check", case or [], of_fields)
     need(*case or [])
     if case and len(case) > 1:
         raise InputError("check: expected one case file")
     from workflow.diagnose.check import check as look_at_case
-    from workflow.diagnose.simulator_case import settings_of
+    from workflow.diagnose.simulator_settings import settings_of
 
     _show(look_at_case(case[0] if case else settings_of(stated, "--log")), as_json)
 
 
-@app.command(cls=_OfSettings, short_help="Cause and size of a model error; how much of it is explained.")
+@app.command(short_help="Cause and size of a model error; how much of it is explained.")
+@with_fields(simulator=_SIMULATOR)
 def diagnose(
-    out: Annotated[Path, typer.Option(help="Directory for answers, pages and repaired rigs; new or empty.")],
-    case: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            help="Case folder with case.toml, rig.toml and logs, or a TOML file like case.toml with a column "
-            "map beside logs of your own, or one that names a simulator's model; several give an overview as "
-            "well."
-        ),
-    ] = None,
-    mjcf: Mjcf = None,
-    fmu: Fmu = None,
-    python: Python = None,
-    motion: Motion = None,
-    log: MachineLog = None,
-    dt_s: MachineDt = None,
-    repair: Annotated[bool, typer.Option("--repair", help=_LOGS)] = False,
-    resample_s: Annotated[float | None, typer.Option(help=_LOGS)] = None,
+    out: NewDirectory,
+    case: Cases = None,
     rig: Annotated[
         str | None,
         typer.Option(
@@ -749,11 +651,11 @@ def diagnose(
     ] = None,
     quiet: Quiet = False,
     as_json: Json = False,
+    **of_fields: Any,
 ) -> None:
     """Records and rig -> is there a gap, where, which effect, how far it shrinks, what to do next."""
     case = case or []
-    of_logs = {"motion": motion, "dt_s": dt_s, "repair": repair or None, "resample_s": resample_s}
-    stated = _of_simulator("diagnose", case, mjcf, fmu, python, log, of_logs)
+    stated = _of_simulator("diagnose", case, of_fields)
     _one_of(jobs, scheduler)
     if case and not any(place.exists() for place in case):
         need(*case)
@@ -765,7 +667,7 @@ def diagnose(
         load_case(case[0], rig)  # what is refused does not wait for what diagnoses to be loaded: seconds
     with _watched(quiet) as progress:
         from workflow.diagnose.command import diagnose_cases
-        from workflow.diagnose.simulator_case import settings_of
+        from workflow.diagnose.simulator_settings import settings_of
 
         found = diagnose_cases(
             case or [settings_of(stated, "--log")],
@@ -790,17 +692,11 @@ def diagnose(
         raise typer.Exit(found.exit_code)
 
 
-def _of_simulator(
-    command: str,
-    cases: Sequence[Path],
-    mjcf: str | None,
-    fmu: str | None,
-    python: str | None,
-    log: Sequence[str] | None,
-    of_logs: Mapping[str, Any],
-) -> dict[str, Any]:
+def _of_simulator(command: str, cases: Sequence[Path], of_fields: Mapping[str, Any]) -> dict[str, Any]:
     """A simulator's case as the options state it; empty beside case files. Raises InputError."""
-    model, of_logs = _stated({"mjcf": mjcf, "fmu": fmu, "python": python}), _stated(of_logs)
+    stated = {name: value for name, value in of_fields.items() if value}
+    model: dict[str, Any] = {name: stated.pop(name) for name in ("mjcf", "fmu", "python") if name in stated}
+    log, of_logs = stated.pop("log", None), stated
     if cases and model and log:
         raise InputError(f"{command}: {cases[0]}: write --log before each log, as --log A.csv --log B.csv")
     if model and not log:
@@ -810,7 +706,7 @@ def _of_simulator(
     if of_logs and not model:
         option = f"--{next(iter(of_logs)).replace('_', '-')}"
         raise InputError(f"{command}: {option} is of --mjcf, --fmu or --python; a case file says it itself")
-    if mjcf and "motion" in of_logs:
+    if "mjcf" in model and "motion" in of_logs:
         raise InputError(f"{command}: --motion is of --fmu or --python")
     need(*map(Path, (*model.values(), *(log or []))))
     return {**model, "log": log, **of_logs} if model else {}
@@ -848,12 +744,11 @@ def _reading(given: Mapping[str, Any]) -> Reading:
     """How the options of a command say that logs are read."""
     from workflow.commands.logs import Reading
 
-    lists = {"scale": "--scale", "offset": "--offset", "unwrap": "--unwrap"}
-    stated = _stated({field.name: given.get(field.name) for field in fields(Reading)})
-    for name in lists.keys() & stated.keys():
-        pairs = _named(lists[name], stated[name])
-        stated[name] = {column: _number(lists[name], text) for column, text in pairs.items()}
-    return Reading(**stated, units=_named("--unit", given.get("unit")))
+    stated = dict(given)
+    for name in ("scale", "offset", "unwrap", "units"):
+        pairs, option = _named(option_name(name), given.get(name)), option_name(name)
+        stated[name] = pairs if name == "units" else {key: _number(option, pairs[key]) for key in pairs}
+    return _settings(Reading, stated)
 
 
 def _named(option: str, stated: Sequence[str] | None) -> dict[str, str]:
@@ -880,16 +775,13 @@ def _number(option: str, text: str) -> float:
 def _settings(model: type[ModelT], given: Mapping[str, Any]) -> ModelT:
     """The settings that options state; a complaint has the option's name."""
     from workflow.config.settings import check
-    from workflow.text.options import OPTIONS
 
-    names = OPTIONS["identify"]
     try:
         stated = {key: given[key] for key in model.model_fields if given.get(key) is not None}
         return check(model, stated, source="options")
     except InputError as error:
-        raise InputError(
-            re.sub(r"^options: (\w+)(?=:)", lambda m: names.get(m[1], m[0]), str(error))
-        ) from error
+        named = re.sub(r"^options: (\w+)(?=:)", lambda found: option_name(found[1]), str(error))
+        raise InputError(named) from error
 
 
 def print_json(document: Mapping[str, Any]) -> None:
@@ -1035,7 +927,7 @@ def _explain(error: Exception) -> tuple[str, int]:
 
 def _key_of_case(option: str) -> str:
     """The key of a simulator's case file that has the name of an option; empty without one."""
-    from workflow.diagnose.simulator_case import SimulatorSettings
+    from workflow.diagnose.simulator_settings import SimulatorSettings
 
     key = option.removeprefix("--").replace("-", "_")
     return key if key in SimulatorSettings.model_fields else ""

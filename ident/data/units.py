@@ -196,6 +196,14 @@ def ends_with_time(name: str) -> bool:
     return bool(words) and re.fullmatch(r"\w*(time|timestamp|stamp|zeit|clock)", words[-1]) is not None
 
 
+def stated_time_unit(stated: str) -> str:
+    """A unit of time as it is spelled here. Raises ValueError for one that is not known."""
+    unit = TIME_UNITS.get(stated.lower(), stated.lower())
+    if unit not in KNOWN_TIME_UNITS:
+        raise ValueError(f"unknown unit of time '{stated}'; expected {', '.join(KNOWN_TIME_UNITS)}")
+    return unit
+
+
 @dataclass(frozen=True)
 class TimeColumn:
     """What the time stamps of a log were taken for: unit, one of `KNOWN_TIME_UNITS`; in_header: that in the
@@ -223,9 +231,7 @@ class TimeColumn:
         unit that is not known, or where the file contradicts itself, unless it is stated."""
         evidence = UnitEvidence.of(name, beside)
         if stated is not None:
-            unit = TIME_UNITS.get(stated.lower(), stated.lower())
-            if unit not in KNOWN_TIME_UNITS:
-                raise ValueError(f"unknown unit of time '{stated}'; expected {', '.join(KNOWN_TIME_UNITS)}")
+            unit = stated_time_unit(stated)
             return cls(name, unit, evidence.unit, stated=True)
         if evidence.unclear:
             raise ValueError(

@@ -22,7 +22,8 @@ from diagnosis.machine import mujoco_simulation  # noqa: E402
 from diagnosis.machine.mujoco_plant import MujocoArm  # noqa: E402
 from diagnosis.machine.plant_effect import Change  # noqa: E402
 from tests.workflow.command import ROOT  # noqa: E402
-from workflow.diagnose.simulator_case import SimulatorCase, load_simulator_case, settings_of  # noqa: E402
+from workflow.diagnose.simulator_case import SimulatorCase, load_simulator_case  # noqa: E402
+from workflow.diagnose.simulator_settings import settings_of  # noqa: E402
 
 DT_S, FINE_S, NOISE_RAD = 0.01, 2.5e-4, 1e-4
 MOTOR = '<motor name="motor" joint="hinge" {}/>'

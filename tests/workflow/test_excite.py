@@ -44,7 +44,7 @@ def test_files_keep_the_limits_and_the_plan_says_what_is_in_them(tmp_path):
         (["--angle", "5"], ["give a rig or gain_rad_per_Vs"]),
         (["--rms", "3", "--angle", "5", "--gain", "1"], ["expected to turn by", "5 are allowed"]),
         (["--band", "0.5", "140"], ["Nyquist"]),
-        (["--voltage", "-1"], ["peak_V must be positive"]),
+        (["--voltage", "-1"], ["--voltage: input should be greater than 0"]),
         (["--rig", "absent.toml"], ["absent.toml"]),
     ],
 )

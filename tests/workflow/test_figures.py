@@ -105,7 +105,9 @@ def same_row(one, other) -> bool:
 
 
 def test_pictures_of_a_planned_experiment():
-    limits = ExperimentLimits((0.5, 90.0), 0.005, 40.0, 24.0, rig=paper_link(), noise_std_rad=1e-3)
+    limits = ExperimentLimits(
+        band_Hz=(0.5, 90.0), dt_s=0.005, duration_s=40.0, peak_V=24.0, rig=paper_link(), noise_std_rad=1e-3
+    )
     plan = plan_experiment(limits, seed=1, realisations=2)
     steady = np.tile(plan.voltages_V, 2)  # a gain of one, as it stands
     records = [Record(str(k), u[:, None], u[:, None], 0.005, ("u",), ("y",)) for k, u in enumerate(steady[0])]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import typer.main
+from click import Context
 
 from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.data.finding import FindingKind, finding
@@ -98,9 +99,9 @@ def every_sentence():
 
 
 def options_of(command):
-    return {
-        name for parameter in typer.main.get_command(app).commands[command].params for name in parameter.opts
-    }
+    group = typer.main.get_command(app)
+    _, found, _ = group.resolve_command(Context(group), [command])
+    return {name for parameter in found.params for name in parameter.opts}
 
 
 KEYS = {

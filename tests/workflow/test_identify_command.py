@@ -59,7 +59,7 @@ def test_unclear_columns_offer_a_command_with_every_log(tmp_path, refused):
 
 def identify_first(logs, **written):
     fresh = [logs / "fresh.csv"]
-    read = read_logs([logs / "first.csv"], Reading("u_V", "tip_m", time="t_s"), fresh)
+    read = read_logs([logs / "first.csv"], Reading(input_name="u_V", output_name="tip_m", time="t_s"), fresh)
     return identify_logs(read, **written)
 
 
@@ -337,7 +337,7 @@ def test_integers_called_seconds_are_doubted(refused, tmp_path):
         (("--report", "{log}"), "that is a source already"),
         (("--report", "{out}/a", "--out", "{out}/a"), "that is --out already"),
         (("--reference", "r"), "no column 'r'"),
-        (("--input-limit", "0"), "the limit of the input must be positive; got 0"),
+        (("--input-limit", "0"), "--input-limit: input should be greater than 0"),
         (("--level", "0.2"), "flexlink: --level: input should be greater than 0.5"),
         (("--pairs", "13"), "flexlink: --pairs: input should be less than or equal to 12, got 13"),
         (("--response", "amplitude 2"), "should be 'as recorded', 'without friction' or 'this amplitude'"),
@@ -362,7 +362,7 @@ def test_hostile_names_are_escaped(undrawn, tmp_path):
     record = p2(3, 600).record
     hostile = f"{ATTACK}&$x_1$"
     log = write_log(tmp_path / "log.csv", record.input[:, 0], record.output[:, 0], ("t_s", "u_V", hostile))
-    logs = read_logs([log], Reading("u_V", hostile, time="t_s"))
+    logs = read_logs([log], Reading(input_name="u_V", output_name=hostile, time="t_s"))
     summary = identify_logs(logs, report=tmp_path / "page.html", export=tmp_path / "m.json")
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert ATTACK not in text

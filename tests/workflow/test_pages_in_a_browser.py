@@ -205,7 +205,9 @@ def test_the_shape_of_a_page_is_measured(browser, tmp_path):
 
 
 def test_page_of_a_planned_experiment(faults_seen, tmp_path):
-    limits = ExperimentLimits((0.5, 90.0), 0.005, 40.0, 24.0, rig=paper_link(), noise_std_rad=1e-3)
+    limits = ExperimentLimits(
+        band_Hz=(0.5, 90.0), dt_s=0.005, duration_s=40.0, peak_V=24.0, rig=paper_link(), noise_std_rad=1e-3
+    )
     plan = plan_experiment(limits, seed=1, realisations=2)
     path = tmp_path / "plan.html"
     path.write_text(render_page("experiment.html.j2", title="Planned experiment", found=plan).html)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from workflow.diagnose.simulator_case import load_simulator_case, settings_of
+from workflow.diagnose.simulator_case import load_simulator_case
+from workflow.diagnose.simulator_settings import settings_of
 from workflow.engine.errors import InputError
 
 mujoco = pytest.importorskip("mujoco")

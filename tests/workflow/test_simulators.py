@@ -18,7 +18,8 @@ from diagnosis.machine.plant_effect import Change
 from diagnosis.machine.telling import Alike, Telling
 from tests.workflow.command import ROOT
 from workflow.diagnose import check
-from workflow.diagnose.simulator_case import load_simulator_case, settings_of
+from workflow.diagnose.simulator_case import load_simulator_case
+from workflow.diagnose.simulator_settings import settings_of
 from workflow.diagnose.words import FILTERS
 from workflow.engine.errors import InputError
 

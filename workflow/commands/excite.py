@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 PLAN_FILE, PAGE_FILE = "plan.json", "plan.html"
 
 
-def write_experiment(
-    limits: ExperimentLimits, out: Path, *, seed: int, lead_in_s: float, **settings: object
-) -> list[Path]:
+def write_experiment(limits: ExperimentLimits, out: Path, *, seed: int, **settings: object) -> list[Path]:
     """Plan an experiment within limits; one CSV (time_s, voltage_V) per record, the plan and its page.
 
     settings: fields of `plant.ExperimentPlan` by name. Raises InputError.
@@ -31,7 +29,7 @@ def write_experiment(
     from workflow.tasks.experiment import plan_experiment
 
     RunDirectory(out).refuse_unless_free()
-    found = plan_experiment(limits, seed=seed, lead_in_s=lead_in_s, **settings)
+    found = plan_experiment(limits, seed=seed, **settings)
     # Here: these take seconds to load, and limits that are refused do not need them.
     from workflow.report.rendering import render_page
     from workflow.tasks.simulated_rig import INPUT_NAME

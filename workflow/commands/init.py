@@ -165,22 +165,23 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> ReadCha
             raise ValueError(f"no column looks like time: type flexlink {command} {typed} {ways}")
     options = [_stamps(table, roles, stated.time_unit) for table in tables]
     steps = [float(text.split()[1]) for text in options if text.startswith("--resample-s")]
-    how = replace(
-        stated,
-        input_name=roles.input,
-        output_name=roles.output,
-        reference=roles.reference,
-        doubts=roles.doubts,
-        time=roles.time,
-        time_unit=stated.time_unit if roles.time else None,
-        repair="--repair" in options and not steps,
-        resample_s=max(steps, default=None),
-        unwrap=stated.unwrap or _wrapping(tables, roles.output),
+    how = stated.model_copy(
+        update={
+            "input_name": roles.input,
+            "output_name": roles.output,
+            "reference": roles.reference,
+            "doubts": roles.doubts,
+            "time": roles.time,
+            "time_unit": stated.time_unit if roles.time else None,
+            "repair": "--repair" in options and not steps,
+            "resample_s": max(steps, default=None),
+            "unwrap": stated.unwrap or _wrapping(tables, roles.output),
+        }
     )
     records = how.records(tables)
     repeats = min(_repeats(record) for record in records)
     if repeats > 1 and not steps:
-        how = replace(how, resample_s=float(f"{repeats * records[0].dt_s:.9g}"))
+        how = how.model_copy(update={"resample_s": float(f"{repeats * records[0].dt_s:.9g}")})
         records = how.records(tables)
     for record in records:
         refuse_constant_input(record)

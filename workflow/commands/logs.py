@@ -3,43 +3,38 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from ident.data.finding import Finding
+from pydantic import Field
+
 from ident.data.record import Record, in_one_unit
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response
 from ident.data.roles import Roles, roles_with_reference
 from ident.data.table import Table
+from workflow.config.log_reading import LogReading
 from workflow.engine.errors import naming
 
 
-@dataclass(frozen=True)
-class Reading:
-    """Columns of one channel and how they are read, as stated; the rest as in `Record.from_file`.
+class Reading(LogReading):
+    """Columns of one channel and how they are read, as stated; the rest as in `Record.from_file`. doubts: of
+    how the columns were found."""
 
-    reference: column of logs made in closed loop; input_limit: larger commands are taken as that; doubts: of
-    how the columns were found.
-    """
-
-    input_name: str | None = None
-    output_name: str | None = None
-    reference: str | None = None
-    time: str | None = None
-    time_unit: str | None = None
-    dt_s: float | None = None
-    scale: Mapping[str, float] = field(default_factory=dict)
-    offset: Mapping[str, float] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
-    repair: bool = False
-    resample_s: float | None = None
-    unwrap: Mapping[str, float] = field(default_factory=dict)
-    decimal: str | None = None
-    input_limit: float | None = None
-
-    doubts: tuple[Finding, ...] = ()
+    input_name: str | None = Field(
+        None, description="name of the input column; default: as names and units say"
+    )
+    output_name: str | None = Field(None, description="name of the output column; default: the same")
+    reference: str | None = Field(
+        None, description="reference column of logs made in closed loop; default: what looks like one"
+    )
+    time: str | None = Field(None, description="name of the time column; default: what looks like it")
+    dt_s: float | None = Field(
+        None, gt=0, description="sampling period [s], without a time column; beside it the exact one"
+    )
+    doubts: tuple[Any, ...] = ()
 
     def roles(self, table: Table, logs: str, command: str) -> Roles:
         """What is stated, and what names and units of the table tell. Raises ValueError."""
@@ -110,13 +105,13 @@ def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: S
             roles = how.roles(table, shlex.join(map(str, logs)), "identify")
         found = roles.reference
         everywhere = found and all(found in read_table(path).names for path in (*logs[1:], *validation))
-        how = replace(
-            how,
-            input_name=roles.input,
-            output_name=roles.output,
-            reference=found if everywhere else how.reference,
-            time=roles.time if how.time is None and how.dt_s is None else how.time,
-            doubts=roles.doubts,
-        )
+        given: dict[str, Any] = {
+            "input_name": roles.input,
+            "output_name": roles.output,
+            "doubts": roles.doubts,
+        }
+        given |= {"reference": found} if everywhere else {}
+        given |= {"time": roles.time} if how.time is None and how.dt_s is None else {}
+        how = how.model_copy(update=given)
     records = tuple(how.records([*logs, *validation]))
     return Logs(records[: len(logs)], records[len(logs) :], (*logs, *validation), how.input_limit)

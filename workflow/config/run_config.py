@@ -16,6 +16,7 @@ from control_design.specification import Specification
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from plant.experiment_plan import ExperimentPlan
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
+from workflow.config.log_reading import LogReading, TimeUnit
 from workflow.config.rig_settings import EffectTable, Excitation, Multisine, RigChoice
 from workflow.config.settings import InputPath, Section, check, repeated
 from workflow.config.uncertainty_options import FitOptions, UncertaintyOptions
@@ -107,16 +108,6 @@ def _planned(plan: ExperimentPlan) -> tuple[SimulatedRecord, ...]:
     )
 
 
-def _not_zero(scale: float) -> float:
-    if scale == 0:
-        raise ValueError("a scale must not be 0")
-    return scale
-
-
-Scale = Annotated[float, AfterValidator(_not_zero)]
-TimeUnit = Literal["s", "ms", "us", "ns", "min", "h", "d"]
-
-
 class FileRecord(Section):
     """One log file; [source] gives the keys that are left out."""
 
@@ -136,43 +127,9 @@ class FileRecord(Section):
     mirrored: bool = Field(False, description="change the sign of every signal (G stays the same)")
 
 
-class FileSource(Section):
+class FileSource(LogReading):
     kind: Literal["files"] = Field(description="records are log files")
-    time: str | None = Field(None, description="name of the time column; give this or dt_s")
-    time_unit: TimeUnit | None = Field(
-        None, description="unit of the time column; default: as in its name ('t_ms', 'Zeit [ms]'), else s"
-    )
-    dt_s: float | None = Field(None, gt=0, description="sampling period [s]; give this or time")
     references: tuple[str, ...] = Field((), description="reference columns of logs made in closed loop")
-    units: Mapping[str, str] = Field(
-        default_factory=dict, description="unit of a column, for axes: {theta_rad = 'rad'}"
-    )
-    input_limit: float | None = Field(
-        None,
-        gt=0,
-        description="limit of the amplifier: larger commands in the logs are clipped to it",
-    )
-    scale: Mapping[str, Scale] = Field(
-        default_factory=dict, description="factor per column: quantity = scale * column + offset"
-    )
-    offset: Mapping[str, float] = Field(
-        default_factory=dict, description="offset per column, added after scaling"
-    )
-    repair: bool = Field(
-        False, description="put jittering time stamps and single missing rows on a uniform grid"
-    )
-    resample_s: float | None = Field(
-        None,
-        gt=0,
-        description="put all rows on a coarser grid of this step [s], for stamps that keep to none",
-    )
-    unwrap: Mapping[str, Annotated[float, Field(gt=0)]] = Field(
-        default_factory=dict,
-        description="of a column that wraps, the period: {encoder = 4096}, {angle_deg = 360}; before scale",
-    )
-    decimal: Literal["point", "comma"] | None = Field(
-        None, description="what separates decimals in text; default: as the numbers say"
-    )
     records: tuple[FileRecord, ...] = Field(min_length=1)
 
     @model_validator(mode="after")

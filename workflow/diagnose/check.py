@@ -15,13 +15,8 @@ from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.probed import doubtful_columns
 from diagnosis.machine.telling import Telling, telling
 from workflow.diagnose.case_settings import case_document
-from workflow.diagnose.simulator_case import (
-    SimulatorCase,
-    SimulatorSettings,
-    is_simulator,
-    load_simulator_case,
-    settings_of,
-)
+from workflow.diagnose.simulator_case import SimulatorCase, load_simulator_case
+from workflow.diagnose.simulator_settings import SimulatorSettings, is_simulator, settings_of
 from workflow.diagnose.words import FILTERS
 from workflow.engine import codec
 from workflow.engine.errors import InputError

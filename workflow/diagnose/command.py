@@ -18,13 +18,8 @@ from workflow.diagnose.case_settings import CASE_FILE, case_document
 from workflow.diagnose.directory import DiagnosisDirectory
 from workflow.diagnose.fleet import FleetMachine, csv_text, groups, trends
 from workflow.diagnose.outputs import Work
-from workflow.diagnose.simulator_case import (
-    SimulatorCase,
-    SimulatorSettings,
-    is_simulator,
-    load_simulator_case,
-    settings_of,
-)
+from workflow.diagnose.simulator_case import SimulatorCase, load_simulator_case
+from workflow.diagnose.simulator_settings import SimulatorSettings, is_simulator, settings_of
 from workflow.diagnose.words import FILTERS, short_answer
 from workflow.engine import codec
 from workflow.engine.code_version import code_digest

@@ -13,10 +13,9 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, PositiveFloat, model_validator
 
 from diagnosis.answer import Diagnosis, NamedEffect
 from diagnosis.machine.around import Body
@@ -32,15 +31,14 @@ from ident.data.table import Table
 from ident.data.time_grid import TimeGrid, sampling_time
 from ident.data.units import COUNTED, per, size_of, written_unit
 from plant.effects.search_space import geometric
-from workflow.config.settings import Section, check
-from workflow.diagnose.case_settings import CaseName, Column, ColumnChoice
+from workflow.diagnose.case_settings import Column
+from workflow.diagnose.simulator_settings import KINDS, SimulatorSettings
 from workflow.engine import storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import hash_of
 from workflow.text.formats import listing
 from workflow.text.names import unit_of
 
-_KINDS = ("mjcf", "fmu", "python")
 _PLACES = ("input", "output")
 # Of one log the last part judges what the first part fitted.
 _FITTED = 2 / 3
@@ -57,55 +55,6 @@ _UNITS_OF_TIME = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
 _SLOWEST_S = 0.5  # machines are logged faster than twice a second
 # Third differences of white noise have twenty times its variance; no motion is left in them.
 _THIRD = 20.0
-
-
-class SimulatorSettings(Section):
-    """A TOML file that names a model, or the options of the command line."""
-
-    case: CaseName = None
-    mjcf: str | None = Field(None, description="MuJoCo model")
-    fmu: str | None = Field(None, description="FMI 2.0 for co-simulation")
-    python: str | None = Field(None, description="file with simulate, PARAMETERS, INPUTS and OUTPUTS")
-    log: str | Annotated[tuple[str, ...], Field(min_length=1)] = Field(
-        description="log files; the last one is for validation, of a single one its last third"
-    )
-    columns: dict[str, ColumnChoice] = Field({}, description="name in the model -> column, where they differ")
-    dt_s: PositiveFloat | None = Field(None, description="sampling period of logs without a time column")
-    repair: bool = Field(False, description="put stamps that jitter, and missing rows, on a uniform grid")
-    resample_s: PositiveFloat | None = Field(None, description="put all rows on a grid of this step")
-    noise: dict[str, PositiveFloat] = Field(
-        {}, description="output -> standard deviation; default: estimated"
-    )
-    tolerances: dict[str, PositiveFloat] = Field({}, description="parameter -> relative standard deviation")
-    candidates: tuple[str, ...] = Field(
-        ("*",), description="what may be wrong or missing, * for any part of a name; all else is as stated"
-    )
-    exclude: tuple[str, ...] = Field((), description="what is as stated all the same")
-    bounds: dict[str, tuple[PositiveFloat, PositiveFloat]] = Field(
-        {}, description="effect -> smallest and largest size, in its unit"
-    )
-    model_error: float = Field(0.05, ge=0, lt=1, description="share of the motion that the model may miss")
-    tracking_rad_s: float | None = Field(None, ge=0, description="MJCF: see docs/simulators.md; 0: free run")
-    motion: Literal["position", "speed"] | None = Field(
-        None,
-        description="FMU and Python: kind of the first output, if it is the motion of the body that "
-        "the first input pushes",
-    )
-
-    @model_validator(mode="after")
-    def _one_model(self) -> SimulatorSettings:
-        stated = [key for key in _KINDS if getattr(self, key) is not None]
-        if len(stated) != 1:
-            raise ValueError(f"expected one of mjcf, fmu, python; got {' and '.join(stated) or 'none'}")
-        return self
-
-    @property
-    def logs(self) -> tuple[str, ...]:
-        return (self.log,) if isinstance(self.log, str) else self.log
-
-    @property
-    def model(self) -> str:
-        return str(self.mjcf or self.fmu or self.python)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,15 +75,6 @@ class SimulatorCase:
     doubts: tuple[str, ...] = ()
 
 
-def is_simulator(document: Mapping[str, Any]) -> bool:
-    """Whether a TOML file names a simulator's model."""
-    return any(key in document for key in _KINDS)
-
-
-def settings_of(document: Mapping[str, Any], source: str) -> SimulatorSettings:
-    return check(SimulatorSettings, dict(document), source=source)
-
-
 def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) -> SimulatorCase:
     """Model and logs relative to `folder`. Raises InputError: one line naming the file and what is wrong."""
     model = folder / settings.model
@@ -150,7 +90,7 @@ def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) 
     dt_s = _sampling(tables, settings)
     name = settings.case or model.stem
     with naming(str(model)):
-        open_simulator = _SIMULATORS[next(kind for kind in _KINDS if getattr(settings, kind))]
+        open_simulator = _SIMULATORS[next(kind for kind in KINDS if getattr(settings, kind))]
         inputs, outputs, finish = open_simulator(model, tables, settings, dt_s)
     experiments = _experiments(paths, tables, settings, inputs, outputs, tracked=settings.mjcf is not None)
     noise = _noise(experiments, outputs, settings)
@@ -570,7 +510,7 @@ def _refuse_other_unit(
 
 def _which_column(names: Sequence[str], table: Table, settings: SimulatorSettings) -> str:
     """What to write where quantities of the model have no column."""
-    kind = next(kind for kind in _KINDS if getattr(settings, kind))
+    kind = next(kind for kind in KINDS if getattr(settings, kind))
     columns = ", ".join(f'{name if name.isidentifier() else json.dumps(name)} = "COLUMN"' for name in names)
     return (
         f"in a case file (.toml) with {kind} = ... and log = [...] write "

@@ -8,33 +8,57 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from plant.excitation import crest_factor
 from plant.experiment_plan import ExperimentPlan
 from plant.modal import linear_arm
 from plant.rig import Rig
+from workflow.config.settings import Section
 from workflow.engine.errors import InputError
 
 Real = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class ExperimentLimits:
-    """What an experiment may do; angles are those of the hub, None where nobody stated one.
+class ExperimentLimits(Section):
+    """What an experiment may do; angles are those of the hub, None where nobody stated one."""
 
-    rms_V: the ladder, or none for half of the highest that the limits allow, and that. gain_rad_per_Vs: speed
-    per volt of an arm taken as an integrator, where there is no rig. noise_std_rad: of the hub's sensor.
-    """
-
-    band_Hz: tuple[float, float]
-    dt_s: float
-    duration_s: float
-    peak_V: float
-    rms_V: tuple[float, ...] = ()
-    angle_deg: float | None = None
-    gain_rad_per_Vs: float | None = None
-    rig: Rig | None = None
-    noise_std_rad: float | None = None
+    band_Hz: tuple[float, float] = Field(
+        description="frequencies to excite [Hz], low and high; default with --closed-loop: two decades up to "
+        "twice the first mode, or the highest that the logs tell"
+    )
+    dt_s: float = Field(gt=0, description="sampling period [s]; of logs their own")
+    duration_s: float = Field(
+        gt=0,
+        description="time allowed for all records together [s]; default with --closed-loop: what the band "
+        "needs",
+    )
+    peak_V: float = Field(
+        gt=0,
+        description="largest voltage allowed [V]; with --closed-loop the largest command, in its unit, "
+        "default: 80 % of the logs' largest",
+    )
+    rms_V: tuple[float, ...] = Field(
+        (), description="root mean square [V] (repeatable); default: the highest allowed, and half of it"
+    )
+    angle_deg: float | None = Field(
+        None, gt=0, description="largest hub angle allowed [degrees]; needs --rig or --gain"
+    )
+    gain_rad_per_Vs: float | None = Field(
+        None, gt=0, description="rough speed of the hub per volt [rad/s per V], without a rig"
+    )
+    rig: Rig | None = Field(
+        None, description="rig file or 'paper_link': predicts motion and response; default: none"
+    )
+    noise_std_rad: float | None = Field(
+        None, gt=0, description="sensor noise of the hub angle [rad]: predicts radii"
+    )
+    lead_in_s: float = Field(1.0, ge=0, description="from rest to steady state [s]")
+    motion: float | None = Field(
+        None,
+        gt=0,
+        description="with --closed-loop: largest motion, in the output's unit; default: the logs' largest",
+    )
 
 
 @dataclass(frozen=True)
@@ -115,16 +139,11 @@ def motion_of(limits: ExperimentLimits) -> Callable[[Real], Real] | None:
     return None
 
 
-def plan_experiment(
-    limits: ExperimentLimits, *, seed: int, lead_in_s: float = 1.0, **settings: object
-) -> PlannedExperiment:
+def plan_experiment(limits: ExperimentLimits, *, seed: int, **settings: object) -> PlannedExperiment:
     """The longest periods and largest voltages that the limits allow; settings: fields of the plan by name.
 
     Raises InputError (one line) where no experiment stays within them.
     """
-    for name, value in vars(limits).items():
-        if isinstance(value, int | float) and not 0 < value < np.inf:
-            raise InputError(f"{name} must be positive and finite; got {value}")
     motion = motion_of(limits)
     if limits.angle_deg is not None and motion is None:
         raise InputError("angle_deg is a limit of the motion: give a rig or gain_rad_per_Vs to predict it")
@@ -135,7 +154,7 @@ def plan_experiment(
             band_Hz=limits.band_Hz,
             dt_s=limits.dt_s,
             duration_s=limits.duration_s,
-            lead_in_s=lead_in_s,
+            lead_in_s=limits.lead_in_s,
             lines_seed=seed,
             **settings,
         )

@@ -1,0 +1,138 @@
+"""Options of a command that set fields of settings: name, kind, range and words come from the field.
+
+Settings are slow to load, so these options are made when their command is called (`completed`).
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+
+import typer
+
+if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
+
+F = TypeVar("F", bound=Callable[..., Any])
+_LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
+# Where it is not that of the field, and no hint names it (`workflow.text.options`).
+_NAMES = {
+    "input_name": "--input",
+    "output_name": "--output",
+    "units": "--unit",
+    "band_Hz": "--band",
+    "duration_s": "--duration",
+    "peak_V": "--voltage",
+    "rms_V": "--rms",
+    "angle_deg": "--angle",
+    "gain_rad_per_Vs": "--gain",
+    "noise_std_rad": "--noise-std",
+    "lead_in_s": "--lead-in",
+}
+_BY_COLUMN = "COLUMN=VALUE (repeatable): "
+
+
+def with_fields(**places: Sequence[str]) -> Callable[[F], F]:
+    """Give a command, which takes them as `**given`, options for fields of settings. places: by the name of
+    a place in `SETTINGS`, fields, with what stands before them in the table of option names ("x.field")."""
+
+    def noted(function: F) -> F:
+        own = inspect.signature(function)
+        kept = [each for each in own.parameters.values() if each.kind is not each.VAR_KEYWORD]
+        function.__signature__ = own.replace(parameters=kept)  # type: ignore[attr-defined]
+        function.of_fields = places  # type: ignore[attr-defined]
+        return function
+
+    return noted
+
+
+SETTINGS = {
+    "fit": "workflow.config.uncertainty_options:FitOptions",
+    "ellipses": "workflow.config.uncertainty_options:UncertaintyOptions",
+    "reading": "workflow.commands.logs:Reading",
+    "channel": "workflow.config.run_config:Channel",
+    "loop": "workflow.config.run_config:ClosedLoopData",
+    "plan": "plant.experiment_plan:ExperimentPlan",
+    "limits": "workflow.tasks.experiment:ExperimentLimits",
+    "simulator": "workflow.diagnose.simulator_settings:SimulatorSettings",
+}
+
+
+def completed(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The command with the options that `with_fields` promised."""
+    hints = get_type_hints(function, include_extras=True)
+    own = inspect.signature(function).parameters.values()
+    parameters = [each.replace(annotation=hints[each.name]) for each in own]
+    for place, names in function.of_fields.items():  # type: ignore[attr-defined]
+        fields = resolve_name(SETTINGS[place]).model_fields
+        parameters += [_parameter(name, fields[name.rpartition(".")[2]]) for name in names]
+
+    @wraps(function)
+    def called(**given: Any) -> Any:
+        return function(**given)
+
+    called.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [each.replace(kind=each.KEYWORD_ONLY) for each in parameters]
+    )
+    called.__annotations__ = {each.name: each.annotation for each in parameters}
+    return called
+
+
+def option_name(key: str) -> str:
+    """What the option for a field is called."""
+    from workflow.text.options import OPTIONS
+
+    return {**_NAMES, **OPTIONS["identify"]}.get(key, f"--{key.replace('_', '-')}")
+
+
+def _parameter(key: str, field: FieldInfo) -> inspect.Parameter:
+    kind = _kind(field.annotation)
+    words = (_BY_COLUMN if _is_mapping(field.annotation) else "") + described(field)
+    said = typer.Option(option_name(key), help=words[0].upper() + words[1:])
+    return inspect.Parameter(
+        key.replace(".", "_"),
+        inspect.Parameter.KEYWORD_ONLY,
+        default=False if kind is bool else None,
+        annotation=Annotated[kind if kind is bool else kind | None, said],
+    )
+
+
+def _is_mapping(annotation: Any) -> bool:
+    origin = get_origin(annotation)
+    return isinstance(origin, type) and issubclass(origin, Mapping)
+
+
+def _kind(annotation: Any) -> Any:
+    """What the command line takes for a field; settings check the rest."""
+    if _is_mapping(annotation):
+        return list[str]
+    kinds = [
+        getattr(kind, "__origin__", kind) if hasattr(kind, "__metadata__") else kind
+        for kind in (annotation, *get_args(annotation))
+    ]
+    pairs = [kind for kind in kinds if get_origin(kind) is tuple]
+    if pairs:
+        return list[get_args(pairs[0])[0]] if Ellipsis in get_args(pairs[0]) else pairs[0]  # type: ignore[misc]
+    plain = [kind for kind in kinds if kind in (bool, int, float)]
+    return plain[0] if len(plain) == 1 and not any(map(_is_choice, kinds)) else str
+
+
+def _is_choice(kind: Any) -> bool:
+    return any(isinstance(choice, str) for choice in get_args(kind))
+
+
+def described(field: FieldInfo) -> str:
+    """Description, choices, range and, where it is not said, default of a field."""
+    from pydantic_core import PydanticUndefined
+
+    choices = [get_args(kind) for kind in (field.annotation, *get_args(field.annotation))]
+    more = [", ".join(some) for some in choices if len(some) > 1 and isinstance(some[0], str)]
+    more += [f"{_LIMITS[k]} {getattr(m, k):g}" for m in field.metadata for k in _LIMITS if hasattr(m, k)]
+    said = str(field.description)
+    unsaid = not any(field.default is none for none in (None, False, PydanticUndefined, ()))
+    if unsaid and "default:" not in said:
+        more.append(f"default: {field.default}")
+    return said + (f" [{'; '.join(more)}]" if more else ".")
