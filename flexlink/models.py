@@ -260,8 +260,8 @@ def identify(
 ) -> Identification:
     """Identify a model of one input and one output; the data choose the order unless you give it.
 
-    settings: fields of `IdentOptions`, instead of `options`. Raises ValueError for a setting or a record that
-    cannot be used.
+    settings: fields of `IdentOptions`, instead of `options`; as in `flexlink identify` the data decide about
+    the noise unless you state it. Raises ValueError for a setting or a record that cannot be used.
 
     Examples
     --------
@@ -270,9 +270,13 @@ def identify(
       mode at 20 rad/s (3.18 Hz), damping ratio 0.0499
     """
     chosen, used = _options(IdentOptions, options, settings), _records(records)
+    if chosen is None:
+        chosen = IdentOptions()
+    if "noise" not in chosen.model_fields_set:
+        chosen = chosen.model_copy(update={"noise": "auto"})
     with threadpool_limits(1):
         found = identify_records(used, chosen)
-    return replace(found, records=used, order_given=chosen is not None and chosen.n_pairs is not None)
+    return replace(found, records=used, order_given=chosen.n_pairs is not None)
 
 
 def identify_mimo(
@@ -312,8 +316,9 @@ def uncertainty(
     """Posterior of the response around an identified model: noise, pole error and unmodelled dynamics.
 
     records: those of the identification; not needed if it came from `flexlink.identify`. settings: fields of
-    `EmbeddingOptions`, instead of `options`. `order_given` is taken from `flexlink.identify`. Ellipses of
-    another level than 95 %: `spread.at(omega_rad_s).ellipse(level)`.
+    `EmbeddingOptions`, instead of `options`; the data decide about a noise model unless you state one.
+    `order_given` is taken from `flexlink.identify`. Ellipses of another level than 95 %:
+    `spread.at(omega_rad_s).ellipse(level)`. Raises ValueError where the output does not answer to the input.
 
     Examples
     --------
@@ -331,6 +336,9 @@ def uncertainty(
         if name in settings:
             raise ValueError(f"{name} is no setting of uncertainty: {mend}")
     chosen = _options(EmbeddingOptions, options, settings) or EmbeddingOptions()
+    if "coloured_noise" not in chosen.model_fields_set:
+        asked = "max_ar_order" in chosen.model_fields_set or "auto"
+        chosen = chosen.model_copy(update={"coloured_noise": asked})
     if chosen.order_given is None:
         chosen = chosen.model_copy(update={"order_given": getattr(identification, "order_given", False)})
     used = _records_of(identification, records)

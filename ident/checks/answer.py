@@ -7,6 +7,7 @@ an output that wanders by itself (drift, hum).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -47,3 +48,15 @@ def zero_is_inside(posterior: ResponsePosterior, omega_rad_s: RealArray, *, doub
     n_rows = 2 if posterior.report is None else max(posterior.report.n_rows, 2)
     places = n_rows / 2 if doubted else 1.0
     return bool(np.all(squared <= chi2.isf((1 - _LEVEL) / places, 2)))
+
+
+def refuse_unanswered(
+    posterior: ResponsePosterior, omega_rad_s: RealArray, warnings: Iterable[Finding], *, why: str = ""
+) -> None:
+    """Raises ValueError, one line, where a response of zero lies inside all ellipses at omega (F,): no number
+    of such a model means anything. warnings: of the fit; why: what else is known."""
+    doubts = {FindingKind.NO_POLE, FindingKind.NO_ANSWER} & {warning.kind for warning in warnings}
+    if zero_is_inside(posterior, omega_rad_s, doubted=bool(doubts)):
+        unknown = "no response at all explains the log as well as any model; check columns, wiring and unit"
+        names = f"the output '{posterior.output_name}' does not answer to the input '{posterior.input_name}'"
+        raise ValueError(f"{names}: {why or unknown}")

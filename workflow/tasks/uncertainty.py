@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
-from operator import itemgetter
-from typing import TypeVar
 
 import numpy as np
 
@@ -15,11 +13,11 @@ from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import Mode
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
-from ident.checks.answer import zero_is_inside
+from ident.checks.answer import refuse_unanswered
 from ident.checks.residual_tests import residual_advice, residual_tests, whiteness_test
 from ident.checks.validation import ScatterRow, repeat_scatter
 from ident.data.distortion import distortion_of
-from ident.data.finding import FindingKind, distinct, finding
+from ident.data.finding import FindingKind, finding
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
 from ident.data.signal_filter import increments
@@ -33,6 +31,7 @@ from ident.friction import (
     precedes_command,
     without_friction,
 )
+from ident.response_uncertainty import with_noise_model
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.conditions import combine_posteriors, group_posteriors, repeat_posteriors
 from ident.uncertainty.embedding import tangent
@@ -58,15 +57,12 @@ from workflow.text.templates import said, words
 
 _FEWEST_FREQUENCIES = 100  # over a band of the data, some decade: a nominal model has a tenth as many numbers
 _SHARE_INSIDE = 0.9  # of the ellipses: below it a nominal is no member of the set it stands for
-# Largest orders of the noise model that are tried, until the residuals behind it are white.
-_NOISE_ORDERS = (8, 32)
 # A model explains nothing whose best fit to a log is below this, where the sensor's noise leaves a third of
 # the rest at most (right ones had 90 % and more, wrong ones 75 % and less).
 _EXPLAINED, _BEYOND_NOISE = 80.0, 3.0
 # So does one whose friction has a standard deviation above both of these shares, of its level and of the rms
 # command: wrong levels, and logs behind a filter, whose ellipses missed the machine (docs/decisions.md).
 _UNTOLD, _UNTOLD_OF_COMMAND = 0.05, 0.004
-T = TypeVar("T")
 
 N_BANDS = 6
 """Bands of equal width on the log axis in which radii and scatter are summarised."""
@@ -127,7 +123,7 @@ def uncertainty_of(
             return found, residual_tests(found, result.bounded)
 
         if options.method == "tangent" or options.coloured_noise == "auto":
-            (posterior, tests), options = _with_noise_model(options, white, posterior_behind)
+            (posterior, tests), options = with_noise_model(options, white, posterior_behind)
         if options.method != "tangent":
             posterior = posterior_of(result.model, result.bounded, options, records)
             tests = residual_tests(posterior, result.bounded)
@@ -143,7 +139,7 @@ def uncertainty_of(
                 return found, residual_tests(found.response, result.bounded)
             return found, residual_tests(found.response, measured, found.friction)
 
-        (behind, tests), _ = _with_noise_model(options, white, arm_behind)
+        (behind, tests), _ = with_noise_model(options, white, arm_behind)
         linear = behind.response
         posterior, poles, equivalent = described_response(
             behind, poles, friction, measured, channel.uncertainty, rng, equivalent
@@ -180,31 +176,6 @@ def uncertainty_of(
     if rubs:
         advice.append(finding(FindingKind.UNTRIED_FRICTION, output=result.output))
     return replace(found, advice=(*advice, *found.agreement.doubt)), equivalent
-
-
-def _with_noise_model(
-    options: UncertaintyOptions, white: bool, found_with: Callable[[UncertaintyOptions], tuple[T, Tests]]
-) -> tuple[tuple[T, Tests], UncertaintyOptions]:
-    """What is found with as much of a noise model as the residuals ask for, and the settings with it.
-
-    White-noise bounds around coloured residuals are far too narrow, so the data decide unless it is stated.
-    """
-    if options.coloured_noise != "auto":
-        return found_with(options), options
-    if white:
-        plain = options.model_copy(update={"coloured_noise": False})
-        return found_with(plain), plain
-    tried = []
-    for order in _NOISE_ORDERS:
-        asked = options.model_copy(update={"coloured_noise": True, "max_ar_order": order})
-        found = found_with(asked)
-        whiteness, _ = found[1]
-        tried.append((whiteness.probability, found, asked))
-        if whiteness.passed:
-            break
-    # A longer noise model has to make the residuals whiter: inside a band it can also turn upon itself.
-    _, best, asked = max(tried, key=itemgetter(0))
-    return best, asked
 
 
 def described_response(
@@ -244,7 +215,9 @@ def uncertain_channel(
     the residuals; poles: of the nominal, where they are not the model's; linear: posterior of the model,
     where that is another one."""
     model, linear = result.model, linear or posterior
-    refuse_unanswered(result, linear, omega)
+    doubts = [doubt for record in result.bounded for doubt in record.doubts]
+    why = next((words(doubt) for doubt in doubts if doubt.kind is FindingKind.WRAPS), "")
+    refuse_unanswered(linear, omega, result.identification.warnings, why=why)
     frequency = posterior.at(omega, level)
     bands = pairwise(np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist())  # of equal ratio
     nominal = nominal_of(posterior, poles or model.poles, omega)
@@ -266,23 +239,6 @@ def uncertain_channel(
         agreement=NominalAgreement.of(frequency, nominal.frequency_response),
         intervals=intervals_of(linear, model.stable_poles, level),
     )
-
-
-def refuse_unanswered(result: IdentifiedChannel, posterior: ResponsePosterior, omega: Real) -> None:
-    """Raises ValueError, one line, where a response of zero lies inside all ellipses: no number of such a
-    model means anything. omega (F,): where ellipses are shown."""
-    doubts = {FindingKind.NO_POLE, FindingKind.NO_ANSWER} & {
-        warning.kind for warning in result.identification.warnings
-    }
-    if zero_is_inside(posterior, omega, doubted=bool(doubts)):
-        wrapped = distinct(
-            [doubt for record in result.bounded for doubt in record.doubts if doubt.kind is FindingKind.WRAPS]
-        )
-        why = "no response at all explains the log as well as any model; check columns, wiring and unit"
-        raise ValueError(
-            f"the output '{result.output}' does not answer to the input '{result.input}': "
-            f"{words(wrapped[0]) if wrapped else why}"
-        )
 
 
 def refuse_unexplained(
