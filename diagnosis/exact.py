@@ -159,7 +159,9 @@ def _fitted(
         k, after = end.names.index(name), gap_of(end)
         rest = {n for n in end.names if n != name}
         without = [gap_of(h.end) for h in hypotheses if rest == set(h.names)] if rest else [gap_refit]
-        share = _explained(min(without, default=float("nan")), after, gap_refit, floor)
+        # Of the energy of the validation error beyond noise.
+        energy, explained = gap_refit**2 - floor**2, min(without, default=np.nan) ** 2 - after**2
+        share = float(np.clip(explained / energy, 0.0, 1.0)) if energy > 0 else float("nan")
         # What is left beyond the noise widens intervals in proportion, as does what solvers disagree about.
         wider = max(1.0, end.rms**2) * _solver_variance(end, samples)
         inverse = wider * np.asarray(np.linalg.pinv(end.hessian, hermitian=True), dtype=np.float64)
@@ -174,12 +176,6 @@ def _fitted(
         )
 
     return fitted
-
-
-def _explained(without: float, after: float, refit: float, floor: float) -> float:
-    """Share of the energy of the validation error beyond noise that an effect explains; nan without one."""
-    error = refit**2 - floor**2
-    return float(np.clip((without**2 - after**2) / error, 0.0, 1.0)) if error > 0 else float("nan")
 
 
 def _solver_variance(end: Descent, samples_per_record: float) -> float:

@@ -41,9 +41,9 @@ _attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 def __getattr__(name: str) -> object:
     from flexlink.keywords import one_line
-    from flexlink.shown import put_in_front
+    from flexlink.shown import Shown
 
-    put_in_front()
+    Shown.front = sys.modules[__name__]  # results say from now on what was found
     found = _attribute(name)
     if isinstance(found, FunctionType):
         found = globals()[name] = one_line(found)

@@ -337,8 +337,7 @@ def uncertainty(
             raise ValueError(f"{name} is no setting of uncertainty: {mend}")
     chosen = _options(EmbeddingOptions, options, settings) or EmbeddingOptions()
     if "coloured_noise" not in chosen.model_fields_set:
-        asked = "max_ar_order" in chosen.model_fields_set or "auto"
-        chosen = chosen.model_copy(update={"coloured_noise": asked})
+        chosen = chosen.model_copy(update={"coloured_noise": "auto"})
     if chosen.order_given is None:
         chosen = chosen.model_copy(update={"order_given": getattr(identification, "order_given", False)})
     used = _records_of(identification, records)

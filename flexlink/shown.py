@@ -3,44 +3,31 @@
 from __future__ import annotations
 
 import html
-import sys
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ident.basis.model import GobfModel
 from ident.basis.model_files import ModelFile
 from ident.data.shown import Shown
 
-if TYPE_CHECKING:
-    import pandas as pd
-    from matplotlib.figure import Figure
-
 
 def text(result: object) -> str:
     """The sentences of a result: the macro in results.j2 that has the name of its class."""
-    return "\n".join(_lines(result))
+    macros = _macros()
+    name = next(kind.__name__ for kind in type(result).__mro__ if hasattr(macros, kind.__name__))
+    said = str(getattr(macros, name)(result))
+    return "\n".join(line.rstrip() for line in said.splitlines() if line.strip())
 
 
 def html_text(result: Shown) -> str:
     """The same for a notebook, with a table where the class has a short one."""
-    first, *others = (html.escape(line.strip()) for line in _lines(result))
+    first, *others = (html.escape(line.strip()) for line in text(result).splitlines())
     said = f"<p>{'<br>'.join([f'<b>{first}</b>', *others])}</p>"
     if not result.table_in_notebook:
         return said
-    return said + table(result).to_html(index=False, na_rep="", float_format="{:.4g}".format, border=0)
-
-
-def plot(result: object) -> Figure:
-    from flexlink.pictures import plot as draw
-
-    return draw(result)
-
-
-def table(result: object) -> pd.DataFrame:
-    from flexlink.tables import table as tabulate
-
-    return tabulate(result)
+    table = result.table().to_html(index=False, na_rep="", float_format="{:.4g}".format, border=0)
+    return f"{said}{table}"
 
 
 def save(model: GobfModel, path: Path) -> None:
@@ -50,18 +37,6 @@ def save(model: GobfModel, path: Path) -> None:
     if path.suffix.lower() not in MODEL_SUFFIXES:
         raise ValueError(f"{path}: expected a file name that ends in {' or '.join(MODEL_SUFFIXES)}")
     write_bytes(path, model_bytes(path, ModelFile(model)))
-
-
-def put_in_front() -> None:
-    """Results say from now on what was found."""
-    Shown.front = sys.modules[__name__]
-
-
-def _lines(result: object) -> list[str]:
-    macros = _macros()
-    name = next(kind.__name__ for kind in type(result).__mro__ if hasattr(macros, kind.__name__))
-    text = str(getattr(macros, name)(result))
-    return [line.rstrip() for line in text.splitlines() if line.strip()]
 
 
 @cache

@@ -18,7 +18,6 @@ from ident.basis.mimo_model import MimoModel
 from ident.basis.model import MisoModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.basis.structure import Structure
 from ident.checks.answer import explains_nothing
 from ident.checks.input_checks import alike_inputs, few_samples, refuse_unusable
 from ident.checks.plausible_modes import pole_warnings
@@ -190,8 +189,22 @@ def _described(
         poles, coefficients, direct = shaped.poles, shaped.coefficients, shaped.direct
         residual, rss, unknowns = shaped.residual, shaped.rss, unknowns - shaped.saved
     back = np.linalg.inv(white)
-    own_units = np.einsum("xy,yub->xub", back, coefficients), back @ direct
-    model = _model(records[0], data.structure, poles, options, *own_units)
+    coefficients, direct = np.einsum("xy,yub->xub", back, coefficients), back @ direct
+    model = MimoModel(
+        tuple(
+            MisoModel(
+                poles=poles,
+                coefficients=coefficients[k],
+                feedthrough=direct[k],
+                dt_s=records[0].dt_s,
+                input_names=records[0].input_names,
+                output_name=name,
+                integrators=options.integrators,
+                input_delay_samples=data.structure.input_delay_samples,
+            )
+            for k, name in enumerate(records[0].output_names)
+        )
+    )
     noise = residual @ residual.T / (residual.shape[1] * (1 - unknowns / data.n_samples))
     own, segments = back @ residual, data.each[0].segments
     measured = back @ np.stack([one.y for one in data.each])
@@ -224,31 +237,6 @@ def _described(
         verdicts=found.verdicts,
         search=SearchTrace(tuple(search.stages), tuple(search.minima), (), search.evaluations),
         advise=partial(_advice, records, search, model, residual),
-    )
-
-
-def _model(
-    record: Record,
-    structure: Structure,
-    poles: Poles,
-    options: IdentOptions,
-    coefficients: RealArray,
-    direct: RealArray,
-) -> MimoModel:
-    return MimoModel(
-        tuple(
-            MisoModel(
-                poles=poles,
-                coefficients=coefficients[k],
-                feedthrough=direct[k],
-                dt_s=record.dt_s,
-                input_names=record.input_names,
-                output_name=name,
-                integrators=options.integrators,
-                input_delay_samples=structure.input_delay_samples,
-            )
-            for k, name in enumerate(record.output_names)
-        )
     )
 
 

@@ -761,15 +761,10 @@ def _named(option: str, stated: Sequence[str] | None) -> dict[str, str]:
 
 
 def _number(option: str, text: str) -> float:
-    from math import isfinite
-
     try:
-        number = float(text)
+        return float(text)
     except ValueError:
-        number = float("nan")
-    if not isfinite(number) or (number == 0 and option == "--scale"):
-        raise InputError(f"{option} {text}: expected a finite number{', not 0' * (option == '--scale')}")
-    return number
+        raise InputError(f"{option} {text}: expected a number") from None
 
 
 def _settings(model: type[ModelT], given: Mapping[str, Any]) -> ModelT:

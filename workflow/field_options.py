@@ -117,11 +117,8 @@ def _kind(annotation: Any) -> Any:
     if pairs:
         return list[get_args(pairs[0])[0]] if Ellipsis in get_args(pairs[0]) else pairs[0]  # type: ignore[misc]
     plain = [kind for kind in kinds if kind in (bool, int, float)]
-    return plain[0] if len(plain) == 1 and not any(map(_is_choice, kinds)) else str
-
-
-def _is_choice(kind: Any) -> bool:
-    return any(isinstance(choice, str) for choice in get_args(kind))
+    choices = [choice for kind in kinds for choice in get_args(kind) if isinstance(choice, str)]
+    return plain[0] if len(plain) == 1 and not choices else str
 
 
 def described(field: FieldInfo) -> str:

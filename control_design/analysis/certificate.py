@@ -221,7 +221,9 @@ def _check_plant(
     near = [m for m in (*plant.modes, *loop_modes, *own_modes) if m.omega_rad_s < plant.nyquist_rad_s]
     light = [Mode(m.omega_rad_s, max(abs(m.zeta), 1e-5)) for m in near if abs(m.zeta) < 0.4]
     # Whatever is narrow: poles and zeros of the loop next to the circle, before and after it is closed.
-    roots = np.concatenate([plant.poles, plant.zeros, controller.poles, _zeros(controller), poles])
+    zeros = np.asarray(controller.to_control().zeros() if controller.order else [], dtype=np.complex128)
+    zeros = zeros[np.isfinite(zeros)]
+    roots = np.concatenate([plant.poles, plant.zeros, controller.poles, zeros, poles])
     grid = checked_grid(plant, light, n_dense, 120, roots=roots, extra=near_the_circle(roots, plant.dt_s))
     assumed_linear = plant.own_grid is not None and between_own_points == "linear"
     own_points = with_own_grid(plant, grid)
@@ -310,9 +312,3 @@ def _check_plant(
     if plant.uncertainty is None and plant.damped.uncertainty is None:
         items = [replace(item, about="nominal loop") for item in items]
     return verdict, items
-
-
-def _zeros(controller: Controller) -> Complex:
-    """Finite zeros of the controller in z."""
-    zeros = np.asarray(controller.to_control().zeros() if controller.order else [], dtype=np.complex128)
-    return np.asarray(zeros[np.isfinite(zeros)], dtype=np.complex128)

@@ -157,7 +157,7 @@ class GobfModel(Shown):
 
     def save(self, path: str | Path) -> None:
         """Write poles, coefficients and state space to a .json or .mat file, as `identify --export` does."""
-        self.front.save(self, Path(path))
+        self.front.shown.save(self, Path(path))
 
     def simulate(self, u: RealArray) -> RealArray:
         """Output (T,) for the input u (T,) or (T, 1), from rest. Raises ValueError for an unstable model."""

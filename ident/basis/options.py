@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from numbers import Complex
 from typing import Annotated, Any, Literal
 
@@ -241,6 +242,13 @@ class EmbeddingOptions(Settings):
         description="the order was given, not chosen from these data; default: as in the "
         "identification of the same channel, else no",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _order_asked_for(cls, stated: Any) -> Any:
+        if isinstance(stated, Mapping) and "max_ar_order" in stated:
+            return {"coloured_noise": True, **stated}
+        return stated
 
     @property
     def no_remainder(self) -> float:

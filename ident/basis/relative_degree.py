@@ -96,18 +96,14 @@ def conditions_with_sensitivities(
         at = here.stop
     change = np.eye(total, dtype=np.complex128)
     for at, pole in pairs:
-        change[at : at + 2, at : at + 2] = _schur_vectors(matrix[at : at + 2, at : at + 2], pole)
+        # Unitary U with U^* block U lower triangular; the block is [[., .], [b, c]] with b != 0.
+        x, y = pole.conjugate() - matrix[at + 1, at + 1], matrix[at + 1, at]
+        change[at : at + 2, at : at + 2] = np.array([[y, x], [-np.conj(x), y]]) / np.hypot(abs(x), y)
     triangular = change.conj().T @ matrix @ change
     values = (_log_moments(triangular, relative_degree - 1) @ change.T).real
     rows = values[:, 1:size].copy()
     rows[:, :k] = rows[:, :k] @ expansion.T
     return rows, values[:, size:] * scale
-
-
-def _schur_vectors(block: RealArray, pole: complex) -> ComplexArray:
-    """Unitary (2, 2) U with U^* block U lower triangular; block is [[., .], [b, c]] with b != 0."""
-    x, y = pole.conjugate() - block[1, 1], block[1, 0]
-    return np.asarray(np.array([[y, x], [-np.conj(x), y]]) / np.hypot(abs(x), y), dtype=np.complex128)
 
 
 @numba.njit(**COMPILED)

@@ -53,7 +53,11 @@ def hdf5_columns(content: bytes) -> Columns:
         for path, data in parts:
             if path.startswith("#") or data.external or data.is_virtual or "MATLAB_empty" in data.attrs:
                 continue  # what other files hold is none of this log's business
-            if data.shape is None or not 0 < data.ndim <= 2 or _is_only_a_length(data):
+            # netCDF writes a dimension without a variable as zeros.
+            length = _words(data.attrs.get("NAME", "")).startswith(
+                "This is a netCDF dimension but not a netCDF variable"
+            )
+            if data.shape is None or not 0 < data.ndim <= 2 or length:
                 continue
             total += data.size * data.dtype.itemsize
             if total > LARGEST_BYTES:
@@ -77,13 +81,6 @@ def hdf5_columns(content: bytes) -> Columns:
 
 def _words(attribute: Any) -> str:
     return attribute.decode("utf-8", "replace") if isinstance(attribute, bytes) else str(attribute)
-
-
-def _is_only_a_length(data: Any) -> bool:
-    """netCDF writes a dimension without a variable as zeros."""
-    return _words(data.attrs.get("NAME", "")).startswith(
-        "This is a netCDF dimension but not a netCDF variable"
-    )
 
 
 def _unpacked(path: str, values: Any, attributes: Any) -> Any:

@@ -9,17 +9,17 @@ NOT_STORED = {"stored": False}
 
 
 class Shown:
-    """Base of results. Words and pictures are the front door's: `flexlink.shown` puts itself here as `front`
-    with the first name that is asked of it; before, a result prints as any object."""
+    """Base of results. Words and pictures are the front door's: `flexlink` puts itself here as `front` with
+    the first name that is asked of it; before, a result prints as any object."""
 
     front: ClassVar[Any] = None
     table_in_notebook: ClassVar[bool] = False  # where it is short, and says more than the sentences
 
     def __repr__(self) -> str:
-        return object.__repr__(self) if self.front is None else str(self.front.text(self))
+        return object.__repr__(self) if self.front is None else str(self.front.shown.text(self))
 
     def _repr_html_(self) -> str:
-        return str(self.front.html_text(self))
+        return str(self.front.shown.html_text(self))
 
     def plot(self) -> Any:
         """Draw the result; see `flexlink.plot`."""

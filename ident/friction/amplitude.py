@@ -50,11 +50,6 @@ _UNEVEN = 0.25
 _HALF_WIDTHS = np.array([-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0])
 
 
-def _input_rms(records: Sequence[Record]) -> RealArray:
-    """Root mean square (R,) of the input of every record."""
-    return np.array([float(np.sqrt(np.mean(record.input[:, 0] ** 2))) for record in records])
-
-
 @dataclass(frozen=True, eq=False)
 class EquivalentFriction:
     """The viscous friction that acts like the dry one, on average, at an amplitude of the input.
@@ -96,7 +91,7 @@ def equivalent_friction(
     rng: np.random.Generator,
 ) -> EquivalentFriction:
     """For random-phase multisines with the records' power spectrum, and the rms of them together."""
-    rms = float(np.sqrt(np.mean(_input_rms(records) ** 2)))
+    rms = float(np.sqrt(np.mean([np.mean(record.input[:, 0] ** 2) for record in records])))
     spectrum = _power_spectrum(records)
     lines = np.flatnonzero(spectrum > _EXCITED * spectrum.max())
     omega = lines.astype(np.float64) * (np.pi / ((spectrum.size - 1) * friction.arm.dt_s))

@@ -14,7 +14,7 @@ from workflow.engine import codec, interrupts, storage
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
 from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
-from workflow.tasks.log_identification import LogIdentification, identify_records
+from workflow.tasks.log_identification import identify_records
 from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
 from workflow.tasks.results import IdentifiedPlant
 from workflow.tasks.simulated_rig import beside, truth_beside
@@ -79,34 +79,28 @@ def identify_logs(
     interrupts.check()
     storage.write_together(written)
     with speaking("identify"):
-        return _summary(result, out, report, export)
-
-
-def _summary(
-    result: LogIdentification, out: Path | None, report: Path | None, export: Path | None
-) -> RunSummary:
-    about, spread = result.about, result.spread
-    return RunSummary(
-        title=f"{about.input} to {about.output}",
-        sections=rows_of("summary/identification.j2", result=result),
-        numbers={
-            **model_numbers(about),
-            "warnings": [words(item) for item in result.careful],
-            "logs": [
-                {
-                    "name": record.name,
-                    "dt_s": record.dt_s,
-                    "time_column": codec.plain(record.time_column),
-                    "input_unit": "".join(record.input_units),
-                    "output_unit": "".join(record.output_units),
-                    "input_cut_samples": record.cut,
-                }
-                for record in (*result.measured, *result.fresh_records)
-            ],
-            "uncertainty": uncertainty_numbers(spread),
-            "file": None if out is None else str(out),
-            "model_file": None if export is None else str(export),
-        },
-        verdict=count(len(result.careful), "warning"),
-        report_path=None if report is None else str(report),
-    )
+        about, spread = result.about, result.spread
+        return RunSummary(
+            title=f"{about.input} to {about.output}",
+            sections=rows_of("summary/identification.j2", result=result),
+            numbers={
+                **model_numbers(about),
+                "warnings": [words(item) for item in result.careful],
+                "logs": [
+                    {
+                        "name": record.name,
+                        "dt_s": record.dt_s,
+                        "time_column": codec.plain(record.time_column),
+                        "input_unit": "".join(record.input_units),
+                        "output_unit": "".join(record.output_units),
+                        "input_cut_samples": record.cut,
+                    }
+                    for record in (*result.measured, *result.fresh_records)
+                ],
+                "uncertainty": uncertainty_numbers(spread),
+                "file": None if out is None else str(out),
+                "model_file": None if export is None else str(export),
+            },
+            verdict=count(len(result.careful), "warning"),
+            report_path=None if report is None else str(report),
+        )

@@ -82,7 +82,16 @@ class SimulatedSource(Section):
     @model_validator(mode="after")
     def _with_planned_records(self) -> Self:
         if self.plan is not None:
-            object.__setattr__(self, "records", (*_planned(self.plan), *self.records))
+            shared = self.plan.model_dump(exclude={"rms_V", "realisations"})
+            planned = (
+                SimulatedRecord(
+                    name=f"{rms_V:g} V rms, realisation {k}",
+                    excitation=Multisine(kind="multisine", grid="odd_random", rms_V=rms_V, **shared),
+                )
+                for rms_V in self.plan.rms_V
+                for k in range(1, self.plan.realisations + 1)
+            )
+            object.__setattr__(self, "records", (*planned, *self.records))
             object.__setattr__(self, "plan", None)
         if not self.records:
             raise ValueError("there is nothing to simulate: give [source.plan] or [[source.records]]")
@@ -93,19 +102,6 @@ class SimulatedSource(Section):
         """What the amplifier gives at most, V: a number of its data sheet, like the rig's."""
         limits = [effect["limit_V"] for effect in self.effects if effect["name"] == "actuator_saturation"]
         return min(limits, default=None)
-
-
-def _planned(plan: ExperimentPlan) -> tuple[SimulatedRecord, ...]:
-    """The records of a plan, named by amplitude and realisation."""
-    shared = plan.model_dump(exclude={"rms_V", "realisations"})
-    return tuple(
-        SimulatedRecord(
-            name=f"{rms_V:g} V rms, realisation {k}",
-            excitation=Multisine(kind="multisine", grid="odd_random", rms_V=rms_V, **shared),
-        )
-        for rms_V in plan.rms_V
-        for k in range(1, plan.realisations + 1)
-    )
 
 
 class FileRecord(Section):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -41,13 +40,6 @@ class UncertaintyOptions(EmbeddingOptions):
         "without friction; this amplitude: best linear approximation with friction, at "
         "the rms of the recorded inputs",
     )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _order_asked_for(cls, stated: Any) -> Any:
-        if isinstance(stated, Mapping) and "max_ar_order" in stated:
-            return {"coloured_noise": True, **stated}
-        return stated
 
     @property
     def friction_identified(self) -> bool:

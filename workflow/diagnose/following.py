@@ -66,7 +66,14 @@ def following(found: Diagnosis) -> Following:
             return Following("confirm")
         likely = {name for name in found.ambiguous_with if found.presence(name) >= _LOOKED_FOR} - {"none"}
         return Following("look" if likely else "repeat_worst")
-    competing = _left(found)
+    # By name; a second one only where it is thinkable at all or fits as well.
+    competing = tuple(
+        replace(one, name=listing([in_words(cause) for cause in one.causes] or [in_words("none")]))
+        for k, one in enumerate(found.competing)
+        if k == 0
+        or one.probability >= _THINKABLE
+        or any(cause in found.ambiguous_with for cause in one.causes)
+    )
     if not isinstance(found.case, Case) or (found.case.model_error > 0 and len(competing) < 2):
         # Of a machine of one's own nobody has said what it can be asked for.
         repeat = best_repeat(found.case, competing) if len(competing) > 1 else None
@@ -76,14 +83,3 @@ def following(found: Diagnosis) -> Following:
     longest = max(e.voltage_V.size for e in found.case.experiments)
     proposal = next_experiment(competing, Limits.of_records(found.case), n_samples=max(longest, _SHORTEST))
     return Following("separate", proposal, competing)
-
-
-def _left(found: Diagnosis) -> tuple[CompetingHypothesis, ...]:
-    """Hypotheses by name; a second one only where it is thinkable at all or fits as well."""
-    return tuple(
-        replace(one, name=listing([in_words(cause) for cause in one.causes] or [in_words("none")]))
-        for k, one in enumerate(found.competing)
-        if k == 0
-        or one.probability >= _THINKABLE
-        or any(cause in found.ambiguous_with for cause in one.causes)
-    )

@@ -23,7 +23,7 @@ _REFERENCE: dict[str, Any] = style.REFERENCE_STEPS | {"label": "reference"}
 @style.drawing("closed-loop")
 def draw_run(run: RunView) -> Figure:
     """The reference step and the disturbance of a run, predicted and on its machine."""
-    loop, channel, performance = run.loop, run.config.control_channel, run.performance
+    loop, channel, performance = run.results.closed_loop.check, run.config.control_channel, run.performance
     assert loop is not None
     labels = {"output": (channel.output, run.output_unit)}
     if performance is not None:
@@ -201,9 +201,12 @@ def draw_measured_sensitivity(run: RunView) -> Figure | None:
 
     Left: over the measured band. Right: around its peak, with two standard deviations.
     """
-    if run.loop is None or run.loop.sensitivity is None:
+    if run.results.closed_loop.check is None or run.results.closed_loop.check.sensitivity is None:
         return None
-    measured, (low, high) = run.loop.sensitivity.measured, run.loop.sensitivity.band_rad_s
+    measured, (low, high) = (
+        run.results.closed_loop.check.sensitivity.measured,
+        run.results.closed_loop.check.sensitivity.band_rad_s,
+    )
     omega = np.geomspace(0.9 * low, min(1.1 * high, run.plant.nyquist_rad_s), 900)
     curve = curves_of(run, omega)[0]
     low = min(float(m.omega_rad_s[0]) for m in measured)
@@ -246,7 +249,7 @@ def draw_conditions(run: RunView) -> Figure | None:
 
     Nothing where none was tried.
     """
-    loop, columns = run.loop, 3
+    loop, columns = run.results.closed_loop.check, 3
     if loop is None or not loop.conditions:
         return None
     time_s = loop.time_s[: loop.conditions[0].reference.size]
@@ -272,9 +275,9 @@ def draw_conditions(run: RunView) -> Figure | None:
 def draw_friction(run: RunView) -> Figure | None:
     """Left: peak of |S| over the rms of the reference, predicted with friction, measured, certified. Right:
     error on the sine. Nothing where friction was not identified."""
-    if run.loop is None or run.loop.friction is None:
+    if run.results.closed_loop.check is None or run.results.closed_loop.check.friction is None:
         return None
-    loop, found, unit = run.loop, run.loop.friction, run.output_unit
+    loop, found, unit = run.results.closed_loop.check, run.results.closed_loop.check.friction, run.output_unit
     name, sine = run.config.control_channel.output, found.tracking
     figure, (peaks, errors) = style.panels(3.9, 1, 2)
     middle = np.sqrt(found.low * found.high)

@@ -35,10 +35,6 @@ class JointsView:
         """Outputs, as the columns are called."""
         return tuple(joint.output for joint in self.config.joints)
 
-    def unit(self, name: str) -> str:
-        """Unit of a column, empty where nobody stated it."""
-        return self.results.records.unit(name)
-
     @cached_property
     def worst(self) -> tuple[Real, dict[str, Real]]:
         """Frequencies (F,) [rad/s], and by requirement the largest worst case over the plants there (F,)."""
@@ -90,7 +86,7 @@ def draw_joint_steps(run: JointsView) -> Figure | None:
         grid[0, k].plot(*steps, **style.REFERENCE_STEPS, label="reference")
         _draw_limit(grid[1, k], joint.input_limit, loop.runs, k)
         for row, name in ((0, joint.output), (1, joint.input)):
-            grid[row, k].set_ylabel(style.two_lines(name, run.unit(name)))
+            grid[row, k].set_ylabel(style.two_lines(name, run.results.records.unit(name)))
         grid[1, k].set_xlabel("time [s]")
     return figure
 
@@ -134,7 +130,9 @@ def draw_matrix_response(run: JointsView) -> Figure:
                 )
             axes.set(xscale="log", yscale="log", xlim=(shown.omega_rad_s[0], shown.omega_rad_s[-1]))
             axes.set_title(f"{source.input} to {output.output}", fontsize=9.5)
-            unit = style.ratio_unit(run.unit(output.output), run.unit(source.input))
+            unit = style.ratio_unit(
+                run.results.records.unit(output.output), run.results.records.unit(source.input)
+            )
             if j == 0:
                 axes.set_ylabel(f"|G| [{style.plain(unit, 16)}]")
             if i == n - 1:
@@ -164,7 +162,7 @@ def draw_singular_values(run: JointsView) -> Figure:
             axes.plot(omega, each, **line, label=None if number else label)
     axes.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]), xlabel="frequency [rad/s]")
     first = run.config.joints[0]
-    unit = style.ratio_unit(run.unit(first.output), run.unit(first.input))
+    unit = style.ratio_unit(run.results.records.unit(first.output), run.results.records.unit(first.input))
     axes.set_ylabel(f"singular value [{style.plain(unit, 16)}]")
     return figure
 

@@ -17,7 +17,7 @@ def draw_overview(run: RunView) -> Figure:
     """Left: identified gain with its ellipses; middle: the loop around -1; right: the reference step, without
     the disturbance that follows it."""
     figure, (gain, around, step) = style.panels(4.4, 1, 3, width_in=12.0)
-    spread, loop = run.control.spread, run.loop
+    spread, loop = run.control.spread, run.results.closed_loop.check
     assert loop is not None
     band = response_band(spread.frequency)
     factor = enlargement(band)

@@ -92,7 +92,9 @@ def _name_dampings(axes: Axes, corner: float) -> None:
 
 def _frequency_arcs(axes: Axes, corner: float, dt_s: float) -> None:
     """Lines of constant undamped frequency at round numbers of rad/s."""
-    step = _round_down(corner / dt_s / 3)
+    most = corner / dt_s / 3
+    power = 10.0 ** np.floor(np.log10(most))
+    step = float(max(step for step in (1, 2, 5) if step * power <= most * (1 + 1e-12)) * power)
     zeta = np.linspace(0, 0.999, 200)
     for omega in (step, 2 * step, 3 * step):
         z = np.exp((-zeta + 1j * np.sqrt(1 - zeta**2)) * omega * dt_s)
@@ -103,8 +105,3 @@ def _frequency_arcs(axes: Axes, corner: float, dt_s: float) -> None:
 def _label(axes: Axes, z: complex, text: str, **look: Any) -> None:
     box = {"facecolor": "white", "lw": 0, "pad": 0.7, "alpha": 0.85}
     axes.annotate(text, (z.real, z.imag), ha="center", va="center", bbox=box, **look)
-
-
-def _round_down(value: float) -> float:
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-12)) * power)

@@ -13,13 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from control_design.analysis.certificate import Certificate
 from control_design.analysis.stability import ModeChange, closed_loop_poles
 from control_design.controllers.controller import Controller
 from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification
-from control_design.synthesis.synthesis_result import SynthesisResult
 from ident.basis.options import IdentOptions
 from ident.checks.distortion_findings import distortion_findings
 from ident.data.distortion import Distortion, distortion_of
@@ -34,7 +32,7 @@ from workflow.tasks.design import joint_numbers
 from workflow.tasks.exports import Logged
 from workflow.tasks.identification import as_fitted
 from workflow.tasks.log_identification import LogIdentification
-from workflow.tasks.results import IdentifiedChannel, LoopCheck, ModelMode, RunResults, UncertainChannel
+from workflow.tasks.results import IdentifiedChannel, ModelMode, RunResults, UncertainChannel
 
 MACHINE = {"simulated": "simulated arm", "identified": "plants drawn from the identified uncertainty"}
 FRICTION = "identified arm with friction"
@@ -181,7 +179,10 @@ class RunView:
             channel.identification,
             tuple(_as_fitted(by_name[fit.name], channel, friction) for fit in found.fresh),
             tuple(self.results.records.fitted(channel)),
-            (self.unit(found.model.input_name), self.unit(found.model.output_name)),
+            (
+                self.results.records.unit(found.model.input_name),
+                self.results.records.unit(found.model.output_name),
+            ),
             f"{index + 1}-{slug}".strip("-"),
             closed_loop_poles(self.controller, self.plant) if with_loop else None,
         )
@@ -196,48 +197,24 @@ class RunView:
         return None if index is None else self.channels[index]
 
     @property
-    def inputs(self) -> list[str]:
-        return list(dict.fromkeys(channel.input for channel in self.config.channels))
-
-    @property
-    def outputs(self) -> list[str]:
-        return list(dict.fromkeys(channel.output for channel in self.config.channels))
-
-    def unit(self, signal: str) -> str:
-        """Unit of a signal, empty where nobody stated it."""
-        return self.results.records.unit(signal)
-
-    @property
     def input_unit(self) -> str:
-        return self.unit(self.config.control_channel.input)
+        return self.results.records.unit(self.config.control_channel.input)
 
     @property
     def output_unit(self) -> str:
-        return self.unit(self.config.control_channel.output)
-
-    @property
-    def synthesis(self) -> SynthesisResult | None:
-        return self.results.design.synthesis
+        return self.results.records.unit(self.config.control_channel.output)
 
     @property
     def controller(self) -> Controller:
         """Raises ValueError where there is none."""
-        if self.synthesis is None:
+        if self.results.design.synthesis is None:
             raise ValueError("the run has no design")
-        return self.synthesis.controller
+        return self.results.design.synthesis.controller
 
     @property
     def logged_controller(self) -> Controller:
         """As the run's files have it."""
         return Logged.of(self.config, self.results.records).law(self.controller)
-
-    @property
-    def certificate(self) -> Certificate | None:
-        return self.results.certify.certificate
-
-    @property
-    def loop(self) -> LoopCheck | None:
-        return self.results.closed_loop.check
 
     @property
     def plant(self) -> UncertainPlant:
@@ -251,13 +228,13 @@ class RunView:
     @property
     def certified_level(self) -> float:
         """Level of the ellipses that were certified: calibrated to sampled responses where asked for."""
-        joint = None if self.certificate is None else self.certificate.joint
+        joint = None if self.results.certify.certificate is None else self.results.certify.certificate.joint
         return self.level if joint is None else max(self.level, joint.level)
 
     @property
     def proved(self) -> bool:
         """Whether the certificate speaks for every frequency between the grid's points too."""
-        certificate = self.certificate
+        certificate = self.results.certify.certificate
         return certificate is not None and all(v.all_frequencies.proved for v in certificate.plants)
 
     @property
@@ -289,7 +266,7 @@ class RunView:
     @property
     def lasting_error(self) -> float:
         """Largest error that the constant disturbance leaves, predicted or in a run."""
-        loop = self.loop
+        loop = self.results.closed_loop.check
         if loop is None:
             return 0.0
         return max(abs(row.disturbance_left) for row in (loop.predicted, *loop.achieved))
@@ -297,13 +274,13 @@ class RunView:
     @property
     def lasting_error_share(self) -> float:
         """Of the reference step that a constant disturbance leaves as error; 0 without tracking."""
-        loop = self.loop
+        loop = self.results.closed_loop.check
         return 0.0 if loop is None or not loop.tracking else self.lasting_error / loop.reference_step
 
     @property
     def damped_mode(self) -> ModeChange | None:
         """The mode of the nominal that the loop takes most damping from, else the slowest; None without."""
-        plants = () if self.certificate is None else self.certificate.plants
+        plants = () if self.results.certify.certificate is None else self.results.certify.certificate.plants
         changes = [change for p in plants if p.plant == self.plant.name for change in p.mode_changes]
         lost = [change for change in changes if change.loses_damping]
         ratio = {change: change.closed_loop.zeta / change.open_loop.zeta for change in lost}
@@ -329,7 +306,7 @@ class RunView:
             for mode in modes_of(np.concatenate(poles), self.plant.dt_s)
             if omega[0] < mode.omega_rad_s < omega[-1]
         ]
-        plants = () if self.certificate is None else self.certificate.plants
+        plants = () if self.results.certify.certificate is None else self.results.certify.certificate.plants
         worst = [v.worst_margin_omega_rad_s for v in plants if 0 < v.worst_margin_omega_rad_s <= omega[-1]]
         dense = frequency_grid(
             float(omega[-1]), modes, omega_min_rad_s=float(omega[0]), n_log=2, n_mode=81 * len(modes)

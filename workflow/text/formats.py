@@ -193,11 +193,10 @@ def setting(value: Any) -> str:
     return str(value)
 
 
-def _finite(value: float | None) -> bool:
-    return value is not None and math.isfinite(value)
-
-
-TESTS: Mapping[str, Callable[..., bool]] = {"finite": _finite, "nan": math.isnan}
+TESTS: Mapping[str, Callable[..., bool]] = {
+    "finite": lambda value: value is not None and math.isfinite(value),
+    "nan": math.isnan,
+}
 _NAMED: tuple[Callable[..., Any], ...] = (
     number, at_least, at_most, bound, si, percent, share, portion, signed, fixed, interval, extent, frequency,
     hertz, decibels, in_decibels, unit, listing, sparkline, count, sentence, yes_no, setting,
