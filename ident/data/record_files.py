@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import re
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -14,7 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from ident.data.foreign_files import LARGEST_BYTES, content_of, distinct, npz_arrays, read_in_child, shown
+from ident.data.foreign_files import (
+    LARGEST_BYTES,
+    Unread,
+    content_of,
+    distinct,
+    npz_arrays,
+    read_in_child,
+    shown,
+)
 from ident.data.json_columns import json_columns
 from ident.data.mat_files import mat_variables
 from ident.data.table import Table
@@ -48,8 +57,10 @@ def read_table(path: str | PathLike[str]) -> Table:
         known = ", ".join(READERS)
         raise ValueError(f"{file}: unknown kind of file '{shown(ending)}'; expected one of {known} (or .gz)")
     try:
-        content = content_of(file)
-        return READERS[ending](file, _unpacked(content) if packed else content)
+        content = _unpacked(content_of(file)) if packed else content_of(file)
+        if re.match(rb"\s*# (Created by Octave|name: .*\r?\n# type: )", content):
+            raise ValueError("Octave text; expected numbers as MATLAB has them: save -v7 FILE.mat NAMES")
+        return READERS[ending](file, content)
     except ValueError as error:
         text = str(error)
         between = "" if text.startswith((":", ",")) else ": "
@@ -100,6 +111,12 @@ def _text_table(file: Path, layout: Layout, columns: Mapping[str, tuple[str, ...
         if (counted is not None or not given) and not layout.skipped:
             raw[name], units[name] = start + step * np.arange(n_rows), "s"
     raw = {name: cells for name, cells in raw.items() if not isinstance(cells, tuple) or any(cells)}
+    # Some write a time for each signal.
+    times = [name for name in raw if name.startswith("#") and says_time(name.partition(" ")[2])]
+    if len(times) > 1 and len({raw[name] for name in times}) > 1:
+        raise ValueError(f": '{times[0]}' and '{times[1]}' differ; expected one time for all signals")
+    raw = {name.partition(" ")[2] if name in times else name: cells for name, cells in raw.items()}
+    units |= {name.partition(" ")[2]: units.get(name, "") for name in times}
     table = Table(file, raw, layout.first, layout, units)
     filled = {name: [k for k, cell in enumerate(cells) if cell] for name, cells in columns.items()}
     ends = {name: rows for name, rows in filled.items() if rows and len(rows) < n_rows}
@@ -127,7 +144,14 @@ def _read_mat(file: Path, content: bytes) -> Table:
     """A MATLAB file; what stands in structs is called log.signals[0].values."""
     if b"\x89HDF\r\n" in content[:1024]:  # version 7.3
         return _read_columns(file, content, "HDF5", "h5py")
-    return Table(file, _flat("", mat_variables(content, file)))
+    parts = _flat("", mat_variables(content, file))
+    names = distinct([name for name, _, _ in parts])
+    told = list(zip(names, parts, strict=True))
+    return Table(
+        file,
+        {name: value for name, (_, value, _) in told},
+        units={name: unit for name, (_, _, unit) in told if unit},
+    )
 
 
 @reads(".h5", ".hdf5")
@@ -194,18 +218,33 @@ def _read_bag(file: Path, content: bytes) -> Table:
 def _read_columns(file: Path, content: bytes, kind: str, library: str) -> Table:
     arrays = npz_arrays(read_in_child(kind, library, content))
     about = json.loads(arrays.pop("about").tobytes())
-    names = distinct([name for name, _ in about])
-    columns = {name: arrays[str(k)] for k, name in enumerate(names)}
-    units = {name: unit for name, (_, unit) in zip(names, about, strict=True) if unit}
+    names = distinct([name for name, _, _ in about])
+    told = list(zip(names, about, strict=True))
+    columns = {name: Unread(why) if why else arrays[str(k)] for k, (name, (_, _, why)) in enumerate(told)}
+    units = {name: unit for name, (_, unit, _) in told if unit}
     return Table(file, columns, units=units)
 
 
-def _flat(name: str, value: Any) -> dict[str, Any]:
-    """Nested fields and lists under the names by which a program would call them; text is no column."""
+def _flat(name: str, value: Any, unit: str = "") -> list[tuple[str, Any, str]]:
+    """Nested fields and lists under the names by which a program would call them, with their units; text is
+    no column. What says its name beside its data, as recorders do, has that."""
+    if isinstance(value, str):
+        return []
     if isinstance(value, Mapping):
+        said = {key.lower(): text.strip() for key, text in value.items() if isinstance(text, str)}
+        if said.get("name"):
+            return [
+                part
+                for key, item in value.items()
+                for part in _flat(
+                    said["name"] if key.lower() in ("data", "values") else f"{name}.{key}",
+                    item,
+                    said.get("unit", ""),
+                )
+            ]
         parts = [(f"{name}.{key}" if name else key, item) for key, item in value.items()]
     elif isinstance(value, list):
         parts = [(f"{name}[{k}]", item) for k, item in enumerate(value)]
     else:
-        return {} if isinstance(value, str) else {name: value}
-    return {key: item for part in parts for key, item in _flat(*part).items()}
+        return [(name, value, unit)]
+    return [item for part in parts for item in _flat(*part)]

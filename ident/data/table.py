@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 
 from ident.data.arrays import RealArray
-from ident.data.foreign_files import as_numbers, shown
+from ident.data.foreign_files import MOST_COLUMNS, as_numbers, shown
+from ident.data.json_columns import columns_in
 from ident.data.text_tables import Layout, doubtful_groups, is_number, number
 from ident.data.time_stamps import StampError, is_stamp, may_be_minutes, seconds_since_first
 from ident.data.units import SIGNAL_WORDS, TimeColumn, size_of, written_unit
 
 # Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
 LARGEST = 1e100
+_LIST = re.compile(r"\[[\s\[]*[-+.\d]")
 # Larger stamps, as those since 1970, lose digits where they are divided by a unit.
 _LONG_STAMP = 1e9
-# Of a matrix so many columns at most are offered by number.
-_MOST_NUMBERED = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +46,8 @@ class Table:
         columns: dict[str, Any] = {}
         for name, values in self.raw.items():
             columns |= _split(name, values)
+        if len(columns) > MOST_COLUMNS:
+            raise ValueError(f"{self.path}: {len(columns)} columns; expected at most {MOST_COLUMNS}")
         object.__setattr__(self, "raw", columns)
 
     @property
@@ -275,14 +277,16 @@ class Table:
 
 def _split(name: str, values: Any) -> dict[str, Any]:
     """A matrix (T, C), or (C, T) as of Simulink, as C columns; (T, 1), (1, T) as vectors; records by
-    field."""
+    field; lists in cells of text, '[0.1, 0.2]', as `columns_in`."""
+    if isinstance(values, tuple) and values and _LIST.match(values[0]):
+        return columns_in(name, [re.findall(r"[^][()\s,;]+", cell) or None for cell in values])
     if isinstance(values, np.ndarray) and values.dtype.names and values.ndim == 1:
         return {f"{name}.{field}": values[field] for field in values.dtype.names}
     if not isinstance(values, np.ndarray) or values.ndim != 2:
         return {name: values}
     if 1 in values.shape or values.size == 0:
         return {name: values.ravel()}
-    if min(values.shape) > _MOST_NUMBERED:
+    if min(values.shape) > MOST_COLUMNS:
         return {name: values}
     columns = values if values.shape[0] >= values.shape[1] else values.T
     return {f"{name}[{k}]": column for k, column in enumerate(columns.T)}

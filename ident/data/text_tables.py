@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from ident.data.foreign_files import distinct
+from ident.data.foreign_files import MOST_COLUMNS, distinct
 from ident.data.time_stamps import is_stamp
 from ident.data.units import is_unit, says_time
 
@@ -44,6 +44,10 @@ _INCREMENT = re.compile(
 _BEYOND = re.compile(r"comment|start|increment|[+-]?\d+\.?\d*(e[+-]?\d+)?|", re.IGNORECASE)
 _UNITS_OF_X = re.compile(r"(?:horizontal|x)[_ ]units?\b|x_dimension\b", re.IGNORECASE)
 _UNITS_OF_Y = re.compile(r"(?:vertical|y)[_ ]unit", re.IGNORECASE)
+# What a serial monitor puts before each line: '10:15:30.000 -> ', '[2024-03-01 10:15:30.000] '.
+_ARRIVED = re.compile(r"\s*(?:\[([^]]{4,40})\]|(\S[^>]{3,40}?)\s*->)(?:\s+|$)")
+# A number with its name, as plotters of serial ports take it: 'angle:0.01', 'volt = -3.00'.
+_LABELLED = re.compile(r"([^\W\d][^:=,;\t|]*?)\s*[:=]\s*([^:=,;\t| ]+) *([,;\t|]?)\s*")
 _SIGNS = frozenset("#%/!-*rR")
 _NO_TEXT = re.compile(r"[\x00-\x08\x0e-\x1f]")
 
@@ -114,6 +118,9 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
         lines.pop()  # blank lines at the very end are no samples
     if not lines:
         raise ValueError(": the file is empty; expected a header line and rows of numbers")
+    end = "\n" if text.endswith("\n") else ""
+    if inside := _arrived(lines, end) or _labelled(lines, end):
+        return inside
     layout = _layout(lines[:_SAMPLE], len(lines))
     first = layout.first - 1
     commented = [k for k in range(first, len(lines)) if _is_comment(lines[k])]
@@ -146,6 +153,45 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
     )
     layout = replace(layout, plain=sure)
     return layout, dict(zip(layout.names, zip(*rows, strict=True), strict=True))
+
+
+def _arrived(lines: Sequence[str], end: str) -> tuple[Layout, dict[str, tuple[str, ...]]] | None:
+    """The table behind the stamps that a serial monitor puts before its lines, and these; None without."""
+    heads = [_ARRIVED.match(line) for line in lines]
+    stamps = [(head[1] or head[2]) if head else "" for head in heads]
+    if 2 * sum(map(is_stamp, stamps)) <= len(lines):
+        return None
+    rest = [line[head.end() if head else 0 :] for line, head in zip(lines, heads, strict=True)]
+    layout, columns = read_text("\n".join(rest) + end)
+    rows = range(len(next(iter(columns.values()))))
+    names = distinct(["time", *columns])
+    cells = [tuple(stamps[layout.line(row) - 1] for row in rows), *columns.values()]
+    return replace(layout, names=tuple(names)), dict(zip(names, cells, strict=True))
+
+
+def _labelled(lines: Sequence[str], end: str) -> tuple[Layout, dict[str, tuple[str, ...]]] | None:
+    """The table of lines that name each of their numbers, in one order; None where they do not."""
+
+    def parts(line: str) -> list[tuple[str, str, str]]:
+        found = _LABELLED.findall(line)
+        whole = found and all(is_number(value, ".") for _, value, _ in found)
+        return found if whole and not _LABELLED.sub("", line).strip() else []
+
+    looked = Counter(tuple(name for name, _, _ in parts(line)) for line in lines[:_SAMPLE] if line.strip())
+    names, times = looked.most_common(1)[0]
+    if not names or 2 * times <= looked.total():
+        return None
+    rows = [parts(line) for line in lines]
+    alike = [tuple(name for name, _, _ in row) == names for row in rows]
+    first, columns = alike.index(True), distinct(names)
+    # Another line stays as it is: whoever takes the column is told.
+    values = [
+        ";".join(value for _, value, _ in row) if like else line
+        for row, like, line in zip(rows, alike, lines, strict=True)
+    ]
+    layout, cells = read_text("\n" * first + "\n".join(values[first:]) + end)
+    layout = replace(layout, names=tuple(columns), separator=rows[first][0][2] or " ", header=first + 1)
+    return layout, dict(zip(columns, cells.values(), strict=True))
 
 
 def _is_cut(rows: Sequence[Sequence[str]], decimal: str) -> bool:
@@ -193,6 +239,10 @@ class _Fit:
     def of(cls, lines: Sequence[str], separator: str, decimal: str) -> _Fit:
         rows = _rows(lines, separator)
         live = [k for k, row in enumerate(rows) if any(row) and not _is_comment(lines[k])]
+        widest = max(live, key=lambda k: len(rows[k]), default=0)
+        if len(rows[widest]) > MOST_COLUMNS:
+            what = f"{len(rows[widest])} cells; expected at most {MOST_COLUMNS} columns, a row per sample"
+            raise ValueError(f", line {widest + 1}: {what}")
         filled = [rows[k] for k in live[-100:] if any(_is_value(cell, decimal) for cell in rows[k])]
         if not filled:
             return cls(separator, decimal, lines, rows)
@@ -289,6 +339,10 @@ class _Fit:
             sampling = self._increment(self.start, [], []) if stated else None
             first = self.start if stated else self.first
             return Layout(self.separator, self.decimal, numbered, {}, 0, first + 1, increment=sampling)
+        if channels := self._channels():
+            every = distinct([name for name, _ in channels])
+            own = {name: unit for name, (_, unit) in zip(every, channels, strict=True) if unit}
+            return Layout(self.separator, self.decimal, tuple(every), own, header + 1, self.start + 1)
         names, units, below = self._names_at(header) or [], list[str](), header + 1
         over = self._above(header)[:1]
         longer = self._names_at(over[0], numbered=True) if over else None
@@ -311,6 +365,27 @@ class _Fit:
         return Layout(
             separator, decimal, tuple(columns), beside | known, header + 1, below + 1, increment=sampling
         )
+
+    def _channels(self) -> list[tuple[str, str]] | None:
+        """Names and units of the columns where each channel has a time and a value, and lines above say of
+        each what it is: 'Name, drive, Name, hub', as scopes of a PLC do."""
+        above = [row[: self.most] for row in self.rows[: self.start] if len(row) >= self.most]
+        told = {row[0].lower(): row[1::2] for row in above if row[0] and set(row[::2]) == {row[0]}}
+        if self.most % 2 or "name" not in told or not all(told["name"]):
+            return None
+        step, unit = "", ""
+        for key, values in told.items():
+            if found := re.fullmatch(r"sampl\w+\s*(?:time|period|interval)\s*[\[(](\w+)[\])]", key):
+                step, unit = values[0], found[1]
+        if self.most == 2 and not unit:
+            return None  # any line is of two cells
+        stamps = [self.rows[k][0] for k in (self.start, self.start + 1)]
+        if all(is_number(cell, self.decimal) for cell in (step, *stamps)):
+            first, second, every = (number(cell, self.decimal) for cell in (*stamps, step))
+            unit = unit if abs(second - first - every) < 0.01 * every else ""
+        units = [text.strip("[](){} ") for text in told.get("unit", [""] * len(told["name"]))]
+        channels = zip(told["name"], units, strict=True)
+        return [column for name, own in channels for column in (("time", unit), (name, own))]
 
     def _are_units(self, cells: Sequence[str]) -> bool:
         """Whether most words of a line are units; numbers are no words (Rigol's start and step)."""
