@@ -71,6 +71,14 @@ def wraps_at(values: RealArray) -> float:
     return period if smooth <= _SMOOTHER * np.std(np.diff(values, 2)) else 0.0
 
 
+def counts_rows(values: RealArray) -> bool:
+    """Whether readings (T,) only count: they go on by one, but for where they start again."""
+    steps = np.diff(values)
+    return (
+        bool(np.all((steps == 1) | (steps < 0)) and np.mean(steps == 1) > 1 - _FEW) if steps.size else False
+    )
+
+
 def spikes_in(values: RealArray) -> IntArray:
     """The samples (of T) to which a signal jumps, and from which it comes back or where it ends: around them
     are steps many times longer than all others. What goes on moving there, as in a shock, is none."""

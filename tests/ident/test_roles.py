@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident.data.roles import Roles, is_position, roles_of, roles_with_reference
+from ident.data.roles import Roles, is_position, roles_of
 from ident.data.table import Table
 
 
@@ -41,20 +41,6 @@ def test_what_is_stated_decides():
     )
 
 
-LOOP = table("t_s", "u_ref_rad", "v_drive_counts", "theta_rad", drive="counts")
-
-
-def test_a_reference_is_neither_input_nor_output():
-    """Columns of a measured arm in closed loop."""
-    assert roles_of(LOOP, "a.csv", reference="u_ref_rad") == Roles("t_s", "v_drive_counts", "theta_rad")
-    with pytest.raises(
-        ValueError, match=r"--input v_drive_counts --output theta_rad --reference u_ref_rad --time t_s$"
-    ):
-        roles_of(LOOP, "a.csv")
-    named = {"input": "v_drive_counts", "output": "theta_rad"}
-    assert roles_of(LOOP, "a.csv", **named) == Roles("t_s", "v_drive_counts", "theta_rad")
-
-
 @pytest.mark.parametrize(
     ("wished", "drive", "moved"),
     [
@@ -68,7 +54,7 @@ def test_a_reference_is_neither_input_nor_output():
 )
 def test_set_points_by_other_names(wished, drive, moved):
     names = ("t_s", moved, wished, drive)
-    roles = roles_with_reference(table(*names), "a.csv", "init")
+    roles = roles_of(table(*names), "a.csv", "init")
     assert roles == Roles("t_s", drive, moved, wished)
 
 
@@ -78,7 +64,7 @@ def test_of_two_columns_without_a_known_name_the_follower_is_the_output():
     shortest = min(column.size for column in columns.values())
     log = Table("a.csv", {name: column[:shortest] for name, column in columns.items()}, units={})
     with pytest.raises(ValueError, match=r"--input i_A --output b_deg --reference a_deg --time t_s$"):
-        roles_with_reference(log, "a.csv", "init")
+        roles_of(log, "a.csv", "init")
 
 
 def test_a_first_column_that_rises_may_be_time_but_a_rows_number_is_none():
@@ -131,10 +117,14 @@ def test_the_last_word_of_a_path_counts(input_, output):
         (("t_s", "pos_ref_rad", "pos_rad", "vel_rad_s", "u_V"), ("u_V", "pos_rad", "pos_ref_rad")),
         (("t_s", "u_ref_V", "hub_rad"), ("u_ref_V", "hub_rad", None)),
         (("t_s", "Commanded_PWM", "Motor_Speed(RPM)"), ("Commanded_PWM", "Motor_Speed(RPM)", None)),
+        (("t_ms", "x_ref_mm", "torque_cmd_%", "x_mm"), ("torque_cmd_%", "x_mm", "x_ref_mm")),
+        (("t_us", "ref_cnt", "dac_cnt", "enc_cnt"), ("dac_cnt", "enc_cnt", "ref_cnt")),
+        (("t_s", "setpoint_mm", "output_%", "position_mm"), ("output_%", "position_mm", "setpoint_mm")),
+        (("t_s", "v_est", "u", "current_position", "target"), ("u", "current_position", "target")),
     ],
 )
 def test_a_reference_is_recognised_by_its_name_in_the_unit_of_the_output(names, found):
-    got = roles_with_reference(table(*names), "a.csv", "init")
+    got = roles_of(table(*names), "a.csv", "init")
     assert (got.input, got.output, got.reference) == found
 
 
@@ -143,11 +133,8 @@ def test_two_references_are_asked_for_with_all_that_was_said():
     with pytest.raises(
         ValueError, match=r"a_ref_rad and b_ref_rad may be .* --output a_rad --reference a_ref_rad$"
     ):
-        roles_with_reference(two, "a.csv", "init", output="a_rad")
-    assert (
-        roles_with_reference(two, "a.csv", "init", output="a_rad", reference="b_ref_rad").reference
-        == "b_ref_rad"
-    )
+        roles_of(two, "a.csv", "init", output="a_rad")
+    assert roles_of(two, "a.csv", "init", output="a_rad", reference="b_ref_rad").reference == "b_ref_rad"
 
 
 @pytest.mark.parametrize(

@@ -160,8 +160,9 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> Channel
         if stated.dt_s is not None and stated.time is None:
             roles = replace(roles, time=None)
         if roles.time is None and stated.dt_s is None:
-            named = shlex.quote(shown(next(iter(rising(tables[0])), "NAME"), 30))
-            ways = f"--dt-s SECONDS, or --time {named}"
+            ways = ", or --time ".join(
+                ["--dt-s SECONDS", *(shlex.quote(shown(n, 30)) for n in rising(tables[0]))]
+            )
             raise ValueError(f"no column looks like time: type flexlink {command} {typed} {ways}")
     options = [_stamps(table, roles, stated.time_unit) for table in tables]
     steps = [float(text.split()[1]) for text in options if text.startswith("--resample-s")]

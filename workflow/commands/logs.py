@@ -11,7 +11,7 @@ from ident.data.finding import Finding
 from ident.data.record import Record, in_one_unit
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response
-from ident.data.roles import Roles, roles_with_reference
+from ident.data.roles import Roles, roles_of
 from ident.data.table import Table
 from workflow.engine.errors import naming
 
@@ -43,7 +43,7 @@ class Reading:
 
     def roles(self, table: Table, logs: str, command: str) -> Roles:
         """What is stated, and what names and units of the table tell. Raises ValueError."""
-        return roles_with_reference(
+        return roles_of(
             table,
             logs,
             command,

@@ -13,7 +13,7 @@ from ident.data.finding import Finding, distinct
 from ident.data.record import reading_notes
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response, read_response
-from ident.data.roles import Roles, roles_with_reference, times_in
+from ident.data.roles import Roles, roles_of, times_in
 from ident.data.table import Table
 from ident.data.text_tables import Layout
 from ident.data.time_grid import LARGEST_JITTER, clock_doubts, jitter_of, only_rounded, option_for
@@ -109,7 +109,7 @@ def look_at(
     time = time or (times[0] if times else None)
     roles, unclear = None, ""
     try:
-        roles = roles_with_reference(table, str(path), "identify", time=time) if response is None else None
+        roles = roles_of(table, str(path), "identify", time=time) if response is None else None
     except ValueError as error:
         unclear = str(error)
     columns = tuple(_column(table, name) for name in table.names if name != time)
