@@ -199,10 +199,13 @@ def _only(names: list[str]) -> str | None:
 
 
 def _led_and_follower(table: Table, names: list[str]) -> tuple[str, str] | None:
-    """Of two columns the one that comes first and the one that follows it, in the same unit and by their
-    changes; None where they tell neither."""
+    """Of two columns in one unit the one that leads, by its name or as the other follows its changes, and the
+    other; None where they tell neither."""
     if len(names) != 2 or table.unit(names[0]) != table.unit(names[1]):
         return None
+    called = [name for name in names if any(found[1] for found in _WORD.finditer(name))]
+    if len(called) == 1:
+        return called[0], names[1 - names.index(called[0])]
     with suppress(ValueError):
         first, second = (
             np.diff(column) - np.mean(np.diff(column)) for column in table.columns(names).values()

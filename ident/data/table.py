@@ -7,13 +7,14 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal, InvalidOperation
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ident.data.arrays import RealArray
-from ident.data.foreign_files import MOST_COLUMNS, as_numbers, shown
+from ident.data.foreign_files import MOST_COLUMNS, Unread, as_numbers, shown
 from ident.data.json_columns import columns_in
 from ident.data.text_tables import Layout, doubtful_groups, is_number, number
 from ident.data.time_stamps import StampError, is_stamp, may_be_minutes, seconds_since_first
@@ -32,7 +33,8 @@ class Table:
 
     raw: by name, an array, or text cells (a tuple of str) as `layout` says. A matrix (T, C) is offered as C
     columns name[0], name[1], ... first_line: file line of row 0, None where rows have no lines (npz, mat).
-    units: by name, where the file states them apart from the names.
+    units: by name, where the file states them apart from the names. begin, run: row of the file at which a
+    run of it begins, and what it is called.
     """
 
     path: Path
@@ -41,6 +43,8 @@ class Table:
     layout: Layout | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     clocks: Mapping[str, RealArray] = field(default_factory=dict)
+    begin: int = 0
+    run: str = ""
 
     def __post_init__(self) -> None:
         columns: dict[str, Any] = {}
@@ -56,10 +60,35 @@ class Table:
 
     def place(self, row: int, name: str | None = None) -> str:
         if self.first_line is None:
-            return f"index {row}"
+            return f"index {row + self.begin}"
         if name is not None and name in self.clocks:
             row = int(self.clocks[name][row])
+        row += self.begin
         return f"line {self.layout.line(row) if self.layout else row + self.first_line}"
+
+    def runs(self, time: str | None) -> list[Table]:
+        """The parts of a table in which time starts again where another column changes, and only there: its
+        number or name of the run; else the table alone."""
+        if time is None or self.clocks or time not in self.raw:
+            return [self]
+        try:
+            falls = np.flatnonzero(np.diff(self.columns([time])[time]) < 0) + 1
+        except ValueError:  # who takes the stamps is told what is wrong with them
+            return [self]
+        columns = {
+            name: np.asarray(values) for name, values in self.raw.items() if not isinstance(values, Unread)
+        }
+        of = [n for n, v in columns.items() if np.array_equal(np.flatnonzero(v[1:] != v[:-1]) + 1, falls)]
+        if not falls.size or not of:
+            return [self]
+        found = []
+        for start, stop in pairwise([0, *falls.tolist(), len(columns[time])]):
+            raw = {
+                name: values if isinstance(values, Unread) else values[start:stop]
+                for name, values in self.raw.items()
+            }
+            found.append(replace(self, raw=raw, begin=start, run=f"{of[0]} {columns[of[0]][start]}"))
+        return found
 
     @property
     def sparse(self) -> bool:
@@ -268,7 +297,8 @@ class Table:
         backwards = np.flatnonzero(~(np.diff(stamps) > 0))
         if backwards.size:
             row = int(backwards[0]) + 1
-            what = "take the repeated row out" if stamps[row] == stamps[row - 1] else "split the file there"
+            what = "split the file there, or number its runs in a column"
+            what = "take the repeated row out" if stamps[row] == stamps[row - 1] else what
             raise ValueError(
                 f"{self.path}, {self.place(row)}: time '{name}' goes from {stamps[row - 1]:.9g} to "
                 f"{stamps[row]:.9g} s; expected increasing time ({what})"

@@ -42,7 +42,7 @@ def wraps_at(values: RealArray) -> float:
     """The period at which readings (T,) seem to wrap, else 0: they jump by nearly their whole range, and go
     on smoothly once unwrapped. So does a sawtooth; readings that never came near both ends are not seen."""
     span = float(np.ptp(values)) if values.size >= 20 else 0.0
-    if not span > 0:
+    if not span > 0 or counts_rows(values):
         return 0.0
     share = np.abs(np.diff(values)) / span
     jumps = share > 0.6

@@ -43,6 +43,7 @@ class Entry:
     path: str
     validates: bool
     name: str = ""
+    run: int | None = None
     start: int | None = None
     stop: int | None = None
 
@@ -107,7 +108,7 @@ def init(
         scale[name] = -scale.get(name, 1.0)
         units |= {name: unit_of[name]} if unit_of[name] else {}
     found = Found(tuple(logs), shlex.quote(out.name), stated, read, scale, units, draft)
-    text = configuration(found, _entries(logs, out, draft))
+    text = configuration(found, _entries(read.tables, out, draft))
     config = check(RunConfig, tomllib.loads(text), source=str(out), context={"base": out.absolute().parent})
     storage.write_text(out, text)
     look = draft.look
@@ -135,13 +136,14 @@ def init(
 @dataclass(frozen=True, eq=False)
 class Channel:
     """One channel of logs as read. how: with what was found; unit_of: input and output; repeats: rows of the
-    logs that are alike, one after the other, 1 where each is its own."""
+    logs that are alike, one after the other, 1 where each is its own. tables: of the records."""
 
     roles: Roles
     how: Reading
     unit_of: dict[str, str]
     records: list[Record]
     repeats: int
+    tables: list[Table]
 
 
 def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> Channel:
@@ -157,6 +159,7 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> Channel
     typed = shlex.quote(str(logs[0])) if len(logs) == 1 and len(str(logs[0])) < _SHORT else "LOG..."
     with naming(str(logs[0])):
         roles = stated.roles(tables[0], typed, command)
+        tables = replace(stated, time=roles.time).runs(tables)
         if stated.dt_s is not None and stated.time is None:
             roles = replace(roles, time=None)
         if roles.time is None and stated.dt_s is None:
@@ -189,7 +192,8 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> Channel
         name: stated.units.get(name, "" if name in stated.scale else tables[0].unit(name))
         for name in (roles.input, roles.output)
     }
-    return Channel(roles, how, unit_of, with_common_sampling_time(records), repeats if not steps else 1)
+    common = with_common_sampling_time(records)
+    return Channel(roles, how, unit_of, common, repeats if not steps else 1, tables)
 
 
 def _repeats(record: Record) -> int:
@@ -239,20 +243,21 @@ def _wrapping(tables: Sequence[Table], output: str) -> dict[str, float]:
     return {}
 
 
-def _entries(logs: Sequence[Path], out: Path, draft: Draft) -> list[Entry]:
-    """The last log validates; of one the last part, where it is split."""
-    base = out.absolute().parent
-    paths = [Path(os.path.relpath(path.absolute(), base)).as_posix() for path in logs]
-    if len(logs) == 1:
+def _entries(tables: Sequence[Table], out: Path, draft: Draft) -> list[Entry]:
+    """The last log, or run of one, validates; of one the last part, where it is split."""
+    base, stems = out.absolute().parent, [table.path.stem for table in tables]
+    paths = [Path(os.path.relpath(table.path.absolute(), base)).as_posix() for table in tables]
+    if len(tables) == 1:
         if draft.split_sample is None:
             return [Entry(paths[0], False)]
-        stem = logs[0].stem
         return [
-            Entry(paths[0], False, f"{stem}, first part", stop=draft.split_sample),
-            Entry(paths[0], True, f"{stem}, last part", start=draft.split_sample),
+            Entry(paths[0], False, f"{stems[0]}, first part", stop=draft.split_sample),
+            Entry(paths[0], True, f"{stems[0]}, last part", start=draft.split_sample),
         ]
-    alike = len({path.stem for path in logs}) < len(logs)
-    return [
-        Entry(path, k == len(paths) - 1, f"{k + 1}: {logs[k].stem}" if alike else "")
-        for k, path in enumerate(paths)
+    alike = len(set(stems)) < len(stems)
+    names = [
+        ", ".join(filter(None, (stem if table.run else f"{k}: {stem}" if alike else "", table.run)))
+        for k, (stem, table) in enumerate(zip(stems, tables, strict=True), 1)
     ]
+    runs = [paths[:k].count(path) if tables[k].run else None for k, path in enumerate(paths)]
+    return [Entry(path, k == len(paths) - 1, names[k], runs[k]) for k, path in enumerate(paths)]

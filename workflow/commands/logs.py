@@ -53,14 +53,23 @@ class Reading:
             reference=self.reference,
         )
 
-    def records(self, logs: Sequence[Path | Table]) -> list[Record]:
-        """Of logs that are used together, where input and output are named; each column in one unit. Raises
-        InputError naming file, column or line."""
-        found = list[Record]()
+    def runs(self, logs: Sequence[Path | Table]) -> list[Table]:
+        """The tables of logs; each run of one in which time starts again."""
+        found = list[Table]()
         for log in logs:
             with naming(str(log.path if isinstance(log, Table) else log)):
+                table = log if isinstance(log, Table) else read_table(log).with_decimal(self.decimal)
+                found += table.runs(self.time)
+        return found
+
+    def records(self, tables: Sequence[Table]) -> list[Record]:
+        """Of tables that are used together, where input and output are named; each column in one unit. Raises
+        InputError naming file, column or line."""
+        found = list[Record]()
+        for table in tables:
+            with naming(str(table.path)):
                 record = Record.from_file(
-                    log,
+                    table,
                     [str(self.input_name)],
                     [str(self.output_name)],
                     time=self.time,
@@ -118,5 +127,6 @@ def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: S
             time=roles.time if how.time is None and how.dt_s is None else how.time,
             doubts=roles.doubts,
         )
-    records = tuple(how.records([*logs, *validation]))
-    return Logs(records[: len(logs)], records[len(logs) :], (*logs, *validation), how.input_limit)
+    tables, fresh = how.runs(logs), how.runs(validation)
+    records = tuple(how.records([*tables, *fresh]))
+    return Logs(records[: len(tables)], records[len(tables) :], (*logs, *validation), how.input_limit)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,8 @@ class TimeLook:
     unit: of the column, as `TimeColumn.unit`. period_s: the usual step. jitter: largest distance of a step
     from a whole number of them, as a share, 0 where it is the rounding of the stamps. missing: rows that
     larger steps lack, where jitter leaves no doubt of them; gap_s: the largest step; gap_place: after which
-    row. option: as `option_for`. why: why the stamps are none.
+    row. option: as `option_for`. why: why the stamps are none. runs: names of the first and the last part in
+    which time starts again; the other numbers are of the most uneven one.
     """
 
     name: str
@@ -43,6 +44,7 @@ class TimeLook:
     gap_place: str = ""
     option: str = ""
     why: str = ""
+    runs: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,23 +117,29 @@ def look_at(
     columns = tuple(_column(table, name) for name in table.names if name != time)
     rows = max((len(values) for values in table.raw.values() if hasattr(values, "__len__")), default=0)
     about, doubts = None, list[Finding]()
+    with naming(str(path)):
+        runs = table.runs(time)
     if time is not None:
         # Of a table with rows of their own the stamps of the output's; where it is not known, of those with
         # the most.
         own = [name for name in table.clocks if name != time] if table.sparse else []
         longest = max(own, key=lambda name: table.clocks[name].size, default=None)
         moved = roles.output if roles else None
-        about, doubts = _time(table, time, time_unit, moved if own and moved else longest, moved)
-    for column in columns:
+        rows_of = moved if own and moved else longest
+        looks = [_time(run, time, time_unit, rows_of, moved) for run in runs]
+        about, doubts = max(looks, key=lambda one: (one[0].why, one[0].option, one[0].jitter))
+        about = replace(about, runs=tuple(run.run for run in runs if run.run))
+    for column in columns if response is None else ():
         if column.values is not None:
             inputs, outputs = (
                 ([column.name], []) if roles and column.name == roles.input else ([], [column.name])
             )
             if table.sparse and inputs and roles is not None:
                 outputs = [roles.output]
-            values = {name: table.columns([name])[name] for name in (*inputs, *outputs)}
-            doubts += reading_notes(table, values, inputs, outputs)
-    doubts += _of_the_loop(table, roles) if roles else ()
+            for run in runs:
+                values = {name: run.columns([name])[name] for name in (*inputs, *outputs)}
+                doubts += reading_notes(run, values, inputs, outputs)
+    doubts += _of_the_loop(runs[0], roles) if roles else ()
     return LogLook(path, rows, table.layout, about, columns, roles, unclear, response, distinct(doubts))
 
 
