@@ -156,10 +156,8 @@ def parquet_columns(content: bytes) -> Columns:
             column = column.cast(kind)
         if pa.types.is_integer(kind) and not column.null_count:
             values = column.to_numpy()  # whole: doubles hold integers up to 2^53, stamps in ns are larger
-        elif pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
+        elif (pa.types.is_primitive(kind) and not pa.types.is_temporal(kind)) or pa.types.is_decimal(kind):
             values = column.cast(pa.float64(), safe=False).to_numpy()
-        elif pa.types.is_decimal(kind):
-            values = column.cast(pa.float64()).to_numpy()
         elif pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
             values = column.to_numpy()
         else:

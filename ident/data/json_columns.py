@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -79,13 +80,9 @@ def _column(values: Sequence[Any]) -> Any:
         return tuple(value or "" for value in values)
     if there == {bool} or there <= {int, float}:  # on and off, or numbers: true is no 1 among numbers
         whole = there == {int} and None not in values and all(abs(value) < 2**63 for value in values)
-        return np.array(values, dtype=np.int64) if whole else np.array([_number(value) for value in values])
+        with suppress(OverflowError):
+            return np.array(values, dtype=np.int64 if whole else np.float64)
+        # An integer of hundreds of digits is infinite.
+        return np.array([np.nan if value is None else float(str(value)) for value in values])
     kinds = sorted({_KINDS.get(kind, "objects") for kind in there})
     return Unread(f"{' and '.join(kinds)} in one column; expected numbers")
-
-
-def _number(value: Any) -> float:
-    try:
-        return np.nan if value is None else float(value)
-    except OverflowError:  # an integer of hundreds of digits
-        return np.inf

@@ -7,7 +7,7 @@ import io
 import json
 import re
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -144,14 +144,7 @@ def _read_mat(file: Path, content: bytes) -> Table:
     """A MATLAB file; what stands in structs is called log.signals[0].values."""
     if b"\x89HDF\r\n" in content[:1024]:  # version 7.3
         return _read_columns(file, content, "HDF5", "h5py")
-    parts = _flat("", mat_variables(content, file))
-    names = distinct([name for name, _, _ in parts])
-    told = list(zip(names, parts, strict=True))
-    return Table(
-        file,
-        {name: value for name, (_, value, _) in told},
-        units={name: unit for name, (_, _, unit) in told if unit},
-    )
+    return _table_of(file, _flat("", mat_variables(content, file)))
 
 
 @reads(".h5", ".hdf5")
@@ -218,33 +211,32 @@ def _read_bag(file: Path, content: bytes) -> Table:
 def _read_columns(file: Path, content: bytes, kind: str, library: str) -> Table:
     arrays = npz_arrays(read_in_child(kind, library, content))
     about = json.loads(arrays.pop("about").tobytes())
-    names = distinct([name for name, _, _ in about])
-    told = list(zip(names, about, strict=True))
-    columns = {name: Unread(why) if why else arrays[str(k)] for k, (name, (_, _, why)) in enumerate(told)}
-    units = {name: unit for name, (_, unit, _) in told if unit}
-    return Table(file, columns, units=units)
+    found = [
+        (name, Unread(why) if why else arrays[str(k)], unit) for k, (name, unit, why) in enumerate(about)
+    ]
+    return _table_of(file, found)
+
+
+def _table_of(file: Path, columns: Sequence[tuple[str, Any, str]]) -> Table:
+    """Of names, columns and units; a name may be there several times."""
+    names = distinct([name for name, _, _ in columns])
+    units = {name: unit for name, (_, _, unit) in zip(names, columns, strict=True) if unit}
+    return Table(file, {name: column[1] for name, column in zip(names, columns, strict=True)}, units=units)
 
 
 def _flat(name: str, value: Any, unit: str = "") -> list[tuple[str, Any, str]]:
     """Nested fields and lists under the names by which a program would call them, with their units; text is
     no column. What says its name beside its data, as recorders do, has that."""
-    if isinstance(value, str):
-        return []
     if isinstance(value, Mapping):
         said = {key.lower(): text.strip() for key, text in value.items() if isinstance(text, str)}
-        if said.get("name"):
-            return [
-                part
-                for key, item in value.items()
-                for part in _flat(
-                    said["name"] if key.lower() in ("data", "values") else f"{name}.{key}",
-                    item,
-                    said.get("unit", ""),
-                )
-            ]
-        parts = [(f"{name}.{key}" if name else key, item) for key, item in value.items()]
+        data = ("data", "values") if said.get("name") else ()
+        unit = said.get("unit", "")
+        parts = [
+            (said["name"] if key.lower() in data else f"{name}.{key}" if name else key, item)
+            for key, item in value.items()
+        ]
     elif isinstance(value, list):
         parts = [(f"{name}[{k}]", item) for k, item in enumerate(value)]
     else:
-        return [(name, value, unit)]
-    return [item for part in parts for item in _flat(*part)]
+        return [] if isinstance(value, str) else [(name, value, unit)]
+    return [item for part in parts for item in _flat(*part, unit)]

@@ -45,8 +45,6 @@ _WISHED = re.compile(
     rf"(^|[^a-z])({_MOVES}|q)_?(cmd|command|commanded)(?![a-z])",
     re.I,
 )
-# A column of nothing but this name and a unit is the reference of textbooks.
-_TEXTBOOK = re.compile(r"r", re.I)
 # What neither drives nor shows the machine: computed of other columns, of another quantity, a number of rows.
 _BESIDE = re.compile(
     r"(^|[^a-z])(e|err|error|fehler|abweichung|regelabweichung|residual|est|estimate|estimated|hat|obs|observer|"
@@ -277,7 +275,7 @@ def is_position(name: str, unit: str) -> bool:
 def _is_wished(table: Table, name: str) -> bool:
     bare = re.sub(r"[\W_]*$", "", name.removesuffix(table.unit(name).replace("/", "_")))
     apart = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)  # posRef, SetAngle
-    return _WISHED.search(apart) is not None or _TEXTBOOK.fullmatch(bare) is not None
+    return _WISHED.search(apart) is not None or bare.lower() == "r"
 
 
 def _said(table: Table, name: str) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ident.data.arrays import RealArray
-from ident.data.foreign_files import MOST_COLUMNS, Unread, as_numbers, shown
+from ident.data.foreign_files import MOST_COLUMNS, as_numbers, shown
 from ident.data.json_columns import columns_in
 from ident.data.text_tables import Layout, doubtful_groups, is_number, number
 from ident.data.time_stamps import StampError, is_stamp, may_be_minutes, seconds_since_first
@@ -75,20 +75,24 @@ class Table:
             falls = np.flatnonzero(np.diff(self.columns([time])[time]) < 0) + 1
         except ValueError:  # who takes the stamps is told what is wrong with them
             return [self]
-        columns = {
-            name: np.asarray(values) for name, values in self.raw.items() if not isinstance(values, Unread)
-        }
-        of = [n for n, v in columns.items() if np.array_equal(np.flatnonzero(v[1:] != v[:-1]) + 1, falls)]
-        if not falls.size or not of:
+        size = np.shape(self.raw[time])
+        alike = (
+            [name for name, values in self.raw.items() if np.shape(values)[:1] == size] if falls.size else []
+        )
+        columns, ends = {name: np.asarray(self.raw[name]) for name in alike}, [0, *falls.tolist(), *size]
+        changes = {name: np.flatnonzero(values[1:] != values[:-1]) + 1 for name, values in columns.items()}
+        of = next((name for name, rows in changes.items() if np.array_equal(rows, falls)), None)
+        if of is None or min(np.diff(ends)) < 2:
             return [self]
-        found = []
-        for start, stop in pairwise([0, *falls.tolist(), len(columns[time])]):
-            raw = {
-                name: values if isinstance(values, Unread) else values[start:stop]
-                for name, values in self.raw.items()
-            }
-            found.append(replace(self, raw=raw, begin=start, run=f"{of[0]} {columns[of[0]][start]}"))
-        return found
+        return [
+            replace(
+                self,
+                raw={**self.raw, **{name: self.raw[name][start:stop] for name in alike}},
+                begin=start,
+                run=f"{of} {columns[of][start]}",
+            )
+            for start, stop in pairwise(ends)
+        ]
 
     @property
     def sparse(self) -> bool:

@@ -8,6 +8,7 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from ident.data.foreign_files import MOST_COLUMNS, distinct
@@ -47,7 +48,7 @@ _UNITS_OF_Y = re.compile(r"(?:vertical|y)[_ ]unit", re.IGNORECASE)
 # What a serial monitor puts before each line: '10:15:30.000 -> ', '[2024-03-01 10:15:30.000] '.
 _ARRIVED = re.compile(r"\s*(?:\[([^]]{4,40})\]|(\S[^>]{3,40}?)\s*->)(?:\s+|$)")
 # A number with its name, as plotters of serial ports take it: 'angle:0.01', 'volt = -3.00'.
-_LABELLED = re.compile(r"([^\W\d][^:=,;\t|]*?)\s*[:=]\s*([^:=,;\t| ]+) *([,;\t|]?)\s*")
+_LABELLED = re.compile(r"([^\W\d][^:=,;\t|]*?)\s*[:=]\s*([+-]?(?:\.?\d|nan|inf)[^:=,;\t| ]*) *([,;\t|]?)\s*")
 _SIGNS = frozenset("#%/!-*rR")
 _NO_TEXT = re.compile(r"[\x00-\x08\x0e-\x1f]")
 
@@ -118,10 +119,12 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
         lines.pop()  # blank lines at the very end are no samples
     if not lines:
         raise ValueError(": the file is empty; expected a header line and rows of numbers")
-    end = "\n" if text.endswith("\n") else ""
-    if inside := _arrived(lines, end) or _labelled(lines, end):
-        return inside
+    lines, named = _bare(lines)
     layout = _layout(lines[:_SAMPLE], len(lines))
+    if named:
+        names = distinct([*named, *layout.names[len(named) if layout.header else 0 :]])[: len(layout.names)]
+        header = layout.header or (layout.first if len(named) > 1 else 0)
+        layout = replace(layout, names=tuple(names), header=header)
     first = layout.first - 1
     commented = [k for k in range(first, len(lines)) if _is_comment(lines[k])]
     blank = [k for k in range(first, len(lines)) if not lines[k].strip()]
@@ -155,43 +158,32 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
     return layout, dict(zip(layout.names, zip(*rows, strict=True), strict=True))
 
 
-def _arrived(lines: Sequence[str], end: str) -> tuple[Layout, dict[str, tuple[str, ...]]] | None:
-    """The table behind the stamps that a serial monitor puts before its lines, and these; None without."""
+def _bare(lines: list[str]) -> tuple[list[str], list[str]]:
+    """Lines of a serial port as a table has them, and names of the first columns: without 'angle:' before
+    each number, and with the stamp that a monitor puts before each line as a cell of its own."""
     heads = [_ARRIVED.match(line) for line in lines]
     stamps = [(head[1] or head[2]) if head else "" for head in heads]
-    if 2 * sum(map(is_stamp, stamps)) <= len(lines):
-        return None
-    rest = [line[head.end() if head else 0 :] for line, head in zip(lines, heads, strict=True)]
-    layout, columns = read_text("\n".join(rest) + end)
-    rows = range(len(next(iter(columns.values()))))
-    names = distinct(["time", *columns])
-    cells = [tuple(stamps[layout.line(row) - 1] for row in rows), *columns.values()]
-    return replace(layout, names=tuple(names)), dict(zip(names, cells, strict=True))
+    arrived = 2 * sum(map(is_stamp, stamps)) > len(lines)
+    if arrived:
+        lines = [line[head.end() if head else 0 :] for line, head in zip(lines, heads, strict=True)]
+    ((labels, times),) = Counter(map(_labels, lines[:_SAMPLE])).most_common(1)
+    named = list(labels) if 2 * times > len(lines[:_SAMPLE]) else []
+    if named:
+        between = " " if len(named) > 1 else ";"
+        # Another line stays as it is: whoever takes the column is told.
+        values = [_LABELLED.sub(lambda found: found[2] + (found[3] or between), line) for line in lines]
+        lines = [bare if _labels(line) == labels else line for line, bare in zip(lines, values, strict=True)]
+    if arrived:
+        sign = next((sign for sign in ";\t,|" if sign in lines[len(lines) // 2].strip()), " ")
+        lines = [
+            f'"{stamp}"{sign}{line}' if stamp else line for stamp, line in zip(stamps, lines, strict=True)
+        ]
+    return lines, ["time"] * arrived + named
 
 
-def _labelled(lines: Sequence[str], end: str) -> tuple[Layout, dict[str, tuple[str, ...]]] | None:
-    """The table of lines that name each of their numbers, in one order; None where they do not."""
-
-    def parts(line: str) -> list[tuple[str, str, str]]:
-        found = _LABELLED.findall(line)
-        whole = found and all(is_number(value, ".") for _, value, _ in found)
-        return found if whole and not _LABELLED.sub("", line).strip() else []
-
-    looked = Counter(tuple(name for name, _, _ in parts(line)) for line in lines[:_SAMPLE] if line.strip())
-    names, times = looked.most_common(1)[0]
-    if not names or 2 * times <= looked.total():
-        return None
-    rows = [parts(line) for line in lines]
-    alike = [tuple(name for name, _, _ in row) == names for row in rows]
-    first, columns = alike.index(True), distinct(names)
-    # Another line stays as it is: whoever takes the column is told.
-    values = [
-        ";".join(value for _, value, _ in row) if like else line
-        for row, like, line in zip(rows, alike, lines, strict=True)
-    ]
-    layout, cells = read_text("\n" * first + "\n".join(values[first:]) + end)
-    layout = replace(layout, names=tuple(columns), separator=rows[first][0][2] or " ", header=first + 1)
-    return layout, dict(zip(columns, cells.values(), strict=True))
+def _labels(line: str) -> tuple[str, ...]:
+    """The names of the numbers of a line that is nothing else."""
+    return () if _LABELLED.sub("", line).strip() else tuple(found[0] for found in _LABELLED.findall(line))
 
 
 def _is_cut(rows: Sequence[Sequence[str]], decimal: str) -> bool:
@@ -310,7 +302,8 @@ class _Fit:
             cells = cells[: self.most]
         if _is_key(cells):
             return None
-        words = sum(bool(cell) and not _is_value(cell, self.decimal) for cell in cells)
+        # A number is no name, whatever its decimal sign.
+        words = sum(bool(cell) and not any(_is_value(cell, sign) for sign in ".,") for cell in cells)
         if numbered and cells and all(re.fullmatch(r"\d{1,3}", cell) for cell in cells[1:]):
             words = len(cells)
         return cells if self.least <= len(cells) <= self.most and 2 * words > len(cells) else None
@@ -371,21 +364,26 @@ class _Fit:
         each what it is: 'Name, drive, Name, hub', as scopes of a PLC do."""
         above = [row[: self.most] for row in self.rows[: self.start] if len(row) >= self.most]
         told = {row[0].lower(): row[1::2] for row in above if row[0] and set(row[::2]) == {row[0]}}
-        if self.most % 2 or "name" not in told or not all(told["name"]):
+        keys = {
+            found[1]: told[found[0]][0]
+            for key in told
+            if (found := re.fullmatch(r"sampl.*[\[(](\w+)[\])]", key))
+        }
+        unit, every = next(iter(keys.items()), ("", ""))
+        names = told.get("name", [])
+        # In a table of two columns any line is of two cells.
+        if self.most % 2 or not all(names) or not names or (self.most == 2 and not unit):
             return None
-        step, unit = "", ""
-        for key, values in told.items():
-            if found := re.fullmatch(r"sampl\w+\s*(?:time|period|interval)\s*[\[(](\w+)[\])]", key):
-                step, unit = values[0], found[1]
-        if self.most == 2 and not unit:
-            return None  # any line is of two cells
-        stamps = [self.rows[k][0] for k in (self.start, self.start + 1)]
-        if all(is_number(cell, self.decimal) for cell in (step, *stamps)):
-            first, second, every = (number(cell, self.decimal) for cell in (*stamps, step))
-            unit = unit if abs(second - first - every) < 0.01 * every else ""
-        units = [text.strip("[](){} ") for text in told.get("unit", [""] * len(told["name"]))]
-        channels = zip(told["name"], units, strict=True)
-        return [column for name, own in channels for column in (("time", unit), (name, own))]
+        with suppress(ValueError):
+            first, second, step = (
+                number(cell, self.decimal)
+                for cell in (self.rows[self.start][0], self.rows[self.start + 1][0], every)
+            )
+            unit = unit if abs(second - first - step) < 0.01 * step else ""
+        units = [text.strip("[](){} ") for text in told.get("unit", [""] * len(names))]
+        return [
+            column for name, own in zip(names, units, strict=True) for column in (("time", unit), (name, own))
+        ]
 
     def _are_units(self, cells: Sequence[str]) -> bool:
         """Whether most words of a line are units; numbers are no words (Rigol's start and step)."""

@@ -59,28 +59,7 @@ class Found:
     scale: Mapping[str, float]
     units: Mapping[str, str]
     draft: Draft
-
-    @property
-    def time_unit(self) -> str:
-        column = self.read.records[0].time_column
-        return "s" if column is None else column.unit
-
-    @property
-    def doubts(self) -> tuple[Finding, ...]:
-        return distinct([doubt for record in self.read.records for doubt in record.doubts])
-
-    @property
-    def input_unit(self) -> str:
-        return self.read.unit_of[self.read.roles.input]
-
-    @property
-    def output_unit(self) -> str:
-        return self.read.unit_of[self.read.roles.output]
-
-    @property
-    def counts(self) -> bool:
-        """Whether the output is in steps of a converter, whose size nobody told."""
-        return self.output_unit.lower() in ("counts", "count", "ticks", "tick", "inc")
+    doubts: tuple[Finding, ...]
 
 
 def init(
@@ -107,7 +86,8 @@ def init(
         name = read.roles.input
         scale[name] = -scale.get(name, 1.0)
         units |= {name: unit_of[name]} if unit_of[name] else {}
-    found = Found(tuple(logs), shlex.quote(out.name), stated, read, scale, units, draft)
+    doubts = distinct([doubt for record in read.records for doubt in record.doubts])
+    found = Found(tuple(logs), shlex.quote(out.name), stated, read, scale, units, draft, doubts)
     text = configuration(found, _entries(read.tables, out, draft))
     config = check(RunConfig, tomllib.loads(text), source=str(out), context={"base": out.absolute().parent})
     storage.write_text(out, text)
@@ -159,15 +139,17 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> Channel
     typed = shlex.quote(str(logs[0])) if len(logs) == 1 and len(str(logs[0])) < _SHORT else "LOG..."
     with naming(str(logs[0])):
         roles = stated.roles(tables[0], typed, command)
-        tables = replace(stated, time=roles.time).runs(tables)
         if stated.dt_s is not None and stated.time is None:
             roles = replace(roles, time=None)
+        tables = replace(stated, time=roles.time).runs(tables)
         if roles.time is None and stated.dt_s is None:
             ways = ", or --time ".join(
                 ["--dt-s SECONDS", *(shlex.quote(shown(n, 30)) for n in rising(tables[0]))]
             )
             raise ValueError(f"no column looks like time: type flexlink {command} {typed} {ways}")
-    options = [_stamps(table, roles, stated.time_unit) for table in tables]
+    with naming(""):
+        options = [_stamps(table, roles, stated.time_unit) for table in tables]
+        period = max(wraps_at(table.columns([roles.output])[roles.output]) for table in tables)
     steps = [float(text.split()[1]) for text in options if text.startswith("--resample-s")]
     how = replace(
         stated,
@@ -179,7 +161,7 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> Channel
         time_unit=stated.time_unit if roles.time else None,
         repair="--repair" in options and not steps,
         resample_s=max(steps, default=None),
-        unwrap=stated.unwrap or _wrapping(tables, roles.output),
+        unwrap=stated.unwrap or ({roles.output: float(period)} if period else {}),
     )
     records = how.records(tables)
     repeats = min(_repeats(record) for record in records)
@@ -225,22 +207,11 @@ def _stamps(table: Table, roles: Roles, time_unit: str | None) -> str:
     """The option that takes a log's time stamps, as `option_for`."""
     if roles.time is None:
         return ""
-    with naming(str(table.path)):
-        wanted = [roles.time, roles.output] if table.sparse else [roles.time]
-        columns = table.columns(wanted, roles.output if table.sparse else None)
-        stamps, _ = table.seconds(roles.time, columns[roles.time], time_unit)
-        table.increasing(stamps, roles.time)
-        return option_for(stamps)
-
-
-def _wrapping(tables: Sequence[Table], output: str) -> dict[str, float]:
-    """The period at which the output wraps in one of the logs, if it does."""
-    for table in tables:
-        with naming(str(table.path)):
-            period = wraps_at(table.columns([output])[output])
-        if period:
-            return {output: float(period)}
-    return {}
+    wanted = [roles.time, roles.output] if table.sparse else [roles.time]
+    columns = table.columns(wanted, roles.output if table.sparse else None)
+    stamps, _ = table.seconds(roles.time, columns[roles.time], time_unit)
+    table.increasing(stamps, roles.time)
+    return option_for(stamps)
 
 
 def _entries(tables: Sequence[Table], out: Path, draft: Draft) -> list[Entry]:

@@ -122,11 +122,9 @@ def look_at(
     if time is not None:
         # Of a table with rows of their own the stamps of the output's; where it is not known, of those with
         # the most.
-        own = [name for name in table.clocks if name != time] if table.sparse else []
-        longest = max(own, key=lambda name: table.clocks[name].size, default=None)
         moved = roles.output if roles else None
-        rows_of = moved if own and moved else longest
-        looks = [_time(run, time, time_unit, rows_of, moved) for run in runs]
+        own = max((n for n in table.clocks if n != time), key=lambda n: table.clocks[n].size, default=None)
+        looks = [_time(run, time, time_unit, (moved or own) if table.sparse else None, moved) for run in runs]
         about, doubts = max(looks, key=lambda one: (one[0].why, one[0].option, one[0].jitter))
         about = replace(about, runs=tuple(run.run for run in runs if run.run))
     for column in columns if response is None else ():
