@@ -49,14 +49,12 @@ def columns_in(name: str, cells: Sequence[Any]) -> dict[str, Any]:
 
 def _parsed(text: str, line: int) -> Any:
     """The value of a text: the whole file, or a line of it (from 1)."""
-
-    where = f", line {line}:" if line else ":"
     try:
         return json_value(text)
     except json.JSONDecodeError as error:
         raise ValueError(f", line {line or error.lineno}: not valid JSON: {error.msg}") from None
     except ValueError as error:
-        raise ValueError(f"{where} {error}") from None
+        raise ValueError(f"{f', line {line}:' if line else ':'} {error}") from None
 
 
 def _lists(name: str, value: Any) -> dict[str, list[Any]]:

@@ -51,8 +51,7 @@ def read_table(path: str | PathLike[str]) -> Table:
     file = Path(path)
     if not file.is_file():  # a pipe would be waited for
         raise ValueError(f"{file}: {'not a file' if file.exists() else 'no such file'}")
-    packed = file.suffix.lower() == ".gz"
-    ending = Path(file.stem).suffix.lower() if packed else file.suffix.lower()
+    ending, packed = _ending(file), file.suffix.lower() == ".gz"
     if ending not in READERS:
         known = ", ".join(READERS)
         raise ValueError(f"{file}: unknown kind of file '{shown(ending)}'; expected one of {known} (or .gz)")
@@ -65,6 +64,10 @@ def read_table(path: str | PathLike[str]) -> Table:
         text = str(error)
         between = "" if text.startswith((":", ",")) else ": "
         raise ValueError(text if text.startswith(str(file)) else f"{file}{between}{text}") from None
+
+
+def _ending(file: Path) -> str:
+    return Path(file.name.lower().removesuffix(".gz")).suffix
 
 
 def _unpacked(content: bytes) -> bytes:
@@ -85,12 +88,7 @@ _OWN_ROWS = 0.8
 @reads(".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm")
 def _read_text(file: Path, content: bytes) -> Table:
     """A text table; its layout is found from the lines (`text_tables`)."""
-    try:
-        text = text_of(content)
-    except ValueError as error:
-        raise ValueError(f": {error}") from None
-    layout, columns = read_text(text)
-    return _text_table(file, layout, columns)
+    return _text_table(file, *read_text(text_of(content)))
 
 
 def _text_table(file: Path, layout: Layout, columns: Mapping[str, tuple[str, ...]]) -> Table:
@@ -133,29 +131,15 @@ def _text_table(file: Path, layout: Layout, columns: Mapping[str, tuple[str, ...
 @reads(".npz")
 def _read_npz(file: Path, content: bytes) -> Table:
     """A numpy archive of named vectors; object arrays (pickles) are not read."""
-    try:
-        return Table(file, npz_arrays(content))
-    except ValueError as error:
-        raise ValueError(f": {error}") from None
+    return Table(file, npz_arrays(content))
 
 
 @reads(".mat")
 def _read_mat(file: Path, content: bytes) -> Table:
     """A MATLAB file; what stands in structs is called log.signals[0].values."""
     if b"\x89HDF\r\n" in content[:1024]:  # version 7.3
-        return _read_columns(file, content, "HDF5", "h5py")
+        return _read_columns(file, content)
     return _table_of(file, _flat("", mat_variables(content, file)))
-
-
-@reads(".h5", ".hdf5")
-def _read_hdf5(file: Path, content: bytes) -> Table:
-    """Datasets by their path: group/signal; of compound ones group/table.field."""
-    return _read_columns(file, content, "HDF5", "h5py")
-
-
-@reads(".parquet")
-def _read_parquet(file: Path, content: bytes) -> Table:
-    return _read_columns(file, content, "parquet", "pyarrow")
 
 
 @reads(".xlsx")
@@ -187,19 +171,13 @@ def _read_xlsx(file: Path, content: bytes) -> Table:
 @reads(".json", ".jsonl", ".ndjson")
 def _read_json(file: Path, content: bytes) -> Table:
     """Rows or columns as `json_columns` finds them; of `.jsonl` and `.ndjson` a row in each line."""
-    try:
-        text = text_of(content)
-    except ValueError as error:
-        raise ValueError(f": {error}") from None
-    ending = file.name.lower().removesuffix(".gz").rpartition(".")[2]
-    return Table(file, json_columns(text, in_lines=ending != "json"))
+    return Table(file, json_columns(text_of(content), in_lines=_ending(file) != ".json"))
 
 
 @reads(".mcap", ".bag", ".db3")
 def _read_bag(file: Path, content: bytes) -> Table:
     """MCAP, ROS 1 and ROS 2 bags: topic.field; signals of several topics hold their last message."""
-    kind = file.name.lower().removesuffix(".gz").rpartition(".")[2]
-    table = _read_columns(file, content, kind, "mcap rosbags")
+    table = _read_columns(file, content)
     recorded = {name[:-1]: table.raw[name] for name in table.names if name.endswith("\t")}
     raw = {name: values for name, values in table.raw.items() if not name.endswith("\t")}
     # A topic's name may be the beginning of another's: the longest that fits comes last.
@@ -208,8 +186,12 @@ def _read_bag(file: Path, content: bytes) -> Table:
     return replace(table, raw=raw, clocks=clocks)
 
 
-def _read_columns(file: Path, content: bytes, kind: str, library: str) -> Table:
-    arrays = npz_arrays(read_in_child(kind, library, content))
+@reads(".h5", ".hdf5", ".parquet")
+def _read_columns(file: Path, content: bytes) -> Table:
+    """What the child makes of a file: of HDF5 datasets by their path, group/signal, and group/table.field."""
+    kinds = dict.fromkeys((".h5", ".hdf5", ".mat"), ("HDF5", "h5py")) | {".parquet": ("parquet", "pyarrow")}
+    kind, libraries = kinds.get(_ending(file), (_ending(file)[1:], "mcap rosbags"))
+    arrays = npz_arrays(read_in_child(kind, libraries, content))
     about = json.loads(arrays.pop("about").tobytes())
     found = [
         (name, Unread(why) if why else arrays[str(k)], unit) for k, (name, unit, why) in enumerate(about)
