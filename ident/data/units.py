@@ -151,7 +151,8 @@ class UnitEvidence:
             strange = strange or name
         if not strange:
             # After the word for time a short one is rather a unit, or its prefix, than a name: t_m, time_cs.
-            short = [word for word in words[1:] if len(word) <= 2 and not _NO_UNIT.fullmatch(word)]
+            behind = words[1:] if any(map(_TIME_WORD.fullmatch, words)) else []
+            short = [word for word in behind if len(word) <= 2 and not _NO_UNIT.fullmatch(word)]
             short = [word for word in short if word not in TIME_UNITS and (not units or word in _PREFIXES)]
             counts = [] if units else [word for word in words if _COUNTS.fullmatch(word)]
             strange = "" if said else next(iter((*counts, *short)), "")
