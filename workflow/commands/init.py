@@ -36,18 +36,6 @@ _SHORT = 60  # letters of a log's name that leave room for a command in a line
 _NEARLY_ALL = 0.99  # rows of a held log: one may be missing
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A log, or a part of it, in the configuration."""
-
-    path: str
-    validates: bool
-    name: str = ""
-    run: int | None = None
-    start: int | None = None
-    stop: int | None = None
-
-
 @dataclass(frozen=True, eq=False)
 class Found:
     """What the template of the configuration shows. scale, units: as stated, and the sign that is turned."""
@@ -187,7 +175,7 @@ def _repeats(record: Record) -> int:
     return usual if usual > 1 and np.mean(gaps % usual == 0) > _NEARLY_ALL else 1
 
 
-def configuration(found: Found, records: Sequence[Entry]) -> str:
+def configuration(found: Found, records: Sequence[Mapping[str, Any]]) -> str:
     """The TOML text."""
     filters = (
         ("toml", _toml),
@@ -214,21 +202,19 @@ def _stamps(table: Table, roles: Roles, time_unit: str | None) -> str:
     return option_for(stamps)
 
 
-def _entries(tables: Sequence[Table], out: Path, draft: Draft) -> list[Entry]:
-    """The last log, or run of one, validates; of one the last part, where it is split."""
+def _entries(tables: Sequence[Table], out: Path, draft: Draft) -> list[dict[str, Any]]:
+    """Keys of each record. The last log, or run, validates; of one the last part, where it is split."""
     base, stems = out.absolute().parent, [table.path.stem for table in tables]
     paths = [Path(os.path.relpath(table.path.absolute(), base)).as_posix() for table in tables]
-    if len(tables) == 1:
-        if draft.split_sample is None:
-            return [Entry(paths[0], False)]
-        return [
-            Entry(paths[0], False, f"{stems[0]}, first part", stop=draft.split_sample),
-            Entry(paths[0], True, f"{stems[0]}, last part", start=draft.split_sample),
-        ]
-    alike = len(set(stems)) < len(stems)
-    names = [
-        ", ".join(filter(None, (stem if table.run else f"{k}: {stem}" if alike else "", table.run)))
-        for k, (stem, table) in enumerate(zip(stems, tables, strict=True), 1)
-    ]
-    runs = [paths[:k].count(path) if tables[k].run else None for k, path in enumerate(paths)]
-    return [Entry(path, k == len(paths) - 1, names[k], runs[k]) for k, path in enumerate(paths)]
+    if len(tables) == 1 and draft.split_sample is not None:
+        first = {"path": paths[0], "name": f"{stems[0]}, first part", "stop_sample": draft.split_sample}
+        last = {"path": paths[0], "name": f"{stems[0]}, last part", "start_sample": draft.split_sample}
+        return [first, last | {"role": "validation"}]
+    alike, found = len(set(stems)) < len(stems), list[dict[str, Any]]()
+    for k, (path, stem, table) in enumerate(zip(paths, stems, tables, strict=True)):
+        run = {"name": f"{stem}, {table.run}", "run": paths[:k].count(path)} if table.run else {}
+        named = {"name": f"{k + 1}: {stem}"} if alike and not run else {}
+        found.append(
+            {"path": path, **run, **named, **({"role": "validation"} if 0 < k == len(paths) - 1 else {})}
+        )
+    return found
