@@ -13,8 +13,9 @@ import numpy as np
 
 from ident.data.arrays import RealArray
 from ident.data.finding import Finding, FindingKind, finding
-from ident.data.foreign_files import shown
+from ident.data.foreign_files import Unread, shown
 from ident.data.table import Table
+from ident.data.text_tables import is_number
 from ident.data.units import (
     COUNTED,
     TIME_UNITS,
@@ -98,7 +99,7 @@ def roles_of(table: Table, log: str, command: str = "identify", **stated: str | 
     output = stated.get("output") or _only([name for name in outputs if table.unit(name) in like])
     input_, output = stated.get("input") or _only(inputs), output or _only(outputs)
     left = [name for name in rest if name not in (*drives, *moves, *wished, *beside)]
-    left = [name for name in left if not _holds(table, name, counts_rows)]
+    left = [name for name in left if not (_is_text(table.raw[name]) or _holds(table, name, counts_rows))]
     loop = wished or stated.get("reference")
     if loop and len(left) == 1 and kind_of(table.unit(left[0])) in ("", *COUNTED):
         input_ = input_ or (None if inputs else left[0])
@@ -254,6 +255,12 @@ def _holds(table: Table, name: str, what: Callable[[RealArray], object], otherwi
     with suppress(ValueError):
         return bool(what(table.columns([name])[name]))
     return otherwise
+
+
+def _is_text(values: object) -> bool:
+    """Whether a column holds words alone, or nothing that is read."""
+    numbers = (is_number(cell, sign) for cell in values for sign in ".,") if isinstance(values, tuple) else ()
+    return isinstance(values, tuple | Unread) and not any(numbers)
 
 
 def _increases(table: Table, name: str) -> bool:

@@ -4,7 +4,7 @@ expectation."""
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
@@ -159,11 +159,12 @@ class Table:
     def listed(self, wanted: str = "") -> str:
         """Names in a line: all, or the columns of a matrix or struct that was asked for by its own name."""
         parts = [name for name in self.names if wanted and name.startswith((f"{wanted}[", f"{wanted}."))]
-        parts = self._alike(wanted) or parts
+        items = self._alike(wanted) or parts or list(self.names)
+        more = f", ... ({len(items)} in all)" if len(items) > 20 else ""
         hint = (
             " (numbers?); expected column names in line 1" if self.layout and not self.layout.header else ""
         )
-        return _listed(parts or self.names) + hint
+        return shown(f"{', '.join(map(shown, items[:20])) or 'no columns'}{more}", 160) + hint
 
     def is_clock(self, name: str) -> bool:
         """Whether a column holds dates or clock times, which need no unit."""
@@ -324,9 +325,3 @@ def _split(name: str, values: Any) -> dict[str, Any]:
         return {name: values}
     columns = values if values.shape[0] >= values.shape[1] else values.T
     return {f"{name}[{k}]": column for k, column in enumerate(columns.T)}
-
-
-def _listed(names: Iterable[str], limit: int = 20) -> str:
-    items = list(names)
-    text = ", ".join(shown(name) for name in items[:limit]) or "no columns"
-    return shown(text if len(items) <= limit else f"{text}, ... ({len(items)} in all)", 160)

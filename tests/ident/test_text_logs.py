@@ -16,7 +16,7 @@ from ident.data.finding import FindingKind
 from ident.data.record import Record
 from ident.data.record_files import read_table
 from ident.data.roles import roles_of, time_of
-from ident.data.units import UnitEvidence
+from ident.data.units import unit_of_time
 
 N, DT_S = 80, 0.005
 K = np.arange(N)
@@ -43,7 +43,7 @@ STRANGE = (
     ("name", "unit"), [(n, unit) for unit, names in KNOWN.items() for n in names.split("|")]
 )
 def test_units_that_are_known(name, unit):
-    assert UnitEvidence.of(*name.split("@")) == UnitEvidence(unit)
+    assert unit_of_time(*name.split("@")) == (unit, "")
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_units_that_are_known(name, unit):
 )
 def test_units_that_are_asked_for(tmp_path, name, words):
     name, _, beside = name.partition("@")
-    assert words in UnitEvidence.of(name, beside).unclear
+    assert words in unit_of_time(name, beside)[1]
     below = [f"{beside};V;rad"] if beside else []
     path = written(tmp_path, ";", [name, "u_V", "y_rad"], below=below)
     with pytest.raises(ValueError, match=words) as caught:
