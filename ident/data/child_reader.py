@@ -115,6 +115,7 @@ def _unpacked(path: str, values: Any, attributes: Any) -> Any:
 def parquet_columns(content: bytes) -> Columns:
     """Columns of numbers and of instants; missing numbers as NaN. What lies in structs is called name.field,
     in lists of one length name[0], name[1], ..."""
+    import numpy as np
     import pyarrow as pa
     import pyarrow.compute as pc
     import pyarrow.parquet as pq
@@ -160,6 +161,8 @@ def parquet_columns(content: bytes) -> Columns:
             values = column.cast(pa.float64(), safe=False).to_numpy()
         elif pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
             values = column.to_numpy()
+        elif pa.types.is_string(kind) or pa.types.is_large_string(kind):
+            values = np.array(column.to_pylist(), dtype="U32")  # as much as tells one run from another
         else:
             values = f"{kind}; expected numbers"
         found.append((name, values, unit))

@@ -34,7 +34,7 @@ _DRIVES = (
     "effort|throttle|action"
 )
 _MOVES = (
-    "angle|winkel|position|pos|theta|phi|alpha|tip|speed|velocity|vel|drehzahl|encoder|enc|hub|observation"
+    "angle|winkel|position|pos|theta|phi|alpha|tip|speed|velocity|vel|drehzahl|encoder|enc|pv|hub|observation"
 )
 _WORD = re.compile(rf"(?<![a-z])(?:({_DRIVES})|({_MOVES}))(?![a-z])", re.I)
 _SYMBOL = re.compile(r"(?:.*[/.])?(?:([uv])|(y|q|output|counts))(?![a-z])", re.I)
@@ -159,7 +159,8 @@ def _ask(
     listed = shown(", ".join(shown(name, 30) for name in table.names), 90)
     reference = found.get("reference") or next(iter(wished), None)
     pair = None if found["output"] or reference else _led_and_follower(table, outputs)
-    if outputs and not inputs and not found["input"] and not left:
+    alone = not left if outputs else len(left) < 2 and not wished
+    if alone and not inputs and not found["input"]:
         named = _typed({"input": pair[0], "output": pair[1]}) if pair else "--input NAME"
         raise ValueError(
             f"{table.path}: no column looks like an input; it has {listed}. A model needs what drives the "
@@ -259,8 +260,9 @@ def _holds(table: Table, name: str, what: Callable[[RealArray], object], otherwi
 
 def _is_text(values: object) -> bool:
     """Whether a column holds words alone, or nothing that is read."""
-    numbers = (is_number(cell, sign) for cell in values for sign in ".,") if isinstance(values, tuple) else ()
-    return isinstance(values, tuple | Unread) and not any(numbers)
+    if isinstance(values, tuple):
+        return not any(is_number(cell, sign) for cell in values for sign in ".,")
+    return isinstance(values, Unread) or np.asarray(values).dtype.kind in "USO"
 
 
 def _increases(table: Table, name: str) -> bool:

@@ -22,7 +22,7 @@ from ident.data.units import SIGNAL_WORDS, TimeColumn, size_of, written_unit
 
 # Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
 LARGEST = 1e100
-_LIST = re.compile(r"\[[\s\[]*[-+.\d]")
+_LIST = re.compile(r"(?:array\()?\[[\s\[]*(?:np\.\w+\()?[-+.\d]")
 # Larger stamps, as those since 1970, lose digits where they are divided by a unit.
 _LONG_STAMP = 1e9
 
@@ -75,7 +75,7 @@ class Table:
             falls = np.flatnonzero(np.diff(self.columns([time])[time]) < 0) + 1
         except ValueError:  # who takes the stamps is told what is wrong with them
             return [self]
-        size = np.shape(self.raw[time])
+        size = np.shape(self.raw[time]) if falls.size else ()
         alike = (
             [name for name, values in self.raw.items() if np.shape(values)[:1] == size] if falls.size else []
         )
@@ -314,7 +314,8 @@ def _split(name: str, values: Any) -> dict[str, Any]:
     """A matrix (T, C), or (C, T) as of Simulink, as C columns; (T, 1), (1, T) as vectors; records by
     field; lists in cells of text, '[0.1, 0.2]', as `columns_in`."""
     if isinstance(values, tuple) and values and _LIST.match(values[0]):
-        return columns_in(name, [re.findall(r"[^][()\s,;]+", cell) or None for cell in values])
+        plain = (re.sub(r"np\.\w+|array", "", cell) for cell in values)
+        return columns_in(name, [re.findall(r"[^][()\s,;]+", cell) or None for cell in plain])
     if isinstance(values, np.ndarray) and values.dtype.names and values.ndim == 1:
         return {f"{name}.{field}": values[field] for field in values.dtype.names}
     if not isinstance(values, np.ndarray) or values.ndim != 2:

@@ -115,10 +115,9 @@ def look_at(
     except ValueError as error:
         unclear = str(error)
     columns = tuple(_column(table, name) for name in table.names if name != time)
-    rows = max((len(values) for values in table.raw.values() if hasattr(values, "__len__")), default=0)
-    about, doubts = None, list[Finding]()
-    with naming(str(path)):
-        runs = table.runs(time)
+    long = [values for values in table.raw.values() if isinstance(values, tuple) or np.ndim(values)]
+    rows = max(map(len, long), default=0)
+    about, doubts, runs = None, list[Finding](), table.runs(time)
     if time is not None:
         # Of a table with rows of their own the stamps of the output's; where it is not known, of those with
         # the most.
