@@ -293,6 +293,14 @@ class Table:
         # The difference of unsigned integers, taken as signed ones, is right whichever is larger.
         return np.asarray((values - values[0]).astype(np.int64), dtype=np.float64)
 
+    def stamps(self, name: str, rows_of: str | None, unit: str | None) -> tuple[RealArray, TimeColumn]:
+        """Time stamps [s] that increase, of a column; rows_of: whose rows count where columns have rows of
+        their own. Raises ValueError."""
+        columns = self.columns([name] if rows_of is None else [name, rows_of], rows_of)
+        stamps, column = self.seconds(name, columns[name], unit)
+        self.increasing(stamps, name)
+        return stamps, column
+
     def increasing(self, stamps: RealArray, name: str | None) -> None:
         """Raises ValueError unless there are two time stamps at least, each later than the one before."""
         if stamps.size < 2:

@@ -129,14 +129,18 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> Channel
         roles = stated.roles(tables[0], typed, command)
         if stated.dt_s is not None and stated.time is None:
             roles = replace(roles, time=None)
-        tables = replace(stated, time=roles.time).runs(tables)
+        tables = [run for table in tables for run in table.runs(roles.time)]
         if roles.time is None and stated.dt_s is None:
             ways = ", or --time ".join(
                 ["--dt-s SECONDS", *(shlex.quote(shown(n, 30)) for n in rising(tables[0]))]
             )
             raise ValueError(f"no column looks like time: type flexlink {command} {typed} {ways}")
     with naming(""):
-        options = [_stamps(table, roles, stated.time_unit) for table in tables]
+        options = [
+            option_for(table.stamps(roles.time, roles.output if table.sparse else None, stated.time_unit)[0])
+            for table in tables
+            if roles.time
+        ]
         period = max(wraps_at(table.columns([roles.output])[roles.output]) for table in tables)
     steps = [float(text.split()[1]) for text in options if text.startswith("--resample-s")]
     how = replace(
@@ -189,17 +193,6 @@ def configuration(found: Found, records: Sequence[Mapping[str, Any]]) -> str:
 def _toml(value: Any) -> str:
     plain = value.item() if isinstance(value, np.generic) else value
     return tomlkit.item(plain).as_string()
-
-
-def _stamps(table: Table, roles: Roles, time_unit: str | None) -> str:
-    """The option that takes a log's time stamps, as `option_for`."""
-    if roles.time is None:
-        return ""
-    wanted = [roles.time, roles.output] if table.sparse else [roles.time]
-    columns = table.columns(wanted, roles.output if table.sparse else None)
-    stamps, _ = table.seconds(roles.time, columns[roles.time], time_unit)
-    table.increasing(stamps, roles.time)
-    return option_for(stamps)
 
 
 def _entries(tables: Sequence[Table], out: Path, draft: Draft) -> list[dict[str, Any]]:

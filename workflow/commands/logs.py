@@ -53,15 +53,6 @@ class Reading:
             reference=self.reference,
         )
 
-    def runs(self, logs: Sequence[Path | Table]) -> list[Table]:
-        """The tables of logs; each run of one in which time starts again."""
-        found = list[Table]()
-        for log in logs:
-            with naming(str(log.path if isinstance(log, Table) else log)):
-                table = log if isinstance(log, Table) else read_table(log).with_decimal(self.decimal)
-                found += table.runs(self.time)
-        return found
-
     def records(self, tables: Sequence[Table]) -> list[Record]:
         """Of tables that are used together, where input and output are named; each column in one unit. Raises
         InputError naming file, column or line."""
@@ -112,21 +103,23 @@ def are_responses(paths: Sequence[Path]) -> bool:
 def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: Sequence[Path] = ()) -> Logs:
     """One channel of log files as stated; columns that are not named are found where names and units leave no
     doubt. Raises InputError: one line naming file, column or line."""
-    how = stated or Reading()
+    how, tables = stated or Reading(), list[Table]()
+    for path in (*logs, *validation):
+        with naming(str(path)):
+            tables.append(read_table(path).with_decimal(how.decimal))
     if how.input_name is None or how.output_name is None or (how.time is None and how.dt_s is None):
         with naming(str(logs[0])):
-            table = read_table(logs[0]).with_decimal(how.decimal)
-            roles = how.roles(table, shlex.join(map(str, logs)), "identify")
-        found = roles.reference
-        everywhere = found and all(found in read_table(path).names for path in (*logs[1:], *validation))
+            roles = how.roles(tables[0], shlex.join(map(str, logs)), "identify")
+        everywhere = roles.reference and all(roles.reference in table.names for table in tables[1:])
         how = replace(
             how,
             input_name=roles.input,
             output_name=roles.output,
-            reference=found if everywhere else how.reference,
+            reference=roles.reference if everywhere else how.reference,
             time=roles.time if how.time is None and how.dt_s is None else how.time,
             doubts=roles.doubts,
         )
-    tables, fresh = how.runs(logs), how.runs(validation)
-    records = tuple(how.records([*tables, *fresh]))
-    return Logs(records[: len(tables)], records[len(tables) :], (*logs, *validation), how.input_limit)
+    runs = [table.runs(how.time) for table in tables]
+    records = tuple(how.records([run for parts in runs for run in parts]))
+    n_measured = sum(map(len, runs[: len(logs)]))
+    return Logs(records[:n_measured], records[n_measured:], (*logs, *validation), how.input_limit)

@@ -167,9 +167,7 @@ def _time(
     """rows_of: the column whose rows count in a table whose columns have rows of their own; moved: the
     output."""
     try:
-        wanted = [name] if rows_of is None else [name, rows_of]
-        stamps, column = table.seconds(name, table.columns(wanted, rows_of)[name], unit)
-        table.increasing(stamps, name)
+        stamps, column = table.stamps(name, rows_of, unit)
         steps = np.diff(stamps)
         period = float(np.median(steps))
         if moved:
