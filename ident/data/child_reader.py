@@ -34,7 +34,8 @@ class RefusedError(ValueError):
     """Something in the file that is not read; the message is for the user."""
 
 
-Columns = list[tuple[str, Any, str]]  # name, array and unit; a name may be there twice
+# Name, array (or words: why there is none) and unit; a name may be there twice.
+Columns = list[tuple[str, Any, str]]
 
 
 def hdf5_columns(content: bytes) -> Columns:
@@ -109,8 +110,11 @@ def _unpacked(path: str, values: Any, attributes: Any) -> Any:
 
 
 def parquet_columns(content: bytes) -> Columns:
-    """Columns of numbers and of instants; missing numbers as NaN."""
+    """Columns of numbers and of instants; missing numbers as NaN. What lies in structs is called name.field,
+    in lists of one length name[0], name[1], ..."""
+    import numpy as np
     import pyarrow as pa
+    import pyarrow.compute as pc
     import pyarrow.parquet as pq
 
     pa.set_cpu_count(1)
@@ -121,8 +125,27 @@ def parquet_columns(content: bytes) -> Columns:
         raise RefusedError(f"unpacks to more than {LARGEST_BYTES >> 20} MiB: split the file")
     table = file.read(use_threads=False)
     found: Columns = []
-    for field, column in zip(table.schema, table.columns, strict=True):
-        kind = field.type
+    units = [(field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace") for field in table.schema]
+    waiting = list(zip(table.schema.names, table.columns, units, strict=True))[::-1]
+    while waiting:
+        name, column, unit = waiting.pop()
+        kind, values = column.type, None
+        if pa.types.is_struct(kind):
+            parts = [
+                (f"{name}.{kind.field(k).name}", pc.struct_field(column, k), unit)
+                for k in range(kind.num_fields)
+            ]
+            waiting += parts[::-1]
+            continue
+        if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+            least, most = (end.as_py() for end in pc.min_max(pc.list_value_length(column)).values())
+            if least == most and 0 < (most or 0) <= _LONGEST_FIELD:
+                parts = [(f"{name}[{k}]", pc.list_element(column, k), unit) for k in range(most)]
+                waiting += parts[::-1]
+            else:
+                what = f"lists of {least} to {most} entries; expected one length, at most {_LONGEST_FIELD}"
+                found.append((name, what, unit))
+            continue
         if pa.types.is_dictionary(kind):
             kind, column = kind.value_type, column.cast(kind.value_type)
         if pa.types.is_time(kind):  # of day
@@ -131,16 +154,15 @@ def parquet_columns(content: bytes) -> Columns:
             column = column.cast(kind)
         if pa.types.is_integer(kind) and not column.null_count:
             values = column.to_numpy()  # whole: doubles hold integers up to 2^53, stamps in ns are larger
-        elif pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
+        elif (pa.types.is_primitive(kind) and not pa.types.is_temporal(kind)) or pa.types.is_decimal(kind):
             values = column.cast(pa.float64(), safe=False).to_numpy()
-        elif pa.types.is_decimal(kind):
-            values = column.cast(pa.float64()).to_numpy()
         elif pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
             values = column.to_numpy()
+        elif pa.types.is_string(kind) or pa.types.is_large_string(kind):
+            values = np.array(column.to_pylist(), dtype="U32")  # as much as tells one run from another
         else:
-            continue
-        unit = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
-        found.append((field.name, values, unit))
+            values = f"{kind}; expected numbers"
+        found.append((name, values, unit))
     return found
 
 
@@ -341,8 +363,10 @@ def main(kind: str) -> int:
         else:
             read = {"hdf5": hdf5_columns, "parquet": parquet_columns}.get(kind)
             columns = read(content) if read else bag_columns(content, kind)
-            about = [[name, unit] for name, _, unit in columns]
-            found = _archive(about, [values for _, values, _ in columns])
+            about = [
+                [name, unit, values if isinstance(values, str) else ""] for name, values, unit in columns
+            ]
+            found = _archive(about, [() if isinstance(values, str) else values for _, values, _ in columns])
     except ImportError as error:
         sys.stderr.write(error.name or str(error))
         return 3

@@ -142,4 +142,4 @@ class PriorTest:
 
 def distinct(found: Sequence[Finding]) -> tuple[Finding, ...]:
     """Each one once, in their order."""
-    return tuple(item for i, item in enumerate(found) if item not in found[:i])
+    return tuple({repr(item): item for item in found}.values())

@@ -22,6 +22,9 @@ from ident.data.child_reader import CPU_SECONDS
 LARGEST_BYTES = 2**30
 """Of a file, and of what it unpacks to: some hundred channels at 1 kHz for twenty minutes as doubles."""
 
+MOST_COLUMNS = 4096
+"""Of a table: each is looked at, and a line of it printed. More is a table that lies on its side."""
+
 _SCRIPT = Path(__file__).with_name("child_reader.py")
 _SECONDS = CPU_SECONDS + 30  # of waiting
 _REFUSED, _NO_LIBRARY = 2, 3
@@ -56,11 +59,10 @@ def content_of(file: Path) -> bytes:
 
 def distinct(names: Sequence[str]) -> list[str]:
     """Names of columns, those that are there several times numbered: '#1 angle', '#2 angle'."""
-    came: Counter[str] = Counter()
-    found = []
+    times, came, found = Counter(names), Counter[str](), list[str]()
     for name in names:
         came[name] += 1
-        found.append(f"#{came[name]} {name}" if names.count(name) > 1 else name)
+        found.append(f"#{came[name]} {name}" if times[name] > 1 else name)
     return found
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
+from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -21,44 +22,48 @@ def json_columns(text: str, *, in_lines: bool) -> dict[str, Any]:
         document: Any = [_parsed(line, k) for k, line in enumerate(text.split("\n"), 1) if line.strip()]
     else:
         document = _parsed(text, 0)
-    if isinstance(document, list):
-        rows = [_leaves("", row) for row in document]
-        names = dict.fromkeys(name for row in rows for name in row)
-        lists = {name: [row.get(name) for row in rows] for name in names}
-    else:
-        lists = _lists("", document)
-    if not lists:
+    lists = {"": document} if isinstance(document, list) else _lists("", document)
+    if not any(lists.values()):
         raise ValueError(": no columns; expected a list of rows, or an object of lists of numbers")
-    return {name: _column(values) for name, values in lists.items()}
+    return {key: column for name, cells in lists.items() for key, column in columns_in(name, cells).items()}
+
+
+def columns_in(name: str, cells: Sequence[Any]) -> dict[str, Any]:
+    """The columns in the cells of one: what lies in objects is called name.key, in lists of one length
+    name[0], name[1], ...; `Unread` where lengths differ."""
+    there = [cell for cell in cells if cell is not None]
+    parts: dict[str, list[Any]]
+    if there and all(isinstance(cell, dict) for cell in there):
+        keys = dict.fromkeys(key for cell in there for key in cell)
+        parts = {f"{name}.{key}" if name else key: [(cell or {}).get(key) for cell in cells] for key in keys}
+    elif there and all(isinstance(cell, list) for cell in there):
+        lengths = [len(cell) for cell in there]
+        least, most = min(lengths), max(lengths)
+        if least < most or not most:
+            return {name or "value": Unread(f"lists of {least} to {most} entries; expected one length")}
+        parts = {f"{name}[{k}]": [cell and cell[k] for cell in cells] for k in range(most)}
+    else:
+        return {name or "value": _column(cells)}
+    return {key: column for part, inner in parts.items() for key, column in columns_in(part, inner).items()}
 
 
 def _parsed(text: str, line: int) -> Any:
     """The value of a text: the whole file, or a line of it (from 1)."""
-
-    where = f", line {line}:" if line else ":"
     try:
         return json_value(text)
     except json.JSONDecodeError as error:
         raise ValueError(f", line {line or error.lineno}: not valid JSON: {error.msg}") from None
     except ValueError as error:
-        raise ValueError(f"{where} {error}") from None
-
-
-def _leaves(name: str, value: Any) -> dict[str, Any]:
-    """Numbers and words of one row."""
-    if isinstance(value, dict):
-        parts = [(f"{name}.{key}" if name else key, item) for key, item in value.items()]
-    elif isinstance(value, list):
-        parts = [(f"{name}[{k}]", item) for k, item in enumerate(value)]
-    else:
-        return {name or "value": value}
-    return {key: leaf for part in parts for key, leaf in _leaves(*part).items()}
+        raise ValueError(f"{f', line {line}:' if line else ':'} {error}") from None
 
 
 def _lists(name: str, value: Any) -> dict[str, list[Any]]:
-    """Lists in an object of columns, or of columns by row number, as pandas writes them."""
+    """Lists in an object of columns, or of columns by row number, as pandas writes them; a matrix (C, T) as
+    T rows."""
     if isinstance(value, list):
-        return {name or "value": value}
+        lying = {len(row) if isinstance(row, list) else 0 for row in value}
+        turned = len(lying) == 1 and max(lying) > len(value)
+        return {name or "value": list(map(list, zip(*value, strict=True))) if turned else value}
     if not isinstance(value, dict):
         return {}
     if len(value) > 1 and list(value) == [str(k) for k in range(len(value))]:
@@ -67,24 +72,15 @@ def _lists(name: str, value: Any) -> dict[str, list[Any]]:
     return {key: found for part in parts for key, found in _lists(*part).items()}
 
 
-def _column(values: list[Any]) -> Any:
+def _column(values: Sequence[Any]) -> Any:
     there = {type(value) for value in values if value is not None}
     if there == {str}:
         return tuple(value or "" for value in values)
     if there == {bool} or there <= {int, float}:  # on and off, or numbers: true is no 1 among numbers
         whole = there == {int} and None not in values and all(abs(value) < 2**63 for value in values)
-        return np.array(values, dtype=np.int64) if whole else np.array([_number(value) for value in values])
-    if there == {list} and None not in values:
-        with contextlib.suppress(ValueError, TypeError, OverflowError):
-            rows = np.array(values)
-            if rows.ndim == 2 and rows.dtype.kind in "if":
-                return rows
+        with suppress(OverflowError):
+            return np.array(values, dtype=np.int64 if whole else np.float64)
+        # An integer of hundreds of digits is infinite.
+        return np.array([np.nan if value is None else float(str(value)) for value in values])
     kinds = sorted({_KINDS.get(kind, "objects") for kind in there})
     return Unread(f"{' and '.join(kinds)} in one column; expected numbers")
-
-
-def _number(value: Any) -> float:
-    try:
-        return np.nan if value is None else float(value)
-    except OverflowError:  # an integer of hundreds of digits
-        return np.inf

@@ -201,6 +201,7 @@ class Record(Shown):
         resample_s: float | None = None,
         unwrap: Mapping[str, float] | None = None,
         decimal: str | None = None,
+        run: int | None = None,
     ) -> Self:
         """Read columns of a log file, or of a table that is there; readers: `ident.data.record_files`.
 
@@ -209,10 +210,18 @@ class Record(Shown):
         units: by column, quantity = scale * column + offset in that unit. repair: stamps that jitter, and
         single missing rows, are put on a uniform grid (`TimeGrid`). resample_s: all rows are put on a grid of
         this step (`CoarseGrid`). unwrap: by column, the period at which its readings wrap (4096, 360), before
-        scale and offset. decimal: 'point' or 'comma', where the numbers leave a doubt. Raises ValueError in
-        one line naming file and place.
+        scale and offset. decimal: 'point' or 'comma', where the numbers leave a doubt. run: of a table in
+        which time starts again (`Table.runs`), from 0. Raises ValueError in one line naming file and place.
         """
         table = (path if isinstance(path, Table) else read_table(path)).with_decimal(decimal)
+        runs = table.runs(time)
+        if run is not None or len(runs) > 1:
+            if run is None or not 0 <= run < len(runs):
+                what = f"{len(runs)} runs, {runs[0].run} to {runs[-1].run}" if runs[0].run else "one run"
+                raise ValueError(
+                    f"{table.path}: holds {what}; expected one of them: run = 0 to {len(runs) - 1}"
+                )
+            table = runs[run]
         for key, names in (("inputs", inputs), ("outputs", outputs), ("references", references)):
             if isinstance(names, str):
                 raise ValueError(
@@ -293,7 +302,7 @@ class Record(Shown):
             of = "".join(stated(references)), "".join(stated(outputs))
             notes += contradicted_by_loop(reference[:, 0], output[:, 0], looked, of, scale)
         return cls(
-            name=table.path.stem if name is None else name,
+            name=", ".join(filter(None, (table.path.stem, table.run))) if name is None else name,
             input=stack(inputs, held=True),
             output=output,
             dt_s=step,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import re
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -14,7 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from ident.data.foreign_files import LARGEST_BYTES, content_of, distinct, npz_arrays, read_in_child, shown
+from ident.data.foreign_files import (
+    LARGEST_BYTES,
+    Unread,
+    content_of,
+    distinct,
+    npz_arrays,
+    read_in_child,
+    shown,
+)
 from ident.data.json_columns import json_columns
 from ident.data.mat_files import mat_variables
 from ident.data.table import Table
@@ -42,18 +51,23 @@ def read_table(path: str | PathLike[str]) -> Table:
     file = Path(path)
     if not file.is_file():  # a pipe would be waited for
         raise ValueError(f"{file}: {'not a file' if file.exists() else 'no such file'}")
-    packed = file.suffix.lower() == ".gz"
-    ending = Path(file.stem).suffix.lower() if packed else file.suffix.lower()
+    ending, packed = _ending(file), file.suffix.lower() == ".gz"
     if ending not in READERS:
         known = ", ".join(READERS)
         raise ValueError(f"{file}: unknown kind of file '{shown(ending)}'; expected one of {known} (or .gz)")
     try:
-        content = content_of(file)
-        return READERS[ending](file, _unpacked(content) if packed else content)
+        content = _unpacked(content_of(file)) if packed else content_of(file)
+        if re.match(rb"\s*# (Created by Octave|name: .*\r?\n# type: )", content):
+            raise ValueError("Octave text; expected numbers as MATLAB has them: save -v7 FILE.mat NAMES")
+        return READERS[ending](file, content)
     except ValueError as error:
         text = str(error)
         between = "" if text.startswith((":", ",")) else ": "
         raise ValueError(text if text.startswith(str(file)) else f"{file}{between}{text}") from None
+
+
+def _ending(file: Path) -> str:
+    return Path(file.name.lower().removesuffix(".gz")).suffix
 
 
 def _unpacked(content: bytes) -> bytes:
@@ -74,12 +88,7 @@ _OWN_ROWS = 0.8
 @reads(".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm")
 def _read_text(file: Path, content: bytes) -> Table:
     """A text table; its layout is found from the lines (`text_tables`)."""
-    try:
-        text = text_of(content)
-    except ValueError as error:
-        raise ValueError(f": {error}") from None
-    layout, columns = read_text(text)
-    return _text_table(file, layout, columns)
+    return _text_table(file, *read_text(text_of(content)))
 
 
 def _text_table(file: Path, layout: Layout, columns: Mapping[str, tuple[str, ...]]) -> Table:
@@ -100,6 +109,12 @@ def _text_table(file: Path, layout: Layout, columns: Mapping[str, tuple[str, ...
         if (counted is not None or not given) and not layout.skipped:
             raw[name], units[name] = start + step * np.arange(n_rows), "s"
     raw = {name: cells for name, cells in raw.items() if not isinstance(cells, tuple) or any(cells)}
+    # Some write a time for each signal.
+    times = [name for name in raw if name.startswith("#") and says_time(name.partition(" ")[2])]
+    if len(times) > 1 and len({raw[name] for name in times}) > 1:
+        raise ValueError(f": '{times[0]}' and '{times[1]}' differ; expected one time for all signals")
+    raw = {name.partition(" ")[2] if name in times else name: cells for name, cells in raw.items()}
+    units |= {name.partition(" ")[2]: units.get(name, "") for name in times}
     table = Table(file, raw, layout.first, layout, units)
     filled = {name: [k for k, cell in enumerate(cells) if cell] for name, cells in columns.items()}
     ends = {name: rows for name, rows in filled.items() if rows and len(rows) < n_rows}
@@ -116,29 +131,15 @@ def _text_table(file: Path, layout: Layout, columns: Mapping[str, tuple[str, ...
 @reads(".npz")
 def _read_npz(file: Path, content: bytes) -> Table:
     """A numpy archive of named vectors; object arrays (pickles) are not read."""
-    try:
-        return Table(file, npz_arrays(content))
-    except ValueError as error:
-        raise ValueError(f": {error}") from None
+    return Table(file, npz_arrays(content))
 
 
 @reads(".mat")
 def _read_mat(file: Path, content: bytes) -> Table:
     """A MATLAB file; what stands in structs is called log.signals[0].values."""
     if b"\x89HDF\r\n" in content[:1024]:  # version 7.3
-        return _read_columns(file, content, "HDF5", "h5py")
-    return Table(file, _flat("", mat_variables(content, file)))
-
-
-@reads(".h5", ".hdf5")
-def _read_hdf5(file: Path, content: bytes) -> Table:
-    """Datasets by their path: group/signal; of compound ones group/table.field."""
-    return _read_columns(file, content, "HDF5", "h5py")
-
-
-@reads(".parquet")
-def _read_parquet(file: Path, content: bytes) -> Table:
-    return _read_columns(file, content, "parquet", "pyarrow")
+        return _read_columns(file, content)
+    return _table_of(file, _flat("", mat_variables(content, file)))
 
 
 @reads(".xlsx")
@@ -170,19 +171,13 @@ def _read_xlsx(file: Path, content: bytes) -> Table:
 @reads(".json", ".jsonl", ".ndjson")
 def _read_json(file: Path, content: bytes) -> Table:
     """Rows or columns as `json_columns` finds them; of `.jsonl` and `.ndjson` a row in each line."""
-    try:
-        text = text_of(content)
-    except ValueError as error:
-        raise ValueError(f": {error}") from None
-    ending = file.name.lower().removesuffix(".gz").rpartition(".")[2]
-    return Table(file, json_columns(text, in_lines=ending != "json"))
+    return Table(file, json_columns(text_of(content), in_lines=_ending(file) != ".json"))
 
 
 @reads(".mcap", ".bag", ".db3")
 def _read_bag(file: Path, content: bytes) -> Table:
     """MCAP, ROS 1 and ROS 2 bags: topic.field; signals of several topics hold their last message."""
-    kind = file.name.lower().removesuffix(".gz").rpartition(".")[2]
-    table = _read_columns(file, content, kind, "mcap rosbags")
+    table = _read_columns(file, content)
     recorded = {name[:-1]: table.raw[name] for name in table.names if name.endswith("\t")}
     raw = {name: values for name, values in table.raw.items() if not name.endswith("\t")}
     # A topic's name may be the beginning of another's: the longest that fits comes last.
@@ -191,21 +186,39 @@ def _read_bag(file: Path, content: bytes) -> Table:
     return replace(table, raw=raw, clocks=clocks)
 
 
-def _read_columns(file: Path, content: bytes, kind: str, library: str) -> Table:
-    arrays = npz_arrays(read_in_child(kind, library, content))
+@reads(".h5", ".hdf5", ".parquet")
+def _read_columns(file: Path, content: bytes) -> Table:
+    """What the child makes of a file: of HDF5 datasets by their path, group/signal, and group/table.field."""
+    kinds = dict.fromkeys((".h5", ".hdf5", ".mat"), ("HDF5", "h5py")) | {".parquet": ("parquet", "pyarrow")}
+    kind, libraries = kinds.get(_ending(file), (_ending(file)[1:], "mcap rosbags"))
+    arrays = npz_arrays(read_in_child(kind, libraries, content))
     about = json.loads(arrays.pop("about").tobytes())
-    names = distinct([name for name, _ in about])
-    columns = {name: arrays[str(k)] for k, name in enumerate(names)}
-    units = {name: unit for name, (_, unit) in zip(names, about, strict=True) if unit}
-    return Table(file, columns, units=units)
+    found = [
+        (name, Unread(why) if why else arrays[str(k)], unit) for k, (name, unit, why) in enumerate(about)
+    ]
+    return _table_of(file, found)
 
 
-def _flat(name: str, value: Any) -> dict[str, Any]:
-    """Nested fields and lists under the names by which a program would call them; text is no column."""
+def _table_of(file: Path, columns: Sequence[tuple[str, Any, str]]) -> Table:
+    """Of names, columns and units; a name may be there several times."""
+    names = distinct([name for name, _, _ in columns])
+    units = {name: unit for name, (_, _, unit) in zip(names, columns, strict=True) if unit}
+    return Table(file, {name: column[1] for name, column in zip(names, columns, strict=True)}, units=units)
+
+
+def _flat(name: str, value: Any, unit: str = "") -> list[tuple[str, Any, str]]:
+    """Nested fields and lists under the names by which a program would call them, with their units; text is
+    no column. What says its name beside its data, as recorders do, has that."""
     if isinstance(value, Mapping):
-        parts = [(f"{name}.{key}" if name else key, item) for key, item in value.items()]
+        said = {key.lower(): text.strip() for key, text in value.items() if isinstance(text, str)}
+        data = ("data", "values") if said.get("name") else ()
+        unit = said.get("unit", "")
+        parts = [
+            (said["name"] if key.lower() in data else f"{name}.{key}" if name else key, item)
+            for key, item in value.items()
+        ]
     elif isinstance(value, list):
         parts = [(f"{name}[{k}]", item) for k, item in enumerate(value)]
     else:
-        return {} if isinstance(value, str) else {name: value}
-    return {key: item for part in parts for key, item in _flat(*part).items()}
+        return [] if isinstance(value, str) else [(name, value, unit)]
+    return [item for part in parts for item in _flat(*part, unit)]

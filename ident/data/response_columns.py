@@ -6,7 +6,6 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -104,38 +103,9 @@ class DoubtError(ValueError):
     """The table is a frequency response, and something of it is not understood: asked for in one line."""
 
 
-@dataclass(frozen=True)
-class ResponseColumns:
-    """The columns of a frequency response: frequency, and real, imag or gain, phase. convert: by column, to
-    rad/s, a factor, rad. double: (column, second column of the same quantity), to be compared."""
-
-    frequency: str
-    pair: tuple[str, str]
-    rectangular: bool
-    convert: Mapping[str, Convert]
-    double: tuple[tuple[str, str], ...] = ()
-    other_pair: tuple[str, str] | None = None
-
-    def read(self, table: Table) -> tuple[RealArray, ComplexArray]:
-        """omega (K,) in rad/s and response (K,). Raises ValueError naming file, line and column; DoubtError
-        where columns contradict each other."""
-        named = [self.frequency, *self.pair, *(name for two in self.double for name in two)]
-        given = table.columns([*named, *(self.other_pair or ())])
-        values = {name: self.convert[name](numbers) for name, numbers in given.items()}
-        for one, two in self.double:
-            scale = np.maximum(np.abs(values[one]), 1e-3 * np.max(np.abs(values[one]), initial=0.0))
-            _refuse_apart(table, np.abs(values[two] - values[one]) > _AGREE * scale, one, two)
-        first, second = (values[name] for name in self.pair)
-        response = first + 1j * second if self.rectangular else first * np.exp(1j * second)
-        if self.other_pair is not None:
-            gain, phase = (values[name] for name in self.other_pair)
-            apart = np.abs(gain * np.exp(1j * phase) - response) > _AGREE * np.abs(response)
-            _refuse_apart(table, apart, " and ".join(self.pair), " and ".join(self.other_pair))
-        return values[self.frequency], response
-
-
-def response_columns(table: Table) -> ResponseColumns | None:
-    """The columns of a frequency response; None where the table is none: it has no frequency, or a time.
+def response_columns(table: Table) -> dict[str, list[str]] | None:
+    """The columns of a frequency response by their role, those of real and imag or of gain and phase first;
+    None where the table is none: it has no frequency, or a time.
 
     Raises DoubtError: one line that says what is not understood and what to write.
     """
@@ -157,27 +127,16 @@ def response_columns(table: Table) -> ResponseColumns | None:
             f"{table.path}: a frequency response without {lacking[0]}: it needs real and imag, or gain and "
             f"phase; found {listed}"
         )
+    if rectangular:
+        for role in wanted:
+            if len(found[role]) > 1:
+                raise DoubtError(
+                    f"{table.path}: {' and '.join(map(repr, found[role]))} are both {role} parts: keep the "
+                    "columns of one response"
+                )
     both = rectangular and bool(found["gain"] and found["phase"])
-    used = ["frequency", *wanted, *(("gain", "phase") if both else ())]
-    convert: dict[str, Convert] = {}
-    for role in used:
-        for name in found[role]:
-            convert[name] = _conversion(table, role, name, found)
-    for role in ("real", "imag"):
-        if len(found[role]) > 1 and rectangular:
-            raise DoubtError(
-                f"{table.path}: {' and '.join(map(repr, found[role]))} are both {role} parts: keep the "
-                "columns of one response"
-            )
-    first = {role: found[role][0] for role in used}
-    return ResponseColumns(
-        first["frequency"],
-        (first[wanted[0]], first[wanted[1]]),
-        rectangular,
-        convert,
-        tuple((first[role], other) for role in used for other in found[role][1:]),
-        (first["gain"], first["phase"]) if both else None,
-    )
+    used = ("frequency", *wanted, *(("gain", "phase") if both else ()))
+    return {role: found[role] for role in used}
 
 
 def has_response(table: Table) -> bool:
@@ -200,7 +159,24 @@ def read_response(table: Table) -> tuple[RealArray, ComplexArray]:
             need += f"; no column {'imag' if 'real' in found else 'real'!r}"
         listed = ", ".join(shown(name, 30) for name in table.names)
         raise ValueError(f"{table.path}, line 1: need {need}; the file has {shown(listed, 120)}")
-    return columns.read(table)
+    convert = {
+        name: _conversion(table, role, name, columns) for role, names in columns.items() for name in names
+    }
+    given = table.columns(list(convert))
+    values = {name: convert[name](numbers) for name, numbers in given.items()}
+    for one, *others in columns.values():
+        for two in others:
+            scale = np.maximum(np.abs(values[one]), 1e-3 * np.max(np.abs(values[one]), initial=0.0))
+            _refuse_apart(table, np.abs(values[two] - values[one]) > _AGREE * scale, one, two)
+    of = {role: values[names[0]] for role, names in columns.items()}
+    polar: ComplexArray = of["gain"] * np.exp(1j * of["phase"]) if "gain" in of else np.zeros(0, complex)
+    response: ComplexArray = of["real"] + 1j * of["imag"] if "real" in of else polar
+    if "real" in of and polar.size:
+        pairs = [
+            " and ".join(columns[role][0] for role in two) for two in (("real", "imag"), ("gain", "phase"))
+        ]
+        _refuse_apart(table, np.abs(polar - response) > _AGREE * np.abs(response), *pairs)
+    return of["frequency"], response
 
 
 def _conversion(table: Table, role: str, name: str, found: Mapping[str, Sequence[str]]) -> Convert:
@@ -213,7 +189,7 @@ def _conversion(table: Table, role: str, name: str, found: Mapping[str, Sequence
     if role == "frequency" and not unit and _words(name) & {"omega", "ω"}:
         return units["rad/s"]
     # The table of our own documentation: gain beside phase_rad is a factor.
-    if name == "gain" and not unit and "phase_rad" in found["phase"]:
+    if name == "gain" and not unit and "phase_rad" in found.get("phase", ()):
         return units["abs"]
     if role == "gain" and re.fullmatch(r"\S+/\S+", unit) and "db" not in unit:
         return units["abs"]  # of one unit per another, as rad/V

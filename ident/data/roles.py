@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import NoReturn
 
 import numpy as np
 
+from ident.data.arrays import RealArray
 from ident.data.finding import Finding, FindingKind, finding
-from ident.data.foreign_files import shown
+from ident.data.foreign_files import Unread, shown
 from ident.data.table import Table
+from ident.data.text_tables import is_number
 from ident.data.units import (
     COUNTED,
     TIME_UNITS,
@@ -22,30 +26,34 @@ from ident.data.units import (
     says_time,
     scaled_by,
 )
+from ident.data.wrapping import counts_rows
 
-_INPUT = re.compile(
-    r"(u|v|input|command|commanded|cmd|drive|voltage|spannung|current|strom|torque|moment|force|pwm|duty)(?![a-z])",
-    re.I,
+# What a name speaks of is its last such word: the current position is a position.
+_DRIVES = (
+    "input|commanded|command|cmd|drive|voltage|volts?|spannung|current|strom|torque|moment|force|pwm|duty|dac|"
+    "effort|throttle|action"
 )
-_OUTPUT = re.compile(
-    r"(y|output|angle|winkel|position|pos|theta|phi|alpha|q|tip|speed|velocity|drehzahl|encoder|enc|counts|hub)"
-    r"(?![a-z])",
-    re.I,
+_MOVES = (
+    "angle|winkel|position|pos|theta|phi|alpha|tip|speed|velocity|vel|drehzahl|encoder|enc|pv|hub|observation"
 )
+_WORD = re.compile(rf"(?<![a-z])(?:({_DRIVES})|({_MOVES}))(?![a-z])", re.I)
+_SYMBOL = re.compile(r"(?:.*[/.])?(?:([uv])|(y|q|output|counts))(?![a-z])", re.I)
 # What the motion should be: the command of a control loop, neither its drive nor what a sensor read.
 _WISHED = re.compile(
-    r"(^|[^a-z])(ref|reference|setpoint|set_point|set|sp|desired|target|soll[a-z]*|vorgabe|des|demand|goal|"
-    r"consigne|consigna|referencia|riferimento)(?![a-z])|给定|设定|目标|参考|目標|"
-    r"(^|[^a-z])(cmd|command|commanded)_?(pos|position|angle|theta|q|speed|vel|velocity)(?![a-z])|"
-    r"(^|[^a-z])(pos|position|angle|theta|q|speed|vel|velocity)_?(cmd|command|commanded)(?![a-z])",
+    rf"(^|[^a-z])(ref|reference|setpoint|set_point|set|sp|desired|target|soll[a-z]*|vorgabe|des|demand|goal|"
+    rf"consigne|consigna|referencia|riferimento)(?![a-z])|给定|设定|目标|参考|目標|"
+    rf"(^|[^a-z])(cmd|command|commanded)_?({_MOVES}|q)(?![a-z])|"
+    rf"(^|[^a-z])({_MOVES}|q)_?(cmd|command|commanded)(?![a-z])",
     re.I,
 )
-# A column of nothing but this name and a unit is the reference of textbooks.
-_TEXTBOOK = re.compile(r"r", re.I)
-# The difference of two other columns.
-_ERROR = re.compile(r"(^|[^a-z])(e|err|error|fehler|abweichung|regelabweichung|residual)(?![a-z])", re.I)
-# Of a PLC's variable, its type: rVoltage, lrAngle.
-_PREFIX = re.compile(r"^(l?r|f|n|i|di|ui|w)(?=[A-Z])")
+# What neither drives nor shows the machine: computed of other columns, of another quantity, a number of rows.
+_BESIDE = re.compile(
+    r"(^|[^a-z])(e|err|error|fehler|abweichung|regelabweichung|residual|est|estimate|estimated|hat|obs|observer|"
+    r"filt|filtered|predicted|sim|temp|temperature?|status|mode|flags?|id|seq|index|idx|counter)(?![a-z])",
+    re.I,
+)
+# Of what drives the machine, as a sensor read it.
+_MEASURED = re.compile(r"(^|[^a-z])(meas|measured|act|actual|ist|fb|feedback|sensed?)(?![a-z])", re.I)
 # Units by their kind.
 _DRIVEN = frozenset({"V", "A", "N", "Nm"})
 _MOVED = frozenset(f"{kind}{rate}" for kind in ("rad", "m", *COUNTED - {"%"}) for rate in ("", "/s", "/s2"))
@@ -69,74 +77,39 @@ class Roles:
 
 
 def roles_of(table: Table, log: str, command: str = "identify", **stated: str | None) -> Roles:
-    """The columns of one channel. stated: input, output, time and reference as far as the user named them.
-    log, command: what a complaint offers to type. Raises ValueError where a role has no column or several, or
-    a reference beside them may mean a closed loop."""
+    """The columns of one channel, and the reference: what is wished for the output, in its unit. In a closed
+    loop the one column that is left is the role that is missing. stated: input, output, time and reference as
+    far as the user named them. log, command: what a complaint offers to type. Raises ValueError where a role
+    has no column or several: it names them."""
     moving = [name for name in table.names if _is_signal(table, name)]
     time = stated.get("time") or time_of(table)
     rest = [name for name in moving if name not in (time, *stated.values())]
-    wished = [name for name in rest if _is_wished(table, name)]
-    inputs = _not_in(wished, [name for name in rest if _says(table, name, _DRIVEN, _INPUT)])
-    outputs = _not_in(wished, [name for name in rest if _says(table, name, _MOVED, _OUTPUT)])
-    outputs = _not_in([name for name in outputs if _ERROR.search(name)], outputs)
-    input_, output = stated.get("input") or _only(inputs), stated.get("output") or _only(outputs)
-    named = stated.get("input") and stated.get("output")
-    wished = (
-        [] if named or stated.get("reference") else [name for name in wished if name not in (input_, output)]
-    )
-    if input_ is not None and output is not None and input_ != output and not wished:
-        return Roles(time, input_, output)
-    for role, found, unit, word in (("input", inputs, _DRIVEN, _INPUT), ("output", outputs, _MOVED, _OUTPUT)):
-        still = [name for name in table.names if name not in moving and _says(table, name, unit, word)]
-        still = [name for name in still if not is_time(table, name) and not _is_wished(table, name)]
-        if still and not found and not stated.get(role):
-            raise ValueError(
-                f"{table.path}: '{shown(still[0], 30)}' stands still, so that nothing can be identified from "
-                f"this log; leave it out, or name the {role} if it is another column: flexlink {command} "
-                f"{log} --{role} NAME"
-            )
-    listed = shown(", ".join(shown(name, 30) for name in table.names), 90)
-    if outputs and not inputs and not stated.get("input") and set(rest) <= {*outputs, *wished}:
-        raise ValueError(
-            f"{table.path}: no column looks like an input; it has {listed}. A model needs what drives the "
-            f"machine (in V, A, N or Nm): record it too, or name it: flexlink {command} {log} --input NAME"
-        )
-    # Of several that fit, two different ones.
-    first = input_ or next((name for name in inputs if name != output), "NAME")
-    second = output or next((name for name in [*outputs, *inputs] if name != first), "NAME")
-    options = [("--input", first), ("--output", second)]
-    reference = stated.get("reference") or _only(wished)
-    if not (output or reference) and (pair := _led_and_follower(table, outputs)):
-        reference, options[1] = pair[0], ("--output", pair[1])
-    options += [("--reference", reference)] if reference else []
-    times = [] if time else times_in(table) or rising(table)
-    options += [("--time", time or times[0])] if time or times else [("--dt-s", "SECONDS")]
-    typed = " ".join(f"{option} {shlex.quote(shown(value, 30))}" for option, value in options)
-    raise ValueError(f"{table.path}: which columns? It has {listed}; type: flexlink {command} {log} {typed}")
-
-
-def roles_with_reference(table: Table, log: str, command: str, **stated: str | None) -> Roles:
-    """As `roles_of`, a reference column found as well: what is wished for the output, in its unit.
-
-    Raises ValueError as there, and where several columns may be the reference: it names them.
-    """
-    if stated.get("reference"):
-        return replace(roles_of(table, log, command, **stated), reference=stated["reference"])
-    moving = [name for name in table.names if _is_signal(table, name) and name not in stated.values()]
-    wished = [name for name in moving if _is_wished(table, name) and kind_of(table.unit(name)) not in _DRIVEN]
-    drives = [name for name in moving if _says(table, name, _DRIVEN, _INPUT)]
+    said = {name: _said(table, name) for name in rest}
+    drives = [name for name in rest if said[name] == "input"]
+    wished = [name for name in rest if _is_wished(table, name) and kind_of(table.unit(name)) not in _DRIVEN]
     if not (stated.get("input") or set(drives) - set(wished)):
         wished = [name for name in wished if name not in drives]
-    output = stated.get("output")
-    if output is None and wished:
-        # Of a position and a speed the one that something is wished for.
-        like = {table.unit(name) for name in wished} - {""}
-        moved = [name for name in moving if name not in wished and _says(table, name, _MOVED, _OUTPUT)]
-        moved = _not_in([name for name in moved if _ERROR.search(name)], moved)
-        output = _only([name for name in moved if table.unit(name) in like]) or _only(moved)
-    roles = roles_of(
-        table, log, command, **{**stated, "output": output, "reference": wished[0] if wished else None}
-    )
+    beside = [name for name in rest if _BESIDE.search(name)]
+    inputs = _not_in(beside, [name for name in drives if name not in wished])
+    moves = [name for name in rest if said[name] == "output" and name not in wished]
+    moves = moves or [name for name in rest if said[name] == "counted" and name not in wished]
+    outputs = _not_in(beside, moves)
+    # Of a position and a speed the one that something is wished for.
+    like = {table.unit(name) for name in wished} - {""}
+    output = stated.get("output") or _only([name for name in outputs if table.unit(name) in like])
+    input_, output = stated.get("input") or _only(inputs), output or _only(outputs)
+    left = [name for name in rest if name not in (*drives, *moves, *wished, *beside)]
+    left = [name for name in left if not (_is_text(table.raw[name]) or _holds(table, name, counts_rows))]
+    loop = wished or stated.get("reference")
+    if loop and len(left) == 1 and kind_of(table.unit(left[0])) in ("", *COUNTED):
+        input_ = input_ or (None if inputs else left[0])
+        output = output or (None if outputs or input_ == left[0] else left[0])
+    if input_ is None or output is None or input_ == output:
+        named = stated | {"input": input_, "output": output, "time": time}
+        _ask(table, f"flexlink {command} {log}", named, inputs, outputs, wished, left)
+    roles = Roles(time, input_, output, stated.get("reference"))
+    if roles.reference or not wished:
+        return roles
     units = {"", table.unit(roles.output)}
     fitting = [
         name
@@ -146,8 +119,7 @@ def roles_with_reference(table: Table, log: str, command: str, **stated: str | N
     ]
     if len(fitting) > 1:
         listed = shown(" and ".join(shown(name, 30) for name in fitting), 90)
-        named = [("--" + role, name) for role, name in stated.items() if name] + [("--reference", fitting[0])]
-        typed = " ".join(f"{option} {shlex.quote(shown(name, 30))}" for option, name in named)
+        typed = _typed({**stated, "reference": fitting[0]})
         raise ValueError(
             f"{table.path}: {listed} may be the reference of '{shown(roles.output, 30)}'; type: flexlink "
             f"{command} {log} {typed}"
@@ -166,9 +138,60 @@ def roles_with_reference(table: Table, log: str, command: str, **stated: str | N
     return replace(roles, doubts=(finding(FindingKind.UNIT_OF_REFERENCE, **told, same=same),))
 
 
-def _not_in(wished: list[str], names: list[str]) -> list[str]:
-    """Those that are no reference; all where none is left, as what drives the arm may be called one."""
-    return [name for name in names if name not in wished] or names
+def _ask(
+    table: Table,
+    typed: str,
+    found: Mapping[str, str | None],
+    inputs: list[str],
+    outputs: list[str],
+    wished: list[str],
+    left: list[str],
+) -> NoReturn:
+    """The complaint that a role has no column or several. typed: the command so far; found: what is known."""
+    for role, candidates in (("input", inputs), ("output", outputs)):
+        still = [name for name in table.names if not (is_time(table, name) or _is_signal(table, name))]
+        still = [name for name in still if _said(table, name) == role and not _is_wished(table, name)]
+        if still and not candidates and not found[role]:
+            raise ValueError(
+                f"{table.path}: '{shown(still[0], 30)}' stands still, so that nothing can be identified from "
+                f"this log; leave it out, or name the {role} if it is another column: {typed} --{role} NAME"
+            )
+    listed = shown(", ".join(shown(name, 30) for name in table.names), 90)
+    reference = found.get("reference") or next(iter(wished), None)
+    pair = None if found["output"] or reference else _led_and_follower(table, outputs)
+    alone = not left if outputs else len(left) < 2 and not wished
+    if alone and not inputs and not found["input"]:
+        named = _typed({"input": pair[0], "output": pair[1]}) if pair else "--input NAME"
+        raise ValueError(
+            f"{table.path}: no column looks like an input; it has {listed}. A model needs what drives the "
+            f"machine (in V, A, N or Nm): record it too, or name it: {typed} {named}"
+        )
+    # Of several that fit the one that is sent before the one that a sensor read, and two different ones.
+    sent = [name for name in inputs if not _MEASURED.search(name)]
+    one = left if len(left) == 1 and (inputs or outputs) else []
+    first = found["input"] or next(
+        (name for name in [*sent, *inputs, *one] if name != found["output"]), "NAME"
+    )
+    second = pair[1] if pair else found["output"]
+    second = second or next((name for name in [*outputs, *one, *inputs[::-1]] if name != first), "NAME")
+    times = times_in(table) or rising(table)
+    options = {
+        "input": first,
+        "output": second,
+        "reference": pair[0] if pair else reference,
+        "time": found["time"] or next(iter(times), None),
+    }
+    options["dt-s"] = None if options["time"] else "SECONDS"
+    raise ValueError(f"{table.path}: which columns? It has {listed}; type: {typed} {_typed(options)}")
+
+
+def _typed(options: Mapping[str, str | None]) -> str:
+    return " ".join(f"--{role} {shlex.quote(shown(name, 30))}" for role, name in options.items() if name)
+
+
+def _not_in(others: list[str], names: list[str]) -> list[str]:
+    """Those that are none of the others; all where none is left."""
+    return [name for name in names if name not in others] or names
 
 
 def _only(names: list[str]) -> str | None:
@@ -176,10 +199,13 @@ def _only(names: list[str]) -> str | None:
 
 
 def _led_and_follower(table: Table, names: list[str]) -> tuple[str, str] | None:
-    """Of two columns the one that comes first and the one that follows it, in the same unit and by their
-    changes; None where they tell neither."""
+    """Of two columns in one unit the one that leads, by its name or as the other follows its changes, and the
+    other; None where they tell neither."""
     if len(names) != 2 or table.unit(names[0]) != table.unit(names[1]):
         return None
+    called = [name for name in names if any(found[1] for found in _WORD.finditer(name))]
+    if len(called) == 1:
+        return called[0], names[1 - names.index(called[0])]
     with suppress(ValueError):
         first, second = (
             np.diff(column) - np.mean(np.diff(column)) for column in table.columns(names).values()
@@ -225,20 +251,27 @@ def time_of(table: Table) -> str | None:
     return _only(times_in(table))
 
 
+def _holds(table: Table, name: str, what: Callable[[RealArray], object], otherwise: bool = False) -> bool:
+    """Whether something holds of the numbers of a column; otherwise: of one that has none."""
+    with suppress(ValueError):
+        return bool(what(table.columns([name])[name]))
+    return otherwise
+
+
+def _is_text(values: object) -> bool:
+    """Whether a column holds words alone, or nothing that is read."""
+    if isinstance(values, tuple):
+        return not any(is_number(cell, sign) for cell in values for sign in ".,")
+    return isinstance(values, Unread) or np.asarray(values).dtype.kind in "USO"
+
+
 def _increases(table: Table, name: str) -> bool:
-    try:
-        return bool(np.all(np.diff(table.columns([name])[name]) > 0))
-    except ValueError:
-        return False
+    return _holds(table, name, lambda values: np.all(np.diff(values) > 0))
 
 
 def _is_signal(table: Table, name: str) -> bool:
-    if is_time(table, name):
-        return False
-    try:
-        return bool(np.ptp(table.columns([name])[name]) > 0)
-    except ValueError:
-        return True  # not left out for another one in silence: who takes it is told what is wrong with it
+    # One without numbers is not left out for another one in silence: who takes it is told what is wrong.
+    return not is_time(table, name) and _holds(table, name, lambda values: np.ptp(values) > 0, otherwise=True)
 
 
 def is_position(name: str, unit: str) -> bool:
@@ -251,14 +284,18 @@ def is_position(name: str, unit: str) -> bool:
 def _is_wished(table: Table, name: str) -> bool:
     bare = re.sub(r"[\W_]*$", "", name.removesuffix(table.unit(name).replace("/", "_")))
     apart = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)  # posRef, SetAngle
-    return _WISHED.search(apart) is not None or _TEXTBOOK.fullmatch(bare) is not None
+    return _WISHED.search(apart) is not None or bare.lower() == "r"
 
 
-def _says(table: Table, name: str, kinds: frozenset[str], word: re.Pattern[str]) -> bool:
-    """What the unit says, where there is one; else what the name does."""
-    stated = table.unit(name)
-    if stated:
-        return kind_of(stated) in kinds
-    # Of a topic, /cmd/voltage, and of a PLC's variable, PLC_PRG.rVoltage, the last word counts too.
-    last = re.split(r"[/.]", name)[-1]
-    return any(word.match(part) for part in (name, last, _PREFIX.sub("", last)))
+def _said(table: Table, name: str) -> str:
+    """What a column is, 'input', 'output' or empty: its unit says it, where there is one, else its name; a
+    unit of counts leaves it to the name, else 'counted'."""
+    unit = table.unit(name)
+    kind = kind_of(unit)
+    if unit and kind not in COUNTED:
+        return "input" if kind in _DRIVEN else "output" if kind in _MOVED else ""
+    words = list(_WORD.finditer(re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)))
+    symbol = None if unit else _SYMBOL.match(name)
+    if found := symbol or (words[-1] if words else None):
+        return "input" if found[1] else "output"
+    return "input" if kind == "%" else "counted" if unit else ""

@@ -4,26 +4,27 @@ expectation."""
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal, InvalidOperation
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ident.data.arrays import RealArray
-from ident.data.foreign_files import as_numbers, shown
+from ident.data.foreign_files import MOST_COLUMNS, as_numbers, shown
+from ident.data.json_columns import columns_in
 from ident.data.text_tables import Layout, doubtful_groups, is_number, number
 from ident.data.time_stamps import StampError, is_stamp, may_be_minutes, seconds_since_first
 from ident.data.units import SIGNAL_WORDS, TimeColumn, size_of, written_unit
 
 # Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
 LARGEST = 1e100
+_LIST = re.compile(r"(?:array\()?\[[\s\[]*(?:np\.\w+\()?[-+.\d]")
 # Larger stamps, as those since 1970, lose digits where they are divided by a unit.
 _LONG_STAMP = 1e9
-# Of a matrix so many columns at most are offered by number.
-_MOST_NUMBERED = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +33,8 @@ class Table:
 
     raw: by name, an array, or text cells (a tuple of str) as `layout` says. A matrix (T, C) is offered as C
     columns name[0], name[1], ... first_line: file line of row 0, None where rows have no lines (npz, mat).
-    units: by name, where the file states them apart from the names.
+    units: by name, where the file states them apart from the names. begin, run: row of the file at which a
+    run of it begins, and what it is called.
     """
 
     path: Path
@@ -41,11 +43,15 @@ class Table:
     layout: Layout | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     clocks: Mapping[str, RealArray] = field(default_factory=dict)
+    begin: int = 0
+    run: str = ""
 
     def __post_init__(self) -> None:
         columns: dict[str, Any] = {}
         for name, values in self.raw.items():
             columns |= _split(name, values)
+        if len(columns) > MOST_COLUMNS:
+            raise ValueError(f"{self.path}: {len(columns)} columns; expected at most {MOST_COLUMNS}")
         object.__setattr__(self, "raw", columns)
 
     @property
@@ -54,10 +60,39 @@ class Table:
 
     def place(self, row: int, name: str | None = None) -> str:
         if self.first_line is None:
-            return f"index {row}"
+            return f"index {row + self.begin}"
         if name is not None and name in self.clocks:
             row = int(self.clocks[name][row])
+        row += self.begin
         return f"line {self.layout.line(row) if self.layout else row + self.first_line}"
+
+    def runs(self, time: str | None) -> list[Table]:
+        """The parts of a table in which time starts again where another column changes, and only there: its
+        number or name of the run; else the table alone."""
+        if time is None or self.clocks or time not in self.raw:
+            return [self]
+        try:
+            falls = np.flatnonzero(np.diff(self.columns([time])[time]) < 0) + 1
+        except ValueError:  # who takes the stamps is told what is wrong with them
+            return [self]
+        size = np.shape(self.raw[time]) if falls.size else ()
+        alike = (
+            [name for name, values in self.raw.items() if np.shape(values)[:1] == size] if falls.size else []
+        )
+        columns, ends = {name: np.asarray(self.raw[name]) for name in alike}, [0, *falls.tolist(), *size]
+        changes = {name: np.flatnonzero(values[1:] != values[:-1]) + 1 for name, values in columns.items()}
+        of = next((name for name, rows in changes.items() if np.array_equal(rows, falls)), None)
+        if of is None or min(np.diff(ends)) < 2:
+            return [self]
+        return [
+            replace(
+                self,
+                raw={**self.raw, **{name: self.raw[name][start:stop] for name in alike}},
+                begin=start,
+                run=f"{of} {columns[of][start]}",
+            )
+            for start, stop in pairwise(ends)
+        ]
 
     @property
     def sparse(self) -> bool:
@@ -124,11 +159,12 @@ class Table:
     def listed(self, wanted: str = "") -> str:
         """Names in a line: all, or the columns of a matrix or struct that was asked for by its own name."""
         parts = [name for name in self.names if wanted and name.startswith((f"{wanted}[", f"{wanted}."))]
-        parts = self._alike(wanted) or parts
+        items = self._alike(wanted) or parts or list(self.names)
+        more = f", ... ({len(items)} in all)" if len(items) > 20 else ""
         hint = (
             " (numbers?); expected column names in line 1" if self.layout and not self.layout.header else ""
         )
-        return _listed(parts or self.names) + hint
+        return shown(f"{', '.join(map(shown, items[:20])) or 'no columns'}{more}", 160) + hint
 
     def is_clock(self, name: str) -> bool:
         """Whether a column holds dates or clock times, which need no unit."""
@@ -257,6 +293,14 @@ class Table:
         # The difference of unsigned integers, taken as signed ones, is right whichever is larger.
         return np.asarray((values - values[0]).astype(np.int64), dtype=np.float64)
 
+    def stamps(self, name: str, rows_of: str | None, unit: str | None) -> tuple[RealArray, TimeColumn]:
+        """Time stamps [s] that increase, of a column; rows_of: whose rows count where columns have rows of
+        their own. Raises ValueError."""
+        columns = self.columns([name] if rows_of is None else [name, rows_of], rows_of)
+        stamps, column = self.seconds(name, columns[name], unit)
+        self.increasing(stamps, name)
+        return stamps, column
+
     def increasing(self, stamps: RealArray, name: str | None) -> None:
         """Raises ValueError unless there are two time stamps at least, each later than the one before."""
         if stamps.size < 2:
@@ -266,7 +310,8 @@ class Table:
         backwards = np.flatnonzero(~(np.diff(stamps) > 0))
         if backwards.size:
             row = int(backwards[0]) + 1
-            what = "take the repeated row out" if stamps[row] == stamps[row - 1] else "split the file there"
+            what = "split the file there, or number its runs in a column"
+            what = "take the repeated row out" if stamps[row] == stamps[row - 1] else what
             raise ValueError(
                 f"{self.path}, {self.place(row)}: time '{name}' goes from {stamps[row - 1]:.9g} to "
                 f"{stamps[row]:.9g} s; expected increasing time ({what})"
@@ -275,20 +320,17 @@ class Table:
 
 def _split(name: str, values: Any) -> dict[str, Any]:
     """A matrix (T, C), or (C, T) as of Simulink, as C columns; (T, 1), (1, T) as vectors; records by
-    field."""
+    field; lists in cells of text, '[0.1, 0.2]', as `columns_in`."""
+    if isinstance(values, tuple) and values and _LIST.match(values[0]):
+        plain = (re.sub(r"np\.\w+|array", "", cell) for cell in values)
+        return columns_in(name, [re.findall(r"[^][()\s,;]+", cell) or None for cell in plain])
     if isinstance(values, np.ndarray) and values.dtype.names and values.ndim == 1:
         return {f"{name}.{field}": values[field] for field in values.dtype.names}
     if not isinstance(values, np.ndarray) or values.ndim != 2:
         return {name: values}
     if 1 in values.shape or values.size == 0:
         return {name: values.ravel()}
-    if min(values.shape) > _MOST_NUMBERED:
+    if min(values.shape) > MOST_COLUMNS:
         return {name: values}
     columns = values if values.shape[0] >= values.shape[1] else values.T
     return {f"{name}[{k}]": column for k, column in enumerate(columns.T)}
-
-
-def _listed(names: Iterable[str], limit: int = 20) -> str:
-    items = list(names)
-    text = ", ".join(shown(name) for name in items[:limit]) or "no columns"
-    return shown(text if len(items) <= limit else f"{text}, ... ({len(items)} in all)", 160)

@@ -8,9 +8,10 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from ident.data.foreign_files import distinct
+from ident.data.foreign_files import MOST_COLUMNS, distinct
 from ident.data.time_stamps import is_stamp
 from ident.data.units import is_unit, says_time
 
@@ -44,6 +45,10 @@ _INCREMENT = re.compile(
 _BEYOND = re.compile(r"comment|start|increment|[+-]?\d+\.?\d*(e[+-]?\d+)?|", re.IGNORECASE)
 _UNITS_OF_X = re.compile(r"(?:horizontal|x)[_ ]units?\b|x_dimension\b", re.IGNORECASE)
 _UNITS_OF_Y = re.compile(r"(?:vertical|y)[_ ]unit", re.IGNORECASE)
+# What a serial monitor puts before each line: '10:15:30.000 -> ', '[2024-03-01 10:15:30.000] '.
+_ARRIVED = re.compile(r"\s*(?:\[([^]]{4,40})\]|(\S[^>]{3,40}?)\s*->)(?:\s+|$)")
+# A number with its name, as plotters of serial ports take it: 'angle:0.01', 'volt = -3.00'.
+_LABELLED = re.compile(r"([^\W\d][^:=,;\t|]*?)\s*[:=]\s*([+-]?(?:\.?\d|nan|inf)[^:=,;\t| ]*) *([,;\t|]?)\s*")
 _SIGNS = frozenset("#%/!-*rR")
 _NO_TEXT = re.compile(r"[\x00-\x08\x0e-\x1f]")
 
@@ -114,7 +119,12 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
         lines.pop()  # blank lines at the very end are no samples
     if not lines:
         raise ValueError(": the file is empty; expected a header line and rows of numbers")
+    lines, named = _bare(lines)
     layout = _layout(lines[:_SAMPLE], len(lines))
+    if named:
+        names = distinct([*named, *layout.names[len(named) if layout.header else 0 :]])[: len(layout.names)]
+        header = layout.header or (layout.first if len(named) > 1 else 0)
+        layout = replace(layout, names=tuple(names), header=header)
     first = layout.first - 1
     commented = [k for k in range(first, len(lines)) if _is_comment(lines[k])]
     blank = [k for k in range(first, len(lines)) if not lines[k].strip()]
@@ -146,6 +156,34 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
     )
     layout = replace(layout, plain=sure)
     return layout, dict(zip(layout.names, zip(*rows, strict=True), strict=True))
+
+
+def _bare(lines: list[str]) -> tuple[list[str], list[str]]:
+    """Lines of a serial port as a table has them, and names of the first columns: without 'angle:' before
+    each number, and with the stamp that a monitor puts before each line as a cell of its own."""
+    heads = [_ARRIVED.match(line) for line in lines]
+    stamps = [(head[1] or head[2]) if head else "" for head in heads]
+    arrived = 2 * sum(map(is_stamp, stamps)) > len(lines)
+    if arrived:
+        lines = [line[head.end() if head else 0 :] for line, head in zip(lines, heads, strict=True)]
+    ((labels, times),) = Counter(map(_labels, lines[:_SAMPLE])).most_common(1)
+    named = list(labels) if 2 * times > len(lines[:_SAMPLE]) else []
+    if named:
+        between = " " if len(named) > 1 else ";"
+        # Another line stays as it is: whoever takes the column is told.
+        values = [_LABELLED.sub(lambda found: found[2] + (found[3] or between), line) for line in lines]
+        lines = [bare if _labels(line) == labels else line for line, bare in zip(lines, values, strict=True)]
+    if arrived:
+        sign = next((sign for sign in ";\t,|" if sign in lines[len(lines) // 2].strip()), " ")
+        lines = [
+            f'"{stamp}"{sign}{line}' if stamp else line for stamp, line in zip(stamps, lines, strict=True)
+        ]
+    return lines, ["time"] * arrived + named
+
+
+def _labels(line: str) -> tuple[str, ...]:
+    """The names of the numbers of a line that is nothing else."""
+    return () if _LABELLED.sub("", line).strip() else tuple(found[0] for found in _LABELLED.findall(line))
 
 
 def _is_cut(rows: Sequence[Sequence[str]], decimal: str) -> bool:
@@ -193,6 +231,10 @@ class _Fit:
     def of(cls, lines: Sequence[str], separator: str, decimal: str) -> _Fit:
         rows = _rows(lines, separator)
         live = [k for k, row in enumerate(rows) if any(row) and not _is_comment(lines[k])]
+        widest = max(live, key=lambda k: len(rows[k]), default=0)
+        if len(rows[widest]) > MOST_COLUMNS:
+            what = f"{len(rows[widest])} cells; expected at most {MOST_COLUMNS} columns, a row per sample"
+            raise ValueError(f", line {widest + 1}: {what}")
         filled = [rows[k] for k in live[-100:] if any(_is_value(cell, decimal) for cell in rows[k])]
         if not filled:
             return cls(separator, decimal, lines, rows)
@@ -260,7 +302,8 @@ class _Fit:
             cells = cells[: self.most]
         if _is_key(cells):
             return None
-        words = sum(bool(cell) and not _is_value(cell, self.decimal) for cell in cells)
+        # A number is no name, whatever its decimal sign.
+        words = sum(bool(cell) and not any(_is_value(cell, sign) for sign in ".,") for cell in cells)
         if numbered and cells and all(re.fullmatch(r"\d{1,3}", cell) for cell in cells[1:]):
             words = len(cells)
         return cells if self.least <= len(cells) <= self.most and 2 * words > len(cells) else None
@@ -289,6 +332,10 @@ class _Fit:
             sampling = self._increment(self.start, [], []) if stated else None
             first = self.start if stated else self.first
             return Layout(self.separator, self.decimal, numbered, {}, 0, first + 1, increment=sampling)
+        if channels := self._channels():
+            every = distinct([name for name, _ in channels])
+            own = {name: unit for name, (_, unit) in zip(every, channels, strict=True) if unit}
+            return Layout(self.separator, self.decimal, tuple(every), own, header + 1, self.start + 1)
         names, units, below = self._names_at(header) or [], list[str](), header + 1
         over = self._above(header)[:1]
         longer = self._names_at(over[0], numbered=True) if over else None
@@ -311,6 +358,32 @@ class _Fit:
         return Layout(
             separator, decimal, tuple(columns), beside | known, header + 1, below + 1, increment=sampling
         )
+
+    def _channels(self) -> list[tuple[str, str]] | None:
+        """Names and units of the columns where each channel has a time and a value, and lines above say of
+        each what it is: 'Name, drive, Name, hub', as scopes of a PLC do."""
+        above = [row[: self.most] for row in self.rows[: self.start] if len(row) >= self.most]
+        told = {row[0].lower(): row[1::2] for row in above if row[0] and set(row[::2]) == {row[0]}}
+        keys = {
+            found[1]: told[found[0]][0]
+            for key in told
+            if (found := re.fullmatch(r"sampl.*[\[(](\w+)[\])]", key))
+        }
+        unit, every = next(iter(keys.items()), ("", ""))
+        names = told.get("name", [])
+        # In a table of two columns any line is of two cells.
+        if self.most % 2 or not all(names) or not names or (self.most == 2 and not unit):
+            return None
+        with suppress(ValueError):
+            first, second, step = (
+                number(cell, self.decimal)
+                for cell in (self.rows[self.start][0], self.rows[self.start + 1][0], every)
+            )
+            unit = unit if abs(second - first - step) < 0.01 * step else ""
+        units = [text.strip("[](){} ") for text in told.get("unit", [""] * len(names))]
+        return [
+            column for name, own in zip(names, units, strict=True) for column in (("time", unit), (name, own))
+        ]
 
     def _are_units(self, cells: Sequence[str]) -> bool:
         """Whether most words of a line are units; numbers are no words (Rigol's start and step)."""

@@ -200,11 +200,6 @@ class TimeGrid:
     late: RealArray
 
     @classmethod
-    def uniform(cls, n_rows: int, dt_s: float) -> TimeGrid:
-        """A log without time stamps."""
-        return cls(dt_s, np.arange(n_rows), np.zeros(n_rows))
-
-    @classmethod
     def of(cls, table: Table, name: str, stamps: RealArray, *, options: bool = True) -> TimeGrid:
         """The grid under the stamps (R,) [s] of the column `name`; its phase is their mean. options: as of
         `sampling_time`. Raises ValueError, one line with file and row: time that does not increase, too many

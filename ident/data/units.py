@@ -121,47 +121,41 @@ _DATES_S = (978_307_200.0, 4_102_444_800.0)
 _NO_CLOCK_S = 1e11
 
 
-@dataclass(frozen=True)
-class UnitEvidence:
-    """What a file says of the unit of a time column. unit: the one known unit, or empty; unclear: why it has
-    to be asked for (units that contradict each other, an unknown word), or empty."""
-
-    unit: str = ""
-    unclear: str = ""
-
-    @classmethod
-    def of(cls, name: str, beside: str = "") -> UnitEvidence:
-        """beside: the unit that the file gives outside of the name, as in a line of units."""
-        name, beside = (unicodedata.normalize("NFKC", text).strip() for text in (name, beside))
-        texts = [beside.strip("[](){}<> "), *_BRACKETS.findall(name)]
-        said, strange = dict[str, str](), ""
-        for text in (text for text in texts if _WORD.search(text)):
-            whole = re.sub(r"[\s._-]", "", text).lower()  # 'm s' is one
-            words = ["days"] if whole == "d" else [whole] if whole in TIME_UNITS else _words(text)
-            units = [TIME_UNITS[word] for word in words if word in TIME_UNITS]
-            odd = [word for word in words if not (word in TIME_UNITS or _NO_UNIT.fullmatch(word))]
-            if (odd and (not units or min(map(len, odd)) <= 2)) or (units and re.search(r"\d", text)):
-                strange = strange or text
-            said |= dict.fromkeys(units, text)
-        outside = _BRACKETS.sub(" ", name)
-        words = _words(outside)
+def unit_of_time(name: str, beside: str = "") -> tuple[str, str]:
+    """What a file says of the unit of a time column: the one known unit, or empty; why it has to be asked for
+    (units that contradict each other, an unknown word), or empty. beside: what the file gives outside of the
+    name, as in a line of units."""
+    name, beside = (unicodedata.normalize("NFKC", text).strip() for text in (name, beside))
+    texts = [beside.strip("[](){}<> "), *_BRACKETS.findall(name)]
+    said, strange = dict[str, str](), ""
+    for text in (text for text in texts if _WORD.search(text)):
+        whole = re.sub(r"[\s._-]", "", text).lower()  # 'm s' is one
+        words = ["days"] if whole == "d" else [whole] if whole in TIME_UNITS else _words(text)
         units = [TIME_UNITS[word] for word in words if word in TIME_UNITS]
-        factors = [word.lower() for found in _FACTOR.findall(outside) for word in found]
-        if _PRIME.search(name) or (said and _CHANGED.search(name)) or set(factors) & TIME_UNITS.keys():
-            strange = strange or name
-        if not strange:
-            # After the word for time a short one is rather a unit, or its prefix, than a name: t_m, time_cs.
-            short = [word for word in words[1:] if len(word) <= 2 and not _NO_UNIT.fullmatch(word)]
-            short = [word for word in short if word not in TIME_UNITS and (not units or word in _PREFIXES)]
-            counts = [] if units else [word for word in words if _COUNTS.fullmatch(word)]
-            strange = "" if said else next(iter((*counts, *short)), "")
-        for unit in units:
-            said.setdefault(unit, name)
-        if strange:
-            return cls(unclear=f"unknown unit '{strange}'")
-        if len(said) > 1:
-            return cls(unclear=f"contradicting units {' and '.join(said)}")
-        return cls(next(iter(said), ""))
+        odd = [word for word in words if not (word in TIME_UNITS or _NO_UNIT.fullmatch(word))]
+        if (odd and (not units or min(map(len, odd)) <= 2)) or (units and re.search(r"\d", text)):
+            strange = strange or text
+        said |= dict.fromkeys(units, text)
+    outside = _BRACKETS.sub(" ", name)
+    words = _words(outside)
+    units = [TIME_UNITS[word] for word in words if word in TIME_UNITS]
+    factors = [word.lower() for found in _FACTOR.findall(outside) for word in found]
+    if _PRIME.search(name) or (said and _CHANGED.search(name)) or set(factors) & TIME_UNITS.keys():
+        strange = strange or name
+    if not strange:
+        # After the word for time a short one is rather a unit, or its prefix, than a name: t_m, time_cs.
+        behind = words[1:] if any(map(_TIME_WORD.fullmatch, words)) else []
+        short = [word for word in behind if len(word) <= 2 and not _NO_UNIT.fullmatch(word)]
+        short = [word for word in short if word not in TIME_UNITS and (not units or word in _PREFIXES)]
+        counts = [] if units else [word for word in words if _COUNTS.fullmatch(word)]
+        strange = "" if said else next(iter((*counts, *short)), "")
+    for unit in units:
+        said.setdefault(unit, name)
+    if strange:
+        return "", f"unknown unit '{strange}'"
+    if len(said) > 1:
+        return "", f"contradicting units {' and '.join(said)}"
+    return next(iter(said), ""), ""
 
 
 def _words(text: str) -> list[str]:
@@ -229,17 +223,16 @@ class TimeColumn:
     def of(cls, name: str, stated: str | None = None, beside: str = "") -> TimeColumn:
         """stated: by the user; beside: by the file, outside of the name. Raises ValueError (one line) for a
         unit that is not known, or where the file contradicts itself, unless it is stated."""
-        evidence = UnitEvidence.of(name, beside)
+        known, unclear = unit_of_time(name, beside)
         if stated is not None:
-            unit = stated_time_unit(stated)
-            return cls(name, unit, evidence.unit, stated=True)
-        if evidence.unclear:
+            return cls(name, stated_time_unit(stated), known, stated=True)
+        if unclear:
             raise ValueError(
-                f"time column '{shown(name, 60)}': {shown(evidence.unclear, 60)}; expected "
+                f"time column '{shown(name, 60)}': {shown(unclear, 60)}; expected "
                 f"{', '.join(KNOWN_TIME_UNITS)}: state it with --time-unit (time_unit), or give --dt-s "
                 "SECONDS instead of --time"
             )
-        return cls(name, evidence.unit or "s", evidence.unit)
+        return cls(name, known or "s", known)
 
     def refuse_stamps(self, stamps: RealArray) -> None:
         """Raise ValueError where stamps are no time of any clock, dates of this century in another unit than

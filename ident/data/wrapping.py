@@ -42,7 +42,7 @@ def wraps_at(values: RealArray) -> float:
     """The period at which readings (T,) seem to wrap, else 0: they jump by nearly their whole range, and go
     on smoothly once unwrapped. So does a sawtooth; readings that never came near both ends are not seen."""
     span = float(np.ptp(values)) if values.size >= 20 else 0.0
-    if not span > 0:
+    if not span > 0 or counts_rows(values):
         return 0.0
     share = np.abs(np.diff(values)) / span
     jumps = share > 0.6
@@ -69,6 +69,14 @@ def wraps_at(values: RealArray) -> float:
             return 0.0
     smooth = np.std(np.diff(going_on, 2))
     return period if smooth <= _SMOOTHER * np.std(np.diff(values, 2)) else 0.0
+
+
+def counts_rows(values: RealArray) -> bool:
+    """Whether readings (T,) only count: they go on by one, but for where they start again."""
+    steps = np.diff(values)
+    return (
+        bool(np.all((steps == 1) | (steps < 0)) and np.mean(steps == 1) > 1 - _FEW) if steps.size else False
+    )
 
 
 def spikes_in(values: RealArray) -> IntArray:

@@ -102,7 +102,7 @@ def parquet(units=("", "", ""), **columns) -> bytes:
     arrays = [pa.array(values) for values in columns.values()]
     fields = [
         pa.field(name, array.type, metadata={"unit": unit})
-        for name, array, unit in zip(columns, arrays, units, strict=True)
+        for name, array, unit in zip(columns, arrays, units, strict=False)
     ]
     pq.write_table(pa.table(arrays, pa.schema(fields)), sink)
     return sink.getvalue().to_pybytes()
@@ -173,6 +173,27 @@ def mcap_of(encoding="json", schema="jsonschema") -> bytes:
     return stream.getvalue()
 
 
+def monitor(line: Callable[[int], str], *above: str) -> bytes:
+    return "\n".join([*above, *map(line, K), ""]).encode()
+
+
+def plc(stamp: Callable[[int], str], other: Callable[[int], str] | None = None) -> bytes:
+    """A time and a value of each channel, below what is said of it."""
+    said = {"Name": ("fTorqueSet", "fActPos"), "SampleTime[ms]": ("10", "10"), "Unit": ("(Nm)", "(rad)")}
+    head = [f"{key}\t{one}\t{key}\t{two}" for key, (one, two) in said.items()]
+    rows = [f"{stamp(k)}\t{U[k]}\t{(other or stamp)(k)}\t{Y[k]}" for k in K]
+    return "\r\n".join(["Name\tA project", "", *head, "", *rows, ""]).encode()
+
+
+def recorder(data: str) -> bytes:
+    """Signals that say their names beside their numbers."""
+    signals = np.array(
+        [{"Name": "voltage_V", data: U}, {"Name": "hub", data: Y, "Unit": "rad"}], dtype=object
+    )
+    return mat(rec={"X": {"Name": "time", data: T_S}, "Y": signals, "Capture": {"Length": 60.0}})
+
+
+SERIAL, NAMED = ("time", "column 1", "column 2"), ("millis", "volt", "angle")
 STATES = ("arm/joint_states.time", "voltage.data", "arm/joint_states.position[1]")
 PREAMBLE = ("Logger 3000;v1.2", "Operator;M. Huber", "Sample rate;100", "")
 LOST = np.delete(K, [20])
@@ -222,9 +243,6 @@ LOGS = {
             cells=lambda row: [*row, "3", "1"],
         ),
         ("Time", "Drive", "Hub"),
-    ),
-    "tabs, blanks in the dates, comments of as many words": Log(
-        "a.tsv", text("\t", above=("# made by a script",), time=lambda t: clock("%Y-%m-%d %H:%M:%S.%f")(t))
     ),
     "names and numbers in quotation marks": Log(
         "a.csv",
@@ -364,6 +382,56 @@ LOGS = {
         "a.xls", b"\xd0\xcf\x11\xe0" + bytes(600), refused=("unknown kind of file '.xls'", ".csv")
     ),
 }
+
+
+# What tools for boards, PLCs and rapid prototyping write; lists in cells; tables that lie on their side.
+PLC, NONE = ("time", "fTorqueSet", "fActPos"), ("", "")
+LOGS |= {
+    "serial monitor": Log("a.txt", monitor(
+        lambda k: f"{clock('%H:%M:%S.%f')(T_S[k])} -> {U[k]:.2f},{Y[k]:.6f}"), SERIAL, units=NONE),
+    "serial monitor, a word first, brackets, blanks": Log("a.txt", monitor(
+        lambda k: f"[2024-03-01 12:00:{T_S[k]:06.3f}] {U[k]:.2f} {Y[k]:.6f}", "Ready"), SERIAL, units=NONE),
+    "serial monitor, names, decimal commas": Log("a.txt", monitor(
+        lambda k: f"12:00:{T_S[k]:06.3f} -> " + f"{U[k]:.2f};{Y[k]:.6f}".replace(".", ","),
+        "12:00:00.000 -> u_V;y_rad"), ("time", "u_V", "y_rad")),
+    "serial plotter": Log("a.txt", monitor(
+        lambda k: f"millis:{1e3 * T_S[k]:.0f}\tvolt:{U[k]:.2f}\tangle:{Y[k]:.6f}"), NAMED, units=NONE),
+    "serial plotter behind a monitor": Log("a.txt", monitor(
+        lambda k: f"12:00:{T_S[k]:06.3f} -> volt:{U[k]:.2f} angle:{Y[k]:.6f}", "12:00:00.000 -> boot ok"),
+        ("time", "volt", "angle"), units=NONE),
+    "names and equal signs": Log("a.txt", monitor(
+        lambda k: f"millis={10 * k}, volt = {U[k]:.2f}, angle = {Y[k]:.6f}", "a b", "c"), NAMED, units=NONE),
+    "scope of a PLC": Log("a.txt", plc(lambda k: f"{10 * k}"), PLC, units=("Nm", "rad")),
+    "scope of a PLC in seconds": Log("a.csv", plc(lambda k: f"{T_S[k]:.2f}"), PLC, units=("Nm", "rad")),
+    "scope of a PLC, times apart": Log("a.txt", plc(lambda k: f"{10 * k}", lambda k: f"{10 * k + 1}"),
+        refused=("'#1 time' and '#2 time' differ",)),
+    "recorder": Log("a.mat", recorder("Data"), ("time", "voltage_V", "hub")),
+    "recorder, in other words": Log("a.mat", recorder("values"), ("time", "voltage_V", "hub")),
+    "Octave text": Log("a.mat", b"# Created by Octave 8.4.0\n# name: t\n# type: matrix\n 0 1\n",
+        refused=("save -v7",)),
+    "Octave text, cut": Log("a.txt", b"# name: t\r\n# type: matrix\r\n 0 1\r\n", refused=("save -v7",)),
+    "parquet with lists": Log("a.parquet", parquet(
+        t_s=T_S, action=list(zip(U, Y, strict=True)), image=[[1.0] * (k % 3) for k in K]),
+        ("t_s", "action[0]", "action[1]"), units=NONE),
+    "parquet with structs of lists": Log("a.parquet", parquet(
+        t_s=T_S, arm=[{"u_V": u, "q": [[0.0, y]]} for u, y in zip(U, Y, strict=True)]),
+        ("t_s", "arm.u_V", "arm.q[0][1]"), units=("V",)),
+    "parquet, lists of several lengths": Log("a.parquet", parquet(
+        t_s=T_S, u_V=U, y_rad=[[1.0] * (1 + k % 3) for k in K]),
+        refused=("column 'y_rad' holds lists of 1 to 3 entries; expected one length",)),
+    "lists in cells": Log("a.csv", text(
+        header=("t_s", "u_V", "q"), cells=lambda row: [row[0], row[1], f'"[ 0.5, {row[2]}]"']),
+        ("t_s", "u_V", "q[1]"), units=("V",)),
+    "lists of several lengths in cells": Log("a.csv", text(
+        cells=lambda row: [row[0], row[1], f'"[{row[2]}{" 1" if row[2] == "0" else ""}]"']),
+        refused=("'y_rad' holds lists of 1 to 2 entries",)),
+    "columns for rows": Log("a.csv", b",".join([b"x"] * 10**5) + b"\n" + b",".join([b"1"] * 10**5),
+        refused=("line 1: 100000 cells; expected at most 4096",)),
+    "a line of a million numbers": Log("a.dat", b"1 " * 10**6, refused=("1000000 cells; expected at most",)),
+    "a million commas": Log("a.csv", text(below=("," * 10**6,))),
+    "arrays of too many names": Log("a.npz", npz(**{f"c{k}": T_S[:2] for k in range(5000)}),
+        refused=("5000 columns; expected at most 4096",)),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", LOGS)

@@ -18,7 +18,13 @@ from tests.ident.mutations import Tally, mutated, tally
 from tests.ident.test_forty_logs import LOGS
 
 # Those that a process of its own reads take a second each.
-IN_PROCESS = ("semicolons, decimal commas", "day.month.year", "packed by gzip", "npz, a matrix")
+IN_PROCESS = (
+    "semicolons, decimal commas",
+    "serial plotter behind a monitor",
+    "packed by gzip",
+    "npz, a matrix",
+    "scope of a PLC",
+)
 IN_A_CHILD = (
     "a spreadsheet with preamble, units and dates", "parquet with instants",
     "HDF5 with groups and attributes", "MATLAB 5", "MATLAB 7.3", "MCAP of JSON", "MCAP of ROS 2, two topics",

@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
-from ident.data.roles import Roles, is_position, roles_of, roles_with_reference
+from ident.data.roles import Roles, is_position, roles_of
 from ident.data.table import Table
 
 
 def table(*names: str, **units: str) -> Table:
-    return Table("a.csv", {name: np.arange(5.0) + k for k, name in enumerate(names)}, units=units)
+    return Table("a.csv", {name: np.sin(np.arange(5.0) + k) for k, name in enumerate(names)}, units=units)
 
 
-@pytest.mark.parametrize(
-    ("names", "units", "found"),
-    [
-        (("t_s", "u_V", "y_rad"), {}, Roles("t_s", "u_V", "y_rad")),
-        (("Zeit [ms]", "Spannung [V]", "Winkel [°]"), {}, Roles("Zeit [ms]", "Spannung [V]", "Winkel [°]")),
-        (
-            ("hub", "motor", "clock"),
-            {"hub": "rad", "motor": "Nm", "clock": "s"},
-            Roles("clock", "motor", "hub"),
-        ),
-        (("voltage", "angle", "temperature"), {}, Roles(None, "voltage", "angle")),
-    ],
-)
-def test_roles(names, units, found):
-    assert roles_of(table(*names, **units), "a.csv") == found
+def test_units_beside_the_names():
+    found = roles_of(table("hub", "motor", "clock", hub="rad", motor="Nm", clock="s"), "a.csv")
+    assert found == Roles("clock", "motor", "hub")
 
 
 def test_what_is_stated_decides():
@@ -41,44 +31,13 @@ def test_what_is_stated_decides():
     )
 
 
-LOOP = table("t_s", "u_ref_rad", "v_drive_counts", "theta_rad", drive="counts")
-
-
-def test_a_reference_is_neither_input_nor_output():
-    """Columns of a measured arm in closed loop."""
-    assert roles_of(LOOP, "a.csv", reference="u_ref_rad") == Roles("t_s", "v_drive_counts", "theta_rad")
-    with pytest.raises(
-        ValueError, match=r"--input v_drive_counts --output theta_rad --reference u_ref_rad --time t_s$"
-    ):
-        roles_of(LOOP, "a.csv")
-    named = {"input": "v_drive_counts", "output": "theta_rad"}
-    assert roles_of(LOOP, "a.csv", **named) == Roles("t_s", "v_drive_counts", "theta_rad")
-
-
-@pytest.mark.parametrize(
-    ("wished", "drive", "moved"),
-    [
-        ("Sollwinkel [deg]", "Strom Soll [A]", "Istwinkel [deg]"),
-        ("set_deg", "current_A", "angle_deg"),
-        ("Consigne [deg]", "Courant [A]", "Mesure [deg]"),
-        ("给定角度(deg)", "电流(A)", "实际角度(deg)"),
-        ("posRef_rad", "u_V", "pos_rad"),
-        ("SP_mm", "i_A", "PV_mm"),
-    ],
-)
-def test_set_points_by_other_names(wished, drive, moved):
-    names = ("t_s", moved, wished, drive)
-    roles = roles_with_reference(table(*names), "a.csv", "init")
-    assert roles == Roles("t_s", drive, moved, wished)
-
-
 def test_of_two_columns_without_a_known_name_the_follower_is_the_output():
     wave = np.cumsum(np.random.default_rng(3).standard_normal(400))
     columns = {"t_s": np.arange(400) * 0.01, "a_deg": wave[5:], "b_deg": wave[:-5], "i_A": np.sin(wave)}
     shortest = min(column.size for column in columns.values())
     log = Table("a.csv", {name: column[:shortest] for name, column in columns.items()}, units={})
     with pytest.raises(ValueError, match=r"--input i_A --output b_deg --reference a_deg --time t_s$"):
-        roles_with_reference(log, "a.csv", "init")
+        roles_of(log, "a.csv", "init")
 
 
 def test_a_first_column_that_rises_may_be_time_but_a_rows_number_is_none():
@@ -88,10 +47,6 @@ def test_a_first_column_that_rises_may_be_time_but_a_rows_number_is_none():
         )
         with pytest.raises(ValueError, match=typed):
             roles_of(log, "a.csv")
-
-
-def test_the_reference_of_a_voltage_may_be_what_drives_the_arm():
-    assert roles_of(table("t_s", "u_ref_V", "hub_rad"), "a.csv") == Roles("t_s", "u_ref_V", "hub_rad")
 
 
 def test_nothing_is_guessed():
@@ -105,37 +60,43 @@ def test_many_long_names_stay_on_a_line():
     assert len(str(caught.value)) <= 300
 
 
-@pytest.mark.parametrize(
-    ("input_", "output"),
-    [
-        ("/cmd/voltage", "/joint_states/motor/position"),
-        ("PLC_PRG.rVoltage", "PLC_PRG.rAngle"),
-        ("MAIN.fTorque", "MAIN.lrPosition"),
-        ("bus.command", "bus.theta"),
-    ],
-)
-def test_the_last_word_of_a_path_counts(input_, output):
-    k = np.arange(50.0)
-    table = Table("a.npz", {"t": 0.01 * k, input_: np.sin(k), output: np.cos(k), "bus.count": k})
-    assert roles_of(table, "a.npz") == Roles("t", input_, output)
+# Time, input, output and reference, and what else is there.
+FOUND = """
+t_ms,i_cmd_A,enc_rad,ref_rad|t_s,torque_Nm,pos_mm,cmd_pos|t_s,v_drive_counts,theta_rad,u_ref_rad|t_s,u,y,r,e
+t_s,tau_Nm,q_rad,q_des_rad,err_rad|t_s,u_V,pos_rad,pos_ref_rad,vel_rad_s|t_s,u_ref_V,hub_rad,|t_s,u_V,pos_rad,posRef_rad
+t_s,Commanded_PWM,Motor_Speed(RPM),|t_s,Strom Soll [A],Istwinkel [deg],Sollwinkel [deg]|t_s,i_A,PV_mm,SP_mm
+t_s,current_A,angle_deg,set_deg|t_s,Courant [A],Mesure [deg],Consigne [deg]
+t_s,电流(A),实际角度(deg),给定角度(deg)
+t,/cmd/voltage,/joint_states/motor/position,,bus.count|t,PLC_PRG.rVoltage,PLC_PRG.rAngle,|t,bus.command,bus.theta,
+t,MAIN.fTorque,MAIN.lrPosition,|t_ms,torque_cmd_%,x_mm,x_ref_mm|t_us,dac_cnt,enc_cnt,ref_cnt|t_s,foo,pv_deg,sp,note
+t_us,out_cnt,pv_cnt,sp_cnt|t_s,output_%,position_mm,setpoint_mm
+t_s,u,current_position,target,v_est|t_s,cmd,pos,ref,vel_est|t_s,pid_out,y_deg,r_deg
+t_s,u_V,meas,ref_deg,temp|t_s,i_A,alpha,alpha_cmd,alpha_err,index
+Zeit [ms],Spannung [V],Winkel [°],|,voltage,angle,,temperature"""
+ASKED = """
+t_s,i_meas_A,i_cmd_A,pos_rad>--input i_cmd_A --output pos_rad|t_s,u_ref_rad,u_cmd>--input u_cmd --output NAME
+t_s,temperature,angle_rad>name it: flexlink init a.csv --input NAME
+t_s,foo,angle_rad>--input foo --output angle_rad
+t_s,accel_counts>no column looks like an input|t_s,cmd_deg,pos_deg>--input cmd_deg --output pos_deg
+t_s,ref_rad,foo,bar,y_rad>--input NAME --output y_rad --reference ref_rad
+t_s,ref_rad,temp_°C,y_rad>--input NAME"""
 
 
-@pytest.mark.parametrize(
-    ("names", "found"),
-    [
-        (("t_ms", "ref_rad", "i_cmd_A", "enc_rad"), ("i_cmd_A", "enc_rad", "ref_rad")),
-        (("t_s", "cmd_pos", "torque_Nm", "pos_mm"), ("torque_Nm", "pos_mm", "cmd_pos")),
-        (("t_s", "u_ref_rad", "v_drive_counts", "theta_rad"), ("v_drive_counts", "theta_rad", "u_ref_rad")),
-        (("t_s", "r", "u", "y", "e"), ("u", "y", "r")),
-        (("t_s", "q_des_rad", "q_rad", "err_rad", "tau_Nm"), ("tau_Nm", "q_rad", "q_des_rad")),
-        (("t_s", "pos_ref_rad", "pos_rad", "vel_rad_s", "u_V"), ("u_V", "pos_rad", "pos_ref_rad")),
-        (("t_s", "u_ref_V", "hub_rad"), ("u_ref_V", "hub_rad", None)),
-        (("t_s", "Commanded_PWM", "Motor_Speed(RPM)"), ("Commanded_PWM", "Motor_Speed(RPM)", None)),
-    ],
-)
-def test_a_reference_is_recognised_by_its_name_in_the_unit_of_the_output(names, found):
-    got = roles_with_reference(table(*names), "a.csv", "init")
-    assert (got.input, got.output, got.reference) == found
+@pytest.mark.parametrize("case", re.split(r"[|\n]", (FOUND + ASKED).strip()))
+@pytest.mark.parametrize("turned", [False, True])
+def test_roles_by_name_and_unit_in_any_order(case, turned):
+    """A reference is in the unit of the output; of a name the last word counts."""
+    names, _, asked = case.partition(">")
+    order = [name for name in names.split(",")[:: -1 if turned else 1] if name]
+    columns = {name: np.sin(k + np.arange(50.0)) for k, name in enumerate(order)}
+    columns |= {name: np.arange(50.0) for name in order if re.fullmatch(r"t(_m?u?s)?|Zeit.*", name)}
+    log = Table("a.csv", columns | ({"note": ("ok",) * 50} if "note" in order else {}), units={})
+    if asked:
+        with pytest.raises(ValueError, match=asked):
+            roles_of(log, "a.csv", "init")
+        return
+    time, input_, output, reference, *_ = names.split(",")
+    assert roles_of(log, "a.csv", "init") == Roles(time or None, input_, output, reference or None)
 
 
 def test_two_references_are_asked_for_with_all_that_was_said():
@@ -143,22 +104,11 @@ def test_two_references_are_asked_for_with_all_that_was_said():
     with pytest.raises(
         ValueError, match=r"a_ref_rad and b_ref_rad may be .* --output a_rad --reference a_ref_rad$"
     ):
-        roles_with_reference(two, "a.csv", "init", output="a_rad")
-    assert (
-        roles_with_reference(two, "a.csv", "init", output="a_rad", reference="b_ref_rad").reference
-        == "b_ref_rad"
-    )
+        roles_of(two, "a.csv", "init", output="a_rad")
+    assert roles_of(two, "a.csv", "init", output="a_rad", reference="b_ref_rad").reference == "b_ref_rad"
 
 
-@pytest.mark.parametrize(
-    ("name", "unit", "position"),
-    [
-        ("q", "rad", True),
-        ("q", "rad/s", False),
-        ("speed", "", False),
-        ("angle", "", True),
-        ("n", "rpm", False),
-    ],
-)
-def test_speeds_are_no_positions(name, unit, position):
-    assert is_position(name, unit) == position
+@pytest.mark.parametrize("case", ["q rad 1", "q rad/s ", "speed  ", "angle  1", "n rpm "])
+def test_speeds_are_no_positions(case):
+    name, unit, position = case.split(" ")
+    assert is_position(name, unit) == bool(position)

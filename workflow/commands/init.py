@@ -36,17 +36,6 @@ _SHORT = 60  # letters of a log's name that leave room for a command in a line
 _NEARLY_ALL = 0.99  # rows of a held log: one may be missing
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A log, or a part of it, in the configuration."""
-
-    path: str
-    validates: bool
-    name: str = ""
-    start: int | None = None
-    stop: int | None = None
-
-
 @dataclass(frozen=True, eq=False)
 class Found:
     """What the template of the configuration shows. scale, units: as stated, and the sign that is turned."""
@@ -58,28 +47,7 @@ class Found:
     scale: Mapping[str, float]
     units: Mapping[str, str]
     draft: Draft
-
-    @property
-    def time_unit(self) -> str:
-        column = self.read.records[0].time_column
-        return "s" if column is None else column.unit
-
-    @property
-    def doubts(self) -> tuple[Finding, ...]:
-        return distinct([doubt for record in self.read.records for doubt in record.doubts])
-
-    @property
-    def input_unit(self) -> str:
-        return self.read.unit_of[self.read.roles.input]
-
-    @property
-    def output_unit(self) -> str:
-        return self.read.unit_of[self.read.roles.output]
-
-    @property
-    def counts(self) -> bool:
-        """Whether the output is in steps of a converter, whose size nobody told."""
-        return self.output_unit.lower() in ("counts", "count", "ticks", "tick", "inc")
+    doubts: tuple[Finding, ...]
 
 
 def init(
@@ -106,8 +74,9 @@ def init(
         name = read.roles.input
         scale[name] = -scale.get(name, 1.0)
         units |= {name: unit_of[name]} if unit_of[name] else {}
-    found = Found(tuple(logs), shlex.quote(out.name), stated, read, scale, units, draft)
-    text = configuration(found, _entries(logs, out, draft))
+    doubts = distinct([doubt for record in read.records for doubt in record.doubts])
+    found = Found(tuple(logs), shlex.quote(out.name), stated, read, scale, units, draft, doubts)
+    text = configuration(found, _entries(read.tables, out, draft))
     config = check(RunConfig, tomllib.loads(text), source=str(out), context={"base": out.absolute().parent})
     storage.write_text(out, text)
     look = draft.look
@@ -135,13 +104,14 @@ def init(
 @dataclass(frozen=True, eq=False)
 class ReadChannel:
     """One channel of logs as read. how: with what was found; unit_of: input and output; repeats: rows of the
-    logs that are alike, one after the other, 1 where each is its own."""
+    logs that are alike, one after the other, 1 where each is its own. tables: of the records."""
 
     roles: Roles
     how: Reading
     unit_of: dict[str, str]
     records: list[Record]
     repeats: int
+    tables: list[Table]
 
 
 def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> ReadChannel:
@@ -159,11 +129,19 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> ReadCha
         roles = stated.roles(tables[0], typed, command)
         if stated.dt_s is not None and stated.time is None:
             roles = replace(roles, time=None)
+        tables = [run for table in tables for run in table.runs(roles.time)]
         if roles.time is None and stated.dt_s is None:
-            named = shlex.quote(shown(next(iter(rising(tables[0])), "NAME"), 30))
-            ways = f"--dt-s SECONDS, or --time {named}"
+            ways = ", or --time ".join(
+                ["--dt-s SECONDS", *(shlex.quote(shown(n, 30)) for n in rising(tables[0]))]
+            )
             raise ValueError(f"no column looks like time: type flexlink {command} {typed} {ways}")
-    options = [_stamps(table, roles, stated.time_unit) for table in tables]
+    with naming(""):
+        options = [
+            option_for(table.stamps(roles.time, roles.output if table.sparse else None, stated.time_unit)[0])
+            for table in tables
+            if roles.time
+        ]
+        period = max(wraps_at(table.columns([roles.output])[roles.output]) for table in tables)
     steps = [float(text.split()[1]) for text in options if text.startswith("--resample-s")]
     how = stated.model_copy(
         update={
@@ -175,7 +153,7 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> ReadCha
             "time_unit": stated.time_unit if roles.time else None,
             "repair": "--repair" in options and not steps,
             "resample_s": max(steps, default=None),
-            "unwrap": stated.unwrap or _wrapping(tables, roles.output),
+            "unwrap": stated.unwrap or ({roles.output: float(period)} if period else {}),
         }
     )
     records = how.records(tables)
@@ -189,7 +167,8 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> ReadCha
         name: stated.units.get(name, "" if name in stated.scale else tables[0].unit(name))
         for name in (roles.input, roles.output)
     }
-    return ReadChannel(roles, how, unit_of, with_common_sampling_time(records), repeats if not steps else 1)
+    common = with_common_sampling_time(records)
+    return ReadChannel(roles, how, unit_of, common, repeats if not steps else 1, tables)
 
 
 def _repeats(record: Record) -> int:
@@ -201,7 +180,7 @@ def _repeats(record: Record) -> int:
     return usual if usual > 1 and np.mean(gaps % usual == 0) > _NEARLY_ALL else 1
 
 
-def configuration(found: Found, records: Sequence[Entry]) -> str:
+def configuration(found: Found, records: Sequence[Mapping[str, Any]]) -> str:
     """The TOML text."""
     filters = (
         ("toml", _toml),
@@ -217,42 +196,19 @@ def _toml(value: Any) -> str:
     return tomlkit.item(plain).as_string()
 
 
-def _stamps(table: Table, roles: Roles, time_unit: str | None) -> str:
-    """The option that takes a log's time stamps, as `option_for`."""
-    if roles.time is None:
-        return ""
-    with naming(str(table.path)):
-        wanted = [roles.time, roles.output] if table.sparse else [roles.time]
-        columns = table.columns(wanted, roles.output if table.sparse else None)
-        stamps, _ = table.seconds(roles.time, columns[roles.time], time_unit)
-        table.increasing(stamps, roles.time)
-        return option_for(stamps)
-
-
-def _wrapping(tables: Sequence[Table], output: str) -> dict[str, float]:
-    """The period at which the output wraps in one of the logs, if it does."""
-    for table in tables:
-        with naming(str(table.path)):
-            period = wraps_at(table.columns([output])[output])
-        if period:
-            return {output: float(period)}
-    return {}
-
-
-def _entries(logs: Sequence[Path], out: Path, draft: Draft) -> list[Entry]:
-    """The last log validates; of one the last part, where it is split."""
-    base = out.absolute().parent
-    paths = [Path(os.path.relpath(path.absolute(), base)).as_posix() for path in logs]
-    if len(logs) == 1:
-        if draft.split_sample is None:
-            return [Entry(paths[0], False)]
-        stem = logs[0].stem
-        return [
-            Entry(paths[0], False, f"{stem}, first part", stop=draft.split_sample),
-            Entry(paths[0], True, f"{stem}, last part", start=draft.split_sample),
-        ]
-    alike = len({path.stem for path in logs}) < len(logs)
-    return [
-        Entry(path, k == len(paths) - 1, f"{k + 1}: {logs[k].stem}" if alike else "")
-        for k, path in enumerate(paths)
-    ]
+def _entries(tables: Sequence[Table], out: Path, draft: Draft) -> list[dict[str, Any]]:
+    """Keys of each record. The last log, or run, validates; of one the last part, where it is split."""
+    base, stems = out.absolute().parent, [table.path.stem for table in tables]
+    paths = [Path(os.path.relpath(table.path.absolute(), base)).as_posix() for table in tables]
+    if len(tables) == 1 and draft.split_sample is not None:
+        first = {"path": paths[0], "name": f"{stems[0]}, first part", "stop_sample": draft.split_sample}
+        last = {"path": paths[0], "name": f"{stems[0]}, last part", "start_sample": draft.split_sample}
+        return [first, last | {"role": "validation"}]
+    alike, found = len(set(stems)) < len(stems), list[dict[str, Any]]()
+    for k, (path, stem, table) in enumerate(zip(paths, stems, tables, strict=True)):
+        run = {"name": f"{stem}, {table.run}", "run": paths[:k].count(path)} if table.run else {}
+        named = {"name": f"{k + 1}: {stem}"} if alike and not run else {}
+        found.append(
+            {"path": path, **run, **named, **({"role": "validation"} if 0 < k == len(paths) - 1 else {})}
+        )
+    return found

@@ -13,7 +13,7 @@ from pydantic import Field
 from ident.data.record import Record, in_one_unit
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response
-from ident.data.roles import Roles, roles_with_reference
+from ident.data.roles import Roles, roles_of
 from ident.data.table import Table
 from workflow.config.log_reading import LogReading
 from workflow.engine.errors import naming
@@ -38,7 +38,7 @@ class Reading(LogReading):
 
     def roles(self, table: Table, logs: str, command: str) -> Roles:
         """What is stated, and what names and units of the table tell. Raises ValueError."""
-        return roles_with_reference(
+        return roles_of(
             table,
             logs,
             command,
@@ -48,14 +48,14 @@ class Reading(LogReading):
             reference=self.reference,
         )
 
-    def records(self, logs: Sequence[Path | Table]) -> list[Record]:
-        """Of logs that are used together, where input and output are named; each column in one unit. Raises
+    def records(self, tables: Sequence[Table]) -> list[Record]:
+        """Of tables that are used together, where input and output are named; each column in one unit. Raises
         InputError naming file, column or line."""
         found = list[Record]()
-        for log in logs:
-            with naming(str(log.path if isinstance(log, Table) else log)):
+        for table in tables:
+            with naming(str(table.path)):
                 record = Record.from_file(
-                    log,
+                    table,
                     [str(self.input_name)],
                     [str(self.output_name)],
                     time=self.time,
@@ -98,20 +98,24 @@ def are_responses(paths: Sequence[Path]) -> bool:
 def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: Sequence[Path] = ()) -> Logs:
     """One channel of log files as stated; columns that are not named are found where names and units leave no
     doubt. Raises InputError: one line naming file, column or line."""
-    how = stated or Reading()
+    how, tables = stated or Reading(), list[Table]()
+    for path in (*logs, *validation):
+        with naming(str(path)):
+            tables.append(read_table(path).with_decimal(how.decimal))
     if how.input_name is None or how.output_name is None or (how.time is None and how.dt_s is None):
         with naming(str(logs[0])):
-            table = read_table(logs[0]).with_decimal(how.decimal)
-            roles = how.roles(table, shlex.join(map(str, logs)), "identify")
-        found = roles.reference
-        everywhere = found and all(found in read_table(path).names for path in (*logs[1:], *validation))
+            roles = how.roles(tables[0], shlex.join(map(str, logs)), "identify")
         given: dict[str, Any] = {
             "input_name": roles.input,
             "output_name": roles.output,
             "doubts": roles.doubts,
         }
-        given |= {"reference": found} if everywhere else {}
-        given |= {"time": roles.time} if how.time is None and how.dt_s is None else {}
+        if roles.reference and all(roles.reference in table.names for table in tables[1:]):
+            given["reference"] = roles.reference
+        if how.time is None and how.dt_s is None:
+            given["time"] = roles.time
         how = how.model_copy(update=given)
-    records = tuple(how.records([*logs, *validation]))
-    return Logs(records[: len(logs)], records[len(logs) :], (*logs, *validation), how.input_limit)
+    runs = [table.runs(how.time) for table in tables]
+    records = tuple(how.records([run for parts in runs for run in parts]))
+    n_measured = sum(map(len, runs[: len(logs)]))
+    return Logs(records[:n_measured], records[n_measured:], (*logs, *validation), how.input_limit)

@@ -120,6 +120,11 @@ class FileRecord(Section):
     references: tuple[str, ...] | None = Field(None, description="reference columns, closed loop")
     start_sample: int = Field(0, ge=0, description="first row used, counted from 0")
     stop_sample: int | None = Field(None, ge=1, description="row after the last one used")
+    run: int | None = Field(
+        None,
+        ge=0,
+        description="of a table in which time starts again, and another column changes there; from 0",
+    )
     mirrored: bool = Field(False, description="change the sign of every signal (G stays the same)")
 
 
@@ -409,7 +414,7 @@ class RunConfig(Section):
         for first, second in combinations(self.source.records, 2):
             ends = [math.inf if r.stop_sample is None else r.stop_sample for r in (first, second)]
             overlap = first.start_sample < ends[1] and second.start_sample < ends[0]
-            if first.path == second.path and overlap:
+            if (first.path, first.run) == (second.path, second.run) and overlap:
                 raise ValueError(
                     f"records {record_name(first)!r} and {record_name(second)!r} share rows of "
                     f"{first.path.name}: use each row once"

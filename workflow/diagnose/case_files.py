@@ -127,7 +127,7 @@ def _experiment(
                 )
             values[quantity] = place.quantity(read[place.column], usual)
         n_rows = len(values["voltage_V"])
-        grid = TimeGrid.uniform(n_rows, settings.dt_s or rig.sampling.dt_s)
+        grid = TimeGrid(settings.dt_s or rig.sampling.dt_s, np.arange(n_rows), np.zeros(n_rows))
         if "time_s" in values:
             time = names["time_s"]
             if time.scale is None:

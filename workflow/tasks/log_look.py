@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from ident.data.finding import Finding, distinct
 from ident.data.record import reading_notes
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response, read_response
-from ident.data.roles import Roles, roles_with_reference, times_in
+from ident.data.roles import Roles, roles_of, times_in
 from ident.data.table import Table
 from ident.data.text_tables import Layout
 from ident.data.time_grid import LARGEST_JITTER, clock_doubts, jitter_of, only_rounded, option_for
@@ -30,7 +30,8 @@ class TimeLook:
     unit: of the column, as `TimeColumn.unit`. period_s: the usual step. jitter: largest distance of a step
     from a whole number of them, as a share, 0 where it is the rounding of the stamps. missing: rows that
     larger steps lack, where jitter leaves no doubt of them; gap_s: the largest step; gap_place: after which
-    row. option: as `option_for`. why: why the stamps are none.
+    row. option: as `option_for`. why: why the stamps are none. runs: names of the first and the last part in
+    which time starts again; the other numbers are of the most uneven one.
     """
 
     name: str
@@ -43,6 +44,7 @@ class TimeLook:
     gap_place: str = ""
     option: str = ""
     why: str = ""
+    runs: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,29 +111,32 @@ def look_at(
     time = time or (times[0] if times else None)
     roles, unclear = None, ""
     try:
-        roles = roles_with_reference(table, str(path), "identify", time=time) if response is None else None
+        roles = roles_of(table, str(path), "identify", time=time) if response is None else None
     except ValueError as error:
         unclear = str(error)
     columns = tuple(_column(table, name) for name in table.names if name != time)
-    rows = max((len(values) for values in table.raw.values() if hasattr(values, "__len__")), default=0)
-    about, doubts = None, list[Finding]()
+    long = [values for values in table.raw.values() if isinstance(values, tuple) or np.ndim(values)]
+    rows = max(map(len, long), default=0)
+    about, doubts, runs = None, list[Finding](), table.runs(time)
     if time is not None:
         # Of a table with rows of their own the stamps of the output's; where it is not known, of those with
         # the most.
-        own = [name for name in table.clocks if name != time] if table.sparse else []
-        longest = max(own, key=lambda name: table.clocks[name].size, default=None)
         moved = roles.output if roles else None
-        about, doubts = _time(table, time, time_unit, moved if own and moved else longest, moved)
-    for column in columns:
+        own = max((n for n in table.clocks if n != time), key=lambda n: table.clocks[n].size, default=None)
+        looks = [_time(run, time, time_unit, (moved or own) if table.sparse else None, moved) for run in runs]
+        about, doubts = max(looks, key=lambda one: (one[0].why, one[0].option, one[0].jitter))
+        about = replace(about, runs=tuple(run.run for run in runs if run.run))
+    for column in columns if response is None else ():
         if column.values is not None:
             inputs, outputs = (
                 ([column.name], []) if roles and column.name == roles.input else ([], [column.name])
             )
             if table.sparse and inputs and roles is not None:
                 outputs = [roles.output]
-            values = {name: table.columns([name])[name] for name in (*inputs, *outputs)}
-            doubts += reading_notes(table, values, inputs, outputs)
-    doubts += _of_the_loop(table, roles) if roles else ()
+            for run in runs:
+                values = {name: run.columns([name])[name] for name in (*inputs, *outputs)}
+                doubts += reading_notes(run, values, inputs, outputs)
+    doubts += _of_the_loop(runs[0], roles) if roles else ()
     return LogLook(path, rows, table.layout, about, columns, roles, unclear, response, distinct(doubts))
 
 
@@ -162,9 +167,7 @@ def _time(
     """rows_of: the column whose rows count in a table whose columns have rows of their own; moved: the
     output."""
     try:
-        wanted = [name] if rows_of is None else [name, rows_of]
-        stamps, column = table.seconds(name, table.columns(wanted, rows_of)[name], unit)
-        table.increasing(stamps, name)
+        stamps, column = table.stamps(name, rows_of, unit)
         steps = np.diff(stamps)
         period = float(np.median(steps))
         if moved:

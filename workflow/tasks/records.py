@@ -85,6 +85,7 @@ def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channe
             resample_s=source.resample_s,
             unwrap=source.unwrap,
             decimal=source.decimal,
+            run=entry.run,
         )
         if entry.start_sample or entry.stop_sample is not None:
             record = record.slice(entry.start_sample, entry.stop_sample or record.n_samples)
