@@ -21,7 +21,7 @@ from control_design.plants.ellipses import (
     quotient,
 )
 from control_design.plants.frequency_grid import GridOptions, local_maxima, programme_grid
-from control_design.plants.plant_set import Mode, UncertainPlant
+from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction, WeightedRequirement
 
@@ -218,7 +218,14 @@ class Grids:
         self.grids: list[Real] = []
         self.dense: list[PlantData] = []
         for plant in plants:
-            modes = _grid_modes(plant, specification)
+            # The plant's, and the performance channel's where damping is asked for.
+            modes = list(plant.modes)
+            if specification.mode_peak_ratio is not None:
+                modes += [
+                    mode
+                    for mode in plant.damped.modes
+                    if all(abs(mode.omega_rad_s - o.omega_rad_s) > 1e-6 * o.omega_rad_s for o in modes)
+                ]
             edges = [edge for asked in specification.weighted(plant) for edge in asked.band or ()]
             lean = programme_grid(plant, modes, options, edges)
             self.grids.append(lean)
@@ -242,16 +249,3 @@ class Grids:
         if not candidates:
             return 0.1 * self.plants[0].nyquist_rad_s
         return float(np.exp(np.mean(np.log(candidates))))
-
-
-def _grid_modes(plant: UncertainPlant, specification: Specification) -> tuple[Mode, ...]:
-    """Modes that deserve dense points: the plant's, and the performance channel's where damping is asked
-    for."""
-    modes = list(plant.modes)
-    if specification.mode_peak_ratio is not None:
-        modes += [
-            m
-            for m in plant.damped.modes
-            if all(abs(m.omega_rad_s - o.omega_rad_s) > 1e-6 * o.omega_rad_s for o in modes)
-        ]
-    return tuple(modes)

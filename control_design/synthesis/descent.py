@@ -269,12 +269,14 @@ class _Boundary:
     ) -> tuple[Real, Complex]:
         """Curvature of sum share log|g^open_loop/(1 + g K)| but for that of log K, and the factor of the
         latter, (F,)."""
-        g, g1, _ = member
+        g, g1, g2 = member
         back = _not_zero(1.0 + g * k)
         w = g * k / back
         total = -np.real((relative * (share * (w - w**2))[:, None]).T @ relative)
         mixed = -np.real((g1 * k / back**2)[:, None] * relative)
-        bend = _bend_along_boundary(member, k, open_loop)
+        # Of log|g^open_loop/(1 + g K)| along the boundary.
+        own = open_loop / _not_zero(g)
+        bend = np.real(own * g2 - own**2 * g1**2 - g2 * k / back + (g1 * k / back) ** 2)
         use = (bend < -1e-12) & (share > 0)
         total = total + (mixed[use] * (share[use] / -bend[use])[:, None]).T @ mixed[use]
         return total, np.asarray(-share * w, dtype=np.complex128)
@@ -422,13 +424,6 @@ def _vertex(slope: float, bend: float) -> float:
 
 def _not_zero(value: Complex) -> Complex:
     return np.where(np.abs(value) < 1e-300, 1e-300, value)
-
-
-def _bend_along_boundary(member: Complex, k: Complex, open_loop: float) -> Real:
-    """Bend of log|g^open_loop/(1 + g K)| along the boundary, from members and their derivatives (3, D)."""
-    g, g1, g2 = member
-    back, own = _not_zero(1.0 + g * k), open_loop / _not_zero(g)
-    return np.asarray((own * g2 - own**2 * g1**2 - g2 * k / back + (g1 * k / back) ** 2).real)
 
 
 def natural_units(cascade: Cascade, x: Real) -> Real:

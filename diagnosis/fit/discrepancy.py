@@ -62,7 +62,10 @@ def discrepancy(residuals: Real, segments: Sequence[int], outputs: int = 2) -> D
         if T % 2 == 0:
             dof[-1] = 1.0
         power = np.abs(lines) ** 2 * dof[:, None] / T
-        band = _band(np.arange(lines.shape[0]) / T)
+        # Octave below half the sampling rate of each line; the last holds all below.
+        with np.errstate(divide="ignore"):
+            octave = np.floor(-np.log2(2 * np.arange(lines.shape[0]) / T))
+        band = np.clip(octave, 0, _OCTAVES).astype(np.int64)
         for b in range(_OCTAVES + 1):
             energy[:, b] += power[band == b].sum(axis=0)
             freedom[:, b] += dof[band == b].sum()
@@ -74,13 +77,6 @@ def discrepancy(residuals: Real, segments: Sequence[int], outputs: int = 2) -> D
     some = log_gain + np.log1p(-np.exp(min(nothing - log_gain, -1e-12))) - np.log1p(-np.exp(nothing))
     held = np.where(factor > 0, np.maximum(S / n - 1, 0.0), 0.0)
     return Discrepancy(log_gain, float(some), float(np.sqrt(np.sum(n * held) / np.sum(n))))
-
-
-def _band(frequency: Real) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Octave below half the sampling rate of each frequency (cycles per sample); the last holds all below."""
-    with np.errstate(divide="ignore"):
-        octave = np.floor(-np.log2(2 * frequency))
-    return np.clip(octave, 0, _OCTAVES).astype(np.int64)
 
 
 def _log_factor(n: float, S: float) -> float:

@@ -180,7 +180,9 @@ def put_shape(name: str, i: int, j: int, spec: Any, value: float) -> None:
     shears are log-Cholesky coordinates, and any of them leave an inertia that a body can have.
     """
     body = spec.body(name)
-    turn = _matrix(body.iquat)
+    flat = np.zeros(9)
+    mujoco.mju_quat2Mat(flat, np.array(body.iquat))
+    turn = flat.reshape(3, 3)
     inertia = turn @ np.diag(body.inertia) @ turn.T
     moments = 0.5 * np.trace(inertia) * np.eye(3) - inertia
     shorter, longer = (i, j) if moments[i, i] < moments[j, j] else (j, i)
@@ -193,12 +195,6 @@ def put_shape(name: str, i: int, j: int, spec: Any, value: float) -> None:
     body.inertia, quaternion = np.sum(principal) - principal, np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, axes.ravel())
     body.iquat = quaternion
-
-
-def _matrix(quaternion: Any) -> Any:
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, np.array(quaternion))
-    return matrix.reshape(3, 3)
 
 
 def put_payload(name: str, at: tuple[float, ...], spec: Any, mass: float) -> None:

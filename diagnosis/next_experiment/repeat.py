@@ -103,7 +103,10 @@ def _choice(
 ) -> _Choice | None:
     inputs = _CHANGES[change](record.input)
     outputs = [one.outputs(inputs) for one in competing]
-    noise = _noise(case, competing[0], outputs[0])
+    # That of a hypothesis about the records, for this motion, (Y,).
+    beyond = np.maximum(competing[0].noise ** 2 - case.noise**2, 0.0)
+    recorded = np.mean([np.var(e.output, axis=0) for e in case.experiments], axis=0)
+    noise = np.sqrt(case.noise**2 + beyond * np.var(outputs[0], axis=0) / recorded)
     whitened = [np.asarray(y / noise).ravel() for y in outputs]
     if not all(np.all(np.isfinite(y)) for y in whitened):
         return None
@@ -123,11 +126,3 @@ def _records(case: CaseOfMachine) -> list[RecordOfMachine]:
     ranked = sorted(case.experiments, key=lambda e: float(np.mean(np.var(e.output, axis=0) / case.noise**2)))
     chosen = np.unique(np.linspace(0, len(ranked) - 1, _MOST_RECORDS).round().astype(int))
     return [ranked[k] for k in chosen]
-
-
-def _noise(case: CaseOfMachine, hypothesis: CompetingHypothesis, output: Real) -> Real:
-    """(Y,) that of a hypothesis about the records, for this motion."""
-    sensors = case.noise
-    beyond = np.maximum(hypothesis.noise**2 - sensors**2, 0.0)
-    recorded = np.mean([np.var(e.output, axis=0) for e in case.experiments], axis=0)
-    return np.asarray(np.sqrt(sensors**2 + beyond * np.var(output, axis=0) / recorded))

@@ -166,7 +166,13 @@ def common_findings(case: Case, residuals: Mapping[str, Real], level: float) -> 
         yes = bool(
             p_value < level / len(case.outputs) and share[0] >= _LEAST_SHARE and share[0] > max(chance, 0.0)
         )
-        peak_Hz, peak_share = _peak(e[:, :, s].mean(axis=0), dt)
+        # The strongest line, and the share of the whole energy within one line of it. Offset and the two
+        # slowest lines are left out: drifts lie there, and the swing into a disturbance.
+        power = np.abs(np.fft.rfft(e[:, :, s].mean(axis=0))) ** 2
+        power[1:] *= 2.0  # both signs of a frequency; an offset has one
+        top = int(np.argmax(power[3:])) + 3
+        peak_Hz = float(top / (e.shape[1] * dt))
+        peak_share = float(power[top - 1 : top + 2].sum() / power.sum())
         found.append(
             CommonFinding(sensor, n, float(share[0]), max(chance, 0.0), peak_Hz, peak_share, p_value, yes)
         )
@@ -189,17 +195,6 @@ def _correlation(a: Real, b: Real) -> float:
     a, b = a[:length], b[:length]
     size = float(np.linalg.norm(a) * np.linalg.norm(b))
     return float(a @ b) / size if size > 0 else 1.0
-
-
-def _peak(mean: Real, dt_s: float) -> tuple[float, float]:
-    """Frequency of the strongest line and the share of the whole energy within one line of it.
-
-    Offset and the two slowest lines are left out: drifts lie there, and the swing into a disturbance.
-    """
-    power = np.abs(np.fft.rfft(mean)) ** 2
-    power[1:] *= 2.0  # both signs of a frequency; an offset has one
-    top = int(np.argmax(power[3:])) + 3
-    return float(top / (mean.size * dt_s)), float(power[top - 1 : top + 2].sum() / power.sum())
 
 
 def linear_correction(case: Case, residuals: Mapping[str, Real]) -> LinearCorrection | None:

@@ -125,18 +125,14 @@ def search_space(n_real: int, n_pairs: int, longest: int, dt_s: float, options: 
         )
     low = [np.log10(0.2 / n), np.log10(4 * np.pi / n), np.log10(ZETA_LEAST)]
     high = [np.log10(0.7), np.log10(0.9 * np.pi), np.log10(0.63)]
-    if options.decay_min_per_s is not None:
-        low[0] = np.log10(-np.expm1(-options.decay_min_per_s * dt_s))
-    if options.decay_max_per_s is not None:
-        high[0] = np.log10(-np.expm1(-options.decay_max_per_s * dt_s))
-    if options.omega_min_rad_s is not None:
-        low[1] = np.log10(options.omega_min_rad_s * dt_s)
-    if options.omega_max_rad_s is not None:
-        high[1] = np.log10(min(options.omega_max_rad_s * dt_s, 0.99 * np.pi))
-    if options.zeta_min is not None:
-        low[2] = np.log10(options.zeta_min)
-    if options.zeta_max is not None:
-        high[2] = np.log10(options.zeta_max)
+    for side, end in ((low, "min"), (high, "max")):
+        decay, omega = getattr(options, f"decay_{end}_per_s"), getattr(options, f"omega_{end}_rad_s")
+        stated = (
+            None if decay is None else -np.expm1(-decay * dt_s),
+            None if omega is None else min(omega * dt_s, 0.99 * np.pi),
+            getattr(options, f"zeta_{end}"),
+        )
+        side[:] = [was if to is None else np.log10(to) for was, to in zip(side, stated, strict=True)]
     return SearchSpace(n_real, n_pairs, np.array(low), np.array(high), False, dt_s)
 
 

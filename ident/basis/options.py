@@ -212,10 +212,6 @@ class EmbeddingOptions(Settings):
         ge=1,
         description="taps of the kernel for unmodelled dynamics; default: 150, fewer for short records",
     )
-    hyperparameters: Literal["average", "maximum"] = Field(
-        default="average",
-        description="average the kernel over a grid weighted by restricted likelihood, or take the largest",
-    )
     estimate_offset: bool = Field(default=True, description="a constant on each record's output")
     estimate_initial_state: bool = Field(
         default=True, description="free response of all poles in each record"

@@ -178,7 +178,11 @@ def repeat_scatter(
             float(np.sqrt(np.mean(part[inside]))) for part in (predicted, measured, between, between_noise)
         )
         relative = _relative_spread(everything[0], posterior, inside, size)
-        freedom = _independent(relative) * (len(everything) - len(groups))
+        # Satterthwaite's of |e|^2 for e ~ N(0, M M^T): tr(K)^2 / tr(K^2), K = M M^T.
+        wide = relative.shape[1] < relative.shape[0]
+        inner = relative.T @ relative if wide else relative @ relative.T
+        independent = float(np.trace(inner)) ** 2 / max(float(np.sum(inner**2)), np.finfo(float).tiny)
+        freedom = independent * (len(everything) - len(groups))
         interval = np.sqrt(chi2.ppf([0.025, 0.975], freedom) / freedom) if freedom > 0 else [np.nan, np.nan]
         rows.append(
             ScatterRow(
@@ -210,13 +214,6 @@ def _relative_spread(
     values, vectors = np.linalg.eigh(estimate.covariance[inside] / size[inside, None, None] ** 2)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     return np.asarray(block_diag(*roots))
-
-
-def _independent(spread: RealArray) -> float:
-    """Satterthwaite's degrees of freedom of |e|^2 for e ~ N(0, M M^T): tr(K)^2 / tr(K^2), K = M M^T."""
-    inner = spread.T @ spread if spread.shape[1] < spread.shape[0] else spread @ spread.T
-    total = float(np.trace(inner))
-    return total**2 / float(np.sum(inner**2)) if total > 0 else 0.0
 
 
 def _variance(estimate: FrequencyUncertainty) -> RealArray:

@@ -283,7 +283,11 @@ def _levels(group: Sequence[_Steady]) -> Distortion:
     noise = None
     if freedom:
         squares = sum(np.sum(np.abs(o - o.mean(axis=0)) ** 2, axis=0) for o in outputs)
-        noise = _smoothed(np.asarray(squares, dtype=np.float64) / freedom)
+        # Moving mean over harmonics, narrower next to zero, where drift makes noise steep.
+        total = np.concatenate([[0.0], np.cumsum(np.asarray(squares, dtype=np.float64) / freedom)])
+        index = np.arange(total.size - 1)
+        reach = np.minimum(np.minimum(index, index[::-1]), _SMOOTHING)
+        noise = (total[index + reach + 1] - total[index - reach]) / (2 * reach + 1)
     share = float(np.mean([1 / output.shape[0] for output in outputs]))
     at = np.flatnonzero(first.excited)
     g = means[:, at] / inputs[:, at]
@@ -326,11 +330,3 @@ def _levels(group: Sequence[_Steady]) -> Distortion:
         even=levels(np.flatnonzero(inside & (harmonics % 2 == 0))),
         drift=max((steady.drift for steady in group), key=abs),
     )
-
-
-def _smoothed(power: RealArray) -> RealArray:
-    """Moving mean (F,) over harmonics, narrower next to zero, where drift makes noise steep."""
-    total = np.concatenate([[0.0], np.cumsum(power)])
-    index = np.arange(power.size)
-    reach = np.minimum(np.minimum(index, power.size - 1 - index), _SMOOTHING)
-    return np.asarray((total[index + reach + 1] - total[index - reach]) / (2 * reach + 1))

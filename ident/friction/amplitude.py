@@ -104,7 +104,11 @@ def at_amplitude(
     """Posterior of the best linear approximation, and poles of a model of it."""
     friction, arm = behind.friction, behind.friction.arm
     spaced = np.geomspace(0.5 * equivalent.omega_rad_s[0], np.pi / arm.dt_s, _N_GRID)
-    omega = _around_pairs(spaced, behind.response.poles, arm.dt_s)
+    # Within and beside the half bandwidths of every pole pair, too: a mode that may have been missed is
+    # narrower than the grid, and coefficients nobody looked at may have any size.
+    poles = behind.response.poles
+    near = poles.omega_rad_s(arm.dt_s)[:, None] * (1 + poles.zeta()[:, None] * _HALF_WIDTHS)
+    omega = np.unique(np.concatenate([spaced, near[(near > spaced[0]) & (near < spaced[-1])]]))
     normals = rng.standard_normal((_DRAWS, behind.level_factor.size))
     coefficients, shaft = (
         part.mean + normals @ part.covariance_factor.T for part in (behind.response, behind.shaft)
@@ -225,14 +229,6 @@ def _power_spectrum(records: Sequence[Record]) -> RealArray:
         power += np.interp(grid, np.linspace(0, 1, own.size), own / own.sum())
     power[0] = power[-1] = 0.0
     return np.sqrt(power)
-
-
-def _around_pairs(omega: RealArray, poles: Poles, dt_s: float) -> RealArray:
-    """The grid (F,) and points within and beside the half bandwidths of every pole pair: a mode that may have
-    been missed is narrower than the grid, and coefficients nobody looked at may have any size."""
-    pairs = poles.omega_rad_s(dt_s)
-    near = pairs[:, None] * (1 + poles.zeta()[:, None] * _HALF_WIDTHS)
-    return np.unique(np.concatenate([omega, near[(near > omega[0]) & (near < omega[-1])]]))
 
 
 def _on_poles(

@@ -15,7 +15,6 @@ from scipy.linalg import solve_triangular
 
 from ident.basis.functions import basis_response, regressor
 from ident.basis.model import GobfModel
-from ident.basis.poles import Poles
 from ident.basis.structure import Structure, answered, filter_input
 from ident.data.arrays import ComplexArray, RealArray, real_rows
 from ident.data.record import Record
@@ -274,7 +273,11 @@ def driven_by_shape(found: FrictionFit, record: Record, speed: float) -> RealArr
 def started(model: GobfModel, structure: Structure, law: FrictionLaw) -> FrictionFit:
     """Where Gauss-Newton steps on the poles of a model begin; nothing is known of the noise yet."""
     arm = SteppedArm.of(model.poles, structure, model.dt_s)
-    coefficients = _on_doubled(arm.poles, model)
+    # Of the model's response on its poles taken twice.
+    z = np.exp(1j * np.linspace(1e-3, np.pi, 400))
+    basis, response = basis_response(arm.poles.doubled(), z), basis_response(model.poles, z)
+    target = real_rows(response @ model.coefficients)
+    coefficients = np.asarray(np.linalg.lstsq(real_rows(basis), target, rcond=None)[0])
     nothing = np.zeros((coefficients.size + parameters_of(law).size, 1))
     return FrictionFit(law, model, arm, coefficients, nothing, 0.0, 0.0)
 
@@ -387,11 +390,3 @@ def least_squares(
         raise LostError
     solution = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=1e-12)[0] / length
     return solution, triangle[:-1, :-1] * length, float(b @ b), float(triangle[-1, -1] ** 2)
-
-
-def _on_doubled(poles: Poles, model: GobfModel) -> RealArray:
-    """Coefficients (2 order,) of the model's response on its poles taken twice."""
-    z = np.exp(1j * np.linspace(1e-3, np.pi, 400))
-    basis = basis_response(poles.doubled(), z)
-    response = basis_response(model.poles, z) @ model.coefficients
-    return np.asarray(np.linalg.lstsq(real_rows(basis), real_rows(response), rcond=None)[0])

@@ -87,7 +87,10 @@ def _predicted_by_others(
             factor = posteriors[j].covariance_factor
             report = posteriors[j].report
             assert report is not None
-            summed = _window_sums((columns[j] @ factor) * differs[:, None], window)
+            # Sums over every stretch of `window` rows, those that reach over the ends too.
+            total = np.cumsum((columns[j] @ factor) * differs[:, None], axis=0)
+            summed = np.vstack([total, np.repeat(total[-1:], window - 1, axis=0)])
+            summed[window:] -= total[:-1]
             weights = triangle_of(summed).T / (np.sqrt(window * len(others)) * report.noise_std**2)
             factors.append(factor @ weights)
         predicted.append(replace(posterior, covariance_factor=np.hstack(factors)))
@@ -106,14 +109,6 @@ def _linear_rows(
     nuisance = nuisance_basis(block.nuisance)
     both = both - nuisance @ (nuisance.T @ both)
     return both[:, :-1], both[:, -1]
-
-
-def _window_sums(summands: RealArray, window: int) -> RealArray:
-    """(T + window - 1, P): sums over every stretch of `window` rows, those that reach over the ends too."""
-    total = np.vstack([np.zeros((1, summands.shape[1])), np.cumsum(summands, axis=0)])
-    padded = np.vstack([total, np.repeat(total[-1:], window - 1, axis=0)])
-    padded[window:] -= total[:-1]
-    return np.asarray(padded[1:])
 
 
 def combine_posteriors(

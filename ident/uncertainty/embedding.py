@@ -27,9 +27,10 @@ from ident.uncertainty.embedding_algebra import (
     RegressionBlock,
     StackedBlocks,
     alternating_factor,
-    averaged_posterior,
+    conditional_posterior,
     embedding_report,
     exponential_factor,
+    grid_weights,
     joint_factor,
     kernel_grid,
     reduce_regression,
@@ -195,7 +196,7 @@ def embed_response(
     block = RegressionBlock(nothing, regressors[measured], data.whiten(taps)[measured], data.y[measured])
     reduced = reduce_regression([block])
     grid = kernel_grid(reduced, _SHAPES, order_given=bool(options.order_given))
-    kernel = averaged_posterior(grid, options.no_remainder, options.hyperparameters)
+    kernel = conditional_posterior(grid, *grid_weights(grid, options.no_remainder))
     mean, factor = joint_factor(reduced, kernel)
     widening = np.sqrt(max(kernel.noise_variance, 1.0) / kernel.noise_variance)
     factor = np.column_stack([widening * factor, shared_gain_std * mean])
@@ -289,7 +290,7 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
             rows = replace(rows, known_std=_noise_std(rows, stacked))
         reduced = reduce_stacked(stack_blocks(rows.known_blocks(), stacked))
         grid = kernel_grid(reduced, _SHAPES, order_given=bool(options.order_given))
-        kernel = averaged_posterior(grid, options.no_remainder, options.hyperparameters)
+        kernel = conditional_posterior(grid, *grid_weights(grid, options.no_remainder))
         if not options.prior_missed_mode > 0:
             return _Solved(rows, reduced, kernel)
         candidates = candidate_pairs(max(record.n_samples for record in rows.records))

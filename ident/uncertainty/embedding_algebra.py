@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -373,19 +373,6 @@ def grid_weights(grid: KernelGrid, prior_no_remainder: float) -> tuple[RealArray
     weights, none = np.exp(log_grid - top), float(np.exp(log_none - top))
     total = float(weights.sum()) + none
     return weights / total, none / total
-
-
-def averaged_posterior(
-    grid: KernelGrid, prior_no_remainder: float, hyperparameters: Literal["average", "maximum"]
-) -> KernelPosterior:
-    """`conditional_posterior` with the weights of the data, or all weight on the likeliest pair."""
-    weights, none = grid_weights(grid, prior_no_remainder)
-    if hyperparameters == "maximum":
-        # alpha = 0 is the lower end of the grid in the limit, so it wins only where the whole grid is worse.
-        none = float(grid.log_likelihood_none >= grid.log_likelihood.max())
-        weights = np.zeros_like(weights)
-        weights.flat[int(np.argmax(grid.log_likelihood))] = 1.0 - none
-    return conditional_posterior(grid, weights, none)
 
 
 def conditional_posterior(grid: KernelGrid, weights: RealArray, weight_none: float) -> KernelPosterior:

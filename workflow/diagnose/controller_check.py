@@ -114,8 +114,11 @@ def check_controller(case: Case, rig: Rig, effects: tuple[Effect, ...]) -> Contr
     for controller, plant, certificate in zip(designs, plants, certificates, strict=True):
         name, margin = plant.uncertain.name, certificate.plants[0].nominal_margins.modulus
         runs.append(trial.run(controller, LinearMachine(plant.both), name, "its own model", margin))
-        margin = _measured_margin(controller, plant, arm, case, trial)
-        runs.append(trial.run(controller, arm, name, "repaired machine", margin))
+        # On the arm: one over the largest |S| measured there.
+        input_rms = rms_of([e.voltage_V for e in case.estimation])
+        plan = plan_sensitivity(controller, plant.uncertain, input_rms, trial.time_s.size // 2)
+        seen = measure_sensitivity(controller, arm, np.random.default_rng(_SEED), **plan.excitation())
+        runs.append(trial.run(controller, arm, name, "repaired machine", 1.0 / seen.peak[0]))
     return ControllerCheck(
         trial=trial,
         specification=specification,
@@ -235,16 +238,6 @@ class _WatchedArm(SampledArm):
 
     def measure(self) -> Real:
         return np.append(super().measure(), self.true_output[1])
-
-
-def _measured_margin(
-    controller: Controller, plant: _Plant, arm: SampledArm, case: Case, trial: ControllerTrial
-) -> float:
-    """One over the largest |S| measured on the arm."""
-    input_rms = rms_of([e.voltage_V for e in case.estimation])
-    plan = plan_sensitivity(controller, plant.uncertain, input_rms, trial.time_s.size // 2)
-    seen = measure_sensitivity(controller, arm, np.random.default_rng(_SEED), **plan.excitation())
-    return 1.0 / seen.peak[0]
 
 
 def sampled_linear_machine(rig: Rig, effects: Sequence[Effect]) -> control.StateSpace:

@@ -70,15 +70,18 @@ def draw_nyquist(run: RunView) -> Figure:
     loop, margin = loop_of(run), run.specification.modulus_margin
     figure, (whole, near) = style.panels(6.0, 1, 2)
     size = np.abs(loop.centre)
-    reach = _reach(size)
+    # Of the whole view: all that the loop does after it first falls below 1, no integrator.
+    below = np.flatnonzero(size < 1)
+    after = size[below[0] :] if below.size else size
+    reach = float(np.clip(1.25 * after.max(), 1.8, 6.0))
     _draw_loop(whole, loop, (-reach, reach), (-reach, reach), run.level)
     _mark_forbidden(whole, margin)
     draw_around_minus_one(near, loop, level=run.level, modulus_margin=margin)
     whole.set_title(f"Loop K G: {style.plain(run.control.name, 34)}")
     slow = size > reach
     if slow.any():
-        below = f"beyond the frame below {loop.omega_rad_s[slow].max():.3g} rad/s"
-        words = below if slow[0] and not slow[-1] else "partly beyond the frame"
+        beyond = f"beyond the frame below {loop.omega_rad_s[slow].max():.3g} rad/s"
+        words = beyond if slow[0] and not slow[-1] else "partly beyond the frame"
         box = {"facecolor": "white", "lw": 0, "alpha": 0.8, "pad": 1}
         whole.text(0.02, 0.02, words, transform=whole.transAxes, fontsize=8.5, color="#555555", bbox=box)
     return figure
@@ -103,13 +106,6 @@ def _mark_forbidden(axes: Axes, modulus_margin: float) -> None:
     disc.set(edgecolor=style.LIMIT, linewidth=1.3, linestyle=style.LIMIT_LINE["ls"])
     axes.add_patch(disc)
     axes.plot([-1], [0], marker="P", ms=8, color=style.REFERENCE, ls="none", label="-1")
-
-
-def _reach(size: Real) -> float:
-    """Half-width of the whole view: all that the loop does after it first falls below 1, no integrator."""
-    below = np.flatnonzero(size < 1)
-    after = size[below[0] :] if below.size else size
-    return float(np.clip(1.25 * after.max(), 1.8, 6.0))
 
 
 def _draw_loop(

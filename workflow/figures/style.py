@@ -165,7 +165,10 @@ def render(figure: Figure, also: Iterable[str] = ()) -> Picture:
         canvas: Any = FigureCanvasSVG(figure)
         canvas.print_svg(text, metadata=nothing)  # savefig would lay everything out once more
         FigureCanvasAgg(figure)
-        svg = _shorter(text.getvalue().encode())
+        # Where the font is not installed, others as wide stand in for it. Coordinates of paths to a hundredth
+        # of a point: a third of the size goes, nothing a printer could show.
+        svg = text.getvalue().encode().replace(b"'DejaVu Sans'", b"'DejaVu Sans', Verdana, sans-serif")
+        svg = re.sub(rb'\b(d|x|y)="[^"]*"', lambda match: re.sub(rb"(\.\d\d)\d+", rb"\1", match.group()), svg)
         files = {kind: _saved(figure, kind) for kind in also}
         small = len(svg) <= SVG_LIMIT_BYTES
         png = b"" if small else files.get("png") or _saved(figure, "png")
@@ -178,13 +181,6 @@ def _saved(figure: Figure, kind: str) -> bytes:
     dated = ("Software",) if kind == "png" else ("Creator", "Producer", "CreationDate")
     figure.savefig(buffer, format=kind, metadata=dict.fromkeys(dated), dpi=_PNG_DPI)
     return buffer.getvalue()
-
-
-def _shorter(svg: bytes) -> bytes:
-    """Coordinates of paths to a hundredth of a point: a third of the size goes, nothing a printer could
-    show. Where the font is not installed, others as wide stand in for it."""
-    svg = svg.replace(b"'DejaVu Sans'", b"'DejaVu Sans', Verdana, sans-serif")
-    return re.sub(rb'\b(d|x|y)="[^"]*"', lambda match: re.sub(rb"(\.\d\d)\d+", rb"\1", match.group()), svg)
 
 
 @cache

@@ -92,7 +92,10 @@ def run_pipeline(
             resume=resume,
             replace=replace,
         )
-        dialect = _dialect(run, c_code or {})
+        kept = run.manifest().get("c_code", {})
+        with naming(str(run.manifest_path)):
+            before = changed(Dialect(), **{k: kept[k] for k in ("prefix", "number") if k in kept})
+        dialect = changed(before, **(c_code or {}))  # as stated now, or else before
         run.record_status("running", c_code=asdict(dialect))
         stages = kind.stages if page is None else (*kind.stages, page)
         progress.plan([(stage.name, stage.expected_s) for stage in stages])
@@ -221,14 +224,6 @@ def stage_input_hash(stage: Stage, config: AnyConfig, run: RunDirectory, inputs:
             "after": {name: run.stage_digest(name) for name in stage.after},
         }
     )
-
-
-def _dialect(run: RunDirectory, stated: Mapping[str, Any]) -> Dialect:
-    """How its C code is written: as stated now, or else before. Raises InputError."""
-    kept = run.manifest().get("c_code", {})
-    with naming(str(run.manifest_path)):
-        before = changed(Dialect(), **{name: kept[name] for name in ("prefix", "number") if name in kept})
-    return changed(before, **stated)
 
 
 def _keep_files(results: RunResults, config: RunConfig, dialect: Dialect) -> list[Path]:
