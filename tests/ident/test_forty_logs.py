@@ -178,7 +178,6 @@ def monitor(line: Callable[[int], str], *above: str) -> bytes:
 
 
 def plc(stamp: Callable[[int], str], other: Callable[[int], str] | None = None) -> bytes:
-    """A time and a value of each channel, below what is said of it."""
     said = {"Name": ("fTorqueSet", "fActPos"), "SampleTime[ms]": ("10", "10"), "Unit": ("(Nm)", "(rad)")}
     head = [f"{key}\t{one}\t{key}\t{two}" for key, (one, two) in said.items()]
     rows = [f"{stamp(k)}\t{U[k]}\t{(other or stamp)(k)}\t{Y[k]}" for k in K]
@@ -186,11 +185,8 @@ def plc(stamp: Callable[[int], str], other: Callable[[int], str] | None = None) 
 
 
 def recorder(data: str) -> bytes:
-    """Signals that say their names beside their numbers."""
-    signals = np.array(
-        [{"Name": "voltage_V", data: U}, {"Name": "hub", data: Y, "Unit": "rad"}], dtype=object
-    )
-    return mat(rec={"X": {"Name": "time", data: T_S}, "Y": signals, "Capture": {"Length": 60.0}})
+    signals = [{"Name": "voltage_V", data: U}, {"Name": "hub", data: Y, "Unit": "rad"}]
+    return mat(rec={"X": {"Name": "time", data: T_S}, "Y": np.array(signals, dtype=object), "n": 60.0})
 
 
 SERIAL, NAMED = ("time", "column 1", "column 2"), ("millis", "volt", "angle")
@@ -345,13 +341,6 @@ LOGS = {
         "a.parquet",
         parquet(("", "V", ""), t_s=T_S, drive=U, y_rad=Y.astype(np.float32)),
         ("t_s", "drive", "y_rad"),
-    ),
-    "parquet with instants": Log(
-        "a.parquet",
-        parquet(
-            when=np.datetime64("2024-02-29T23:59:59.9") + (1e9 * T_S).round().astype("m8[ns]"), u_V=U, y_rad=Y
-        ),
-        ("when", "u_V", "y_rad"),
     ),
     "HDF5 with groups and attributes": Log(
         "a.h5",

@@ -18,15 +18,10 @@ from tests.ident.mutations import Tally, mutated, tally
 from tests.ident.test_forty_logs import LOGS
 
 # Those that a process of its own reads take a second each.
-IN_PROCESS = (
-    "semicolons, decimal commas",
-    "serial plotter behind a monitor",
-    "packed by gzip",
-    "npz, a matrix",
-    "scope of a PLC",
-)
+IN_PROCESS = ("semicolons, decimal commas", "serial plotter behind a monitor", "packed by gzip",
+              "npz, a matrix", "scope of a PLC")  # fmt: skip
 IN_A_CHILD = (
-    "a spreadsheet with preamble, units and dates", "parquet with instants",
+    "a spreadsheet with preamble, units and dates", "parquet with structs of lists",
     "HDF5 with groups and attributes", "MATLAB 5", "MATLAB 7.3", "MCAP of JSON", "MCAP of ROS 2, two topics",
     "ROS 1 bag", "ROS 2 bag",
 )  # fmt: skip

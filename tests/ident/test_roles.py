@@ -16,8 +16,8 @@ def table(*names: str, **units: str) -> Table:
 
 
 def test_units_beside_the_names():
-    found = roles_of(table("hub", "motor", "clock", hub="rad", motor="Nm", clock="s"), "a.csv")
-    assert found == Roles("clock", "motor", "hub")
+    log = table("hub", "motor", "clock", hub="rad", motor="Nm", clock="s")
+    assert roles_of(log, "a.csv") == Roles("clock", "motor", "hub")
 
 
 def test_what_is_stated_decides():
