@@ -113,7 +113,14 @@ class Record(PlainRecord):
         if isinstance(dt_s, bool) or not isinstance(dt_s, (int, float, np.integer, np.floating)):
             raise ValueError(f"dt_s must be a positive number of seconds; got {dt_s!r}")
         u, y = (_either(*pair) for pair in (("u", u, "input", input), ("y", y, "output", output)))
-        _refuse_other_rows(u, y, reference)
+        # Columns of pandas have to have the same rows: nothing is put in line by its index.
+        indices = [getattr(one, "index", None) for one in (u, y, reference)]
+        rows: list[Any] = [index for index in indices if hasattr(index, "equals")]
+        if any(not index.equals(rows[0]) for index in rows):
+            raise ValueError(
+                "u and y have rows of different index; put them in line first: "
+                "u, y = u.align(y, join='inner')"
+            )
         inputs, input_names = _signals("u", u, input_names)
         outputs, output_names = _signals("y", y, output_names)
         if reference is not None:
@@ -244,15 +251,6 @@ def _real(name: str, values: Any) -> npt.NDArray[np.float64]:
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
         raise ValueError(f"{name} holds what is no number; expected real numbers") from None
-
-
-def _refuse_other_rows(*signals: Any) -> None:
-    """Columns of pandas have to have the same rows: nothing is put in line by its index."""
-    rows: list[Any] = [one.index for one in signals if hasattr(getattr(one, "index", None), "equals")]
-    if any(not index.equals(rows[0]) for index in rows):
-        raise ValueError(
-            "u and y have rows of different index; put them in line first: u, y = u.align(y, join='inner')"
-        )
 
 
 def identify(

@@ -121,7 +121,11 @@ def _on_records(records: Sequence[Record], behind: Identification, noise_filter:
         noise_filter=noise_filter,
         advise=partial(_advice, records, behind),
     )
-    share = _innovations(result) / (rss / n_samples)
+    # Variance of the residuals behind an autoregressive model of their own.
+    order = min(_RESIDUAL_ORDER, (min(part.size for part in result.residuals) - 1) // 4)
+    whitening = fit_autoregression(result.residuals, order)
+    errors = [lfilter(whitening, np.ones(1), part)[whitening.size - 1 :] for part in result.residuals]
+    share = float(np.mean(np.concatenate(errors) ** 2)) / (rss / n_samples)
     said = finding(
         FindingKind.COLOURED_NOISE,
         half_power_Hz=_half_power_Hz(result),
@@ -144,12 +148,3 @@ def _half_power_Hz(found: Identification) -> float:
     power = np.convolve(power, np.full(_LINES, 1 / _LINES), "same")
     beyond = np.cumsum(np.maximum(power - 2 * np.median(power), 0.0))
     return float(np.searchsorted(beyond, 0.5 * beyond[-1]) / (2 * longest.size * found.model.dt_s))
-
-
-def _innovations(found: Identification) -> float:
-    """Variance of the residuals behind an autoregressive model of their own."""
-    order = min(_RESIDUAL_ORDER, (min(part.size for part in found.residuals) - 1) // 4)
-    whitening = fit_autoregression(found.residuals, order)
-    n = whitening.size - 1
-    errors = [lfilter(whitening, np.ones(1), part)[n:] for part in found.residuals]
-    return float(np.mean(np.concatenate(errors) ** 2))

@@ -136,7 +136,11 @@ def _searched(
     if options.estimate_initial_state == "auto" and not in_mid_record and end.poles.order:
         free = PoleSearch(prepare_outputs(part, replace(structure, estimate_initial_state=True)), options)
         other = free.descend(end.poles, "with initial state")
-        test = _initial_state_test(search, end, free, other)
+        # Likelihood ratio, the samples counted that the residual is worth.
+        columns = free.data.n_parameters(end.poles.order) - search.data.n_parameters(end.poles.order)
+        worth = free.colour(other).effective_samples
+        ratio = max(end.rss, 1e-300) / max(other.rss, 1e-300)
+        test = NuisanceTest("initial state", columns, float(worth * np.log(ratio)))
         verdicts = (test.finding,)
         if test.needed:
             search, selection = free, OrderSelection(free, report)
@@ -149,17 +153,6 @@ def _searched(
         everything.stages[:0] = search.stages
         search = everything
     return _Found(search, selection, end, verdicts)
-
-
-def _initial_state_test(
-    search: PoleSearch[OutputRegressions], end: Refined, free: PoleSearch[OutputRegressions], other: Refined
-) -> NuisanceTest:
-    """Likelihood ratio, the samples counted that the residual is worth."""
-    order = end.poles.order
-    columns = free.data.n_parameters(order) - search.data.n_parameters(order)
-    worth = free.colour(other).effective_samples
-    ratio = max(end.rss, 1e-300) / max(other.rss, 1e-300)
-    return NuisanceTest("initial state", columns, float(worth * np.log(ratio)))
 
 
 def _described(

@@ -145,7 +145,13 @@ def common_findings(case: Case, residuals: Mapping[str, Real], level: float) -> 
     Found asks for more energy in the mean than noise leaves there (chi-square, exact), for half of the gap,
     and that no other choice of signs of the experiments gives as much.
     """
-    chosen = _different(case)
+    # Those whose voltages hardly resemble each other, longest first.
+    chosen: list[Experiment] = []
+    for x in sorted(case.experiments, key=lambda x: -x.voltage_V.size):
+        alike = (_correlation(x.voltage_V, other.voltage_V) for other in chosen)
+        if all(abs(c) < _LARGEST_CORRELATION for c in alike):
+            chosen.append(x)
+    chosen = chosen[:_MOST_EXPERIMENTS]
     if len(chosen) < _LEAST_EXPERIMENTS:
         return ()
     length = min(x.voltage_V.size for x in chosen)
@@ -179,16 +185,6 @@ def common_findings(case: Case, residuals: Mapping[str, Real], level: float) -> 
     return tuple(found)
 
 
-def _different(case: Case) -> list[Experiment]:
-    """Experiments whose voltages hardly resemble each other, longest first."""
-    chosen: list[Experiment] = []
-    for x in sorted(case.experiments, key=lambda x: -x.voltage_V.size):
-        alike = (_correlation(x.voltage_V, other.voltage_V) for other in chosen)
-        if all(abs(c) < _LARGEST_CORRELATION for c in alike):
-            chosen.append(x)
-    return chosen[:_MOST_EXPERIMENTS]
-
-
 def _correlation(a: Real, b: Real) -> float:
     """Cosine of two voltages over their common length; resting inputs resemble each other."""
     length = min(a.size, b.size)
@@ -209,7 +205,11 @@ def linear_correction(case: Case, residuals: Mapping[str, Real]) -> LinearCorrec
         whole = Energy.of(residuals[x.name] for x in records)
         if not whole.gap > _CLEAR * np.sqrt(2.0 * whole.count):
             return None
-    poles = _poles(case)
+    z = np.exp(linear_arm(case.rig).poles() * case.rig.sampling.dt_s)
+    # The integrator of the hub enters as summed input: a pole inside the circle cannot stand for it.
+    inside = z[np.abs(z) < 1 - 1e-7]
+    real, pairs = inside.real[np.abs(inside.imag) < 1e-12], inside[inside.imag >= 1e-12]
+    poles = Poles(np.concatenate([np.repeat(real, 2), _FREE_POLES]), np.repeat(pairs, 2))
     estimation = [(_columns(poles, x.voltage_V), residuals[x.name]) for x in case.estimation]
     X = np.vstack([columns for columns, _ in estimation])
     scale = np.sqrt(np.mean(X**2, axis=0))
@@ -226,15 +226,6 @@ def linear_correction(case: Case, residuals: Mapping[str, Real]) -> LinearCorrec
     # e = gap + noise: the energy taken, 2 e.p - p.p, moves with the noise by 2 |p|.
     half = _Z95 * 2 * np.sqrt(moved) / gap
     return LinearCorrection(share, (float(share - half), float(share + half)))
-
-
-def _poles(case: Case) -> Poles:
-    z = np.exp(linear_arm(case.rig).poles() * case.rig.sampling.dt_s)
-    # The integrator of the hub enters as summed input: a pole inside the circle cannot stand for it.
-    inside = z[np.abs(z) < 1 - 1e-7]
-    real = inside.real[np.abs(inside.imag) < 1e-12]
-    pairs = inside[inside.imag >= 1e-12]
-    return Poles(np.concatenate([np.repeat(real, 2), _FREE_POLES]), np.repeat(pairs, 2))
 
 
 def _columns(poles: Poles, voltage: Real) -> Real:

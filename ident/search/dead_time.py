@@ -136,18 +136,15 @@ def first_answer(records: Sequence[Record]) -> FirstAnswer:
     if missed[0]:
         return FirstAnswer((), at_once)
     starts = [int(np.argmax(missed))] if missed.any() else []
-    late = _most_correlated_lag(records, shortest // 2)
-    return FirstAnswer((*starts, *([late] if late > lags or (late and not starts) else [])), at_once)
-
-
-def _most_correlated_lag(records: Sequence[Record], limit: int) -> int:
-    total = np.zeros(limit)
+    total = np.zeros(shortest // 2)
     for record in records:
         u, y = np.diff(record.input[:, 0]), np.diff(record.output[:, 0])
-        total += correlate(y, u, mode="full", method="fft")[u.size - 1 :][:limit]
+        total += correlate(y, u, mode="full", method="fft")[u.size - 1 :][: total.size]
     # A peak that lags of nothing but chance would show once in a thousand such records.
     peak, usual = int(np.argmax(np.abs(total))), float(np.sqrt(np.mean(total**2)))
-    return max(peak - 1, 0) if abs(total[peak]) > usual * np.sqrt(2 * np.log(limit / _MISSED)) else 0
+    seen = abs(total[peak]) > usual * np.sqrt(2 * np.log(total.size / _MISSED))
+    late = max(peak - 1, 0) if seen else 0
+    return FirstAnswer((*starts, *([late] if late > lags or (late and not starts) else [])), at_once)
 
 
 @dataclass(frozen=True, eq=False)

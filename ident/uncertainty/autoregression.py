@@ -84,7 +84,13 @@ def fit_autoregression(
     _, d, vt = np.linalg.svd(rows[:, :order], full_matrices=False)
     kept = d > np.finfo(np.float64).eps * n * d[0]
     step = variance * (vt[kept].T / d[kept] ** 2) @ (vt[kept] @ gradient)
-    return _moved(_stable(best), step)
+    # A(q) - s B(q), b_1 .. b_n = step, with the largest s <= 1 for which s |B / A| <= _LARGEST_MOVE where it
+    # matters most: next to the roots, however sharp their peaks.
+    stable = _stable(best)
+    delays = np.exp(-1j * np.concatenate([_FREQUENCIES, np.angle(np.roots(stable))]))
+    moved = np.polyval(np.concatenate([step[::-1], [0.0]]), delays) / np.polyval(stable[::-1], delays)
+    share = min(1.0, _LARGEST_MOVE / max(float(np.abs(moved).max()), _LARGEST_MOVE))
+    return np.asarray(stable - share * np.concatenate([[0.0], step]), dtype=np.float64)
 
 
 def first_rows(whitening: RealArray) -> RealArray:
@@ -125,16 +131,6 @@ def autocovariance(whitening: RealArray, max_lag: int) -> RealArray:
     for k in range(order + 1, max_lag + 1):
         gamma[k] = -whitening[:0:-1] @ gamma[k - order : k]
     return gamma[: max_lag + 1]
-
-
-def _moved(whitening: RealArray, step: RealArray) -> RealArray:
-    """A(q) - s B(q), b_1 .. b_n = step, with the largest s <= 1 for which s |B / A| <= _LARGEST_MOVE."""
-    # Where it matters most: next to the roots, however sharp their peaks.
-    peaks = np.angle(np.roots(whitening))
-    delays = np.exp(-1j * np.concatenate([_FREQUENCIES, peaks]))
-    moved = np.polyval(np.concatenate([step[::-1], [0.0]]), delays) / np.polyval(whitening[::-1], delays)
-    share = min(1.0, _LARGEST_MOVE / max(float(np.abs(moved).max()), _LARGEST_MOVE))
-    return np.asarray(whitening - share * np.concatenate([[0.0], step]), dtype=np.float64)
 
 
 def _stable(whitening: RealArray) -> RealArray:

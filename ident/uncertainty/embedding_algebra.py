@@ -193,7 +193,11 @@ def reduce_stacked(stacked: StackedBlocks) -> ReducedRegression:
             f"{n_rows} usable samples do not determine {p} regressors and {length} kernel coefficients: "
             "give a longer record or a smaller fir_length"
         )
-    kept = _distinguishable(triangle[:p, :p])
+    own = np.linalg.norm(triangle[:p, :p], axis=0)
+    if np.any(own == 0):
+        raise ValueError(f"the input does not excite regressor {int(np.argmax(own == 0)) + 1} of {own.size}")
+    # Columns that are not, to rounding, combinations of earlier ones.
+    kept = np.flatnonzero(np.abs(np.diag(triangle[:p, :p])) > _EXCITATION * own)
     if kept.size < p:
         columns = np.concatenate([kept, np.arange(p, p + length + 1)])
         triangle = triangle_of(triangle[:, columns])
@@ -222,16 +226,6 @@ def triangle_of(columns: RealArray) -> RealArray:
     upper = np.zeros((n, n))
     upper[: min(n_rows, n)] = np.triu(packed[:n])
     return upper
-
-
-def _distinguishable(r11: RealArray) -> npt.NDArray[np.intp]:
-    """Indices of the columns of an upper triangle that are not, to rounding, combinations of earlier ones."""
-    length = np.linalg.norm(r11, axis=0)
-    if np.any(length == 0):
-        raise ValueError(
-            f"the input does not excite regressor {int(np.argmax(length == 0)) + 1} of {length.size}"
-        )
-    return np.flatnonzero(np.abs(np.diag(r11)) > _EXCITATION * length)
 
 
 def tc_factor(lam: float, length: int) -> RealArray:

@@ -17,7 +17,6 @@ from typing import Any
 
 import numba
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import solve_triangular
 
 from ident.basis.functions import basis_response, block_parameters
@@ -260,7 +259,14 @@ def pair_mixture(
     joint = np.exp(logs - top)
     per_pair = joint.sum(axis=1)
     total = per_pair.sum() + np.exp(log_rest - top)
-    kept = _worth_keeping(candidates.poles, per_pair / total)
+    # The likeliest pairs of probable neighbourhoods (two half bandwidths), in grid order. Moments of a mixture
+    # feel an improbable hypothesis by the square of its distance; one whose neighbourhood is improbable is
+    # outside every confidence region, and left out.
+    probability, frequency = per_pair / total, np.angle(candidates.poles)
+    decay = -np.log(np.abs(candidates.poles))
+    near = np.abs(frequency[:, None] - frequency) <= 2 * np.maximum(decay[:, None], decay)
+    probable = np.flatnonzero((near @ probability > _LEAST_PROBABILITY) & (probability > _NEGLIGIBLE))
+    kept = np.sort(probable[np.argsort(probability[probable])[::-1][:_MOST_PAIRS]])
     share = joint[kept] / per_pair[kept, None]
     mean = np.einsum("ja,jak->jk", share, evidence.mean[kept])
     apart = evidence.mean[kept] - mean[:, None, :]
@@ -282,20 +288,6 @@ def pair_mixture(
         probability=float(per_pair.sum() / total),
         visible=complex(candidates.poles[best]) if visible else None,
     )
-
-
-def _worth_keeping(poles: ComplexArray, probability: RealArray) -> npt.NDArray[np.intp]:
-    """Indices of the likeliest pairs in neighbourhoods that are probable enough, in grid order.
-
-    Neighbours resonate within two half bandwidths. Moments of a mixture feel an improbable hypothesis by the
-    square of its distance; one whose neighbourhood is improbable is outside every confidence region, and left
-    out.
-    """
-    frequency, decay = np.angle(poles), -np.log(np.abs(poles))
-    near = np.abs(frequency[:, None] - frequency) <= 2 * np.maximum(decay[:, None], decay)
-    candidates = np.flatnonzero((near @ probability > _LEAST_PROBABILITY) & (probability > _NEGLIGIBLE))
-    likeliest = candidates[np.argsort(probability[candidates])[::-1][:_MOST_PAIRS]]
-    return np.sort(likeliest)
 
 
 def refined_pair(

@@ -197,7 +197,13 @@ def _unpack(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: str) -
     if origin is np.ndarray or kind is np.ndarray:
         return _unpack_array(kind, document, arrays, at)
     if isinstance(origin, type) and issubclass(origin, tuple):
-        return _unpack_tuple(get_args(kind), document, arrays, at)
+        parts = get_args(kind)
+        _expect(isinstance(document, list), document, at, "a list")
+        if len(parts) == 2 and parts[1] is Ellipsis:
+            parts = (parts[0],) * len(document)
+        _expect(len(parts) == len(document), document, at, f"{len(parts)} entries")
+        each = enumerate(zip(parts, document, strict=True))
+        return tuple(_unpack(part, item, arrays, f"{at}[{i}]") for i, (part, item) in each)
     if isinstance(origin, type) and issubclass(origin, Mapping):
         _expect(isinstance(document, dict), document, at, "an object")
         return {
@@ -233,17 +239,6 @@ def _unpack_dataclass(kind: Any, document: Any, arrays: Mapping[str, AnyArray], 
         return kind(**values)
     except ValueError as error:
         raise CodecError(f"{at}: {error}") from error
-
-
-def _unpack_tuple(parts: tuple[Any, ...], document: Any, arrays: Mapping[str, AnyArray], at: str) -> Any:
-    _expect(isinstance(document, list), document, at, "a list")
-    if len(parts) == 2 and parts[1] is Ellipsis:
-        parts = (parts[0],) * len(document)
-    _expect(len(parts) == len(document), document, at, f"{len(parts)} entries")
-    return tuple(
-        _unpack(part, item, arrays, f"{at}[{i}]")
-        for i, (part, item) in enumerate(zip(parts, document, strict=True))
-    )
 
 
 def _unpack_array(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: str) -> AnyArray:

@@ -62,7 +62,11 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
         raise
     for folder in {place.parent for place in places.values()}:
         with cannot("write", folder):
-            _flush_directory(folder)
+            descriptor = os.open(folder, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
 
 
 def _replaced(path: Path) -> Path | None:
@@ -229,11 +233,3 @@ def locked(directory: Path, what: str, *below: Path) -> Iterator[None]:
         for place in (directory, *below):
             remove_leftovers(place)
         yield
-
-
-def _flush_directory(directory: Path) -> None:
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

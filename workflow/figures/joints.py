@@ -16,7 +16,7 @@ from control_design.specification.multivariable import gram
 from workflow.config.joints_config import JointsConfig
 from workflow.figures import style
 from workflow.figures.bands import Real, envelope, outline
-from workflow.tasks.joints import JointsResults, JointsRun
+from workflow.tasks.joints import JointsResults
 
 _LOW = 1e-3  # smallest frequency of the singular values, of the Nyquist frequency
 
@@ -84,7 +84,10 @@ def draw_joint_steps(run: JointsView) -> Figure | None:
                 grid[row, k].plot(*line, **style.ACHIEVED_LINE, label=label)
         steps = outline(loop.time_s, loop.reference[:, k], 150)
         grid[0, k].plot(*steps, **style.REFERENCE_STEPS, label="reference")
-        _draw_limit(grid[1, k], joint.input_limit, loop.runs, k)
+        largest, limit = max(float(np.max(np.abs(one.command[:, k]))) for one in loop.runs), joint.input_limit
+        if limit is not None and largest > 0.5 * limit:
+            grid[1, k].axhline(limit, **style.LIMIT_LINE, label="limit of the actuator")
+            grid[1, k].axhline(-limit, **style.LIMIT_LINE)
         for row, name in ((0, joint.output), (1, joint.input)):
             grid[row, k].set_ylabel(style.two_lines(name, run.results.records.unit(name)))
         grid[1, k].set_xlabel("time [s]")
@@ -93,13 +96,6 @@ def draw_joint_steps(run: JointsView) -> Figure | None:
 
 def _draw_runs(axes: Any, time_s: Real, lines: list[Real], label: str) -> None:
     axes.fill_between(*envelope(time_s, np.stack(lines)), **style.ACHIEVED_BAND, label=label)
-
-
-def _draw_limit(axes: Any, limit: float | None, runs: tuple[JointsRun, ...], k: int) -> None:
-    largest = max(float(np.max(np.abs(one.command[:, k]))) for one in runs)
-    if limit is not None and largest > 0.5 * limit:
-        axes.axhline(limit, **style.LIMIT_LINE, label="limit of the actuator")
-        axes.axhline(-limit, **style.LIMIT_LINE)
 
 
 @style.drawing("matrix-response")

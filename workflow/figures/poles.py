@@ -26,8 +26,14 @@ def draw_poles(
     """
     poles = np.concatenate([model.stable_poles.values, model.unstable_poles])
     figure, (whole, near) = style.panels(5.6, 1, 2)
+    turn = np.linspace(0, 2 * np.pi, 361)
+    angle = np.concatenate([np.linspace(0, 0.3, 120), np.linspace(0.301, np.pi, 160)])
     for axes in (whole, near):
-        _damping_lines(axes)
+        axes.plot(np.cos(turn), np.sin(turn), color="#333333", lw=1.0)
+        for zeta in _DAMPINGS:
+            z = _constant_damping(zeta, angle)
+            for side in (z, z.conj()):
+                axes.plot(side.real, side.imag, color="#b5b5b5", lw=0.7, ls=(0, (3, 2)))
         if closed_loop is not None:
             squares = {"marker": "s", "ms": 5.5, "mec": style.PREDICTED, "mew": 1.4}
             label = "closed loop, nominal plant"
@@ -66,16 +72,6 @@ def _near_corner(poles: Complex) -> float:
 
 def _constant_damping(zeta: float, angle: Real) -> Complex:
     return np.asarray(np.exp((-zeta / np.sqrt(1 - zeta**2) + 1j) * angle))
-
-
-def _damping_lines(axes: Axes) -> None:
-    turn = np.linspace(0, 2 * np.pi, 361)
-    axes.plot(np.cos(turn), np.sin(turn), color="#333333", lw=1.0)
-    angle = np.concatenate([np.linspace(0, 0.3, 120), np.linspace(0.301, np.pi, 160)])
-    for zeta in _DAMPINGS:
-        z = _constant_damping(zeta, angle)
-        for side in (z, z.conj()):
-            axes.plot(side.real, side.imag, color="#b5b5b5", lw=0.7, ls=(0, (3, 2)))
 
 
 def _name_dampings(axes: Axes, corner: float) -> None:
