@@ -259,9 +259,9 @@ def pair_mixture(
     joint = np.exp(logs - top)
     per_pair = joint.sum(axis=1)
     total = per_pair.sum() + np.exp(log_rest - top)
-    # The likeliest pairs of probable neighbourhoods (two half bandwidths), in grid order. Moments of a mixture
-    # feel an improbable hypothesis by the square of its distance; one whose neighbourhood is improbable is
-    # outside every confidence region, and left out.
+    # The likeliest pairs of probable neighbourhoods (two half bandwidths), in grid order: moments of a
+    # mixture feel an improbable hypothesis by the square of its distance, and it is outside every confidence
+    # region.
     probability, frequency = per_pair / total, np.angle(candidates.poles)
     decay = -np.log(np.abs(candidates.poles))
     near = np.abs(frequency[:, None] - frequency) <= 2 * np.maximum(decay[:, None], decay)

@@ -2,10 +2,6 @@
 
 import ast
 import contextlib
-import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -229,25 +225,3 @@ def test_tests_of_a_checkout_that_is_none_are_refused_in_one_line(tmp_path, caps
         run(print, tests_of=str(tmp_path))
     said, expected = capsys.readouterr().err, "no tests/ there; expected a checkout of this repository\n"
     assert said == f"--tests-of {tmp_path}: {expected}"
-
-
-def test_an_end_by_signal_leaves_nothing(checkout, tmp_path):
-    code = (
-        "import tempfile, time\nfrom pathlib import Path\nfrom benchmarks import mutants\n"
-        f"mutants.ROOT, mutants.ROOMS = Path({str(checkout)!r}), {{'plant': ('tests/plant',)}}\n"
-        "mutants.Judge._ran = lambda self, root, *words: print('now', flush=True) or time.sleep(60)\n"
-        "mutants.run(print, rooms=('plant',), frozen=False)\n"
-    )
-    before, temporary = texts(checkout), tmp_path / "temporary"
-    temporary.mkdir()
-    environment = {**os.environ, "TMPDIR": str(temporary)}
-    process = subprocess.Popen(
-        [sys.executable, "-c", code], cwd=ROOT, env=environment, stdout=subprocess.PIPE
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == b"now\n"
-    process.send_signal(signal.SIGTERM)
-    process.communicate()
-    assert process.returncode == 143
-    assert texts(checkout) == before
-    assert list(temporary.iterdir()) == []

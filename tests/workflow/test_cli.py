@@ -315,20 +315,6 @@ def test_main_without_arguments_shows_help(capsys):
 
 
 @pytest.mark.parametrize(
-    ("command", "words"),
-    [
-        ("run", ["[default: runs/<name>-<date>-<time>]"]),
-        ("identify", ["Zeit [ms]", "Sampling period [s]", "[samples]", "one-page report"]),
-        ("design", ["[specification]"]),
-    ],
-)
-def test_help_keeps_what_stands_in_brackets(flexlink, command, words):
-    shown = " ".join(flexlink(command, "--help").out.split())
-    for word in words:
-        assert word in shown
-
-
-@pytest.mark.parametrize(
     ("command", "settings", "option", "key", "more"),
     [
         ("identify", IdentOptions, "--pairs", "n_pairs", "[at least 0; at most 12]"),
