@@ -6,7 +6,7 @@ import control
 import numpy as np
 import pytest
 
-from control_design import Channel, Controller, Specification, UncertainPlant, certify
+from control_design import Controller, PlantChannel, Specification, UncertainPlant, certify
 from control_design.analysis.between_grid_points import Obstacle
 from control_design.analysis.worst_case import worst_case
 from control_design.plants.first_order import FirstOrder, FrequencyIntervals, RationalResponse
@@ -102,7 +102,7 @@ def test_integrating_loops_are_bounded_down_to_zero_frequency(integrators):
 @pytest.mark.parametrize("separate", [False, True])
 def test_damping_of_the_mode_is_bounded_for_both_channels(separate):
     tip = tip_acceleration()
-    performance = Channel(tip, RationalDisc(tip, 0, 0.03, 60.0)) if separate else None
+    performance = PlantChannel(tip, RationalDisc(tip, 0, 0.03, 60.0)) if separate else None
     system = hub_arm()
     plant = UncertainPlant("arm", system, RationalDisc(system, 1, 0.05, 60.0), performance=performance)
     spec = Specification(modulus_margin=0.4, mode_peak_ratio=0.5)

@@ -6,7 +6,7 @@ import control
 import numpy as np
 import pytest
 
-from control_design import Channel, LoopFunction, Specification, UncertainPlant, certify
+from control_design import LoopFunction, PlantChannel, Specification, UncertainPlant, certify
 from validation.example_plants import ResponseRecord
 
 from .plants import RelativeDisc, gain, hub_arm, tip_acceleration, uncertain_hub
@@ -57,7 +57,7 @@ def test_every_requirement_is_listed_with_its_number():
         "arm",
         hub_arm(),
         RelativeDisc(hub_arm(), 0.02, 60.0),
-        performance=Channel(tip_acceleration(), RelativeDisc(tip_acceleration(), 0.02, 60.0)),
+        performance=PlantChannel(tip_acceleration(), RelativeDisc(tip_acceleration(), 0.02, 60.0)),
     )
     spec = Specification(
         bandwidth_rad_s=2.0, integrator=True, modulus_margin=0.6, effort_limit=10.0, mode_peak_ratio=0.2,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from control_design import Channel, LoopFunction, RationalWeight, Specification, UncertainPlant
+from control_design import LoopFunction, PlantChannel, RationalWeight, Specification, UncertainPlant
 from control_design.plants.first_order import FirstOrder, FrequencyIntervals, RationalResponse
 from control_design.plants.plant_set import frequency_response
 from control_design.plants.set_expansion import SetExpansion, own_grid_set, posterior_expansion
@@ -213,7 +213,7 @@ def test_own_grid_with_the_straight_line_assumption_is_the_sum_of_neighbours():
         (),
         {"omega_rad_s": own, "centre": frequency_response(arm, own), "covariance": covariance, "level": 0.95},
     )()
-    channel = Channel(arm, record)
+    channel = PlantChannel(arm, record)
     nominal = RationalResponse.from_state_space(arm, 1)
     left, right = channel.at(own[2:3]), channel.at(own[3:4])
     for share in (0.0, 0.3, 1.0):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from control_design import Channel, Controller, Specification, UncertainPlant, certify
+from control_design import Controller, PlantChannel, Specification, UncertainPlant, certify
 from control_design.analysis.joint_coverage import SampledLoop, joint_coverage
 from control_design.plants.first_order import FirstOrder, FrequencyIntervals, RationalResponse
 from control_design.plants.set_expansion import stacked
@@ -84,7 +84,7 @@ def test_certificate_uses_the_calibrated_level_and_says_so():
 def test_performance_channel_and_several_plants_are_drawn_together():
     system, tip = hub_arm(), tip_acceleration()
     measured, performed = (GaussianGain(g, n, 0.05) for g, n in ((system, 1), (tip, 0)))
-    arm = UncertainPlant("arm", system, measured, performance=Channel(tip, performed))
+    arm = UncertainPlant("arm", system, measured, performance=PlantChannel(tip, performed))
     spec = Specification(modulus_margin=0.3, mode_peak_ratio=0.9)
     controller = gain(0.3)
     one = joint_coverage(controller, [arm], spec, rng=np.random.default_rng(3), draws=3000)
@@ -92,9 +92,9 @@ def test_performance_channel_and_several_plants_are_drawn_together():
     # binomial, both sides: 0.56 %; four of it
     assert np.mean(fresh.gamma <= one.gamma) == pytest.approx(0.95, abs=0.023)
     # The damping weight rules: gamma is W4 |Gp| |S| at the peak, Gp drawn apart from G.
-    centre = SampledLoop(controller, UncertainPlant("exact", system, performance=Channel(tip)), spec).gamma(
-        np.random.default_rng(0), 1
-    )
+    centre = SampledLoop(
+        controller, UncertainPlant("exact", system, performance=PlantChannel(tip)), spec
+    ).gamma(np.random.default_rng(0), 1)
     assert one.gamma > centre.gamma[0]
     # Twice the same plant, drawn independently: P(max <= q) = P(gamma <= q)^2, so the quantile moves up.
     two = joint_coverage(controller, [arm, arm], spec, rng=np.random.default_rng(3), draws=3000)

@@ -6,7 +6,7 @@ import control
 import numpy as np
 import pytest
 
-from control_design import Channel, UncertainPlant
+from control_design import PlantChannel, UncertainPlant
 from control_design.plants.plant_set import count_integrators, frequency_response, modes_of
 from validation.example_plants import LinkUncertainty, ResponseRecord, flexible_link
 
@@ -86,13 +86,13 @@ def test_plants_that_cannot_be_used_are_refused(system, message):
 
 def test_uncertainty_records_are_checked():
     with pytest.raises(ValueError, match="uncertainty needs a method at"):
-        Channel(hub_arm(), object())  # type: ignore[arg-type]
+        PlantChannel(hub_arm(), object())  # type: ignore[arg-type]
     record = ResponseRecord(np.array([2.0, 1.0]), np.zeros(2), np.zeros((2, 2, 2)), 0.95)
     with pytest.raises(ValueError, match="ascending"):
-        Channel(hub_arm(), record)
+        PlantChannel(hub_arm(), record)
     record = ResponseRecord(np.array([1.0, 1000.0]), np.zeros(2), np.zeros((2, 2, 2)), 0.95)
     with pytest.raises(ValueError, match="Nyquist frequency is 628"):
-        Channel(hub_arm(), record)
+        PlantChannel(hub_arm(), record)
 
 
 def test_modes_of_known_poles():

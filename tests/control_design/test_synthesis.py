@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from control_design import (
-    Channel,
     Outcome,
+    PlantChannel,
     Specification,
     SpecificationError,
     SynthesisOptions,
@@ -95,7 +95,7 @@ def test_integral_action_beside_an_integrator_is_not_slow(integrators):
 
 def test_active_damping_through_the_tip_without_tracking():
     """The closed-loop mode is damped at least about as much as the peak is pressed down: 0.015/0.4."""
-    performance = Channel(tip_acceleration(), RelativeDisc(tip_acceleration(), 0.05, 60.0))
+    performance = PlantChannel(tip_acceleration(), RelativeDisc(tip_acceleration(), 0.05, 60.0))
     plant = uncertain_hub(0.03, performance=performance)
     specification = Specification(
         mode_peak_ratio=0.4, effort_limit=60.0, effort_rolloff_rad_s=100.0, controller_order=4

@@ -126,6 +126,7 @@ def test_an_fmu_that_misbehaves_ends_a_trial_and_nothing_else(
 ) -> None:
     """It aborts, hangs, or returns an error, and it prints; the next trial is as if nothing had been."""
     monkeypatch.setattr("diagnosis.machine.fmu_plant._LONGEST_S", 3.0)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # others unpack at the same time
     before = unpacked()
     fmu = Fmu(compiled(tmp_path, "-DMISBEHAVES"), DT_S)
     force = np.ones((40, 1))
