@@ -92,9 +92,8 @@ def test_performance_channel_and_several_plants_are_drawn_together():
     # binomial, both sides: 0.56 %; four of it
     assert np.mean(fresh.gamma <= one.gamma) == pytest.approx(0.95, abs=0.023)
     # The damping weight rules: gamma is W4 |Gp| |S| at the peak, Gp drawn apart from G.
-    centre = SampledLoop(
-        controller, UncertainPlant("exact", system, performance=PlantChannel(tip)), spec
-    ).gamma(np.random.default_rng(0), 1)
+    exact = UncertainPlant("exact", system, performance=PlantChannel(tip))
+    centre = SampledLoop(controller, exact, spec).gamma(np.random.default_rng(0), 1)
     assert one.gamma > centre.gamma[0]
     # Twice the same plant, drawn independently: P(max <= q) = P(gamma <= q)^2, so the quantile moves up.
     two = joint_coverage(controller, [arm, arm], spec, rng=np.random.default_rng(3), draws=3000)
