@@ -157,12 +157,6 @@ def dense(records, poles, structure, alpha, lam, s2, length):
     return mean[wanted], covariance[wanted, wanted]
 
 
-def likeliest_alone(grid, _prior):
-    weights = np.zeros_like(grid.log_likelihood)
-    weights.flat[int(np.argmax(grid.log_likelihood))] = 1.0
-    return weights, 0.0
-
-
 @pytest.mark.parametrize("structure", [(0, 0, False), (0, 2, True), (1, 1, True)])
 def test_whole_path_equals_dense_formulas(structure, monkeypatch):
     integrators, delay, direct = structure
@@ -177,7 +171,8 @@ def test_whole_path_equals_dense_formulas(structure, monkeypatch):
         records.append(Record("r", u, y, DT, ("u",), ("y",)))
     model = GobfModel(Poles(poles), np.zeros(2), DT, integrators=integrators, input_delay_samples=delay)
     options = EmbeddingOptions(fir_length=length, feedthrough=direct, prior_missed_mode=0.0)
-    monkeypatch.setattr(embedding, "grid_weights", likeliest_alone)  # as the dense formulas
+    one = lambda grid, _: ((grid.log_likelihood == grid.log_likelihood.max()).astype(float), 0.0)  # noqa: E731
+    monkeypatch.setattr(embedding, "grid_weights", one)  # the likeliest alone, as in the dense formulas
     posterior = tangent(records, model, options)
     report = posterior.report
     assert report.n_rows == 160 - 2 * delay - 2 * (max(1, integrators) + 4)

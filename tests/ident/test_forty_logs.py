@@ -399,6 +399,11 @@ LOGS |= {
     "Octave text": Log("a.mat", b"# Created by Octave 8.4.0\n# name: t\n# type: matrix\n 0 1\n",
         refused=("save -v7",)),
     "Octave text, cut": Log("a.txt", b"# name: t\r\n# type: matrix\r\n 0 1\r\n", refused=("save -v7",)),
+    "parquet with instants": Log("a.parquet", parquet(
+        when=np.datetime64("2024-02-29T23:59:59.9") + (1e9 * T_S).round().astype("m8[ns]"), u_V=U, y_rad=Y),
+        ("when", "u_V", "y_rad")),
+    "tabs, blanks in the dates, comments of as many words": Log("a.tsv", text(
+        "\t", above=("# made by a script",), time=lambda t: clock("%Y-%m-%d %H:%M:%S.%f")(t))),
     "parquet with lists": Log("a.parquet", parquet(
         t_s=T_S, action=list(zip(U, Y, strict=True)), image=[[1.0] * (k % 3) for k in K]),
         ("t_s", "action[0]", "action[1]"), units=NONE),
