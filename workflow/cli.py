@@ -48,6 +48,10 @@ if TYPE_CHECKING:
     from workflow.console import TerminalProgress
     from workflow.text.templates import RunSummary
 
+_READING = (
+    *("input_name", "output_name", "reference", "time", "time_unit", "dt_s"),
+    *("scale", "units", "unwrap", "decimal", "input_limit"),
+)
 _SIMULATOR = ("mjcf", "fmu", "python", "motion", "log", "dt_s", "repair", "resample_s")
 _MANIFESTS = ("manifest.json", "study.json", "diagnose.json", "blind.json")  # of what can be continued
 
@@ -317,21 +321,7 @@ def look(
 
 
 @app.command(short_help="Write a configuration that runs, from logs.")
-@with_fields(
-    reading=(
-        "input_name",
-        "output_name",
-        "reference",
-        "time",
-        "time_unit",
-        "dt_s",
-        "scale",
-        "units",
-        "unwrap",
-        "decimal",
-        "input_limit",
-    )
-)
+@with_fields(reading=_READING)
 def init(
     log: Logs,
     out: Annotated[Path, typer.Option(help="Write the configuration here (TOML), for `flexlink run`.")],
@@ -349,22 +339,7 @@ def init(
 
 @app.command(short_help="Identify one channel from log files; one-page report.")
 @with_fields(
-    reading=(
-        "input_name",
-        "output_name",
-        "reference",
-        "time",
-        "time_unit",
-        "dt_s",
-        "scale",
-        "offset",
-        "units",
-        "repair",
-        "resample_s",
-        "unwrap",
-        "decimal",
-        "input_limit",
-    ),
+    reading=(*_READING, "offset", "repair", "resample_s"),
     loop=("closed_loop_data.method",),
     fit=(
         "n_pairs",
@@ -775,8 +750,9 @@ def _settings(model: type[ModelT], given: Mapping[str, Any]) -> ModelT:
         stated = {key: given[key] for key in model.model_fields if given.get(key) is not None}
         return check(model, stated, source="options")
     except InputError as error:
-        named = re.sub(r"^options: (\w+)(?=:)", lambda found: option_name(found[1]), str(error))
-        raise InputError(named) from error
+        raise InputError(
+            re.sub(r"^options: (\w+)(?=:)", lambda found: option_name(found[1]), str(error))
+        ) from error
 
 
 def print_json(document: Mapping[str, Any]) -> None:
