@@ -64,8 +64,8 @@ def altered(config: RunConfig, *, seed: int | None = None, **effects: dict[str, 
 
 def identified(config: RunConfig, folder: Path) -> UncertainPlant:
     """The uncertain plant, from records to ellipses."""
-    run = RunDirectory.begin(
-        folder, config_text="", config=config.to_document(), seed=config.run.seed, inputs={}
+    run = RunDirectory(folder).begin_run(
+        config_text="", config=config.to_document(), seed=config.run.seed, inputs={}
     )
     results = RunResults(run)
     for stage in STAGES[:3]:

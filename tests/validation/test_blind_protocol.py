@@ -192,7 +192,7 @@ def test_a_finished_run_resumes_without_a_diagnosis_and_only_as_itself(finished_
     before = (finished_run / "scores.json").read_bytes()
     run_blind(2, 8, finished_run, resume=True, diagnose=never)
     assert (finished_run / "scores.json").read_bytes() == before
-    with pytest.raises(InputError, match="begun with seed = 8, not 9"):
+    with pytest.raises(InputError, match="seed \\(was 8, now 9\\)"):
         run_blind(2, 9, finished_run, resume=True, diagnose=never)
     with pytest.raises(InputError, match="--resume continues it"):
         run_blind(2, 8, finished_run, diagnose=never)

@@ -217,8 +217,7 @@ def build_run(
     config_text: str = "# as given\n[run]\nname = 'example'\n",
 ) -> RunDirectory:
     """Write every stage but the report, through the same types and words as the real stages."""
-    run = RunDirectory.begin(
-        path,
+    run = RunDirectory(path).begin_run(
         config_text=config_text,
         config=settings.to_document(),
         seed=settings.run.seed,

@@ -407,11 +407,11 @@ def test_other_inputs_are_refused_unless_replaced(cases, tmp_path, here):
     diagnose_cases(cases, out, controller=False, engine=engine)
     with pytest.raises(InputError, match="--resume or start it afresh with --replace"):
         diagnose_cases(cases, out, controller=False, engine=engine)
-    with pytest.raises(InputError, match=r"other inputs: inputs\.two"):
+    with pytest.raises(InputError, match=r"the diagnosis began: inputs\.two"):
         diagnose_cases(cases[:1], out, controller=False, resume=True, engine=engine)
-    with pytest.raises(InputError, match=r"other inputs: inputs\.one"):
+    with pytest.raises(InputError, match=r"the diagnosis began: inputs\.one"):
         diagnose_cases(cases, out, rig="rig_uncertain.toml", controller=False, resume=True, engine=engine)
-    with pytest.raises(InputError, match=r"other inputs: options\.controller"):
+    with pytest.raises(InputError, match=r"the diagnosis began: options\.controller"):
         diagnose_cases(cases, out, resume=True, engine=engine)
     (out / "notes.txt").write_text("mine")
     diagnose_cases(cases[:1], out, controller=False, replace=True, engine=engine)

@@ -12,13 +12,14 @@ import pytest
 
 from workflow.engine.errors import InputError
 from workflow.engine.randomness import stage_rng
-from workflow.engine.run_directory import RunDirectory, default_directory, first_difference, hash_of
+from workflow.engine.run_directory import RunDirectory, default_directory, hash_of
+from workflow.engine.store import first_difference
 
 CONFIG = {"run": {"name": "a", "seed": 1}, "channels": [{"input": "u", "output": "y"}]}
 
 
-def begin(path, config=CONFIG, inputs=None, **how):
-    return RunDirectory.begin(path, config_text="# text\n", config=config, seed=1, inputs=inputs or {}, **how)
+def begin(path, config=CONFIG, **how):
+    return RunDirectory(path).begin_run(config_text="# text\n", config=config, seed=1, **{"inputs": {}} | how)
 
 
 def test_begin_writes_config_and_manifest(tmp_path):
@@ -69,7 +70,7 @@ def test_replace_keeps_what_is_not_ours(tmp_path):
 
 def test_changed_input_file_is_refused_naming_the_file(tmp_path):
     begin(tmp_path / "run", inputs={"log.csv": "00"})
-    with pytest.raises(InputError, match=r"log\.csv changed"):
+    with pytest.raises(InputError, match=r"changed since the run began: inputs\.log\.csv"):
         begin(tmp_path / "run", inputs={"log.csv": "01"}, resume=True)
 
 
@@ -91,8 +92,6 @@ def test_open_refuses_what_is_no_run(tmp_path):
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A result with or without an array."""
-
     gain: float
     text: str
     trace: npt.NDArray[np.float64] | None = None

@@ -337,7 +337,7 @@ def test_the_default_arm_is_identified_behind_its_friction(tmp_path):
     clipped; all read back from the run's files.
     """
     config, text = built_in_config()
-    run = RunDirectory.begin(tmp_path, config_text=text, config=config.to_document(), seed=2006, inputs={})
+    run = RunDirectory(tmp_path).begin_run(config_text=text, config=config.to_document(), seed=6, inputs={})
     for stage in STAGES[:3]:
         run.save_stage(stage.name, stage.run(StageInput(config, RunResults(run), Progress())), "test")
     results = RunResults(run)

@@ -258,7 +258,9 @@ def test_a_base_that_cannot_be_identified_is_refused(refused, tmp_path):
 def children_of(pid: int) -> list[int]:
     """Child processes, from the system's own books."""
     try:
-        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+        return [
+            int(w) for one in Path(f"/proc/{pid}/task").glob("*/children") for w in one.read_text().split()
+        ]
     except OSError:
         return []
 
@@ -364,18 +366,18 @@ def test_places_that_are_taken_are_refused(refused, small_study, tmp_path):
 
 def test_replacing_a_study_deletes_what_was_its_own_and_nothing_else(tmp_path):
     base = SimpleNamespace(config=load_config(FAST_ARM)[0], inputs={}, digests={}, run=None)
-    first = StudyDirectory.begin(tmp_path / "out", text="first", base=base, resume=False)
+    first = StudyDirectory(tmp_path / "out").begin_study(text="first", base=base, resume=False)
     (first.points_path / "old").mkdir()
     (first.path / "table.csv").write_text("old")
     (first.path / "notes.txt").write_text("mine")
     other = SimpleNamespace(**{**vars(base), "digests": {"records": "other"}})
-    with pytest.raises(InputError, match=r"the base changed.*--replace"):
-        StudyDirectory.begin(first.path, text="second", base=other, resume=True)
+    with pytest.raises(InputError, match=r"the study began: stages_taken_over.*--replace"):
+        first.begin_study(text="second", base=other, resume=True)
     refusal = pytest.raises(InputError, match="another process is writing this study")
     with first.locked(), refusal, first.writing(replace=True):
-        StudyDirectory.begin(first.path, text="second", base=other, resume=False, replace=True)
+        first.begin_study(text="second", base=other, resume=False, replace=True)
     assert (first.points_path / "old").is_dir()
-    second = StudyDirectory.begin(first.path, text="second", base=other, resume=False, replace=True)
+    second = first.begin_study(text="second", base=other, resume=False, replace=True)
     held = {path.name for path in second.path.iterdir()}
     assert held == {"study.toml", "study.json", "plants", "points", "lock", "notes.txt"}
     assert not any(second.points_path.iterdir())
@@ -384,10 +386,10 @@ def test_replacing_a_study_deletes_what_was_its_own_and_nothing_else(tmp_path):
 
 def test_a_study_is_not_replaced_by_one_that_starts_from_a_run_in_it(tmp_path):
     base = SimpleNamespace(config=load_config(FAST_ARM)[0], inputs={}, digests={}, run=None)
-    first = StudyDirectory.begin(tmp_path / "out", text="first", base=base, resume=False)
+    first = StudyDirectory(tmp_path / "out").begin_study(text="first", base=base, resume=False)
     own = SimpleNamespace(**{**vars(base), "run": RunDirectory(first.points_path / "best")})
     with pytest.raises(InputError, match="--replace would delete the base"):
-        StudyDirectory.begin(first.path, text="second", base=own, resume=False, replace=True)
+        first.begin_study(text="second", base=own, resume=False, replace=True)
     assert (first.path / "study.json").is_file()
 
 

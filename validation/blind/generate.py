@@ -8,10 +8,8 @@ writes open cases for development: DIR/<case>/answer.toml and rig_exact.toml lie
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
-from multiprocessing import get_context
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,6 +26,8 @@ from validation.blind.workshop.cases import (
     workshop_schedule,
 )
 from validation.blind.workshop.files import write_workshop_case
+from workflow.engine.errors import StageError
+from workflow.engine.executor import Failure, Report, workers
 from workflow.engine.storage import write_text
 
 Answer = dict[str, Any]
@@ -80,22 +80,32 @@ def answer_toml(answer: Mapping[str, Any]) -> str:
     return str(tomlkit.dumps(shown))
 
 
-def _one(seed: int, out: Path, open_cases: bool, job: tuple[int, Plan]) -> Answer:
-    index, plan = job
-    folder = out / case_name(index)
-    rng = np.random.default_rng([seed, 1, index])
-    case: BlindCase | WorkshopCase
-    if isinstance(plan, WorkshopPlan):
-        case = make_workshop_case(plan, rng)
-        write_workshop_case(case, folder, rng)
-    else:
-        case = make_case(*plan, rng)
-        write_case(case, folder)
-    answer = {"case": folder.name, **case.answer}
-    if open_cases:
-        write_text(folder / "rig_exact.toml", rig_toml(answer["true_rig"]))
-        write_text(folder / "answer.toml", answer_toml(answer))
-    return {**answer, "sha256": folder_hash(folder)}
+@dataclass(frozen=True)
+class _Case:
+    """One case to be made, wherever that is."""
+
+    seed: int
+    out: Path
+    open_cases: bool
+    index: int
+    plan: Plan
+
+    def run(self, report: Report) -> Answer:
+        """Its answer; its folder is written."""
+        plan, folder = self.plan, self.out / case_name(self.index)
+        rng = np.random.default_rng([self.seed, 1, self.index])
+        case: BlindCase | WorkshopCase
+        if isinstance(plan, WorkshopPlan):
+            case = make_workshop_case(plan, rng)
+            write_workshop_case(case, folder, rng)
+        else:
+            case = make_case(*plan, rng)
+            write_case(case, folder)
+        answer = {"case": folder.name, **case.answer}
+        if self.open_cases:
+            write_text(folder / "rig_exact.toml", rig_toml(answer["true_rig"]))
+            write_text(folder / "answer.toml", answer_toml(answer))
+        return {**answer, "sha256": folder_hash(folder)}
 
 
 def generate(
@@ -118,22 +128,18 @@ def generate(
     """
     out.mkdir(parents=True, exist_ok=True)
     answers = dict(finished or {})
-    work = partial(_one, seed, out, open_cases)
     drawn = np.random.default_rng([seed, 0, n_cases])
     plans: list[Plan] = [*(workshop_schedule if workshop else schedule)(n_cases, drawn, only)]
-    tasks = [(k, plan) for k, plan in enumerate(plans) if case_name(k) not in answers]
-
-    def take(done: Iterable[Answer]) -> None:
-        for answer in done:
+    tasks = [
+        _Case(seed, out, open_cases, k, plan) for k, plan in enumerate(plans) if case_name(k) not in answers
+    ]
+    with workers(jobs, preload=[__spec__.name]) as processes:
+        for _, answer in processes.run(tasks):
+            if isinstance(answer, Failure):
+                raise StageError(answer.reason)
             answers[answer["case"]] = answer
             if keep:
                 keep(answer)
-
-    if jobs == 1 or len(tasks) == 1:
-        take(map(work, tasks))
-    elif tasks:
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            take(pool.map(work, tasks))
     return [answers[name] for name in sorted(answers)]
 
 

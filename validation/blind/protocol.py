@@ -114,16 +114,7 @@ def _begin(store: BlindDirectory, settings: Mapping[str, Any], resume: bool) -> 
             f"{store.path}: "
             + ("no blind run to resume" if resume else "a blind run is there already; --resume continues it")
         )
-    if not store.prepare(resume=True):
-        write_json(store.manifest_path, settings)
-        return
-    before = read_json(store.manifest_path)
-    for key in {**before, **settings}:
-        begun, value = before.get(key), settings.get(key)
-        if begun != value:
-            raise InputError(
-                f"{store.path}: cannot resume, the run was begun with {key} = {begun!r}, not {value!r}"
-            )
+    store.begin(settings, resume=True)
 
 
 def _sealed_cases(out: Path, settings: Mapping[str, Any], jobs: int, progress: Progress) -> None:

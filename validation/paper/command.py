@@ -26,7 +26,6 @@ from validation.paper.findings import CLOSE_TO_BEST, PEERS, Findings, findings_o
 from validation.paper.methods import BETTER_STARTS, JUDGED_BAND_RAD_S, METHODS
 from validation.paper.quotes import OPEN_CHOICES, REPORTED, SOURCE
 from validation.paper.settings import PaperSettings
-from workflow.engine import storage
 from workflow.engine.codec import plain_text
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
@@ -110,7 +109,7 @@ def redraw_paper(
         files[store.manifest_name] = page.encode()
         with store.writing(replace=True):
             store.prepare(replace=True)
-            storage.write_together({store.path / name: content for name, content in files.items()})
+            store.write(files)
     return _summary(store.path, document)
 
 

@@ -15,7 +15,7 @@ from diagnosis.diagnosis import diagnose
 from workflow.config.settings import repeated
 from workflow.diagnose.case_files import LoadedCase, load_case
 from workflow.diagnose.case_settings import CASE_FILE, case_document
-from workflow.diagnose.directory import DiagnosisDirectory
+from workflow.diagnose.directory import LAYOUT_VERSION, DiagnosisDirectory
 from workflow.diagnose.fleet import FleetMachine, csv_text, groups, trends
 from workflow.diagnose.outputs import Work
 from workflow.diagnose.simulator_case import SimulatorCase, load_simulator_case
@@ -115,17 +115,11 @@ def diagnose_cases(
     )
     width = max(1, min(jobs or os.cpu_count() or 1, len(work)))
     preload = ["diagnosis.diagnosis", "workflow.diagnose.command"]
-    with (
-        workers(width, scheduler, preload) as executor,
-        DiagnosisDirectory(out).writing(resume=resume, replace=replace),
-    ):
-        directory = DiagnosisDirectory.begin(
-            out,
-            inputs={one.name: one.input_sha256 for one in work},
-            options=options,
-            resume=resume,
-            replace=replace,
-        )
+    inputs = {one.name: one.input_sha256 for one in work}
+    directory = DiagnosisDirectory(out)
+    with workers(width, scheduler, preload) as executor, directory.writing(resume=resume, replace=replace):
+        begun_with = {"layout": LAYOUT_VERSION, "inputs": inputs, "options": options}
+        directory.begin(begun_with, resume=resume, replace=replace)
         machines, failures = _compute(directory, work, executor, progress)
         failures = [*unreadable, *failures]
         if len(places) == 1 and failures:
@@ -138,8 +132,8 @@ def diagnose_cases(
             page = out / "index.html"
             with progress.stage("overview"):
                 failed = {case: failure.reason for case, failure in failures}
-                directory.write("index.html", _overview(machines, failed).encode())
-                directory.write("fleet.csv", csv_text(machines, failed).encode())
+                overview, table = _overview(machines, failed), csv_text(machines, failed)
+                directory.write({"index.html": overview.encode(), "fleet.csv": table.encode()})
         summary = _summary(documents, machines, failures, page)
     return DiagnosisRun(documents, tuple(failures), summary)
 
@@ -252,7 +246,7 @@ def _compute(
         [("cases", _CASE_S * len(todo) / width), *((("overview", _OVERVIEW_S),) if several else ())]
     )
     shares = [0.0] * len(todo)
-    timings = directory.timings()
+    timings = directory.document("timings.json")
     failures: dict[str, Failure] = {}
 
     def watch(index: int, fraction: float, message: str) -> None:

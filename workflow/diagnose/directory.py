@@ -14,16 +14,13 @@ file stands, made from the same inputs by the same code, is done.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from workflow.engine import codec, storage
-from workflow.engine.errors import InputError, naming
-from workflow.engine.run_directory import first_difference
+from workflow.engine.errors import InputError
 from workflow.engine.store import Store
 
 LAYOUT_VERSION = 1  # the first; a directory of another one is not resumed
@@ -55,32 +52,6 @@ class DiagnosisDirectory(Store):
         ]  # no path elsewhere
         return (*(f"{case}{ending}" for case in named for ending in _ENDINGS), *self.own_files)
 
-    @classmethod
-    def begin(
-        cls, path: Path, *, inputs: Mapping[str, str], options: Mapping[str, Any], resume: bool, replace: bool
-    ) -> DiagnosisDirectory:
-        """A new or empty directory, the same diagnosis with `resume`, or whatever diagnosis is there
-        replaced.
-
-        inputs: case -> hash. Raises InputError: not writable, not empty, holding something else, or begun
-        with other inputs or options.
-        """
-        place = cls(path)
-        document = {"layout": LAYOUT_VERSION, "inputs": dict(inputs), "options": dict(options)}
-        if place.prepare(resume=resume, replace=replace):
-            changed = first_difference(storage.read_json(place.manifest_path), document)
-            if changed:
-                raise InputError(
-                    f"{path}: cannot resume, other inputs: {changed}; choose another --out or --replace"
-                )
-            return place
-        with naming(f"cannot write {path}"):
-            place.write(MANIFEST, (json.dumps(document, indent=1) + "\n").encode())
-        return place
-
-    def write(self, name: str, content: bytes) -> None:
-        storage.write_bytes(self.path / name, content)
-
     def save(self, case: str, files: Mapping[str, bytes]) -> None:
         """All files of a case, its JSON file last, and the timings; what an earlier answer had goes."""
         answer = f"{case}.json"
@@ -89,12 +60,14 @@ class DiagnosisDirectory(Store):
             if f"{case}{ending}" not in files:
                 (self.path / f"{case}{ending}").unlink(missing_ok=True)
         names = sorted(files, key=lambda name: name == answer)
-        storage.write_together({self.path / name: files[name] for name in names})
+        self.write({name: files[name] for name in names})
 
     def finished(self, case: str, made_from: Mapping[str, Any]) -> dict[str, Any] | None:
         """The answer to a case if it is there, whole and made from this; else None."""
-        document = self._document(f"{case}.json")
-        if document.get("made_from") != made_from or answer_text(document) != self._text(case):
+        document = self.document(f"{case}.json")
+        if document.get("made_from") != made_from or answer_text(document) != (
+            self.path / f"{case}.json"
+        ).read_text("utf-8"):
             return None
         for name, digest in document.get("files", {}).items():
             file = self.path / name
@@ -106,21 +79,9 @@ class DiagnosisDirectory(Store):
         """Of a case that is done."""
         return storage.read_json(self.path / f"{case}.json")
 
-    def timings(self) -> dict[str, Any]:
-        """Seconds per case so far."""
-        return self._document("timings.json")
-
-    def _document(self, name: str) -> dict[str, Any]:
+    def document(self, name: str) -> dict[str, Any]:
         """A JSON file of ours; empty where it is not there or cannot be read."""
         try:
             return storage.read_json(self.path / name)
         except InputError:
             return {}
-
-    def _text(self, case: str) -> str:
-        return (self.path / f"{case}.json").read_text("utf-8")
-
-    def discard_if_empty(self) -> None:
-        """Take back what `begin` wrote if there is no answer: a corrected case may come. Hold the lock."""
-        if self.held() <= {MANIFEST}:
-            self.discard()

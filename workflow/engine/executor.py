@@ -11,20 +11,20 @@ import asyncio
 import logging
 import multiprocessing
 import os
+import queue
 import signal
 import sys
 import threading
 import time
-import uuid
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager, suppress
+from concurrent import futures
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import forkserver, resource_tracker
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol, TypeVar
@@ -39,7 +39,7 @@ R = TypeVar("R")
 Report = Callable[[float, str], None]
 Watch = Callable[[int, float, str], None]
 
-MOST_ATTEMPTS = 3  # the second and third have the machine for themselves
+MOST_ATTEMPTS = 3  # the second and third alone, when the others are done
 CONNECT_S = 10.0  # a scheduler in the same network answers in milliseconds
 # Work that cannot go on says so within a minute.
 WITHOUT_WORKERS_S = 50.0
@@ -48,7 +48,8 @@ ANSWER_S = 10.0  # as `CONNECT_S`
 _LOOK_S = 0.05  # short beside any task
 _ASK_S = 2.0  # often beside `SILENT_S`, seldom beside what a scheduler can answer
 
-# CasADi and numba's caches are used by one thread at a time, whatever a worker was started with.
+# CasADi and numba's caches are used by one thread at a time, whatever a worker was started with; processes
+# are begun with variables of the environment that are put back.
 _ONE_AT_A_TIME = threading.Lock()
 
 
@@ -83,37 +84,89 @@ def _done(task: Task[R], report: Report) -> R | Failure:
         return attempt(lambda: task.run(report))
 
 
-class Executor(Protocol):
-    """Runs tasks somewhere; results come as they finish."""
+class Executor:
+    """Tasks on a pool of `concurrent.futures`, about `width` at once; `close` gives it up."""
 
-    @property
-    def width(self) -> int:
-        """How many tasks run at once."""
+    def __init__(self, pool: futures.Executor, width: int) -> None:
+        self.pool, self.width = pool, width
 
     def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R | Failure]]:
-        """Position and result of every task. watch: told position, share done and a word, where known."""
+        """Position and result of every task, as they finish. watch: told position, share done and a word,
+        where known. Raises StageError: the pool is lost."""
+        events: queue.SimpleQueue[tuple[int, Any, str]] = queue.SimpleQueue()
+        attempts = [0] * len(tasks)
+        running: set[int] = set()
+
+        def begin(index: int) -> None:
+            attempts[index] += 1
+            running.add(index)
+            told = self._submit(tasks[index], lambda share, word: events.put((index, share, word)))
+            told.add_done_callback(lambda done: events.put((index, done, "")))
+
+        for index in range(len(tasks)):
+            begin(index)
+        again: deque[int] = deque()
+        while running or again:
+            if not running:  # alone, so that there is as much memory for it as can be
+                begin(again.popleft())
+            try:
+                index, what, word = events.get(timeout=_LOOK_S)
+            except queue.Empty:
+                self._see_that_it_lives()
+                continue
+            if not isinstance(what, futures.Future):
+                if watch is not None:
+                    watch(index, what, word)
+                continue
+            running.remove(index)
+            try:
+                found = what.result()
+            except futures.BrokenExecutor:
+                if attempts[index] < MOST_ATTEMPTS:
+                    again.append(index)
+                    continue
+                found = Failure(f"the process computing it died {attempts[index]} times (out of memory?)")
+            except (futures.CancelledError, Exception) as error:
+                found = self._failure(error)
+            yield index, found
+
+    def _submit(self, task: Task[Any], report: Report) -> futures.Future[Any]:
+        """Given to the pool; what has no way to tell of its progress does not."""
+        with warnings.catch_warnings():
+            # A large plant travels with its task: nothing is lost with a worker.
+            warnings.simplefilter("ignore")
+            return self.pool.submit(run_on_worker, task)
+
+    def _see_that_it_lives(self) -> None:
+        """Asked while nothing comes. Raises StageError."""
+
+    def _failure(self, error: BaseException) -> Failure:
+        """Of a task that did not run to its end: what goes wrong inside one is its result."""
+        raise error
+
+    def close(self) -> None:
+        self.pool.shutdown(cancel_futures=True)
 
 
-@contextmanager
-def workers(jobs: int, scheduler: str | None = None, preload: Sequence[str] = ()) -> Iterator[Executor]:
+def workers(
+    jobs: int, scheduler: str | None = None, preload: Sequence[str] = ()
+) -> AbstractContextManager[Executor]:
     """Up to `jobs` processes of this machine, or a scheduler's workers. Raises InputError: none there."""
-    found: Any = LocalProcesses(jobs, preload) if scheduler is None else DaskCluster(scheduler)
-    with closing(found):
-        yield found
+    return closing(LocalProcesses(jobs, preload) if scheduler is None else DaskCluster(scheduler))
 
 
-class LocalProcesses:
+class LocalProcesses(Executor):
     """Up to `jobs` processes of this machine, one thread each. `close` ends them.
 
-    A process that dies (out of memory, a crash in compiled code) leaves its task to a new one, which from the
-    second time on has the machine for itself; after three times it is the task's failure. preload: modules
-    that are loaded once for all processes, where the system can fork.
+    A process that dies (out of memory, a crash in compiled code) leaves its task to a new one, which has the
+    machine for itself; after three times it is the task's failure. preload: modules that are loaded once for
+    all processes, where the system can fork.
     """
 
     def __init__(self, jobs: int, preload: Sequence[str] = ()) -> None:
         if jobs < 1:
             raise ValueError(f"jobs must be at least 1, got {jobs}")
-        self._jobs = jobs
+        super().__init__(futures.ThreadPoolExecutor(jobs), jobs)  # a thread waits for each process
         self._context: ForkServerContext | SpawnContext
         if sys.platform.startswith("linux"):
             # Forked off a process that has loaded the libraries (seconds) and done nothing else; first
@@ -124,65 +177,40 @@ class LocalProcesses:
             )
         else:
             self._context = multiprocessing.get_context("spawn")
-        self._running: dict[Connection, tuple[int, BaseProcess]] = {}
+        self._processes: set[BaseProcess] | None = set()
 
-    @property
-    def width(self) -> int:
-        return self._jobs
+    def _submit(self, task: Task[Any], report: Report) -> futures.Future[Any]:
+        return self.pool.submit(self._compute, task, report)
 
-    def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R | Failure]]:
-        """Position and result of every task, as they finish."""
-        attempts = [0] * len(tasks)
-        waiting = deque(range(len(tasks)))
-        try:
-            while waiting or self._running:
-                while waiting and self._has_room(attempts, waiting[0]):
-                    index = waiting.popleft()
-                    attempts[index] += 1
-                    self._start(index, tasks[index])
-                for connection in [one for one in wait(list(self._running)) if isinstance(one, Connection)]:
-                    index, process = self._running[connection]
-                    share: float | None = None
-                    said: Any = None
-                    with suppress(EOFError, OSError):
-                        share, said = connection.recv()
-                    if share is not None:
-                        if watch is not None:
-                            watch(index, share, said)
-                        continue
-                    del self._running[connection]
-                    connection.close()
-                    process.join()
-                    if said is not None:
-                        yield index, said
-                    elif attempts[index] < MOST_ATTEMPTS:
-                        waiting.append(index)
-                    else:
-                        reason = f"the process computing it died {attempts[index]} times (out of memory?)"
-                        yield index, Failure(reason)
-        finally:
-            self.close()
-
-    def _has_room(self, attempts: Sequence[int], index: int) -> bool:
-        """A task whose process died runs alone, so that there is as much memory for it as can be."""
-        alone = attempts[index] > 0 or any(attempts[other] > 1 for other, _ in self._running.values())
-        return not self._running if alone else len(self._running) < self._jobs
-
-    def _start(self, index: int, task: Task[Any]) -> None:
+    def _compute(self, task: Task[Any], report: Report) -> Any:
+        """In a process of its own. Raises BrokenExecutor where that dies."""
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=_work, args=(theirs, task), daemon=True)
-        with one_thread_each():
-            _begin(process)
-        theirs.close()
-        self._running[ours] = (index, process)
+        with ours:
+            with _ONE_AT_A_TIME, theirs, one_thread_each():
+                if self._processes is None:
+                    raise futures.BrokenExecutor
+                _begin(process)
+                self._processes.add(process)
+            try:
+                while (message := ours.recv())[0] is not None:
+                    report(*message)
+                return message[1]
+            except (EOFError, OSError) as error:
+                raise futures.BrokenExecutor from error
+            finally:
+                process.join()
+                with _ONE_AT_A_TIME:
+                    if self._processes is not None:
+                        self._processes.remove(process)
 
     def close(self) -> None:
         """End whatever is still running."""
-        for connection, (_, process) in self._running.items():
+        with _ONE_AT_A_TIME:
+            ended, self._processes = self._processes or set(), None
+        for process in ended:
             process.terminate()
-            process.join()
-            connection.close()
-        self._running.clear()
+        super().close()
 
 
 def _begin(process: BaseProcess) -> None:
@@ -244,7 +272,7 @@ async def _call(distributed: Any, address: str) -> None:
     await line.close()
 
 
-class DaskCluster:
+class DaskCluster(Executor):
     """The workers behind a scheduler's address. `close` hangs up.
 
     A worker that dies, or is not heard of any more while others are, is the scheduler's business: its task
@@ -264,7 +292,7 @@ class DaskCluster:
         self._distributed = distributed
         self.address = address
         self._last_seen: dict[str, Any] = {}
-        self._heard_s = self._staffed_s = 0.0
+        self._asked_s = self._heard_s = self._staffed_s = 0.0
         # Its own reports of lost connections would bury our one line.
         self._loggers = [
             logger
@@ -278,7 +306,7 @@ class DaskCluster:
         try:
             # First without a client: one that fails to connect is closed when it is collected, at any time
             # and in any thread, and waits forever for the lock of a client that is being made just then.
-            with ThreadPoolExecutor(1) as aside:
+            with futures.ThreadPoolExecutor(1) as aside:
                 aside.submit(asyncio.run, _call(distributed, address)).result()
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # differing versions of packages: the code digest is checked
@@ -294,6 +322,8 @@ class DaskCluster:
                 f"--scheduler {address}: no worker within {WITHOUT_WORKERS_S:.0f} s; start one with "
                 f"`dask worker {address}`"
             ) from error
+        self._ask()
+        super().__init__(self._client.get_executor(pure=False), max(1, len(self._last_seen)))
 
     def close(self) -> None:
         """Leave the cluster and its workers as they are."""
@@ -301,57 +331,36 @@ class DaskCluster:
             self._client.close(timeout=2)
         self._restore()
 
-    @property
-    def width(self) -> int:
-        """How many tasks run at once, as far as is known."""
-        self._ask()
-        return max(1, len(self._last_seen))
-
     def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R | Failure]]:
-        """Position and result of every task, as they finish. Raises StageError when the scheduler is lost or
-        silent, or has no workers."""
-        name = uuid.uuid4().hex  # results of other work on the same cluster are not ours
-        with warnings.catch_warnings():
-            # A large plant travels with its task: nothing is lost with a worker.
-            warnings.simplefilter("ignore")
-            futures = {
-                self._client.submit(run_on_worker, task, key=f"flexlink-{name}-{index}", pure=False): index
-                for index, task in enumerate(tasks)
-            }
-        asked_s = self._heard_s = self._staffed_s = time.monotonic()
-        while futures:
-            # A client that loses its scheduler cancels them all.
-            finished = [future for future in futures if future.done()]
-            if not finished:
-                time.sleep(_LOOK_S)
-            if time.monotonic() - asked_s > _ASK_S:
-                self._ask()
-                asked_s = time.monotonic()
-                missing = ""
-                if asked_s - self._heard_s > SILENT_S:
-                    missing = f"the Dask scheduler at {self.address} has not answered for {SILENT_S:.0f} s"
-                elif self._heard_s - self._staffed_s > WITHOUT_WORKERS_S:
-                    seconds = f"{WITHOUT_WORKERS_S:.0f} s"
-                    missing = f"the Dask cluster at {self.address} had no worker that answers for {seconds}"
-                if missing:
-                    raise StageError(f"{missing}; --resume continues it")
-            if finished:  # what finishes tells of both
-                self._heard_s = self._staffed_s = time.monotonic()
-            for future in finished:
-                yield futures.pop(future), self._result(future)
+        """As of every executor. Raises StageError when the scheduler is lost or silent, or has no workers."""
+        self._asked_s = self._heard_s = self._staffed_s = time.monotonic()
+        for found in super().run(tasks, watch):
+            yield found
+            self._heard_s = self._staffed_s = time.monotonic()  # what finishes tells of both
 
-    def _result(self, future: Any) -> Any:
-        try:
-            return future.result(timeout=CONNECT_S)
-        except self._distributed.KilledWorker:
+    def _see_that_it_lives(self) -> None:
+        if time.monotonic() - self._asked_s < _ASK_S:
+            return
+        self._ask()
+        self._asked_s = time.monotonic()
+        missing = ""
+        if self._asked_s - self._heard_s > SILENT_S:
+            missing = f"the Dask scheduler at {self.address} has not answered for {SILENT_S:.0f} s"
+        elif self._heard_s - self._staffed_s > WITHOUT_WORKERS_S:
+            seconds = f"{WITHOUT_WORKERS_S:.0f} s"
+            missing = f"the Dask cluster at {self.address} had no worker that answers for {seconds}"
+        if missing:
+            raise StageError(f"{missing}; --resume continues it")
+
+    def _failure(self, error: BaseException) -> Failure:
+        if isinstance(error, self._distributed.KilledWorker):
             return Failure("every worker computing it died (out of memory?)")
-        except (self._distributed.client.FutureCancelledError, TimeoutError, OSError):
+        if isinstance(error, (futures.CancelledError, TimeoutError, OSError)):
             raise StageError(
                 f"the Dask scheduler at {self.address} was lost; --resume continues it"
             ) from None
-        except Exception as error:
-            # What goes wrong in a task is its result: this is a worker that cannot even load it.
-            return Failure(f"the worker cannot run flexlink ({type(error).__name__}: {one_line(error)})")
+        # What goes wrong in a task is its result: this is a worker that cannot even load it.
+        return Failure(f"the worker cannot run flexlink ({type(error).__name__}: {one_line(error)})")
 
     def _ask(self) -> None:
         """Note when the scheduler was heard of last, and when it had heard of a worker. A process that is

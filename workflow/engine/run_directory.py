@@ -18,19 +18,19 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from platform import python_version
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from workflow.engine import codec, documents, storage
-from workflow.engine.errors import InputError, naming, shortened
+from workflow.engine.errors import InputError, naming
 from workflow.engine.store import Store
 
 LAYOUT_VERSION = 8  # 8: no design beside it that holds over amplitudes
@@ -67,12 +67,13 @@ class _Manifest(BaseModel):
 
 @dataclass(frozen=True)
 class RunDirectory(Store):
-    """A run's files. Make one with `begin` (to write) or `open` (to read)."""
+    """A run's files. Make one with `begin_run` (to write) or `open` (to read)."""
 
     what = "run"
     manifest_name = "manifest.json"
     folders = ("stages", "figures")
-    own_files = ("report.html", *KEPT_FILES, "config.toml", "config.json")
+    first_files = ("config.toml", "config.json")
+    own_files = ("report.html", *KEPT_FILES)
 
     # -- opening ---------------------------------------------------------------------------------------------
 
@@ -90,10 +91,13 @@ class RunDirectory(Store):
             raise InputError(f"{path}: written by another version of flexlink; start a new run")
         return run
 
-    @classmethod
-    def begin(
-        cls,
-        path: Path,
+    def begun_with(self) -> Mapping[str, Any]:
+        """Configuration and digests of the input files. Raises InputError: of another version, or damaged."""
+        RunDirectory.open(self.path)
+        return {"config": self.config_document(), "inputs": self.manifest()["inputs"]}
+
+    def begin_run(
+        self,
         *,
         config_text: str,
         config: Mapping[str, Any],
@@ -101,19 +105,9 @@ class RunDirectory(Store):
         inputs: Mapping[str, str],
         resume: bool = False,
         replace: bool = False,
-    ) -> RunDirectory:
-        """Create the directory, or with `resume` take up the run that is there, or with `replace` start it
-        afresh.
-
-        `config` is the resolved configuration (JSON-able), `inputs` maps every input file as the user named
-        it to its SHA-256. Hold the lock (`writing`). Raises InputError: see `prepare`; on resuming also a
-        changed configuration (naming the key) or a changed input file (naming the file).
-        """
-        path = Path(path)
-        run = cls(path)
-        if run.prepare(resume=resume, replace=replace):
-            run._check_same(config, inputs)
-            return run
+    ) -> Self:
+        """As `begin`. config: the resolved configuration, JSON-able; inputs: every input file as the user
+        named it, with its SHA-256."""
         manifest = {
             "layout": LAYOUT_VERSION,
             "status": "running",
@@ -125,29 +119,9 @@ class RunDirectory(Store):
             "inputs": dict(inputs),
             "stages": {},
         }
-        # The manifest comes last: a directory without it holds nothing worth keeping and is begun afresh.
-        storage.write_together(
-            {
-                path / "config.toml": config_text.encode(),
-                path / "config.json": storage.json_bytes(config),
-                run.manifest_path: storage.json_bytes(manifest),
-            }
-        )
-        return run
-
-    def _check_same(self, config: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
-        RunDirectory.open(self.path)
-        changed = first_difference(self.config_document(), config)
-        if changed:
-            raise InputError(
-                f"{self.path}: cannot resume, the configuration changed at {changed}; choose another --out"
-            )
-        recorded = self.manifest()["inputs"]
-        for name in sorted({*recorded, *inputs}):
-            if recorded.get(name) != inputs.get(name):
-                raise InputError(
-                    f"{self.path}: cannot resume, the input file {name} changed since the run began"
-                )
+        first = {"config.toml": config_text.encode(), "config.json": storage.json_bytes(config)}
+        begun_with = {"config": config, "inputs": dict(inputs)}
+        return self.begin(begun_with, first, manifest, resume=resume, replace=replace)
 
     # -- places ----------------------------------------------------------------------------------------------
 
@@ -305,30 +279,6 @@ def hash_of(document: Mapping[str, Any]) -> str:
     """SHA-256 of a JSON-able document, independent of the order of its keys."""
     text = json.dumps(codec.pack(document)[0], sort_keys=True, ensure_ascii=False)
     return storage.sha256_of_bytes(text.encode("utf-8"))
-
-
-def first_difference(old: Any, new: Any) -> str | None:
-    """Dotted key of the first difference between two JSON-able values with both values, or None."""
-    before, after = dict(_leaves(old)), dict(_leaves(new))
-    for key in before | after:
-        # repr tells 1 from 1.0 and True, and nan from nan is no difference.
-        if key not in before or key not in after or repr(before[key]) != repr(after[key]):
-            was, now = (shortened(one[key]) if key in one else "absent" for one in (before, after))
-            return f"{key} (was {was}, now {now})"
-    return None
-
-
-def _leaves(value: Any, where: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted key and value of everything in a JSON-able value that has nothing inside."""
-    inner: list[tuple[str, Any]] = []
-    if isinstance(value, Mapping):
-        inner = [(f"{where}.{key}" if where else str(key), item) for key, item in value.items()]
-    elif isinstance(value, list):
-        inner = [(f"{where}[{index}]", item) for index, item in enumerate(value)]
-    if not inner:
-        yield where, value
-    for name, item in inner:
-        yield from _leaves(item, name)
 
 
 def _now() -> str:

@@ -9,25 +9,27 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 from workflow.engine import storage
-from workflow.engine.errors import InputError, cannot, naming
+from workflow.engine.errors import InputError, cannot, naming, shortened
 
 
 @dataclass(frozen=True)
 class Store:
-    """Files of a command in one directory: `what` they are, the name of their manifest, their folders."""
+    """Files of a command in one directory: `what` they are, the name of their manifest, their folders, the
+    files that are there from the beginning, all others."""
 
     path: Path
 
     what: ClassVar[str]
     manifest_name: ClassVar[str]
     folders: ClassVar[tuple[str, ...]] = ()
+    first_files: ClassVar[tuple[str, ...]] = ()
     own_files: ClassVar[tuple[str, ...]] = ()
 
     @property
@@ -36,7 +38,7 @@ class Store:
 
     def own_entries(self) -> Sequence[str]:
         """Names that are ours here, besides manifest and lock."""
-        return (*self.folders, *self.own_files)
+        return (*self.folders, *self.first_files, *self.own_files)
 
     def held(self) -> set[str]:
         """What is in the directory, leftovers of killed writers and the lock aside. Raises InputError where
@@ -91,6 +93,44 @@ class Store:
                         self.discard()
                 raise
 
+    def begun_with(self) -> Mapping[str, Any]:
+        """What a command that continues is held to."""
+        return storage.read_json(self.manifest_path)
+
+    def begin(
+        self,
+        begun_with: Mapping[str, Any],
+        first_files: Mapping[str, bytes] | None = None,
+        manifest: Mapping[str, Any] | None = None,
+        *,
+        resume: bool = False,
+        replace: bool = False,
+    ) -> Self:
+        """Make the directory with its first files and, last, its manifest (default: begun_with), JSON-able;
+        or with `resume` take up what is there. Hold the lock.
+
+        Raises InputError: see `prepare`; on resuming also what differs from what it was begun with.
+        """
+        if not self.prepare(resume=resume, replace=replace):
+            document = begun_with if manifest is None else manifest
+            self.write({**(first_files or {}), self.manifest_name: storage.json_bytes(document)})
+        elif changed := first_difference(self.begun_with(), begun_with):
+            raise InputError(
+                f"{self.path}: cannot resume, changed since the {self.what} began: {changed}; choose another "
+                "--out or start it afresh with --replace"
+            )
+        return self
+
+    def write(self, files: Mapping[str, bytes]) -> None:
+        """All of them or none. Raises InputError."""
+        storage.write_together({self.path / name: content for name, content in files.items()})
+
+    def discard_if_empty(self) -> None:
+        """Take back what `begin` wrote if nothing was added: a corrected input may come. Hold the lock."""
+        empty = {name for name in self.folders if not any((self.path / name).iterdir())}
+        if self.held() <= {*empty, *self.first_files, self.manifest_name}:
+            self.discard()
+
     def prepare(self, *, resume: bool = False, replace: bool = False) -> bool:
         """Make the directory and its folders; with `replace` what is there is deleted first (hold the lock).
 
@@ -126,3 +166,27 @@ class Store:
                 shutil.rmtree(entry)
             else:
                 entry.unlink(missing_ok=True)
+
+
+def first_difference(old: Any, new: Any) -> str | None:
+    """Dotted key of the first difference between two JSON-able values with both values, or None."""
+    before, after = dict(_leaves(old)), dict(_leaves(new))
+    for key in before | after:
+        # repr tells 1 from 1.0 and True, and nan from nan is no difference.
+        if key not in before or key not in after or repr(before[key]) != repr(after[key]):
+            was, now = (shortened(one[key]) if key in one else "absent" for one in (before, after))
+            return f"{key} (was {was}, now {now})"
+    return None
+
+
+def _leaves(value: Any, where: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted key and value of everything in a JSON-able value that has nothing inside."""
+    inner: list[tuple[str, Any]] = []
+    if isinstance(value, Mapping):
+        inner = [(f"{where}.{key}" if where else str(key), item) for key, item in value.items()]
+    elif isinstance(value, list):
+        inner = [(f"{where}[{index}]", item) for index, item in enumerate(value)]
+    if not inner:
+        yield where, value
+    for name, item in inner:
+        yield from _leaves(item, name)

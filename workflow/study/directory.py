@@ -18,10 +18,10 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
-from workflow.engine import storage
 from workflow.engine.errors import InputError
-from workflow.engine.run_directory import RunDirectory, first_difference
+from workflow.engine.run_directory import RunDirectory
 from workflow.engine.store import Store
 from workflow.study.points import Base, Combination, Point
 from workflow.study.task import Done
@@ -33,54 +33,30 @@ LAYOUT_VERSION = 1  # the first; a study of another one is not resumed
 
 @dataclass(frozen=True)
 class StudyDirectory(Store):
-    """Where a study is kept. Make one with `begin`."""
+    """Where a study is kept. Make one with `begin_study`."""
 
     what = "study"
     manifest_name = "study.json"
     folders = ("points", "plants")
-    own_files = ("study.html", "table.csv", "table.json", "pareto.svg", "study.toml")
+    first_files = ("study.toml",)
+    own_files = ("study.html", "table.csv", "table.json", "pareto.svg")
 
-    @classmethod
-    def begin(
-        cls, path: Path, *, text: str, base: Base, resume: bool, replace: bool = False
-    ) -> StudyDirectory:
-        """A new or empty directory, with `resume` the study that is there, with `replace` afresh in its
-        place.
-
-        Raises InputError: not writable, not empty, holding something else, or begun with another base (axes
-        may change: points are found again by their content). With `replace` also where the base
-        is a run of the study that would be deleted, or another process is writing it.
-        """
-        study = cls(Path(path))
+    def begin_study(self, *, text: str, base: Base, resume: bool, replace: bool = False) -> Self:
+        """As `begin`, held to the base: axes may change, points are found again by their content. Raises
+        InputError also with `replace` where the base is a run of the study that would be deleted."""
+        if replace and base.run is not None and self.path.resolve() in base.run.path.resolve().parents:
+            raise InputError(
+                f"{self.path}: --replace would delete the base, {base.run.path}; choose another --out"
+            )
         document = {
             "layout": LAYOUT_VERSION,
             "base": base.config.to_document(),
             "inputs": dict(base.inputs),
             "stages_taken_over": base.digests,
         }
-        if replace and base.run is not None and study.path.resolve() in base.run.path.resolve().parents:
-            raise InputError(
-                f"{study.path}: --replace would delete the base, {base.run.path}; choose another --out"
-            )
-        if study.prepare(resume=resume, replace=replace):
-            changed = first_difference(storage.read_json(study.manifest_path), document)
-            if changed:
-                raise InputError(
-                    f"{path}: cannot resume, the base changed at {changed}; choose another --out or start "
-                    "afresh with --replace"
-                )
-        storage.write_together(
-            {
-                study.path / "study.toml": text.encode(),
-                study.manifest_path: storage.json_bytes(document),
-            }
-        )
-        return study
-
-    def discard_if_empty(self) -> None:
-        """Take back what `begin` wrote if neither a plant nor a point is there: a corrected base may come."""
-        if not (any(self.plants_path.iterdir()) or any(self.points_path.iterdir())):
-            self.discard()
+        first = {"study.toml": text.encode()}
+        self.begin(document, first, resume=resume, replace=replace).write(first)
+        return self
 
     @property
     def plants_path(self) -> Path:
@@ -89,10 +65,6 @@ class StudyDirectory(Store):
     @property
     def points_path(self) -> Path:
         return self.path / "points"
-
-    @property
-    def page_path(self) -> Path:
-        return self.path / "study.html"
 
     def plant(self, point: Point) -> RunDirectory:
         """The run directory of the plant that a point shares."""
@@ -146,8 +118,7 @@ def _plant(point: Point) -> tuple[str, ...]:
 
 
 def _write(run: RunDirectory, point: Point, given: Mapping[str, bytes], done: Done) -> None:
-    begun = RunDirectory.begin(
-        run.path,
+    run.begin_run(
         config_text=f"# {point.name}\n\n{point.config.to_toml()}",
         config=point.config.to_document(),
         seed=point.config.run.seed,
@@ -155,9 +126,9 @@ def _write(run: RunDirectory, point: Point, given: Mapping[str, bytes], done: Do
         resume=True,
     )
     for name, file in {**given, **done.files}.items():
-        begun.write_stage(*os.path.splitext(name), file)
+        run.write_stage(*os.path.splitext(name), file)
     for name, seconds in done.seconds.items():
-        begun.record_stage(name, seconds, done.hashes[name])
+        run.record_stage(name, seconds, done.hashes[name])
 
 
 def _matches(run: RunDirectory, point: Point, stages: tuple[Stage, ...], skip: tuple[str, ...] = ()) -> bool:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from workflow.config.joints_config import AnyConfig, JointsConfig
-from workflow.engine import codec, storage
+from workflow.engine import codec
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import InputError, StageError
 from workflow.engine.executor import Executor, Failure, workers
@@ -63,8 +63,9 @@ def run_study(
     with ExitStack() as stack:
         here = stack.enter_context(workers(processes, preload=["workflow.study.task"]))
         executor = here if scheduler is None else stack.enter_context(workers(processes, scheduler))
-        with StudyDirectory(out).writing(resume=resume, replace=replace):
-            directory = StudyDirectory.begin(out, text=file.text, base=base, resume=resume, replace=replace)
+        directory = StudyDirectory(out)
+        with directory.writing(resume=resume, replace=replace):
+            directory.begin_study(text=file.text, base=base, resume=resume, replace=replace)
             share = _POINT_S * len(points) / executor.width
             progress.plan([("plant", _PLANT_S), ("points", share), ("page", _PAGE_S)])
             work = _Work(directory, base, maker.base_point(), executor, here, progress, len(points))
@@ -211,9 +212,9 @@ def _write_up(directory: StudyDirectory, file: StudyFile, base: Base, rows: Sequ
     files = {f"{name}.{picture.kind}": picture.content for name, picture in page.pictures.items()}
     files["table.csv"] = csv_text(study.axes, rows, view.fronts).encode()
     files["table.json"] = codec.plain_text(view.document).encode()
-    files[directory.page_path.name] = page.html.encode()
-    storage.write_together({directory.path / name: content for name, content in files.items()})
-    return study_summary(view, str(directory.page_path))
+    files["study.html"] = page.html.encode()
+    directory.write(files)
+    return study_summary(view, str(directory.path / "study.html"))
 
 
 def _units(directory: StudyDirectory, config: AnyConfig, rows: Sequence[PointRow]) -> dict[str, str]:

@@ -83,8 +83,7 @@ def run_pipeline(
             ready = kind.stages[0].run(changed(given, read=read)), time.monotonic() - started
     # More threads round otherwise.
     with run.writing(resume=resume, replace=replace), threadpool_limits(1):
-        RunDirectory.begin(
-            run.path,
+        run.begin_run(
             config_text=config_text,
             config=config.to_document(),
             seed=config.run.seed,
@@ -129,8 +128,7 @@ def identify_only(
     inputs = {str(path): storage.sha256_of_file(path) for path in config.input_files}
     stages = kind_of(config).plant
     with given.results.run.writing(replace=True), threadpool_limits(1):
-        RunDirectory.begin(
-            out,
+        given.results.run.begin_run(
             config_text=config_text,
             config=config.to_document(),
             seed=config.run.seed,
