@@ -13,6 +13,7 @@ Neglected: a level that depends on position or load; records start at rest.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -24,10 +25,19 @@ from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.basis.structure import answered, driving_input
 from ident.checks.plausible_modes import LARGEST_DAMPING
+from ident.checks.residual_tests import whiteness_test
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.arm import PRESLIDING, FrictionLaw, less_friction
-from ident.friction.gauss_newton import WORTH, FrictionFit, descended, equations, least_squares, started
+from ident.friction.gauss_newton import (
+    WORTH,
+    FrictionFit,
+    LostError,
+    descended,
+    equations,
+    least_squares,
+    started,
+)
 from ident.friction.in_loop import fit_friction_in_loop, recorded_in_loop
 from ident.one_input import untested_model
 
@@ -53,6 +63,7 @@ def fit_friction(
     options: IdentOptions | None = None,
     *,
     presliding: float = PRESLIDING,
+    free: bool = False,
     progress: Report | None = None,
 ) -> FrictionFit:
     """Law of the friction and the arm behind it.
@@ -60,16 +71,37 @@ def fit_friction(
     records: one input, and the position of the shaft that the friction acts on as the one output; at rest at
     their first sample, unless made in a loop (`ident.friction.in_loop`). options: of the search for the arm's
     poles; integrators at most 1. presliding: expected, in output units, within a factor of twenty (in a loop
-    a share of the motion). Raises ValueError where the shaft does not move, there is more than one integrator
-    or a direct term, or `identify` refuses the records.
+    a share of the motion). free: the arm's free run is asked for, even where it leaves more than noise;
+    otherwise an observer follows such records too. Raises ValueError where the shaft does not move, there is
+    more than one integrator or a direct term, or `identify` refuses the records.
     """
     options = _swinging(options or IdentOptions())
     if recorded_in_loop(records):
         return fit_friction_in_loop(records, options, progress=progress)
-    report = progress or (lambda fraction, message: None)
     for record in records:
         if not np.ptp(record.output[:, 0]) > 0:
             raise ValueError(f"{record.label}: the shaft does not move, so that its friction cannot be seen")
+    report = progress or (lambda fraction, message: None)
+    try:
+        found = _running_free(records, options, presliding, report)
+    except LostError:
+        if free:
+            raise
+        return fit_friction_in_loop(records, options, progress=progress)
+    white = whiteness_test([found.residual(record) for record in records]).passed
+    if found.significant and not (white or free):
+        # What is wrong with arm or law adds up in a free run, whose first order does not reach far then.
+        with suppress(ValueError):
+            followed = fit_friction_in_loop(records, options, progress=progress)
+            found = followed if followed.significant else found
+    report(1.0, "friction identified")
+    return found
+
+
+def _running_free(
+    records: Sequence[Record], options: IdentOptions, presliding: float, report: Report
+) -> FrictionFit:
+    """The fit whose simulation starts at rest with every record and sees nothing of it but the input."""
     report(0.0, "friction: start")
     structure = options.structure()
     level, model = _start(records, options)
@@ -86,10 +118,7 @@ def fit_friction(
         model = untested_model([found.taken_off(record) for record in records], options)
     assert best is not None
     best = descended(best, records, presliding, least, held=False)
-    if best.significant:
-        best = _with_stribeck(best, records, presliding, least)
-    report(1.0, "friction identified")
-    return best
+    return _with_stribeck(best, records, presliding, least) if best.significant else best
 
 
 def _swinging(options: IdentOptions) -> IdentOptions:

@@ -338,6 +338,8 @@ def with_covariance(
         [np.hstack(pair) for pair in zip(blocks, own, strict=True)], targets, known
     )
     scale = np.linalg.norm(triangle, axis=0)
+    if not np.all(scale > 0):  # beside numbers of a simulation that runs away
+        raise LostError
     # The covariance is that of the noise, not of a residual that another step would still lower.
     factor = np.sqrt(rest / n) * solve_triangular(triangle / scale, np.eye(scale.size)) / scale[:, None]
     factor = np.asarray(np.linalg.qr(factor[: blocks[0].shape[1]].T, mode="r")).T

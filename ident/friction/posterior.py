@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 
 from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
-from ident.data.arrays import RealArray, real_rows
+from ident.checks.plausible_modes import LARGEST_DAMPING
+from ident.data.arrays import ComplexArray, RealArray, real_rows
 from ident.data.ellipses import chi2_radius
 from ident.data.record import Record
 from ident.friction.arm import less_friction
@@ -29,6 +30,10 @@ _NOISE_ORDER = 32  # as in `ident.friction.in_loop`
 _SHAPE = 0.05
 # Grid of what is put onto the basis; an ellipse beyond this share of the gain gets a passive arm's sign.
 _FREQUENCIES, _LENGTHS, _LARGEST, _LEVEL = 400, 100, 0.85, 0.95
+# Along so many normals the second order is held: t^2 + t^4 / k^2 is the 95 % radius (of two numbers) where t
+# is that of one.
+_MOST_CURVED, _RANK = 3, 1e-8
+_CURVED = float(chi2.ppf(_LEVEL, 1) / np.sqrt(chi2.ppf(_LEVEL, 2) - chi2.ppf(_LEVEL, 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +109,13 @@ def _behind_observed(
     wider = np.sqrt(heterogeneity(found, records, autoregressive(whitening)))
     by_force = _by_linear_force(records, less, response)
     response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
-    response, factor_of_arm = of_known_sign(response, longest_s=max(r.n_samples for r in less) * model.dt_s)
+    longest_s = max(record.n_samples for record in less) * model.dt_s
+    response, factor_of_arm = of_known_sign(response, longest_s)
+    response = curved(response, model.poles, longest_s)
     both = [0, *([plain.shape[1] - 1] if found.spring is not None else [])]
     level, spread = found.level + float(change[both].sum()), wider * factor[both].sum(axis=0)
     spread = factor_of_arm @ np.append(spread, np.zeros(by_force.shape[1]))
+    spread = np.append(spread, np.zeros(response.covariance_factor.shape[1] - spread.size))
     return BehindFriction(response, response, level, spread, found)
 
 
@@ -134,24 +142,58 @@ def of_known_sign(response: ResponsePosterior, longest_s: float) -> tuple[Respon
     # The mean of what the data leave above zero.
     more_by = float(norm.pdf(value / spread) / norm.cdf(value / spread))
     rho = chi2_radius(_LEVEL) / (value / spread + more_by)
-    gain = rows @ (mean := response.mean + more_by * (factor @ along))
+    gain = rows @ (_mean := response.mean + more_by * (factor @ along))
     moved = rows @ (factor @ along)
     corner = float(omega[np.argmax(np.abs(moved / gain) < np.abs(moved / gain)[0] / np.sqrt(2))])
     slow, fast = np.exp(-response.dt_s * corner * np.array([1.0, 1 + rho]))
     z = np.exp(1j * omega * response.dt_s)
-    poles = response.poles.appended(Poles(np.array([fast])))
+    wanted = [*(rows @ (factor - np.outer(factor @ along, along))).T, moved * (z - slow) / (z - fast)]
+    onto = np.vstack([np.eye(n) - np.outer(along, along), along])
+    return _with_poles(response, Poles(np.array([fast])), omega, gain, wanted), onto
+
+
+def curved(response: ResponsePosterior, poles: Poles, longest_s: float) -> ResponsePosterior:
+    """The same with room for what is of second order where the data leave the arm's force open. poles: of the
+    arm, which the response has twice.
+
+    An arm answers with G = 1 / D, and what is not known of it (damping, stiffness, friction like them) adds
+    to D. To first order ellipses are lines there, as wide as they may be: the truth lies beside them. With x
+    the relative change of G along a normal t, 1 / (1 - x t) = 1 + x t + x^2 t^2 + ...: a column `_CURVED` x^2
+    holds the second term as far as the 95 % interval of t goes. Of the normals that move the gain below the
+    first light mode most; x^2 G stands on poles taken three times.
+    """
+    omega = np.geomspace(1 / (_LENGTHS * longest_s), np.pi / response.dt_s, _FREQUENCIES)
+    rows = response.frequency_rows(omega)
+    gain = rows @ response.mean
+    moved = rows @ response.covariance_factor / gain[:, None]
+    modes = poles.omega_rad_s(response.dt_s)[poles.zeta() < LARGEST_DAMPING]
+    low = real_rows(moved[omega < np.min(modes, initial=omega[-1])])
+    along = np.linalg.svd(low, full_matrices=False)[2][:_MOST_CURVED]
+    more = _CURVED * gain[:, None] * (moved @ along.T) ** 2
+    return _with_poles(response, poles, omega, gain, [*(gain[:, None] * moved).T, *more.T], _RANK)
+
+
+def _with_poles(
+    response: ResponsePosterior,
+    poles: Poles,
+    omega: RealArray,
+    gain: ComplexArray,
+    columns: Sequence[ComplexArray],
+    rank: float | None = None,
+) -> ResponsePosterior:
+    """On more poles, which take up these columns (F,) of the factor, as of the gain. rank: singular values of
+    the basis below this share are left out, for of a kernel's many taps some do nearly the same."""
+    size = response.mean.size + poles.order
     more = replace(
         response,
-        poles=poles,
-        mean=np.zeros(response.mean.size + 1),
-        covariance_factor=np.zeros((response.mean.size + 1, 1)),
+        poles=response.poles.appended(poles),
+        mean=np.zeros(size),
+        covariance_factor=np.zeros((size, 1)),
     )
-    wanted = [gain, *(rows @ (factor - np.outer(factor @ along, along))).T, moved * (z - slow) / (z - fast)]
     basis = real_rows(more.frequency_rows(omega) / gain[:, None])
-    found = np.linalg.lstsq(basis, real_rows(np.column_stack(wanted) / gain[:, None]), rcond=None)[0]
-    onto = np.vstack([np.eye(n) - np.outer(along, along), along])
-    mean, factor = np.asarray(found[:, 0], np.float64), np.asarray(found[:, 1:], np.float64)
-    return replace(more, mean=mean, covariance_factor=factor), onto
+    wanted = real_rows(np.column_stack([gain, *columns]) / gain[:, None])
+    found = np.asarray(np.linalg.lstsq(basis, wanted, rcond=rank)[0], np.float64)
+    return replace(more, mean=found[:, 0], covariance_factor=found[:, 1:])
 
 
 def _by_linear_force(

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
+import control
 import numpy as np
 import pytest
 
 from benchmarks.at_an_amplitude import recorded as small_and_large
 from benchmarks.without_friction import with_friction
 from ident import GobfModel, IdentOptions, Poles, Record, Structure, identify
-from ident.data.arrays import ComplexArray, RealArray
+from ident.basis.posterior import ResponsePosterior
+from ident.data.arrays import ComplexArray, RealArray, real_rows
 from ident.friction import (
     EquivalentFriction,
     FrictionFit,
@@ -25,6 +28,7 @@ from ident.friction import (
 from ident.friction.amplitude import damped_poles, more_at_a_strong_line
 from ident.friction.arm import FrictionLaw, SteppedArm
 from ident.friction.gauss_newton import linearised
+from ident.friction.posterior import curved
 from ident.uncertainty.embedding import tangent
 from plant import parse_effect, simulate
 from plant.excitation import multisine, multisine_lines
@@ -406,3 +410,62 @@ def test_a_shaft_that_the_records_do_not_show_is_refused() -> None:
     tip = recorded(0.1, 5, output=1)
     with pytest.raises(ValueError, match=r"'y' is no position of the driven shaft, or .* degrees"):
         refuse_unseen_shaft(fit_friction(tip, OPTIONS), tip)
+
+
+def two_inertias(seed: int, n: int = 5000) -> tuple[Record, Callable[[RealArray], ComplexArray]]:
+    """Motor angle under a multisine torque, friction at motor and load, by midpoint steps that share nothing
+    with the product; and the response without friction, sampled with a hold."""
+    rng, dt_s, fine = np.random.default_rng(seed), 1e-3, 10
+    motor, load, stiffness, damping, viscous = 7.8e-5, 7.1e-5, 6.5, 4.8e-4, 2.5e-4
+    pull = np.array([stiffness, damping, -stiffness, -damping])
+    slopes = np.zeros((4, 4))
+    slopes[0, 1] = slopes[2, 3] = 1.0
+    slopes[1], slopes[3] = -pull / motor, pull / load
+    slopes[1, 1] -= viscous / motor
+    lines = np.arange(1, n // 10)
+    angle = 2 * np.pi * np.outer(np.arange(n), lines) / n + rng.uniform(0, 2 * np.pi, lines.size)
+    torque_Nm = 0.06 * np.sqrt(2 / lines.size) * np.cos(angle).sum(axis=1)
+    state, angles, rub = np.zeros(4), np.zeros(n), np.array([0, 2.9e-3 / motor, 0, 1.3e-3 / load])
+    for k, torque in enumerate(torque_Nm):
+        angles[k], push = round(state[0], 5), np.array([0, torque / motor, 0, 0])
+        for _ in range(fine):
+            middle = state
+            for part in (0.5, 1.0):
+                rate = slopes @ middle + push - rub * np.tanh(100 * middle)
+                middle = state + part * dt_s / fine * rate
+            state = middle
+    arm = control.ss(slopes, [[0], [1 / motor], [0], [0]], [[1, 0, 0, 0]], 0).sample(dt_s)
+    record = Record(f"log{seed}", torque_Nm[:, None], angles[:, None], dt_s, ("torque_Nm",), ("angle_rad",))
+    return record, lambda omega: np.array([arm(np.exp(1j * one * dt_s)) for one in omega])
+
+
+@pytest.mark.slow
+def test_an_observer_follows_what_a_free_run_does_not_explain():
+    """Friction at both ends, which a free run with friction at the motor takes for another arm."""
+    record, response = two_inertias(1)
+    found = fit_friction([record], IdentOptions(integrators=1))
+    assert found.in_loop
+    assert found.law.level == pytest.approx(2.9e-3, rel=0.05)
+    assert found.beyond == pytest.approx(1.3e-3, rel=0.05)
+    omega = np.geomspace(2 * np.pi, 200 * np.pi, 100)
+    ellipses = without_friction([record], found).response.at(omega, 0.95)
+    assert np.mean(ellipses.contains(response(omega))) >= 0.93
+
+
+def test_ellipses_bend_where_the_data_leave_the_force_open():
+    """1 / (J s^2 + c s) with c known to a third: to first order 95 % of c lie on a line beside the truth."""
+    dt_s, wide = 0.01, 0.3
+    omega = np.geomspace(0.05, 50.0, 200)
+    arms = {c: control.tf([1], [1, c, 0]).sample(dt_s) for c in (1.0, 1 - 1.9 * wide, 1 + 1.9 * wide)}
+    truth = {c: np.array([arm(np.exp(1j * one * dt_s)) for one in omega]) for c, arm in arms.items()}
+    poles = Poles(np.array([np.exp(-dt_s)]))
+    size = 2 + 20
+    nothing = ResponsePosterior(poles.doubled(), np.zeros(size), np.zeros((size, 1)), dt_s, 20, integrators=1)
+    rows = nothing.frequency_rows(omega) / truth[1.0][:, None]
+    change = -wide * 1j * omega * truth[1.0]
+    mean, column = np.linalg.lstsq(real_rows(rows), real_rows(np.column_stack([0 * omega + 1, change])))[0].T
+    straight = replace(nothing, mean=mean, covariance_factor=column[:, None] + 1e-6 * np.eye(size))
+    bent = curved(straight, poles, 100.0)
+    for c, response in truth.items():
+        assert c == 1 or np.mean(straight.at(omega, 0.95).contains(response)) < 0.5
+        assert np.mean(bent.at(omega, 0.95).contains(response)) > 0.97

@@ -88,7 +88,13 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
     if config.friction_identified:
         with naming(f"channel {shaft.label!r}"):
             progress = partial(stage.progress.update, "identify", 0.0)
-            friction = shaft_friction(records.fitted(shaft), shaft, lambda done, what: progress(what))
+            others = [one for one in config.channels if one is not shaft]
+            friction = shaft_friction(
+                records.fitted(shaft),
+                shaft,
+                lambda done, what: progress(what),
+                free=any(one.uncertainty.friction_identified for one in others),
+            )
     in_loop = isinstance(config.source, FileSource) and (
         config.closed_loop_data.stated or made_in_loop(records.fitted(shaft))
     )
@@ -124,9 +130,12 @@ def shaft_friction(
     measured: Sequence[Record],
     channel: Channel,
     report: Report,
+    *,
+    free: bool = False,
 ) -> FrictionFit:
-    """Coulomb friction of the shaft whose position a channel measures."""
-    found = fit_friction(measured, channel.identification, progress=report)
+    """Coulomb friction of the shaft whose position a channel measures; free: as of `fit_friction`, for other
+    outputs behind the same friction."""
+    found = fit_friction(measured, channel.identification, free=free, progress=report)
     refuse_unseen_shaft(found, measured)
     return found
 

@@ -60,9 +60,6 @@ _SHARE_INSIDE = 0.9  # of the ellipses: below it a nominal is no member of the s
 # A model explains nothing whose best fit to a log is below this, where the sensor's noise leaves a third of
 # the rest at most (right ones had 90 % and more, wrong ones 75 % and less).
 _EXPLAINED, _BEYOND_NOISE = 80.0, 3.0
-# So does one whose friction has a standard deviation above both of these shares, of its level and of the rms
-# command: wrong levels, and logs behind a filter, whose ellipses missed the machine (docs/decisions.md).
-_UNTOLD, _UNTOLD_OF_COMMAND = 0.05, 0.004
 
 N_BANDS = 6
 """Bands of equal width on the log axis in which radii and scatter are summarised."""
@@ -163,8 +160,7 @@ def uncertainty_of(
             and FindingKind.ANSWERS_AT_ONCE in {warning.kind for warning in result.identification.warnings}
             and precedes_command(friction, measured, channel.identification)
         )
-        rms = np.sqrt(np.mean(np.concatenate([record.input for record in measured]) ** 2))
-        refuse_unexplained(result, found.agreement, friction, rms_input=float(rms), late=late)
+        refuse_unexplained(result, found.agreement, friction, late=late)
     # In a loop friction biases damping and poles, also where a noise model leaves white residuals.
     rubs = friction is None and result.closed_loop is not None and not white
     advice = residual_advice(
@@ -246,12 +242,11 @@ def refuse_unexplained(
     agreement: NominalAgreement,
     friction: FrictionFit | None,
     *,
-    rms_input: float,
     late: bool = False,
 ) -> None:
     """Raises ValueError, one line, where the model of logs made in a loop explains nothing, so that no number
-    of it means anything. friction: of the fit, None where none was identified; rms_input: of the
-    commands; late: the motion comes before its command."""
+    of it means anything. friction: of the fit, None where none was identified; late: the motion comes
+    before its command."""
     found = result.identification
     best = max(*found.fit_percent.tolist(), *(fit.fit_percent for fit in result.fresh), 0.0)
     why = ""
@@ -263,13 +258,6 @@ def refuse_unexplained(
         why = f"its best fit to one is {best:.0f} %, and it leaves {times:.0f} times the sensor's noise"
     elif late:
         why = "the motion comes before its command, as if that was logged late"
-    elif friction is not None and friction.level_std > max(
-        _UNTOLD * friction.level, _UNTOLD_OF_COMMAND * rms_input
-    ):
-        known = (
-            f"twice its standard deviation is {200 * friction.level_std / rms_input:.2g} % of the rms command"
-        )
-        why = f"its friction cannot be told from slow poles ({known}), as behind a filter"
     if why:
         raise ValueError(said("unexplained_logs", result.output, why, friction is not None))
 

@@ -1,0 +1,127 @@
+"""Machines of another simulator with their truth: `flexlink init` and `flexlink run`, nothing typed.
+
+    python -m benchmarks.machines_with_truth [--machines DIR] [--only NAME,NAME] [--keep DIR]
+
+DIR holds a folder a machine: run*.csv and truth.json. What is printed of each: the share of the frequencies
+that its command excites (above 1e-3 of the largest power density) at which the 95 % ellipse holds the true
+response without friction; friction and modes with their intervals; whether the certified loop keeps its
+modulus margin with the true response (between the truth's frequencies it is interpolated).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import scipy.signal
+
+from benchmarks.harness import Print, main
+
+_RADIUS_2 = -2 * np.log(0.05)  # chi-square of two degrees of freedom, 95 %
+
+
+def answered(folder: Path, work: Path) -> tuple[float, int, str]:
+    """Seconds, exit code and last line of both commands."""
+    logs = [str(path) for path in sorted(folder.glob("run*.csv"))]
+    config = str(work / "my.toml")
+    calls = [
+        ["init", *logs, "--out", config, "--replace"],
+        ["run", "--config", config, "--out", str(work / "run"), "--replace", "--json"],
+    ]
+    begun, line = time.monotonic(), ""
+    for call in calls:
+        ended = subprocess.run(
+            [sys.executable, "-m", "flexlink", *call], capture_output=True, text=True, check=False
+        )
+        said = [x for x in ended.stderr.splitlines() if x.strip() and not re.match(r"flexlink: \d+ s:", x)]
+        line = said[-1] if said else ""
+        if ended.stdout.lstrip().startswith("{"):
+            line = str(json.loads(ended.stdout).get("verdict"))
+        if ended.returncode:
+            break
+    return time.monotonic() - begun, ended.returncode, line
+
+
+def told(folder: Path, work: Path) -> list[str]:
+    """What the run's model and certificate say, beside the truth."""
+    from workflow.engine.run_directory import RunDirectory
+    from workflow.tasks.results import RunResults
+
+    truth = json.loads((folder / "truth.json").read_text())
+    run, said = RunDirectory(work / "run"), list[str]()
+    if run.stage_file("uncertainty") is None:
+        return ["no ellipses"]
+    results = RunResults(run)
+    channel, spread = results.identify.channels[0], results.uncertainty.channels[0]
+    response = truth["friction_free_response"]
+    omega = np.array(response["omega_rad_s"])
+    g = np.array(response["real"]) + 1j * np.array(response["imag"])
+    records = results.records.of_role("estimation")
+    power = np.zeros(omega.size)
+    for item in records:
+        u, dt = item.record.input[:, 0], item.record.dt_s
+        f, own = scipy.signal.welch(u - u.mean(), 1 / dt, nperseg=min(u.size, round(4 / dt)))
+        power = power + np.interp(omega / (2 * np.pi), f, own, right=0.0)
+    excited = power > 1e-3 * power.max()
+    ellipses = spread.posterior.at(omega[excited], spread.level)
+    apart = np.stack([(g[excited] - ellipses.centre).real, (g[excited] - ellipses.centre).imag], axis=1)
+    distance = np.einsum("fi,fij,fj->f", apart, np.linalg.pinv(ellipses.covariance), apart)
+    low, high = omega[excited][[0, -1]] / (2 * np.pi)
+    said.append(f"ellipses {np.mean(distance <= _RADIUS_2):.0%} of {low:.2f} to {high:.1f} Hz")
+    width = np.sqrt(np.trace(ellipses.covariance, axis1=1, axis2=2)) / np.abs(g[excited])
+    error = np.abs(g[excited] - ellipses.centre) / np.abs(g[excited])
+    said.append(f"error {np.median(error):.1%}, width {np.median(width):.1%}")
+    if results.identify.friction is not None:
+        found = results.identify.friction
+        true = sum(truth["coulomb_at_each_inertia_in_command_units"])
+        said.append(f"friction {found.level:.4g} ± {found.level_std:.2g} (Coulomb {true:.4g})")
+    modes = [
+        f"{mode.frequency_Hz:.2f} ({mode.damping:.3f})" for mode in channel.modes if channel.is_mode(mode)
+    ]
+    true_modes = [
+        f"{f:.2f} ({z:.3f})" for f, z in zip(truth["modes_hz"], truth["mode_dampings"], strict=True)
+    ]
+    said.append(f"modes {', '.join(modes) or 'none'} Hz (true {', '.join(true_modes)})")
+    law, verdict = results.design.controller, results.certify.certificate
+    if law is not None and verdict is not None:
+        z = np.exp(1j * omega * law.dt_s)
+        k = np.array(
+            [(law.C @ np.linalg.solve(x * np.eye(law.order) - law.A, law.B) + law.D).item() for x in z]
+        )
+        nearest, stated = np.min(np.abs(1 + k * g)), verdict.plants[0].worst_margins.modulus
+        said.append(f"modulus margin {nearest:.3f}, stated {stated:.3f}")
+        if nearest < 0.99 * stated:
+            said.append("VIOLATED")
+    return said
+
+
+def run(
+    out: Print, *, machines: str = "../shared/machines", only: str = "", keep: str = "", jobs: int = 2
+) -> None:
+    """A line a machine."""
+    folders = [path.parent for path in sorted(Path(machines).glob("*/truth.json"))]
+    folders = [path for path in folders if not only or path.name in only.split(",")]
+    with tempfile.TemporaryDirectory() as scratch, ThreadPoolExecutor(jobs) as pool:
+
+        def one(folder: Path) -> tuple[tuple[float, int, str], list[str]]:
+            work = Path(keep or scratch).absolute() / folder.name
+            work.mkdir(parents=True, exist_ok=True)
+            return answered(folder.absolute(), work), told(folder, work)
+
+        for folder, ((seconds, code, line), said) in zip(folders, pool.map(one, folders), strict=True):
+            out(f"{folder.name}: exit {code}, {seconds:.0f} s, {'; '.join(said)}; {line}")
+    out(f"CPU {resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime:.0f} s")
+
+
+if __name__ == "__main__":
+    main(run, seeds="none")
