@@ -189,7 +189,12 @@ def _root(
 
 
 @app.command(short_help="Everything, from records to report.html.")
+@with_fields(reading=_READING)
 def run(
+    log: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Logs, in place of --config: what `flexlink init` writes of them is run."),
+    ] = None,
     config: Config = None,
     out: Annotated[
         Path | None, typer.Option(help="Run directory, new or empty [default: runs/<name>-<date>-<time>]")
@@ -201,15 +206,23 @@ def run(
     time_limit: TimeLimit = None,
     quiet: Quiet = False,
     as_json: Json = False,
+    **of_fields: Any,
 ) -> None:
     """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
-    need(config)
+    need(config, *(log or []))
+    given = [option_name(name) for name, value in of_fields.items() if value not in (None, False, [])]
+    if given and not log:
+        raise InputError(
+            f"{given[0]} says how logs are read: name them, as in flexlink run LOG... {given[0]}"
+        )
     with _watched(quiet) as progress:
         from workflow.commands.run import run_from_files  # a word comes first: it takes its time to load
 
         summary = run_from_files(
             config,
             out,
+            log or (),
+            _reading(of_fields),
             resume=resume,
             replace=replace,
             c_code=_c_code(c_prefix, c_float),

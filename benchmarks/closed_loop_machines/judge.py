@@ -261,9 +261,8 @@ def _model(one: Machine, truth: dict[str, Any], run: Path, bla: int) -> dict[str
     if truth["unstable_1_s"]:
         growth = [pole for pole, _ in channel.unstable_poles]
         found["unstable_error"] = growth[0] / truth["unstable_1_s"][0] - 1 if len(growth) == 1 else None
-    about = spread.behind_friction.posterior if spread.behind_friction else spread.posterior
     omega = spread.frequency.omega_rad_s
-    ellipses = about.at(omega, spread.level)
+    ellipses = spread.posterior.at(omega, spread.level)
     a, b, c = (np.array(truth[k]) for k in "ABC")
     excited = _excited(one, omega)
     inside = _holds(ellipses, response(a, b, c, omega, one.plant.dt_s), 0.0)

@@ -158,19 +158,28 @@ def curved(response: ResponsePosterior, poles: Poles, longest_s: float) -> Respo
 
     An arm answers with G = 1 / D, and what is not known of it (damping, stiffness, friction like them) adds
     to D. To first order ellipses are lines there, as wide as they may be: the truth lies beside them. With x
-    the relative change of G along a normal t, 1 / (1 - x t) = 1 + x t + x^2 t^2 + ...: a column `_CURVED` x^2
-    holds the second term as far as the 95 % interval of t goes. Of the normals that move the gain below the
-    first light mode most; x^2 G stands on poles taken three times.
+    the relative change of G along a normal t, 1 / (1 - x t) is 1 + x t + x^2 t^2 + ...: a column `_CURVED`
+    x^2 G holds the second term as far as the 95 % interval of t goes. Of the normals that move the gain below
+    the first light mode most, and there only; x^2 G stands on poles taken three times.
     """
-    omega = np.geomspace(1 / (_LENGTHS * longest_s), np.pi / response.dt_s, _FREQUENCIES)
+    omega = _frequencies(response, longest_s)
     rows = response.frequency_rows(omega)
-    gain = rows @ response.mean
-    moved = rows @ response.covariance_factor / gain[:, None]
+    gain, moved = rows @ response.mean, rows @ response.covariance_factor
     modes = poles.omega_rad_s(response.dt_s)[poles.zeta() < LARGEST_DAMPING]
-    low = real_rows(moved[omega < np.min(modes, initial=omega[-1])])
-    along = np.linalg.svd(low, full_matrices=False)[2][:_MOST_CURVED]
-    more = _CURVED * gain[:, None] * (moved @ along.T) ** 2
-    return _with_poles(response, poles, omega, gain, [*(gain[:, None] * moved).T, *more.T], _RANK)
+    low = omega < np.min(modes, initial=omega[-1])
+    change = np.where(low[:, None], moved / gain[:, None], 0.0)
+    along = np.linalg.svd(real_rows(change), full_matrices=False)[2][:_MOST_CURVED]
+    more = _CURVED * gain[:, None] * (change @ along.T) ** 2
+    return _with_poles(response, poles, omega, gain, [*moved.T, *more.T], _RANK)
+
+
+def _frequencies(response: ResponsePosterior, longest_s: float) -> RealArray:
+    """(F,) [rad/s], as dense as what a kernel does between them."""
+    nyquist = np.pi / response.dt_s
+    slow = np.geomspace(1 / (_LENGTHS * longest_s), nyquist, _FREQUENCIES)
+    return np.union1d(
+        slow, nyquist * np.arange(1, 2 * response.fir_length + 1) / (2 * response.fir_length + 1)
+    )
 
 
 def _with_poles(

@@ -30,6 +30,7 @@ from workflow.tasks.records import refuse_constant_input, with_common_sampling_t
 from workflow.text.templates import RunSummary, environment, rows_of
 
 if TYPE_CHECKING:
+    from workflow.config.run_config import RunConfig
     from workflow.tasks.draft import Draft
 
 _SHORT = 60  # letters of a log's name that leave room for a command in a line
@@ -57,36 +58,16 @@ def init(
     storage.refuse_in_the_way(logs, [("--out", out)])
     if out.is_file() and not replace_file:
         raise InputError(f"{out} exists: take another --out, or --replace to write over it")
-    stated = stated or Reading()
-    read = read_channel("init", logs, stated)
-    # A log that is refused does not wait for what looks at it: that takes seconds to load.
-    from workflow.config.run_config import RunConfig
-    from workflow.config.settings import check
-    from workflow.tasks.draft import draft_of
-
-    output, unit_of = read.roles.output, read.unit_of
-    with naming("init"):
-        draft = draft_of(
-            read.records, position=is_position(output, unit_of[output]), limit=stated.input_limit
-        )
-    scale, units = dict(stated.scale), dict(stated.units)
-    if draft.look.turned:
-        name = read.roles.input
-        scale[name] = -scale.get(name, 1.0)
-        units |= {name: unit_of[name]} if unit_of[name] else {}
-    doubts = distinct([doubt for record in read.records for doubt in record.doubts])
-    found = Found(tuple(logs), shlex.quote(out.name), stated, read, scale, units, draft, doubts)
-    text = configuration(found, _entries(read.tables, out, draft))
-    config = check(RunConfig, tomllib.loads(text), source=str(out), context={"base": out.absolute().parent})
+    config, text, found = drafted("init", logs, out, stated)
     storage.write_text(out, text)
-    look = draft.look
+    look, draft = found.draft.look, found.draft
     return RunSummary(
         title=str(out),
         sections=rows_of("summary/init.j2", found=found, config=config),
         numbers={
             "configuration": config.to_document(),
             "seen": {
-                "roles": codec.plain(read.roles),
+                "roles": codec.plain(found.read.roles),
                 "told_rad_s": codec.plain(look.told_rad_s),
                 "first_mode": codec.plain(look.mode),
                 "notch_rad_s": look.notch,
@@ -99,6 +80,35 @@ def init(
         },
         verdict=f"flexlink run --config {shlex.quote(str(out))}",
     )
+
+
+def drafted(
+    command: str, logs: Sequence[Path], out: Path, stated: Reading | None
+) -> tuple[RunConfig, str, Found]:
+    """The configuration of one channel of these logs, to stand at `out`, its text, and what was seen; nothing
+    is written. command: what a complaint says to type again. Raises InputError, one line."""
+    stated = stated or Reading()
+    read = read_channel(command, logs, stated)
+    # A log that is refused does not wait for what looks at it: that takes seconds to load.
+    from workflow.config.run_config import RunConfig
+    from workflow.config.settings import check
+    from workflow.tasks.draft import draft_of
+
+    output, unit_of = read.roles.output, read.unit_of
+    with naming(command):
+        draft = draft_of(
+            read.records, position=is_position(output, unit_of[output]), limit=stated.input_limit
+        )
+    scale, units = dict(stated.scale), dict(stated.units)
+    if draft.look.turned:
+        name = read.roles.input
+        scale[name] = -scale.get(name, 1.0)
+        units |= {name: unit_of[name]} if unit_of[name] else {}
+    doubts = distinct([doubt for record in read.records for doubt in record.doubts])
+    found = Found(tuple(logs), shlex.quote(out.name), stated, read, scale, units, draft, doubts)
+    text = configuration(found, _entries(read.tables, out, draft))
+    config = check(RunConfig, tomllib.loads(text), source=str(out), context={"base": out.absolute().parent})
+    return config, text, found
 
 
 @dataclass(frozen=True, eq=False)

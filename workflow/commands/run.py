@@ -25,12 +25,15 @@ from workflow.engine.run_directory import RunDirectory, default_directory
 from workflow.tasks.records import read_records
 
 if TYPE_CHECKING:
+    from workflow.commands.logs import Reading
     from workflow.text.templates import RunSummary
 
 
 def run_from_files(
     config_path: Path | None,
     out: Path | None,
+    logs: Sequence[Path] = (),
+    stated: Reading | None = None,
     *,
     resume: bool = False,
     replace: bool = False,
@@ -39,16 +42,26 @@ def run_from_files(
 ) -> RunSummary:
     """Load a configuration and run it; see `run_pipeline`.
 
-    Without `config_path` the built-in default arm is run, or on resuming the configuration kept in `out`;
+    Of logs the configuration is drafted as `flexlink init` does, as stated, and kept in `out`. Without
+    `config_path` or logs the built-in default arm is run, or on resuming the configuration kept in `out`;
     without `out` a new directory below runs/ is made. Raises InputError.
     """
+    if logs and config_path is not None:
+        raise InputError("give logs or --config FILE, which names its logs, not both")
     if (resume or replace) and out is None:
         raise InputError(
             f"{'--resume' if resume else '--replace'} needs --out DIR, the directory of the earlier run"
         )
     config: AnyConfig
     note = ""
-    if config_path is not None:
+    if logs:
+        from workflow.commands.init import drafted
+
+        out = out if out is not None else default_directory(logs[0].stem)
+        RunDirectory(out).refuse_unless_free(resume=resume, replace=replace)
+        # Paths in it count from where it will stand.
+        config, text, _ = drafted("run", logs, out / "config.toml", stated)
+    elif config_path is not None:
         config, text = load_any(config_path)
     elif resume and out is not None and (out / "manifest.json").is_file():
         from workflow.tasks.pipeline import any_config_of
@@ -72,7 +85,7 @@ def run_from_files(
         config,
         place,
         config_text=text,
-        called=str(config_path or "default arm"),
+        called=str(config_path or ("logs" if logs else "default arm")),
         page=page_of(config),
         resume=resume,
         replace=replace,
