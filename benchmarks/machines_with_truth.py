@@ -1,4 +1,4 @@
-"""Machines of another simulator with their truth: `flexlink init` and `flexlink run`, nothing typed.
+"""Machines of another simulator with their truth: `flexlink run LOG...`, nothing typed.
 
     python -m benchmarks.machines_with_truth [--machines DIR] [--only NAME,NAME] [--keep DIR]
 
@@ -19,10 +19,8 @@ import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pandas as pd
 import scipy.signal
 
 from benchmarks.harness import Print, main
@@ -31,24 +29,17 @@ _RADIUS_2 = -2 * np.log(0.05)  # chi-square of two degrees of freedom, 95 %
 
 
 def answered(folder: Path, work: Path) -> tuple[float, int, str]:
-    """Seconds, exit code and last line of both commands."""
+    """Seconds, exit code and last line."""
     logs = [str(path) for path in sorted(folder.glob("run*.csv"))]
-    config = str(work / "my.toml")
-    calls = [
-        ["init", *logs, "--out", config, "--replace"],
-        ["run", "--config", config, "--out", str(work / "run"), "--replace", "--json"],
-    ]
-    begun, line = time.monotonic(), ""
-    for call in calls:
-        ended = subprocess.run(
-            [sys.executable, "-m", "flexlink", *call], capture_output=True, text=True, check=False
-        )
-        said = [x for x in ended.stderr.splitlines() if x.strip() and not re.match(r"flexlink: \d+ s:", x)]
-        line = said[-1] if said else ""
-        if ended.stdout.lstrip().startswith("{"):
-            line = str(json.loads(ended.stdout).get("verdict"))
-        if ended.returncode:
-            break
+    call = ["run", *logs, "--out", str(work / "run"), "--replace", "--json"]
+    begun = time.monotonic()
+    ended = subprocess.run(
+        [sys.executable, "-m", "flexlink", *call], capture_output=True, text=True, check=False
+    )
+    said = [x for x in ended.stderr.splitlines() if x.strip() and not re.match(r"flexlink: \d+ s:", x)]
+    line = said[-1] if said else ""
+    if ended.stdout.lstrip().startswith("{"):
+        line = str(json.loads(ended.stdout).get("verdict"))
     return time.monotonic() - begun, ended.returncode, line
 
 

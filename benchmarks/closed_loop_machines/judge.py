@@ -1,6 +1,6 @@
 """What came out for one machine, against its truth. Nothing of the product computes here; it is only read.
 
-Ran: `flexlink init LOGS --out my.toml` and `flexlink run --config my.toml --json`, no edit.
+Ran: `flexlink run LOGS --out run --json`, nothing typed.
 
 Settles, 20 runs on the nonlinear machine: from rest at a start between the 5th and 95th percentile of the
 recorded output, half a second later a step of 10 to 50 % of that range into it (through the reference filter
@@ -53,15 +53,13 @@ _PROGRESS = re.compile(r"flexlink: \d+ s: ")
 def judged(one: Machine, folder: Path, bla: int = 0, judge_only: bool = False) -> dict[str, Any]:
     """Everything the table needs, also written to FOLDER/NAME/judged.json. judge_only: runs are there."""
     work = folder / one.name
-    config, run, told = work / "my.toml", work / "run", work / "told.json"
+    run, told = work / "run", work / "told.json"
     if not judge_only:
         logs = write(one, folder / "logs", folder / "truth")
         work.mkdir(parents=True, exist_ok=True)
         begin = _cpu_s()
-        code, text, lines = _flexlink("init", *map(str, logs), "--out", str(config), "--replace")
-        if code == 0:
-            words = "--config", str(config), "--out", str(run), "--replace", "--json"
-            code, text, lines = _flexlink("run", *words)
+        words = "--out", str(run), "--replace", "--json"
+        code, text, lines = _flexlink("run", *map(str, logs), *words)
         answer = json.loads(text) if text.lstrip().startswith("{") else {}
         line = answer.get("verdict") or " | ".join(lines[-3:])
         row = {"kind": one.kind, "seed": one.seed, "code": code, "cpu_s": _cpu_s() - begin, "line": line}
@@ -82,7 +80,7 @@ def followed(one: Machine, folder: Path, line: str) -> bool | None:
     none. A reference that is planned is played on the machine, its last record validates; of several steps
     that one is taken."""
     work, logs = folder / one.name, sorted((folder / "logs" / one.name).glob("*"))
-    config, run, steps = work / "my.toml", work / "followed", work / "played"
+    config, run, steps = work / "run" / "config.toml", work / "followed", work / "played"
     if "flexlink excite --closed-loop" in line:
         asked = [] if one.kept else ["--rms", f"{0.5 * one.draft.motion_rad * one.plant.scale:.4g}"]
         plan = work / "plan"
@@ -104,13 +102,15 @@ def followed(one: Machine, folder: Path, line: str) -> bool | None:
     elif meets := re.search(r"(\w+) = ([\d.e+-]+) would meet it", line):
         config = work / "followed.toml"
         key = re.escape(meets[1])
-        text = re.sub(rf"(?m)^{key} = \S+", f"{meets[1]} = {meets[2]}", (work / "my.toml").read_text())
+        text = re.sub(
+            rf"(?m)^{key} = \S+", f"{meets[1]} = {meets[2]}", (work / "run" / "config.toml").read_text()
+        )
         if meets[1] == "bandwidth_rad_s":  # the value that was left open is now stated
             text = re.sub(r"(?m)^lowest_bandwidth_rad_s = .*\n", "", text)
         config.write_text(text)
     elif "controller_order" in line:
         config = work / "followed.toml"
-        text = (work / "my.toml").read_text()
+        text = (work / "run" / "config.toml").read_text()
         config.write_text(text.replace("controller_order = 5", "controller_order = 8"))
     else:
         return None

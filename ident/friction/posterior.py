@@ -41,7 +41,7 @@ class BehindFriction:
     """What records say of an arm and of the friction at its shaft, together.
 
     response: from the input to an output, as if there were no dry friction; shaft: the same of the shaft's
-    position; level + level_factor (P',) times unit normals: level of the friction. All three stand on the
+    position, to first order; level + level_factor (P',) times unit normals: level of the friction. All three stand on the
     same P' unit normals.
     """
 
@@ -111,12 +111,14 @@ def _behind_observed(
     response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
     longest_s = max(record.n_samples for record in less) * model.dt_s
     response, factor_of_arm = of_known_sign(response, longest_s)
+    straight = response
     response = curved(response, model.poles, longest_s)
     both = [0, *([plain.shape[1] - 1] if found.spring is not None else [])]
     level, spread = found.level + float(change[both].sum()), wider * factor[both].sum(axis=0)
     spread = factor_of_arm @ np.append(spread, np.zeros(by_force.shape[1]))
-    spread = np.append(spread, np.zeros(response.covariance_factor.shape[1] - spread.size))
-    return BehindFriction(response, response, level, spread, found)
+    more = response.covariance_factor.shape[1] - spread.size
+    straight = replace(straight, covariance_factor=np.pad(straight.covariance_factor, ((0, 0), (0, more))))
+    return BehindFriction(response, straight, level, np.append(spread, np.zeros(more)), found)
 
 
 def of_known_sign(response: ResponsePosterior, longest_s: float) -> tuple[ResponsePosterior, RealArray]:

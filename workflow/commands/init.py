@@ -39,7 +39,8 @@ _NEARLY_ALL = 0.99  # rows of a held log: one may be missing
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What the template of the configuration shows. scale, units: as stated, and the sign that is turned."""
+    """What the template of the configuration shows. scale, units: as stated, and the sign that is turned;
+    before: the draft that the logs were identified by, where `draft` is what followed."""
 
     logs: tuple[Path, ...]
     file_name: str
@@ -49,6 +50,7 @@ class Found:
     units: Mapping[str, str]
     draft: Draft
     doubts: tuple[Finding, ...]
+    before: Draft | None = None
 
 
 def init(
@@ -58,7 +60,7 @@ def init(
     storage.refuse_in_the_way(logs, [("--out", out)])
     if out.is_file() and not replace_file:
         raise InputError(f"{out} exists: take another --out, or --replace to write over it")
-    config, text, found = drafted("init", logs, out, stated)
+    config, text, found = drafted("init", logs, out, stated or Reading())
     storage.write_text(out, text)
     look, draft = found.draft.look, found.draft
     return RunSummary(
@@ -82,16 +84,11 @@ def init(
     )
 
 
-def drafted(
-    command: str, logs: Sequence[Path], out: Path, stated: Reading | None
-) -> tuple[RunConfig, str, Found]:
+def drafted(command: str, logs: Sequence[Path], out: Path, stated: Reading) -> tuple[RunConfig, str, Found]:
     """The configuration of one channel of these logs, to stand at `out`, its text, and what was seen; nothing
     is written. command: what a complaint says to type again. Raises InputError, one line."""
-    stated = stated or Reading()
     read = read_channel(command, logs, stated)
     # A log that is refused does not wait for what looks at it: that takes seconds to load.
-    from workflow.config.run_config import RunConfig
-    from workflow.config.settings import check
     from workflow.tasks.draft import draft_of
 
     output, unit_of = read.roles.output, read.unit_of
@@ -106,9 +103,17 @@ def drafted(
         units |= {name: unit_of[name]} if unit_of[name] else {}
     doubts = distinct([doubt for record in read.records for doubt in record.doubts])
     found = Found(tuple(logs), shlex.quote(out.name), stated, read, scale, units, draft, doubts)
-    text = configuration(found, _entries(read.tables, out, draft))
-    config = check(RunConfig, tomllib.loads(text), source=str(out), context={"base": out.absolute().parent})
-    return config, text, found
+    return (*written(found, out), found)
+
+
+def written(found: Found, out: Path) -> tuple[RunConfig, str]:
+    """The configuration, to stand at `out`, and its text."""
+    from workflow.config.run_config import RunConfig
+    from workflow.config.settings import check
+
+    text = configuration(found, _entries(found.read.tables, out, found.draft))
+    base = {"base": out.absolute().parent}
+    return check(RunConfig, tomllib.loads(text), source=str(out), context=base), text
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace as changed
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,7 +44,8 @@ def run_from_files(
 ) -> RunSummary:
     """Load a configuration and run it; see `run_pipeline`.
 
-    Of logs the configuration is drafted as `flexlink init` does, as stated, and kept in `out`. Without
+    Of logs, read as stated, the configuration is written as `flexlink init` does, but for the specification,
+    which follows from the identified model; it is kept in `out`. Without
     `config_path` or logs the built-in default arm is run, or on resuming the configuration kept in `out`;
     without `out` a new directory below runs/ is made. Raises InputError.
     """
@@ -54,13 +57,11 @@ def run_from_files(
         )
     config: AnyConfig
     note = ""
+    known: dict[str, bytes] = {}
     if logs:
-        from workflow.commands.init import drafted
-
         out = out if out is not None else default_directory(logs[0].stem)
         RunDirectory(out).refuse_unless_free(resume=resume, replace=replace)
-        # Paths in it count from where it will stand.
-        config, text, _ = drafted("run", logs, out / "config.toml", stated)
+        config, text, known = _decided(logs, out / "config.toml", stated, progress)
     elif config_path is not None:
         config, text = load_any(config_path)
     elif resume and out is not None and (out / "manifest.json").is_file():
@@ -74,7 +75,7 @@ def run_from_files(
         note = "no --config: this is the built-in default arm, not a machine of yours"
     place, read = out if out is not None else default_directory(config.run.name), list[Record]()
     # What is refused does not wait for what computes: that takes seconds to load.
-    if isinstance(config.source, FileSource) and not (resume and place.exists()):
+    if isinstance(config.source, FileSource) and not known and not (resume and place.exists()):
         RunDirectory(place).refuse_unless_free(resume=resume, replace=replace)
         channels: Any = config.channels if isinstance(config, RunConfig) else config.joints
         read = read_records(config.source, channels)
@@ -92,8 +93,30 @@ def run_from_files(
         c_code=c_code,
         note=note,
         read=read,
+        known=known,
         progress=progress,
     )
+
+
+def _decided(
+    logs: Sequence[Path], file: Path, stated: Reading | None, progress: Progress | None
+) -> tuple[RunConfig, str, dict[str, bytes]]:
+    """The configuration of logs, to stand in a file, with a specification that follows from the model they
+    were identified by; its text, and the files of the stages up to that model. Raises InputError."""
+    from workflow.commands.init import drafted, written
+    from workflow.commands.logs import Reading
+    from workflow.tasks.draft import informed
+    from workflow.tasks.pipeline import identify_only
+    from workflow.tasks.results import RunResults
+
+    config, text, found = drafted("run", logs, file, stated or Reading())
+    with tempfile.TemporaryDirectory(prefix="flexlink-") as folder:
+        run = RunDirectory(Path(folder))
+        identify_only(config, run.path, config_text=text, progress=progress)
+        results, at = RunResults(run), config.control_index
+        draft = informed(found.draft, results.identify.channels[at], results.uncertainty.channels[at])
+        known = run.stage_files(("records", "identify", "uncertainty"))
+    return (*written(changed(found, draft=draft, before=found.draft), file), known)
 
 
 def rebuild_report(

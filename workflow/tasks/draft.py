@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,13 +15,17 @@ from ident.data.arrays import clipped_share
 from ident.data.record import Record
 from ident.friction import recorded_in_loop
 from workflow.tasks.first_look import (
+    SWINGS,
+    TOLD,
     FirstLook,
     first_look,
     from_reference,
+    notches,
     told_response,
     unseen_limit,
 )
 from workflow.tasks.loop_sensitivity import rms_of
+from workflow.tasks.results import IdentifiedChannel, UncertainChannel
 
 # Of the first mode or notch, or of the highest frequency that the logs tell: the bandwidth that is asked for,
 # and the one that is asked for at least.
@@ -38,6 +42,8 @@ _MORE = 3.0
 _SAME_LIMIT = 1e-3
 # A limit that the motion shows is known to this share.
 _SAME_DIGITS = 5e-3
+# Of the frequencies below one that ellipses tell: those at a notch they may not.
+_MOSTLY_TOLD = 0.8
 
 
 @dataclass(frozen=True)
@@ -103,6 +109,30 @@ def draft_of(records: Sequence[Record], *, position: bool, limit: float | None =
         _rounded(reached / effort if unstable or not spread > 0 else 0.5 * spread),
         unstable,
     )
+
+
+def informed(draft: Draft, found: IdentifiedChannel, spread: UncertainChannel) -> Draft:
+    """The same with the specification that follows from the model that came out of the logs: its first mode
+    that swings and whose damping is told, its first notch, the band that its ellipses tell."""
+    look, model, omega = draft.look, found.model, spread.frequency.omega_rad_s
+    width = np.sqrt(np.trace(spread.frequency.covariance, axis1=1, axis2=2))
+    told = width < TOLD * np.abs(spread.frequency.centre)
+    share = np.cumsum(told) / np.arange(1, told.size + 1)
+    known = omega[told & (share > _MOSTLY_TOLD)]
+    if look.told_rad_s is None or not known.size:
+        return draft
+    band = min(look.told_rad_s[0], float(known[0])), float(known[-1])
+    intervals = [None] * len(found.modes) if spread.intervals is None else spread.intervals.modes
+    modes = [
+        (mode.omega_rad_s, mode.damping)
+        for mode, interval in zip(found.modes, intervals, strict=True)
+        if interval is not None and found.is_mode(mode) and mode.damping < SWINGS and interval.told
+    ]
+    notch = next((float(zero) for zero in notches(model) if band[0] < zero < band[1]), None)
+    look = replace(look, told_rad_s=band, mode=min(modes, default=None), notch=notch)
+    unstable = max((growth for growth, _ in found.unstable_poles), default=0.0)
+    specification = _specification(look, draft.specification["effort_limit"], draft.limit, unstable)
+    return replace(draft, look=look, specification=specification, unstable_per_s=unstable)
 
 
 def recorded_effort(records: Sequence[Record]) -> float:

@@ -19,11 +19,11 @@ from ident.data.record import Record
 from ident.frequency_fit import FrfIdentification, identify_frf
 
 # A response is told where its standard deviation is below this share of it ...
-_TOLD = 0.3
+TOLD = 0.3
 # ... at this share of the lines just below, and at so many in all: those in between may not be excited.
 _OF_LINES, _FEWEST = 0.2, 3
 # A pole or zero that swings: less damped ones show as a peak or a notch.
-_SWINGS = 0.3
+SWINGS = 0.3
 # Of the rigid motion: well below a notch or peak, with two more derivatives for what bends there, as far up
 # as it explains this share of the command's power.
 _RIGID, _EXPLAINED = 0.5, 0.97
@@ -168,7 +168,7 @@ def first_look(records: Sequence[Record], *, position: bool) -> FirstLook:
     if found is None:
         return look
     above = max(told[0], 0.0 if motion is None else motion.below_rad_s)
-    notch = next((float(omega) for omega in _notches(found.model) if above < omega < told[1]), None)
+    notch = next((float(omega) for omega in notches(found.model) if above < omega < told[1]), None)
     mode = _first_mode(found.model, above, told[1])
     return replace(look, model=found.model, mode=mode, notch=notch, delay=delay)
 
@@ -249,7 +249,7 @@ def _told_by(records: Sequence[Record]) -> FrequencyUncertainty | None:
         for part in (spectra.instrument, spectra.output)
     )
     floor = float(np.median(output[-max(1, omega.size // 5) :]))
-    told = (spread < _TOLD * np.abs(response.centre)) & (instrument > _EXCITED * instrument.max())
+    told = (spread < TOLD * np.abs(response.centre)) & (instrument > _EXCITED * instrument.max())
     told &= output > _ABOVE_FLOOR * floor
     before = np.concatenate([[0], np.cumsum(told)])
     first = np.searchsorted(omega, omega / 1.5)
@@ -311,17 +311,17 @@ def _delayed(
     return fits[delay], delay
 
 
-def _notches(model: GobfModel) -> RealArray:
+def notches(model: GobfModel) -> RealArray:
     """Natural frequencies [rad/s] of lightly damped zeros, ascending."""
     zeros = np.asarray(model.zeros())
     s = np.log(zeros[(np.imag(zeros) > 0) & (np.abs(zeros) > 0)]) / model.dt_s
-    return np.sort(np.abs(s)[np.abs(np.real(s)) < _SWINGS * np.abs(s)])
+    return np.sort(np.abs(s)[np.abs(np.real(s)) < SWINGS * np.abs(s)])
 
 
 def _swinging(model: GobfModel) -> RealArray:
     """Natural frequencies [rad/s] of lightly damped poles and zeros, ascending."""
-    peaks = model.poles.omega_rad_s(model.dt_s)[model.poles.zeta() < _SWINGS]
-    return np.sort(np.concatenate([_notches(model), peaks]))
+    peaks = model.poles.omega_rad_s(model.dt_s)[model.poles.zeta() < SWINGS]
+    return np.sort(np.concatenate([notches(model), peaks]))
 
 
 def _first_mode(model: GobfModel, above_rad_s: float, told_rad_s: float) -> tuple[float, float] | None:
@@ -335,7 +335,7 @@ def _first_mode(model: GobfModel, above_rad_s: float, told_rad_s: float) -> tupl
         nearest = min(np.abs(zeros - z[k]), default=np.inf) if zeros.size else np.inf
         left = min(nearest, abs(z[k] - z[k].conj())) / abs(at - z[k])
         inside = above_rad_s < omega[k] < 1.2 * told_rad_s
-        if 1.05 * _LEAST_DAMPING < zeta[k] < _SWINGS and inside and left > _PROMINENT:
+        if 1.05 * _LEAST_DAMPING < zeta[k] < SWINGS and inside and left > _PROMINENT:
             found = float(omega[k]), float(zeta[k])
     return found
 

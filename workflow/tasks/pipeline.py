@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -58,6 +59,7 @@ def run_pipeline(
     c_code: Mapping[str, Any] | None = None,
     note: str = "",
     read: Sequence[Record] = (),
+    known: Mapping[str, bytes] | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
     """Run every stage into `out` and return the table of numbers.
@@ -65,7 +67,8 @@ def run_pipeline(
     config_text: kept as config.toml (`called` in complaints); resume takes up a run that is there, replace
     starts it afresh; page: the last stage, which writes the page; c_code: the fields of `Dialect` that are
     stated, kept for when it is resumed; note: said once nothing refuses the run; read: the logs,
-    where they have been read. A result that is not certified is no error.
+    where they have been read; known: files of stages that were performed elsewhere, which stand where they
+    were made from the same. A result that is not certified is no error.
 
     Raises InputError (one line) for anything wrong with what the user gave; what this call created is removed
     then, unless identification had already been paid for. Raises StageError when a computation fails.
@@ -77,7 +80,7 @@ def run_pipeline(
     inputs = {str(path): storage.sha256_of_file(path) for path in config.input_files}
     # Records are read before anything is written: a bad log leaves no directory behind.
     ready: tuple[Any, float] | None = None
-    if not (resume and existed):
+    if not (resume and existed) and not known:
         started = time.monotonic()
         with threadpool_limits(1):
             ready = kind.stages[0].run(changed(given, read=read)), time.monotonic() - started
@@ -94,6 +97,8 @@ def run_pipeline(
         kept = run.manifest().get("c_code", {})
         with naming(str(run.manifest_path)):
             before = changed(Dialect(), **{k: kept[k] for k in ("prefix", "number") if k in kept})
+        for name, content in (known or {}).items():
+            run.write_stage(*os.path.splitext(name), content)
         dialect = changed(before, **(c_code or {}))  # as stated now, or else before
         run.record_status("running", c_code=asdict(dialect))
         stages = kind.stages if page is None else (*kind.stages, page)

@@ -137,7 +137,7 @@ def uncertainty_of(
             return found, residual_tests(found.response, measured, found.friction)
 
         (behind, tests), _ = with_noise_model(options, white, arm_behind)
-        linear = behind.response
+        linear = behind.shaft if at_shaft else behind.response
         posterior, poles, equivalent = described_response(
             behind, poles, friction, measured, channel.uncertainty, rng, equivalent
         )
