@@ -81,6 +81,10 @@ def followed(one: Machine, folder: Path, line: str) -> bool | None:
     that one is taken."""
     work, logs = folder / one.name, sorted((folder / "logs" / one.name).glob("*"))
     config, run, steps = work / "run" / "config.toml", work / "followed", work / "played"
+    if not config.is_file():  # refused before there was a run
+        config = work / "my.toml"
+        _flexlink("init", *map(str, logs), "--out", str(config), "--replace")
+    edited = config.with_name("followed.toml")
     if "flexlink excite --closed-loop" in line:
         asked = [] if one.kept else ["--rms", f"{0.5 * one.draft.motion_rad * one.plant.scale:.4g}"]
         plan = work / "plan"
@@ -96,22 +100,16 @@ def followed(one: Machine, folder: Path, line: str) -> bool | None:
         if _flexlink("init", *map(str, sorted(steps.glob("*"))), "--out", str(config), "--replace")[0]:
             return False
     elif "response = 'as recorded'" in line:
-        text = config.read_text().replace('response = "without friction"', 'response = "as recorded"')
-        config = work / "followed.toml"
-        config.write_text(text)
+        text = config.read_text()
+        edited.write_text(text.replace('response = "without friction"', 'response = "as recorded"'))
+        config = edited
     elif meets := re.search(r"(\w+) = ([\d.e+-]+) would meet it", line):
-        config = work / "followed.toml"
         key = re.escape(meets[1])
-        text = re.sub(
-            rf"(?m)^{key} = \S+", f"{meets[1]} = {meets[2]}", (work / "run" / "config.toml").read_text()
-        )
-        if meets[1] == "bandwidth_rad_s":  # the value that was left open is now stated
-            text = re.sub(r"(?m)^lowest_bandwidth_rad_s = .*\n", "", text)
-        config.write_text(text)
+        edited.write_text(re.sub(rf"(?m)^{key} = \S+", f"{meets[1]} = {meets[2]}", config.read_text()))
+        config = edited
     elif "controller_order" in line:
-        config = work / "followed.toml"
-        text = (work / "run" / "config.toml").read_text()
-        config.write_text(text.replace("controller_order = 5", "controller_order = 8"))
+        edited.write_text(config.read_text().replace("controller_order = 5", "controller_order = 8"))
+        config = edited
     else:
         return None
     words = "--config", str(config), "--out", str(run), "--replace", "--json"

@@ -71,6 +71,7 @@ def find_design(
     specification = Specification.model_validate(
         specification.model_dump(include=set(Specification.model_fields))
     )
+    left_open = specification.lowest_bandwidth_rad_s is not None
     try:
         if options.calibrate and undrawable(plants) is None:
             parts = [part_of(progress, number, 2) if progress else None for number in range(2)]
@@ -90,7 +91,13 @@ def find_design(
         return DesignResult(None, met=False, reason=str(impossible), specification=specification)
     reason = said("outcome", result)
     if advise and 1.0 < result.gamma < math.inf:
-        reason += said("would_meet", would_meet(plants, specification, result.gamma, synthesis, rng))
+        meets = would_meet(plants, specification, result.gamma, synthesis, rng)
+        if meets is not None and left_open and meets[0] == "bandwidth_rad_s":
+            meets = (
+                "lowest_bandwidth_rad_s",
+                meets[1],
+            )  # the one tried is the lowest: a lower one is to be stated
+        reason += said("would_meet", meets)
     return DesignResult(result, result.gamma <= 1.0, reason, jointly, specification)
 
 
