@@ -4,8 +4,9 @@ The position is G (u - f) with f set by the motion itself (Armstrong-Helouvry, D
 Automatica 30(7), 1994). Given the arm, the motion under friction is simulated; law and coefficients of the
 arm on its poles, each taken twice, are one least-squares problem (Gauss-Newton). The poles come from the
 search of `ident.one_input` on the records with the friction taken off; both are repeated until the residual
-no longer falls. Friction that falls with speed (Stribeck) is tried afterwards. How much the level differs
-between records is estimated, and at least a thousandth.
+no longer falls. How much the level differs between records is estimated, and at least a thousandth. What this
+does not explain, friction that falls with speed (Stribeck) or at the load among it, an observer follows
+(`ident.friction.in_loop`).
 
 Neglected: a level that depends on position or load; records start at rest.
 """
@@ -34,15 +35,12 @@ from ident.friction.gauss_newton import (
     FrictionFit,
     LostError,
     descended,
-    equations,
     least_squares,
     started,
 )
 from ident.friction.in_loop import fit_friction_in_loop, recorded_in_loop
 from ident.one_input import untested_model
 
-# Speeds over which friction may fall, in units of the rms speed, and the first guess of what it falls by.
-_FALLS, _EXCESS = (0.03, 0.1, 0.3), 0.1
 # The start takes the sign of the speed, smoothed below this share of Nyquist; a fiftieth of it is the turn.
 _SMOOTHING, _SLOW = 0.15, 0.02
 _START_ROUNDS, _MOST_SEARCHES = 4, 8
@@ -117,8 +115,7 @@ def _running_free(
         # The poles may have been led astray by friction that was not yet right: search for them again.
         model = untested_model([found.taken_off(record) for record in records], options)
     assert best is not None
-    best = descended(best, records, presliding, least, held=False)
-    return _with_stribeck(best, records, presliding, least) if best.significant else best
+    return descended(best, records, presliding, least, held=False)
 
 
 def _swinging(options: IdentOptions) -> IdentOptions:
@@ -174,34 +171,6 @@ def _start(records: Sequence[Record], options: IdentOptions) -> tuple[float, Gob
         if abs(level - before) < 0.02 * level:
             break
     return level, model
-
-
-def _with_stribeck(
-    found: FrictionFit, records: Sequence[Record], presliding: float, least: float
-) -> FrictionFit:
-    """The same with friction that falls with speed, where that is worth its two parameters."""
-    speed = float(np.sqrt(np.mean([np.mean(np.diff(r.output[:, 0]) ** 2) for r in records]))) / found.arm.dt_s
-    blocks, targets = equations(found, records)
-    nothing, delay = np.zeros((0, blocks[0].shape[1] + 2)), found.arm.structure.input_delay_samples
-
-    def left(law: FrictionLaw) -> float:
-        """What the fit would leave to first order in an excess of this law."""
-        columns = [
-            answered(found.arm.run(found.coefficients, r.input[:, 0], law)[0] - found.motion(r)[0], delay)
-            for r in records
-        ]
-        more = [np.column_stack(pair) for pair in zip(blocks, columns, strict=True)]
-        return least_squares(more, targets, nothing)[3]
-
-    laws = [replace(found.law, excess=_EXCESS * found.level, fall=share * speed) for share in _FALLS]
-    rests = [left(law) for law in laws]
-    k, rss = int(np.argmin(rests)), _rss(found, records)
-    worth = 2 * np.log(_n_rows(found, records)) * found.noise_std**2
-    if rests[k] > rss - worth:
-        return found
-    tried = descended(replace(found, law=laws[k]), records, presliding, least)
-    tried = descended(tried, records, presliding, least, held=False)
-    return tried if tried.law.excess > 0 and _rss(tried, records) < rss - worth else found
 
 
 def _basis(poles: Poles, record: Record, options: IdentOptions) -> RealArray:

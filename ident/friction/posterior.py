@@ -41,8 +41,8 @@ class BehindFriction:
     """What records say of an arm and of the friction at its shaft, together.
 
     response: from the input to an output, as if there were no dry friction; shaft: the same of the shaft's
-    position, to first order; level + level_factor (P',) times unit normals: level of the friction. All three stand on the
-    same P' unit normals.
+    position, to first order; level + level_factor (P',) times unit normals: level of the friction. All three
+    stand on the same P' unit normals.
     """
 
     response: ResponsePosterior

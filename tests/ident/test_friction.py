@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.at_an_amplitude import recorded as small_and_large
+from benchmarks.closed_loop_machines.simulator import Law, Plant, response
 from benchmarks.without_friction import with_friction
 from ident import GobfModel, IdentOptions, Poles, Record, Structure, identify
 from ident.basis.posterior import ResponsePosterior
@@ -30,6 +30,7 @@ from ident.friction.arm import FrictionLaw, SteppedArm
 from ident.friction.gauss_newton import linearised
 from ident.friction.posterior import curved
 from ident.uncertainty.embedding import tangent
+from ident.uncertainty.pole_intervals import pole_intervals
 from plant import parse_effect, simulate
 from plant.excitation import multisine, multisine_lines
 from plant.modal import linear_arm
@@ -120,7 +121,7 @@ def test_friction_that_falls_with_speed_is_told_from_coulomb_friction() -> None:
     truth = np.array([0.05 * VOLTS_PER_NM, np.log(1e-5), 0.05 * VOLTS_PER_NM, np.log(0.05)])
     law = found.law
     off = np.array([law.level, np.log(law.presliding), law.excess, np.log(law.fall)]) - truth
-    std = np.linalg.norm(found.covariance_factor[found.coefficients.size :], axis=1)
+    std = np.linalg.norm(found.covariance_factor[found.coefficients.size :][:4], axis=1)
     assert np.all(np.abs(off) < 4 * std)
     assert np.all(std < [0.02 * truth[0], 1.0, 0.3 * truth[2], 0.3])
 
@@ -412,44 +413,26 @@ def test_a_shaft_that_the_records_do_not_show_is_refused() -> None:
         refuse_unseen_shaft(fit_friction(tip, OPTIONS), tip)
 
 
-def two_inertias(seed: int, n: int = 5000) -> tuple[Record, Callable[[RealArray], ComplexArray]]:
-    """Motor angle under a multisine torque, friction at motor and load, by midpoint steps that share nothing
-    with the product; and the response without friction, sampled with a hold."""
-    rng, dt_s, fine = np.random.default_rng(seed), 1e-3, 10
-    motor, load, stiffness, damping, viscous = 7.8e-5, 7.1e-5, 6.5, 4.8e-4, 2.5e-4
-    pull = np.array([stiffness, damping, -stiffness, -damping])
-    slopes = np.zeros((4, 4))
-    slopes[0, 1] = slopes[2, 3] = 1.0
-    slopes[1], slopes[3] = -pull / motor, pull / load
-    slopes[1, 1] -= viscous / motor
-    lines = np.arange(1, n // 10)
-    angle = 2 * np.pi * np.outer(np.arange(n), lines) / n + rng.uniform(0, 2 * np.pi, lines.size)
-    torque_Nm = 0.06 * np.sqrt(2 / lines.size) * np.cos(angle).sum(axis=1)
-    state, angles, rub = np.zeros(4), np.zeros(n), np.array([0, 2.9e-3 / motor, 0, 1.3e-3 / load])
-    for k, torque in enumerate(torque_Nm):
-        angles[k], push = round(state[0], 5), np.array([0, torque / motor, 0, 0])
-        for _ in range(fine):
-            middle = state
-            for part in (0.5, 1.0):
-                rate = slopes @ middle + push - rub * np.tanh(100 * middle)
-                middle = state + part * dt_s / fine * rate
-            state = middle
-    arm = control.ss(slopes, [[0], [1 / motor], [0], [0]], [[1, 0, 0, 0]], 0).sample(dt_s)
-    record = Record(f"log{seed}", torque_Nm[:, None], angles[:, None], dt_s, ("torque_Nm",), ("angle_rad",))
-    return record, lambda omega: np.array([arm(np.exp(1j * one * dt_s)) for one in omega])
-
-
 @pytest.mark.slow
 def test_an_observer_follows_what_a_free_run_does_not_explain():
-    """Friction at both ends, which a free run with friction at the motor takes for another arm."""
-    record, response = two_inertias(1)
+    """Friction at motor and load in open loop: a free run with the motor's takes it for another arm."""
+    friction, spring = np.zeros((2, 5)), np.array([[0, 1, 6.5, 4.8e-4, 0]])
+    friction[:, :3] = [[2.9e-3, 2.9e-3, 1.0], [1.3e-3, 1.3e-3, 1.0]]
+    inertia, viscous, none = np.array([7.8e-5, 7.1e-5]), np.array([2.5e-4, 0]), np.zeros(3)
+    plant = Plant(inertia, viscous, none[:2], spring, friction, none, 0.02, 0, 1.0, 1e-3, 0, 1e-5, np.inf)
+    through = Law(np.zeros((1, 1)), np.zeros((1, 2)), none[:1], np.array([1.0, 0.0]), none[:1])
+    phases, turn = np.random.default_rng(1).uniform(0, 2 * np.pi, 499), 2 * np.pi * np.arange(5000) / 5000
+    volts = 0.19 * np.cos(np.outer(turn, np.arange(1, 500)) + phases).sum(axis=1)
+    angle = plant.run(through, volts, 0.0, np.zeros(volts.size))["y"]
+    record = Record("log", volts[:, None], angle[:, None], 1e-3, ("motor_V",), ("angle_rad",))
     found = fit_friction([record], IdentOptions(integrators=1))
     assert found.in_loop
-    assert found.law.level == pytest.approx(2.9e-3, rel=0.05)
-    assert found.beyond == pytest.approx(1.3e-3, rel=0.05)
-    omega = np.geomspace(2 * np.pi, 200 * np.pi, 100)
-    ellipses = without_friction([record], found).response.at(omega, 0.95)
-    assert np.mean(ellipses.contains(response(omega))) >= 0.93
+    assert found.law.level == pytest.approx(2.9e-3 / 0.02, rel=0.05)
+    assert found.beyond == pytest.approx(1.3e-3 / 0.02, rel=0.05)
+    omega, behind = np.geomspace(2 * np.pi, 200 * np.pi, 100), without_friction([record], found)
+    truth = response(*plant.sampled(), omega, 1e-3)
+    assert np.mean(behind.response.at(omega, 0.95).contains(truth)) >= 0.93
+    assert np.all(pole_intervals(behind.shaft, found.model.poles).omega_rad_s < 1e3)
 
 
 def test_ellipses_bend_where_the_data_leave_the_force_open():
@@ -466,6 +449,6 @@ def test_ellipses_bend_where_the_data_leave_the_force_open():
     mean, column = np.linalg.lstsq(real_rows(rows), real_rows(np.column_stack([0 * omega + 1, change])))[0].T
     straight = replace(nothing, mean=mean, covariance_factor=column[:, None] + 1e-6 * np.eye(size))
     bent = curved(straight, poles, 100.0)
-    for c, response in truth.items():
-        assert c == 1 or np.mean(straight.at(omega, 0.95).contains(response)) < 0.5
-        assert np.mean(bent.at(omega, 0.95).contains(response)) > 0.97
+    for c, true in truth.items():
+        assert c == 1 or np.mean(straight.at(omega, 0.95).contains(true)) < 0.5
+        assert np.mean(bent.at(omega, 0.95).contains(true)) > 0.97

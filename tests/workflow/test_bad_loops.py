@@ -7,6 +7,7 @@ The machine is two inertias on a spring with dry friction, from the independent 
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -90,11 +91,10 @@ def up_to_design(monkeypatch):
 
 @pytest.fixture
 def taken(flexlink, tmp_path, up_to_design):
-    """Results of `init` and `run` on logs that have to be taken."""
+    """Results of `run` on logs that have to be taken."""
 
     def run(paths):
-        assert flexlink("init", *paths, "--out", tmp_path / "my.toml").code == 0
-        answer = flexlink("run", "--config", tmp_path / "my.toml", "--out", tmp_path / "out")
+        answer = flexlink("run", *paths, "--out", tmp_path / "out")
         assert REACHED in answer.err, answer.err
         return RunResults(RunDirectory.open(tmp_path / "out"))
 
@@ -103,14 +103,11 @@ def taken(flexlink, tmp_path, up_to_design):
 
 @pytest.fixture
 def line(flexlink, tmp_path, up_to_design):
-    """The one line with which `init`, or else `run` on what it wrote, refuses logs."""
+    """The one line with which `run` refuses logs; nothing is left of it."""
 
     def ask(paths):
-        answer = flexlink("init", *paths, "--out", tmp_path / "my.toml")
-        if answer.code == 0:
-            answer = flexlink("run", "--config", tmp_path / "my.toml", "--out", tmp_path / "out")
-        assert answer.code == 2, answer
-        assert answer.out == "" or "my.toml" in answer.out
+        answer = flexlink("run", *paths, "--out", tmp_path / "out")
+        assert (answer.code, answer.out, (tmp_path / "out").exists()) == (2, "", False), answer
         assert answer.err.count("\n") == 1, answer.err
         assert REACHED not in answer.err
         return answer.err
@@ -290,8 +287,7 @@ def test_what_is_taken_is_certified_and_holds_on_the_true_machine(flexlink, tmp_
         log(3, 0.15, machine=machine),
     ]
     paths = written(tmp_path, [{**one, "u": -one["u"]} for one in made])
-    assert flexlink("init", *paths, "--out", tmp_path / "my.toml").code == 0
-    answer = flexlink("run", "--config", tmp_path / "my.toml", "--out", tmp_path / "out", "--json")
+    answer = flexlink("run", *paths, "--out", tmp_path / "out", "--json")
     assert answer.document()["certified"]
     said = answer.document()["numbers"]["signals"]
     assert said == (
@@ -304,3 +300,21 @@ def test_what_is_taken_is_certified_and_holds_on_the_true_machine(flexlink, tmp_
     law, delay = read_law(tmp_path / "out" / "controller.json")
     stated = {"worst_margins": vars(verdict.worst_margins), "bandwidth_rad_s": verdict.bandwidth_rad_s}
     assert violations(replace(plant(), delay=1 + delay, torque_per_u=-TORQUE), 0.0, law, stated) == []
+
+
+@pytest.mark.slow
+def test_the_configuration_of_a_run_of_logs_runs_again_to_the_same(flexlink, refused, tmp_path, taken):
+    """Its specification follows from the model: a band around its mode, whatever was taken for it before."""
+    paths = written(tmp_path, logs(levels=(0.2, 0.15)))
+    first = taken(paths)
+    pole = max(np.linalg.eigvals(plant().linear()[0]), key=np.imag)
+    config = tmp_path / "out" / "config.toml"
+    low, high = tomllib.loads(config.read_text())["specification"]["mode_band_rad_s"]
+    assert low < abs(pole) < high
+    assert REACHED in flexlink("run", "--config", config, "--out", tmp_path / "again").err
+    again = RunResults(RunDirectory.open(tmp_path / "again"))
+    assert np.array_equal(
+        again.uncertainty.channels[0].posterior.mean, first.uncertainty.channels[0].posterior.mean
+    )
+    assert "not both" in refused("run", *paths, "--config", config, "--out", tmp_path / "third")
+    assert "name them, as in flexlink run LOG... --unwrap" in refused("run", "--unwrap", "a=1", "--out", "x")
