@@ -161,8 +161,9 @@ def curved(response: ResponsePosterior, poles: Poles, longest_s: float) -> Respo
     An arm answers with G = 1 / D, and what is not known of it (damping, stiffness, friction like them) adds
     to D. To first order ellipses are lines there, as wide as they may be: the truth lies beside them. With x
     the relative change of G along a normal t, 1 / (1 - x t) is 1 + x t + x^2 t^2 + ...: a column `_CURVED`
-    x^2 G holds the second term as far as the 95 % interval of t goes. Of the normals that move the gain below
-    the first light mode most, and there only; x^2 G stands on poles taken three times.
+    x^2 G would hold the second term as far as the 95 % interval of t goes; here its part across x, j x Im(x),
+    for along it `of_known_sign` cares. Of the normals that move the gain below the first light mode most, and
+    there only; on poles taken three times, as x^2 G is.
     """
     omega = _frequencies(response, longest_s)
     rows = response.frequency_rows(omega)
@@ -171,7 +172,8 @@ def curved(response: ResponsePosterior, poles: Poles, longest_s: float) -> Respo
     low = omega < np.min(modes, initial=omega[-1])
     change = np.where(low[:, None], moved / gain[:, None], 0.0)
     along = np.linalg.svd(real_rows(change), full_matrices=False)[2][:_MOST_CURVED]
-    more = _CURVED * gain[:, None] * (change @ along.T) ** 2
+    x = change @ along.T
+    more = _CURVED * gain[:, None] * 1j * x * x.imag
     return _with_poles(response, poles, omega, gain, [*moved.T, *more.T], _RANK)
 
 
