@@ -15,35 +15,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
-from ident.basis.functions import regressor
 from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
-from ident.basis.poles import Poles
-from ident.basis.structure import answered, driving_input
 from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.checks.residual_tests import whiteness_test
-from ident.data.arrays import RealArray
 from ident.data.record import Record
-from ident.friction.arm import PRESLIDING, FrictionLaw, less_friction
+from ident.friction.arm import PRESLIDING, FrictionLaw
 from ident.friction.gauss_newton import (
     WORTH,
     FrictionFit,
     LostError,
     descended,
-    least_squares,
     started,
 )
 from ident.friction.in_loop import fit_friction_in_loop, recorded_in_loop
+from ident.friction.inverse_dynamics import presliding_of, with_measured_direction
 from ident.one_input import untested_model
 
-# The start takes the sign of the speed, smoothed below this share of Nyquist; a fiftieth of it is the turn.
-_SMOOTHING, _SLOW = 0.15, 0.02
-_START_ROUNDS, _MOST_SEARCHES = 4, 8
+_MOST_SEARCHES = 8
 
 Report = Callable[[float, str], None]
 # Different positions: with 21 the level was within its standard deviation (7 %), with 11 a third too low.
@@ -102,12 +94,12 @@ def _running_free(
     """The fit whose simulation starts at rest with every record and sees nothing of it but the input."""
     report(0.0, "friction: start")
     structure = options.structure()
-    level, model = _start(records, options)
     least = 1e-6 * max(float(np.std(record.input)) for record in records)
+    level, model = _start(records, options, least)
     best: FrictionFit | None = None
     for search in range(_MOST_SEARCHES):
         report(0.2 + 0.8 * search / _MOST_SEARCHES, "friction: arm and level together")
-        law = FrictionLaw(max(level, least), presliding) if best is None else best.law
+        law = FrictionLaw(level, presliding) if best is None else best.law
         found = descended(started(model, structure, law), records, presliding, least)
         if best is not None and not _rss(found, records) < _rss(best, records) - WORTH * found.noise_std**2:
             break
@@ -141,41 +133,14 @@ def _n_rows(found: FrictionFit, records: Sequence[Record]) -> int:
     return sum(record.n_samples - found.arm.structure.input_delay_samples for record in records)
 
 
-def _start(records: Sequence[Record], options: IdentOptions) -> tuple[float, GobfModel]:
-    """Level and arm with the friction that the sign of the measured speed gives."""
-    sections = butter(2, _SMOOTHING, output="sos")
-    signs = []
-    for record in records:
-        speed = np.gradient(sosfiltfilt(sections, record.output[:, 0]))
-        sign = np.tanh(speed / (_SLOW * np.std(speed)))
-        signs.append(0.5 * (sign + np.append(sign[1:], sign[-1])))
+def _start(records: Sequence[Record], options: IdentOptions, least: float) -> tuple[float, GobfModel]:
+    """Level and arm with the friction that the measured motion gives."""
+    level, less = with_measured_direction(
+        records, presliding_of(records), options.input_delay_samples, stiff=not options.integrators
+    )
     # One pair more than asked for: what a wrong level leaves would otherwise take the place of a weak mode.
     options = options.model_copy(update={"n_pairs": None if options.n_pairs is None else options.n_pairs + 1})
-    level, delay = 0.0, options.input_delay_samples
-    for _ in range(_START_ROUNDS):
-        less = [
-            less_friction(record, level * sign, delay) for record, sign in zip(records, signs, strict=True)
-        ]
-        model = untested_model(less, options)
-        undelayed = replace(model, input_delay_samples=0)
-        blocks = [
-            np.column_stack(
-                [_basis(model.poles.doubled(), record, options), -answered(undelayed.simulate(sign), delay)]
-            )
-            for record, sign in zip(less, signs, strict=True)
-        ]
-        targets = [answered(record.output[:, 0], delay) for record in less]
-        nothing = np.zeros((0, blocks[0].shape[1] + 1))
-        before = level
-        level = max(level + float(least_squares(blocks, targets, nothing)[0][-1]), 0.0)
-        if abs(level - before) < 0.02 * level:
-            break
-    return level, model
-
-
-def _basis(poles: Poles, record: Record, options: IdentOptions) -> RealArray:
-    driving = driving_input(record.input[:, 0], options.integrators, options.input_delay_samples)
-    return regressor(poles, driving)
+    return max(level, least), untested_model(less, options)
 
 
 def refuse_unseen_shaft(found: FrictionFit, records: Sequence[Record]) -> None:

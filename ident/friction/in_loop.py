@@ -33,7 +33,7 @@ from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.fit.least_squares import fit as linear_fit
 from ident.fit.regression import prepare
-from ident.friction.arm import FrictionLaw, less_friction
+from ident.friction.arm import FrictionLaw
 from ident.friction.gauss_newton import (
     STD_LOG,
     FrictionFit,
@@ -45,7 +45,12 @@ from ident.friction.gauss_newton import (
     started,
     with_covariance,
 )
-from ident.friction.inverse_dynamics import direction_of, highest_Hz, level_of, rms_speed, smoothed
+from ident.friction.inverse_dynamics import (
+    highest_Hz,
+    presliding_of,
+    rms_speed,
+    with_measured_direction,
+)
 from ident.friction.observer import ObserverFilter, observed, prediction_errors
 from ident.friction.spring import Spring
 from ident.identification import Identification
@@ -66,8 +71,6 @@ _LARGEST_STEP, _LENGTHS = 0.3, (1.0, 0.5, 0.25, 0.1)
 _EARLIER, _MUCH_BETTER = 2, 0.8
 # Change of a constant force, as a share of the rms input, that a derivative is taken from.
 _CHANGE_OF_BIAS = 0.01
-# Deflection before slipping, as a share of the rms motion, within a factor of twenty; the start takes more.
-_PRESLIDING, _COARSE = 1e-5, 10.0
 # Lowest further pair, as a share of the first mode: friction that is left over looks like slow poles.
 _LOWEST_PAIR, _ABOVE_NOISE = 0.4, 1.2
 # Stribeck friction begins with this excess and one of these speeds, in units of the rms speed.
@@ -121,11 +124,10 @@ class _Logs:
 
     @classmethod
     def of(cls, records: Sequence[Record]) -> _Logs:
-        motion = float(np.sqrt(np.mean([np.var(record.output) for record in records])))
         rms = float(np.sqrt(np.mean([np.mean(record.input**2) for record in records])))
         plain = tuple(replace(record, reference=None, reference_names=()) for record in records)
         centre = float(np.mean([np.mean(record.output) for record in records]))
-        return cls(plain, _PRESLIDING * motion, 1e-6 * rms, rms, centre)
+        return cls(plain, presliding_of(records), 1e-6 * rms, rms, centre)
 
     @property
     def criterion(self) -> float:
@@ -233,12 +235,10 @@ def _simple(
 ) -> tuple[IdentOptions, FrictionFit] | None:
     """The options with the unstable poles that show, and level and arm in turns; thrown_over: None without
     any."""
-    ways = [direction_of(smoothed(r.output[:, 0]), _COARSE * logs.presliding) for r in logs.records]
-    level = max(level_of(logs.records, ways, stiff=not options.integrators), logs.least)
-    used = [
-        less_friction(record, level * way, options.input_delay_samples)
-        for record, way in zip(logs.records, ways, strict=True)
-    ]
+    level, used = with_measured_direction(
+        logs.records, logs.presliding, options.input_delay_samples, stiff=not options.integrators
+    )
+    level = max(level, logs.least)
     sought = not (options.integrators or options.unstable_poles)
     if sought:
         options = options.with_unstable(find_unstable(used, options))

@@ -10,6 +10,7 @@ import numpy as np
 
 from ident.data.arrays import COMPILED, ComplexArray, RealArray
 from ident.data.record import Record
+from ident.friction.arm import less_friction
 
 # Lines over which a spectrum is smoothed, and what lines of white noise may have beyond their median.
 _LINES, _BEYOND = 25, 1.5
@@ -18,6 +19,8 @@ _WELL = 10.0
 _LEAST_NOISE = 1e-6  # of the motion: a sensor of 20 bits
 # Bands, the lowest with so many periods in the shortest record; steepness of their edge.
 _BANDS, _PERIODS, _STEEP = 8, 8, 8
+# Deflection before slipping, as a share of the rms motion; the start takes more.
+_PRESLIDING, _COARSE = 1e-5, 10.0
 _DERIVATIVES = 3  # stiffness, damping, inertia, and the lag of a drive behind them
 
 
@@ -88,6 +91,22 @@ def _slip(moved: Any) -> None:
     for k in range(moved.size):
         state = min(max(state + moved[k], -1.0), 1.0)
         moved[k] = state
+
+
+def presliding_of(records: Sequence[Record]) -> float:
+    """Deflection before slipping that is expected, within a factor of twenty, in units of the position."""
+    return _PRESLIDING * float(np.sqrt(np.mean([np.var(record.output) for record in records])))
+
+
+def with_measured_direction(
+    records: Sequence[Record], presliding: float, delay_samples: int, *, stiff: bool
+) -> tuple[float, list[Record]]:
+    """Where a fit begins: the level by inverse dynamics (`level_of`), and the records with that friction, in
+    the direction of the measured motion, taken off."""
+    ways = [direction_of(smoothed(record.output[:, 0]), _COARSE * presliding) for record in records]
+    level = level_of(records, ways, stiff=stiff)
+    both = zip(records, ways, strict=True)
+    return level, [less_friction(record, level * way, delay_samples) for record, way in both]
 
 
 def level_of(records: Sequence[Record], directions: Sequence[RealArray], *, stiff: bool) -> float:
