@@ -23,6 +23,7 @@ import control
 import numpy as np
 import pandas as pd
 from scipy.signal import dlsim
+from scipy.stats import chi2
 
 from benchmarks.harness import Print, main, timed
 from ident import IdentOptions, Record
@@ -147,7 +148,8 @@ def _plant(out: Print, name: str, seeds: range) -> None:
         states.append(len(result.model.state_space()[0]))
         balls = matrix_posterior([record], result).at(BALLS)
         held.append(balls.holds(response(plant, BALLS)))
-        enclosure.append(float(np.median(balls.enclosure)))
+        independent = np.sqrt(chi2.ppf(balls.level, 2 * balls.centre[0].size) / 2)
+        enclosure.append(float(np.median(balls.radius / independent)))
         for peer, fit in PEERS.items():
             try:
                 found, taken = timed(partial(fit, record, plant.nstates))

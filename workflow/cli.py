@@ -135,6 +135,9 @@ CFloat = Annotated[
 Logs = Annotated[
     list[Path], typer.Argument(help="CSV or other tables, npz, MAT, ... (docs/logs.md); used together.")
 ]
+SomeLogs = Annotated[
+    list[Path] | None, typer.Argument(help="Logs (docs/logs.md): run them; or of the loop, --closed-loop.")
+]
 Config = Annotated[
     Path | None, typer.Option(help="TOML file (see examples/ and README); without it the built-in arm.")
 ]
@@ -191,10 +194,7 @@ def _root(
 @app.command(short_help="Everything, from records to report.html.")
 @with_fields(reading=_READING)
 def run(
-    log: Annotated[
-        list[Path] | None,
-        typer.Argument(help="Logs, in place of --config: what `flexlink init` writes of them is run."),
-    ] = None,
+    log: SomeLogs = None,
     config: Config = None,
     out: Annotated[
         Path | None, typer.Option(help="Run directory, new or empty [default: runs/<name>-<date>-<time>]")
@@ -210,8 +210,7 @@ def run(
 ) -> None:
     """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
     need(config, *(log or []))
-    given = [option_name(name) for name, value in of_fields.items() if value not in (None, False, [])]
-    if given and not log:
+    if not log and (given := [option_name(name) for name in _stated(of_fields)]):
         raise InputError(
             f"{given[0]} says how logs are read: name them, as in flexlink run LOG... {given[0]}"
         )
@@ -266,9 +265,7 @@ def simulate(
 )
 def excite(
     out: NewDirectory,
-    log: Annotated[
-        list[Path] | None, typer.Argument(help="With --closed-loop: logs of the loop that is there.")
-    ] = None,
+    log: SomeLogs = None,
     closed_loop: Annotated[
         bool, typer.Option("--closed-loop", help="Plan a reference for the loop that made the logs.")
     ] = False,

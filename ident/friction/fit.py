@@ -78,8 +78,8 @@ def fit_friction(
         if free:
             raise
         return fit_friction_in_loop(records, options, progress=progress)
-    white = whiteness_test([found.residual(record) for record in records]).passed
-    if found.significant and not (white or free):
+    residuals = [found.residual(record) for record in records]
+    if not free and found.significant and not whiteness_test(residuals).passed:
         # What is wrong with arm or law adds up in a free run, whose first order does not reach far then.
         with suppress(ValueError):
             followed = fit_friction_in_loop(records, options, progress=progress)

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
 
 from ident.basis.mimo_model import MimoModel
 from ident.basis.structure import front_response
@@ -50,12 +49,6 @@ class MatrixUncertainty:
     def __post_init__(self) -> None:
         lock(self, "omega_rad_s", "output_factor", "radius")
         lock(self, "centre", "input_factor", dtype=np.complex128)
-
-    @property
-    def enclosure(self) -> RealArray:
-        """Radius over that of independent circular normals, (F,): 1 where nothing is enclosed."""
-        count = 2 * self.centre.shape[1] * self.centre.shape[2]
-        return np.asarray(self.radius / np.sqrt(chi2.ppf(self.level, count) / 2))
 
     def distance(self, response: ComplexArray) -> RealArray:
         """|Lo^-1 (G - G0) Li^-1|_F over the radius, (F,), of responses (F, Y, U); up to 1 inside."""

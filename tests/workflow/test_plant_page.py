@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workflow.diagnose.pages import write_plant_page
+from workflow.diagnose.following import following
+from workflow.diagnose.pages import plant_page
 
 GUIDE = Path(__file__).resolve().parents[2] / "docs" / "own_plant.md"
 DT_S, SAMPLES = 0.01, 500
@@ -54,16 +55,13 @@ def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path, faults_seen):
     assert f"a delay of the command (over 99.9 %, {found.repair[0].values['delay_s']:.3g} s)" in words.lower()
     assert f"{found.rig.parameters['time_constant_s']:.5g} s" in words
     assert "less noise than specified" not in words
-    write_plant_page(
-        replace(found, noise_below_stated=(("speed_rad_s", 0.05, 0.5),)), tmp_path / "quiet.html"
-    )
-    page = " ".join(re.sub(r"<[^>]+>", " ", (tmp_path / "quiet.html").read_text()).split())
+    quiet = replace(found, noise_below_stated=(("speed_rad_s", 0.05, 0.5),))
+    page = " ".join(re.sub(r"<[^>]+>", " ", plant_page(quiet, following(quiet))).split())
     assert page.count("the noise they show is used: speed 0.05 rad/s (specified: 0.5 rad/s).") == 1
     # Of two effects of the repaired model the one that may carry less than the threshold is not left out.
     doubtful = tuple(replace(e, presence=0.24) if e.name == "output_offset" else e for e in found.effects)
     beside = replace(found.shares, small=("output_offset",))
     alone = replace(found, combination=("input_delay",), effects=doubtful, shares=beside, ambiguous_with=())
-    write_plant_page(alone, tmp_path / "alone.html")
-    page = " ".join(re.sub(r"<[^>]+>", " ", (tmp_path / "alone.html").read_text()).split())
+    page = " ".join(re.sub(r"<[^>]+>", " ", plant_page(alone, following(alone))).split())
     assert page.count("; the repaired model also has output offset (not certain: 24 %)") == 1
     assert "With the effects added, every experiment is below the threshold of" in page

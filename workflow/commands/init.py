@@ -60,7 +60,7 @@ def init(
     storage.refuse_in_the_way(logs, [("--out", out)])
     if out.is_file() and not replace_file:
         raise InputError(f"{out} exists: take another --out, or --replace to write over it")
-    config, text, found = drafted("init", logs, out, stated or Reading())
+    config, text, found = drafted("init", logs, out, stated)
     storage.write_text(out, text)
     look, draft = found.draft.look, found.draft
     return RunSummary(
@@ -74,7 +74,6 @@ def init(
                 "first_mode": codec.plain(look.mode),
                 "notch_rad_s": look.notch,
                 "motion": codec.plain(look.motion),
-                "delay_samples": look.delay,
                 "turned": look.turned,
                 "friction": draft.friction,
                 "unstable_per_s": draft.unstable_per_s,
@@ -84,9 +83,12 @@ def init(
     )
 
 
-def drafted(command: str, logs: Sequence[Path], out: Path, stated: Reading) -> tuple[RunConfig, str, Found]:
+def drafted(
+    command: str, logs: Sequence[Path], out: Path, stated: Reading | None
+) -> tuple[RunConfig, str, Found]:
     """The configuration of one channel of these logs, to stand at `out`, its text, and what was seen; nothing
     is written. command: what a complaint says to type again. Raises InputError, one line."""
+    stated = stated or Reading()
     read = read_channel(command, logs, stated)
     # A log that is refused does not wait for what looks at it: that takes seconds to load.
     from workflow.tasks.draft import draft_of
@@ -112,8 +114,10 @@ def written(found: Found, out: Path) -> tuple[RunConfig, str]:
     from workflow.config.settings import check
 
     text = configuration(found, _entries(found.read.tables, out, found.draft))
-    base = {"base": out.absolute().parent}
-    return check(RunConfig, tomllib.loads(text), source=str(out), context=base), text
+    return (
+        check(RunConfig, tomllib.loads(text), source=str(out), context={"base": out.absolute().parent}),
+        text,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -104,12 +104,11 @@ def _decided(
     """The configuration of logs, to stand in a file, with a specification that follows from the model they
     were identified by; its text, and the files of the stages up to that model. Raises InputError."""
     from workflow.commands.init import drafted, written
-    from workflow.commands.logs import Reading
     from workflow.tasks.draft import informed
     from workflow.tasks.pipeline import identify_only
     from workflow.tasks.results import RunResults
 
-    config, text, found = drafted("run", logs, file, stated or Reading())
+    config, text, found = drafted("run", logs, file, stated)
     with tempfile.TemporaryDirectory(prefix="flexlink-") as folder:
         run = RunDirectory(Path(folder))
         identify_only(config, run.path, config_text=text, progress=progress)

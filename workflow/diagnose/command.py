@@ -153,7 +153,11 @@ class Answers(Sequence[Mapping[str, Any]]):
 
     def __getitem__(self, index: Any) -> Any:
         name = self.names[index]
-        return self.directory.answer(name) if isinstance(name, str) else Answers(self.directory, name)
+        return (
+            self.directory.document(f"{name}.json")
+            if isinstance(name, str)
+            else Answers(self.directory, name)
+        )
 
 
 @dataclass(frozen=True, eq=False)

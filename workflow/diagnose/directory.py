@@ -75,10 +75,6 @@ class DiagnosisDirectory(Store):
                 return None
         return document
 
-    def answer(self, case: str) -> dict[str, Any]:
-        """Of a case that is done."""
-        return storage.read_json(self.path / f"{case}.json")
-
     def document(self, name: str) -> dict[str, Any]:
         """A JSON file of ours; empty where it is not there or cannot be read."""
         try:

@@ -100,8 +100,9 @@ class Executor:
         def begin(index: int) -> None:
             attempts[index] += 1
             running.add(index)
-            told = self._submit(tasks[index], lambda share, word: events.put((index, share, word)))
-            told.add_done_callback(lambda done: events.put((index, done, "")))
+            self._submit(
+                tasks[index], lambda share, word: events.put((index, share, word))
+            ).add_done_callback(lambda done: events.put((index, done, "")))
 
         for index in range(len(tasks)):
             begin(index)
@@ -292,7 +293,6 @@ class DaskCluster(Executor):
         self._distributed = distributed
         self.address = address
         self._last_seen: dict[str, Any] = {}
-        self._asked_s = self._heard_s = self._staffed_s = 0.0
         # Its own reports of lost connections would bury our one line.
         self._loggers = [
             logger

@@ -59,16 +59,12 @@ class StudyDirectory(Store):
         return self
 
     @property
-    def plants_path(self) -> Path:
-        return self.path / "plants"
-
-    @property
     def points_path(self) -> Path:
         return self.path / "points"
 
     def plant(self, point: Point) -> RunDirectory:
         """The run directory of the plant that a point shares."""
-        return RunDirectory(self.plants_path / point.plant_key[:16])
+        return RunDirectory(self.path / "plants" / point.plant_key[:16])
 
     def point(self, point: Point) -> RunDirectory:
         """The run directory of a point."""

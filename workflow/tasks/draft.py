@@ -42,8 +42,8 @@ _MORE = 3.0
 _SAME_LIMIT = 1e-3
 # A limit that the motion shows is known to this share.
 _SAME_DIGITS = 5e-3
-# Of the frequencies below one that ellipses tell: those at a notch they may not.
-_MOSTLY_TOLD = 0.8
+# A damping that may be anything is that of no mode: width of its interval.
+_ANYTHING = 0.5
 
 
 @dataclass(frozen=True)
@@ -115,10 +115,8 @@ def informed(draft: Draft, found: IdentifiedChannel, spread: UncertainChannel) -
     """The same with the specification that follows from the model that came out of the logs: its first mode
     that swings and whose damping is told, its first notch, the band that its ellipses tell."""
     look, model, omega = draft.look, found.model, spread.frequency.omega_rad_s
-    width = np.sqrt(np.trace(spread.frequency.covariance, axis1=1, axis2=2))
-    told = width < TOLD * np.abs(spread.frequency.centre)
-    share = np.cumsum(told) / np.arange(1, told.size + 1)
-    known = omega[told & (share > _MOSTLY_TOLD)]
+    variance = np.trace(spread.frequency.covariance, axis1=1, axis2=2)
+    known = omega[variance < (TOLD * np.abs(spread.frequency.centre)) ** 2]
     if look.told_rad_s is None or not known.size:
         return draft
     band = min(look.told_rad_s[0], float(known[0])), float(known[-1])
@@ -126,13 +124,18 @@ def informed(draft: Draft, found: IdentifiedChannel, spread: UncertainChannel) -
     modes = [
         (mode.omega_rad_s, mode.damping)
         for mode, interval in zip(found.modes, intervals, strict=True)
-        if interval is not None and found.is_mode(mode) and mode.damping < SWINGS and interval.told
+        if interval is not None and np.ptp(interval.damping) < _ANYTHING
+        if found.is_mode(mode) and mode.damping < SWINGS
     ]
     notch = next((float(zero) for zero in notches(model) if band[0] < zero < band[1]), None)
     look = replace(look, told_rad_s=band, mode=min(modes, default=None), notch=notch)
     unstable = max((growth for growth, _ in found.unstable_poles), default=0.0)
-    specification = _specification(look, draft.specification["effort_limit"], draft.limit, unstable)
-    return replace(draft, look=look, specification=specification, unstable_per_s=unstable)
+    return replace(
+        draft,
+        look=look,
+        specification=_specification(look, draft.specification["effort_limit"], draft.limit, unstable),
+        unstable_per_s=unstable,
+    )
 
 
 def recorded_effort(records: Sequence[Record]) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -42,11 +42,8 @@ _LESS, _LIMITS = 0.25, (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.93, 0.96, 0.98)
 _AGREES = 0.8
 # Least damping that the fit is allowed; a pair that stays there is none that the response shows.
 _LEAST_DAMPING = 1e-3
-# Chi-square by which another delay has to be worse: 3 standard deviations of one unknown.
-_WORSE, _FAR_WORSE = 9.0, 50.0
 _MOST_LINES = 300  # of the fit: more take longer and tell the same structure
 _SLOWEST = 0.1  # of the lowest frequency that is told: a slower pole looks like an integrator there
-_DELAYS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 
 
 @dataclass(frozen=True)
@@ -116,7 +113,7 @@ class RigidMotion:
 class FirstLook:
     """told_rad_s: lowest and highest frequency at which the response is told. model: None where nothing
     explains it. mode: natural frequency [rad/s] and damping ratio of the first; notch: frequency [rad/s] of
-    the slowest lightly damped zero. delay: fewest samples that the response allows. turned: the output falls
+    the slowest lightly damped zero. turned: the output falls
     when the command is positive; records and model have the command with its sign changed then."""
 
     records: tuple[Record, ...]
@@ -125,7 +122,6 @@ class FirstLook:
     motion: RigidMotion | None = None
     mode: tuple[float, float] | None = None
     notch: float | None = None
-    delay: int = 0
     turned: bool = False
 
     @property
@@ -147,12 +143,15 @@ def first_look(records: Sequence[Record], *, position: bool) -> FirstLook:
     found = _fitted(response, int(position))
     motion = _rigid(cut, found, response, position)
     turned = motion is not None and motion.turned
-    if turned:
+    if motion is not None and turned:
         cut = tuple(replace(record, input=-record.input) for record in cut)
-        motion = None if motion is None else _turned(motion)
+        terms: Any = {name: one for name, one in vars(motion).items() if isinstance(one, Term)}
+        motion = replace(motion, **{name: replace(one, value=-one.value) for name, one in terms.items()})
     if motion is not None and motion.friction.shown and motion.friction.value > 0:
         # Once more with the friction off the command: it bends the response below and damps the modes.
-        less = [_less_friction(record, motion.friction.value, told[1], position) for record in cut]
+        low = butter(3, min(told[1] * cut[0].dt_s / np.pi, 0.6), output="sos")
+        friction = [motion.friction.value * _sign(_speed(record, low, position)) for record in cut]
+        less = [replace(r, input=r.input - force[:, None]) for r, force in zip(cut, friction, strict=True)]
         response = told_response(less) or response
     elif turned:
         response = replace(response, centre=-response.centre)
@@ -164,13 +163,13 @@ def first_look(records: Sequence[Record], *, position: bool) -> FirstLook:
         # No pole either that is slower than the logs tell.
         slowest = _SLOWEST * told[0]
         bounds = {"omega_min_rad_s": look.rigid_below_rad_s, "decay_min_per_s": slowest, "max_real": 1}
-    found, delay = _delayed(response, _fitted(response, integrators, **bounds), integrators, bounds)
+    found = _fitted(response, integrators, **bounds)
     if found is None:
         return look
     above = max(told[0], 0.0 if motion is None else motion.below_rad_s)
     notch = next((float(omega) for omega in notches(found.model) if above < omega < told[1]), None)
     mode = _first_mode(found.model, above, told[1])
-    return replace(look, model=found.model, mode=mode, notch=notch, delay=delay)
+    return replace(look, model=found.model, mode=mode, notch=notch)
 
 
 def unseen_limit(look: FirstLook, *, position: bool) -> float | None:
@@ -194,12 +193,6 @@ def unseen_limit(look: FirstLook, *, position: bool) -> float | None:
         return None
     around = float(limits[max(k - 1, 0)]), float(limits[min(k + 1, limits.size - 1)])
     return float(minimize_scalar(left, bounds=around, method="bounded", options={"maxiter": 12}).x)
-
-
-def _less_friction(record: Record, level: float, below_rad_s: float, position: bool) -> Record:
-    low = butter(3, min(below_rad_s * record.dt_s / np.pi, 0.6), output="sos")
-    sign = _sign(_speed(record, low, position))
-    return replace(record, input=record.input - level * sign[:, None])
 
 
 def _speed(record: Record, low: RealArray, position: bool) -> RealArray:
@@ -284,31 +277,6 @@ def _fitted(response: FrequencyUncertainty, integrators: int, **known: float) ->
         return identify_frf(response, IdentOptions.model_validate(options))
     except ValueError:  # too few frequencies for the order
         return None
-
-
-def _delayed(
-    response: FrequencyUncertainty,
-    found: FrfIdentification | None,
-    integrators: int,
-    bounds: Mapping[str, float],
-) -> tuple[FrfIdentification | None, int]:
-    """The fit with the fewest samples of delay that no longer delay beats."""
-    if found is None:
-        return None, 0
-    poles = found.model.poles
-    n_real, n_pairs = poles.real.size - integrators, poles.pairs.size
-    fits = {0: found}
-    for delay in _DELAYS:
-        known = {**bounds, "input_delay_samples": delay, "n_real": n_real, "n_pairs": n_pairs}
-        fit = _fitted(response, integrators, **known)
-        least = min(fits.values(), key=lambda one: one.rss)
-        if fit is None or fit.rss - least.rss > _FAR_WORSE * max(1.0, least.dispersion):
-            break
-        fits[delay] = fit
-    scale = max(1.0, min(one.dispersion for one in fits.values()))
-    best = min(one.rss for one in fits.values())
-    delay = next(delay for delay, one in fits.items() if one.rss - best <= _WORSE * scale)
-    return fits[delay], delay
 
 
 def notches(model: GobfModel) -> RealArray:
@@ -417,9 +385,3 @@ def rigid_motion(
         below_rad_s,
         1 - rss / total**2 / target.size,
     )
-
-
-def _turned(motion: RigidMotion) -> RigidMotion:
-    terms = {name: term for name, term in vars(motion).items() if isinstance(term, Term)}
-    turned: Any = {name: replace(term, value=-term.value) for name, term in terms.items()}
-    return replace(motion, **turned)

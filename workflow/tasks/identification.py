@@ -158,9 +158,8 @@ def identify_channel(
     `with_stated_controller`. Raises ValueError, one line, where the logs cannot carry it.
     """
     options, given = _searched_around(channel, measured[0].dt_s), None
-    if friction is not None or loop is not None:
-        # The arm with friction was fitted without delay, and a closed loop looks like one.
-        options = options.with_delay_stated()
+    # The arm with friction was fitted without delay, and a closed loop looks like one.
+    as_logged = options if friction is None and loop is None else options.with_delay_stated()
     # A free run of an integrating plant drifts away with friction; it is judged as it was fitted.
     fresh = [(as_fitted(record, channel, friction), role) for record, role in unseen]
     doubted = (*measured, *(record for record, _ in unseen))
@@ -175,7 +174,13 @@ def identify_channel(
             if channel.bounds_band_rad_s is not None:
                 used = [as_fitted(record, channel) for record in bounded]
         found = identified_channel(
-            channel.label, used, fresh, options, report, with_plot=with_plot, friction=friction
+            channel.label,
+            used,
+            fresh,
+            as_logged if opened is None else options,
+            report,
+            with_plot=with_plot,
+            friction=friction,
         )
         if friction is not None:
             found = clipped_as_measured(found, measured)

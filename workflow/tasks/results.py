@@ -217,11 +217,6 @@ class ModeInterval:
     damping: Interval
 
     @property
-    def told(self) -> bool:
-        """Whether the records say that it swings: a damping that may be anything is that of no mode."""
-        return self.damping[1] - self.damping[0] < 0.5
-
-    @property
     def frequency_Hz(self) -> Interval:
         return self.omega_rad_s[0] / (2 * np.pi), self.omega_rad_s[1] / (2 * np.pi)
 
