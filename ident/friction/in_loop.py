@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.signal import lfilter
@@ -163,7 +164,11 @@ def fit_friction_in_loop(
     ends = list[FrictionFit]()
     for k, start in enumerate(starts):
         with suppress(LostError):
-            ends.append(_completed(logs, *start, _part_of(report, k, len(starts))))
+            ends.append(
+                _completed(
+                    logs, *start, partial(lambda k, done, what: report((k + done) / len(starts), what), k)
+                )
+            )
     if not ends:
         raise LostError
     found = min(ends, key=logs.worth)
@@ -177,10 +182,6 @@ def fit_friction_in_loop(
             "load, temperature)"
         )
     return wider
-
-
-def _part_of(report: Report, k: int, parts: int) -> Report:
-    return lambda fraction, message: report((k + fraction) / parts, message)
 
 
 def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: Report) -> FrictionFit:

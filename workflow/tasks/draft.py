@@ -115,8 +115,8 @@ def informed(draft: Draft, found: IdentifiedChannel, spread: UncertainChannel) -
     """The same with the specification that follows from the model that came out of the logs: its first mode
     that swings and whose damping is told, its first notch, the band that its ellipses tell."""
     look, model, omega = draft.look, found.model, spread.frequency.omega_rad_s
-    variance = np.trace(spread.frequency.covariance, axis1=1, axis2=2)
-    known = omega[variance < (TOLD * np.abs(spread.frequency.centre)) ** 2]
+    size = np.abs(spread.frequency.centre)
+    known = omega[np.trace(spread.frequency.covariance, axis1=1, axis2=2) < (TOLD * size) ** 2]
     if look.told_rad_s is None or not known.size:
         return draft
     band = min(look.told_rad_s[0], float(known[0])), float(known[-1])
