@@ -35,7 +35,7 @@ from ident.friction.in_loop import fit_friction_in_loop, recorded_in_loop
 from ident.friction.inverse_dynamics import presliding_of, with_measured_direction
 from ident.one_input import untested_model
 
-_MOST_SEARCHES = 8
+_MOST_SEARCHES = 8  # for the poles, anew with each better level; two or three are usual
 
 Report = Callable[[float, str], None]
 # Different positions: with 21 the level was within its standard deviation (7 %), with 11 a third too low.
