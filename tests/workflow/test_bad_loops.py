@@ -149,7 +149,7 @@ def test_a_limit_of_the_amplifier_is_seen_before_and_after_it(taken, tmp_path, c
     made = logs(levels=(0.2, 0.2), machine=plant(limit=0.5))
     results = taken(written(tmp_path, made, COLUMNS | {"i_cmd_A": column}))
     assert_right(results)
-    assert "input_limit = 0.5" in (tmp_path / "my.toml").read_text()
+    assert "input_limit = 0.5" in (tmp_path / "out" / "config.toml").read_text()
 
 
 @pytest.mark.long
