@@ -225,7 +225,7 @@ class Simulated(Protocol):
     """A machine that simulates its records: `ident.friction.FrictionFit`."""
 
     @property
-    def in_loop(self) -> bool: ...
+    def observed(self) -> bool: ...
 
     def residual(self, record: Record) -> RealArray: ...
 
@@ -240,7 +240,7 @@ def residual_tests(
     residuals behind it: they rest on those.
     """
     # Prediction errors of an observer are white as they are.
-    in_loop = friction is not None and friction.in_loop
+    in_loop = friction is not None and friction.observed
     colour = () if posterior.report is None or in_loop else posterior.report.ar_coefficients
     filter_of_noise = np.array([1.0, *colour])
     residuals = [

@@ -58,10 +58,10 @@ class FrictionFit:
     logarithm of the deflection; excess, logarithm of its speed). noise_std: output units. between: standard
     deviation of the level from record to record.
 
-    Of logs of a loop: correction (N,), the observer's (`step_through`) for a force of `ratio` at the input
-    (in its unit per unit of the noise); the constant force, bias, and the level beyond the first spring
-    (`spring`), both in units of the input, each with a row of the covariance. centre: from where positions of
-    an arm that does not integrate are told.
+    Where an observer follows the records: correction (N,), the observer's (`step_through`) for a force of
+    `ratio` at the input (in its unit per unit of the noise); the constant force, bias, and the level beyond
+    the first spring (`spring`), both in units of the input, each with a row of the covariance. centre: from
+    where positions of an arm that does not integrate are told.
     """
 
     law: FrictionLaw
@@ -79,8 +79,9 @@ class FrictionFit:
     centre: float = field(default=0.0, metadata={"since": 2})
 
     @property
-    def in_loop(self) -> bool:
-        """Fitted to logs of a loop, which an observer follows (`ident.friction.in_loop`)."""
+    def observed(self) -> bool:
+        """An observer follows the records (`ident.friction.in_loop`): those of a loop, and what no free run
+        explains."""
         return self.correction is not None
 
     @property
@@ -150,7 +151,7 @@ class FrictionFit:
         friction = self.motion(record)[1]
         if not np.all(np.isfinite(friction)):
             raise LostError
-        return less_friction(record, friction + self.steady(record) if self.in_loop else friction, delay)
+        return less_friction(record, friction + self.steady(record) if self.observed else friction, delay)
 
 
 @dataclass(frozen=True, eq=False)

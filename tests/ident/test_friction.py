@@ -426,7 +426,7 @@ def test_an_observer_follows_what_a_free_run_does_not_explain():
     angle = plant.run(through, volts, 0.0, np.zeros(volts.size))["y"]
     record = Record("log", volts[:, None], angle[:, None], 1e-3, ("motor_V",), ("angle_rad",))
     found = fit_friction([record], IdentOptions(integrators=1))
-    assert found.in_loop
+    assert found.observed
     assert found.law.level == pytest.approx(2.9e-3 / 0.02, rel=0.05)
     assert found.beyond == pytest.approx(1.3e-3 / 0.02, rel=0.05)
     omega, behind = np.geomspace(2 * np.pi, 200 * np.pi, 100), without_friction([record], found)

@@ -55,7 +55,7 @@ def belt() -> tuple[Machine, list[Record], FrictionFit]:
 @pytest.mark.slow
 def test_level_and_dead_time_of_a_belt_are_found(belt: tuple[Machine, list[Record], FrictionFit]) -> None:
     one, _, found = belt
-    assert found.in_loop
+    assert found.observed
     assert found.significant
     assert found.level == pytest.approx(levels_of(one), rel=0.02)
     assert abs(found.level - levels_of(one)) < 4 * found.level_std

@@ -107,7 +107,7 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
 
         with naming(f"channel {channel.label!r}"):
             known = friction if channel.uncertainty.friction_identified else None
-            if known is not None and known.in_loop and k != config.control_index:
+            if known is not None and known.observed and k != config.control_index:
                 raise ValueError(
                     "the friction of logs made in a loop is known behind the output that is fed back only: "
                     "leave this channel out, or give it response = 'as recorded'"
@@ -199,7 +199,10 @@ def identify_channel(
         )
 
     if friction is not None:
-        return fitted(None, finding(FindingKind.DIRECT_WITH_FRICTION) if friction.in_loop else None)
+        return fitted(
+            None,
+            finding(FindingKind.DIRECT_WITH_FRICTION) if friction.observed and loop is not None else None,
+        )
     if loop is None:
         return fitted(None)
     moving = all(record.reference is not None and np.ptp(record.reference) > 0 for record in measured)
@@ -287,7 +290,7 @@ def identified_channel(
     friction: taken off these records; of logs made in a loop, everything is over windows and behind its
     observer, because the arm drifts.
     """
-    share, in_loop = _OF_THE_FIT if with_plot else 1.0, friction is not None and friction.in_loop
+    share, in_loop = _OF_THE_FIT if with_plot else 1.0, friction is not None and friction.observed
 
     def part(done: float, what: str) -> None:
         report(share * done, what)

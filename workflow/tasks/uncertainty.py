@@ -127,7 +127,7 @@ def uncertainty_of(
         linear = posterior
     else:
         # An observer has a noise model of its own.
-        white = friction.in_loop or whiteness_test([friction.residual(record) for record in measured]).passed
+        white = friction.observed or whiteness_test([friction.residual(record) for record in measured]).passed
         find = without_friction if at_shaft else other_output_without_friction
 
         def arm_behind(asked: UncertaintyOptions) -> tuple[BehindFriction, Tests]:
@@ -143,7 +143,7 @@ def uncertainty_of(
         )
     band = result.data_band_rad_s
     omega = nominal_grid(display_grid(result.model, result.bounded), band)
-    observer = friction is not None and friction.in_loop
+    observer = friction is not None and friction.observed
     found = uncertain_channel(
         channel.uncertainty.method,
         channel.uncertainty.level,
