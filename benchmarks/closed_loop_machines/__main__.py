@@ -1,5 +1,5 @@
-"""Logs of machines under their own controllers, made by an independent simulator, from `flexlink init` and
-`flexlink run`, without an edit, to a controller: what came out, against the truth (criteria: judge.py).
+"""Logs of machines under their own controllers, made by an independent simulator, through
+`flexlink run LOG...`, nothing typed, to a controller: what came out, against the truth (criteria: judge.py).
 
 Seeds with seed mod 6 below 4 record the reference. Series 1 is for development.
     python -m benchmarks.closed_loop_machines --make-only LOGS    writes logs, and the truth to LOGS_truth

@@ -132,7 +132,7 @@ def of_known_sign(response: ResponsePosterior, longest_s: float) -> tuple[Respon
     than twice the centre's.
     """
     factor, n = response.covariance_factor, response.covariance_factor.shape[1]
-    omega = np.geomspace(1 / (_LENGTHS * longest_s), np.pi / response.dt_s, _FREQUENCIES)
+    omega = _frequencies(response, longest_s)
     rows = response.frequency_rows(omega)
     # The force it takes to move that slowly; the shaft goes where it is pushed.
     turned = (1j * omega[0]) ** response.integrators
@@ -216,7 +216,7 @@ def _by_linear_force(
     which no data tell: k y^(i) changes G by k s^i G^2 (i up to 2; no stiffness in an arm that integrates),
     each a share of the friction, rms over the records. less: the records with the friction taken off."""
     longest_s = max(record.n_samples for record in records) * response.dt_s
-    omega = np.geomspace(1 / (_LENGTHS * longest_s), np.pi / response.dt_s, _FREQUENCIES)
+    omega = _frequencies(response, longest_s)
     rows = response.frequency_rows(omega)
     gain = rows @ response.mean
     force = [(one.input - other.input)[:, 0] for one, other in zip(records, less, strict=True)]

@@ -371,7 +371,7 @@ def test_replacing_a_study_deletes_what_was_its_own_and_nothing_else(tmp_path):
     (first.path / "table.csv").write_text("old")
     (first.path / "notes.txt").write_text("mine")
     other = SimpleNamespace(**{**vars(base), "digests": {"records": "other"}})
-    with pytest.raises(InputError, match=r"the study began: stages_taken_over.*--replace"):
+    with pytest.raises(InputError, match=r"began: stages_taken_over.records .was absent.*--replace"):
         first.begin_study(text="second", base=other, resume=True)
     refusal = pytest.raises(InputError, match="another process is writing this study")
     with first.locked(), refusal, first.writing(replace=True):

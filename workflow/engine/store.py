@@ -180,13 +180,13 @@ def first_difference(old: Any, new: Any) -> str | None:
 
 
 def _leaves(value: Any, where: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted key and value of everything in a JSON-able value that has nothing inside."""
+    """Dotted key and value of every plain value in a JSON-able one; what is empty has none."""
     inner: list[tuple[str, Any]] = []
     if isinstance(value, Mapping):
         inner = [(f"{where}.{key}" if where else str(key), item) for key, item in value.items()]
     elif isinstance(value, list):
         inner = [(f"{where}[{index}]", item) for index, item in enumerate(value)]
-    if not inner:
+    else:
         yield where, value
     for name, item in inner:
         yield from _leaves(item, name)
