@@ -12,6 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.signal import lfilter
 
 from ident.basis.functions import basis_response, regressor
 from ident.basis.model import GobfModel
@@ -61,7 +62,8 @@ class FrictionFit:
     Where an observer follows the records: correction (N,), the observer's (`step_through`) for a force of
     `ratio` at the input (in its unit per unit of the noise); the constant force, bias, and the level beyond
     the first spring (`spring`), both in units of the input, each with a row of the covariance. centre: from
-    where positions of an arm that does not integrate are told.
+    where positions of an arm that does not integrate are told. lag: of the drive, in samples: the command
+    reaches the shaft through 1 / (1 + lag (1 - q^-1)), the friction does not.
     """
 
     law: FrictionLaw
@@ -77,6 +79,7 @@ class FrictionFit:
     spring: Spring | None = None
     beyond: float = 0.0
     centre: float = field(default=0.0, metadata={"since": 2})
+    lag: float = field(default=0.0, metadata={"since": 3})
 
     @property
     def observed(self) -> bool:
@@ -117,7 +120,7 @@ class FrictionFit:
         if self.correction is None:
             return self.arm.run(self.coefficients, record.input[:, 0], law)
         delay, position = self.arm.structure.input_delay_samples, self._position(record)
-        driving = less_friction(record, self.steady(record), delay).input[:, 0]
+        driving = less_friction(self.behind_drive(record), self.steady(record), delay).input[:, 0]
         return self.arm.run(self.coefficients, driving, law, position, self.correction)
 
     def _position(self, record: Record) -> RealArray:
@@ -145,13 +148,36 @@ class FrictionFit:
         left = answered(record.output[:, 0] - self.motion(record)[0], self.arm.structure.input_delay_samples)
         return np.asarray(left - left.mean())
 
+    def behind_drive(self, record: Record) -> Record:
+        """The record with what the drive's lag makes of its input."""
+        if not self.lag:
+            return record
+        pole = self.lag / (1 + self.lag)
+        return replace(record, input=record.input[0] + lfilter([1 - pole], [1, -pole], record.input - record.input[0], axis=0))
+
+    def forced(self, record: Record) -> Record:
+        """The record with the force on a linear arm as its input: command behind the drive less friction.
+        Raises LostError where that is not finite."""
+        return less_friction(self.behind_drive(record), self._friction(record), self._delay)
+
     def taken_off(self, record: Record) -> Record:
-        """The record with its input smaller by the friction. Raises LostError where that is not finite."""
-        delay = self.arm.structure.input_delay_samples
+        """The record with its input smaller by the friction, as a command makes it. Raises LostError."""
+        friction = self._friction(record)
+        return less_friction(record, friction + self.lag * np.diff(friction, prepend=friction[0]), self._delay)
+
+    def _friction(self, record: Record) -> RealArray:
         friction = self.motion(record)[1]
         if not np.all(np.isfinite(friction)):
             raise LostError
-        return less_friction(record, friction + self.steady(record) if self.observed else friction, delay)
+        return friction + self.steady(record) if self.observed else friction
+
+    @property
+    def _delay(self) -> int:
+        return self.arm.structure.input_delay_samples
+
+    def drive_response(self, omega_rad_s: RealArray) -> ComplexArray:
+        """(F,) of the drive's lag."""
+        return np.asarray(1 / (1 + self.lag * (1 - np.exp(-1j * omega_rad_s * self.arm.dt_s))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,8 +260,8 @@ def equations(found: FrictionFit, records: Sequence[Record]) -> tuple[list[RealA
 
 def driven_by_law(found: FrictionFit, record: Record) -> RealArray:
     """(T, Q) derivatives of the arm's (stabilised) position with respect to the parameters of the law, to the
-    bias of an integrating arm and to the level beyond a spring, where an observer tells the friction of a
-    record."""
+    drive's lag where there is one, to the bias of an integrating arm and to the level beyond a spring, where
+    an observer tells the friction of a record."""
     arm = replace(found.model.stable_part, input_delay_samples=0)
     friction, parameters = found.motion(record)[1], parameters_of(found.law)
     beyond = 0.0 if found.spring is None else found.force_beyond(record, found.beyond, found.law)
@@ -247,6 +273,9 @@ def driven_by_law(found: FrictionFit, record: Record) -> RealArray:
         columns.append((found.friction_of(record, law) - friction) / size)
         if found.spring is not None and np.isfinite(found.law.fall):
             columns[-1] = columns[-1] + (found.force_beyond(record, found.beyond, law) - beyond) / size
+    if found.lag:
+        faster = np.diff(found.behind_drive(found.behind_drive(record)).input[:, 0], prepend=record.input[0])
+        columns.append(filter_input(faster, 0, found.arm.structure.input_delay_samples))
     if found.arm.structure.integrators:
         columns.append(np.ones(friction.size))
     if found.spring is not None:

@@ -70,6 +70,8 @@ _CAUSES, _NOTHING, _BY_CHANCE = 8, 1e-5, 1e-6
 _LARGEST_STEP, _LENGTHS = 0.3, (1.0, 0.5, 0.25, 0.1)
 # Samples that a command may be late, and errors that are less by much: 1.4 of a belt, .97 of a rigid axis.
 _EARLIER, _MUCH_BETTER = 2, 0.8
+# Where the search for a lag of the drive begins that is none of dead time, samples.
+_LEAST_LAG = 0.5
 # Change of a constant force, as a share of the rms input, that a derivative is taken from.
 _CHANGE_OF_BIAS = 0.01
 # Lowest further pair, as a share of the first mode: friction that is left over looks like slow poles.
@@ -141,7 +143,7 @@ class _Logs:
 
     def worth(self, found: FrictionFit) -> float:
         """Errors, larger by what the number of poles costs."""
-        return self.errors(found) * (1 + found.model.order * self.criterion)
+        return self.errors(found) * (1 + (found.model.order + int(found.lag > 0)) * self.criterion)
 
 
 def fit_friction_in_loop(
@@ -187,7 +189,10 @@ def fit_friction_in_loop(
 def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: Report) -> FrictionFit:
     """From the fit with the fewest poles: the law of the friction, as many poles as the data ask for, the
     dead time. Raises LostError."""
-    few = _simplest(options)
+    few, left_open = _simplest(options), options.delay_left_to_data
+    report(0.2, "friction: dead time, lag of the drive")
+    found = _with_shift(logs, found, few)
+    few, options = (one.model_copy(update=_shift_of(found)) for one in (few, options))
     if found.significant:
         report(0.4, "friction: falling with speed, beyond a spring")
         with suppress(LostError):  # what no observer follows explains nothing better
@@ -198,19 +203,53 @@ def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: R
     simple = found
     with suppress(LostError):
         found = _with_more_poles(logs, found, options)
-    for delay in range(1, _LONGEST_DELAY + 1) if options.delay_left_to_data else ():
-        report(0.5 + 0.1 * min(delay, 4), "friction: dead time")
-        late = {"input_delay_samples": delay}
-        arm = replace(simple.arm, structure=options.model_copy(update=late).structure())
+    while found.lag or (left_open and options.input_delay_samples):
+        # What a simple arm took for a shift may be further poles.
+        delay = simple.arm.structure.input_delay_samples + (round(simple.lag) if simple.lag else -1)
+        earlier = _shifted(simple, delay, 0.0)
+        few, options = (one.model_copy(update=_shift_of(earlier)) for one in (few, options))
+        report(0.8, "friction: dead time, lag of the drive")
         try:
-            simple = _in_turns(logs, replace(simple, arm=arm), few.model_copy(update=late), _FEW_ROUNDS)
-            tried = _with_more_poles(logs, simple, options.model_copy(update=late))
+            simple = _in_turns(logs, earlier, few, _FEW_ROUNDS)
+            tried = _with_more_poles(logs, simple, options)
         except LostError:
             break
-        if not logs.worth(tried) < logs.worth(found):  # a pair more in place of a delay is no better
+        if not logs.worth(tried) < logs.worth(found):
             break
         found = tried
     return _without_needless_stribeck(logs, found)
+
+
+def _with_shift(logs: _Logs, found: FrictionFit, few: IdentOptions) -> FrictionFit:
+    """The same with the dead time that predicts best, and a lag of the drive in place of a part of it."""
+    longest = _LONGEST_DELAY if few.delay_left_to_data else 0
+    delays = [(delay, 0.0) for delay in range(1, longest + 1)]
+
+    def descended(found: FrictionFit, shifts: Sequence[tuple[int, float]]) -> FrictionFit:
+        for shift in shifts:
+            try:
+                tried = _shifted(found, *shift)
+                tried = _in_turns(logs, tried, few.model_copy(update=_shift_of(tried)), _FEW_ROUNDS)
+            except LostError:
+                break
+            if not logs.worth(tried) < logs.worth(found):
+                break
+            found = tried
+        return found
+
+    found = descended(found, delays)
+    whole = found.arm.structure.input_delay_samples
+    parts = [(whole - k, float(k)) for k in range(1, whole + 1)] if longest and whole else [(whole, _LEAST_LAG)]
+    return descended(found, parts)
+
+
+def _shifted(found: FrictionFit, delay: int, lag: float) -> FrictionFit:
+    structure = replace(found.arm.structure, input_delay_samples=delay)
+    return replace(found, arm=replace(found.arm, structure=structure), lag=lag)
+
+
+def _shift_of(found: FrictionFit) -> dict[str, int]:
+    return {"input_delay_samples": found.arm.structure.input_delay_samples}
 
 
 def _of_structure(logs: _Logs, options: IdentOptions) -> list[tuple[IdentOptions, FrictionFit]]:
@@ -251,7 +290,7 @@ def _simple(
     found = _in_turns(logs, replace(start, centre=logs.centre), few)
     if sought and options.unstable_poles:
         # Once more with a better friction, which the growth depends on.
-        options = options.with_unstable(find_unstable([found.taken_off(r) for r in logs.records], options))
+        options = options.with_unstable(find_unstable([found.forced(r) for r in logs.records], options))
         found = _in_turns(logs, found, _simplest(options))
     return options, found
 
@@ -307,7 +346,7 @@ def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: in
     for k in range(rounds):
         found = observed(found, logs.records)
         whiten = ObserverFilter.of(found)
-        white = [whiten.filtered(found.taken_off(record)) for record in logs.records]
+        white = [whiten.filtered(found.forced(record)) for record in logs.records]
         models = [untested_model(white, inside)] if search else []
         if k or found.model.poles.counts == (options.n_real, options.n_pairs):
             there = PoleSearch(prepare(white, inside.structure()), inside)
@@ -318,6 +357,7 @@ def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: in
             anew = started(model, options.structure(), found.law)
             spring = found.spring and (Spring.of(model) or found.spring)
             anew = replace(anew, bias=found.bias, spring=spring, beyond=found.beyond, centre=found.centre)
+            anew = replace(anew, lag=found.lag)
             if not search:
                 anew = replace(anew, correction=found.correction, ratio=found.ratio)
             tried.append(observed(anew, logs.records))
@@ -342,9 +382,9 @@ def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
     known = np.zeros((q // 2 + 1, blocks[0].shape[1] + 1))
     for i, at in enumerate(range(1, q, 2)):
         known[i, p + at], known[i, -1] = noise / STD_LOG, noise / STD_LOG * (expected - theta)[at]
-    integrating = found.arm.structure.integrators > 0
+    integrating, at_bias = found.arm.structure.integrators > 0, q + int(found.lag > 0)
     if integrating:
-        known[-1, p + q], known[-1, -1] = noise / logs.rms, -noise / logs.rms * found.bias
+        known[-1, p + at_bias], known[-1, -1] = noise / logs.rms, -noise / logs.rms * found.bias
     change = least_squares(blocks, targets, known)[0]
     step = change[p:]
     step[1:q:2] = np.clip(step[1:q:2], -1, 1)
@@ -355,7 +395,8 @@ def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
         tried = replace(
             found,
             law=replace(law, level=max(law.level, logs.least)),
-            bias=found.bias + length * float(step[q]) if integrating else found.bias,
+            lag=max(found.lag + length * float(np.clip(step[q], -1, 1)), 0.0) if found.lag else 0.0,
+            bias=found.bias + length * float(step[at_bias]) if integrating else found.bias,
             beyond=max(found.beyond + length * float(step[-1]), 0.0) if found.spring else 0.0,
             coefficients=found.coefficients + arm * length * change[:p],
         )
@@ -467,7 +508,7 @@ def identify_behind(
         all_ - known for all_, known in zip(found.model.poles.counts, options.fixed().counts, strict=True)
     )
     delay = structure.input_delay_samples
-    known = {"n_real": n_real, "n_pairs": n_pairs, "input_delay_samples": delay}
+    known = {"n_real": n_real + int(found.lag > 0), "n_pairs": n_pairs, "input_delay_samples": delay}
     options, whiten = _beyond(found, _moving(options)).model_copy(update=known), ObserverFilter.of(found)
     behind = identify([whiten.filtered(record) for record in records], options, progress=progress)
     fits = [fit_in_windows(behind.model, record) for record in records]
@@ -491,7 +532,7 @@ def _equations(
     record may be (free responses, an offset) is taken off both."""
     blocks, targets, structure = [], [], found.arm.structure
     for record in records:
-        less = found.taken_off(record)
+        less = found.forced(record)
         driven = driving_input(less.input[:, 0], structure.integrators, structure.input_delay_samples)
         basis = regressor(found.arm.poles.doubled(), driven)
         position = answered(

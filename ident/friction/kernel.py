@@ -188,6 +188,7 @@ def loop_through(
     steps: Any,
     delay: int,
     input_delay: int,
+    lag: float,
     moves: Any,
     rates: Any,
     chain: Any,
@@ -206,13 +207,14 @@ def loop_through(
     added (T,): joins the law's command before it is limited. law (n + 1, n + 2): rows of the state and the
     output, columns A, B, M and C, D, - of x+ = A x + B e + M (limited - wanted), wanted = C x + D e + added.
     limits: of the command and of its change per sample, inf for none; steps: of measurement and command, 0
-    for none. delay, input_delay: samples until a command is given to the arm, and until it acts. spring: as
-    of `hold_load`, level 0 for no friction at the load; it acts a sample after its motion.
+    for none. delay, input_delay: samples until a command is given to the arm, and until it acts, through a
+    drive that lags by `lag` samples. spring: as of `hold_load`, level 0 for no friction at the load; it acts
+    a sample after its motion.
     """
     order = law.shape[0] - 1
     state, x, later = np.zeros(rates.size, dtype=np.complex128), np.zeros(order), np.zeros(order)
     shaft, last = np.zeros(3), 0.0
-    load, held = np.zeros(4), 0.0
+    load, held, applied = np.zeros(4), 0.0, 0.0
     queue, waiting = np.zeros(delay + 1), np.zeros(input_delay + 1)
     for k in range(reference.size):
         y = shaft[0] + noise[k]
@@ -237,7 +239,7 @@ def loop_through(
         u = queue[(k + 1) % (delay + 1)]
         measured[k], command[k], limited[k] = y, u, last != wanted
         waiting[k % (input_delay + 1)] = u
-        applied = waiting[(k + 1) % (input_delay + 1)]
+        applied += (waiting[(k + 1) % (input_delay + 1)] - applied) / (1 + lag)
         before = shaft[0]
         advance(applied - held, state, shaft, moves, rates, chain, weights, dt_s, law_of_friction)
         if spring[5] > 0:

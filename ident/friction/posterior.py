@@ -95,7 +95,9 @@ def _behind_observed(
         by_law = driven_by_law(found, record)
         shape = _SHAPE * found.level * driven_by_shape(found, record, speed)
         logs = STD_LOG * by_law[:, 1::2][:, : found.law.n_logs]
-        plain = np.delete(by_law, 1 + 2 * np.arange(found.law.n_logs), axis=1)
+        # The basis has the drive's lag; how far that moves the friction which is taken off is neglected.
+        others = [*(1 + 2 * np.arange(found.law.n_logs)), *([2 * found.law.n_logs] if found.lag else [])]
+        plain = np.delete(by_law, others, axis=1)
         own = np.outer(found.between * plain[:, 0], np.arange(len(records)) == k)
         beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([plain, shape, logs, own])))
         less.append(found.taken_off(record))
@@ -107,7 +109,7 @@ def _behind_observed(
     response, change, factor = tangent_beside(less, model, beside, options, n_known=known)
     whitening = np.array([1.0, *(response.report.ar_coefficients if response.report else ())])
     wider = np.sqrt(heterogeneity(found, records, autoregressive(whitening)))
-    by_force = _by_linear_force(records, less, response)
+    by_force = _by_linear_force(found, records, less, response)
     response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
     longest_s = max(record.n_samples for record in less) * model.dt_s
     response, factor_of_arm = of_known_sign(response, longest_s)
@@ -210,7 +212,7 @@ def _with_poles(
 
 
 def _by_linear_force(
-    records: Sequence[Record], less: Sequence[Record], response: ResponsePosterior
+    friction: FrictionFit, records: Sequence[Record], less: Sequence[Record], response: ResponsePosterior
 ) -> RealArray:
     """(P, S) changes of the response's coefficients by a part of the friction that looks like a linear force,
     which no data tell: k y^(i) changes G by k s^i G^2 (i up to 2; no stiffness in an arm that integrates),
@@ -225,7 +227,7 @@ def _by_linear_force(
     for i in range(3):
         if i >= response.integrators:
             size = _SHAPE * np.sqrt(_mean_square(force) / _mean_square(moved))
-            change = size * (1j * omega) ** i * gain
+            change = size * (1j * omega) ** i * gain / friction.drive_response(omega)
             # On the doubled poles, which hold G^2 s^i but for the delay, relative to G.
             basis = real_rows(rows[:, : response.poles.order] / gain[:, None])
             columns.append(np.asarray(np.linalg.lstsq(basis, real_rows(change), rcond=None)[0]))

@@ -83,6 +83,7 @@ class FrictionLoop:
             np.array([self.measurement_step, self.command_step]),
             law.computational_delay_samples,
             arm.structure.input_delay_samples,
+            self.found.lag,
             arm.moves,
             arm.rates,
             arm.chain,
@@ -173,7 +174,7 @@ def predicted_peak(
 def friction_feedforward(controller: Controller, found: FrictionFit) -> FrictionFeedforward:
     """Of the identified friction at shaft and load, as late as T = G K / (1 + G K) is towards standstill."""
     omega = np.array([1e-5 * np.pi / controller.dt_s])
-    loop = controller.response(omega) * found.model.frequency_response(omega)
+    loop = controller.response(omega) * found.model.frequency_response(omega) * found.drive_response(omega)
     delay_s = float(-np.angle(loop / (1 + loop))[0] / omega[0])
     law = found.law
     both = found.level / law.level if law.level > 0 else 1.0
