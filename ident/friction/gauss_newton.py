@@ -153,7 +153,10 @@ class FrictionFit:
         if not self.lag:
             return record
         pole = self.lag / (1 + self.lag)
-        return replace(record, input=record.input[0] + lfilter([1 - pole], [1, -pole], record.input - record.input[0], axis=0))
+        return replace(
+            record,
+            input=record.input[0] + lfilter([1 - pole], [1, -pole], record.input - record.input[0], axis=0),
+        )
 
     def forced(self, record: Record) -> Record:
         """The record with the force on a linear arm as its input: command behind the drive less friction.
@@ -163,7 +166,9 @@ class FrictionFit:
     def taken_off(self, record: Record) -> Record:
         """The record with its input smaller by the friction, as a command makes it. Raises LostError."""
         friction = self._friction(record)
-        return less_friction(record, friction + self.lag * np.diff(friction, prepend=friction[0]), self._delay)
+        return less_friction(
+            record, friction + self.lag * np.diff(friction, prepend=friction[0]), self._delay
+        )
 
     def _friction(self, record: Record) -> RealArray:
         friction = self.motion(record)[1]

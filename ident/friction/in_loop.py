@@ -14,6 +14,7 @@ Neglected: a level that depends on position or load; what the sensor's noise doe
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -70,14 +71,15 @@ _CAUSES, _NOTHING, _BY_CHANCE = 8, 1e-5, 1e-6
 _LARGEST_STEP, _LENGTHS = 0.3, (1.0, 0.5, 0.25, 0.1)
 # Samples that a command may be late, and errors that are less by much: 1.4 of a belt, .97 of a rigid axis.
 _EARLIER, _MUCH_BETTER = 2, 0.8
-# Where the search for a lag of the drive begins that is none of dead time, samples.
+# How dead time and lag are changed, samples: later, a lag in place of dead time, a first lag, the reverse.
 _LEAST_LAG = 0.5
+_SHIFTS = ((1, 0.0), (-1, 1.0), (0, _LEAST_LAG), (1, -1.0))
 # Change of a constant force, as a share of the rms input, that a derivative is taken from.
 _CHANGE_OF_BIAS = 0.01
 # Lowest further pair, as a share of the first mode: friction that is left over looks like slow poles.
 _LOWEST_PAIR, _ABOVE_NOISE = 0.4, 1.2
 # Stribeck friction begins with this excess and one of these speeds, in units of the rms speed.
-_FALLS, _EXCESS, _STRIBECK_STEPS = (0.03, 0.1, 0.3), 0.1, 6
+_FALLS, _EXCESS, _STEPS = (0.03, 0.1, 0.3), 0.1, 6
 # Errors of the fewest poles, as a multiple of the other structure's, above which a structure is given up. An
 # arm that a weight throws over was right at 1.02 of an integrator's, and ended at .79 of them.
 _WORSE_AT_FIRST = 1.5
@@ -187,30 +189,30 @@ def fit_friction_in_loop(
 
 
 def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: Report) -> FrictionFit:
-    """From the fit with the fewest poles: the law of the friction, as many poles as the data ask for, the
-    dead time. Raises LostError."""
-    few, left_open = _simplest(options), options.delay_left_to_data
+    """From the fit with the fewest poles: dead time and lag of the drive, the law of the friction, as many
+    poles as the data ask for. Raises LostError."""
+    left_open = options.delay_left_to_data
     report(0.2, "friction: dead time, lag of the drive")
-    found = _with_shift(logs, found, few)
-    few, options = (one.model_copy(update=_shift_of(found)) for one in (few, options))
-    if found.significant:
-        report(0.4, "friction: falling with speed, beyond a spring")
-        with suppress(LostError):  # what no observer follows explains nothing better
-            found = _with_friction_beyond(logs, found, few)
-        with suppress(LostError):
-            found = _with_stribeck(logs, found)
+    found = _with_shift(logs, found, options, left_open=left_open)
+    report(0.4, "friction: falling with speed, beyond a spring")
+    simple = _with_law(logs, found, options)
+    if simple is not found:  # a law that was wrong is taken for a lag
+        simple = _with_shift(logs, simple, options, left_open=left_open)
     report(0.5, "friction: level and arm in turns")
-    simple = found
+    found = simple
     with suppress(LostError):
-        found = _with_more_poles(logs, found, options)
-    while found.lag or (left_open and options.input_delay_samples):
+        found = _with_more_poles(logs, simple, options)
+    if found is not simple:
+        found = _with_law(logs, found, options)
+    while found.lag or (left_open and found.arm.structure.input_delay_samples):
         # What a simple arm took for a shift may be further poles.
-        delay = simple.arm.structure.input_delay_samples + (round(simple.lag) if simple.lag else -1)
-        earlier = _shifted(simple, delay, 0.0)
-        few, options = (one.model_copy(update=_shift_of(earlier)) for one in (few, options))
         report(0.8, "friction: dead time, lag of the drive")
+        delay = found.arm.structure.input_delay_samples + (round(found.lag) if found.lag else -1)
+        earlier = replace(
+            _shifted(simple, delay, 0.0), law=found.law, spring=found.spring, beyond=found.beyond
+        )
         try:
-            simple = _in_turns(logs, earlier, few, _FEW_ROUNDS)
+            simple = _in_turns(logs, earlier, _of_order(simple, options, delay), _FEW_ROUNDS)
             tried = _with_more_poles(logs, simple, options)
         except LostError:
             break
@@ -220,27 +222,39 @@ def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: R
     return _without_needless_stribeck(logs, found)
 
 
-def _with_shift(logs: _Logs, found: FrictionFit, few: IdentOptions) -> FrictionFit:
-    """The same with the dead time that predicts best, and a lag of the drive in place of a part of it."""
-    longest = _LONGEST_DELAY if few.delay_left_to_data else 0
-    delays = [(delay, 0.0) for delay in range(1, longest + 1)]
+def _with_shift(logs: _Logs, found: FrictionFit, options: IdentOptions, *, left_open: bool) -> FrictionFit:
+    """The same with the dead time and the lag of the drive, in place of a part of it, that predict best;
+    left_open: the dead time is."""
+    seen, moves, failed = {(found.arm.structure.input_delay_samples, round(2 * found.lag))}, deque(_SHIFTS), 0
+    while failed < len(moves):
+        later, slower = moves[0]
+        delay, lag = found.arm.structure.input_delay_samples + later, max(found.lag + slower, 0.0)
+        place, one = (delay, round(2 * lag)), found
+        if place not in seen and (not later or (left_open and 0 <= delay <= _LONGEST_DELAY)):
+            with suppress(LostError):
+                one = _shifted(found, delay, lag)
+                one = _in_turns(logs, one, _of_order(found, options, delay), _FEW_ROUNDS)
+        seen.add(place)
+        if logs.worth(one) < logs.worth(found):  # and once more the same way
+            found, failed = one, 0
+        else:
+            moves.rotate(-1)
+            failed += 1
+    settled = _in_turns(logs, found, _of_order(found, options))
+    return min(found, settled, key=logs.errors)
 
-    def descended(found: FrictionFit, shifts: Sequence[tuple[int, float]]) -> FrictionFit:
-        for shift in shifts:
-            try:
-                tried = _shifted(found, *shift)
-                tried = _in_turns(logs, tried, few.model_copy(update=_shift_of(tried)), _FEW_ROUNDS)
-            except LostError:
-                break
-            if not logs.worth(tried) < logs.worth(found):
-                break
-            found = tried
-        return found
 
-    found = descended(found, delays)
-    whole = found.arm.structure.input_delay_samples
-    parts = [(whole - k, float(k)) for k in range(1, whole + 1)] if longest and whole else [(whole, _LEAST_LAG)]
-    return descended(found, parts)
+def _of_order(found: FrictionFit, options: IdentOptions, delay: int | None = None) -> IdentOptions:
+    """The options with the structure and the number of poles of a fit, but for another dead time."""
+    structure = found.arm.structure
+    options = options.model_copy(update={"integrators": structure.integrators})
+    if structure.unstable.order:
+        options = options.with_unstable(structure.unstable)
+    n_real, n_pairs = (
+        all_ - known for all_, known in zip(found.model.poles.counts, options.fixed().counts, strict=True)
+    )
+    delay = structure.input_delay_samples if delay is None else delay
+    return options.model_copy(update={"n_real": n_real, "n_pairs": n_pairs, "input_delay_samples": delay})
 
 
 def _shifted(found: FrictionFit, delay: int, lag: float) -> FrictionFit:
@@ -248,8 +262,14 @@ def _shifted(found: FrictionFit, delay: int, lag: float) -> FrictionFit:
     return replace(found, arm=replace(found.arm, structure=structure), lag=lag)
 
 
-def _shift_of(found: FrictionFit) -> dict[str, int]:
-    return {"input_delay_samples": found.arm.structure.input_delay_samples}
+def _with_law(logs: _Logs, found: FrictionFit, options: IdentOptions) -> FrictionFit:
+    """The same with friction at the load, and falling with speed, where that is worth it."""
+    if found.significant:
+        with suppress(LostError):  # what no observer follows explains nothing better
+            found = _with_friction_beyond(logs, found, _of_order(found, options))
+        with suppress(LostError):
+            found = _with_stribeck(logs, found)
+    return found
 
 
 def _of_structure(logs: _Logs, options: IdentOptions) -> list[tuple[IdentOptions, FrictionFit]]:
@@ -296,11 +316,14 @@ def _simple(
 
 
 def _simplest(options: IdentOptions) -> IdentOptions:
-    """One real pole and one pair, unless numbers are given: with more, a wrong level is taken for poles."""
-    given = (("n_real", options.n_real, options.max_real), ("n_pairs", options.n_pairs, options.max_pairs))
-    return options.model_copy(
-        update={key: min(1, most) if known is None else known for key, known, most in given}
+    """One real pole and one pair, and one more where a spring or weight holds the arm, unless numbers are
+    given: with more, a wrong level is taken for poles."""
+    pairs = 1 + int(not options.integrators and not options.fixed().order)
+    given = (
+        ("n_real", options.n_real, min(1, options.max_real)),
+        ("n_pairs", options.n_pairs, min(pairs, options.max_pairs)),
     )
+    return options.model_copy(update={key: most if known is None else known for key, known, most in given})
 
 
 def _moving(options: IdentOptions) -> IdentOptions:
@@ -325,8 +348,9 @@ def _beyond(found: FrictionFit, options: IdentOptions) -> IdentOptions:
     modes = poles.omega_rad_s(found.model.dt_s)[poles.zeta() < LARGEST_DAMPING]
     if modes.size:
         least = _LOWEST_PAIR * float(modes.min())
-        if found.spring is not None and found.spring.omega_rad_s < modes.max():
-            least = float(np.sqrt(found.spring.omega_rad_s * modes[modes > found.spring.omega_rad_s].min()))
+        spring = found.spring if found.arm.structure.integrators else None
+        if spring is not None and spring.omega_rad_s < modes.max():
+            least = float(np.sqrt(spring.omega_rad_s * modes[modes > spring.omega_rad_s].min()))
         update["omega_min_rad_s"] = max(least, options.omega_min_rad_s or 0.0)
     return options.model_copy(update=update)
 
@@ -335,7 +359,8 @@ def _with_more_poles(logs: _Logs, found: FrictionFit, options: IdentOptions) -> 
     """The same with as many poles as the data ask for, where they are worth it."""
     if options == _simplest(options):
         return found
-    more = _in_turns(logs, found, _beyond(found, options))
+    delay = {"input_delay_samples": found.arm.structure.input_delay_samples}
+    more = _in_turns(logs, found, _beyond(found, options.model_copy(update=delay)))
     extra = more.model.order - found.model.order
     return more if logs.errors(more) < logs.errors(found) * (1 - extra * logs.criterion) else found
 
@@ -424,13 +449,21 @@ def _held(logs: _Logs, found: FrictionFit) -> FrictionFit:
     return tried if logs.errors(tried) < logs.errors(found) else found
 
 
+def _settled(logs: _Logs, found: FrictionFit) -> FrictionFit:
+    """Gauss-Newton steps, each behind the observer that follows what the one before has found."""
+    for _ in range(_STEPS):
+        found = _stepped(logs, observed(found, logs.records))
+    return found
+
+
 def _with_stribeck(logs: _Logs, found: FrictionFit) -> FrictionFit:
     """The same with friction that falls with speed, where that is worth its two parameters."""
+    if np.isfinite(found.law.fall):
+        return found
     speed, excess = rms_speed(logs.records), _EXCESS * found.law.level
     laws = [replace(found.law, level=found.law.level - excess, excess=excess, fall=f * speed) for f in _FALLS]
     best = min((replace(found, law=law) for law in laws), key=logs.errors)
-    for _ in range(_STRIBECK_STEPS):
-        best = _stepped(logs, best)
+    best = _settled(logs, best)
     better = logs.errors(best) < logs.errors(found) * (1 - 2 * logs.criterion)
     return best if best.law.excess > 0 and better else found
 
@@ -443,8 +476,7 @@ def _without_needless_stribeck(logs: _Logs, found: FrictionFit) -> FrictionFit:
         return found
     plain = replace(found, law=replace(law, level=law.level + law.excess, excess=0.0, fall=np.inf))
     with suppress(LostError):
-        for _ in range(_STRIBECK_STEPS):
-            plain = _stepped(logs, plain)
+        plain = _settled(logs, plain)
         if logs.errors(plain) * (1 - 2 * logs.criterion) < logs.errors(found):
             return plain
     return found
@@ -454,13 +486,11 @@ def _with_friction_beyond(logs: _Logs, found: FrictionFit, few: IdentOptions) ->
     """The same with friction on the other side of the first spring, where that is worth its parameter. The
     spring is read off the arm once more when most of the friction is known, which bends the arm's zero."""
     spring = Spring.of(found.model)
-    if spring is None:
+    if spring is None or found.spring is not None:
         return found
     half = 0.5 * found.law.level
     best = replace(found, spring=spring, beyond=half, law=replace(found.law, level=half))
-    for _ in range(_STRIBECK_STEPS):
-        best = _stepped(logs, best)
-    best = _in_turns(logs, best, few)
+    best = _in_turns(logs, _settled(logs, best), few)
     better = logs.errors(best) < logs.errors(found) * (1 - logs.criterion)
     return best if best.beyond > 0 and better else found
 
@@ -468,15 +498,9 @@ def _with_friction_beyond(logs: _Logs, found: FrictionFit, few: IdentOptions) ->
 def precedes_command(found: FrictionFit, records: Sequence[Record], options: IdentOptions) -> bool:
     """Whether the motion of logs comes before its command: an arm with as many poles predicts much better
     where the command is logged two samples earlier. records, options: those of the fit."""
-    structure, poles = found.arm.structure, found.model.poles
-    if structure.input_delay_samples:
+    if found.arm.structure.input_delay_samples:
         return False
-    options = _above_noise(records, options).model_copy(update={"integrators": structure.integrators})
-    options = options.with_unstable(structure.unstable)
-    known = zip(("n_real", "n_pairs"), poles.counts, options.fixed().counts, strict=True)
-    same = options.model_copy(
-        update={"input_delay_samples": 0} | {key: all_ - fixed for key, all_, fixed in known}
-    )
+    same = _of_order(found, _above_noise(records, options))
     earlier = [
         replace(record.slice(0, record.n_samples - _EARLIER), input=record.input[_EARLIER:])
         for record in records
@@ -500,16 +524,9 @@ def identify_behind(
     """The arm behind the friction of logs of a loop: poles of the number that the fit of the friction has, on
     records with the friction taken off, whitened by its observer. Residuals and fit are over windows
     (`fit_in_windows`)."""
-    options, structure = _above_noise(records, options or IdentOptions()), found.arm.structure
-    options = options.model_copy(update={"integrators": structure.integrators})
-    if structure.unstable.order:
-        options = options.with_unstable(structure.unstable)
-    n_real, n_pairs = (
-        all_ - known for all_, known in zip(found.model.poles.counts, options.fixed().counts, strict=True)
-    )
-    delay = structure.input_delay_samples
-    known = {"n_real": n_real + int(found.lag > 0), "n_pairs": n_pairs, "input_delay_samples": delay}
-    options, whiten = _beyond(found, _moving(options)).model_copy(update=known), ObserverFilter.of(found)
+    options = _of_order(found, _beyond(found, _moving(_above_noise(records, options or IdentOptions()))))
+    options = options.model_copy(update={"n_real": (options.n_real or 0) + int(found.lag > 0)})
+    whiten = ObserverFilter.of(found)
     behind = identify([whiten.filtered(record) for record in records], options, progress=progress)
     fits = [fit_in_windows(behind.model, record) for record in records]
     residuals = tuple(fit.residual for fit in fits)

@@ -3,7 +3,7 @@
 The load follows the motor as Z = (w^2 + 2 zeta w s) / (s^2 + 2 zeta w s + w^2), w, zeta the lowest zero of
 the motor's response, less what its friction holds back; by reciprocity a torque at the load moves the motor
 as Z times as much at the motor does. The load is stepped behind the motor's position, from rest. Neglected:
-further springs.
+further springs; what a weight adds to the stiffness.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ident.data.arrays import RealArray
 from ident.friction.arm import FrictionLaw
 from ident.friction.kernel import behind_motor
 
-# A zero that is damped more than this, or lies above the first mode, is no load behind a spring.
+# A zero that is damped more than this is no load behind a spring.
 _LARGEST_DAMPING = 0.5
 # Of the zero: where the inertia is read off.
 _RIGID = 0.5
@@ -35,18 +35,19 @@ class Spring:
 
     @classmethod
     def of(cls, model: GobfModel) -> Spring | None:
-        """From the lowest zero below the first mode of a model of the motor's position, if there is one."""
+        """From the lowest zero with a mode above it of a model of the motor's position, if there is one."""
         zeros = model.zeros()
         rates = np.log(zeros[zeros.imag > 0]) / model.dt_s
         zeta = np.abs(rates.real) / np.abs(rates)
         of_poles = model.poles.zeta()
-        modes = np.where(of_poles < _LARGEST_DAMPING, model.poles.omega_rad_s(model.dt_s), np.inf)
-        pole = float(modes.min(initial=np.inf))
-        low = (zeta < _LARGEST_DAMPING) & (np.abs(rates) < pole)
-        if not (np.isfinite(pole) and np.any(low)):
+        modes = np.where(of_poles < _LARGEST_DAMPING, model.poles.omega_rad_s(model.dt_s), 0.0)
+        low = (zeta < _LARGEST_DAMPING) & (np.abs(rates) < modes.max(initial=0.0))
+        if not np.any(low):
             return None
         k = int(np.flatnonzero(low)[np.argmin(np.abs(rates[low]))])
-        zero, both = float(np.abs(rates[k])), (zeta[k], of_poles[np.argmin(modes)])
+        zero = float(np.abs(rates[k]))
+        above = int(np.argmin(np.where(modes > zero, modes, np.inf)))
+        pole, both = float(modes[above]), (zeta[k], of_poles[above])
         # Below the zero the arm is an inertia, of which the load's share sets the mode apart from the zero.
         at = _RIGID * zero
         late = np.exp(1j * at * model.dt_s * (model.input_delay_samples + 0.5))
