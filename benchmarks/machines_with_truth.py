@@ -76,8 +76,13 @@ def told(folder: Path, work: Path) -> list[str]:
         found = results.identify.friction
         true = sum(truth["coulomb_at_each_inertia_in_command_units"])
         said.append(f"friction {found.level:.4g} ± {found.level_std:.2g} (Coulomb {true:.4g})")
+    told = (
+        [True] * len(channel.modes) if spread.intervals is None else [m.told for m in spread.intervals.modes]
+    )
     modes = [
-        f"{mode.frequency_Hz:.2f} ({mode.damping:.3f})" for mode in channel.modes if channel.is_mode(mode)
+        f"{mode.frequency_Hz:.2f} ({mode.damping:.3f})"
+        for mode, known in zip(channel.modes, told, strict=True)
+        if known and channel.is_mode(mode)
     ]
     true_modes = [
         f"{f:.2f} ({z:.3f})" for f, z in zip(truth["modes_hz"], truth["mode_dampings"], strict=True)

@@ -43,6 +43,7 @@ class FindingKind(Enum):
     CUT_ROW = auto()
     HELD = auto()
     WRAPS = auto()
+    LATE_COMMAND = auto()
     SPIKES = auto()
     LONG_STEPS = auto()
     UNIT_CONTRADICTED = auto()

@@ -4,7 +4,12 @@ from ident.friction.amplitude import EquivalentFriction, at_amplitude, equivalen
 from ident.friction.arm import FrictionLaw
 from ident.friction.fit import fit_friction, refuse_unseen_shaft
 from ident.friction.gauss_newton import FrictionFit
-from ident.friction.in_loop import identify_behind, precedes_command, recorded_in_loop
+from ident.friction.in_loop import (
+    identify_behind,
+    precedes_command,
+    recorded_in_loop,
+    with_commands_in_time,
+)
 from ident.friction.posterior import BehindFriction, other_output_without_friction, without_friction
 
 __all__ = [
@@ -20,5 +25,6 @@ __all__ = [
     "precedes_command",
     "recorded_in_loop",
     "refuse_unseen_shaft",
+    "with_commands_in_time",
     "without_friction",
 ]

@@ -32,6 +32,7 @@ from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.checks.validation import fit_in_windows
 from ident.coloured_noise import long_arx_filter, prewhitened
 from ident.data.arrays import RealArray
+from ident.data.finding import FindingKind, finding
 from ident.data.record import Record
 from ident.fit.least_squares import fit as linear_fit
 from ident.fit.regression import prepare
@@ -67,6 +68,7 @@ _ROUNDS, _FEW_ROUNDS, _LONGEST_DELAY = 12, 3, 20
 _STAYS, _MOVES = 5e-3, 0.05
 # Lags by which a command follows; a residual that is rounding; one log in a million is taken for a loop.
 _CAUSES, _NOTHING, _BY_CHANCE = 8, 1e-5, 1e-6
+_LATEST = 40  # samples that a command is looked for to be logged late
 # Largest step of the level, as a share of it; parts of a step that are tried.
 _LARGEST_STEP, _LENGTHS = 0.3, (1.0, 0.5, 0.25, 0.1)
 # Samples that a command may be late, and errors that are less by much: 1.4 of a belt, .97 of a rigid axis.
@@ -94,8 +96,46 @@ def recorded_in_loop(records: Sequence[Record]) -> bool:
     """
     if any(record.reference is not None for record in records):
         return True
-    told = max(_told_by_position(record.input[:, 0], record.output[:, 0]) for record in records)
-    return bool(chi2.sf(told, _CAUSES) * len(records) < _BY_CHANCE)
+    return any(_follows(record, 0, len(records)) for record in records)
+
+
+def with_commands_in_time(records: Sequence[Record]) -> list[Record]:
+    """The records, their command as much earlier as it was logged late: an open loop's command that then no
+    longer follows the position, as a loop's does however early it is taken. Said in their notes."""
+    n = len(records)
+    if any(record.reference is not None or record.input.shape[1] > 1 for record in records):
+        return list(records)
+    if not all(_follows(record, 0, n) for record in records):
+        return list(records)
+    for late in range(1, _LATEST + 1):
+        if not any(_follows(record, late + more, n) for more in range(_CAUSES) for record in records):
+            while all(_answers_at_once(record, late) for record in records):
+                late += 1
+            note = finding(FindingKind.LATE_COMMAND, name=records[0].input_names[0], samples=late)
+            return [
+                replace(
+                    record.slice(0, record.n_samples - late),
+                    input=record.input[late:],
+                    notes=(*record.notes, note),
+                )
+                for record in records
+            ]
+    return list(records)
+
+
+def _follows(record: Record, late: int, among: int) -> bool:
+    """Whether the command, taken so many samples earlier, is told by the position, of one of so many logs."""
+    u, y = record.input[late:, 0], record.output[: record.n_samples - late, 0]
+    return bool(chi2.sf(_told_by_position(u, y), _CAUSES) * among < _BY_CHANCE)
+
+
+def _answers_at_once(record: Record, late: int) -> bool:
+    """Whether the position still answers to a command of the same sample, taken so many samples earlier."""
+    y, u = record.output[:, 0], record.input[:, 0]
+    rows, lags = np.arange(2 * _CAUSES, y.size - late)[:, None], np.arange(1, 2 * _CAUSES + 1)
+    past = np.hstack([y[rows - lags], u[rows - lags + late]])
+    left = [_unexplained(y[rows[:, 0]], part) for part in (past, np.hstack([past, u[rows + late]]))]
+    return bool(rows.size * np.log(left[0] / left[1]) > 2 * np.log(rows.size))
 
 
 def _told_by_position(u: RealArray, y: RealArray) -> float:
@@ -105,15 +145,19 @@ def _told_by_position(u: RealArray, y: RealArray) -> float:
     if u.size < 8 * n:
         return 0.0
     rows, lags = np.arange(3 * n, u.size)[:, None], np.arange(1, n + 1)
-    own, wanted = u[rows - np.arange(1, 3 * n + 1)], u[3 * n :]
-    left = list[float]()
-    for columns in (own, np.hstack([own[:, : 2 * n], y[rows - lags + 1] - y.mean()])):
-        columns = np.column_stack([np.ones(rows.size), columns])
-        size = np.linalg.norm(columns, axis=0)
-        columns = columns / np.where(size > 0, size, 1.0)
-        rest = wanted - columns @ np.linalg.lstsq(columns, wanted, rcond=1e-10)[0]
-        left.append(max(float(rest @ rest), float((_NOTHING * np.std(u)) ** 2 * rest.size)))
+    own = u[rows - np.arange(1, 3 * n + 1)]
+    ways = own, np.hstack([own[:, : 2 * n], y[rows - lags + 1] - y.mean()])
+    left = [_unexplained(u[3 * n :], columns) for columns in ways]
     return float(max(rows.size - 3 * n - 1, 0) * np.log(left[0] / left[1]))
+
+
+def _unexplained(wanted: RealArray, columns: RealArray) -> float:
+    """Sum of squares that a constant and these columns (T, N) leave, at least that of rounding."""
+    columns = np.column_stack([np.ones(wanted.size), columns])
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(size > 0, size, 1.0)
+    rest = wanted - columns @ np.linalg.lstsq(columns, wanted, rcond=1e-10)[0]
+    return max(float(rest @ rest), float((_NOTHING * np.std(wanted)) ** 2 * rest.size))
 
 
 @dataclass(frozen=True, eq=False)

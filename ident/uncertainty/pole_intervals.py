@@ -12,14 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from ident.basis.functions import basis_response
+from ident.basis.functions import all_pass_response, basis_response
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
+from ident.basis.structure import front_response
 from ident.data.arrays import ComplexArray, RealArray, lock
 
 # 16 points determine a Laurent series to 1/3^15 = 7e-8 when the next pole is three radii away.
 _POINTS = 16
 _SHARE_OF_DISTANCE = 1 / 3  # see `_POINTS`
+_NOTHING = np.array([np.inf + 1j * np.inf])  # deviation of what records do not tell
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +29,8 @@ class PoleIntervals:
     """Ends (low, high) of confidence intervals, in the order of the poles.
 
     omega_rad_s (P,2), zeta (P,2) of the pairs, decay_per_s (R,2) of the real poles; each holds the truth with
-    probability `level`, taken alone. (0, inf) where the records do not tell, NaN for a real pole a <= 0.
+    probability `level`, taken alone. (0, inf) where the records do not tell, as of a pair that adds nothing
+    outside the ellipses; NaN for a real pole a <= 0.
     """
 
     level: float
@@ -55,7 +58,8 @@ def pole_intervals(posterior: ResponsePosterior, poles: Poles, level: float = 0.
     ends_omega, ends_zeta = np.empty((omega.size, 2)), np.empty((omega.size, 2))
     for i, pole in enumerate(poles.pairs):
         # d log p = d p / p; omega = |log p|, and d log(omega) = Re(d log p / log p).
-        slope = _pole_rows(posterior, pole, everything) / (pole * np.log(pole))
+        told = _carried(posterior, pole, everything, level) > 1
+        slope = _pole_rows(posterior, pole, everything) / (pole * np.log(pole)) if told else _NOTHING
         by_omega = slope.real
         # zeta = -Re(log p)/|log p|: with log p = -zeta w + j w sqrt(1 - zeta^2),
         # d zeta = Im(d log p / log p) sqrt(1 - zeta^2).
@@ -88,16 +92,10 @@ def growth_intervals(posterior: ResponsePosterior, level: float = 0.95) -> RealA
 
 def _pole_rows(posterior: ResponsePosterior, pole: complex, everything: ComplexArray) -> ComplexArray:
     """Deviation of the pole as a complex row (P',) on the columns of the covariance factor."""
-    away = np.abs(everything - pole)
-    others = away[away > 0]
     # A pole that the basis has more often than twice has no displacement of its own.
-    if np.count_nonzero(away == 0) > 2:
+    if np.count_nonzero(everything == pole) > 2:
         return np.full(posterior.covariance_factor.shape[1], np.inf + 0j)
-    radius = _SHARE_OF_DISTANCE * float(others.min(initial=1.0))
-    turn = np.exp(2j * np.pi * np.arange(_POINTS) / _POINTS)
-    rows = basis_response(posterior.poles, pole + radius * turn)
-    simple = np.mean(rows * (radius * turn)[:, None], axis=0)
-    double = np.mean(rows * ((radius * turn) ** 2)[:, None], axis=0)
+    simple, double = _laurent(posterior, pole, everything)
     n = posterior.poles.order
     mean, factor = posterior.mean[:n], posterior.covariance_factor[:n]
     r, q = simple @ mean, double @ mean
@@ -105,6 +103,34 @@ def _pole_rows(posterior: ResponsePosterior, pole: complex, everything: ComplexA
         return np.full(factor.shape[1], np.inf + 0j)
     # Derivative of q/r; q itself is zero at the optimum, up to what the kernel took over.
     return np.asarray((double @ factor) / r - (simple @ factor) * q / r**2)
+
+
+def _carried(posterior: ResponsePosterior, pole: complex, everything: ComplexArray, level: float) -> float:
+    """What a pair adds to the response at its own frequency, in radii of the ellipse there: up to one it need
+    not exist."""
+    omega = np.array([np.angle(pole) / posterior.dt_s])
+    z = np.exp(1j * omega * posterior.dt_s)
+    r = _laurent(posterior, pole, everything)[0] @ posterior.mean[: posterior.poles.order]
+    front = front_response(omega, posterior.dt_s, posterior.integrators, posterior.input_delay_samples)
+    own = (
+        front / all_pass_response(posterior.unstable, z) * (r / (z - pole) + np.conj(r) / (z - np.conj(pole)))
+    )
+    radius = float(posterior.at(omega, level).ellipse().semi_major[0])
+    return float(np.abs(own[0])) / max(radius, np.finfo(np.float64).tiny)
+
+
+def _laurent(
+    posterior: ResponsePosterior, pole: complex, everything: ComplexArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """(P,) rows of the coefficients of 1/(z - pole) and 1/(z - pole)^2."""
+    away = np.abs(everything - pole)
+    radius = _SHARE_OF_DISTANCE * float(away[away > 0].min(initial=1.0))
+    turn = np.exp(2j * np.pi * np.arange(_POINTS) / _POINTS)
+    rows = basis_response(posterior.poles, pole + radius * turn)
+    return (
+        np.mean(rows * (radius * turn)[:, None], axis=0),
+        np.mean(rows * ((radius * turn) ** 2)[:, None], axis=0),
+    )
 
 
 def _interval(value: float, deviation: float, width: float) -> tuple[float, float]:

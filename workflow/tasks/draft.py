@@ -42,8 +42,6 @@ _MORE = 3.0
 _SAME_LIMIT = 1e-3
 # A limit that the motion shows is known to this share.
 _SAME_DIGITS = 5e-3
-# A damping that may be anything is that of no mode: width of its interval.
-_ANYTHING = 0.5
 
 
 @dataclass(frozen=True)
@@ -124,7 +122,7 @@ def informed(draft: Draft, found: IdentifiedChannel, spread: UncertainChannel) -
     modes = [
         (mode.omega_rad_s, mode.damping)
         for mode, interval in zip(found.modes, intervals, strict=True)
-        if interval is not None and np.ptp(interval.damping) < _ANYTHING
+        if interval is not None and interval.told
         if found.is_mode(mode) and mode.damping < SWINGS
     ]
     notch = next((float(zero) for zero in notches(model) if band[0] < zero < band[1]), None)

@@ -103,8 +103,9 @@ def refuse_constant_input(record: Record) -> None:
 
 
 def with_common_sampling_time(records: Sequence[Record]) -> list[Record]:
-    """The records with the first one's sampling time and units. Raises InputError where they really differ,
-    or are together longer than the memory of most machines allows.
+    """The records with the first one's sampling time and units, and a command that was logged late earlier.
+    Raises InputError where they really differ, or are together longer than the memory of most machines
+    allows.
 
     Clocks of hosts differ by some ten parts in a million, and time stamps are written with a few digits.
     """
@@ -125,4 +126,6 @@ def with_common_sampling_time(records: Sequence[Record]) -> list[Record]:
                 f"{max(record.dt_s for record in records):.6g} (resample_s), or identify them in separate "
                 "runs"
             )
-    return [replace(record, dt_s=first.dt_s) for record in records]
+    from ident.friction import with_commands_in_time
+
+    return with_commands_in_time([replace(record, dt_s=first.dt_s) for record in records])

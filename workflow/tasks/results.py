@@ -209,12 +209,21 @@ class Band:
     largest_radius_percent: float
 
 
+# A damping that may be anything is that of no mode: width of its interval.
+_ANYTHING = 0.5
+
+
 @dataclass(frozen=True)
 class ModeInterval:
     """Confidence intervals of a mode."""
 
     omega_rad_s: Interval
     damping: Interval
+
+    @property
+    def told(self) -> bool:
+        """Whether the records tell that the pair is a mode: its damping is not just anything."""
+        return self.damping[1] - self.damping[0] < _ANYTHING
 
     @property
     def frequency_Hz(self) -> Interval:

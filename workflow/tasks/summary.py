@@ -181,9 +181,12 @@ def uncertainty_numbers(spread: UncertainChannel) -> dict[str, Any]:
 
 def channel_numbers(found: IdentifiedChannel, spread: UncertainChannel) -> dict[str, Any]:
     """The model of a channel and its ellipses together."""
-    ellipses = uncertainty_numbers(spread)
+    ellipses, model = uncertainty_numbers(spread), model_numbers(found)
+    if spread.intervals is not None:
+        for row, known in zip(model["modes"], spread.intervals.modes, strict=True):
+            row["is_mode"] &= known.told
     return {
-        **model_numbers(found),
+        **model,
         **{key: ellipses[key] for key in ("bands", "intervals", "tests", "advice", "repeat_scatter")},
     }
 

@@ -16,6 +16,7 @@ from ident.basis.poles import Poles
 from ident.checks.answer import refuse_unanswered
 from ident.checks.residual_tests import residual_advice, residual_tests, whiteness_test
 from ident.checks.validation import ScatterRow, repeat_scatter
+from ident.data.arrays import ComplexArray
 from ident.data.distortion import distortion_of
 from ident.data.finding import FindingKind, finding
 from ident.data.nonparametric import empirical_frf
@@ -216,7 +217,8 @@ def uncertain_channel(
     refuse_unanswered(linear, omega, result.identification.warnings, why=why)
     frequency = posterior.at(omega, level)
     bands = pairwise(np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist())  # of equal ratio
-    nominal = nominal_of(posterior, poles or model.poles, omega)
+    intervals = intervals_of(linear, model.stable_poles, level)
+    nominal = nominal_of(posterior, poles or model.poles, omega, _untold(model, intervals))
     return UncertainChannel(
         name=result.name,
         method=method,
@@ -233,7 +235,7 @@ def uncertain_channel(
         bands=tuple(band_row(frequency, low, high) for low, high in bands),
         tests=tests,
         agreement=NominalAgreement.of(frequency, nominal.frequency_response),
-        intervals=intervals_of(linear, model.stable_poles, level),
+        intervals=intervals,
     )
 
 
@@ -290,20 +292,30 @@ def nominal_grid(omega: Real, band: tuple[float, float] | None) -> Real:
     return inside if inside.size >= _FEWEST_FREQUENCIES else np.geomspace(*band, _FEWEST_FREQUENCIES)
 
 
-def nominal_of(posterior: ResponsePosterior, poles: Poles, omega: Real) -> GobfModel:
-    """Nearest model on the identified poles; on every pole taken twice where only that one stays in its
-    ellipses.
+def nominal_of(posterior: ResponsePosterior, poles: Poles, omega: Real, untold: ComplexArray) -> GobfModel:
+    """Nearest model on the identified poles without the pairs (P,) that the records do not tell, with them,
+    or on every pole taken twice: the first that stays in its ellipses, else the second.
 
     The nominal gives the design its closed-loop poles, so it should be a member of the set it stands for;
-    but a pole taken twice is a mode listed twice, so it has to earn that.
+    but a pole taken twice is a mode listed twice, and one that is not told may be none, so they have to earn
+    that.
     """
-    single = nominal_near(posterior, poles, omega)
-    double = nominal_near(posterior, poles.doubled(), omega)
+    told = Poles(poles.real, poles.pairs[~np.isin(poles.pairs, untold)])
+    single, *others = (nominal_near(posterior, each, omega) for each in (poles, told, poles.doubled()))
     ellipses = posterior.at(omega)
-    inside = [
-        float(np.mean(ellipses.contains(model.frequency_response(omega)))) for model in (single, double)
-    ]
-    return double if inside[0] < _SHARE_INSIDE <= inside[1] else single
+
+    def stays(model: GobfModel) -> bool:
+        return float(np.mean(ellipses.contains(model.frequency_response(omega)))) >= _SHARE_INSIDE
+
+    return next((model for model in (others[0], single, others[1]) if stays(model)), single)
+
+
+def _untold(model: GobfModel, intervals: Intervals | None) -> ComplexArray:
+    """(P,) pole pairs that the records do not tell."""
+    pairs = model.stable_poles.pairs
+    by_frequency = np.argsort(model.stable_poles.omega_rad_s(model.dt_s), kind="stable")
+    told = [True] * pairs.size if intervals is None else [each.told for each in intervals.modes]
+    return pairs[by_frequency][~np.array(told, np.bool_)]
 
 
 def display_grid(model: GobfModel, records: Sequence[Record]) -> Real:
