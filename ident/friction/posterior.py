@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.stats import chi2, norm, qmc
 
 from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions
@@ -15,7 +15,6 @@ from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.data.arrays import ComplexArray, RealArray, real_rows
-from ident.data.ellipses import chi2_radius
 from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
@@ -28,12 +27,13 @@ from ident.uncertainty.embedding_rows import Beside
 _NOISE_ORDER = 32  # as in `ident.friction.in_loop`
 # Share of the level that another law, or a linear force that shows in no residual, may have (deviation).
 _SHAPE = 0.05
-# Grid of what is put onto the basis; an ellipse beyond this share of the gain gets a passive arm's sign.
-_FREQUENCIES, _LENGTHS, _LARGEST, _LEVEL = 400, 100, 0.85, 0.95
-# Along so many normals the second order is held: t^2 + t^4 / k^2 is the 95 % radius (of two numbers) where t
-# is that of one.
-_MOST_CURVED, _RANK = 3, 1e-8
-_CURVED = float(chi2.ppf(_LEVEL, 1) / np.sqrt(chi2.ppf(_LEVEL, 2) - chi2.ppf(_LEVEL, 1)))
+# Grid of what is put onto the basis.
+_FREQUENCIES, _LENGTHS, _LEVEL = 400, 100, 0.95
+# Normals along which the force is drawn, draws, principal parts that are kept, as a share of the largest.
+_MOST_CURVED, _DRAWS, _SMALL, _RANK = 3, 512, 1e-3, 1e-8
+_MOST_GAIN = 10.0
+# Rates of further real poles, as multiples of the slowest one's, which the force may move so far.
+_AROUND = (0.1, 0.4, 2.0, 5.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,71 +112,77 @@ def _behind_observed(
     by_force = _by_linear_force(found, records, less, response)
     response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
     longest_s = max(record.n_samples for record in less) * model.dt_s
-    response, factor_of_arm = of_known_sign(response, longest_s)
-    straight = response
-    response = curved(response, model.poles, longest_s)
+    response, straight, onto, moved = of_force(response, model.poles, longest_s)
     both = [0, *([plain.shape[1] - 1] if found.spring is not None else [])]
-    level, spread = found.level + float(change[both].sum()), wider * factor[both].sum(axis=0)
-    spread = factor_of_arm @ np.append(spread, np.zeros(by_force.shape[1]))
-    more = response.covariance_factor.shape[1] - spread.size
-    straight = replace(straight, covariance_factor=np.pad(straight.covariance_factor, ((0, 0), (0, more))))
-    return BehindFriction(response, straight, level, np.append(spread, np.zeros(more)), found)
+    spread = np.append(wider * factor[both].sum(axis=0), np.zeros(by_force.shape[1]))
+    level = found.level + float(change[both].sum()) + float(spread @ moved)
+    return BehindFriction(response, straight, level, onto @ spread, found)
 
 
-def of_known_sign(response: ResponsePosterior, longest_s: float) -> tuple[ResponsePosterior, RealArray]:
-    """The same with a gain at low frequencies that keeps its sign, and the unit normals it stands on now:
-    (P'', P') times those before.
+def of_force(
+    response: ResponsePosterior, poles: Poles, longest_s: float
+) -> tuple[ResponsePosterior, ResponsePosterior, RealArray, RealArray]:
+    """The same where what the data leave open adds to the arm's force, not to its response; to first order;
+    the unit normals they stand on now, (P'', P') times those before; mean (P',) of those before. poles: of
+    the arm, which the response has twice.
 
-    Below what the logs tell, the arm is its inertia and one damping or stiffness k. Data tell k, and G = 1 /
-    k is not Gaussian where its deviation is large: an ellipse would hold zero, which no passive arm has.
-    Along the one normal that moves the gain at low frequency, with x = rho a / (jw + a) the relative change
-    of G at the 95 % radius, x / (1 + x) takes its place: a further pole at a (1 + rho). Neglected: gains more
-    than twice the centre's.
-    """
-    factor, n = response.covariance_factor, response.covariance_factor.shape[1]
-    omega = _frequencies(response, longest_s)
-    rows = response.frequency_rows(omega)
-    # The force it takes to move that slowly; the shaft goes where it is pushed.
-    turned = (1j * omega[0]) ** response.integrators
-    value, lowest = float(np.real(turned * rows[0] @ response.mean)), np.real(turned * rows[0] @ factor)
-    spread = float(np.linalg.norm(lowest))
-    if response.unstable.order or chi2_radius(_LEVEL) * spread < _LARGEST * value:
-        return response, np.eye(n)
-    along = lowest / spread
-    # The mean of what the data leave above zero.
-    more_by = float(norm.pdf(value / spread) / norm.cdf(value / spread))
-    rho = chi2_radius(_LEVEL) / (value / spread + more_by)
-    gain = rows @ (_mean := response.mean + more_by * (factor @ along))
-    moved = rows @ (factor @ along)
-    corner = float(omega[np.argmax(np.abs(moved / gain) < np.abs(moved / gain)[0] / np.sqrt(2))])
-    slow, fast = np.exp(-response.dt_s * corner * np.array([1.0, 1 + rho]))
-    z = np.exp(1j * omega * response.dt_s)
-    wanted = [*(rows @ (factor - np.outer(factor @ along, along))).T, moved * (z - slow) / (z - fast)]
-    onto = np.vstack([np.eye(n) - np.outer(along, along), along])
-    return _with_poles(response, Poles(np.array([fast])), omega, gain, wanted), onto
-
-
-def curved(response: ResponsePosterior, poles: Poles, longest_s: float) -> ResponsePosterior:
-    """The same with room for what is of second order where the data leave the arm's force open. poles: of the
-    arm, which the response has twice.
-
-    An arm answers with G = 1 / D, and what is not known of it (damping, stiffness, friction like them) adds
-    to D. To first order ellipses are lines there, as wide as they may be: the truth lies beside them. With x
-    the relative change of G along a normal t, 1 / (1 - x t) is 1 + x t + x^2 t^2 + ...: a column `_CURVED`
-    x^2 G would hold the second term as far as the 95 % interval of t goes; here its part across x, j x Im(x),
-    for along it `of_known_sign` cares. Of the normals that move the gain below the first light mode most, and
-    there only; on poles taken three times, as x^2 G is.
+    An arm answers with G = 1 / D, and what is not known of it at low frequency (damping, stiffness, friction
+    like them) adds to D: with x the relative change of G along a normal t, G becomes G / (1 - x t), a line
+    only where x is small. The normals that move the gain below the first light mode most are drawn, without
+    those that turn the arm against its command at the lowest frequency, which no passive arm does; mean and
+    principal parts of the draws take their place, as wide as holds 95 % of them at every frequency.
+    Neglected: gains more than `_MOST_GAIN` times the centre's.
     """
     omega = _frequencies(response, longest_s)
     rows = response.frequency_rows(omega)
     gain, moved = rows @ response.mean, rows @ response.covariance_factor
     modes = poles.omega_rad_s(response.dt_s)[poles.zeta() < LARGEST_DAMPING]
     low = omega < np.min(modes, initial=omega[-1])
-    change = np.where(low[:, None], moved / gain[:, None], 0.0)
-    along = np.linalg.svd(real_rows(change), full_matrices=False)[2][:_MOST_CURVED]
-    x = change @ along.T
-    more = _CURVED * gain[:, None] * 1j * x * x.imag
-    return _with_poles(response, poles, omega, gain, [*moved.T, *more.T], _RANK)
+    change = moved / gain[:, None]
+    along = np.linalg.svd(real_rows(np.where(low[:, None], change, 0.0)), full_matrices=False)[2][
+        :_MOST_CURVED
+    ]
+    t = norm.ppf(qmc.Halton(len(along), scramble=False).random(_DRAWS + 1)[1:])
+    if not response.unstable.order:
+        way = np.sign(np.real((1j * omega[0]) ** response.integrators * gain[0]))
+        upright = way * (1 - t @ (along @ change[0].real)) > 1 / _MOST_GAIN
+        t = t[upright] if np.any(upright) else t
+    x = (change @ along.T) @ t.T
+    inverse = 1 / np.where(np.abs(1 - x) > 1 / _MOST_GAIN, 1 - x, 1 / _MOST_GAIN)
+    drawn = np.where(low[:, None], inverse, 1 + x)
+    mean = drawn.mean(axis=1)
+    parts, sizes, scores = np.linalg.svd(
+        real_rows(drawn - mean[:, None]) / np.sqrt(t.shape[0]), full_matrices=False
+    )
+    n = int(np.count_nonzero(sizes > _SMALL * sizes[0]))
+    parts, scores = parts[:, :n] * sizes[:n], np.sqrt(t.shape[0]) * scores[:n]
+    columns = gain[:, None] * (parts[: omega.size] + 1j * parts[omega.size :])
+    rest = np.eye(along.shape[1]) - along.T @ along
+    onto = np.vstack([rest, scores @ t / t.shape[0] @ along])
+    wanted = [*(moved @ rest).T, *(_held(drawn, mean, columns / gain[:, None]) * columns).T]
+    slow = _rates_around(poles, response.dt_s)
+    curved = _with_poles(response, poles.appended(Poles(slow)), omega, gain * mean, wanted, _RANK)
+    straight = replace(response, covariance_factor=response.covariance_factor @ onto.T)
+    return curved, straight, onto, t.mean(axis=0) @ along
+
+
+def _held(drawn: ComplexArray, mean: ComplexArray, columns: ComplexArray) -> float:
+    """Factor for columns (F, N), at least 1, by which their ellipses hold a level's share of what was drawn
+    (F, K) at every frequency."""
+    off = drawn - mean[:, None]
+    largest = 1.0
+    for row, own in zip(off, columns, strict=True):
+        covariance = real_rows(own[None]) @ real_rows(own[None]).T
+        both = np.vstack([row.real, row.imag])
+        squared = np.sum(both * (np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ both), axis=0)
+        largest = max(largest, float(np.quantile(squared, _LEVEL)) / float(chi2.ppf(_LEVEL, 2)))
+    return float(np.sqrt(largest))
+
+
+def _rates_around(poles: Poles, dt_s: float) -> RealArray:
+    """Real poles well below and above the slowest one, where that lies if more or less damps the arm."""
+    real = poles.real[(poles.real > 0) & (poles.real < 1)]
+    return np.array([]) if real.size == 0 else np.max(real) ** np.array(_AROUND)
 
 
 def _frequencies(response: ResponsePosterior, longest_s: float) -> RealArray:

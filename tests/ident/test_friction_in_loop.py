@@ -6,23 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from benchmarks.closed_loop_machines.logs import Machine, machine
 from benchmarks.closed_loop_machines.simulator import Law, response
 from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.basis.posterior import ResponsePosterior
 from ident.checks.validation import fit_in_windows, fit_on_fresh_data
-from ident.data.ellipses import chi2_radius
 from ident.data.record import Record
 from ident.friction import FrictionFit, fit_friction, identify_behind, without_friction
 from ident.friction.arm import FrictionLaw
 from ident.friction.gauss_newton import LostError, least_squares
 from ident.friction.in_loop import recorded_in_loop
 from ident.friction.inverse_dynamics import direction_of, level_of, smoothed
-from ident.friction.posterior import of_known_sign
 from ident.friction.spring import Spring
 
 
@@ -151,50 +147,6 @@ def test_the_fit_decides_that_a_weight_throws_the_arm_over() -> None:
     assert structure.integrators == 0
     assert -np.log(structure.unstable.real) / one.plant.dt_s == pytest.approx([growth], rel=0.02)
     assert found.level == pytest.approx(levels_of(one), rel=0.03)
-
-
-def test_a_gain_that_the_logs_do_not_tell_keeps_its_sign() -> None:
-    """1 / (s (s + a)) with a known to twice its size: its gain at low frequency is 1 / a, or anything."""
-    dt_s, a = 1e-2, 0.5
-    poles = Poles.from_continuous(decay_per_s=[a, 20.0], dt_s=dt_s).doubled()
-    omega = np.geomspace(1e-3, 100.0, 200)
-    empty = np.zeros((poles.order, 1))
-    blank = ResponsePosterior(poles, empty[:, 0], empty, dt_s, integrators=1)
-    rows, s = blank.frequency_rows(omega), 1j * omega
-    late = np.exp(-0.5j * omega * dt_s) / (s + 20.0)
-    arm, by_damping = late / (s * (s + a)), late / (s * (s + a) ** 2)
-    wanted = np.column_stack([arm, a * by_damping, 0.01 * arm]) / np.abs(arm)[:, None]
-    basis = rows / np.abs(arm)[:, None]
-    held = np.linalg.lstsq(
-        np.vstack([basis.real, basis.imag]), np.vstack([wanted.real, wanted.imag]), rcond=None
-    )[0]
-    before = replace(blank, mean=held[:, 0], covariance_factor=held[:, 1:])
-    after, normals = of_known_sign(before, longest_s=10.0)
-    ellipses = [one.at(omega) for one in (before, after)]
-    radius = [
-        chi2_radius(0.95) * np.sqrt(np.linalg.eigvalsh(one.covariance)[:, -1]) / np.abs(one.centre)
-        for one in ellipses
-    ]
-    assert radius[0][0] == pytest.approx(chi2_radius(0.95), rel=0.01)
-    # One deviation above zero: the mean of a normal variable that is positive.
-    above = 1 + norm.pdf(1) / norm.cdf(1)
-    rho = chi2_radius(0.95) / above
-    assert np.abs(ellipses[1].centre[0] / ellipses[0].centre[0]) == pytest.approx(above, rel=0.01)
-    assert radius[1][0] == pytest.approx(rho / (1 + rho), rel=0.02)
-    assert radius[1].max() < 1
-    # Where the logs tell the gain, little changes: from ten times the corner on.
-    high = omega > 10 * a * (1 + rho)
-    assert np.abs(ellipses[1].centre / ellipses[0].centre - 1)[high].max() < 0.02
-    assert radius[1][high] == pytest.approx(radius[0][high], rel=0.05)
-    assert normals.shape == (after.covariance_factor.shape[1], before.covariance_factor.shape[1])
-    # A centre that noise has turned round goes where it is pushed.
-    turned = replace(before, mean=held @ [1.0, -1.3, 0.0])
-    assert np.real(1j * omega[0] * turned.centre(omega[:1]))[0] < 0
-    found, _ = of_known_sign(turned, longest_s=10.0)
-    assert np.real(1j * omega[0] * found.centre(omega[:1]))[0] > 0
-    # A gain that is told stays as it is.
-    told = replace(before, covariance_factor=0.1 * before.covariance_factor)
-    assert of_known_sign(told, longest_s=10.0)[0] is told
 
 
 @pytest.mark.parametrize("seed", range(2))
