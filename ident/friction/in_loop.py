@@ -19,13 +19,16 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from ident.basis.functions import nuisance_columns, regressor
+from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
+from ident.basis.poles import Poles
 from ident.basis.structure import answered, driving_input, stabilised
 from ident.checks.input_checks import refuse_few_lines
 from ident.checks.plausible_modes import LARGEST_DAMPING
@@ -54,16 +57,17 @@ from ident.friction.inverse_dynamics import (
     rms_speed,
     with_measured_direction,
 )
-from ident.friction.observer import ObserverFilter, observed, prediction_errors
+from ident.friction.observer import NEARBY, ObserverFilter, observed, prediction_errors
 from ident.friction.spring import Spring
 from ident.identification import Identification
 from ident.one_input import identify, untested_model
 from ident.search.pole_search import PoleSearch
 from ident.uncertainty.autoregression import fit_autoregression
+from ident.uncertainty.pole_intervals import laurent_rows
 from ident.unstable import find_unstable
 
 Report = Callable[[float, str], None]
-_ROUNDS, _FEW_ROUNDS, _LONGEST_DELAY = 12, 3, 20
+_ROUNDS, _FEW_ROUNDS, _LONGEST_DELAY = 6, 2, 20
 # A level that moves by less than the first share stays; by more than the second, the order is chosen anew.
 _STAYS, _MOVES = 5e-3, 0.05
 # Lags by which a command follows; a residual that is rounding; one log in a million is taken for a loop.
@@ -256,7 +260,9 @@ def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: R
             _shifted(simple, delay, 0.0), law=found.law, spring=found.spring, beyond=found.beyond
         )
         try:
-            simple = _in_turns(logs, earlier, _of_order(simple, options, delay), _FEW_ROUNDS)
+            later, simple = simple, _in_turns(logs, earlier, _of_order(simple, options, delay), _FEW_ROUNDS)
+            if not logs.errors(simple) < _WORSE_AT_FIRST * logs.errors(later):
+                break
             tried = _with_more_poles(logs, simple, options)
         except LostError:
             break
@@ -423,12 +429,9 @@ def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: in
             models.append(replace(found.model, poles=poles, coefficients=np.ravel(linear.coefficients)))
         tried = []
         for model in models:
-            anew = started(model, options.structure(), found.law)
-            spring = found.spring and (Spring.of(model) or found.spring)
-            anew = replace(anew, bias=found.bias, spring=spring, beyond=found.beyond, centre=found.centre)
-            anew = replace(anew, lag=found.lag)
-            if not search:
-                anew = replace(anew, correction=found.correction, ratio=found.ratio)
+            anew = _on(found, model)
+            if search:
+                anew = replace(anew, correction=None, ratio=0.0)
             tried.append(observed(anew, logs.records))
         found = min(tried, key=logs.errors)
         level, found = found.level, _stepped(logs, found)
@@ -439,9 +442,38 @@ def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: in
     return found
 
 
+def _on(found: FrictionFit, model: GobfModel) -> FrictionFit:
+    """The fit on another model of the arm."""
+    anew = started(model, found.arm.structure, found.law)
+    spring = found.spring and (Spring.of(model) or found.spring)
+    kept: dict[str, Any] = {
+        key: getattr(found, key) for key in ("correction", "ratio", "bias", "beyond", "centre", "lag")
+    }
+    return replace(anew, spring=spring, **kept)
+
+
+def _on_moved_poles(logs: _Logs, found: FrictionFit) -> FrictionFit:
+    """The fit with its poles where its coefficients on the doubled ones have moved them, at most half of
+    their way to the unit circle, and the arm anew on them."""
+
+    def moved(pole: complex) -> complex:
+        simple, double = (rows @ found.coefficients for rows in laurent_rows(found.arm.poles.doubled(), pole))
+        change, most = complex(double / simple) if simple else 0j, 0.5 * (1 - abs(pole))
+        return complex(pole + change * min(1.0, most / max(abs(change), most)))
+
+    poles, images = found.model.poles, found.arm.structure.unstable.values
+    real = [pole if np.any(images == pole) or pole <= 0 else moved(pole).real for pole in poles.real.tolist()]
+    pairs = [pole if np.any(images == pole) else moved(pole) for pole in poles.pairs.tolist()]
+    poles, whiten = Poles(np.array(real), np.array(pairs, np.complex128)), ObserverFilter.of(found)
+    white = [whiten.filtered(found.forced(record)) for record in logs.records]
+    linear = linear_fit(prepare(white, replace(found.arm.structure, estimate_initial_state=True)), poles)
+    model = replace(found.model, poles=poles, coefficients=np.ravel(linear.coefficients))
+    return observed(_on(found, model), logs.records, nearby=NEARBY[1:2])
+
+
 def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
-    """One Gauss-Newton step in arm, law and bias, or the last two, as far as it lowers the prediction
-    errors."""
+    """One Gauss-Newton step in arm, with its poles, law, lag and bias, or without the arm, as far as it
+    lowers the prediction errors."""
     errors = logs.errors(found)
     blocks, targets = _equations(found, logs.records, ObserverFilter.of(found))
     p, theta = found.coefficients.size, parameters_of(found.law)
@@ -469,6 +501,11 @@ def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
             beyond=max(found.beyond + length * float(step[-1]), 0.0) if found.spring else 0.0,
             coefficients=found.coefficients + arm * length * change[:p],
         )
+        # Poles taken twice follow more than moved ones do: a wrong friction among it.
+        try:
+            tried = _on_moved_poles(logs, tried) if arm else tried
+        except ValueError:  # no observer follows, or one that runs away
+            continue
         if logs.errors(tried) < errors:
             found = tried
             break

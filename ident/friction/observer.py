@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import block_diag, solve_discrete_are
@@ -24,7 +25,7 @@ from ident.friction.inverse_dynamics import noise_of
 
 # Force over the position's noise: from an observer slower than the arm to one of the last two samples.
 _RATIOS = np.geomspace(1e-4, 10, 11)
-_NEARBY = np.array([0.5, 1.0, 2.0])
+NEARBY = np.array([0.5, 1.0, 2.0])
 # Share of the force that each state takes by itself, so that equal poles have a filter, too.
 _OWN = 1e-9
 # An observer that has forgotten its start to this has settled.
@@ -96,22 +97,27 @@ class ObserverFilter:
         )
 
 
-def prediction_errors(found: FrictionFit, records: Sequence[Record]) -> float:
-    """Sum of squares of the prediction errors, without the start of each record; infinite where it is
-    lost."""
+@lru_cache(maxsize=64)
+def _errors_of(found: FrictionFit, records: tuple[Record, ...]) -> float:
     with np.errstate(over="ignore", invalid="ignore"):
         parts = [found.residual(record) for record in records]
         total = sum(float(np.sum(part[part.size // _START :] ** 2)) for part in parts)
     return total if np.isfinite(total) else np.inf
 
 
-def observed(found: FrictionFit, records: Sequence[Record]) -> FrictionFit:
-    """The fit with the observer that predicts best, near the one it has. Raises LostError where none
-    follows."""
+def prediction_errors(found: FrictionFit, records: Sequence[Record]) -> float:
+    """Sum of squares of the prediction errors, without the start of each record; infinite where it is
+    lost."""
+    return _errors_of(found, tuple(records))
+
+
+def observed(found: FrictionFit, records: Sequence[Record], nearby: RealArray = NEARBY) -> FrictionFit:
+    """The fit with the observer that predicts best, near the one it has: nearby, its force as a share of that
+    one's. Raises LostError where none follows."""
     noise = np.sqrt(np.mean([noise_of(record.output[:, 0]) ** 2 for record in records]))
     rms = np.sqrt(np.mean([np.mean(record.input**2) for record in records]))
     tried = list[tuple[float, FrictionFit]]()
-    for ratio in _RATIOS * rms / noise if found.correction is None else found.ratio * _NEARBY:
+    for ratio in _RATIOS * rms / noise if found.correction is None else found.ratio * nearby:
         with suppress(ValueError, np.linalg.LinAlgError):
             correction = correction_of(found.arm, found.coefficients, float(ratio))
             one = replace(found, correction=correction, ratio=float(ratio))

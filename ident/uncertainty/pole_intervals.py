@@ -58,7 +58,7 @@ def pole_intervals(posterior: ResponsePosterior, poles: Poles, level: float = 0.
     ends_omega, ends_zeta = np.empty((omega.size, 2)), np.empty((omega.size, 2))
     for i, pole in enumerate(poles.pairs):
         # d log p = d p / p; omega = |log p|, and d log(omega) = Re(d log p / log p).
-        told = _carried(posterior, pole, everything, level) > 1
+        told = _carried(posterior, pole, level) > 1
         slope = _pole_rows(posterior, pole, everything) / (pole * np.log(pole)) if told else _NOTHING
         by_omega = slope.real
         # zeta = -Re(log p)/|log p|: with log p = -zeta w + j w sqrt(1 - zeta^2),
@@ -95,7 +95,7 @@ def _pole_rows(posterior: ResponsePosterior, pole: complex, everything: ComplexA
     # A pole that the basis has more often than twice has no displacement of its own.
     if np.count_nonzero(everything == pole) > 2:
         return np.full(posterior.covariance_factor.shape[1], np.inf + 0j)
-    simple, double = _laurent(posterior, pole, everything)
+    simple, double = laurent_rows(posterior.poles, pole)
     n = posterior.poles.order
     mean, factor = posterior.mean[:n], posterior.covariance_factor[:n]
     r, q = simple @ mean, double @ mean
@@ -105,12 +105,12 @@ def _pole_rows(posterior: ResponsePosterior, pole: complex, everything: ComplexA
     return np.asarray((double @ factor) / r - (simple @ factor) * q / r**2)
 
 
-def _carried(posterior: ResponsePosterior, pole: complex, everything: ComplexArray, level: float) -> float:
+def _carried(posterior: ResponsePosterior, pole: complex, level: float) -> float:
     """What a pair adds to the response at its own frequency, in radii of the ellipse there: up to one it need
     not exist."""
     omega = np.array([np.angle(pole) / posterior.dt_s])
     z = np.exp(1j * omega * posterior.dt_s)
-    r = _laurent(posterior, pole, everything)[0] @ posterior.mean[: posterior.poles.order]
+    r = laurent_rows(posterior.poles, pole)[0] @ posterior.mean[: posterior.poles.order]
     front = front_response(omega, posterior.dt_s, posterior.integrators, posterior.input_delay_samples)
     own = (
         front / all_pass_response(posterior.unstable, z) * (r / (z - pole) + np.conj(r) / (z - np.conj(pole)))
@@ -119,14 +119,13 @@ def _carried(posterior: ResponsePosterior, pole: complex, everything: ComplexArr
     return float(np.abs(own[0])) / max(radius, np.finfo(np.float64).tiny)
 
 
-def _laurent(
-    posterior: ResponsePosterior, pole: complex, everything: ComplexArray
-) -> tuple[ComplexArray, ComplexArray]:
-    """(P,) rows of the coefficients of 1/(z - pole) and 1/(z - pole)^2."""
-    away = np.abs(everything - pole)
+def laurent_rows(poles: Poles, pole: complex) -> tuple[ComplexArray, ComplexArray]:
+    """(P,) rows on the coefficients of poles taken twice: what stands before 1/(z - pole) and 1/(z - pole)^2;
+    to first order the pole has moved by their ratio."""
+    away = np.abs(poles.values - pole)
     radius = _SHARE_OF_DISTANCE * float(away[away > 0].min(initial=1.0))
     turn = np.exp(2j * np.pi * np.arange(_POINTS) / _POINTS)
-    rows = basis_response(posterior.poles, pole + radius * turn)
+    rows = basis_response(poles, pole + radius * turn)
     return (
         np.mean(rows * (radius * turn)[:, None], axis=0),
         np.mean(rows * ((radius * turn) ** 2)[:, None], axis=0),
