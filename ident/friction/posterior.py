@@ -32,10 +32,10 @@ _FREQUENCIES, _LENGTHS, _LEVEL = 400, 100, 0.95
 # Normals along which the response is bent, points of an arc, its parts that are kept as a share of the
 # largest, singular values of the basis that are left out.
 _MOST_CURVED, _STEPS, _SMALL, _RANK = 3, 17, 1e-3, 1e-8
-_MOST_GAIN = 4.0
+_MOST_GAIN = 3.0
 # Size of an ellipse over the rms of even points of the arc it holds (1.7 of a line); at most, where the sign
 # of the gain is known, as a share of it.
-_REACH, _LARGEST = 2.0, 0.95
+_REACH, _LARGEST = 1.7, 0.9
 # Rates of further real poles, as multiples of the slowest one's, which the force may move so far.
 _AROUND = (0.1, 0.4, 2.0, 5.0)
 
