@@ -81,6 +81,7 @@ _LARGEST_STEP, _LENGTHS = 0.3, (1.0, 0.5, 0.25, 0.1)
 _EARLIER, _MUCH_BETTER = 2, 0.8
 # How dead time and lag are changed, samples: later, a lag in place of dead time, a first lag, the reverse.
 _LEAST_LAG = 0.5
+_SIZES = (1.1, 1 / 1.1, 1.02, 1 / 1.02)  # of the friction as a whole
 _SHIFTS = ((1, 0.0), (-1, 1.0), (0, _LEAST_LAG), (1, -1.0))
 # Change of a constant force, as a share of the rms input, that a derivative is taken from.
 _CHANGE_OF_BIAS = 0.01
@@ -262,8 +263,7 @@ def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: R
     found = simple
     with suppress(LostError):
         found = _with_more_poles(logs, simple, options)
-    if found is not simple:
-        found = _with_law(logs, found, options)
+    found = _with_law(logs, found, options)
     while found.lag or (left_open and found.arm.structure.input_delay_samples):
         # What a simple arm took for a shift may be further poles.
         report(0.8, "friction: dead time, lag of the drive")
@@ -331,6 +331,8 @@ def _with_law(logs: _Logs, found: FrictionFit, options: IdentOptions) -> Frictio
             found = _with_friction_beyond(logs, found, _of_order(found, options))
         with suppress(LostError):
             found = _with_stribeck(logs, found)
+        with suppress(ValueError):
+            found = _along_valley(logs, found, options)
     return found
 
 
@@ -431,20 +433,12 @@ def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: in
     """Arm and law in turns; the poles are searched for once more where the level has moved."""
     search, inside = True, _moving(options)
     for k in range(rounds):
-        found = observed(found, logs.records)
-        whiten = ObserverFilter.of(found)
-        white = [whiten.filtered(found.forced(record)) for record in logs.records]
-        models = [untested_model(white, inside)] if search else []
+        found, tried = observed(found, logs.records), list[FrictionFit]()
+        if search:
+            anew = _on(found, untested_model(_white(logs, found), inside))
+            tried = [observed(replace(anew, correction=None, ratio=0.0), logs.records)]
         if k or found.model.poles.counts == (options.n_real, options.n_pairs):
-            there = PoleSearch(prepare(white, inside.structure()), inside)
-            linear = linear_fit(there.data, poles := there.descend(found.model.poles, "friction").poles)
-            models.append(replace(found.model, poles=poles, coefficients=np.ravel(linear.coefficients)))
-        tried = []
-        for model in models:
-            anew = _on(found, model)
-            if search:
-                anew = replace(anew, correction=None, ratio=0.0)
-            tried.append(observed(anew, logs.records))
+            tried.append(_with_near_poles(logs, found, inside))
         found = min(tried, key=logs.errors)
         level, found = found.level, _stepped(logs, found)
         moved = abs(found.level - level) / max(found.level, level)
@@ -452,6 +446,33 @@ def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: in
             break
         search = moved > _MOVES or (not search and moved < _STAYS)
     return found
+
+
+def _white(logs: _Logs, found: FrictionFit) -> list[Record]:
+    whiten = ObserverFilter.of(found)
+    return [whiten.filtered(found.forced(record)) for record in logs.records]
+
+
+def _with_near_poles(logs: _Logs, found: FrictionFit, options: IdentOptions) -> FrictionFit:
+    """The fit with the arm anew behind its friction, on poles near those it has."""
+    there = PoleSearch(prepare(_white(logs, found), options.structure()), options)
+    linear = linear_fit(there.data, poles := there.descend(found.model.poles, "friction").poles)
+    model = replace(found.model, poles=poles, coefficients=np.ravel(linear.coefficients))
+    return observed(_on(found, model), logs.records)
+
+
+def _along_valley(logs: _Logs, found: FrictionFit, options: IdentOptions) -> FrictionFit:
+    """The same with more or less friction as a whole, as long as it predicts better with the arm anew: where
+    friction and slow poles trade, single steps creep."""
+    inside = _moving(_of_order(found, options))
+    for size in _SIZES:
+        better = True
+        while better:
+            law = replace(found.law, level=size * found.law.level, excess=size * found.law.excess)
+            tried = _with_near_poles(logs, replace(found, law=law, beyond=size * found.beyond), inside)
+            better = logs.errors(tried) < logs.errors(found)
+            found = tried if better else found
+    return _stepped(logs, found)
 
 
 def _on(found: FrictionFit, model: GobfModel) -> FrictionFit:
@@ -476,9 +497,9 @@ def _on_moved_poles(logs: _Logs, found: FrictionFit) -> FrictionFit:
     poles, images = found.model.poles, found.arm.structure.unstable.values
     real = [pole if np.any(images == pole) or pole <= 0 else moved(pole).real for pole in poles.real.tolist()]
     pairs = [pole if np.any(images == pole) else moved(pole) for pole in poles.pairs.tolist()]
-    poles, whiten = Poles(np.array(real), np.array(pairs, np.complex128)), ObserverFilter.of(found)
-    white = [whiten.filtered(found.forced(record)) for record in logs.records]
-    linear = linear_fit(prepare(white, replace(found.arm.structure, estimate_initial_state=True)), poles)
+    poles = Poles(np.array(real), np.array(pairs, np.complex128))
+    data = prepare(_white(logs, found), replace(found.arm.structure, estimate_initial_state=True))
+    linear = linear_fit(data, poles)
     model = replace(found.model, poles=poles, coefficients=np.ravel(linear.coefficients))
     return observed(_on(found, model), logs.records, nearby=NEARBY[1:2])
 
