@@ -83,8 +83,6 @@ _EARLIER, _MUCH_BETTER = 2, 0.8
 _LEAST_LAG = 0.5
 _SIZES = (1.1, 1 / 1.1, 1.02, 1 / 1.02)  # of the friction as a whole
 _SHIFTS = ((1, 0.0), (-1, 1.0), (0, _LEAST_LAG), (1, -1.0))
-# Change of a constant force, as a share of the rms input, that a derivative is taken from.
-_CHANGE_OF_BIAS = 0.01
 # Lowest further pair, as a share of the first mode: friction that is left over looks like slow poles.
 _LOWEST_PAIR, _ABOVE_NOISE = 0.4, 1.2
 # Stribeck friction begins with this excess and one of these speeds, in units of the rms speed.
@@ -263,25 +261,7 @@ def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: R
     found = simple
     with suppress(LostError):
         found = _with_more_poles(logs, simple, options)
-    found = _with_law(logs, found, options)
-    while found.lag or (left_open and found.arm.structure.input_delay_samples):
-        # What a simple arm took for a shift may be further poles.
-        report(0.8, "friction: dead time, lag of the drive")
-        delay = found.arm.structure.input_delay_samples + (round(found.lag) if found.lag else -1)
-        earlier = replace(
-            _shifted(simple, delay, 0.0), law=found.law, spring=found.spring, beyond=found.beyond
-        )
-        try:
-            later, simple = simple, _in_turns(logs, earlier, _of_order(simple, options, delay), _FEW_ROUNDS)
-            if not logs.errors(simple) < _WORSE_AT_FIRST * logs.errors(later):
-                break
-            tried = _with_more_poles(logs, simple, options)
-        except LostError:
-            break
-        if not logs.worth(tried) < logs.worth(found):
-            break
-        found = tried
-    return _without_needless_stribeck(logs, found)
+    return _with_law(logs, found, options)
 
 
 def _with_shift(logs: _Logs, found: FrictionFit, options: IdentOptions, *, left_open: bool) -> FrictionFit:
@@ -542,25 +522,7 @@ def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
         if logs.errors(tried) < errors:
             found = tried
             break
-    return with_covariance(_held(logs, found), blocks, targets, noise)
-
-
-def _held(logs: _Logs, found: FrictionFit) -> FrictionFit:
-    """The same with the constant force that leaves predictions no mean error, where that makes them better:
-    an integrating arm drifts with any other; elsewhere the mean is also where the arm is told from."""
-
-    def left(one: FrictionFit) -> RealArray:
-        parts = [one.prediction_error(record) for record in logs.records]
-        return np.concatenate([part[part.size // 20 :] for part in parts])
-
-    size = _CHANGE_OF_BIAS * logs.rms
-    before, after = (np.mean(left(one)) for one in (found, replace(found, bias=found.bias + size)))
-    if not np.isfinite(after) or after == before:
-        return found
-    tried = replace(found, bias=found.bias - float(size * before / (after - before)))
-    if found.arm.structure.integrators:
-        return tried if np.sum(left(tried) ** 2) < np.sum(left(found) ** 2) else found
-    return tried if logs.errors(tried) < logs.errors(found) else found
+    return with_covariance(found, blocks, targets, noise)
 
 
 def _settled(logs: _Logs, found: FrictionFit) -> FrictionFit:
@@ -580,20 +542,6 @@ def _with_stribeck(logs: _Logs, found: FrictionFit) -> FrictionFit:
     best = _settled(logs, best)
     better = logs.errors(best) < logs.errors(found) * (1 - 2 * logs.criterion)
     return best if best.law.excess > 0 and better else found
-
-
-def _without_needless_stribeck(logs: _Logs, found: FrictionFit) -> FrictionFit:
-    """The same without friction that falls with speed, where that is no longer worth its two parameters: it
-    was let in before dead time and further poles were known, and makes the level uncertain."""
-    law = found.law
-    if not law.excess > 0:
-        return found
-    plain = replace(found, law=replace(law, level=law.level + law.excess, excess=0.0, fall=np.inf))
-    with suppress(LostError):
-        plain = _settled(logs, plain)
-        if logs.errors(plain) * (1 - 2 * logs.criterion) < logs.errors(found):
-            return plain
-    return found
 
 
 def _with_friction_beyond(logs: _Logs, found: FrictionFit, few: IdentOptions) -> FrictionFit:
