@@ -42,7 +42,7 @@ Tests = tuple[ResidualTest, ResidualTest]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Uncertainty(ResponsePosterior):
-    """Response with ellipses at any frequency (`at`); `joint_level` gives the level for a whole curve.
+    """Response with ellipses at any frequency (`at`).
 
     nominal_poles: of the identified model; prior_missed_mode: as it was stated; advice: what the residuals
     say about the ellipses.

@@ -166,7 +166,14 @@ class Rig(_Checked):
                 lines += ["", "# relative standard deviations of the values above; not listed = exact"]
                 lines += ["[tolerances]", *(f'"{key}" = {float(value)!r}' for key, value in values.items())]
             else:
-                lines += ["", f"[{section}]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
+                lines += [
+                    "",
+                    f"[{section}]",
+                    *(
+                        f"{k} = " + (f'"{v}"' if isinstance(v, str) else f"{float(v)!r}")
+                        for k, v in values.items()
+                    ),
+                ]
         return "\n".join(lines) + "\n"
 
     def value(self, key: str) -> float:
@@ -214,10 +221,6 @@ def parameter_keys() -> tuple[str, ...]:
         for key, entry in getattr(field.annotation, "model_fields", {}).items()
         if entry.annotation is float
     )
-
-
-def _toml(value: float | str) -> str:
-    return f'"{value}"' if isinstance(value, str) else repr(float(value))
 
 
 def one_line(error: ValidationError, known: Collection[str] = ()) -> str:

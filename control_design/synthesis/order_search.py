@@ -168,7 +168,8 @@ class OrderSearch:
         damping = max(1.01 * (self.spec.controller_damping or 0.0), _NO_RESONANCE)
         rng = self.rng if turn else None
         fits = [fitted(self.cascade, each, least_damping=damping, rng=rng) for each in free.each]
-        stable = [self._stabilised(x) for x in fits if x is not None]
+        value = self._descent().value
+        stable = [x if np.isfinite(value(x)) else self._retreat(x) for x in fits if x is not None]
         return [x for x in stable if x is not None]
 
     def _others(self) -> list[Real]:
@@ -178,9 +179,6 @@ class OrderSearch:
         maker = self._maker()
         shaped = [x for x, _ in maker.shaped(_ROUGH_DRAWS, _SHAPED_TRACKING)]
         return shaped + [maker.low_gain() for _ in range(min(self.options.starts, _SHAPED_TRACKING))]
-
-    def _stabilised(self, parameters: Real) -> Real | None:
-        return parameters if np.isfinite(self._descent().value(parameters)) else self._retreat(parameters)
 
     def _nearest(self, ends: Sequence[TriedController]) -> Real:
         """Parameters that are stable on the grid, the smallest worst case first; else nearest to the

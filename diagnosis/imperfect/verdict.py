@@ -420,14 +420,10 @@ def below_threshold(search: Search, explanation: Explanation) -> float:
     return max(found)
 
 
-def _left(explanation: Explanation) -> float:
-    """Share of the motion that is left of estimation and held-out records."""
-    return float(np.sqrt(np.mean(np.max(explanation.shares, axis=1) ** 2)))
-
-
 def _beyond(explanation: Explanation) -> float:
-    """What is left, as it would be without contacts."""
-    return _left(explanation) / (_AFTER_CONTACTS if explanation.end.non_smooth else 1.0)
+    """Share of the motion that is left of estimation and held-out records, as if without contacts."""
+    left = float(np.sqrt(np.mean(np.max(explanation.shares, axis=1) ** 2)))
+    return left / (_AFTER_CONTACTS if explanation.end.non_smooth else 1.0)
 
 
 def _enough(left: float, weighing: Weighing) -> float:

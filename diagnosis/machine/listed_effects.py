@@ -75,10 +75,6 @@ def _drifting(signal: Real, values: Values, dt_s: float, before: float) -> Real:
     return np.asarray(signal + values["rate_per_s"] * dt_s * np.arange(signal.size))
 
 
-def _dead(signal: Real, values: Values, dt_s: float, before: float) -> Real:
-    return np.asarray(np.sign(signal) * np.maximum(np.abs(signal) - values["width"], 0.0))
-
-
 def _clipped(signal: Real, values: Values, dt_s: float, before: float) -> Real:
     return np.clip(signal, -values["limit"], values["limit"])
 
@@ -166,7 +162,9 @@ KINDS: dict[str, Callable[[str, Sizes], PlantEffect]] = {
         name,
         (_log("width", s.input, 1e-5, 1.0, 1e-3, 0.5, 12),),
         where="input",
-        change=_dead,
+        change=lambda signal, values, dt_s, before: np.asarray(
+            np.sign(signal) * np.maximum(np.abs(signal) - values["width"], 0.0)
+        ),
         dependence="continuous",
         check="raise the command slowly from zero and note where something begins to follow",
         group="actuator",

@@ -17,7 +17,6 @@ import numpy.typing as npt
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.machine_protocol import Real
 from plant.modal import link_modes
-from plant.rig import Rig
 
 Spectrum = npt.NDArray[np.complex128]
 
@@ -205,10 +204,11 @@ def _fault(case: Case, found: Sequence[_Match], least: float) -> str:
         return ""
     alike = len(far) == len(case.outputs) > 1 and max(far.values()) < _ALIKE * min(far.values())
     ratio = next(iter(far.values()))
+    gear = (case.rig.motor.gear_ratio, "gear ratio")
     near = sorted(
         (float(abs(np.log(max(ratio, 1 / ratio) / factor))), f"{quantity} off by {factor:.4g} ({word})")
         for quantity in (("voltage_V",) if alike else (*either, next(iter(far))))
-        for factor, word in _factors(quantity, case.rig)
+        for factor, word in (*_FACTORS[quantity], *([gear] if quantity == "hub_angle_rad" else []))
     )
     guesses = [guess for distance, guess in near if distance < np.log(_ALIKE / 2)]
     return (
@@ -216,11 +216,6 @@ def _fault(case: Case, found: Sequence[_Match], least: float) -> str:
         f"{' or '.join(guesses) or 'unit of a column, or value of the rig file'}? Expected {LESS:.2g} to "
         f"{FARTHER:g}; see scale in [columns]"
     )
-
-
-def _factors(quantity: str, rig: Rig) -> tuple[tuple[float, str], ...]:
-    at_motor = ((rig.motor.gear_ratio, "gear ratio"),) if quantity == "hub_angle_rad" else ()
-    return (*_FACTORS[quantity], *at_motor)
 
 
 def _speed(signal: Real, dt_s: float, highest_Hz: float) -> Spectrum:

@@ -14,12 +14,9 @@ from ident.basis.model import refuse_unstable
 from ident.basis.poles import NO_POLES, Poles
 from ident.basis.structure import filter_input, front_response
 from ident.data.arrays import ComplexArray, RealArray, lock
-from ident.data.ellipses import ellipse_distance, spread_covariance
+from ident.data.ellipses import spread_covariance
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.shown import Shown
-
-# Responses times frequencies that are drawn at once for simultaneous bands.
-_LARGEST_BATCH = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -183,22 +180,3 @@ class ResponsePosterior(Shown):
         return replace(
             self, mean=self.mean[kept], covariance_factor=self.covariance_factor[kept], unstable=NO_POLES
         )
-
-    def joint_level(
-        self, omega_rad_s: npt.ArrayLike, level: float, rng: np.random.Generator, n_draws: int = 2000
-    ) -> float:
-        """Per-frequency level whose ellipses hold the whole response on omega (F,) with probability `level`:
-        the quantile of the largest normalised distance of n_draws sampled responses. Its error is sqrt(level
-        (1 - level) / n_draws)."""
-        median = self.at(omega_rad_s, level=0.5)
-        axes, rows = median.ellipse(), self.frequency_rows(omega_rad_s).T
-        largest = np.empty(n_draws)
-        step = max(1, _LARGEST_BATCH // median.centre.size)
-        for start in range(0, n_draws, step):
-            responses = self.sample(rng, min(step, n_draws - start)) @ rows
-            magnitude = np.abs(median.centre) + np.abs(responses)
-            distance = ellipse_distance(responses - median.centre, axes, magnitude)
-            largest[start : start + step] = distance.max(axis=1)
-        # Ellipses at level 1/2 have squared radius 2 ln 2; a distance d on them is level 1 - 2^(-d^2).
-        worst = float(np.quantile(largest, level))
-        return float(min(-np.expm1(-(worst**2) * np.log(2)), 1 - 1e-15))

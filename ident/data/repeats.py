@@ -145,14 +145,10 @@ def repeats_of(records: Sequence[Record]) -> tuple[Repeats, ...]:
     single one are left out. Raises ValueError for several inputs or outputs."""
     for record in records:
         record.refuse_several()
-    moving = [(record, course) for record in records if np.any(course := _course(record))]
+    signals = [(one, (one.input if one.reference is None else one.reference)[:, 0]) for one in records]
+    moving = [(one, np.asarray(signal - signal.mean())) for one, signal in signals if np.ptp(signal) > 0]
     found = (_experiment(form) for form in in_groups(moving, _alike))
     return tuple(experiment for experiment in found if experiment is not None)
-
-
-def _course(record: Record) -> RealArray:
-    signal = record.input if record.reference is None else record.reference
-    return np.asarray(signal[:, 0] - signal[:, 0].mean())
 
 
 def _alike(one: tuple[Record, RealArray], another: tuple[Record, RealArray]) -> bool:

@@ -89,7 +89,8 @@ def _walk(model: type[BaseModel], location: Iterable[int | str]) -> tuple[str, l
         if isinstance(step, int):
             parts.append(f"[{step}]")
             continue
-        tagged = [candidate for candidate in here if step in _tags(candidate)]
+        kinds = [(candidate, candidate.model_fields.get("kind")) for candidate in here]
+        tagged = [candidate for candidate, kind in kinds if kind and step in get_args(kind.annotation)]
         if tagged and not any(step in candidate.model_fields for candidate in here):
             here = tagged
             known = _keys(here)
@@ -103,11 +104,6 @@ def _walk(model: type[BaseModel], location: Iterable[int | str]) -> tuple[str, l
 
 def _keys(models: Iterable[type[BaseModel]]) -> list[str]:
     return sorted({field.alias or name for model in models for name, field in model.model_fields.items()})
-
-
-def _tags(model: type[BaseModel]) -> set[str]:
-    field = model.model_fields.get("kind")
-    return {str(value) for value in get_args(field.annotation)} if field else set()
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

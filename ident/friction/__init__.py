@@ -6,7 +6,6 @@ from ident.friction.fit import fit_friction, refuse_unseen_shaft
 from ident.friction.gauss_newton import FrictionFit
 from ident.friction.in_loop import (
     identify_behind,
-    precedes_command,
     recorded_in_loop,
     with_commands_in_time,
 )
@@ -22,7 +21,6 @@ __all__ = [
     "fit_friction",
     "identify_behind",
     "other_output_without_friction",
-    "precedes_command",
     "recorded_in_loop",
     "refuse_unseen_shaft",
     "with_commands_in_time",

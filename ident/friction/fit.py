@@ -95,7 +95,12 @@ def _running_free(
     report(0.0, "friction: start")
     structure = options.structure()
     least = 1e-6 * max(float(np.std(record.input)) for record in records)
-    level, model = _start(records, options, least)
+    level, less = with_measured_direction(
+        records, presliding_of(records), options.input_delay_samples, stiff=not options.integrators
+    )
+    # One pair more than asked for: what a wrong level leaves would otherwise take the place of a weak mode.
+    pairs = None if options.n_pairs is None else options.n_pairs + 1
+    level, model = max(level, least), untested_model(less, options.model_copy(update={"n_pairs": pairs}))
     best: FrictionFit | None = None
     for search in range(_MOST_SEARCHES):
         report(0.2 + 0.8 * search / _MOST_SEARCHES, "friction: arm and level together")
@@ -125,22 +130,8 @@ def moved_to(found: FrictionFit, records: Sequence[Record], model: GobfModel) ->
 
 
 def _rss(found: FrictionFit, records: Sequence[Record]) -> float:
-    return found.noise_std**2 * _n_rows(found, records)
-
-
-def _n_rows(found: FrictionFit, records: Sequence[Record]) -> int:
-    """Rows that answer to the inputs of the records."""
-    return sum(record.n_samples - found.arm.structure.input_delay_samples for record in records)
-
-
-def _start(records: Sequence[Record], options: IdentOptions, least: float) -> tuple[float, GobfModel]:
-    """Level and arm with the friction that the measured motion gives."""
-    level, less = with_measured_direction(
-        records, presliding_of(records), options.input_delay_samples, stiff=not options.integrators
-    )
-    # One pair more than asked for: what a wrong level leaves would otherwise take the place of a weak mode.
-    options = options.model_copy(update={"n_pairs": None if options.n_pairs is None else options.n_pairs + 1})
-    return max(level, least), untested_model(less, options)
+    delay = found.arm.structure.input_delay_samples
+    return found.noise_std**2 * sum(record.n_samples - delay for record in records)
 
 
 def refuse_unseen_shaft(found: FrictionFit, records: Sequence[Record]) -> None:

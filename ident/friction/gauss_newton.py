@@ -128,10 +128,6 @@ class FrictionFit:
         position = record.output[:, 0]
         return np.asarray(position - (position[0] if self.arm.structure.integrators else self.centre))
 
-    def prediction_error(self, record: Record) -> RealArray:
-        """(T,) what an observer leaves of the position, its mean, which a constant force makes, with it."""
-        return self._position(record) - self.motion(record)[0]
-
     def steady(self, record: Record) -> RealArray:
         """(T,) bias and friction beyond the spring, at the shaft: what the observer need not simulate."""
         force = np.full(record.n_samples, self.bias)
@@ -287,22 +283,6 @@ def driven_by_law(found: FrictionFit, record: Record) -> RealArray:
         size = _CHANGE_BEYOND * found.level
         columns.append((found.force_beyond(record, found.beyond + size, found.law) - beyond) / size)
     return np.column_stack([-arm.simulate(column) for column in columns])
-
-
-def driven_by_shape(found: FrictionFit, record: Record, speed: float) -> RealArray:
-    """(T, S) changes of the arm's position per unit of what was not found: an excess that falls with a tenth
-    of this speed, a share beyond the first spring; where an observer tells the friction of a record."""
-    arm = replace(found.model.stable_part, input_delay_samples=0)
-    friction, columns = found.motion(record)[1], []
-    if not np.isfinite(found.law.fall):
-        excess = _CHANGE_OF_LEVEL * found.law.level
-        law = replace(found.law, excess=excess, fall=0.1 * speed)
-        columns.append((found.friction_of(record, law) - friction) / excess)
-    spring = Spring.of(found.model) if found.spring is None else None
-    if spring is not None:
-        there = spring.force(record.output[:, 0], found.law.level, found.law)
-        columns.append(there - friction / found.law.level)
-    return np.column_stack([np.zeros((friction.size, 0)), *(-arm.simulate(column) for column in columns)])
 
 
 def started(model: GobfModel, structure: Structure, law: FrictionLaw) -> FrictionFit:

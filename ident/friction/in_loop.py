@@ -77,8 +77,6 @@ _CAUSES, _NOTHING, _BY_CHANCE = 8, 1e-5, 1e-6
 _LATEST, _FEW_LEVELS = 40, 16
 # Largest step of the level, as a share of it; parts of a step that are tried.
 _LARGEST_STEP, _LENGTHS = 0.3, (1.0, 0.5, 0.25, 0.1)
-# Samples that a command may be late, and errors that are less by much: 1.4 of a belt, .97 of a rigid axis.
-_EARLIER, _MUCH_BETTER = 2, 0.8
 # How dead time and lag are changed, samples: later, a lag in place of dead time, a first lag, the reverse.
 _LEAST_LAG = 0.5
 _SIZES = (1.1, 1 / 1.1, 1.02, 1 / 1.02)  # of the friction as a whole
@@ -113,7 +111,9 @@ def with_commands_in_time(records: Sequence[Record]) -> list[Record]:
     n = len(records)
     if any(record.reference is not None or record.input.shape[1] > 1 for record in records):
         return list(records)
-    if not all(_generated(record.input[:, 0]) and _follows(record, 0, n) for record in records):
+    if any(np.unique(r.input).size > _FEW_LEVELS and period_of(r.input[:, 0]) is None for r in records):
+        return list(records)
+    if not all(_follows(record, 0, n) for record in records):
         return list(records)
     for late in range(1, _LATEST + 1):
         if not any(_follows(record, late + more, n) for more in range(_CAUSES) for record in records):
@@ -135,11 +135,6 @@ def _follows(record: Record, late: int, among: int) -> bool:
     """Whether the command, taken so many samples earlier, is told by the position, of one of so many logs."""
     u, y = record.input[late:, 0], record.output[: record.n_samples - late, 0]
     return bool(chi2.sf(_told_by_position(u, y), _CAUSES) * among < _BY_CHANCE)
-
-
-def _generated(u: RealArray) -> bool:
-    """Whether a command has few levels, or repeats."""
-    return np.unique(u).size <= _FEW_LEVELS or period_of(u) is not None
 
 
 def _answers_at_once(record: Record, late: int) -> bool:
@@ -201,8 +196,9 @@ class _Logs:
         return prediction_errors(found, self.records)
 
     def worth(self, found: FrictionFit) -> float:
-        """Errors, larger by what the number of poles costs."""
-        return self.errors(found) * (1 + (found.model.order + int(found.lag > 0)) * self.criterion)
+        """Errors, larger by what the number of poles and of parameters of the friction costs."""
+        law = 2 * int(np.isfinite(found.law.fall)) + int(found.spring is not None)
+        return self.errors(found) * (1 + (found.model.order + law + int(found.lag > 0)) * self.criterion)
 
 
 def fit_friction_in_loop(
@@ -305,30 +301,43 @@ def _shifted(found: FrictionFit, delay: int, lag: float) -> FrictionFit:
 
 
 def _with_law(logs: _Logs, found: FrictionFit, options: IdentOptions) -> FrictionFit:
-    """The same with friction at the load, and falling with speed, where that is worth it."""
-    if found.significant:
-        with suppress(LostError):  # what no observer follows explains nothing better
-            found = _with_friction_beyond(logs, found, _of_order(found, options))
-        with suppress(LostError):
-            found = _with_stribeck(logs, found)
-        with suppress(ValueError):
-            found = _along_valley(logs, found, options)
+    """The same with friction at the load, behind the first spring, and with friction that falls with speed,
+    where that is worth it."""
+    if not found.significant:
+        return found
+    spring, half = Spring.of(found.model), 0.5 * found.law.level
+    if spring is not None and found.spring is None:
+        law = replace(found.law, level=half)
+        found = _kept_if_better(logs, found, [replace(found, spring=spring, beyond=half, law=law)])
+    if not np.isfinite(found.law.fall):
+        speed, excess, level = rms_speed(logs.records), _EXCESS * found.law.level, found.law.level
+        laws = [replace(found.law, level=level - excess, excess=excess, fall=f * speed) for f in _FALLS]
+        found = _kept_if_better(logs, found, [replace(found, law=law) for law in laws])
+    with suppress(ValueError):
+        found = _along_valley(logs, found, options)
+    return found
+
+
+def _kept_if_better(logs: _Logs, found: FrictionFit, starts: Sequence[FrictionFit]) -> FrictionFit:
+    """What follows from the best of these starts, where its parameters are worth it. What no observer follows
+    explains nothing better."""
+    with suppress(ValueError):
+        return min(found, _settled(logs, min(starts, key=logs.errors)), key=logs.worth)
     return found
 
 
 def _of_structure(logs: _Logs, options: IdentOptions) -> list[tuple[IdentOptions, FrictionFit]]:
     """The options with each structure that is possible, and the fit with the fewest poles: where the
     integrators are not stated, one of them, or a weight that throws the arm over."""
-    if options.model_fields_set & {"integrators", "unstable_poles"}:
-        found = _simple(logs, options)
-        assert found is not None
-        return [found]
+    stated = bool(options.model_fields_set & {"integrators", "unstable_poles"})
     tried = list[tuple[IdentOptions, FrictionFit]]()
     for integrators in (1, 0):
         with suppress(LostError):
-            one = options.model_copy(update={"integrators": integrators})
-            found = _simple(logs, one, thrown_over=not integrators)
+            one = options if stated else options.model_copy(update={"integrators": integrators})
+            found = _simple(logs, one, thrown_over=not (integrators or stated))
             tried += [found] if found else []
+        if stated:
+            break
     if not tried:
         raise LostError
     return tried
@@ -405,16 +414,15 @@ def _with_more_poles(logs: _Logs, found: FrictionFit, options: IdentOptions) -> 
         return found
     delay = {"input_delay_samples": found.arm.structure.input_delay_samples}
     more = _in_turns(logs, found, _beyond(found, options.model_copy(update=delay)))
-    extra = more.model.order - found.model.order
-    return more if logs.errors(more) < logs.errors(found) * (1 - extra * logs.criterion) else found
+    return min(found, more, key=logs.worth)
 
 
 def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: int = _ROUNDS) -> FrictionFit:
     """Arm and law in turns; the poles are searched for once more where the level has moved."""
-    search, inside = True, _moving(options)
+    moved, inside = np.inf, _moving(options)
     for k in range(rounds):
         found, tried = observed(found, logs.records), list[FrictionFit]()
-        if search:
+        if moved > _MOVES:
             anew = _on(found, untested_model(_white(logs, found), inside))
             tried = [observed(replace(anew, correction=None, ratio=0.0), logs.records)]
         if k or found.model.poles.counts == (options.n_real, options.n_pairs):
@@ -422,9 +430,8 @@ def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: in
         found = min(tried, key=logs.errors)
         level, found = found.level, _stepped(logs, found)
         moved = abs(found.level - level) / max(found.level, level)
-        if search and k and moved < _STAYS:
+        if k and moved < _STAYS:
             break
-        search = moved > _MOVES or (not search and moved < _STAYS)
     return found
 
 
@@ -532,51 +539,6 @@ def _settled(logs: _Logs, found: FrictionFit) -> FrictionFit:
     return found
 
 
-def _with_stribeck(logs: _Logs, found: FrictionFit) -> FrictionFit:
-    """The same with friction that falls with speed, where that is worth its two parameters."""
-    if np.isfinite(found.law.fall):
-        return found
-    speed, excess = rms_speed(logs.records), _EXCESS * found.law.level
-    laws = [replace(found.law, level=found.law.level - excess, excess=excess, fall=f * speed) for f in _FALLS]
-    best = min((replace(found, law=law) for law in laws), key=logs.errors)
-    best = _settled(logs, best)
-    better = logs.errors(best) < logs.errors(found) * (1 - 2 * logs.criterion)
-    return best if best.law.excess > 0 and better else found
-
-
-def _with_friction_beyond(logs: _Logs, found: FrictionFit, few: IdentOptions) -> FrictionFit:
-    """The same with friction on the other side of the first spring, where that is worth its parameter. The
-    spring is read off the arm once more when most of the friction is known, which bends the arm's zero."""
-    spring = Spring.of(found.model)
-    if spring is None or found.spring is not None:
-        return found
-    half = 0.5 * found.law.level
-    best = replace(found, spring=spring, beyond=half, law=replace(found.law, level=half))
-    best = _in_turns(logs, _settled(logs, best), few)
-    better = logs.errors(best) < logs.errors(found) * (1 - logs.criterion)
-    return best if best.beyond > 0 and better else found
-
-
-def precedes_command(found: FrictionFit, records: Sequence[Record], options: IdentOptions) -> bool:
-    """Whether the motion of logs comes before its command: an arm with as many poles predicts much better
-    where the command is logged two samples earlier. records, options: those of the fit."""
-    if found.arm.structure.input_delay_samples:
-        return False
-    same = _of_order(found, _above_noise(records, options))
-    earlier = [
-        replace(record.slice(0, record.n_samples - _EARLIER), input=record.input[_EARLIER:])
-        for record in records
-    ]
-    errors = []
-    for tried in (records, earlier):
-        logs = _Logs.of(tried)
-        try:
-            errors.append(logs.errors(_in_turns(logs, found, same, _FEW_ROUNDS)))
-        except LostError:
-            errors.append(np.inf)
-    return errors[1] < _MUCH_BETTER * min(errors[0], _Logs.of(records).errors(found))
-
-
 def identify_behind(
     found: FrictionFit,
     records: Sequence[Record],
@@ -657,12 +619,8 @@ def heterogeneity(
     nothing = np.zeros((0, blocks[0].shape[1] + 1))
     together = least_squares(blocks, targets, nothing)
     alone = [least_squares([b], [t], nothing) for b, t in zip(blocks, targets, strict=True)]
-    rank = [_rank(one[1]) for one in (together, *alone)]
+    sizes = [(one[1], np.linalg.norm(one[1], axis=0)) for one in (together, *alone)]
+    rank = [int(np.linalg.matrix_rank(r / np.where(n > 0, n, 1.0), tol=_RANK)) for r, n in sizes]
     left = sum(one[3] for one in alone)
     freedom = max(sum(rank[1:]) - rank[0], 1), sum(t.size for t in targets) - sum(rank[1:])
     return max(1.0, float((together[3] - left) / freedom[0] / (left / freedom[1])))
-
-
-def _rank(triangle: RealArray) -> int:
-    size = np.linalg.norm(triangle, axis=0)
-    return int(np.linalg.matrix_rank(triangle / np.where(size > 0, size, 1.0), tol=_RANK))

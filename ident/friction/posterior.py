@@ -18,14 +18,14 @@ from ident.data.ellipses import chi2_radius
 from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
-from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, driven_by_shape, linearised
+from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, linearised
 from ident.friction.in_loop import autoregressive, heterogeneity
-from ident.friction.inverse_dynamics import rms_speed, smoothed
+from ident.friction.inverse_dynamics import smoothed
 from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
 
 _NOISE_ORDER = 32  # as in `ident.friction.in_loop`
-# Share of the level that another law, or a linear force that shows in no residual, may have (deviation).
+# Share of the level that a linear force which shows in no residual may have (deviation).
 _SHAPE = 0.05
 # Grid of what is put onto the basis.
 _FREQUENCIES, _LENGTHS, _LEVEL = 400, 100, 0.95
@@ -94,18 +94,16 @@ def _behind_observed(
     """The same where an observer tells the friction from the measured motion: it does not depend on the arm,
     to first order."""
     less, beside, options = list[Record](), list[Beside](), options or EmbeddingOptions()
-    speed = rms_speed(records)
     for k, record in enumerate(records):
         by_law = driven_by_law(found, record)
-        shape = _SHAPE * found.level * driven_by_shape(found, record, speed)
         logs = STD_LOG * by_law[:, 1::2][:, : found.law.n_logs]
         # The basis has the drive's lag; how far that moves the friction which is taken off is neglected.
         others = [*(1 + 2 * np.arange(found.law.n_logs)), *([2 * found.law.n_logs] if found.lag else [])]
         plain = np.delete(by_law, others, axis=1)
         own = np.outer(found.between * plain[:, 0], np.arange(len(records)) == k)
-        beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([plain, shape, logs, own])))
+        beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([plain, logs, own])))
         less.append(found.taken_off(record))
-    known = shape.shape[1] + found.law.n_logs + len(records)
+    known = found.law.n_logs + len(records)
     # What drives an arm away from its simulation is never white; as missed modes five slow ones were added.
     order = max(options.max_ar_order, _NOISE_ORDER)
     coloured = {"coloured_noise": True, "max_ar_order": order, "prior_missed_mode": 0.0}
@@ -173,7 +171,9 @@ def of_force(
         onto += [np.zeros((parts.shape[1], along.shape[1]))]
         # Of its parts the first takes the normal's place.
         onto[-1][0] = direction
-    slow = Poles(_rates_around(poles, response.dt_s))
+    # Real poles well below and above the slowest one, where that lies if more or less damps the arm.
+    slowest = np.max(poles.real[(poles.real > 0) & (poles.real < 1)], initial=0.0)
+    slow = Poles(slowest ** np.array(_AROUND if slowest else ()))
     wanted = np.hstack([moved @ onto[0], *columns]).T
     bent = _with_poles(response, poles.appended(slow), omega, gain * centre, [*wanted], _RANK)
     normals = np.vstack(onto)
@@ -191,12 +191,6 @@ def _parts_of(arc: ComplexArray, middle: ComplexArray) -> ComplexArray:
     most = np.full(n, _REACH)
     most[0] = min(_REACH, _LARGEST * abs(middle[0]) / abs(parts[0, 0]))
     return np.asarray(parts * most / chi2_radius(_LEVEL), np.complex128)
-
-
-def _rates_around(poles: Poles, dt_s: float) -> RealArray:
-    """Real poles well below and above the slowest one, where that lies if more or less damps the arm."""
-    real = poles.real[(poles.real > 0) & (poles.real < 1)]
-    return np.array([]) if real.size == 0 else np.max(real) ** np.array(_AROUND)
 
 
 def _frequencies(response: ResponsePosterior, longest_s: float) -> RealArray:

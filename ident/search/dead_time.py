@@ -219,11 +219,9 @@ def _moved(records: Sequence[Record], found: Fitted) -> tuple[Fitted, dict[int, 
 def gain(found: Fitted, other: Fitted) -> float:
     """Ne ln(J of other / J of found) on the rows that both answer to."""
     delay = max(_delay(found), _delay(other))
-    ours, theirs = (_power_from(item, delay - _delay(item)) for item in (found, other))
+    ours, theirs = (
+        sum(float(np.sum(item.residual[here][delay - _delay(item) :] ** 2)) for here in item.data.segments)
+        for item in (found, other)
+    )
     floor = EXPLAINED * found.data.power
     return found.worth() * float(np.log(max(theirs, floor) / max(ours, floor)))
-
-
-def _power_from(found: Fitted, skip: int) -> float:
-    residual = found.residual
-    return float(sum(residual[here][skip:] @ residual[here][skip:] for here in found.data.segments))

@@ -75,17 +75,6 @@ def test_simulation_from_rest_has_the_impulse_response_of_the_centre(integrators
         p.simulate(u, np.zeros(2))
 
 
-def test_joint_level_holds_whole_responses_together():
-    p = posterior(5, integrators=0)
-    level = p.joint_level(OMEGA, 0.9, np.random.default_rng(6), n_draws=4000)
-    assert level > 0.9
-    ellipses = p.at(OMEGA, level)
-    fresh = p.response_of(p.sample(np.random.default_rng(7), 2000), OMEGA)
-    inside = np.mean([np.all(ellipses.contains(response)) for response in fresh])
-    # Binomial error of 2000 trials and of the 4000 draws behind the level: 0.008 together; 4 of those.
-    assert abs(inside - 0.9) < 0.033
-
-
 def test_integrator_is_accurate_close_to_zero_frequency():
     p = posterior(10, integrators=2, delay=0)
     omega = 1e-7

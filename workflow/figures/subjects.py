@@ -70,17 +70,14 @@ class ChannelView:
             return (), [], str(error)
         return found, distortion_findings(self.measured, found, repeats_of(self.measured)), ""
 
-    def told(self, k: int) -> bool:
-        """Whether the records tell a mode."""
-        return self.spread.intervals is None or self.spread.intervals.modes[k].told
-
     @property
     def light(self) -> list[tuple[int, ModelMode]]:
         """Lightly damped modes with their place among all modes."""
         return [
             (k, mode)
             for k, mode in enumerate(self.found.modes)
-            if mode.damping < LIGHT and self.found.is_mode(mode) and self.told(k)
+            if mode.damping < LIGHT and self.found.is_mode(mode)
+            if self.spread.intervals is None or self.spread.intervals.modes[k].told
         ]
 
     @property

@@ -29,7 +29,6 @@ from ident.friction import (
     at_amplitude,
     equivalent_friction,
     other_output_without_friction,
-    precedes_command,
     without_friction,
 )
 from ident.response_uncertainty import with_noise_model
@@ -156,12 +155,7 @@ def uncertainty_of(
         tests=tests,
     )
     if observer or (result.closed_loop is not None and result.closed_loop.kind is not FindingKind.DIRECT):
-        late = (
-            friction is not None
-            and FindingKind.ANSWERS_AT_ONCE in {warning.kind for warning in result.identification.warnings}
-            and precedes_command(friction, measured, channel.identification)
-        )
-        refuse_unexplained(result, found.agreement, friction, late=late)
+        refuse_unexplained(result, found.agreement, friction)
     # In a loop friction biases damping and poles, also where a noise model leaves white residuals.
     rubs = friction is None and result.closed_loop is not None and not white
     advice = residual_advice(
@@ -243,12 +237,9 @@ def refuse_unexplained(
     result: IdentifiedChannel,
     agreement: NominalAgreement,
     friction: FrictionFit | None,
-    *,
-    late: bool = False,
 ) -> None:
     """Raises ValueError, one line, where the model of logs made in a loop explains nothing, so that no number
-    of it means anything. friction: of the fit, None where none was identified; late: the motion comes
-    before its command."""
+    of it means anything. friction: of the fit, None where none was identified."""
     found = result.identification
     best = max(*found.fit_percent.tolist(), *(fit.fit_percent for fit in result.fresh), 0.0)
     why = ""
@@ -258,8 +249,6 @@ def refuse_unexplained(
     elif friction is not None and best < _EXPLAINED and found.noise_std > _BEYOND_NOISE * friction.noise_std:
         times = found.noise_std / friction.noise_std
         why = f"its best fit to one is {best:.0f} %, and it leaves {times:.0f} times the sensor's noise"
-    elif late:
-        why = "the motion comes before its command, as if that was logged late"
     if why:
         raise ValueError(said("unexplained_logs", result.output, why, friction is not None))
 
@@ -304,10 +293,9 @@ def nominal_of(posterior: ResponsePosterior, poles: Poles, omega: Real, untold: 
     single, *others = (nominal_near(posterior, each, omega) for each in (poles, told, poles.doubled()))
     ellipses = posterior.at(omega)
 
-    def stays(model: GobfModel) -> bool:
-        return float(np.mean(ellipses.contains(model.frequency_response(omega)))) >= _SHARE_INSIDE
-
-    return next((model for model in (others[0], single, others[1]) if stays(model)), single)
+    models = (others[0], single, others[1])
+    inside = [float(np.mean(ellipses.contains(each.frequency_response(omega)))) for each in models]
+    return next((each for each, share in zip(models, inside, strict=True) if share >= _SHARE_INSIDE), single)
 
 
 def _untold(model: GobfModel, intervals: Intervals | None) -> ComplexArray:
