@@ -308,21 +308,26 @@ def _with_law(logs: _Logs, found: FrictionFit, options: IdentOptions) -> Frictio
     spring, half = Spring.of(found.model), 0.5 * found.law.level
     if spring is not None and found.spring is None:
         law = replace(found.law, level=half)
-        found = _kept_if_better(logs, found, [replace(found, spring=spring, beyond=half, law=law)])
+        starts = [replace(found, spring=spring, beyond=half, law=law)]
+        found = _kept_if_better(logs, found, starts, _of_order(found, options))
     if not np.isfinite(found.law.fall):
         speed, excess, level = rms_speed(logs.records), _EXCESS * found.law.level, found.law.level
         laws = [replace(found.law, level=level - excess, excess=excess, fall=f * speed) for f in _FALLS]
-        found = _kept_if_better(logs, found, [replace(found, law=law) for law in laws])
+        starts = [replace(found, law=law) for law in laws]
+        found = _kept_if_better(logs, found, starts, _of_order(found, options))
     with suppress(ValueError):
         found = _along_valley(logs, found, options)
     return found
 
 
-def _kept_if_better(logs: _Logs, found: FrictionFit, starts: Sequence[FrictionFit]) -> FrictionFit:
+def _kept_if_better(
+    logs: _Logs, found: FrictionFit, starts: Sequence[FrictionFit], options: IdentOptions
+) -> FrictionFit:
     """What follows from the best of these starts, where its parameters are worth it. What no observer follows
     explains nothing better."""
     with suppress(ValueError):
-        return min(found, _settled(logs, min(starts, key=logs.errors)), key=logs.worth)
+        best = _settled(logs, min(starts, key=logs.errors))
+        return min(found, best, _in_turns(logs, best, options), key=logs.worth)
     return found
 
 
