@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from scipy.signal import lfilter
@@ -21,7 +20,7 @@ from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.checks.residual_tests import whiteness_test
 from ident.checks.validation import fit_on_fresh_data
 from ident.data.arrays import RealArray
-from ident.data.finding import Finding, FindingKind, finding
+from ident.data.finding import FindingKind, finding
 from ident.data.record import Record
 from ident.fit.regression import thinned
 from ident.identification import Identification
@@ -119,7 +118,8 @@ def _on_records(records: Sequence[Record], behind: Identification, noise_filter:
         rss=rss,
         noise_std=float(np.sqrt(rss / max(n_samples - unknowns, 1))),
         noise_filter=noise_filter,
-        advise=partial(_advice, records, behind),
+        # The filter hides where a signal was cut off.
+        advise=lambda: [*clipped(records), *behind.advise()],
     )
     # Variance of the residuals behind an autoregressive model of their own.
     order = min(_RESIDUAL_ORDER, (min(part.size for part in result.residuals) - 1) // 4)
@@ -133,11 +133,6 @@ def _on_records(records: Sequence[Record], behind: Identification, noise_filter:
         order=noise_filter.size - 1,
     )
     return replace(result, verdicts=(*behind.verdicts, said))
-
-
-def _advice(records: Sequence[Record], behind: Identification) -> list[Finding]:
-    """The filter hides where a signal was cut off."""
-    return [*clipped(records), *behind.advise()]
 
 
 def _half_power_Hz(found: Identification) -> float:

@@ -91,15 +91,6 @@ def _with_play(signal: Real, values: Values, dt_s: float, before: float) -> Real
     return np.asarray(followed(np.ascontiguousarray(signal), 0.5 * values["gap"], before))
 
 
-def _stribeck(values: Values) -> dict[str, float]:
-    share, static = values["coulomb_share"], values["static_force"]
-    return {
-        "coulomb": share * static,
-        "excess": (1 - share) * static,
-        "stribeck_velocity": values["velocity"],
-    }
-
-
 def _delays(s: Sizes) -> tuple[EffectParameter, ...]:
     return (_log("delay_s", s.dt_s, 2e-4, min(100.0, 0.2 * s.duration_s / s.dt_s), 0.04, 30.0, 14),)
 
@@ -204,7 +195,11 @@ KINDS: dict[str, Callable[[str, Sizes], PlantEffect]] = {
             _log("velocity", s.speed, 0.01, 2.0, 0.012, 0.3, 3),
         ),
         where="body",
-        change=_stribeck,
+        change=lambda values: {
+            "coulomb": values["coulomb_share"] * values["static_force"],
+            "excess": (1 - values["coulomb_share"]) * values["static_force"],
+            "stribeck_velocity": values["velocity"],
+        },
         dependence="continuous",
         contains="coulomb_friction",
         check="creep at several slow, steady speeds and note the input that each takes",

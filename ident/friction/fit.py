@@ -29,6 +29,7 @@ from ident.friction.gauss_newton import (
     FrictionFit,
     LostError,
     descended,
+    simulated_rss,
     started,
 )
 from ident.friction.in_loop import fit_friction_in_loop, recorded_in_loop
@@ -106,7 +107,9 @@ def _running_free(
         report(0.2 + 0.8 * search / _MOST_SEARCHES, "friction: arm and level together")
         law = FrictionLaw(level, presliding) if best is None else best.law
         found = descended(started(model, structure, law), records, presliding, least)
-        if best is not None and not _rss(found, records) < _rss(best, records) - WORTH * found.noise_std**2:
+        if best is not None and not (
+            simulated_rss(found, records) + WORTH * found.noise_std**2 < simulated_rss(best, records)
+        ):
             break
         best = found
         # The poles may have been led astray by friction that was not yet right: search for them again.
@@ -127,11 +130,6 @@ def moved_to(found: FrictionFit, records: Sequence[Record], model: GobfModel) ->
     """The same fit on the poles of another model of the arm, near those it was made with."""
     start = started(model, found.arm.structure, found.law)
     return descended(start, records, found.law.presliding, 0.1 * found.level)
-
-
-def _rss(found: FrictionFit, records: Sequence[Record]) -> float:
-    delay = found.arm.structure.input_delay_samples
-    return found.noise_std**2 * sum(record.n_samples - delay for record in records)
 
 
 def refuse_unseen_shaft(found: FrictionFit, records: Sequence[Record]) -> None:

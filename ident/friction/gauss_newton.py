@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -29,15 +28,13 @@ _HELD = 1e4  # over the deviation of a logarithm that is to stay: 1e-4
 # How well a joint's friction repeats from record to record at best, as a share of its level.
 _REPEATS = 1e-3
 # Gauss-Newton steps at most; a step, and its parts where the whole does not lower the residual.
-_STEPS, _LENGTHS = 8, (1.0, 0.5, 0.25, 0.1)
+_STEPS, LENGTHS = 8, (1.0, 0.5, 0.25, 0.1)
 # A residual sum of squares that falls by less than this many noise variances is at its end.
 WORTH = 0.5
 # Sizes of the changes that derivatives are taken from, relative to the motion and to the level: of the
 # simulation, whose friction turns at other times after a large change, and where an observer tells it.
 _CHANGE = 1e-6
 _CHANGE_OF_LEVEL, _CHANGE_OF_LOG, _CHANGE_BEYOND = 2e-3, 0.02, 0.05
-# Samples of a record up to which its derivatives are kept for the next who asks: 32 of them take 130 MB.
-_LONGEST_KEPT = 20_000
 
 
 class LostError(ValueError):
@@ -157,13 +154,17 @@ class FrictionFit:
     def forced(self, record: Record) -> Record:
         """The record with the force on a linear arm as its input: command behind the drive less friction.
         Raises LostError where that is not finite."""
-        return less_friction(self.behind_drive(record), self._friction(record), self._delay)
+        return less_friction(
+            self.behind_drive(record), self._friction(record), self.arm.structure.input_delay_samples
+        )
 
     def taken_off(self, record: Record) -> Record:
         """The record with its input smaller by the friction, as a command makes it. Raises LostError."""
         friction = self._friction(record)
         return less_friction(
-            record, friction + self.lag * np.diff(friction, prepend=friction[0]), self._delay
+            record,
+            friction + self.lag * np.diff(friction, prepend=friction[0]),
+            self.arm.structure.input_delay_samples,
         )
 
     def _friction(self, record: Record) -> RealArray:
@@ -171,10 +172,6 @@ class FrictionFit:
         if not np.all(np.isfinite(friction)):
             raise LostError
         return friction + self.steady(record) if self.observed else friction
-
-    @property
-    def _delay(self) -> int:
-        return self.arm.structure.input_delay_samples
 
     def drive_response(self, omega_rad_s: RealArray) -> ComplexArray:
         """(F,) of the drive's lag."""
@@ -208,18 +205,6 @@ def law_of(parameters: RealArray) -> FrictionLaw:
 
 def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray) -> LinearisedRecord:
     """Differences of the simulation with input u (T,): the friction follows every change."""
-    if u.size > _LONGEST_KEPT:
-        return _linearised(arm, coefficients, law, u)
-    return _kept(arm, coefficients.tobytes(), law, u.tobytes())
-
-
-@lru_cache(maxsize=32)
-def _kept(arm: SteppedArm, coefficients: bytes, law: FrictionLaw, u: bytes) -> LinearisedRecord:
-    # Where one descent ends the next begins, and so does what is said of the friction-free arm.
-    return _linearised(arm, np.frombuffer(coefficients), law, np.frombuffer(u))
-
-
-def _linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray) -> LinearisedRecord:
     position, friction = arm.run(coefficients, u, law)
     structure = arm.structure
     effort = filter_input(u, 0, structure.input_delay_samples) - friction
@@ -309,7 +294,7 @@ def descended(
     expected = parameters_of(found.law if held else replace(found.law, presliding=presliding))
     p, q = found.coefficients.size, expected.size
     logs, trust = np.arange(1, q, 2), _HELD if held else 1 / STD_LOG
-    noise = np.sqrt(_simulated_rss(found, records) / n)
+    noise = np.sqrt(simulated_rss(found, records) / n)
     for left in reversed(range(_STEPS)):
         blocks, targets = equations(found, records)
         # What is expected of a logarithm is one more measurement of it.
@@ -318,14 +303,14 @@ def descended(
         known[:, -1] = (expected - parameters_of(found.law))[logs]
         change, _, rss, rest = least_squares(blocks, targets, trust * noise * known)
         noise = np.sqrt(rest / n)
-        for length in _LENGTHS if left else ():
+        for length in LENGTHS if left else ():
             step = length * change
             step[p] = max(step[p], max(0.6 * found.level, least) - found.level)
             step[p + logs] = np.clip(step[p + logs], -1, 1)
             coefficients, law = found.moved(step)
             there = replace(found, coefficients=coefficients, law=law)
             off = trust * noise * (parameters_of(law) - expected)[logs]
-            if _simulated_rss(there, records) + off @ off < rss - WORTH * noise**2:
+            if simulated_rss(there, records) + off @ off < rss - WORTH * noise**2:
                 found = there
                 break
         else:
@@ -385,7 +370,7 @@ def _between_records(
     return float(np.sqrt(max(variance, least**2)))
 
 
-def _simulated_rss(found: FrictionFit, records: Sequence[Record]) -> float:
+def simulated_rss(found: FrictionFit, records: Sequence[Record]) -> float:
     """Sum of squares of the residuals, each record's less its mean."""
     return float(sum(np.sum(found.residual(record) ** 2) for record in records))
 

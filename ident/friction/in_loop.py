@@ -42,6 +42,7 @@ from ident.fit.least_squares import fit as linear_fit
 from ident.fit.regression import prepare
 from ident.friction.arm import FrictionLaw
 from ident.friction.gauss_newton import (
+    LENGTHS,
     STD_LOG,
     FrictionFit,
     LostError,
@@ -73,14 +74,12 @@ _ROUNDS, _FEW_ROUNDS, _LONGEST_DELAY = 6, 2, 20
 _STAYS, _MOVES = 5e-3, 0.05
 # Lags by which a command follows; a residual that is rounding; one log in a million is taken for a loop.
 _CAUSES, _NOTHING, _BY_CHANCE = 8, 1e-5, 1e-6
-# Samples that a command is looked for to be logged late; levels of a binary or staircase signal, at most.
-_LATEST, _FEW_LEVELS = 40, 16
+_FEW_LEVELS = 16  # of a binary or staircase signal, at most
 # Largest step of the level, as a share of it; parts of a step that are tried.
-_LARGEST_STEP, _LENGTHS = 0.3, (1.0, 0.5, 0.25, 0.1)
+_LARGEST_STEP = 0.3
 # How dead time and lag are changed, samples: later, a lag in place of dead time, a first lag, the reverse.
-_LEAST_LAG = 0.5
 _SIZES = (1.1, 1 / 1.1, 1.02, 1 / 1.02)  # of the friction as a whole
-_SHIFTS = ((1, 0.0), (-1, 1.0), (0, _LEAST_LAG), (1, -1.0))
+_SHIFTS = ((1, 0.0), (-1, 1.0), (0, 0.5), (1, -1.0))
 # Lowest further pair, as a share of the first mode: friction that is left over looks like slow poles.
 _LOWEST_PAIR, _ABOVE_NOISE = 0.4, 1.2
 # Stribeck friction begins with this excess and one of these speeds, in units of the rms speed.
@@ -89,8 +88,8 @@ _FALLS, _EXCESS, _STEPS = (0.03, 0.1, 0.3), 0.1, 6
 # arm that a weight throws over was right at 1.02 of an integrator's, and ended at .79 of them.
 _WORSE_AT_FIRST = 1.5
 # Directions of a start (columns of unit length) below this are left out; as few of the parameters.
-_NUISANCE_RANK, _RANK = 1e-10, 1e-9
-_NOISE_ORDER = 32  # as `EmbeddingOptions.max_ar_order` where 8 leave residuals that are not white
+_RANK = 1e-10
+NOISE_ORDER = 32  # as `EmbeddingOptions.max_ar_order` where 8 leave residuals that are not white
 
 
 def recorded_in_loop(records: Sequence[Record]) -> bool:
@@ -109,13 +108,15 @@ def with_commands_in_time(records: Sequence[Record]) -> list[Record]:
     the position tells of it all the same, it is taken earlier until that ends. Neglected: relays.
     """
     n = len(records)
-    if any(record.reference is not None or record.input.shape[1] > 1 for record in records):
+    if not all(
+        record.reference is None
+        and record.input.shape[1] == 1
+        and (np.unique(record.input).size <= _FEW_LEVELS or period_of(record.input[:, 0]) is not None)
+        and _follows(record, 0, n)
+        for record in records
+    ):
         return list(records)
-    if any(np.unique(r.input).size > _FEW_LEVELS and period_of(r.input[:, 0]) is None for r in records):
-        return list(records)
-    if not all(_follows(record, 0, n) for record in records):
-        return list(records)
-    for late in range(1, _LATEST + 1):
+    for late in range(1, 2 * _LONGEST_DELAY + 1):
         if not any(_follows(record, late + more, n) for more in range(_CAUSES) for record in records):
             while all(_answers_at_once(record, late) for record in records):
                 late += 1
@@ -154,7 +155,7 @@ def _told_by_position(u: RealArray, y: RealArray) -> float:
         return 0.0
     rows, lags = np.arange(3 * n, u.size)[:, None], np.arange(1, n + 1)
     own = u[rows - np.arange(1, 3 * n + 1)]
-    ways = own, np.hstack([own[:, : 2 * n], y[rows - lags + 1] - y.mean()])
+    ways = own, np.hstack([own, y[rows - lags + 1] - y.mean()])
     left = [_unexplained(u[3 * n :], columns) for columns in ways]
     return float(max(rows.size - 3 * n - 1, 0) * np.log(left[0] / left[1]))
 
@@ -213,8 +214,7 @@ def fit_friction_in_loop(
     report = progress or (lambda fraction, message: None)
     refuse_few_lines(records)
     logs = _Logs.of(records)
-    report(0.0, "friction: start")
-    report(0.1, "friction: level and a simple arm in turns")
+    report(0.0, "friction: level and a simple arm in turns")
     starts = _of_structure(logs, _above_noise(logs.records, options))
     least = _WORSE_AT_FIRST * min(logs.worth(found) for _, found in starts)
     starts = [start for start in starts if logs.worth(start[1]) <= least]
@@ -245,9 +245,8 @@ def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: R
     """From the fit with the fewest poles: dead time and lag of the drive, the law of the friction, as many
     poles as the data ask for. Raises LostError."""
     left_open = options.delay_left_to_data
-    report(0.2, "friction: dead time, lag of the drive")
+    report(0.2, "friction: dead time, lag of the drive, law")
     shifted = _with_shift(logs, found, options, left_open=left_open)
-    report(0.4, "friction: falling with speed, beyond a spring")
     simple = _with_law(logs, shifted, options)
     if simple.spring is None:  # a shift may stand for it
         simple = min(simple, _with_law(logs, found, options), key=logs.worth)
@@ -270,7 +269,8 @@ def _with_shift(logs: _Logs, found: FrictionFit, options: IdentOptions, *, left_
         place, one = (delay, round(2 * lag)), found
         if place not in seen and (not later or (left_open and 0 <= delay <= _LONGEST_DELAY)):
             with suppress(LostError):
-                one = _shifted(found, delay, lag)
+                structure = replace(found.arm.structure, input_delay_samples=delay)
+                one = replace(found, arm=replace(found.arm, structure=structure), lag=lag)
                 one = _in_turns(logs, one, _of_order(found, options, delay), _FEW_ROUNDS)
         seen.add(place)
         if logs.worth(one) < logs.worth(found):  # and once more the same way
@@ -278,8 +278,7 @@ def _with_shift(logs: _Logs, found: FrictionFit, options: IdentOptions, *, left_
         else:
             moves.rotate(-1)
             failed += 1
-    settled = _in_turns(logs, found, _of_order(found, options))
-    return min(found, settled, key=logs.errors)
+    return min(found, _in_turns(logs, found, _of_order(found, options)), key=logs.errors)
 
 
 def _of_order(found: FrictionFit, options: IdentOptions, delay: int | None = None) -> IdentOptions:
@@ -293,11 +292,6 @@ def _of_order(found: FrictionFit, options: IdentOptions, delay: int | None = Non
     )
     delay = structure.input_delay_samples if delay is None else delay
     return options.model_copy(update={"n_real": n_real, "n_pairs": n_pairs, "input_delay_samples": delay})
-
-
-def _shifted(found: FrictionFit, delay: int, lag: float) -> FrictionFit:
-    structure = replace(found.arm.structure, input_delay_samples=delay)
-    return replace(found, arm=replace(found.arm, structure=structure), lag=lag)
 
 
 def _with_law(logs: _Logs, found: FrictionFit, options: IdentOptions) -> FrictionFit:
@@ -326,7 +320,9 @@ def _kept_if_better(
     """What follows from the best of these starts, where its parameters are worth it. What no observer follows
     explains nothing better."""
     with suppress(ValueError):
-        best = _settled(logs, min(starts, key=logs.errors))
+        best = min(starts, key=logs.errors)
+        for _ in range(_STEPS):  # each behind the observer that follows what the one before has found
+            best = _stepped(logs, observed(best, logs.records))
         return min(found, best, _in_turns(logs, best, options), key=logs.worth)
     return found
 
@@ -469,12 +465,11 @@ def _along_valley(logs: _Logs, found: FrictionFit, options: IdentOptions) -> Fri
 
 def _on(found: FrictionFit, model: GobfModel) -> FrictionFit:
     """The fit on another model of the arm."""
-    anew = started(model, found.arm.structure, found.law)
     spring = found.spring and (Spring.of(model) or found.spring)
     kept: dict[str, Any] = {
         key: getattr(found, key) for key in ("correction", "ratio", "bias", "beyond", "centre", "lag")
     }
-    return replace(anew, spring=spring, **kept)
+    return replace(started(model, found.arm.structure, found.law), spring=spring, **kept)
 
 
 def _on_moved_poles(logs: _Logs, found: FrictionFit) -> FrictionFit:
@@ -516,7 +511,7 @@ def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
     step[1:q:2] = np.clip(step[1:q:2], -1, 1)
     largest = max(_LARGEST_STEP * found.level, 10 * logs.least)
     step[0] = np.clip(step[0], -largest, largest)
-    for arm, length in ((arm, length) for arm in (1.0, 0.0) for length in _LENGTHS):
+    for arm, length in ((arm, length) for arm in (1.0, 0.0) for length in LENGTHS):
         law = law_of(theta + length * step[:q])
         tried = replace(
             found,
@@ -535,13 +530,6 @@ def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
             found = tried
             break
     return with_covariance(found, blocks, targets, noise)
-
-
-def _settled(logs: _Logs, found: FrictionFit) -> FrictionFit:
-    """Gauss-Newton steps, each behind the observer that follows what the one before has found."""
-    for _ in range(_STEPS):
-        found = _stepped(logs, observed(found, logs.records))
-    return found
 
 
 def identify_behind(
@@ -566,7 +554,7 @@ def identify_behind(
         fit_percent=np.array([fit.fit_percent for fit in fits]),
         rss=rss,
         noise_std=float(np.sqrt(rss / sum(residual.size for residual in residuals))),
-        noise_filter=fit_autoregression(residuals, _NOISE_ORDER),
+        noise_filter=fit_autoregression(residuals, NOISE_ORDER),
     )
 
 
@@ -594,7 +582,7 @@ def _equations(
         if not np.all(np.isfinite(length)):
             raise LostError
         u, d, _ = np.linalg.svd(nuisance[:, length > 0] / length[length > 0], full_matrices=False)
-        u = u[:, d > _NUISANCE_RANK * d.max(initial=0.0)]
+        u = u[:, d > _RANK * d.max(initial=0.0)]
         rows = rows - u @ (u.T @ rows)
         if not np.all(np.isfinite(rows)):
             raise LostError

@@ -98,17 +98,13 @@ class ObserverFilter:
 
 
 @lru_cache(maxsize=64)
-def _errors_of(found: FrictionFit, records: tuple[Record, ...]) -> float:
+def prediction_errors(found: FrictionFit, records: tuple[Record, ...]) -> float:
+    """Sum of squares of the prediction errors, without the start of each record; infinite where it is
+    lost."""
     with np.errstate(over="ignore", invalid="ignore"):
         parts = [found.residual(record) for record in records]
         total = sum(float(np.sum(part[part.size // _START :] ** 2)) for part in parts)
     return total if np.isfinite(total) else np.inf
-
-
-def prediction_errors(found: FrictionFit, records: Sequence[Record]) -> float:
-    """Sum of squares of the prediction errors, without the start of each record; infinite where it is
-    lost."""
-    return _errors_of(found, tuple(records))
 
 
 def observed(found: FrictionFit, records: Sequence[Record], nearby: RealArray = NEARBY) -> FrictionFit:
@@ -121,7 +117,7 @@ def observed(found: FrictionFit, records: Sequence[Record], nearby: RealArray = 
         with suppress(ValueError, np.linalg.LinAlgError):
             correction = correction_of(found.arm, found.coefficients, float(ratio))
             one = replace(found, correction=correction, ratio=float(ratio))
-            tried.append((prediction_errors(one, records), one))
+            tried.append((prediction_errors(one, tuple(records)), one))
     if not tried:
         raise LostError
     return min(tried, key=lambda one: one[0])[1]

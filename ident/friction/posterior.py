@@ -19,12 +19,11 @@ from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
 from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, linearised
-from ident.friction.in_loop import autoregressive, heterogeneity
+from ident.friction.in_loop import NOISE_ORDER, autoregressive, heterogeneity
 from ident.friction.inverse_dynamics import smoothed
 from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
 
-_NOISE_ORDER = 32  # as in `ident.friction.in_loop`
 # Share of the level that a linear force which shows in no residual may have (deviation).
 _SHAPE = 0.05
 # Grid of what is put onto the basis.
@@ -32,7 +31,7 @@ _FREQUENCIES, _LENGTHS, _LEVEL = 400, 100, 0.95
 # Normals along which the response is bent, points of an arc, its parts that are kept as a share of the
 # largest, singular values of the basis that are left out.
 _MOST_CURVED, _STEPS, _SMALL, _RANK = 3, 17, 1e-3, 1e-8
-_MOST_GAIN = 3.0
+_MOST_GAIN = 3.0  # of an arc, over the centre: a damping that is not told from none has no end
 # Size of an ellipse over the rms of even points of the arc it holds (1.7 of a line); at most, where the sign
 # of the gain is known, as a share of it.
 _REACH, _LARGEST = 1.7, 0.9
@@ -105,7 +104,7 @@ def _behind_observed(
         less.append(found.taken_off(record))
     known = found.law.n_logs + len(records)
     # What drives an arm away from its simulation is never white; as missed modes five slow ones were added.
-    order = max(options.max_ar_order, _NOISE_ORDER)
+    order = max(options.max_ar_order, NOISE_ORDER)
     coloured = {"coloured_noise": True, "max_ar_order": order, "prior_missed_mode": 0.0}
     options = options.model_copy(update=coloured)
     response, change, factor = tangent_beside(less, model, beside, options, n_known=known)
@@ -140,8 +139,7 @@ def of_force(
     modes = poles.omega_rad_s(response.dt_s)[poles.zeta() < LARGEST_DAMPING]
     change = moved / gain[:, None]
     # Above the frequency where the gain is known best it is no longer the force of a slow motion.
-    best = omega[np.argmin(np.linalg.norm(change, axis=1))]
-    low = omega < np.min(modes, initial=best)
+    low = omega < np.min(modes, initial=omega[np.argmin(np.linalg.norm(change, axis=1))])
     along = np.linalg.svd(real_rows(np.where(low[:, None], change, 0.0)), full_matrices=False)[2][
         :_MOST_CURVED
     ]
@@ -159,8 +157,7 @@ def of_force(
             elif k == 0:
                 ends = turns + np.array([0.0, np.sign(turns) * radius])
         # Even steps of the force, and of the gain, at standstill.
-        gains = [1 / (1 - x[0].real * end) for end in ends.tolist()]
-        even = 1 - 1 / np.linspace(gains[0], gains[1], _STEPS)
+        even = 1 - 1 / np.linspace(1 / (1 - x[0].real * ends[0]), 1 / (1 - x[0].real * ends[1]), _STEPS)
         t = np.concatenate([np.linspace(ends[0], ends[1], _STEPS), even / x[0].real])
         left = 1 - np.outer(x, t)
         arc = np.where(low[:, None], 1 / np.where(np.abs(left) > 0.5 * least, left, least), 2 - left)
@@ -168,12 +165,10 @@ def of_force(
         parts = _parts_of(np.asarray(arc - middle[:, None], np.complex128), np.asarray(middle))
         centre += middle - 1
         columns += [gain[:, None] * parts]
-        onto += [np.zeros((parts.shape[1], along.shape[1]))]
         # Of its parts the first takes the normal's place.
-        onto[-1][0] = direction
+        onto += [np.vstack([direction, np.zeros((parts.shape[1] - 1, direction.size))])]
     # Real poles well below and above the slowest one, where that lies if more or less damps the arm.
-    slowest = np.max(poles.real[(poles.real > 0) & (poles.real < 1)], initial=0.0)
-    slow = Poles(slowest ** np.array(_AROUND if slowest else ()))
+    slow = Poles(poles.real[np.argsort(-poles.real)[:1]].clip(1e-9, 1 - 1e-9) ** np.array(_AROUND))
     wanted = np.hstack([moved @ onto[0], *columns]).T
     bent = _with_poles(response, poles.appended(slow), omega, gain * centre, [*wanted], _RANK)
     normals = np.vstack(onto)
@@ -188,8 +183,7 @@ def _parts_of(arc: ComplexArray, middle: ComplexArray) -> ComplexArray:
     n = int(np.count_nonzero(sizes > _SMALL * sizes[0]))
     parts = parts[: middle.size, :n] * sizes[:n] + 1j * parts[middle.size :, :n] * sizes[:n]
     parts = parts @ np.linalg.qr(np.column_stack([parts[0].real, np.eye(n)]))[0]
-    most = np.full(n, _REACH)
-    most[0] = min(_REACH, _LARGEST * abs(middle[0]) / abs(parts[0, 0]))
+    most = np.append(min(_REACH, _LARGEST * abs(middle[0]) / abs(parts[0, 0])), np.full(n - 1, _REACH))
     return np.asarray(parts * most / chi2_radius(_LEVEL), np.complex128)
 
 

@@ -108,15 +108,13 @@ def _pole_rows(posterior: ResponsePosterior, pole: complex, everything: ComplexA
 def _carried(posterior: ResponsePosterior, pole: complex, level: float) -> float:
     """What a pair adds to the response at its own frequency, in radii of the ellipse there: up to one it need
     not exist."""
-    omega = np.array([np.angle(pole) / posterior.dt_s])
-    z = np.exp(1j * omega * posterior.dt_s)
+    omega, z = np.array([np.angle(pole) / posterior.dt_s]), pole / np.array([abs(pole)])
     r = laurent_rows(posterior.poles, pole)[0] @ posterior.mean[: posterior.poles.order]
     front = front_response(omega, posterior.dt_s, posterior.integrators, posterior.input_delay_samples)
     own = (
         front / all_pass_response(posterior.unstable, z) * (r / (z - pole) + np.conj(r) / (z - np.conj(pole)))
     )
-    radius = float(posterior.at(omega, level).ellipse().semi_major[0])
-    return float(np.abs(own[0])) / max(radius, np.finfo(np.float64).tiny)
+    return float(np.abs(own[0]) / max(posterior.at(omega, level).ellipse().semi_major[0], 1e-300))
 
 
 def laurent_rows(poles: Poles, pole: complex) -> tuple[ComplexArray, ComplexArray]:

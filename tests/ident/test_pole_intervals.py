@@ -99,6 +99,17 @@ def test_what_the_records_do_not_tell_is_open():
     assert found.zeta.tolist() == [[0.0, 1.0]]
 
 
+def test_a_pair_that_adds_nothing_outside_its_ellipse_is_open():
+    """Two pairs of which one is a hundredth of the other: told, or not, by the size of the ellipses."""
+    poles = Poles.from_continuous(omega_rad_s=[20.0, 90.0], zeta=[0.1, 0.05], dt_s=DT_S)
+    z, (first, second) = CIRCLE, poles.pairs
+    response = 1 / (z - first) + 1 / (z - np.conj(first)) + 0.01 / (z - second) + 0.01 / (z - np.conj(second))
+    mean = on_doubled_basis(poles, response)
+    for size, told in ((1e-4, [True, True]), (0.02, [True, False])):
+        found = pole_intervals(ResponsePosterior(poles.doubled(), mean, size * np.eye(8), DT_S), poles)
+        assert np.isfinite(found.omega_rad_s[:, 1]).tolist() == told
+
+
 def test_real_pole_left_of_zero_has_no_rate():
     poles = Poles(np.array([-0.3, 0.5]))
     posterior = ResponsePosterior(poles.doubled(), np.ones(4), 1e-6 * np.eye(4), DT_S)

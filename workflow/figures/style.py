@@ -296,10 +296,6 @@ def _has_power(axis: Axis) -> bool:
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def _number(value: float, _: int) -> str:
-    return f"{value:g}"
-
-
 def _power_of_ten(value: float, _: int) -> str:
     if not value > 0:
         return ""
@@ -323,7 +319,7 @@ def plain_log_labels(figure: Figure) -> None:
             if few:
                 subs = LogLocator(base=10, subs=(1.0, 2.0, 5.0))
                 axis.set_major_locator(subs if high / low >= 5 else MaxNLocator(5))
-            axis.set_major_formatter(FuncFormatter(_number if few else _power_of_ten))
+            axis.set_major_formatter(FuncFormatter((lambda value, _: f"{value:g}") if few else _power_of_ten))
             axis.set_minor_formatter(NullFormatter())
 
 

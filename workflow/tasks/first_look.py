@@ -286,12 +286,6 @@ def notches(model: GobfModel) -> RealArray:
     return np.sort(np.abs(s)[np.abs(np.real(s)) < SWINGS * np.abs(s)])
 
 
-def _swinging(model: GobfModel) -> RealArray:
-    """Natural frequencies [rad/s] of lightly damped poles and zeros, ascending."""
-    peaks = model.poles.omega_rad_s(model.dt_s)[model.poles.zeta() < SWINGS]
-    return np.sort(np.concatenate([notches(model), peaks]))
-
-
 def _first_mode(model: GobfModel, above_rad_s: float, told_rad_s: float) -> tuple[float, float] | None:
     """The slowest pair that swings, shows, and is no motion of the rigid machine on a spring."""
     z, zeros = model.poles.pairs, np.asarray(model.zeros())
@@ -316,7 +310,10 @@ def _rigid(
 ) -> RigidMotion | None:
     """The rigid motion as far up as it explains the command, else below the first notch or peak."""
     told = response.omega_rad_s[[0, -1]].tolist()
-    swinging = np.zeros(0) if found is None else _swinging(found.model)
+    swinging = np.zeros(0)
+    if found is not None:
+        slow, zeta = found.model.poles.omega_rad_s(found.model.dt_s), found.model.poles.zeta()
+        swinging = np.sort(np.concatenate([notches(found.model), slow[zeta < SWINGS]]))
     ends = [told[1], *swinging[(swinging > 2 * told[0]) & (swinging < told[1])][::-1]]
     tried = [rigid_motion(records, _RIGID * float(end), told[1], position=position) for end in ends]
     motions = [motion for motion in tried if motion is not None]

@@ -300,10 +300,9 @@ def nominal_of(posterior: ResponsePosterior, poles: Poles, omega: Real, untold: 
 
 def _untold(model: GobfModel, intervals: Intervals | None) -> ComplexArray:
     """(P,) pole pairs that the records do not tell."""
-    pairs = model.stable_poles.pairs
-    by_frequency = np.argsort(model.stable_poles.omega_rad_s(model.dt_s), kind="stable")
-    told = [True] * pairs.size if intervals is None else [each.told for each in intervals.modes]
-    return pairs[by_frequency][~np.array(told, np.bool_)]
+    poles, modes = model.stable_poles, () if intervals is None else intervals.modes
+    by_frequency = np.argsort(poles.omega_rad_s(model.dt_s), kind="stable")
+    return poles.pairs[[i for i, mode in zip(by_frequency, modes, strict=False) if not mode.told]]
 
 
 def display_grid(model: GobfModel, records: Sequence[Record]) -> Real:
