@@ -36,8 +36,8 @@ class FrfIdentification:
     posterior: tangent embedding on the same rows. residual (F,): measured minus fitted; distance (F,): its
     length in units of the measurement's own ellipses. rss: chi-square; degrees_of_freedom: measured real
     numbers minus unknowns. decay_std_per_s (R,), omega_std_rad_s (P,), zeta_std (P,): standard deviations of
-    the model's poles, to first order, times sqrt(dispersion) where that is above 1; known poles (first of
-    each type) have 0.
+    the model's poles, to first order, times sqrt(rss / degrees_of_freedom) where that is above 1; known
+    poles (first of each type) have 0.
     """
 
     model: GobfModel
@@ -61,11 +61,6 @@ class FrfIdentification:
             raise ValueError("omega_rad_s, residual and distance must be (F,)")
         if not self.degrees_of_freedom > 0:
             raise ValueError(f"degrees_of_freedom must be positive; got {self.degrees_of_freedom}")
-
-    @property
-    def dispersion(self) -> float:
-        """rss / degrees_of_freedom."""
-        return self.rss / self.degrees_of_freedom
 
     @property
     def warnings(self) -> tuple[Finding, ...]:

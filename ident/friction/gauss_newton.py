@@ -116,11 +116,11 @@ class FrictionFit:
     def _run(self, record: Record, law: FrictionLaw) -> tuple[RealArray, RealArray]:
         if self.correction is None:
             return self.arm.run(self.coefficients, record.input[:, 0], law)
-        delay, position = self.arm.structure.input_delay_samples, self._position(record)
+        delay, position = self.arm.structure.input_delay_samples, self.observed_position(record)
         driving = less_friction(self.behind_drive(record), self.steady(record), delay).input[:, 0]
         return self.arm.run(self.coefficients, driving, law, position, self.correction)
 
-    def _position(self, record: Record) -> RealArray:
+    def observed_position(self, record: Record) -> RealArray:
         """(T,) from where an observer counts: the start, where the arm integrates."""
         position = record.output[:, 0]
         return np.asarray(position - (position[0] if self.arm.structure.integrators else self.centre))

@@ -22,7 +22,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from ident.basis.functions import nuisance_columns, regressor
@@ -187,19 +186,14 @@ class _Logs:
         centre = float(np.mean([np.mean(record.output) for record in records]))
         return cls(plain, presliding_of(records), 1e-6 * rms, rms, centre)
 
-    @property
-    def criterion(self) -> float:
-        """Share by which one more parameter has to lower the errors."""
-        n = sum(record.n_samples for record in self.records)
-        return float(2 * np.log(n) / n)
-
     def errors(self, found: FrictionFit) -> float:
         return prediction_errors(found, self.records)
 
     def worth(self, found: FrictionFit) -> float:
         """Errors, larger by what the number of poles and of parameters of the friction costs."""
-        law = 2 * int(np.isfinite(found.law.fall)) + int(found.spring is not None)
-        return self.errors(found) * (1 + (found.model.order + law + int(found.lag > 0)) * self.criterion)
+        n, law = sum(record.n_samples for record in self.records), 2 * int(np.isfinite(found.law.fall))
+        count = found.model.order + law + int(found.spring is not None) + int(found.lag > 0)
+        return self.errors(found) * float(1 + count * 2 * np.log(n) / n)
 
 
 def fit_friction_in_loop(
@@ -229,7 +223,6 @@ def fit_friction_in_loop(
     if not ends:
         raise LostError
     found = min(ends, key=logs.worth)
-    report(1.0, "friction identified")
     spread = heterogeneity(found, logs.records, ObserverFilter.of(found))
     wider = replace(found, covariance_factor=np.sqrt(spread) * found.covariance_factor)
     if found.significant and not wider.significant:
@@ -252,7 +245,6 @@ def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: R
         simple = min(simple, _with_law(logs, found, options), key=logs.worth)
     if simple is not shifted:
         simple = _with_shift(logs, simple, options, left_open=left_open)
-    report(0.5, "friction: level and arm in turns")
     found = simple
     with suppress(LostError):
         found = _with_more_poles(logs, simple, options)
@@ -510,7 +502,8 @@ def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
     step = change[p:]
     step[1:q:2] = np.clip(step[1:q:2], -1, 1)
     largest = max(_LARGEST_STEP * found.level, 10 * logs.least)
-    step[0] = np.clip(step[0], -largest, largest)
+    # A load that stands tells no level: without an end its step has none.
+    step[[0, -1 if found.spring else 0]] = np.clip(step[[0, -1 if found.spring else 0]], -largest, largest)
     for arm, length in ((arm, length) for arm in (1.0, 0.0) for length in LENGTHS):
         law = law_of(theta + length * step[:q])
         tried = replace(
@@ -529,7 +522,23 @@ def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
         if logs.errors(tried) < errors:
             found = tried
             break
-    return with_covariance(found, blocks, targets, noise)
+    return with_covariance(_held(logs, found), blocks, targets, noise)
+
+
+def _held(logs: _Logs, found: FrictionFit) -> FrictionFit:
+    """The same with the constant force that leaves predictions no mean error, where that makes them better:
+    an integrating arm drifts with any other."""
+
+    def left(one: FrictionFit) -> RealArray:
+        errors = [one.observed_position(record) - one.motion(record)[0] for record in logs.records]
+        return np.concatenate([part[part.size // 20 :] for part in errors])
+
+    size = _STAYS * logs.rms
+    before, after = (np.mean(left(one)) for one in (found, replace(found, bias=found.bias + size)))
+    if not np.isfinite(after) or after == before:
+        return found
+    tried = replace(found, bias=found.bias - float(size * before / (after - before)))
+    return min(found, tried, key=lambda one: float(np.sum(left(one) ** 2)))
 
 
 def identify_behind(
@@ -589,12 +598,6 @@ def _equations(
         blocks.append(rows[:, :-1])
         targets.append(rows[:, -1])
     return blocks, targets
-
-
-def autoregressive(noise_filter: RealArray) -> Callable[[RealArray], RealArray]:
-    """Signals (T, ...) through A(q), without the first rows."""
-    n = noise_filter.size - 1
-    return lambda signal: np.asarray(lfilter(noise_filter, np.ones(1), signal, axis=0)[n:])
 
 
 def heterogeneity(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.signal import lfilter
 
 from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions
@@ -19,7 +20,7 @@ from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
 from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, linearised
-from ident.friction.in_loop import NOISE_ORDER, autoregressive, heterogeneity
+from ident.friction.in_loop import NOISE_ORDER, heterogeneity
 from ident.friction.inverse_dynamics import smoothed
 from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
@@ -109,7 +110,13 @@ def _behind_observed(
     options = options.model_copy(update=coloured)
     response, change, factor = tangent_beside(less, model, beside, options, n_known=known)
     whitening = np.array([1.0, *(response.report.ar_coefficients if response.report else ())])
-    wider = np.sqrt(heterogeneity(found, records, autoregressive(whitening)))
+    wider = np.sqrt(
+        heterogeneity(
+            found,
+            records,
+            lambda signal: np.asarray(lfilter(whitening, [1.0], signal, axis=0)[whitening.size - 1 :]),
+        )
+    )
     by_force = _by_linear_force(found, records, less, response)
     response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
     longest_s = max(record.n_samples for record in less) * model.dt_s

@@ -71,7 +71,7 @@ def test_poles_and_order_from_noisy_data(plant, turn):
     ):
         # Sixteen numbers in all: 4 standard deviations are exceeded once in a thousand choices of seeds.
         assert np.all(np.abs(estimate - truth) < 4 * deviation)
-    assert 0.7 < found.dispersion < 1.3  # chi-square with 224 degrees of freedom: sd 0.094
+    assert 0.7 < (found.rss / found.degrees_of_freedom) < 1.3  # of 224: sd 0.094
     said = only(found.verdicts, FindingKind.CHI_SQUARE)
     assert said["expected_low"] < said["chi_square"] < said["expected_high"]
     assert found.posterior.at(OMEGA).contains(response).mean() > 0.8
@@ -84,7 +84,9 @@ def test_posterior_widens_when_the_covariances_are_too_small(plant):
     bold = FrequencyUncertainty(OMEGA, honest.centre, honest.covariance / 16, DT_S)
     options = IdentOptions(n_real=2, n_pairs=3)
     right, wide = identify_frf(honest, options), identify_frf(bold, options)
-    assert wide.dispersion == pytest.approx(16 * right.dispersion, rel=1e-3)
+    assert (wide.rss / wide.degrees_of_freedom) == pytest.approx(
+        16 * (right.rss / right.degrees_of_freedom), rel=1e-3
+    )
     said = only(wide.verdicts, FindingKind.CHI_SQUARE)
     assert said["chi_square"] > said["expected_high"]
     ratio = wide.posterior.at(OMEGA).enclosing_radius() / right.posterior.at(OMEGA).enclosing_radius()
