@@ -33,7 +33,7 @@ from ident.friction.gauss_newton import (
     started,
 )
 from ident.friction.in_loop import fit_friction_in_loop, recorded_in_loop
-from ident.friction.inverse_dynamics import noise_of, presliding_of, with_measured_direction
+from ident.friction.inverse_dynamics import presliding_of, with_measured_direction
 from ident.one_input import untested_model
 
 _MOST_SEARCHES = 8  # for the poles, anew with each better level; two or three are usual
@@ -80,9 +80,7 @@ def fit_friction(
             raise
         return fit_friction_in_loop(records, options, progress=progress)
     residuals = [found.residual(record) for record in records]
-    # Twice the sensor's own noise: below that an arm of another law would not tell more.
-    noise = 2 * max(noise_of(record.output[:, 0]) for record in records)
-    if not free and found.significant and found.noise_std > noise and not whiteness_test(residuals).passed:
+    if not free and found.significant and not whiteness_test(residuals).passed:
         # What is wrong with arm or law adds up in a free run, whose first order does not reach far then.
         with suppress(ValueError):
             followed = fit_friction_in_loop(records, options, progress=progress)
