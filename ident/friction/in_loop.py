@@ -154,7 +154,7 @@ def _told_by_position(u: RealArray, y: RealArray) -> float:
         return 0.0
     rows, lags = np.arange(3 * n, u.size)[:, None], np.arange(1, n + 1)
     own = u[rows - np.arange(1, 3 * n + 1)]
-    ways = own, np.hstack([own, y[rows - lags + 1] - y.mean()])
+    ways = own, np.hstack([own[:, : 2 * n], y[rows - lags + 1] - y.mean()])
     left = [_unexplained(u[3 * n :], columns) for columns in ways]
     return float(max(rows.size - 3 * n - 1, 0) * np.log(left[0] / left[1]))
 
@@ -403,8 +403,6 @@ def _beyond(found: FrictionFit, options: IdentOptions) -> IdentOptions:
 
 def _with_more_poles(logs: _Logs, found: FrictionFit, options: IdentOptions) -> FrictionFit:
     """The same with as many poles as the data ask for, where they are worth it."""
-    if options == _simplest(options):
-        return found
     delay = {"input_delay_samples": found.arm.structure.input_delay_samples}
     more = _in_turns(logs, found, _beyond(found, options.model_copy(update=delay)))
     return min(found, more, key=logs.worth)

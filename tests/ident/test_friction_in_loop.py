@@ -153,7 +153,7 @@ def test_a_command_that_nobody_closes_a_loop_around_is_none(seed: int) -> None:
         got = one.plant.run(open_loop, command, 0.0, np.zeros(command.size))
         record = Record("open", command[:, None], got["y"][:, None], one.plant.dt_s, ("u",), ("y",))
         assert not recorded_in_loop([record])
-    quick = size * np.repeat(np.sign(rng.standard_normal(1300)), 3)
+    quick = size * np.sign(rng.standard_normal(4000))
     got = one.plant.run(open_loop, quick, 0.0, np.zeros(quick.size))
     late = replace(record, input=np.roll(quick, 5)[:, None], output=got["y"][:, None])
     (taken,) = with_commands_in_time([late])
