@@ -457,6 +457,3 @@ def test_ellipses_hold_the_force_that_the_data_leave_open(wide: float, share: fl
     assert np.mean(inside, axis=0).min() > share
     assert np.mean(inside) > 0.95
     assert np.mean(straight.at(omega, 0.95).contains(arm(1 + 1.9 * wide))) < 0.5
-    turned = replace(straight, mean=mean + 1.3 * column / wide)
-    both = [(1j * omega * one.centre(omega))[0].real for one in (turned, of_force(turned, poles, 100.0)[0])]
-    assert both[0] < 0 < both[1]

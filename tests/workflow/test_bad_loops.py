@@ -311,5 +311,7 @@ def test_the_margins_of_a_drive_that_lags_hold(flexlink, tmp_path):
     assert found.lag + found.arm.structure.input_delay_samples == pytest.approx(1 + 7 / 3, abs=0.1)
     assert found.level == pytest.approx(COULOMB / TORQUE, rel=0.1)
     machine = response(*plant().sampled(), omega, DT_S) * 0.3 / (1 - 0.7 * np.exp(-1j * omega * DT_S))
-    loop = results.design.controller.response(omega) * machine
-    assert np.min(np.abs(1 + loop)) > 0.99 * verdict.worst_margins.modulus
+    assert (
+        np.min(np.abs(1 + results.design.controller.response(omega) * machine))
+        > 0.99 * verdict.worst_margins.modulus
+    )
