@@ -293,8 +293,7 @@ def _with_law(logs: _Logs, found: FrictionFit, options: IdentOptions) -> Frictio
         return found
     spring, half = Spring.of(found.model), 0.5 * found.law.level
     if spring is not None and found.spring is None:
-        law = replace(found.law, level=half)
-        starts = [replace(found, spring=spring, beyond=half, law=law)]
+        starts = [replace(found, spring=spring, beyond=half, law=replace(found.law, level=half))]
         found = _kept_if_better(logs, found, starts, _of_order(found, options))
     if not np.isfinite(found.law.fall):
         speed, excess, level = rms_speed(logs.records), _EXCESS * found.law.level, found.law.level
@@ -315,7 +314,10 @@ def _kept_if_better(
         best = min(starts, key=logs.errors)
         for _ in range(_STEPS):  # each behind the observer that follows what the one before has found
             best = _stepped(logs, observed(best, logs.records))
-        return min(found, best, _in_turns(logs, best, options), key=logs.worth)
+        # A shape that has gone to nothing is none.
+        # An excess that has gone to nothing is none.
+        ends = best, _in_turns(logs, best, options)
+        return min((found, *(e for e in ends if np.isinf(e.law.fall) or e.law.excess)), key=logs.worth)
     return found
 
 
@@ -445,7 +447,8 @@ def _along_valley(logs: _Logs, found: FrictionFit, options: IdentOptions) -> Fri
     inside = _moving(_of_order(found, options))
     for size in _SIZES:
         better = True
-        while better:
+        # With more friction than the largest command nothing moves, however well that predicts.
+        while better and found.level < max(np.abs(record.input).max() for record in logs.records):
             law = replace(found.law, level=size * found.law.level, excess=size * found.law.excess)
             tried = _with_near_poles(logs, replace(found, law=law, beyond=size * found.beyond), inside)
             better = logs.errors(tried) < logs.errors(found)
