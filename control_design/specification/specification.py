@@ -103,8 +103,9 @@ class Specification(Settings):
     )
     controller_order: Annotated[int, Field(ge=1, le=16)] | Literal["auto"] = Field(
         default=4,
-        description="number of controller states; auto: the lowest within 2 % of what a controller of any "
-        "order reaches",
+        description="number of controller states, with lowest_bandwidth_rad_s at most: fewer where the step "
+        "then settles sooner with the identified friction; auto: the lowest within 2 % of what a controller "
+        "of any order reaches",
     )
     structure: Literal["biquads", "pi_d_notch"] = Field(
         default="biquads",

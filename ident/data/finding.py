@@ -143,4 +143,4 @@ class PriorTest:
 
 def distinct(found: Sequence[Finding]) -> tuple[Finding, ...]:
     """Each one once, in their order."""
-    return tuple({repr(item): item for item in found}.values())
+    return tuple({(item.kind, repr(dict(item.values))): item for item in found}.values())

@@ -314,7 +314,6 @@ def _kept_if_better(
         best = min(starts, key=logs.errors)
         for _ in range(_STEPS):  # each behind the observer that follows what the one before has found
             best = _stepped(logs, observed(best, logs.records))
-        # A shape that has gone to nothing is none.
         # An excess that has gone to nothing is none.
         ends = best, _in_turns(logs, best, options)
         return min((found, *(e for e in ends if np.isinf(e.law.fall) or e.law.excess)), key=logs.worth)
@@ -347,19 +346,20 @@ def _simple(
         logs.records, logs.presliding, options.input_delay_samples, stiff=not options.integrators
     )
     level = max(level, logs.least)
-    sought = not (options.integrators or options.unstable_poles)
-    if sought:
-        options = options.with_unstable(find_unstable(used, options))
-    if thrown_over and not options.unstable_poles:
-        return None
-    few = _simplest(options)
-    model = untested_model([prewhitened(record, long_arx_filter(used, few)) for record in used], _moving(few))
-    start = started(model, few.structure(), FrictionLaw(level, logs.presliding))
-    found = _in_turns(logs, replace(start, centre=logs.centre), few)
-    if sought and options.unstable_poles:
+    sought, bias = not (options.integrators or options.unstable_poles), 0.0
+    for _ in range(2):
+        if sought:
+            options = options.with_unstable(find_unstable(used, options))
+        if thrown_over and not options.unstable_poles:
+            return None
+        few = _simplest(options)
+        model = untested_model([prewhitened(r, long_arx_filter(used, few)) for r in used], _moving(few))
+        start = started(model, few.structure(), FrictionLaw(level, logs.presliding))
+        found = _in_turns(logs, replace(start, centre=logs.centre, bias=bias), few)
+        if not (sought and options.unstable_poles):
+            break
         # Once more with a better friction, which the growth depends on.
-        options = options.with_unstable(find_unstable([found.forced(r) for r in logs.records], options))
-        found = _in_turns(logs, found, _simplest(options))
+        level, bias, used = found.level, found.bias, [found.forced(record) for record in logs.records]
     return options, found
 
 

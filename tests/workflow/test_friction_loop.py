@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmarks.closed_loop_machines.simulator import Law, Plant, response
 from control_design import Controller, simulate
-from control_design.analysis.closed_loop import measure_sensitivity
+from control_design.analysis.closed_loop import measure_sensitivity, step_metrics
 from control_design.controllers.controller import FrictionFeedforward
 from ident import GobfModel, IdentOptions, Poles, Record, Structure
 from ident.friction import FrictionFit, FrictionLaw, fit_friction
@@ -17,7 +18,16 @@ from ident.friction.arm import SteppedArm
 from ident.friction.spring import Spring
 from plant import SampledArm, parse_effect
 from plant.presets import paper_link
-from workflow.tasks.friction_loop import FrictionLoop, drawn, friction_feedforward, holds_from, interval_of
+from workflow.config.run_config import built_in_config
+from workflow.tasks.friction_loop import (
+    FrictionLoop,
+    beside_recorded,
+    drawn,
+    friction_feedforward,
+    holds_from,
+    interval_of,
+    soonest,
+)
 from workflow.tasks.results import SlowSine
 from workflow.text.templates import said
 
@@ -142,6 +152,82 @@ class Slider:
 
     def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
         self.y += self.gain * DT_S * (u - np.clip(u, -self.level, self.level))
+
+
+def lead(gain=12.0, integral=0.0, **fields) -> Controller:
+    """`controller`, with integral action beside it."""
+    return Controller([[0.8, 0], [0, 1]], [[1.0], [1.0]], [[-1.4, integral]], [[gain]], DT_S, **fields)
+
+
+def stage_of(found, records=(), step=0.02):
+    """What `soonest` and `beside_recorded` read of a run's stage."""
+    config = built_in_config()[0]
+    asked = config.specification.model_copy(update={"lowest_bandwidth_rad_s": 1.0})
+    loop = config.closed_loop.model_copy(update={"reference_step": step, "measurement_step": 0.0})
+    results = SimpleNamespace(
+        identify=SimpleNamespace(friction=found), records=SimpleNamespace(fitted=lambda channel: records)
+    )
+    return SimpleNamespace(
+        config=config.model_copy(update={"specification": asked, "closed_loop": loop}),
+        results=results,
+        plant=None,
+    )
+
+
+def test_the_recorded_loop_stands_beside_the_new_one():
+    """A log that a loop with friction made: its controller is found, and leaves what was recorded."""
+    rng, found = np.random.default_rng(3), replace(fit(), noise_std=1e-6)
+    reference = 0.2 * np.cumsum(rng.standard_normal(4000)) / 60
+    made = FrictionLoop.of(lead(integral=0.02, computational_delay_samples=0), found)
+    run = made.run(reference, rng)
+    record = Record(
+        "log",
+        run.command[:, None],
+        run.measured[:, None],
+        DT_S,
+        ("u",),
+        ("y",),
+        reference=reference[:, None],
+        reference_names=("r",),
+    )
+    step = np.append(0.0, np.full(400, 0.02))
+    slower = FrictionLoop.of(lead(gain=9.0, integral=0.002), found)
+    seen = beside_recorded(stage_of(found, [record]), slower, step)
+    assert seen.errors[1] == pytest.approx(seen.errors[0], rel=3e-3)  # without the noise
+    assert seen.errors[2] > 1.2 * seen.errors[0]
+    assert seen.step.settling_time_s == pytest.approx(
+        step_metrics(made.answer(step)).settling_time_s, rel=0.02
+    )
+    unknown = replace(record, reference=None, reference_names=())
+    assert beside_recorded(stage_of(found, [unknown]), slower, step) is None
+
+
+@pytest.mark.parametrize(("first", "chosen"), [(0.001, 3), (0.05, 5)])
+def test_fewer_states_are_taken_where_friction_lets_them_settle_sooner(monkeypatch, first, chosen):
+    """Little integral action waits until friction lets go; no design is tried where it does not."""
+    monkeypatch.setattr("workflow.tasks.friction_loop.closed_loop_poles", lambda *_: np.array([0.98]))
+    found, tried = fit(), list[int]()
+
+    def design(order: int, integral: float):
+        asked = stage.config.specification.model_copy(update={"controller_order": order})
+        law = lead(gain=9.0, integral=integral)
+        padded = Controller(
+            np.diag([0.8, 1.0, *[0.1] * (order - 2)]),
+            np.append([[1.0], [1.0]], np.zeros((order - 2, 1)), axis=0),
+            np.append(law.C, np.zeros((1, order - 2)), axis=1),
+            law.D,
+            DT_S,
+        )
+        return SimpleNamespace(met=True, controller=padded, specification=asked)
+
+    def again(asked):
+        tried.append(asked.controller_order)
+        return design(asked.controller_order, {4: 0.002, 3: 0.05}[asked.controller_order])
+
+    stage = stage_of(found)
+    best = soonest(stage, design(5, first), again)
+    assert best.controller.order == chosen
+    assert tried == ([4, 3] if chosen == 3 else [])
 
 
 def test_feedforward_is_the_friction_of_a_pure_integrator():

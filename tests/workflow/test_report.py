@@ -164,7 +164,7 @@ def test_a_certified_run_says_so_and_why(drawn):
     assert "The mode at 2.23 Hz loses damping: 0.05 in open loop, 0.037 in closed loop" in page.text
     assert "All 3 runs on the simulated arm settle" in page.text
     assert "The certificate covers linear dynamics at the recorded amplitudes: the 95 % ellipses" in page.text
-    assert any("certified" in (attributes.get("class") or "").split() for _, attributes in page.tags)
+    assert any((attributes.get("class") or "").split() == ["verdict", "plain"] for _, attributes in page.tags)
 
 
 def test_an_uncertified_run_says_what_is_missed(unbuilt, tmp_path):

@@ -10,7 +10,9 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from diagnosis.machine.quantisation_grid import grid_step
+from ident.basis.model import GobfModel
 from ident.checks.input_checks import refuse_few_lines
+from ident.closed_loop import controller_of
 from ident.data.arrays import clipped_share
 from ident.data.record import Record
 from ident.friction import recorded_in_loop
@@ -29,13 +31,15 @@ from workflow.tasks.results import IdentifiedChannel, UncertainChannel
 
 # Of the first mode or notch, or of the highest frequency that the logs tell: the bandwidth that is asked for,
 # and the one that is asked for at least.
-_PART, _LEAST_PART = 3, 30
+_PART, _LEAST_PART = 3, 100
 _ORDER = 5  # of the controller: integrator, roll-off and a notch, with one state to spare
 # An unstable pole has to be left behind by the bandwidth, by this factor.
 _BEYOND_UNSTABLE = 2.5
 # Of one log the last part validates, where that leaves so many samples and the parts are driven alike within
 # a factor of two.
 _FITTED, _FEWEST = 0.7, 1000
+# Where the recorded loop's bandwidth is looked for: lowest frequency, of the sampling rate, and how many.
+_SLOWEST, _LINES = 1e-5, 2000
 # Gain of the controller, beside that of the recorded loop.
 _MORE = 3.0
 # Both ends of the command stand at one limit within this.
@@ -50,7 +54,8 @@ class Draft:
     stated, or at which commands stand in the logs (`clipped`) or were cut after they were logged (`unseen`),
     else the largest command. in_loop: a reference was recorded, or the command follows the position. step: of
     the output's quantisation, 0 without one. specification: keys of [specification]. reference_step: half the
-    rms motion, or, beside an unstable pole, what the effort limit answers with the largest command."""
+    rms motion, or, beside an unstable pole, what the effort limit answers with the largest command.
+    recorded_rad_s: bandwidth of the loop that made the logs, 0 where they do not tell it."""
 
     look: FirstLook
     position: bool
@@ -63,6 +68,7 @@ class Draft:
     specification: Mapping[str, Any]
     reference_step: float
     unstable_per_s: float
+    recorded_rad_s: float = 0.0
 
     @property
     def friction(self) -> bool:
@@ -113,6 +119,7 @@ def informed(draft: Draft, found: IdentifiedChannel, spread: UncertainChannel) -
     """The same with the specification that follows from the model that came out of the logs: its first mode
     that swings and whose damping is told, its first notch, the band that its ellipses tell."""
     look, model, omega = draft.look, found.model, spread.frequency.omega_rad_s
+    effort, recorded = _of_recorded_loop(look.records, model)
     size = np.abs(spread.frequency.centre)
     known = omega[np.trace(spread.frequency.covariance, axis1=1, axis2=2) < (TOLD * size) ** 2]
     if look.told_rad_s is None or not known.size:
@@ -131,9 +138,24 @@ def informed(draft: Draft, found: IdentifiedChannel, spread: UncertainChannel) -
     return replace(
         draft,
         look=look,
-        specification=_specification(look, draft.specification["effort_limit"], draft.limit, unstable),
+        specification=_specification(
+            look, max(draft.specification["effort_limit"], effort), draft.limit, unstable, recorded
+        ),
         unstable_per_s=unstable,
+        recorded_rad_s=recorded,
     )
+
+
+def _of_recorded_loop(records: Sequence[Record], model: GobfModel) -> tuple[float, float]:
+    """Largest |K S| of the controller that made the records, on the model, and where its |S| first rises to
+    -3 dB; 0 where they do not tell it."""
+    law, dt_s = controller_of(records), records[0].dt_s
+    if law is None:
+        return 0.0, 0.0
+    omega = np.geomspace(_SLOWEST / dt_s, 0.99 * np.pi / dt_s, _LINES)
+    k = np.divide(*(np.polyval(part, np.exp(1j * omega * dt_s)) for part in law))
+    size = 1 / np.abs(1 + k * model.frequency_response(omega))
+    return float(np.max(np.abs(k) * size)), float(omega[np.argmax(size > np.sqrt(0.5))])
 
 
 def recorded_effort(records: Sequence[Record]) -> float:
@@ -186,19 +208,22 @@ def _rounded(value: float) -> float:
     return float(f"{value:.2g}")
 
 
-def _specification(look: FirstLook, effort: float, limit: float, unstable: float) -> dict[str, Any]:
-    """Requirements that leave the bandwidth to what the identified arm allows."""
+def _specification(
+    look: FirstLook, effort: float, limit: float, unstable: float, recorded: float = 0.0
+) -> dict[str, Any]:
+    """Requirements that leave the bandwidth to what the identified arm allows; no less is asked for than the
+    recorded loop had."""
     dt_s = look.records[0].dt_s
     highest = look.told_rad_s[1] if look.told_rad_s else 0.05 * np.pi / dt_s
     base = look.mode[0] if look.mode else look.notch or highest
-    bandwidth = max(base / _PART, _BEYOND_UNSTABLE * unstable)
+    bandwidth = max(base / _PART, _BEYOND_UNSTABLE * unstable, recorded)
     band = {
         "mode_peak_ratio": 1.0,
         "mode_band_rad_s": [_rounded(base / 1.5), _rounded(min(1.5 * base, 0.95 * np.pi / dt_s))],
     }
     return {
         "bandwidth_rad_s": _rounded(bandwidth),
-        "lowest_bandwidth_rad_s": _rounded(max(base / _LEAST_PART, unstable)),
+        "lowest_bandwidth_rad_s": _rounded(max(min(base / _LEAST_PART, recorded or np.inf), unstable)),
         "modulus_margin": 0.5,
         "effort_limit": _rounded(effort),
         # Above what the logs tell the command falls off.

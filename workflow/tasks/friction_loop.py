@@ -10,6 +10,7 @@ from typing import Any
 
 import control
 import numpy as np
+import scipy.signal
 from scipy.stats import t as student
 
 from control_design.analysis.closed_loop import (
@@ -20,12 +21,30 @@ from control_design.analysis.closed_loop import (
     simulate,
     step_metrics,
 )
+from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller, FrictionFeedforward
+from control_design.specification import Specification
+from ident.closed_loop import controller_of
 from ident.data.arrays import kernel_array
 from ident.friction import FrictionFit, FrictionLaw
 from ident.friction.kernel import loop_through
-from workflow.tasks.loop_sensitivity import SMALL, measured_on_arm, sensitivity_plan, settling_samples
-from workflow.tasks.results import FrictionCheck, Interval, Real, SensitivityCheck, SlowSine
+from workflow.tasks.loop_sensitivity import (
+    SMALL,
+    measured_on_arm,
+    rms_of,
+    sensitivity_plan,
+    settling_samples,
+)
+from workflow.tasks.results import (
+    STALLS,
+    DesignResult,
+    FrictionCheck,
+    Interval,
+    Real,
+    RecordedLoop,
+    SensitivityCheck,
+    SlowSine,
+)
 from workflow.tasks.simulated_rig import converter_steps, loop_of_arm
 from workflow.tasks.stage import StageInput
 
@@ -40,6 +59,7 @@ _SLOW, _LONGEST = 300.0, 20_000
 _SINE_SHARE = 0.2  # of the reference step
 # Friction lets integral action wait: the step is watched so many times as long as the linear loop needs.
 _WATCHED, _MOST_WATCHED = 20, 100_000
+_FEWEST_STATES = 3  # an integrator, a lead, and what takes the controller's gain off above
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +117,12 @@ class FrictionLoop:
         )
         time_s = np.asarray(np.arange(n) * law.dt_s, dtype=np.float64)
         return ClosedLoopTrajectory(time_s, reference, measured[:, None], command, limited, law.dt_s)
+
+    def answer(self, step: Real, given: Real | None = None) -> ClosedLoopTrajectory:
+        """To a step (T,), held as long as friction may make it wait; given (T,): as a filter has it."""
+        held = min(_WATCHED * step.size, max(_MOST_WATCHED, step.size)) - step.size
+        run = self.run(np.pad(step if given is None else given, (0, held), mode="edge"))
+        return replace(run, reference=np.pad(step, (0, held), mode="edge"))
 
     def sensitivity(
         self, phases: np.random.Generator, noise: np.random.Generator, **excitation: Any
@@ -227,10 +253,8 @@ def check_friction(
     integral = radius > 1 - 1e-9
     sticking = [0.0 if integral else loop.sticking_step(rest) for loop in (fitted, *loops)]
     error_at_rest = 0.0 if integral else fitted.error_at_rest
-    held = min(_WATCHED * reference.size, max(_MOST_WATCHED, reference.size)) - reference.size
     level = at_rest(found.law, found.beyond)
-    run = fitted.run(np.pad(given, (0, held), mode="edge"))
-    run = replace(run, reference=np.pad(reference, (0, held), mode="edge"))
+    run = fitted.answer(reference, given)
     moving = int(np.flatnonzero(run.reference)[0])
     error = np.abs(run.reference - run.measured)[moving:]
     tolerance = TOLERANCE_PERCENT / 100
@@ -258,7 +282,66 @@ def check_friction(
         tracking=slow_sine(
             stage, controller, _SINE_SHARE * float(reference[-1]), on_arm=sensitivity is not None
         ),
+        recorded=beside_recorded(stage, fitted, reference),
     )
+
+
+def recorded_loop(stage: StageInput, loop: FrictionLoop) -> FrictionLoop | None:
+    """The controller that made the logs in the place of the loop's; None where they do not tell it."""
+    records = stage.results.records.fitted(stage.config.control_channel)
+    law = controller_of(records)
+    if law is None:
+        return None
+    matrices = scipy.signal.tf2ss(*law)
+    return replace(loop, controller=Controller(*matrices, records[0].dt_s, computational_delay_samples=0))
+
+
+def beside_recorded(stage: StageInput, loop: FrictionLoop, step: Real) -> RecordedLoop | None:
+    """The loop that made the logs on the same step (T,), and both on the reference of the first log."""
+    own, first = recorded_loop(stage, loop), stage.results.records.fitted(stage.config.control_channel)[0]
+    if own is None or first.reference is None:
+        return None
+    run, reference = own.answer(step), first.reference[:, 0] - first.reference[0, 0]
+    recorded = float(np.std(first.reference - first.output))
+    simulated, new = (float(np.std(reference - one.run(reference).measured)) for one in (own, loop))
+    return RecordedLoop(step_metrics(run), run.measured[: step.size], (recorded, simulated, new))
+
+
+def soonest(
+    stage: StageInput, first: DesignResult, again: Callable[[Specification], DesignResult]
+) -> DesignResult:
+    """A design whose bandwidth was left open, or one `again` of fewer states, whichever lets the reference
+    step settle sooner with the identified friction: the requirements do not see that a controller with many
+    slow states hunts. Enough is several times what the linear loop needs, and no more than the recorded."""
+    config, found = stage.config, stage.results.identify.friction
+    asked, law = config.specification, first.controller
+    if not first.met or found is None or law is None or asked.lowest_bandwidth_rad_s is None:
+        return first
+    records = stage.results.records.fitted(config.control_channel)
+    size = config.closed_loop.reference_step or 0.5 * rms_of([record.output for record in records])
+    radius = float(np.max(np.abs(closed_loop_poles(law, stage.plant))))
+    step = np.append(0.0, np.full(settling_samples(radius, 200, 60_000) // 2, size))
+
+    def took(loop: FrictionLoop | None) -> float:
+        seconds = None if loop is None else step_metrics(loop.answer(step)).settling_time_s
+        return np.inf if seconds is None else seconds
+
+    loop = FrictionLoop.of(law, found, **converter_steps(config.closed_loop))
+    best, least = first, took(loop)
+    bounds = [STALLS * took(replace(loop, friction=FrictionLaw(0.0))), took(recorded_loop(stage, loop))]
+    enough, reached = (
+        min(bounds),
+        None if first.specification is None else first.specification.bandwidth_rad_s,
+    )
+    fewest = {"bandwidth_rad_s": reached} if reached and reached > asked.lowest_bandwidth_rad_s else {}
+    for fewer in range(1, law.order - _FEWEST_STATES + 1):
+        if least <= enough:
+            break
+        tried = again(asked.model_copy(update={**fewest, "controller_order": law.order - fewer}))
+        if tried.met and tried.controller is not None:
+            seconds = took(replace(loop, controller=tried.controller))
+            best, least = (tried, seconds) if seconds < least else (best, least)
+    return best
 
 
 def _around(value: float, found: FrictionFit) -> Interval:

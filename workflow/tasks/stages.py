@@ -8,10 +8,11 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
+from control_design.specification import Specification
 from workflow.engine.errors import naming
 from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.design import UNKNOWN_TO_BRACKET, certify_asked, find_bracket, find_design, find_filter
-from workflow.tasks.friction_loop import friction_feedforward
+from workflow.tasks.friction_loop import friction_feedforward, soonest
 from workflow.tasks.identification import identify_channels
 from workflow.tasks.records import make_records
 from workflow.tasks.results import (
@@ -28,15 +29,15 @@ from workflow.text.templates import said
 def design_controller(stage: StageInput) -> DesignResult:
     """Best controller found for the plant that was identified."""
     config = stage.config
-    with naming("design"):
+
+    def found(asked: Specification) -> DesignResult:
+        report = partial(stage.progress.update, "design")
         return find_design(
-            [stage.plant],
-            config.specification,
-            config.synthesis,
-            config.certificate,
-            stage.rng("design"),
-            partial(stage.progress.update, "design"),
+            [stage.plant], asked, config.synthesis, config.certificate, stage.rng("design"), report
         )
+
+    with naming("design"):
+        return soonest(stage, found(config.specification), found)
 
 
 def find_achievable(stage: StageInput) -> AchievablePerformance:
@@ -94,10 +95,16 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         "design",
-        _PLANT,
+        ("records", *_PLANT),
         design_controller,
         15.0,
-        uses={"specification": True, "synthesis": True, "certificate": {"calibrate"}, **_PURPOSES},
+        uses={
+            "specification": True,
+            "synthesis": True,
+            "certificate": {"calibrate"},
+            "closed_loop": {"reference_step", "measurement_step"},  # of the step that is to settle
+            **_PURPOSES,
+        },
     ),
     Stage(
         "achievable_performance",
