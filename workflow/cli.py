@@ -344,7 +344,9 @@ def init(
     need(*log)
     from workflow.commands.init import init as write_configuration
 
-    _show(write_configuration(log, out, _reading(of_fields), replace_file=replace), as_json)
+    with _watched(quiet=False) as progress:
+        found = write_configuration(log, out, _reading(of_fields), replace_file=replace, progress=progress)
+    _show(found, as_json)
 
 
 @app.command(short_help="Identify one channel from log files; one-page report.")

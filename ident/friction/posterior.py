@@ -175,7 +175,8 @@ def of_force(
         # Of its parts the first takes the normal's place.
         onto += [np.vstack([direction, np.zeros((parts.shape[1] - 1, direction.size))])]
     # Real poles well below and above the slowest one, where that lies if more or less damps the arm.
-    slow = Poles(poles.real[np.argsort(-poles.real)[:1]].clip(1e-9, 1 - 1e-9) ** np.array(_AROUND))
+    slowest = np.sort(poles.real)[-1:].clip(1e-9, 1 - 1e-9)
+    slow = Poles(np.ravel(np.power.outer(slowest, _AROUND)))
     wanted = np.hstack([moved @ onto[0], *columns]).T
     bent = _with_poles(response, poles.appended(slow), omega, gain * centre, [*wanted], _RANK)
     normals = np.vstack(onto)

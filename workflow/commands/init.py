@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shlex
+import tempfile
 import tomllib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +28,8 @@ from ident.data.wrapping import wraps_at
 from workflow.commands.logs import Reading
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
+from workflow.engine.progress import Progress
+from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
 from workflow.text.templates import RunSummary, environment, rows_of
 
@@ -39,9 +43,11 @@ _NEARLY_ALL = 0.99  # rows of a held log: one may be missing
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What the template of the configuration shows. scale, units: as stated, and the sign that is turned;
-    before: the draft that the logs were identified by, where `draft` is what followed."""
+    """What the template of the configuration shows, of a command. scale, units: as stated, and the sign that
+    is turned; before: the draft that the logs were identified by, where `draft` is what followed; refused:
+    why no friction is identified although it may be there."""
 
+    command: str
     logs: tuple[Path, ...]
     file_name: str
     stated: Reading
@@ -51,16 +57,23 @@ class Found:
     draft: Draft
     doubts: tuple[Finding, ...]
     before: Draft | None = None
+    refused: str = ""
 
 
 def init(
-    logs: Sequence[Path], out: Path, stated: Reading | None = None, *, replace_file: bool = False
+    logs: Sequence[Path],
+    out: Path,
+    stated: Reading | None = None,
+    *,
+    replace_file: bool = False,
+    progress: Progress | None = None,
 ) -> RunSummary:
-    """Write the configuration of one channel of these logs. Raises InputError, one line."""
+    """Write the configuration of one channel of these logs, once they are identified. Raises InputError, one
+    line."""
     storage.refuse_in_the_way(logs, [("--out", out)])
     if out.is_file() and not replace_file:
         raise InputError(f"{out} exists: take another --out, or --replace to write over it")
-    config, text, found = drafted("init", logs, out, stated)
+    config, text, _, found = decided("init", logs, out, stated, progress)
     storage.write_text(out, text)
     look, draft = found.draft.look, found.draft
     return RunSummary(
@@ -81,6 +94,38 @@ def init(
         },
         verdict=f"flexlink run --config {shlex.quote(str(out))}",
     )
+
+
+def decided(
+    command: str, logs: Sequence[Path], file: Path, stated: Reading | None, progress: Progress | None
+) -> tuple[RunConfig, str, dict[str, bytes], Found]:
+    """The configuration of logs, to stand in a file, with a specification that follows from the model they
+    were identified by; its text, the files of the stages up to that model, and what was seen. Raises
+    InputError."""
+    config, text, found = drafted(command, logs, file, stated)
+    from workflow.tasks.draft import informed
+    from workflow.tasks.pipeline import identify_only
+    from workflow.tasks.results import RunResults
+
+    with tempfile.TemporaryDirectory(prefix="flexlink-") as folder:
+        run = RunDirectory(Path(folder))
+        try:
+            identify_only(config, run.path, config_text=text, progress=progress)
+        except InputError as refused:
+            if not config.control_channel.uncertainty.friction_identified:
+                raise
+            # Logs that no model with friction explains still tell the machine as it was recorded.
+            found = replace(found, refused=str(refused).partition(": ")[2].partition(". ")[0])
+            config, text = written(found, file)
+            with suppress(InputError):
+                identify_only(config, run.path, config_text=text, progress=progress)
+            if run.stage_file("uncertainty") is None:
+                raise
+        results, at = RunResults(run), config.control_index
+        draft = informed(found.draft, results.identify.channels[at], results.uncertainty.channels[at])
+        known = run.stage_files(("records", "identify", "uncertainty"))
+    found = replace(found, draft=draft, before=found.draft)
+    return (*written(found, file), known, found)
 
 
 def drafted(
@@ -104,7 +149,7 @@ def drafted(
         scale[name] = -scale.get(name, 1.0)
         units |= {name: unit_of[name]} if unit_of[name] else {}
     doubts = distinct([doubt for record in read.records for doubt in record.doubts])
-    found = Found(tuple(logs), shlex.quote(out.name), stated, read, scale, units, draft, doubts)
+    found = Found(command, tuple(logs), shlex.quote(out.name), stated, read, scale, units, draft, doubts)
     return (*written(found, out), found)
 
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import re
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace as changed
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ident.data.record import Record
+from workflow.commands.init import decided
 from workflow.config.joints_config import AnyConfig, TwoJointSource, is_for_joints, load_any, load_joints
 from workflow.config.run_config import (
     FileSource,
@@ -44,8 +43,7 @@ def run_from_files(
 ) -> RunSummary:
     """Load a configuration and run it; see `run_pipeline`.
 
-    Of logs, read as stated, the configuration is written as `flexlink init` does, but for the specification,
-    which follows from the identified model; it is kept in `out`. Without
+    Of logs, read as stated, the configuration is that of `flexlink init`, kept in `out`. Without
     `config_path` or logs the built-in default arm is run, or on resuming the configuration kept in `out`;
     without `out` a new directory below runs/ is made. Raises InputError.
     """
@@ -61,7 +59,8 @@ def run_from_files(
     if logs:
         out = out if out is not None else default_directory(logs[0].stem)
         RunDirectory(out).refuse_unless_free(resume=resume, replace=replace)
-        config, text, known = _decided(logs, out / "config.toml", stated, progress)
+        config, text, known, found = decided("run", logs, out / "config.toml", stated, progress)
+        note = f"without friction {found.refused}: as recorded" if found.refused else ""
     elif config_path is not None:
         config, text = load_any(config_path)
     elif resume and out is not None and (out / "manifest.json").is_file():
@@ -96,26 +95,6 @@ def run_from_files(
         known=known,
         progress=progress,
     )
-
-
-def _decided(
-    logs: Sequence[Path], file: Path, stated: Reading | None, progress: Progress | None
-) -> tuple[RunConfig, str, dict[str, bytes]]:
-    """The configuration of logs, to stand in a file, with a specification that follows from the model they
-    were identified by; its text, and the files of the stages up to that model. Raises InputError."""
-    from workflow.commands.init import drafted, written
-    from workflow.tasks.draft import informed
-    from workflow.tasks.pipeline import identify_only
-    from workflow.tasks.results import RunResults
-
-    config, text, found = drafted("run", logs, file, stated)
-    with tempfile.TemporaryDirectory(prefix="flexlink-") as folder:
-        run = RunDirectory(Path(folder))
-        identify_only(config, run.path, config_text=text, progress=progress)
-        results, at = RunResults(run), config.control_index
-        draft = informed(found.draft, results.identify.channels[at], results.uncertainty.channels[at])
-        known = run.stage_files(("records", "identify", "uncertainty"))
-    return (*written(changed(found, draft=draft, before=found.draft), file), known)
 
 
 def rebuild_report(

@@ -27,8 +27,6 @@ SWINGS = 0.3
 # Of the rigid motion: well below a notch or peak, with two more derivatives for what bends there, as far up
 # as it explains this share of the command's power.
 _RIGID, _EXPLAINED = 0.5, 0.97
-# A pole pair that the nearest zeros leave less of than this factor is no mode.
-_PROMINENT = 1.5
 # A line with less of the instrument's largest, or of the output's at its highest frequencies, is not excited.
 _EXCITED, _ABOVE_FLOOR = 1e-6, 10.0
 # A term of the motion is there with so many standard deviations, and this share of the rms command below; a
@@ -40,10 +38,7 @@ _LESS, _LIMITS = 0.25, (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.93, 0.96, 0.98)
 # Distance from one of the response times the force that the rigid motion takes, in the median: dry friction
 # makes up to this of it where it is as large as that force.
 _AGREES = 0.8
-# Least damping that the fit is allowed; a pair that stays there is none that the response shows.
-_LEAST_DAMPING = 1e-3
 _MOST_LINES = 300  # of the fit: more take longer and tell the same structure
-_SLOWEST = 0.1  # of the lowest frequency that is told: a slower pole looks like an integrator there
 
 
 @dataclass(frozen=True)
@@ -111,14 +106,13 @@ class RigidMotion:
 
 @dataclass(frozen=True, eq=False)
 class FirstLook:
-    """told_rad_s: lowest and highest frequency at which the response is told. model: None where nothing
-    explains it. mode: natural frequency [rad/s] and damping ratio of the first; notch: frequency [rad/s] of
-    the slowest lightly damped zero. turned: the output falls
-    when the command is positive; records and model have the command with its sign changed then."""
+    """told_rad_s: lowest and highest frequency at which the response is told. turned: the output falls when
+    the command is positive; the records have the command with its sign changed then. Of the identified model,
+    where there is one: mode: natural frequency [rad/s] and damping ratio of the first; notch: frequency
+    [rad/s] of the slowest lightly damped zero."""
 
     records: tuple[Record, ...]
     told_rad_s: tuple[float, float] | None = None
-    model: GobfModel | None = None
     motion: RigidMotion | None = None
     mode: tuple[float, float] | None = None
     notch: float | None = None
@@ -140,36 +134,13 @@ def first_look(records: Sequence[Record], *, position: bool) -> FirstLook:
     if response is None:
         return FirstLook(cut)
     told = float(response.omega_rad_s[0]), float(response.omega_rad_s[-1])
-    found = _fitted(response, int(position))
-    motion = _rigid(cut, found, response, position)
+    motion = _rigid(cut, _fitted(response, int(position)), response, position)
     turned = motion is not None and motion.turned
     if motion is not None and turned:
         cut = tuple(replace(record, input=-record.input) for record in cut)
         terms: Any = {name: one for name, one in vars(motion).items() if isinstance(one, Term)}
         motion = replace(motion, **{name: replace(one, value=-one.value) for name, one in terms.items()})
-    if motion is not None and motion.friction.shown and motion.friction.value > 0:
-        # Once more with the friction off the command: it bends the response below and damps the modes.
-        low = butter(3, min(told[1] * cut[0].dt_s / np.pi, 0.6), output="sos")
-        friction = [motion.friction.value * _sign(_speed(record, low, position)) for record in cut]
-        less = [replace(r, input=r.input - force[:, None]) for r, force in zip(cut, friction, strict=True)]
-        response = told_response(less) or response
-    elif turned:
-        response = replace(response, centre=-response.centre)
-    sprung = motion is not None and motion.sprung
-    integrators = int(position and not sprung)
-    look = FirstLook(cut, told, motion=motion, turned=turned)
-    bounds: dict[str, float] = {}
-    if look.rigid_below_rad_s is not None:
-        # No pole either that is slower than the logs tell.
-        slowest = _SLOWEST * told[0]
-        bounds = {"omega_min_rad_s": look.rigid_below_rad_s, "decay_min_per_s": slowest, "max_real": 1}
-    found = _fitted(response, integrators, **bounds)
-    if found is None:
-        return look
-    above = max(told[0], 0.0 if motion is None else motion.below_rad_s)
-    notch = next((float(omega) for omega in notches(found.model) if above < omega < told[1]), None)
-    mode = _first_mode(found.model, above, told[1])
-    return replace(look, model=found.model, mode=mode, notch=notch)
+    return FirstLook(cut, told, motion, turned=turned)
 
 
 def unseen_limit(look: FirstLook, *, position: bool) -> float | None:
@@ -257,7 +228,7 @@ def _told_by(records: Sequence[Record]) -> FrequencyUncertainty | None:
     )
 
 
-def _fitted(response: FrequencyUncertainty, integrators: int, **known: float) -> FrfIdentification | None:
+def _fitted(response: FrequencyUncertainty, integrators: int) -> FrfIdentification | None:
     options = {
         "integrators": integrators,
         "max_real": 2,
@@ -265,7 +236,7 @@ def _fitted(response: FrequencyUncertainty, integrators: int, **known: float) ->
         "max_pairs": min(3, max(0, (response.omega_rad_s.size - 5) // 4)),
         "evaluations": 100,
         "starts": 2,
-    } | known
+    }
     keep = slice(None, None, -(-response.omega_rad_s.size // _MOST_LINES))
     response = replace(
         response,
@@ -284,22 +255,6 @@ def notches(model: GobfModel) -> RealArray:
     zeros = np.asarray(model.zeros())
     s = np.log(zeros[(np.imag(zeros) > 0) & (np.abs(zeros) > 0)]) / model.dt_s
     return np.sort(np.abs(s)[np.abs(np.real(s)) < SWINGS * np.abs(s)])
-
-
-def _first_mode(model: GobfModel, above_rad_s: float, told_rad_s: float) -> tuple[float, float] | None:
-    """The slowest pair that swings, shows, and is no motion of the rigid machine on a spring."""
-    z, zeros = model.poles.pairs, np.asarray(model.zeros())
-    omega, zeta = model.poles.omega_rad_s(model.dt_s), model.poles.zeta()
-    found = None
-    for k in np.argsort(omega)[::-1]:
-        # What the pair and the zeros nearest to it make of a unit gain at the pair's frequency.
-        at = np.exp(1j * omega[k] * model.dt_s)
-        nearest = min(np.abs(zeros - z[k]), default=np.inf) if zeros.size else np.inf
-        left = min(nearest, abs(z[k] - z[k].conj())) / abs(at - z[k])
-        inside = above_rad_s < omega[k] < 1.2 * told_rad_s
-        if 1.05 * _LEAST_DAMPING < zeta[k] < SWINGS and inside and left > _PROMINENT:
-            found = float(omega[k]), float(zeta[k])
-    return found
 
 
 def _rigid(
