@@ -103,7 +103,7 @@ def decided(
     were identified by; its text, the files of the stages up to that model, and what was seen. Raises
     InputError."""
     config, text, found = drafted(command, logs, file, stated)
-    from workflow.tasks.draft import informed
+    from workflow.tasks.draft import informed, tells
     from workflow.tasks.pipeline import identify_only
     from workflow.tasks.results import RunResults
 
@@ -119,7 +119,7 @@ def decided(
             config, text = written(found, file)
             with suppress(InputError):
                 identify_only(config, run.path, config_text=text, progress=progress)
-            if run.stage_file("uncertainty") is None:
+            if run.stage_file("uncertainty") is None or not tells(RunResults(run).uncertainty.channels):
                 raise
         results, at = RunResults(run), config.control_index
         draft = informed(found.draft, results.identify.channels[at], results.uncertainty.channels[at])

@@ -146,6 +146,11 @@ def informed(draft: Draft, found: IdentifiedChannel, spread: UncertainChannel) -
     )
 
 
+def tells(channels: Sequence[UncertainChannel]) -> bool:
+    """Whether each one's response is told somewhere: over one of its bands."""
+    return all(min(band.median_radius_percent for band in one.bands) < 100 * TOLD for one in channels)
+
+
 def _of_recorded_loop(records: Sequence[Record], model: GobfModel) -> tuple[float, float]:
     """Largest |K S| of the controller that made the records, on the model, and where its |S| first rises to
     -3 dB; 0 where they do not tell it."""
