@@ -69,8 +69,9 @@ from ident.unstable import find_unstable
 
 Report = Callable[[float, str], None]
 _ROUNDS, _FEW_ROUNDS, _LONGEST_DELAY = 6, 2, 20
-# A level that moves by less than the first share stays; by more than the second, the order is chosen anew.
-_STAYS, _MOVES = 5e-3, 0.05
+# A level that moves by less than the first share stays; by more than the second, or with errors that fall to
+# the third, the order is chosen anew.
+_STAYS, _MOVES, _FALLS_TO = 5e-3, 0.05, 0.5
 # Lags by which a command follows; a residual that is rounding; one log in a million is taken for a loop.
 _CAUSES, _NOTHING, _BY_CHANCE = 8, 1e-5, 1e-6
 _FEW_LEVELS = 16  # of a binary or staircase signal, at most
@@ -411,19 +412,21 @@ def _with_more_poles(logs: _Logs, found: FrictionFit, options: IdentOptions) -> 
 
 
 def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: int = _ROUNDS) -> FrictionFit:
-    """Arm and law in turns; the poles are searched for once more where the level has moved."""
-    moved, inside = np.inf, _moving(options)
+    """Arm and law in turns; the poles are searched for once more where level or errors have moved."""
+    search, inside = True, _moving(options)
     for k in range(rounds):
         found, tried = observed(found, logs.records), list[FrictionFit]()
-        if moved > _MOVES:
+        errors = logs.errors(found)
+        if search:
             anew = _on(found, untested_model(_white(logs, found), inside))
             tried = [observed(replace(anew, correction=None, ratio=0.0), logs.records)]
         if k or found.model.poles.counts == (options.n_real, options.n_pairs):
             tried.append(_with_near_poles(logs, found, inside))
         found = min(tried, key=logs.errors)
         level, found = found.level, _stepped(logs, found)
-        moved = abs(found.level - level) / max(found.level, level)
-        if k and moved < _STAYS:
+        moved, fell = abs(found.level - level) / max(found.level, level), logs.errors(found) / errors
+        search = moved > _MOVES or fell < _FALLS_TO
+        if k and moved < _STAYS and not search:
             break
     return found
 

@@ -38,6 +38,8 @@ _MOST_GAIN = 3.0  # of an arc, over the centre: a damping that is not told from 
 _REACH, _LARGEST = 1.7, 0.9
 # Rates of further real poles, as multiples of the slowest one's, which the force may move so far.
 _AROUND = (0.1, 0.4, 2.0, 5.0)
+# Lowest missing mode, over the highest of the model: a nearer one the search would have found.
+_BEYOND = 1.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,11 +106,14 @@ def _behind_observed(
         beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([plain, logs, own])))
         less.append(found.taken_off(record))
     known = found.law.n_logs + len(records)
-    # What drives an arm away from its simulation is never white; as missed modes five slow ones were added.
-    order = max(options.max_ar_order, NOISE_ORDER)
-    coloured = {"coloured_noise": True, "max_ar_order": order, "prior_missed_mode": 0.0}
-    options = options.model_copy(update=coloured)
-    response, change, factor = tangent_beside(less, model, beside, options, n_known=known)
+    # What drives an arm away from its simulation is never white: as missed modes five slow ones were added.
+    # Above those of the model, where logs excite little, one may be missing.
+    coloured = {"coloured_noise": True, "max_ar_order": max(options.max_ar_order, NOISE_ORDER)}
+    swinging = model.poles.pairs if model.poles.pairs.size else model.poles.real[model.poles.real > 0]
+    above = _BEYOND * float(np.max(np.abs(np.log(swinging)), initial=0.0))
+    response, change, factor = tangent_beside(
+        less, model, beside, options.model_copy(update=coloured), n_known=known, missed_above=above
+    )
     whitening = np.array([1.0, *(response.report.ar_coefficients if response.report else ())])
     wider = np.sqrt(
         heterogeneity(

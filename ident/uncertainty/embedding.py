@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -86,20 +87,16 @@ def tangent_beside(
     options: EmbeddingOptions | None = None,
     *,
     n_known: int = 0,
+    missed_above: float = 0.0,
 ) -> tuple[ResponsePosterior, RealArray, RealArray]:
     """The tangent posterior with q columns beside the basis functions, in every record, and their
     coefficients: mean (q,) and factor (q, P') on the same unit normals as the response's covariance_factor.
 
     The last n_known coefficients are independent unknowns of zero mean and unit variance, the others free.
-    Errors as `tangent`.
+    missed_above: least frequency of a mode that may be missing, radians a sample. Errors as `tangent`.
     """
-    return _embed(
-        records,
-        model,
-        options or EmbeddingOptions(),
-        beside=beside,
-        n_known=n_known,
-    )
+    known = {"n_known": n_known, "missed_above": missed_above}
+    return _embed(records, model, options or EmbeddingOptions(), beside=beside, **known)
 
 
 def common_fir_length(records: Sequence[Record], poles: Poles, options: EmbeddingOptions) -> int:
@@ -123,10 +120,10 @@ def _embed(
     options: EmbeddingOptions,
     *,
     beside: Sequence[Beside] = (),
-    n_known: int = 0,
+    **known: Any,
 ) -> tuple[ResponsePosterior, RealArray, RealArray]:
     rows, n_off = _rows(records, model, model.poles.doubled(), options, beside), model.unstable.order
-    rows = replace(rows, n_known=n_known)
+    rows = replace(rows, **known)
     # Coloured noise taken for white passes for modes: none are added before it has been whitened.
     first = options.model_copy(update={"prior_missed_mode": 0.0}) if options.coloured_noise else options
     solved = _solve(rows, first)
@@ -293,7 +290,7 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
         kernel = conditional_posterior(grid, *grid_weights(grid, options.no_remainder))
         if not options.prior_missed_mode > 0:
             return _Solved(rows, reduced, kernel)
-        candidates = candidate_pairs(max(record.n_samples for record in rows.records))
+        candidates = candidate_pairs(max(record.n_samples for record in rows.records), rows.missed_above)
         statistics = pair_statistics(rows.pair_blocks(), reduced, candidates.poles)
         odds = options.prior_missed_mode / (1 - options.prior_missed_mode)
         log_rest = total_log_evidence(grid, options.no_remainder)

@@ -59,7 +59,8 @@ class EmbeddingRows:
 
     poles: of the regressors (doubled for the tangent method); fir_length: of the kernel; whitening: A(q), [1]
     for white noise. beside: one per record, or none, whose last n_known columns have coefficients known to
-    one; known_std: of the (whitened) noise, as far as known.
+    one; known_std: of the (whitened) noise, as far as known. missed_above: least frequency of a mode that
+    may be missing, radians a sample.
     """
 
     records: tuple[Record, ...]
@@ -70,6 +71,7 @@ class EmbeddingRows:
     beside: tuple[Beside, ...] = ()
     n_known: int = 0
     known_std: float | None = None
+    missed_above: float = 0.0
 
     @property
     def n_beside(self) -> int:

@@ -104,13 +104,15 @@ class PairEvidence:
 
 
 @lru_cache(maxsize=16)
-def candidate_pairs(n_samples: int) -> CandidatePairs:
-    """Grid of lightly damped pairs, from six periods in the record to nine tenths of the Nyquist frequency.
+def candidate_pairs(n_samples: int, above: float = 0.0) -> CandidatePairs:
+    """Grid of lightly damped pairs, from six periods in the record, or `above` [rad/sample], to nine
+    tenths of the Nyquist frequency.
 
     Free oscillations of a candidate fall to e^-2 within the record: a sharper peak could stand between the
     frequencies that the record resolves, as high as one likes, and no data would contradict it.
     """
     low, high, rate = 2 * np.pi * _FEWEST_PERIODS / n_samples, _HIGHEST, _DECAY / n_samples
+    low = min(max(low, above), high)
     poles, prior = [], []
     for lower, zeta in zip((0.0, *_ZETA[:-1]), _ZETA, strict=True):
         group = []

@@ -21,9 +21,7 @@ from workflow.tasks.first_look import (
     TOLD,
     FirstLook,
     first_look,
-    from_reference,
     notches,
-    told_response,
     unseen_limit,
 )
 from workflow.tasks.loop_sensitivity import rms_of
@@ -40,8 +38,6 @@ _BEYOND_UNSTABLE = 2.5
 _FITTED, _FEWEST = 0.7, 1000
 # Where the recorded loop's bandwidth is looked for: lowest frequency, of the sampling rate, and how many.
 _SLOWEST, _LINES = 1e-5, 2000
-# Gain of the controller, beside that of the recorded loop.
-_MORE = 3.0
 # Both ends of the command stand at one limit within this.
 _SAME_LIMIT = 1e-3
 # A limit that the motion shows is known to this share.
@@ -97,8 +93,8 @@ def draft_of(records: Sequence[Record], *, position: bool, limit: float | None =
         look = first_look([record.limited(unseen) for record in fitted], position=position)
     reached = limit or at_limit or unseen or highest
     spread = _moved(fitted, look)
-    # A step of half the spread may ask for the largest command, and the loop for more than the recorded one.
-    effort = max(reached / (0.5 * spread) if spread > 0 else 1.0, _MORE * recorded_effort(look.records))
+    # A step of half the spread may ask for the largest command.
+    effort = reached / (0.5 * spread) if spread > 0 else 1.0
     unstable = _unstable_per_s(look)
     return Draft(
         look,
@@ -161,17 +157,6 @@ def _of_recorded_loop(records: Sequence[Record], model: GobfModel) -> tuple[floa
     k = np.divide(*(np.polyval(part, np.exp(1j * omega * dt_s)) for part in law))
     size = 1 / np.abs(1 + k * model.frequency_response(omega))
     return float(np.max(np.abs(k) * size)), float(omega[np.argmax(size > np.sqrt(0.5))])
-
-
-def recorded_effort(records: Sequence[Record]) -> float:
-    """Largest |K S| of the recorded loop, from the reference to the command where that is told; without a
-    reference, rms of the command over that of the output."""
-    if all(record.reference is not None for record in records):
-        response = told_response(from_reference(records, "input"))
-        if response is not None:
-            return float(np.quantile(np.abs(response.centre), 0.95))
-    spread = rms_of([record.output[:, 0] for record in records])
-    return rms_of([record.input[:, 0] for record in records]) / spread if spread > 0 else 0.0
 
 
 def _moved(records: Sequence[Record], look: FirstLook) -> float:

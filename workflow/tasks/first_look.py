@@ -11,12 +11,10 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import butter, sosfiltfilt
 
 from ident.basis.model import GobfModel
-from ident.basis.options import IdentOptions
 from ident.data.arrays import RealArray
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.nonparametric import empirical_frf, spectra_of
 from ident.data.record import Record
-from ident.frequency_fit import FrfIdentification, identify_frf
 
 # A response is told where its standard deviation is below this share of it ...
 TOLD = 0.3
@@ -24,21 +22,21 @@ TOLD = 0.3
 _OF_LINES, _FEWEST = 0.2, 3
 # A pole or zero that swings: less damped ones show as a peak or a notch.
 SWINGS = 0.3
-# Of the rigid motion: well below a notch or peak, with two more derivatives for what bends there, as far up
-# as it explains this share of the command's power.
+# Of the rigid motion: half of the frequency that is tried, with two more derivatives for what bends there; it
+# tells what holds the position where it explains this share of the command's power.
 _RIGID, _EXPLAINED = 0.5, 0.97
 # A line with less of the instrument's largest, or of the output's at its highest frequencies, is not excited.
 _EXCITED, _ABOVE_FLOOR = 1e-6, 10.0
 # A term of the motion is there with so many standard deviations, and this share of the rms command below; a
-# spring with a larger one, as slow drift and the sensor's own errors look like a weak one.
-_SURE, _WORTH, _SPRING = 5.0, 0.01, 0.04
+# spring with a larger one: drift, the sensor's own errors and friction at the load look like a weak one.
+_SURE, _WORTH, _SPRING = 5.0, 0.01, 0.1
 # A limit that the command has without showing it: clipped there, so much less of it stays unexplained. Tried
 # first at these quantiles of the command.
 _LESS, _LIMITS = 0.25, (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.93, 0.96, 0.98)
 # Distance from one of the response times the force that the rigid motion takes, in the median: dry friction
 # makes up to this of it where it is as large as that force.
 _AGREES = 0.8
-_MOST_LINES = 300  # of the fit: more take longer and tell the same structure
+_ENDS = 10  # frequencies up to which the rigid motion is tried
 
 
 @dataclass(frozen=True)
@@ -134,7 +132,7 @@ def first_look(records: Sequence[Record], *, position: bool) -> FirstLook:
     if response is None:
         return FirstLook(cut)
     told = float(response.omega_rad_s[0]), float(response.omega_rad_s[-1])
-    motion = _rigid(cut, _fitted(response, int(position)), response, position)
+    motion = _rigid(cut, response, position)
     turned = motion is not None and motion.turned
     if motion is not None and turned:
         cut = tuple(replace(record, input=-record.input) for record in cut)
@@ -228,28 +226,6 @@ def _told_by(records: Sequence[Record]) -> FrequencyUncertainty | None:
     )
 
 
-def _fitted(response: FrequencyUncertainty, integrators: int) -> FrfIdentification | None:
-    options = {
-        "integrators": integrators,
-        "max_real": 2,
-        # Twice as many numbers measured as fitted: fewer lines draw any mode.
-        "max_pairs": min(3, max(0, (response.omega_rad_s.size - 5) // 4)),
-        "evaluations": 100,
-        "starts": 2,
-    }
-    keep = slice(None, None, -(-response.omega_rad_s.size // _MOST_LINES))
-    response = replace(
-        response,
-        omega_rad_s=response.omega_rad_s[keep],
-        centre=response.centre[keep],
-        covariance=response.covariance[keep],
-    )
-    try:
-        return identify_frf(response, IdentOptions.model_validate(options))
-    except ValueError:  # too few frequencies for the order
-        return None
-
-
 def notches(model: GobfModel) -> RealArray:
     """Natural frequencies [rad/s] of lightly damped zeros, ascending."""
     zeros = np.asarray(model.zeros())
@@ -257,23 +233,13 @@ def notches(model: GobfModel) -> RealArray:
     return np.sort(np.abs(s)[np.abs(np.real(s)) < SWINGS * np.abs(s)])
 
 
-def _rigid(
-    records: Sequence[Record],
-    found: FrfIdentification | None,
-    response: FrequencyUncertainty,
-    position: bool,
-) -> RigidMotion | None:
-    """The rigid motion as far up as it explains the command, else below the first notch or peak."""
-    told = response.omega_rad_s[[0, -1]].tolist()
-    swinging = np.zeros(0)
-    if found is not None:
-        slow, zeta = found.model.poles.omega_rad_s(found.model.dt_s), found.model.poles.zeta()
-        swinging = np.sort(np.concatenate([notches(found.model), slow[zeta < SWINGS]]))
-    ends = [told[1], *swinging[(swinging > 2 * told[0]) & (swinging < told[1])][::-1]]
-    tried = [rigid_motion(records, _RIGID * float(end), told[1], position=position) for end in ends]
-    motions = [motion for motion in tried if motion is not None]
-    explaining = [motion for motion in motions if motion.explained > _EXPLAINED]
-    return next((motion for motion in explaining or motions[::-1] if motion.agrees(response)), None)
+def _rigid(records: Sequence[Record], response: FrequencyUncertainty, position: bool) -> RigidMotion | None:
+    """The rigid motion up to where it explains most of the command."""
+    low, high = response.omega_rad_s[[0, -1]].tolist()
+    ends = np.geomspace(high, min(2 * low, high), _ENDS).tolist()
+    tried = (rigid_motion(records, _RIGID * end, high, position=position) for end in ends)
+    found = [motion for motion in tried if motion is not None and motion.agrees(response)]
+    return max(found, key=lambda motion: motion.explained, default=None)
 
 
 def rigid_motion(

@@ -15,14 +15,14 @@ from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 from plant.experiment_plan import ExperimentPlan
 from workflow.engine.errors import InputError
-from workflow.tasks.first_look import FirstLook, first_look, from_reference, told_response
+from workflow.tasks.first_look import first_look, from_reference, told_response
 
 _LEVELS = (1.0, 0.5)
 # Beyond what the logs tell, the loop is taken to answer so many times as much as at the last line they tell.
 _UNTOLD = 2.0
-# Where no band is stated: up to so many times the first mode, from a part of that on, and so many periods of
-# the lowest frequency in all records together.
-_ABOVE_MODE, _DECADES, _PERIODS = 2.0, 100.0, 60.0
+# Where no band is stated: from this part of the highest frequency that is told, and so many periods of the
+# lowest in all records together.
+_DECADES, _PERIODS = 100.0, 60.0
 # Command that dry friction leaves recognisable: rms over its level.
 _ABOVE_FRICTION = 3.0
 
@@ -72,12 +72,15 @@ def plan_reference(
     """Two levels of random-phase multisines that excite command and motion alike, each as far as allowed.
 
     records: SISO, of the loop as it is. largest_command, largest_motion: allowed, from the operating point;
-    those of the records where left out, of the command a share of it. band_Hz: two decades up to twice the
-    first mode where left out; duration_s: what that needs. rms: of the reference, asked for where
-    the records have none. settings: fields of the plan by name. Raises InputError where there is no plan.
+    those of the records where left out, of the command a share of it. band_Hz: where left out two decades
+    up to the highest frequency that the records tell; duration_s: what that needs. rms: of the reference,
+    asked for where the records have none. settings: fields of the plan by name. Raises InputError where there
+    is no plan.
     """
     dt_s, look = records[0].dt_s, first_look(records, position=position)
-    band_Hz = band_Hz or _band_Hz(look, dt_s)
+    if band_Hz is None:
+        highest = look.told_rad_s[1] / (2 * np.pi) if look.told_rad_s else 0.05 / dt_s
+        band_Hz = float(f"{highest / _DECADES:.2g}"), float(f"{min(highest, 0.4 / dt_s):.2g}")
     duration_s = duration_s or _PERIODS / band_Hz[0]
     try:
         plan = ExperimentPlan.within(
@@ -153,12 +156,6 @@ def plan_reference(
         friction,
         float(np.mean((omega >= told[0]) & (omega <= told[-1]))),
     )
-
-
-def _band_Hz(look: FirstLook, dt_s: float) -> tuple[float, float]:
-    highest = look.told_rad_s[1] if look.told_rad_s else 0.1 * np.pi / dt_s
-    high = min((_ABOVE_MODE * look.mode[0] if look.mode else highest) / (2 * np.pi), 0.4 / dt_s)
-    return float(f"{high / _DECADES:.2g}"), float(f"{high:.2g}")
 
 
 def _signal(plan: ExperimentPlan, lines: IntArray, amplitudes: ComplexArray) -> RealArray:
