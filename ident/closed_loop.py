@@ -38,10 +38,8 @@ _EXPLAINED_PERCENT = 50.0
 # The same for balls: with 89 % they held a response at .90 of the frequencies, not .95, with 70 % at .40.
 _ENOUGH_FOR_BALLS = 90.0
 # The controller of a log: states that are sought; what it leaves of the command's rms, beyond which it is
-# none; of the least that any order leaves, as more states average the log's rounding; what an integrator may
-# cost.
-_CONTROLLER_STATES, _LEFT, _OF_LEAST, _INTEGRATES = 4, 0.01, 3.0, 1.05
-_ROWS = 10  # at least, for each number that is found
+# none; of the least that any order leaves, as more states average the log's rounding.
+_CONTROLLER_STATES, _LEFT, _OF_LEAST = 4, 0.01, 3.0
 _FIRST_STAGE = EmbeddingOptions(coloured_noise=True, prior_missed_mode=0.0, fir_length=1)
 
 
@@ -185,26 +183,26 @@ def controller_of(records: Sequence[Record]) -> tuple[RealArray, RealArray] | No
     found: list[tuple[float, RealArray, RealArray]] = []
     for order in range(1, _CONTROLLER_STATES + 1):
         tried = []
-        for integrator in (0, 1):
-            own, rows = order - integrator, []
+        for own in (order, order - 1):
+            rows = []
             for record in records:
                 error, free = (
                     (np.asarray(record.reference) - record.output)[:, 0],
                     np.abs(record.input[:, 0]) < limit,
                 )
-                command = np.diff(record.input[:, 0], n=integrator, prepend=np.zeros(integrator))
+                command = np.diff(record.input[:, 0], n=order - own, prepend=np.zeros(order - own))
                 past = [sliding_window_view(signal, order + 1) for signal in (command, error)]
                 row = np.hstack([past[0][:, order - own :], past[1]])
                 rows.append(row[sliding_window_view(free, order + 1).all(axis=1)])
             matrix = np.concatenate(rows)
-            if len(matrix) < _ROWS * matrix.shape[1]:
+            if len(matrix) < _CONTROLLER_STATES * matrix.shape[1]:
                 return None
             target, matrix = matrix[:, own], np.delete(matrix, own, axis=1)
             scale = np.maximum(np.linalg.norm(matrix, axis=0), np.finfo(np.float64).tiny)
             solved = np.linalg.lstsq(matrix / scale, target, rcond=None)[0] / scale
-            left = float(np.std(target - matrix @ solved)) * (1 if integrator else _INTEGRATES)
-            poles = np.append(1.0, -solved[:own][::-1])
-            tried.append((left, solved[own:][::-1], np.convolve(poles, [1.0, -1.0]) if integrator else poles))
+            left = float(np.std(target - matrix @ solved)) * (1 + own * np.log(target.size) / target.size)
+            poles = np.convolve(np.append(1.0, -solved[:own][::-1]), [1.0, -1.0][: 1 + order - own])
+            tried.append((left, solved[own:][::-1], poles))
         found.append(min(tried, key=lambda one: one[0]))
     least = min(left for left, _, _ in found)
     if not least < _LEFT * float(np.std(np.concatenate([record.input for record in records]))):

@@ -66,7 +66,11 @@ def fit_friction(
     otherwise an observer follows such records too. Raises ValueError where the shaft does not move, there is
     more than one integrator or a direct term, or `identify` refuses the records.
     """
-    options = _swinging(options or IdentOptions())
+    options = options or IdentOptions()
+    if (options.zeta_min or 0.0) < LARGEST_DAMPING:
+        # Pairs that can be modes: one that does not swing follows what a wrong level leaves.
+        most = min(options.zeta_max or LARGEST_DAMPING, LARGEST_DAMPING)
+        options = options.model_copy(update={"zeta_max": most})
     if recorded_in_loop(records):
         return fit_friction_in_loop(records, options, progress=progress)
     for record in records:
@@ -116,14 +120,6 @@ def _running_free(
         model = untested_model([found.taken_off(record) for record in records], options)
     assert best is not None
     return descended(best, records, presliding, least, held=False)
-
-
-def _swinging(options: IdentOptions) -> IdentOptions:
-    """Pairs that can be modes: one that does not swing follows what a wrong level leaves, which then fits
-    it."""
-    if (options.zeta_min or 0.0) >= LARGEST_DAMPING:
-        return options
-    return options.model_copy(update={"zeta_max": min(options.zeta_max or LARGEST_DAMPING, LARGEST_DAMPING)})
 
 
 def moved_to(found: FrictionFit, records: Sequence[Record], model: GobfModel) -> FrictionFit:

@@ -154,9 +154,17 @@ class Slider:
         self.y += self.gain * DT_S * (u - np.clip(u, -self.level, self.level))
 
 
-def lead(gain=12.0, integral=0.0, **fields) -> Controller:
-    """`controller`, with integral action beside it."""
-    return Controller([[0.8, 0], [0, 1]], [[1.0], [1.0]], [[-1.4, integral]], [[gain]], DT_S, **fields)
+def lead(gain=12.0, integral=0.0, idle=0, **fields) -> Controller:
+    """`controller`, with integral action beside it, and idle states."""
+    rest = [0.0] * idle
+    return Controller(
+        np.diag([0.8, 1.0, *rest]),
+        [[1.0], [1.0], *([0.0] for _ in rest)],
+        [[-1.4, integral, *rest]],
+        [[gain]],
+        DT_S,
+        **fields,
+    )
 
 
 def stage_of(found, records=(), step=0.02):
@@ -193,41 +201,31 @@ def test_the_recorded_loop_stands_beside_the_new_one():
     step = np.append(0.0, np.full(400, 0.02))
     slower = FrictionLoop.of(lead(gain=9.0, integral=0.002), found)
     seen = beside_recorded(stage_of(found, [record]), slower, step)
-    assert seen.errors[1] == pytest.approx(seen.errors[0], rel=3e-3)  # without the noise
-    assert seen.errors[2] > 1.2 * seen.errors[0]
-    assert seen.step.settling_time_s == pytest.approx(
+    assert seen["errors"][1] == pytest.approx(seen["errors"][0], rel=3e-3)  # without the noise
+    assert seen["errors"][2] > 1.2 * seen["errors"][0]
+    assert seen["recorded"].settling_time_s == pytest.approx(
         step_metrics(made.answer(step)).settling_time_s, rel=0.02
     )
     unknown = replace(record, reference=None, reference_names=())
-    assert beside_recorded(stage_of(found, [unknown]), slower, step) is None
+    assert beside_recorded(stage_of(found, [unknown]), slower, step) == {}
 
 
 @pytest.mark.parametrize(("first", "chosen"), [(0.001, 3), (0.05, 5)])
 def test_fewer_states_are_taken_where_friction_lets_them_settle_sooner(monkeypatch, first, chosen):
     """Little integral action waits until friction lets go; no design is tried where it does not."""
     monkeypatch.setattr("workflow.tasks.friction_loop.closed_loop_poles", lambda *_: np.array([0.98]))
-    found, tried = fit(), list[int]()
-
-    def design(order: int, integral: float):
-        asked = stage.config.specification.model_copy(update={"controller_order": order})
-        law = lead(gain=9.0, integral=integral)
-        padded = Controller(
-            np.diag([0.8, 1.0, *[0.1] * (order - 2)]),
-            np.append([[1.0], [1.0]], np.zeros((order - 2, 1)), axis=0),
-            np.append(law.C, np.zeros((1, order - 2)), axis=1),
-            law.D,
-            DT_S,
-        )
-        return SimpleNamespace(met=True, controller=padded, specification=asked)
+    stage, tried = stage_of(fit()), list[int]()
 
     def again(asked):
         tried.append(asked.controller_order)
-        return design(asked.controller_order, {4: 0.002, 3: 0.05}[asked.controller_order])
+        law = lead(
+            9.0, {5: first, 4: 0.002, 3: 0.05}[asked.controller_order], idle=asked.controller_order - 2
+        )
+        return SimpleNamespace(met=True, controller=law, specification=asked)
 
-    stage = stage_of(found)
-    best = soonest(stage, design(5, first), again)
+    best = soonest(stage, again(stage.config.specification.model_copy(update={"controller_order": 5})), again)
     assert best.controller.order == chosen
-    assert tried == ([4, 3] if chosen == 3 else [])
+    assert tried == ([5, 4, 3] if chosen == 3 else [5])
 
 
 def test_feedforward_is_the_friction_of_a_pure_integrator():

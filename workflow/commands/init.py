@@ -103,7 +103,8 @@ def decided(
     were identified by; its text, the files of the stages up to that model, and what was seen. Raises
     InputError."""
     config, text, found = drafted(command, logs, file, stated)
-    from workflow.tasks.draft import informed, tells
+    from workflow.tasks.draft import informed
+    from workflow.tasks.first_look import TOLD
     from workflow.tasks.pipeline import identify_only
     from workflow.tasks.results import RunResults
 
@@ -119,7 +120,8 @@ def decided(
             config, text = written(found, file)
             with suppress(InputError):
                 identify_only(config, run.path, config_text=text, progress=progress)
-            if run.stage_file("uncertainty") is None or not tells(RunResults(run).uncertainty.channels):
+            spread = run.stage_file("uncertainty") and RunResults(run).uncertainty.channels
+            if not spread or min(band.median_radius_percent for band in spread[0].bands) > 100 * TOLD:
                 raise
         results, at = RunResults(run), config.control_index
         draft = informed(found.draft, results.identify.channels[at], results.uncertainty.channels[at])

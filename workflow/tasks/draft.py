@@ -10,7 +10,6 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from diagnosis.machine.quantisation_grid import grid_step
-from ident.basis.model import GobfModel
 from ident.checks.input_checks import refuse_few_lines
 from ident.closed_loop import controller_of
 from ident.data.arrays import clipped_share
@@ -36,8 +35,6 @@ _BEYOND_UNSTABLE = 2.5
 # Of one log the last part validates, where that leaves so many samples and the parts are driven alike within
 # a factor of two.
 _FITTED, _FEWEST = 0.7, 1000
-# Where the recorded loop's bandwidth is looked for: lowest frequency, of the sampling rate, and how many.
-_SLOWEST, _LINES = 1e-5, 2000
 # Both ends of the command stand at one limit within this.
 _SAME_LIMIT = 1e-3
 # A limit that the motion shows is known to this share.
@@ -115,7 +112,12 @@ def informed(draft: Draft, found: IdentifiedChannel, spread: UncertainChannel) -
     """The same with the specification that follows from the model that came out of the logs: its first mode
     that swings and whose damping is told, its first notch, the band that its ellipses tell."""
     look, model, omega = draft.look, found.model, spread.frequency.omega_rad_s
-    effort, recorded = _of_recorded_loop(look.records, model)
+    law, effort, recorded = controller_of(look.records), 0.0, 0.0
+    if law is not None:  # largest |K S| of the recorded loop on the model, and where its |S| rises to -3 dB
+        k = np.divide(*(np.polyval(part, np.exp(1j * omega * model.dt_s)) for part in law))
+        sensitivity = 1 / np.abs(1 + k * model.frequency_response(omega))
+        effort = float(np.max(np.abs(k) * sensitivity))
+        recorded = float(omega[np.argmax(sensitivity > np.sqrt(0.5))])
     size = np.abs(spread.frequency.centre)
     known = omega[np.trace(spread.frequency.covariance, axis1=1, axis2=2) < (TOLD * size) ** 2]
     if look.told_rad_s is None or not known.size:
@@ -140,23 +142,6 @@ def informed(draft: Draft, found: IdentifiedChannel, spread: UncertainChannel) -
         unstable_per_s=unstable,
         recorded_rad_s=recorded,
     )
-
-
-def tells(channels: Sequence[UncertainChannel]) -> bool:
-    """Whether each one's response is told somewhere: over one of its bands."""
-    return all(min(band.median_radius_percent for band in one.bands) < 100 * TOLD for one in channels)
-
-
-def _of_recorded_loop(records: Sequence[Record], model: GobfModel) -> tuple[float, float]:
-    """Largest |K S| of the controller that made the records, on the model, and where its |S| first rises to
-    -3 dB; 0 where they do not tell it."""
-    law, dt_s = controller_of(records), records[0].dt_s
-    if law is None:
-        return 0.0, 0.0
-    omega = np.geomspace(_SLOWEST / dt_s, 0.99 * np.pi / dt_s, _LINES)
-    k = np.divide(*(np.polyval(part, np.exp(1j * omega * dt_s)) for part in law))
-    size = 1 / np.abs(1 + k * model.frequency_response(omega))
-    return float(np.max(np.abs(k) * size)), float(omega[np.argmax(size > np.sqrt(0.5))])
 
 
 def _moved(records: Sequence[Record], look: FirstLook) -> float:

@@ -24,7 +24,7 @@ _OF_LINES, _FEWEST = 0.2, 3
 SWINGS = 0.3
 # Of the rigid motion: half of the frequency that is tried, with two more derivatives for what bends there; it
 # tells what holds the position where it explains this share of the command's power.
-_RIGID, _EXPLAINED = 0.5, 0.97
+_EXPLAINED = 0.97
 # A line with less of the instrument's largest, or of the output's at its highest frequencies, is not excited.
 _EXCITED, _ABOVE_FLOOR = 1e-6, 10.0
 # A term of the motion is there with so many standard deviations, and this share of the rms command below; a
@@ -164,16 +164,6 @@ def unseen_limit(look: FirstLook, *, position: bool) -> float | None:
     return float(minimize_scalar(left, bounds=around, method="bounded", options={"maxiter": 12}).x)
 
 
-def _speed(record: Record, low: RealArray, position: bool) -> RealArray:
-    smooth = sosfiltfilt(low, record.output[:, 0] - record.output[:, 0].mean())
-    return np.gradient(smooth, record.dt_s) if position else smooth
-
-
-def _sign(speed: RealArray) -> RealArray:
-    """Its sign, a fiftieth of the usual speed counting as part of the turn."""
-    return np.tanh(speed / max(0.02 * float(np.std(speed)), 1e-300))
-
-
 def from_reference(records: Sequence[Record], of: Literal["input", "output"]) -> list[Record]:
     """Records of the loop: its reference as the input, and the command or the motion as the output."""
     return [
@@ -237,7 +227,7 @@ def _rigid(records: Sequence[Record], response: FrequencyUncertainty, position: 
     """The rigid motion up to where it explains most of the command."""
     low, high = response.omega_rad_s[[0, -1]].tolist()
     ends = np.geomspace(high, min(2 * low, high), _ENDS).tolist()
-    tried = (rigid_motion(records, _RIGID * end, high, position=position) for end in ends)
+    tried = (rigid_motion(records, end / 2, high, position=position) for end in ends)
     found = [motion for motion in tried if motion is not None and motion.agrees(response)]
     return max(found, key=lambda motion: motion.explained, default=None)
 
@@ -269,7 +259,9 @@ def rigid_motion(
             return signal
 
         more, smooth = int(position), sosfiltfilt(low, y)
-        sign = sosfiltfilt(low, _sign(_speed(record, high, position)))
+        speed = derivative(sosfiltfilt(high, y), more)
+        # A fiftieth of the usual speed counts as part of the turn.
+        sign = sosfiltfilt(low, np.tanh(speed / max(0.02 * float(np.std(speed)), 1e-300)))
         of_record = np.zeros((record.n_samples, len(records)))
         of_record[:, k] = 1.0
         columns = [derivative(smooth, times + more) for times in (1, 0, 2, 3)]

@@ -41,7 +41,6 @@ from workflow.tasks.results import (
     FrictionCheck,
     Interval,
     Real,
-    RecordedLoop,
     SensitivityCheck,
     SlowSine,
 )
@@ -282,8 +281,20 @@ def check_friction(
         tracking=slow_sine(
             stage, controller, _SINE_SHARE * float(reference[-1]), on_arm=sensitivity is not None
         ),
-        recorded=beside_recorded(stage, fitted, reference),
+        **beside_recorded(stage, fitted, reference),
     )
+
+
+def beside_recorded(stage: StageInput, loop: FrictionLoop, step: Real) -> dict[str, Any]:
+    """The loop that made the logs on the same step (T,), and both on the reference of the first log: fields
+    of `FrictionCheck`."""
+    own, first = recorded_loop(stage, loop), stage.results.records.fitted(stage.config.control_channel)[0]
+    if own is None or first.reference is None:
+        return {}
+    reference = first.reference[:, 0] - first.reference[0, 0]
+    runs = (float(np.std(reference - one.run(reference).measured)) for one in (own, loop))
+    errors = float(np.std(first.reference - first.output)), *runs
+    return {"recorded": step_metrics(own.answer(step)), "errors": errors}
 
 
 def recorded_loop(stage: StageInput, loop: FrictionLoop) -> FrictionLoop | None:
@@ -292,19 +303,8 @@ def recorded_loop(stage: StageInput, loop: FrictionLoop) -> FrictionLoop | None:
     law = controller_of(records)
     if law is None:
         return None
-    matrices = scipy.signal.tf2ss(*law)
-    return replace(loop, controller=Controller(*matrices, records[0].dt_s, computational_delay_samples=0))
-
-
-def beside_recorded(stage: StageInput, loop: FrictionLoop, step: Real) -> RecordedLoop | None:
-    """The loop that made the logs on the same step (T,), and both on the reference of the first log."""
-    own, first = recorded_loop(stage, loop), stage.results.records.fitted(stage.config.control_channel)[0]
-    if own is None or first.reference is None:
-        return None
-    run, reference = own.answer(step), first.reference[:, 0] - first.reference[0, 0]
-    recorded = float(np.std(first.reference - first.output))
-    simulated, new = (float(np.std(reference - one.run(reference).measured)) for one in (own, loop))
-    return RecordedLoop(step_metrics(run), run.measured[: step.size], (recorded, simulated, new))
+    own = Controller(*scipy.signal.tf2ss(*law), records[0].dt_s, computational_delay_samples=0)
+    return replace(loop, controller=own)
 
 
 def soonest(

@@ -509,32 +509,20 @@ class FrictionCheck:
     left: float
     output: Real
     tracking: SlowSine
-    recorded: RecordedLoop | None = field(default=None, metadata={"since": 9})
+    recorded: StepMetrics | None = field(default=None, metadata={"since": 9})
+    errors: tuple[float, ...] = field(default=(), metadata={"since": 9})
 
     @property
     def times_slower(self) -> float:
         """Settling of the step beside the recorded loop's, infinite where only that one settles."""
-        if self.recorded is None or self.recorded.step.settling_time_s is None:
-            return 0.0
-        own, before = self.step.settling_time_s, self.recorded.step.settling_time_s
-        return np.inf if own is None else own / before
+        before = None if self.recorded is None else self.recorded.settling_time_s
+        return 0.0 if before is None else (self.step.settling_time_s or np.inf) / before
 
     @property
     def inside(self) -> int:
         """How many of the measured peaks lie inside their intervals."""
         assert self.measured is not None
         return int(np.sum((self.low <= self.measured) & (self.measured <= self.high)))
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedLoop:
-    """The loop that made the logs: the reference step with its controller, as found in them, on the same
-    arm with the same friction as the new one's, watched as long; output (T,): as long as the trial's step;
-    errors: rms on the reference of a log, as recorded, simulated with that controller, and with the new."""
-
-    step: StepMetrics
-    output: Real
-    errors: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -596,9 +584,8 @@ class LoopCheck:
     def waits_for_friction(self) -> bool:
         """Whether friction lets the step settle `STALLS` times as late as without it."""
         free, found = self.predicted.settling_time_s, self.friction
-        if free is None or found is None:
-            return False
-        return found.step.settling_time_s is None or found.step.settling_time_s > STALLS * free
+        slow = np.inf if found is None else found.step.settling_time_s or np.inf
+        return free is not None and found is not None and slow > STALLS * free
 
     @property
     def draws(self) -> int:
