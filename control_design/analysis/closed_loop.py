@@ -378,8 +378,7 @@ def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = 0.0
     size = float(r[-1] - r[0]) if changed.size else float(r[-1])
     if size == 0.0 or not np.all(r[at:] == r[-1]):
         raise ValueError("step_metrics needs a reference that steps once to a new level")
-    base = float(r[0]) if changed.size else 0.0
-    progress = (y[at:] - base) / size
+    progress = (y[at:] - (float(r[0]) if changed.size else 0.0)) / size
     time = t[at:] - t[at]
     ten, ninety = _first_crossing(time, progress, 0.1), _first_crossing(time, progress, 0.9)
     outside = np.flatnonzero(np.abs(progress - 1.0) > settling_band)

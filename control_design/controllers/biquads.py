@@ -151,8 +151,7 @@ def _tustin_section(numerator: Real, denominator: Real, h: float) -> tuple[Real,
     v = h * w0
     scale = 1.0 / (1.0 + h * d + v * v)  # 1/det(I - h F)
     inverse_2 = np.array([[(1.0 + h * d) * scale, v * scale], [-v * scale, scale]])
-    row = np.array([[tail[1] / w0, tail[0]]])
-    through = row @ inverse_2
+    through = np.array([[tail[1] / w0, tail[0]]]) @ inverse_2
     # (I - hF)^-1 (I + hF) = 2 (I - hF)^-1 - I
     a = 2.0 * inverse_2
     a[0, 0] -= 1.0

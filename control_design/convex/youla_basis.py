@@ -39,8 +39,7 @@ def chosen_poles(plant: UncertainPlant, scale_rad_s: float, options: YoulaOption
     resonances = [each for each in resonances if each.omega_rad_s < plant.nyquist_rad_s]
     count = max(2, min(pairs, 3 * pairs // max(len(resonances), 1)))
     for each in resonances:
-        least = np.clip(1.3 * abs(each.zeta), 0.005, 0.3)
-        zeta = np.geomspace(least, 0.7, count)
+        zeta = np.geomspace(np.clip(1.3 * abs(each.zeta), 0.005, 0.3), 0.7, count)
         found.append(np.exp(dt * each.omega_rad_s * (-zeta + 1j * np.sqrt(1 - zeta**2))))
     return Poles(np.append(real, mirrored), np.concatenate(found) if found else np.zeros(0, complex))
 

@@ -149,8 +149,7 @@ def plant_grid(plant: UncertainPlant, wanted: Real) -> Real:
 def local_maxima(value: Real) -> Integer:
     """Positions of local maxima of (F,), ends included, largest value first."""
     padded = np.concatenate([[-np.inf], value, [-np.inf]])
-    peak = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:])
-    index = np.flatnonzero(peak)
+    index = np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:]))
     return np.asarray(index[np.argsort(-value[index], kind="stable")], dtype=np.int64)
 
 

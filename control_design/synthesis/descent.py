@@ -222,8 +222,7 @@ class _Boundary:
             if function.of_plant:
                 worst = next(members)[0]
                 away = 1.0 + worst * k[at]
-                gain = np.abs(worst) / np.maximum(np.abs(away), 1e-300)
-                log = np.log(weight * gain) + of_k
+                log = np.log(weight * (np.abs(worst) / np.maximum(np.abs(away), 1e-300))) + of_k
                 slope = -(worst * k[at] / away)[:, None] * relative[at]
             else:
                 log, slope = np.log(weight) + of_k + distance[at], turned[at]

@@ -135,8 +135,7 @@ class StartMaker:
             if not (usable[index] and peak[index] > 1.0):
                 continue
             excess = max(peak[index] * self.rng.uniform(1.0, 2.0) - 1.0, 0.2)
-            turned = np.exp(1j * self.rng.normal(0.0, 0.4))
-            k = np.array([excess * turned / plant[index]])
+            k = np.array([excess * np.exp(1j * self.rng.normal(0.0, 0.4)) / plant[index]])
             omega.append(grid[index : index + 1])
             wanted.append(k)
             weight.append(10.0 / np.abs(k))
@@ -215,8 +214,7 @@ class StartMaker:
         for x in drawn:
             # Steps in proportion to the parameters, of which some are logarithms near zero.
             size = np.where(np.abs(x) > 1e-3, 0.2 * np.abs(x), 0.1)
-            simplex = np.vstack([x, x + np.diag(size)])
-            end = _simplex(cost, simplex, 200 * x.size)
+            end = _simplex(cost, np.vstack([x, x + np.diag(size)]), 200 * x.size)
             if np.isfinite(self.score(end)):  # on towards what is asked, over valleys the descent stays in
                 end = _simplex(worst, np.vstack([end, end + np.diag(size)]), 60 * x.size)
             found.append((end, self.score(end)))
@@ -319,8 +317,7 @@ class StartMaker:
         omega = data.ellipses.omega_rad_s
         loop = self.cascade.response(parameters, omega) * data.ellipses.centre
         size = float(np.abs(loop[int(np.argmin(np.abs(omega - crossover_rad_s)))]))
-        sign = 1.0 if (loop[0] * 1j**self.integrators).real >= 0 else -1.0
-        return sign / max(size, 1e-12)
+        return (1.0 if (loop[0] * 1j**self.integrators).real >= 0 else -1.0) / max(size, 1e-12)
 
 
 def _simplex(cost: Callable[[Real], float], start: Real, evaluations: int) -> Real:

@@ -85,8 +85,7 @@ def closed_by(search: Search, explanation: Explanation, nominal: Explanation) ->
 def _tells(key: tuple[str, ...], closed: Mapping[tuple[str, ...], float]) -> bool:
     """Whether a set closes more than any part of it does."""
     parts = [closed[rest] for rest in combinations(key, len(key) - 1) if rest in closed]
-    more = _CLOSES if len(key) < 3 else 2 * _CLOSES
-    return closed[key] > max([0.0, *parts]) + more
+    return closed[key] > max([0.0, *parts]) + (_CLOSES if len(key) < 3 else 2 * _CLOSES)
 
 
 def _over_horizon(search: Search, accepted: Explanation, nominal: Explanation) -> dict[str, Any]:

@@ -189,8 +189,7 @@ def _fixed(changed: Callable[[Real], Real], beyond: Real, response: Real, start:
     """x (T,) = changed(beyond + response * x), and that command; Anderson's mixing of the last steps."""
     points, steps, x = list[Real](), list[Real](), start
     for _ in range(_STEPS):
-        command = beyond + scipy.signal.fftconvolve(response, x)[: x.size]
-        step = changed(command) - x
+        step = changed(beyond + scipy.signal.fftconvolve(response, x)[: x.size]) - x
         if not _norm(step) > _STANDS * _norm(x):
             break
         points, steps = [*points, x][-_MIXED:], [*steps, step][-_MIXED:]

@@ -180,8 +180,7 @@ def _doublet(voltage: float, T: int, dt: float, pulse: int) -> Excitation:
 
 
 def _triangle(voltage: float, T: int, dt: float, cycles: int) -> Excitation:
-    phase = np.arange(T) * cycles / T
-    signal = voltage * 2 / np.pi * np.arcsin(np.sin(2 * np.pi * phase))
+    signal = voltage * 2 / np.pi * np.arcsin(np.sin(2 * np.pi * (np.arange(T) * cycles / T)))
     return Excitation("triangle", {"period_s": round(T * dt / cycles, 6)}, signal)
 
 

@@ -102,8 +102,7 @@ def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> P
 def _without_trend(e: Real) -> Real:
     """Residuals without their straight line: a drift is a ramp in every period, yet no answer."""
     time = np.linspace(-1.0, 1.0, e.shape[0])[:, None]
-    slope = np.sum(time * e, axis=0) / np.sum(time**2)
-    return np.asarray(e - e.mean(axis=0) - time * slope)
+    return np.asarray(e - e.mean(axis=0) - time * (np.sum(time * e, axis=0) / np.sum(time**2)))
 
 
 def _lines(signal: Real, period: int, count: int, lines: npt.NDArray[np.int64]) -> ComplexArray:

@@ -167,8 +167,7 @@ def _quantiles(name: str, unit: str, values: Mapping[str, Real], bins: int) -> R
 
 
 def _stretches(time: Mapping[str, Real], bins: int) -> RegimeAxis:
-    longest = max(float(t[-1]) for t in time.values())
-    edges = np.linspace(0.0, longest * (1 + 1e-9), bins + 1)
+    edges = np.linspace(0.0, max(float(t[-1]) for t in time.values()) * (1 + 1e-9), bins + 1)
     labels = {name: np.searchsorted(edges[1:-1], t, side="right") for name, t in time.items()}
     pairs = tuple((float(a), float(b)) for a, b in pairwise(edges))
     titles = tuple(f"{a:.2g} to {b:.2g} s after the start" for a, b in pairs)
@@ -199,8 +198,7 @@ def _shifted_energy(
     All circular shifts of one experiment are one correlation by FFT; experiments shift independently.
     """
     K = len(axis.titles)
-    outputs = next(iter(residuals.values())).shape[1]
-    sums = np.zeros((_SHIFTS + 1, outputs, K))
+    sums = np.zeros((_SHIFTS + 1, next(iter(residuals.values())).shape[1], K))
     counts = np.zeros(K, dtype=np.int64)
     for name, labels in axis.labels.items():
         T = labels.size

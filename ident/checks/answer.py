@@ -46,8 +46,7 @@ def zero_is_inside(posterior: ResponsePosterior, omega_rad_s: RealArray, *, doub
     ellipses = posterior.at(omega_rad_s)
     squared = ellipses.normalised_distance(np.zeros(ellipses.centre.size)) ** 2 * chi2.ppf(ellipses.level, 2)
     n_rows = 2 if posterior.report is None else max(posterior.report.n_rows, 2)
-    places = n_rows / 2 if doubted else 1.0
-    return bool(np.all(squared <= chi2.isf((1 - _LEVEL) / places, 2)))
+    return bool(np.all(squared <= chi2.isf((1 - _LEVEL) / (n_rows / 2 if doubted else 1.0), 2)))
 
 
 def refuse_unanswered(

@@ -40,8 +40,7 @@ def distortion_findings(
     told += [item for each in repeated for item in _of_repeats(each)]
     if rest:
         omega, coherent = (np.concatenate(part) for part in zip(*(coherence([r]) for r in rest), strict=True))
-        share = np.sqrt(1 / np.clip(coherent, 1e-12, 1.0) - 1)
-        seen = omega[share < _HIDDEN] / (2 * np.pi)
+        seen = omega[np.sqrt(1 / np.clip(coherent, 1e-12, 1.0) - 1) < _HIDDEN] / (2 * np.pi)
         values = {"from_Hz": seen.min(), "to_Hz": seen.max()} if seen.size else {"from_Hz": 0.0, "to_Hz": 0.0}
         told.append(finding(FindingKind.NOT_PERIODIC, n_records=len(rest), percent=100 * _HIDDEN, **values))
     if found:

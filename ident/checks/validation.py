@@ -212,8 +212,7 @@ def _relative_spread(
         spread = posterior.frequency_rows(estimate.omega_rad_s[inside]) @ posterior.covariance_factor
         return real_rows(spread / size[inside, np.newaxis])
     values, vectors = np.linalg.eigh(estimate.covariance[inside] / size[inside, None, None] ** 2)
-    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    return np.asarray(block_diag(*roots))
+    return np.asarray(block_diag(*(vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :])))
 
 
 def _variance(estimate: FrequencyUncertainty) -> RealArray:

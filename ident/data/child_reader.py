@@ -296,8 +296,7 @@ def _cell(value: Any) -> str:
         return repr(value)
     if hasattr(value, "total_seconds"):
         return repr(value.total_seconds())
-    text = value.isoformat() if hasattr(value, "isoformat") else str(value)
-    return " ".join(text.split())
+    return " ".join((value.isoformat() if hasattr(value, "isoformat") else str(value)).split())
 
 
 def mat_variables(content: bytes) -> bytes:

@@ -158,8 +158,7 @@ class Distortion:
     def bands_rad_s(self) -> tuple[tuple[float, float], ...]:
         """Half decades from the lowest line up to the highest."""
         low, high = self.omega_rad_s[0] * (1 - 1e-9), self.omega_rad_s[-1] * (1 + 1e-9)
-        count = max(round(2 * np.log10(high / low)), 1)
-        edges = np.geomspace(low, high, count + 1)
+        edges = np.geomspace(low, high, max(round(2 * np.log10(high / low)), 1) + 1)
         return tuple(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
 

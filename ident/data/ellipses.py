@@ -63,8 +63,7 @@ def standard_axes(covariance: RealArray) -> tuple[RealArray, RealArray, ComplexA
     angle = 0.5 * np.arctan2(2 * k, r - i)
     scale = np.sqrt(unit)
     s1 = scale * np.sqrt(major)
-    s2 = np.minimum(scale * np.sqrt(np.maximum(minor, 0.0)), s1)
-    return s1, s2, np.exp(1j * angle)
+    return s1, np.minimum(scale * np.sqrt(np.maximum(minor, 0.0)), s1), np.exp(1j * angle)
 
 
 def spread_covariance(rows: ComplexArray, triangle: RealArray) -> RealArray:

@@ -169,8 +169,7 @@ def prepare_response(
             f"at omega = {at:.6g} rad/s the response is given as exactly known: a fit needs a covariance at "
             "every frequency, the smallest that is still honest"
         )
-    across = 1 / np.maximum(s2, _THINNEST * s1)
-    weight = np.stack([1 / s1, np.where(real_only, 0.0, across)])
+    weight = np.stack([1 / s1, np.where(real_only, 0.0, 1 / np.maximum(s2, _THINNEST * s1))])
     frame = FrfRegression(
         z=np.exp(1j * omega * response.dt_s),
         common=front_response(omega, response.dt_s, integrators, delay_samples),

@@ -202,8 +202,7 @@ def _simulated(
         """N (M,) from H = N j omega G (z^-d - H), whose rest is the relative error of the BLA; and how far
         each realisation (R, M) would move it."""
         mean = ratios.mean(axis=0)
-        columns = (speed * (delayed - mean))[:, None] * terms
-        inverse = np.linalg.pinv(real_rows(columns))
+        inverse = np.linalg.pinv(real_rows((speed * (delayed - mean))[:, None] * terms))
         n = inverse @ real_rows(mean)
         rest = (ratios - mean) * (1 + speed * (terms @ n))
         return n, np.hstack([rest.real, rest.imag]) @ inverse.T

@@ -238,8 +238,7 @@ def _by_linear_force(
     """(P, S) changes of the response's coefficients by a part of the friction that looks like a linear force,
     which no data tell: k y^(i) changes G by k s^i G^2 (i up to 2; no stiffness in an arm that integrates),
     each a share of the friction, rms over the records. less: the records with the friction taken off."""
-    longest_s = max(record.n_samples for record in records) * response.dt_s
-    omega = _frequencies(response, longest_s)
+    omega = _frequencies(response, max(record.n_samples for record in records) * response.dt_s)
     rows = response.frequency_rows(omega)
     gain = rows @ response.mean
     force = [(one.input - other.input)[:, 0] for one, other in zip(records, less, strict=True)]

@@ -56,8 +56,7 @@ class Spring:
             1 - (at / omega) ** 2 + 2j * damping * at / omega
             for omega, damping in zip((zero, pole), both, strict=True)
         ]
-        inertia = -float(np.real(stiff * bends[0] / bends[1])) / at**2
-        load = inertia * (1 - (zero / pole) ** 2)
+        load = (-float(np.real(stiff * bends[0] / bends[1])) / at**2) * (1 - (zero / pole) ** 2)
         return cls(zero, float(zeta[k]), 1 / (load * zero**2) if load > 0 else 0.0, model.dt_s)
 
     def force(self, position: RealArray, level: float, law: FrictionLaw) -> RealArray:

@@ -358,6 +358,5 @@ def cascade_coordinates(poles: ComplexArray) -> RealArray:
         zip(poles, block_parameters(Poles(np.zeros(0), poles)), strict=True)
     ):
         for column, numerator in ((2 * i, sg * (p - beta)), (2 * i + 1, sg * sb)):
-            rho = numerator / (2j * p.imag)
-            out[:, column] = 2 * np.real(rho * cascade[i] / p)
+            out[:, column] = 2 * np.real((numerator / (2j * p.imag)) * cascade[i] / p)
     return out

@@ -141,26 +141,6 @@ def test_stored_then_asked_again_then_moved(asking, tmp_path):
     assert "make frozen STORE=1" in said
 
 
-def test_an_error_is_told_in_one_line_instead_of_all_that_vanished(asking, monkeypatch):
-    asking({"one": ANSWER}, "--store")
-    raised = {"lines": {"raises": "TypeError: no"}}
-    monkeypatch.setattr(frozen_answers, "QUESTIONS", {"one": Question(dict)})
-    monkeypatch.setattr(frozen_answers, "answers", lambda *_: [("one", (raised, "a.py:3", 1.0))])
-    told = []
-    with pytest.raises(SystemExit):
-        frozen_answers.run(lambda line="": told.append(line))
-    assert [line for line in told if line.startswith("    ")] == ["    raises, in a.py:3: TypeError: no"]
-
-
-def test_it_stops_at_the_first_that_moved(asking):
-    asking({"one": ANSWER, "two": ANSWER}, "--store")
-    other = {"said": {"x": 1}}
-    code, said = asking({"one": other, "two": other}, "--stop")
-    assert code == 1
-    assert "1 of 2 questions" in said
-    assert "not as stored 1: one\n" in said
-
-
 def test_storing_a_part_leaves_the_rest(asking, tmp_path):
     other = {"said": {"x": 1}}
     asking({"one": ANSWER, "two": other}, "--store")

@@ -338,17 +338,6 @@ def test_the_axis_of_emps_becomes_a_controller(refused, flexlink, tmp_path, flex
     assert np.abs(model.frequency_response(s.imag)) == pytest.approx(published, rel=0.05)
 
 
-@pytest.mark.slow
-def test_the_notch_of_the_ruler_robot(flexlink, tmp_path, flexlink_data):
-    """The strip with the hub held rings at 2.52 Hz: there the hub does not answer to its drive."""
-    sweeps = [flexlink_data / "slfr_krauss_2009" / f"swept_sine_amp50_rep{k}.csv" for k in (1, 2, 3)]
-    answer = flexlink("init", *sweeps, "--out", tmp_path / "my.toml", "--json")
-    seen = answer.document()["numbers"]["seen"]
-    # Two modes, at 3.7 and 19 Hz, the first of which the motor damps.
-    assert seen["first_mode"][0] / (2 * np.pi) == pytest.approx(19.0, rel=0.06)
-    assert seen["notch_rad_s"] / (2 * np.pi) == pytest.approx(2.52, rel=0.03)
-
-
 def test_a_reference_planned_for_the_loop_keeps_its_limits_on_the_machine(flexlink, tmp_path, signals):
     """Played on the machine that made the logs: within 15 % of what is expected, as friction bends it."""
     logs = write(tmp_path, signals, ("t_s", "ref_rad", "u_A", "y_rad"))

@@ -240,8 +240,7 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> ReadCha
 def _repeats(record: Record) -> int:
     """Rows after which a logger that is faster than the controller writes new ones; 1 where it is not."""
     columns = [record.input, record.output, *([] if record.reference is None else [record.reference])]
-    changes = np.flatnonzero(np.any(np.diff(np.hstack(columns), axis=0) != 0, axis=1))
-    gaps = np.diff(changes)
+    gaps = np.diff(np.flatnonzero(np.any(np.diff(np.hstack(columns), axis=0) != 0, axis=1)))
     usual = int(np.median(gaps)) if gaps.size else 1
     return usual if usual > 1 and np.mean(gaps % usual == 0) > _NEARLY_ALL else 1
 
@@ -258,8 +257,7 @@ def configuration(found: Found, records: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _toml(value: Any) -> str:
-    plain = value.item() if isinstance(value, np.generic) else value
-    return tomlkit.item(plain).as_string()
+    return tomlkit.item(value.item() if isinstance(value, np.generic) else value).as_string()
 
 
 def _entries(tables: Sequence[Table], out: Path, draft: Draft) -> list[dict[str, Any]]:

@@ -72,8 +72,7 @@ def draw_nyquist(run: RunView) -> Figure:
     size = np.abs(loop.centre)
     # Of the whole view: all that the loop does after it first falls below 1, no integrator.
     below = np.flatnonzero(size < 1)
-    after = size[below[0] :] if below.size else size
-    reach = float(np.clip(1.25 * after.max(), 1.8, 6.0))
+    reach = float(np.clip(1.25 * (size[below[0] :] if below.size else size).max(), 1.8, 6.0))
     _draw_loop(whole, loop, (-reach, reach), (-reach, reach), run.level)
     _mark_forbidden(whole, margin)
     draw_around_minus_one(near, loop, level=run.level, modulus_margin=margin)

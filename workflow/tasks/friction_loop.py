@@ -254,8 +254,7 @@ def check_friction(
     error_at_rest = 0.0 if integral else fitted.error_at_rest
     level = at_rest(found.law, found.beyond)
     run = fitted.answer(reference, given)
-    moving = int(np.flatnonzero(run.reference)[0])
-    error = np.abs(run.reference - run.measured)[moving:]
+    error = np.abs(run.reference - run.measured)[int(np.flatnonzero(run.reference)[0]) :]
     tolerance = TOLERANCE_PERCENT / 100
     return FrictionCheck(
         level=level,

@@ -301,8 +301,7 @@ def _described(
 ) -> PointModel:
     posterior = matrix_posterior(records, found, level=level)
     Li = posterior.input_factor(lowest_rad_s)
-    top = np.pi / found.model.dt_s
-    shown = posterior.at(np.geomspace(lowest_rad_s, 0.999 * top, _SHOWN))
+    shown = posterior.at(np.geomspace(lowest_rad_s, 0.999 * (np.pi / found.model.dt_s), _SHOWN))
     return PointModel(
         name, found.model, np.sqrt(np.diag(found.noise_covariance)), found.output_fit_percent, found.rank_one,
         posterior.output_factor, *Li, posterior.largest_radius(lowest_rad_s), shown,

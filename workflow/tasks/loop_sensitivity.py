@@ -66,8 +66,7 @@ def plan_sensitivity(
     large as the rms of the input in the records and the voltage limit allow."""
     dt = controller.dt_s
     omega = np.geomspace(1e-3 / dt, plant.nyquist_rad_s, 8000)
-    loop = controller.response(omega) * plant.channel.nominal_response(omega)
-    size = 1 / np.abs(1 + loop)
+    size = 1 / np.abs(1 + (controller.response(omega) * plant.channel.nominal_response(omega)))
     at = int(np.argmax(size))
     centre = min(float(omega[at]), plant.nyquist_rad_s / 4)
     period = int(np.clip(round(2 * np.pi * _LINES_BELOW_PEAK / (centre * dt)), _SHORTEST, _LONGEST))
