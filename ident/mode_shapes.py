@@ -356,8 +356,7 @@ class ModalFit:
 def _inverse_factor(columns: RealArray) -> RealArray:
     """S with S S^T = (C^T C)^-1; columns scaled, so that what is left out as unseen has no units."""
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    triangle = np.linalg.qr(columns / scale, mode="r")
-    return np.asarray(np.linalg.pinv(triangle, rcond=1e-12) / scale[:, None])
+    return np.asarray(np.linalg.pinv(np.linalg.qr(columns / scale, mode="r"), rcond=1e-12) / scale[:, None])
 
 
 def _shown(rows: RealArray | ComplexArray, mode: ShapedMode) -> RealArray:
@@ -385,8 +384,7 @@ def _start(mode: ShapedMode, sizes: RealArray) -> RealArray:
         numbers = np.concatenate([left[:, 0] * size[0] * b[fixed], np.delete(b / b[fixed], fixed)])
     else:
         numbers = residue.ravel()
-    parts = [numbers.real, numbers.imag] if mode.is_pair else [numbers.real]
-    return np.concatenate([head, *parts])
+    return np.concatenate([head, *([numbers.real, numbers.imag] if mode.is_pair else [numbers.real])])
 
 
 def _largest(mode: ShapedMode) -> int:

@@ -86,8 +86,7 @@ def identify_mimo(
     _refuse_outputs(records, options)
     white = np.diag(1 / np.std(np.concatenate([record.output for record in records]), axis=0))
     for turn in range(_ROUNDS):
-        share = partial(_part, report, turn)
-        found = _searched(whitened(records, white), options, share, start)
+        found = _searched(whitened(records, white), options, partial(_part, report, turn), start)
         data, start = found.search.data, found.end.poles
         residual = data.residual(found.end.poles).reshape(len(data.each), -1)
         spare = 1 - data.n_parameters(found.end.poles.order) / data.n_samples

@@ -91,8 +91,7 @@ class TerminalProgress(progress.Progress):
         if not total_s or self._worked_s < 0.02 * total_s:  # less says nothing about the whole
             return ""
         spent_s = self._reported_s - self._began_s - self._compiled_s
-        slowness = (spent_s + _PRIOR_S) / (self._worked_s + _PRIOR_S)
-        left_s = (total_s - self._worked_s) * slowness
+        left_s = (total_s - self._worked_s) * ((spent_s + _PRIOR_S) / (self._worked_s + _PRIOR_S))
         if self._compiled_s:
             left_s += max(COMPILING_S - self._compiled_s, 0.0)
         left_s -= time.monotonic() - self._reported_s

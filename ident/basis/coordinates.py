@@ -101,8 +101,7 @@ class SearchSpace:
         else:
             first = np.log10(np.concatenate([1 - poles.real, np.abs(np.log(poles.pairs))]))
         low = np.repeat(self.low[:2], poles.counts)
-        high = np.repeat(self.high[:2], poles.counts)
-        return np.asarray(np.clip((first - low) / (high - low), 0, 1))
+        return np.asarray(np.clip((first - low) / (np.repeat(self.high[:2], poles.counts) - low), 0, 1))
 
     def coordinates(self, units: RealArray) -> RealArray:
         """Coordinates (E, D) of points (E, D) of the unit cube; frequencies in rad/s."""

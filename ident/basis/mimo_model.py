@@ -129,8 +129,7 @@ class MimoModel:
         try:
             found = self.residues()
         except ValueError:  # every output by itself
-            each = zip(*(one.state_space() for one in self.outputs), strict=True)
-            a_each, b_each, c_each, d_each = each
+            a_each, b_each, c_each, d_each = zip(*(one.state_space() for one in self.outputs), strict=True)
             return block_diag(*a_each), np.vstack(b_each), block_diag(*c_each), np.vstack(d_each)
         blocks: list[tuple[RealArray, RealArray, RealArray]] = []
         for pole, residue in [(1.0 + 0j, found.at_one + 0j), *zip(found.poles, found.pole, strict=True)]:

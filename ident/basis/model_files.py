@@ -58,7 +58,14 @@ class ModelFile:
 
     def to_json(self) -> str:
         """JSON text; floats with as many digits as they have, so that reading gives the same bits."""
-        text = json.dumps(self._document(), default=_as_lists, indent=1, allow_nan=False, ensure_ascii=False)
+        text = json.dumps(
+            self._document(),
+            # A complex array as rows [real part, imaginary part].
+            default=lambda a: (np.column_stack([a.real, a.imag]) if np.iscomplexobj(a) else a).tolist(),
+            indent=1,
+            allow_nan=False,
+            ensure_ascii=False,
+        )
         return text + "\n"
 
     @classmethod
@@ -83,13 +90,6 @@ class ModelFile:
         """Inverse of `to_mat`. ValueError: one line that begins with `source`."""
         document: dict[str, Any] = _plain(mat_variables(content, source))
         return _read(document, source)
-
-
-def _as_lists(array: Any) -> Any:
-    """An array in JSON; a complex one as rows [real part, imaginary part]."""
-    if np.iscomplexobj(array):
-        array = np.column_stack([array.real, array.imag])
-    return array.tolist()
 
 
 def _plain(value: Any) -> Any:

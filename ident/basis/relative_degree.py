@@ -99,8 +99,7 @@ def conditions_with_sensitivities(
         # Unitary U with U^* block U lower triangular; the block is [[., .], [b, c]] with b != 0.
         x, y = pole.conjugate() - matrix[at + 1, at + 1], matrix[at + 1, at]
         change[at : at + 2, at : at + 2] = np.array([[y, x], [-np.conj(x), y]]) / np.hypot(abs(x), y)
-    triangular = change.conj().T @ matrix @ change
-    values = (_log_moments(triangular, relative_degree - 1) @ change.T).real
+    values = (_log_moments(change.conj().T @ matrix @ change, relative_degree - 1) @ change.T).real
     rows = values[:, 1:size].copy()
     rows[:, :k] = rows[:, :k] @ expansion.T
     return rows, values[:, size:] * scale

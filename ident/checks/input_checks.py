@@ -320,8 +320,7 @@ def _is_a_line(data: Regression, poles: Poles, index: int) -> bool:
     without = poles.without_real(index)
     if not data.n_samples > with_lines.n_parameters(without.order):
         return False
-    there = with_lines.linearise(*without.writable()).rss
-    return there <= _AS_WELL * data.linearise(*poles.writable()).rss
+    return with_lines.linearise(*without.writable()).rss <= _AS_WELL * data.linearise(*poles.writable()).rss
 
 
 def _far_from_zero(records: Sequence[Record], data: Regression) -> list[Finding]:

@@ -86,8 +86,7 @@ def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = 25, level: 
     n = sum(e.size for e in centred)
     correlation = _pooled_correlation(centred, centred, max_lag)[max_lag + 1 :]
     lags = np.arange(1, max_lag + 1)
-    statistic = n * (n + 2) * float(np.sum(correlation**2 / (n - lags)))
-    probability = float(chi2.sf(statistic, max_lag))
+    probability = float(chi2.sf(n * (n + 2) * float(np.sum(correlation**2 / (n - lags))), max_lag))
     passed = probability >= 1 - level
     band = np.full(max_lag, norm.ppf(0.5 + level / 2) / np.sqrt(n))
     return ResidualTest("whiteness", lags.astype(np.float64), correlation, band, level, probability, passed)
@@ -174,8 +173,7 @@ def fed_back(posterior: ResponsePosterior, records: Sequence[Record], level: flo
         )
         for record in records
     ]
-    half = max(5, shortest // (4 * _RESOLVED))
-    common = empirical_frf(rest, half_width_lines=half, level=level)
+    common = empirical_frf(rest, half_width_lines=max(5, shortest // (4 * _RESOLVED)), level=level)
     omega = common.omega_rad_s
     ellipses = posterior.at(omega, level)
     radius = ellipses.ellipse().semi_major
@@ -217,8 +215,7 @@ def _pooled_correlation(e: Sequence[RealArray], u: Sequence[RealArray], max_lag:
     for a, b in zip(e, u, strict=True):
         middle = b.size - 1
         total += correlate(a, b, mode="full", method="fft")[middle - max_lag : middle + max_lag + 1]
-    scale = np.sqrt(sum(float(a @ a) for a in e) * sum(float(b @ b) for b in u))
-    return np.asarray(total / scale)
+    return np.asarray(total / np.sqrt(sum(float(a @ a) for a in e) * sum(float(b @ b) for b in u)))
 
 
 class Simulated(Protocol):

@@ -71,8 +71,7 @@ def fit_on_fresh_data(
     degrees = max(int(estimate_offset), model.integrators if estimate_initial_state else 0)
     nuisance = nuisance_columns(model.poles, y.size, degrees, estimate_initial_state)
     if nuisance.shape[1]:
-        both = np.column_stack([y - simulated, y])
-        coefficients, *_ = np.linalg.lstsq(nuisance, both, rcond=1e-10)
+        coefficients, *_ = np.linalg.lstsq(nuisance, np.column_stack([y - simulated, y]), rcond=1e-10)
         simulated = simulated + nuisance @ coefficients[:, 0]
         without = y - nuisance @ coefficients[:, 1]
     residual = y - simulated

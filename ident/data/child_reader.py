@@ -105,8 +105,7 @@ def _unpacked(path: str, values: Any, attributes: Any) -> Any:
     empty = np.isin(values, fills) if fills else np.zeros(values.shape, dtype=bool)
     if not empty.any() and not {"scale_factor", "add_offset"} & set(attributes):
         return values
-    quantity = number("scale_factor", 1.0) * values + number("add_offset", 0.0)
-    return np.where(empty, np.nan, quantity)
+    return np.where(empty, np.nan, number("scale_factor", 1.0) * values + number("add_offset", 0.0))
 
 
 def parquet_columns(content: bytes) -> Columns:

@@ -15,9 +15,8 @@ def mat_bytes(variables: dict[str, Any], what: str, *, oned_as: Literal["row", "
 
     stream: Any = io.BytesIO()  # scipy takes streams, its stubs know paths only
     scipy.io.savemat(stream, variables, oned_as=oned_as)
-    head = b"MATLAB 5.0 MAT-file, " + what.encode("ascii")
     # The text that opens the file has 116 bytes; scipy writes the date there.
-    return head.ljust(116) + bytes(stream.getvalue()[116:])
+    return (b"MATLAB 5.0 MAT-file, " + what.encode("ascii")).ljust(116) + bytes(stream.getvalue()[116:])
 
 
 def mat_variables(content: bytes, source: object) -> dict[str, Any]:

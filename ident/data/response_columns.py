@@ -225,8 +225,7 @@ def _role(name: str, unit: str) -> str | None:
 
 def _words(name: str) -> frozenset[str]:
     """Words of a name in lower case, parted at blanks, signs and capitals."""
-    plain = unicodedata.normalize("NFKC", name)
-    parted = re.sub(r"(?<=[a-z])(?=[A-Z][A-Za-z])", " ", plain).lower()
+    parted = re.sub(r"(?<=[a-z])(?=[A-Z][A-Za-z])", " ", unicodedata.normalize("NFKC", name)).lower()
     return frozenset(re.findall(r"[^\W\d_]+", parted))
 
 

@@ -41,8 +41,7 @@ def first_complaint(model: type[BaseModel], error: ValidationError) -> str:
     details = sorted(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")
     if len(details) > 1 and all(item["type"] == "missing" for item in details):
         return "missing keys " + ", ".join(_walk(model, item["loc"])[0] for item in details)
-    rest = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
-    return _complaint(model, details[0]) + rest
+    return _complaint(model, details[0]) + (f" (and {len(details) - 1} more)" if len(details) > 1 else "")
 
 
 def meant(word: str, known: Sequence[str], what: str) -> str:

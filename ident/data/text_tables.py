@@ -134,8 +134,7 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
     body = [line for k, line in enumerate(lines[first:], first) if k not in skipped]
     if not body:
         raise ValueError(": no rows under the header line; expected numbers")
-    found = tuple(k + 1 for k in sorted(skipped))
-    layout = replace(layout, skipped=found, commented=len(commented))
+    layout = replace(layout, skipped=tuple(k + 1 for k in sorted(skipped)), commented=len(commented))
     rows, width = _rows(body, layout.separator), len(layout.names)
     if not text.endswith("\n") and len(lines) not in skipped and _is_cut(rows, layout.decimal):
         del rows[-1]
@@ -432,7 +431,8 @@ def _is_comment(line: str) -> bool:
 def _rows(lines: Sequence[str], separator: str) -> list[list[str]]:
     """The cells of every line, without blanks around them; of comment lines without the sign."""
     if separator == " ":
-        return [_blanks(_COMMENT.sub("", line)) for line in lines]
+        words = [re.findall(r'"[^"]*"|\S+', _COMMENT.sub("", line)) for line in lines]
+        return [[word.strip('"') for word in row] or [""] for row in words]
     plain = [_COMMENT.sub("", line) if _is_comment(line) else line for line in lines]
     if not any('"' in line for line in plain):
         return [[cell.strip() for cell in line.split(separator)] for line in plain]
@@ -444,12 +444,6 @@ def _rows(lines: Sequence[str], separator: str) -> list[list[str]]:
     if len(rows) != len(plain):
         raise ValueError(": a quotation mark is not closed; expected one line per row")
     return rows
-
-
-def _blanks(line: str) -> list[str]:
-    if '"' in line:
-        return [word.strip('"') for word in re.findall(r'"[^"]*"|\S+', line)] or [""]
-    return line.split() or [""]
 
 
 def _empty_at_end(row: Sequence[str]) -> int:

@@ -67,8 +67,7 @@ def wraps_at(values: RealArray) -> float:
             usual and usual_place and moves and np.ptp(going_on) > _MOTION * usual_step and usual_step > 0
         ):
             return 0.0
-    smooth = np.std(np.diff(going_on, 2))
-    return period if smooth <= _SMOOTHER * np.std(np.diff(values, 2)) else 0.0
+    return period if np.std(np.diff(going_on, 2)) <= _SMOOTHER * np.std(np.diff(values, 2)) else 0.0
 
 
 def counts_rows(values: RealArray) -> bool:

@@ -37,8 +37,7 @@ class OutputRegressions:
     def starts(self) -> IntArray:
         """Where the records begin, output after output, (Y K + 1,)."""
         ends = self.each[0].starts
-        shifted = [ends[1:] + k * ends[-1] for k in range(len(self.each))]
-        return np.concatenate([ends[:1], *shifted])
+        return np.concatenate([ends[:1], *[ends[1:] + k * ends[-1] for k in range(len(self.each))]])
 
     @property
     def power(self) -> float:

@@ -81,8 +81,7 @@ class EquivalentFriction:
         inside = np.minimum(omega, self.omega_rad_s[-1])
         smooth = values @ _terms(inside, self.omega_rad_s[-1], _corner(self.friction.arm)).T
         stronger = np.interp(omega, self.omega_rad_s, self.stronger)
-        few = _UNEVEN * self.stronger.max()
-        return np.asarray(smooth * (1 + stronger + (few * uneven)[:, None]))
+        return np.asarray(smooth * (1 + stronger + ((_UNEVEN * self.stronger.max()) * uneven)[:, None]))
 
 
 def equivalent_friction(
@@ -154,8 +153,7 @@ def damped_poles(model: GobfModel, damping: float) -> Poles:
     real = np.maximum(model.poles.real, FASTEST_POLE)  # a pole at zero has no rate
     arm = replace(model, poles=Poles(real, model.poles.pairs), input_delay_samples=0).to_control()
     n, dt_s = arm.nstates, model.dt_s
-    held = np.block([[arm.A, arm.B], [np.zeros((1, n)), np.ones((1, 1))]])
-    rates = np.real(logm(held)) / dt_s
+    rates = np.real(logm(np.block([[arm.A, arm.B], [np.zeros((1, n)), np.ones((1, 1))]]))) / dt_s
     a, b = rates[:n, :n], rates[:n, n:]
     poles = np.linalg.eigvals(expm((a - damping * b @ arm.C @ a) * dt_s))
     # The integrators stay: friction that grows with speed holds no position.

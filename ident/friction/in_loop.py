@@ -313,7 +313,11 @@ def _kept_if_better(
     explains nothing better."""
     with suppress(ValueError):
         best = min(starts, key=logs.errors)
-        for _ in range(_STEPS):  # each behind the observer that follows what the one before has found
+        errors, left = np.inf, _STEPS
+        while (
+            left and logs.errors(best) < errors
+        ):  # each behind the observer that follows what was found before
+            errors, left = logs.errors(best), left - 1
             best = _stepped(logs, observed(best, logs.records))
         # An excess that has gone to nothing is none.
         ends = best, _in_turns(logs, best, options)
@@ -482,8 +486,7 @@ def _on_moved_poles(logs: _Logs, found: FrictionFit) -> FrictionFit:
     pairs = [pole if np.any(images == pole) else moved(pole) for pole in poles.pairs.tolist()]
     poles = Poles(np.array(real), np.array(pairs, np.complex128))
     data = prepare(_white(logs, found), replace(found.arm.structure, estimate_initial_state=True))
-    linear = linear_fit(data, poles)
-    model = replace(found.model, poles=poles, coefficients=np.ravel(linear.coefficients))
+    model = replace(found.model, poles=poles, coefficients=np.ravel(linear_fit(data, poles).coefficients))
     return observed(_on(found, model), logs.records, nearby=NEARBY[1:2])
 
 
@@ -508,7 +511,7 @@ def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:
     largest = max(_LARGEST_STEP * found.level, 10 * logs.least)
     # A load that stands tells no level: without an end its step has none.
     step[[0, -1 if found.spring else 0]] = np.clip(step[[0, -1 if found.spring else 0]], -largest, largest)
-    for arm, length in ((arm, length) for arm in (1.0, 0.0) for length in LENGTHS):
+    for arm, length in (*((1.0, length) for length in LENGTHS), *((0.0, length) for length in LENGTHS[:2])):
         law = law_of(theta + length * step[:q])
         tried = replace(
             found,

@@ -170,8 +170,7 @@ def of_force(
                 ends = turns + np.array([0.0, np.sign(turns) * radius])
         # Even steps of the force, and of the gain, at standstill.
         even = 1 - 1 / np.linspace(1 / (1 - x[0].real * ends[0]), 1 / (1 - x[0].real * ends[1]), _STEPS)
-        t = np.concatenate([np.linspace(ends[0], ends[1], _STEPS), even / x[0].real])
-        left = 1 - np.outer(x, t)
+        left = 1 - np.outer(x, np.concatenate([np.linspace(ends[0], ends[1], _STEPS), even / x[0].real]))
         arc = np.where(low[:, None], 1 / np.where(np.abs(left) > 0.5 * least, left, least), 2 - left)
         middle = (arc[:, 0] + arc[:, -1]) / 2
         parts = _parts_of(np.asarray(arc - middle[:, None], np.complex128), np.asarray(middle))
@@ -185,8 +184,7 @@ def of_force(
     wanted = np.hstack([moved @ onto[0], *columns]).T
     bent = _with_poles(response, poles.appended(slow), omega, gain * centre, [*wanted], _RANK)
     normals = np.vstack(onto)
-    straight = replace(response, covariance_factor=response.covariance_factor @ normals.T)
-    return bent, straight, normals
+    return bent, replace(response, covariance_factor=response.covariance_factor @ normals.T), normals
 
 
 def _parts_of(arc: ComplexArray, middle: ComplexArray) -> ComplexArray:

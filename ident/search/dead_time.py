@@ -142,8 +142,7 @@ def first_answer(records: Sequence[Record]) -> FirstAnswer:
         total += correlate(y, u, mode="full", method="fft")[u.size - 1 :][: total.size]
     # A peak that lags of nothing but chance would show once in a thousand such records.
     peak, usual = int(np.argmax(np.abs(total))), float(np.sqrt(np.mean(total**2)))
-    seen = abs(total[peak]) > usual * np.sqrt(2 * np.log(total.size / _MISSED))
-    late = max(peak - 1, 0) if seen else 0
+    late = max(peak - 1, 0) if (abs(total[peak]) > usual * np.sqrt(2 * np.log(total.size / _MISSED))) else 0
     return FirstAnswer((*starts, *([late] if late > lags or (late and not starts) else [])), at_once)
 
 

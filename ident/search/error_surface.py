@@ -76,8 +76,7 @@ def error_surface(
         own = (2 * pole.real / (1 + gamma), gamma)
         width = 1 - gamma
         if first is None:
-            reach = max(10 * width, 0.02) * np.array([-1, 1])
-            left, right = np.clip(own[0] + reach, -1 + 1e-9, 1 - 1e-9)
+            left, right = np.clip(own[0] + (max(10 * width, 0.02) * np.array([-1, 1])), -1 + 1e-9, 1 - 1e-9)
             first = np.linspace(float(left), float(right), n_points)
         if second is None:
             second = 1 - np.geomspace(min(30 * width, 1.0), width / 30, n_points)

@@ -80,8 +80,7 @@ class PoleSearch(Generic[Problem]):
         space = self.space(n_real, n_pairs)
         cost = self.data.candidate_cost(space, self.fixed, self.fixed)
         few = min(self.options.starts, _STARTS_TO_AGREE)
-        most = self.options.starts * _PATIENCE
-        points = self._global(title, cost, self.options.evaluations, most)
+        points = self._global(title, cost, self.options.evaluations, self.options.starts * _PATIENCE)
 
         def starts(chosen: RealArray) -> list[Poles]:
             return [self.fixed.appended(space.poles(point)) for point in chosen]

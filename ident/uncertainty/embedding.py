@@ -185,8 +185,7 @@ def embed_response(
     options = options or EmbeddingOptions()
     basis = model.poles.doubled(fixed.counts)
     regressors = data.columns(basis)
-    spare = data.n_rows - regressors.shape[1]
-    length = options.fir_length or max(1, min(_FRF_FIR_LENGTH, spare // 3))
+    length = options.fir_length or max(1, min(_FRF_FIR_LENGTH, (data.n_rows - regressors.shape[1]) // 3))
     taps = data.common[:, np.newaxis] * data.z[:, np.newaxis] ** -np.arange(1.0, length + 1)
     measured = data.weight.ravel() > 0
     nothing = np.zeros((data.n_rows, 0))
@@ -234,8 +233,7 @@ def _noise_std(rows: EmbeddingRows, stacked: StackedBlocks) -> float:
     Not quite, for a column may do nothing in these records.
     """
     size = max(float(np.std(record.output)) for record in rows.records)
-    free = replace(rows, known_std=_FREE * size).known_blocks()
-    reduced = reduce_stacked(stack_blocks(free, stacked))
+    reduced = reduce_stacked(stack_blocks(replace(rows, known_std=_FREE * size).known_blocks(), stacked))
     return float(np.sqrt(reduced.rest / max(reduced.degrees_of_freedom - reduced.fir_length, 1)))
 
 
@@ -262,8 +260,7 @@ def _rows(
     if model.unstable.order:
         # A change of the unstable poles changes B(q) y: dB y on the other side, before the other columns.
         own = [-all_pass_slopes(model.unstable, record.output[:, 0]) for record in records]
-        others = beside or [Beside(part[:, :0], part[:, :0]) for part in own]
-        both = zip(others, own, strict=True)
+        both = zip(beside or [Beside(part[:, :0], part[:, :0]) for part in own], own, strict=True)
         beside = [replace(other, columns=np.hstack([part, other.columns])) for other, part in both]
     return EmbeddingRows(tuple(records), structure, poles, length, np.ones(1), tuple(beside))
 

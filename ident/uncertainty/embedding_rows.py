@@ -125,8 +125,7 @@ class EmbeddingRows:
         if first.size:
             regressors[: len(first)] = first @ self._driven(head)
         if beside is not None:
-            rows = answered(np.column_stack([beside.first, beside.columns]), delay)
-            more = whitened(rows, whitening)
+            more = whitened(answered(np.column_stack([beside.first, beside.columns]), delay), whitening)
             p = beside.first.shape[1]
             regressors = np.column_stack([more[:, :p], regressors[:, p:], more[:, p:]])
         known = nuisance_columns(
@@ -168,8 +167,7 @@ def gls_residuals(
             u, d, vt = np.linalg.svd(whitened(nuisance, rows.whitening), full_matrices=False)
             rank = int(np.count_nonzero(d > _NUISANCE_RANK * d[0]))
             local = nuisance @ (vt[:rank].T / d[:rank])
-            targets = whitened(np.column_stack([rest, shared]), rows.whitening)
-            fitted = local @ (u[:, :rank].T @ targets)
+            fitted = local @ (u[:, :rank].T @ whitened(np.column_stack([rest, shared]), rows.whitening))
             rest = rest - fitted[:, 0]
             shared = shared - fitted[:, 1:]
         theirs = solve_triangular((reduced.r11 / scale).T, shared.T, lower=True, check_finite=False).T

@@ -58,10 +58,3 @@ def test_rooms_and_the_slowest(tmp_path, capsys):
 def test_times_that_say_nothing_are_refused_in_one_line(tmp_path, make, said):
     with pytest.raises(SystemExit, match=said):
         durations.run(lambda line="": None, **make(tmp_path))
-
-
-def test_a_run_that_noted_no_cpu_time_is_refused(tmp_path):
-    path = tmp_path / "a.xml"
-    path.write_text('<testsuites><testsuite><testcase classname="a" name="b"/></testsuite></testsuites>')
-    with pytest.raises(ValueError, match="no CPU time of b"):
-        durations.read(path)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.mutants import ROOT, Copy, Judge, changed, drawn, files_of, mutants_of, run
+from benchmarks.mutants import Copy, Judge, changed, drawn, mutants_of
 
 SOURCE = b'''"""Docs with 3 * 4."""
 from dataclasses import dataclass
@@ -59,16 +59,6 @@ def test_every_operator_sign_constant_and_return_inside_functions_and_nothing_el
             ("c", "None"),
         ]
     )
-
-
-def test_the_same_seed_draws_the_same_and_two_a_room():
-    small = ["flexlink", "plant"]
-    found = drawn(ROOT, 3, 2, small)
-    assert sorted(one.room for one in found) == [room for room in small for _ in "ab"]
-    assert len(set(found)) == len(found)
-    assert drawn(ROOT, 3, 2, ["plant"]) == [one for one in found if one.room == "plant"]
-    assert drawn(ROOT, 4, 2, ["flexlink"]) != [one for one in found if one.room == "flexlink"]
-    assert not any(file.is_relative_to(ROOT / "ident" / "data") for file in files_of("ident", ROOT))
 
 
 CODE = """def area(width, height):
@@ -161,10 +151,3 @@ def test_compiled_kernels_are_those_of_the_mutant_and_then_those_of_the_checkout
     assert (copy.path / cache).read_bytes() == b"compiled"
     with copy.holding(by_function(checkout, "twice")) as root:
         assert (root / cache).exists()
-
-
-def test_tests_of_a_checkout_that_is_none_are_refused_in_one_line(tmp_path, capsys):
-    with pytest.raises(SystemExit, match="2"):
-        run(print, tests_of=str(tmp_path))
-    said, expected = capsys.readouterr().err, "no tests/ there; expected a checkout of this repository\n"
-    assert said == f"--tests-of {tmp_path}: {expected}"

@@ -288,8 +288,7 @@ def _sampled(a: Real, b: Real, c: Real, dt_s: float, path: VoltagePath) -> contr
     if past:
         B[n] = 1.0
         A[n + 1 :, n:-1] = np.eye(past - 1)
-    C = np.hstack([c, np.zeros((c.shape[0], past))])
-    return control.ss(A, B, C, np.zeros((c.shape[0], 1)), dt_s)
+    return control.ss(A, B, np.hstack([c, np.zeros((c.shape[0], past))]), np.zeros((c.shape[0], 1)), dt_s)
 
 
 def _held(a: Real, b: Real, time_s: float) -> tuple[Real, Real]:

@@ -148,8 +148,7 @@ def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dic
         units["S"] = unit(inputs[acts.on] if acts.where == "input" else names[acts.on])
     found = {}
     for parameter in (one.name for one in effect.parameters):
-        drag = effect.name.endswith("quadratic_drag")
-        size = "{F}s2_{x}2" if drag else _SIZES.get(parameter, "")
+        size = "{F}s2_{x}2" if effect.name.endswith("quadratic_drag") else _SIZES.get(parameter, "")
         if size and all(units.get(key) for key in re.findall(r"{(\w)}", size)):
             # A rate of a speed is per second squared.
             found[parameter] = f"{parameter.removesuffix('_per_s')}_{size.format(**units)}".replace(

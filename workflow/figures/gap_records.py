@@ -80,8 +80,7 @@ def draw_residual_traces(found: Diagnosis) -> Figure:
             for model, e in residuals.items():
                 look = {**gap_style.MODELS[model], "lw": 0.7, "ls": "-"}
                 axes.plot(*outline(time, e[:, column], _TRACE_BINS), **look, label=gap_style.WORDS[model])
-            largest = max(float(np.max(np.abs(e[:, column]))) for e in residuals.values())
-            reach = max(4.0, 1.05 * largest)
+            reach = max(4.0, 1.05 * max(float(np.max(np.abs(e[:, column]))) for e in residuals.values()))
             axes.set_ylim(-reach, reach)
             axes.margins(x=0.01)
             title = f"{style.plain(experiment.name, 30)}{role}: {gap_style.look_of(case.outputs[column])[0]}"

@@ -153,6 +153,5 @@ def _nearest_point(boundary: Complex) -> complex:
     a, b = boundary, np.roll(boundary, -1)
     edge = b - a
     length = np.abs(edge) ** 2
-    along = np.clip(((-1 - a) * np.conj(edge)).real / np.where(length > 0, length, 1.0), 0, 1)
-    points = a + along * edge
+    points = a + np.clip(((-1 - a) * np.conj(edge)).real / np.where(length > 0, length, 1.0), 0, 1) * edge
     return complex(points[np.argmin(np.abs(points + 1))])

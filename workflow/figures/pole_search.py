@@ -118,8 +118,7 @@ def searched_pairs(stages: Sequence[SearchStage], omega_rad_s: float) -> Real:
         for column, name in enumerate(stage.coordinate_names):
             if name.startswith("log10(omega"):
                 points = 10.0 ** stage.points[:, [column, column + 1]]
-                best = points[int(np.argmin(stage.log_cost)), 0]
-                away = abs(float(np.log(best / omega_rad_s)))
+                away = abs(float(np.log(points[int(np.argmin(stage.log_cost)), 0] / omega_rad_s)))
                 nearest = min(nearest, (away, points), key=lambda entry: entry[0])
     return nearest[1]
 

@@ -76,8 +76,7 @@ class RigidMotion:
         s = 1j * response.omega_rad_s[response.omega_rad_s <= self.below_rad_s]
         stiffness = 0.0 if self.stiffness is None else self.stiffness.value
         force = s ** (self.order - 1) * (self.inertia.value * s + self.viscous.value) + stiffness
-        off = np.abs(1 - response.centre[: s.size] * force)
-        return bool(s.size == 0 or np.median(off) < _AGREES)
+        return bool(s.size == 0 or np.median(np.abs(1 - response.centre[: s.size] * force)) < _AGREES)
 
     @property
     def turned(self) -> bool:
@@ -88,8 +87,7 @@ class RigidMotion:
     @property
     def free(self) -> bool:
         """Whether nothing holds the position: a spring or weight would show."""
-        held = self.stiffness is None or self.stiffness.share > _WORTH
-        return self.explained > _EXPLAINED and not held
+        return self.explained > _EXPLAINED and not (self.stiffness is None or self.stiffness.share > _WORTH)
 
     @property
     def sprung(self) -> bool:
@@ -154,8 +152,7 @@ def unseen_limit(look: FirstLook, *, position: bool) -> float | None:
         found = rigid_motion(clipped, motion.below_rad_s, told[1], position=position)
         return np.inf if found is None else 1 - found.explained
 
-    size = np.abs(np.concatenate([record.input[:, 0] for record in look.records]))
-    limits = np.quantile(size, _LIMITS)
+    limits = np.quantile(np.abs(np.concatenate([record.input[:, 0] for record in look.records])), _LIMITS)
     lefts = [left(float(limit)) for limit in limits]
     k = int(np.argmin(lefts))
     if not lefts[k] < _LESS * (1 - motion.explained):
@@ -206,8 +203,7 @@ def _told_by(records: Sequence[Record]) -> FrequencyUncertainty | None:
     before = np.concatenate([[0], np.cumsum(told)])
     first = np.searchsorted(omega, omega / 1.5)
     k = np.arange(omega.size)
-    dense = (before[k + 1] - before[first]) >= _OF_LINES * (k + 1 - first)
-    last = np.flatnonzero(told & dense)
+    last = np.flatnonzero(told & ((before[k + 1] - before[first]) >= _OF_LINES * (k + 1 - first)))
     told[last[-1] + 1 if last.size else 0 :] = False
     if np.count_nonzero(told) < _FEWEST:
         return None

@@ -58,7 +58,6 @@ _SLOW, _LONGEST = 300.0, 20_000
 _SINE_SHARE = 0.2  # of the reference step
 # Friction lets integral action wait: the step is watched so many times as long as the linear loop needs.
 _WATCHED, _MOST_WATCHED = 20, 100_000
-_FEWEST_STATES = 3  # an integrator, a lead, and what takes the controller's gain off above
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,9 +308,10 @@ def recorded_loop(stage: StageInput, loop: FrictionLoop) -> FrictionLoop | None:
 def soonest(
     stage: StageInput, first: DesignResult, again: Callable[[Specification], DesignResult]
 ) -> DesignResult:
-    """A design whose bandwidth was left open, or one `again` of fewer states, whichever lets the reference
-    step settle sooner with the identified friction: the requirements do not see that a controller with many
-    slow states hunts. Enough is several times what the linear loop needs, and no more than the recorded."""
+    """A design whose bandwidth was left open, or one `again` of one or two states fewer, whichever lets the
+    reference step settle soonest with the identified friction: the requirements do not see that a controller
+    with many slow states hunts. Enough is several times what the linear loop needs, and no more than the
+    recorded."""
     config, found = stage.config, stage.results.identify.friction
     asked, law = config.specification, first.controller
     if not first.met or found is None or law is None or asked.lowest_bandwidth_rad_s is None:
@@ -333,7 +333,7 @@ def soonest(
         None if first.specification is None else first.specification.bandwidth_rad_s,
     )
     fewest = {"bandwidth_rad_s": reached} if reached and reached > asked.lowest_bandwidth_rad_s else {}
-    for fewer in range(1, law.order - _FEWEST_STATES + 1):
+    for fewer in range(1, min(3, law.order)):
         if least <= enough:
             break
         tried = again(asked.model_copy(update={**fewest, "controller_order": law.order - fewer}))
@@ -358,8 +358,7 @@ def holds_from(sizes: Sequence[float] | Real, excess: Real) -> float | None:
     k = int(over[0])
     if k == 0:
         return None
-    share = excess[k - 1] / (excess[k - 1] - excess[k])
-    return float(sizes[k - 1] * (sizes[k] / sizes[k - 1]) ** share)
+    return float(sizes[k - 1] * (sizes[k] / sizes[k - 1]) ** (excess[k - 1] / (excess[k - 1] - excess[k])))
 
 
 def slow_sine(stage: StageInput, controller: Controller, amplitude: float, *, on_arm: bool) -> SlowSine:

@@ -31,8 +31,7 @@ def rms_of(signals: Sequence[Real]) -> float:
 
 def settling_samples(pole_radius: float, shortest: int, longest: int) -> int:
     """Of a trial in two halves, in either of which the slowest closed-loop pole dies out (to e^-7)."""
-    wanted = round(2 * 7 / -np.log(min(max(pole_radius, 0.5), 1 - 1e-9)))
-    return int(min(max(wanted, shortest), longest))
+    return int(min(max(round(2 * 7 / -np.log(min(max(pole_radius, 0.5), 1 - 1e-9))), shortest), longest))
 
 
 @dataclass(frozen=True)

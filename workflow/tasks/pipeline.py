@@ -183,8 +183,7 @@ def config_of(run: RunDirectory) -> RunConfig:
 def any_config_of(run: RunDirectory) -> AnyConfig:
     """The same, of a run for several joints too."""
     document, source = run.config_document(), str(run.path / "config.json")
-    kind = JointsConfig if "joints" in document else RunConfig
-    return kind.from_document(document, source=source)
+    return (JointsConfig if "joints" in document else RunConfig).from_document(document, source=source)
 
 
 def _perform(

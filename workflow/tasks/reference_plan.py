@@ -118,8 +118,7 @@ def plan_reference(
     else:
         shape = 1 / (np.abs(to_command) / command_limit + np.abs(to_motion) / motion_limit)
     rng = np.random.default_rng(seed)
-    drawn = [_drawn(plan, lines, shape, to_command, rng) for _ in range(plan.realisations)]
-    spectra = np.stack(drawn)
+    spectra = np.stack([_drawn(plan, lines, shape, to_command, rng) for _ in range(plan.realisations)])
 
     def peaks(gain: ComplexArray | RealArray) -> RealArray:
         return np.asarray(np.max(np.abs(_signal(plan, lines, gain * spectra)), axis=-1))

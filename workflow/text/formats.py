@@ -170,8 +170,7 @@ def sentence(text: str) -> str:
         # "hub: ...", "n_real ...", "elbow.damping ..." and "integrators = 1 ..." start with a name, and names
         # keep their case.
         named = first.endswith(":") or "_" in first or "." in first[:-1] or words.startswith(f"{first} = ")
-        start = words[0] if named else words[0].upper()
-        words = start + words[1:] + ("" if words[-1] in ".!?" else ".")
+        words = (words[0] if named else words[0].upper()) + words[1:] + ("" if words[-1] in ".!?" else ".")
     return Markup(words) if isinstance(text, Markup) else words
 
 
