@@ -340,7 +340,7 @@ def init(
     as_json: Json = False,
     **of_fields: Any,
 ) -> None:
-    """Look at logs and write a configuration that runs: columns, roles, structure and a specification."""
+    """Identify logs and write a configuration that runs: columns, roles, structure and a specification."""
     need(*log)
     from workflow.commands.init import init as write_configuration
 

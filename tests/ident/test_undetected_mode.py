@@ -205,6 +205,13 @@ def test_grid_covers_the_box_and_never_leaves_the_circle():
     assert gaps.max() < 1.5 * zeta.max()
 
 
+def test_a_mode_is_missing_only_above_what_is_asked():
+    for above in (0.3, 3.1):  # the second, beyond the highest, leaves that one
+        candidates = candidate_pairs(1000, above)
+        assert np.all(np.abs(np.log(candidates.poles)) >= min(above, 0.9 * np.pi) * (1 - 1e-9))
+        assert candidates.prior.sum() == pytest.approx(1.0)
+
+
 def test_a_third_mode_left_out_is_found_at_its_place_and_covered():
     arm = random_arm(np.random.default_rng(12))
     model = arm.model(2)
