@@ -141,13 +141,6 @@ def test_stored_then_asked_again_then_moved(asking, tmp_path):
     assert "make frozen STORE=1" in said
 
 
-def test_storing_a_part_leaves_the_rest(asking, tmp_path):
-    other = {"said": {"x": 1}}
-    asking({"one": ANSWER, "two": other}, "--store")
-    asking({"one": other, "two": ANSWER}, "--store", "--only", "two")
-    assert Stored.read(tmp_path / "frozen_answers.txt").answers == {"one": ANSWER, "two": ANSWER}
-
-
 def test_what_needs_absent_data_is_skipped_and_counted(asking, tmp_path):
     code, said = asking({"one": ANSWER}, needs=(tmp_path / "nowhere",))
     assert code == 0

@@ -129,7 +129,9 @@ def test_verdict_of_a_missed_specification_says_whether_a_higher_order_helps():
 def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_have_none():
     design = DesignResult(SimpleNamespace(gamma=0.9), met=True, reason="")
     certify = CertifyResult(None, certified=True, reason="")
-    check = SimpleNamespace(settled_draws=20, draws=20, friction=None, machine="identified")
+    check = SimpleNamespace(
+        settled_draws=20, draws=20, friction=None, machine="identified", waits_for_friction=False
+    )
 
     def verdict(**changed):
         loop = SimpleNamespace(check=SimpleNamespace(**(vars(check) | changed)))
@@ -137,11 +139,13 @@ def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_h
 
     assert verdict() == "certified: every requirement is met, and all 20 closed-loop runs settle"
     step = SimpleNamespace(settling_time_s=7.2)
-    friction = SimpleNamespace(step=step, watched_s=30.0)
+    friction = SimpleNamespace(step=step, watched_s=30.0, times_slower=0.0)
     assert verdict(friction=friction, machine="simulated") == verdict()  # that arm has its friction
     assert verdict(friction=friction) == verdict() + " (linear plants; with dry friction in 7.2 s)"
     step.settling_time_s = None
     assert verdict(friction=friction) == verdict() + " (linear plants; with dry friction not in 30 s)"
+    friction.times_slower = 2.5
+    assert verdict(friction=friction).endswith("; slower than the recorded loop with friction: 2.5 times")
     doubt = finding(FindingKind.UNTRIED_FRICTION, output="enc")
     words = verdict_of(design, certify, SimpleNamespace(check=check), conditions=[doubt])
     assert words.startswith(verdict() + ". But dry friction was not identified")

@@ -188,16 +188,8 @@ def test_the_recorded_loop_stands_beside_the_new_one():
     reference = 0.2 * np.cumsum(rng.standard_normal(4000)) / 60
     made = FrictionLoop.of(lead(integral=0.02, computational_delay_samples=0), found)
     run = made.run(reference, rng)
-    record = Record(
-        "log",
-        run.command[:, None],
-        run.measured[:, None],
-        DT_S,
-        ("u",),
-        ("y",),
-        reference=reference[:, None],
-        reference_names=("r",),
-    )
+    signals, names = [run.command[:, None], run.measured[:, None]], [("u",), ("y",)]
+    record = Record("log", *signals, DT_S, *names, reference=reference[:, None], reference_names=("r",))
     step = np.append(0.0, np.full(400, 0.02))
     slower = FrictionLoop.of(lead(gain=9.0, integral=0.002), found)
     seen = beside_recorded(stage_of(found, [record]), slower, step)
