@@ -23,7 +23,7 @@ from workflow.tasks.results import (
 )
 from workflow.tasks.stage import Stage, StageInput
 from workflow.tasks.uncertainty import find_uncertainty
-from workflow.text.templates import said, words
+from workflow.text.templates import said
 
 
 def design_controller(stage: StageInput) -> DesignResult:
@@ -36,10 +36,6 @@ def design_controller(stage: StageInput) -> DesignResult:
             [stage.plant], asked, config.synthesis, config.certificate, stage.rng("design"), report
         )
 
-    used = dict.fromkeys((config.control_index, config.performance_index))
-    channels = [stage.results.uncertainty.channels[k] for k in used if k is not None]
-    if doubts := [doubt for channel in channels for doubt in channel.agreement.doubt]:
-        return DesignResult(None, met=False, reason=words(doubts[0]), specification=config.specification)
     with naming("design"):
         return soonest(stage, found(config.specification), found)
 
