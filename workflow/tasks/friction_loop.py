@@ -328,10 +328,7 @@ def soonest(
     loop = FrictionLoop.of(law, found, **converter_steps(config.closed_loop))
     best, least = first, took(loop)
     bounds = [STALLS * took(replace(loop, friction=FrictionLaw(0.0))), took(recorded_loop(stage, loop))]
-    enough, reached = (
-        min(bounds),
-        None if first.specification is None else first.specification.bandwidth_rad_s,
-    )
+    enough, reached = min(bounds), getattr(first.specification, "bandwidth_rad_s", None)
     fewest = {"bandwidth_rad_s": reached} if reached and reached > asked.lowest_bandwidth_rad_s else {}
     for fewer in range(1, min(3, law.order)):
         if least <= enough:
