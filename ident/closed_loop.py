@@ -186,14 +186,11 @@ def controller_of(records: Sequence[Record]) -> tuple[RealArray, RealArray] | No
         for own in (order, order - 1):
             rows = []
             for record in records:
-                error, free = (
-                    (np.asarray(record.reference) - record.output)[:, 0],
-                    np.abs(record.input[:, 0]) < limit,
-                )
-                command = np.diff(record.input[:, 0], n=order - own, prepend=np.zeros(order - own))
+                u, error = record.input[:, 0], (np.asarray(record.reference) - record.output)[:, 0]
+                command = np.diff(u, n=order - own, prepend=np.zeros(order - own))
                 past = [sliding_window_view(signal, order + 1) for signal in (command, error)]
                 row = np.hstack([past[0][:, order - own :], past[1]])
-                rows.append(row[sliding_window_view(free, order + 1).all(axis=1)])
+                rows.append(row[sliding_window_view(np.abs(u) < limit, order + 1).all(axis=1)])
             matrix = np.concatenate(rows)
             if len(matrix) < _CONTROLLER_STATES * matrix.shape[1]:
                 return None

@@ -314,9 +314,8 @@ def _kept_if_better(
     with suppress(ValueError):
         best = min(starts, key=logs.errors)
         errors, left = np.inf, _STEPS
-        while (
-            left and logs.errors(best) < errors
-        ):  # each behind the observer that follows what was found before
+        # Each behind the observer that follows what was found before.
+        while left and logs.errors(best) < errors:
             errors, left = logs.errors(best), left - 1
             best = _stepped(logs, observed(best, logs.records))
         # An excess that has gone to nothing is none.

@@ -60,7 +60,7 @@ def run_from_files(
         out = out if out is not None else default_directory(logs[0].stem)
         RunDirectory(out).refuse_unless_free(resume=resume, replace=replace)
         config, text, known, found = decided("run", logs, out / "config.toml", stated, progress)
-        note = f"without friction {found.refused}: as recorded" if found.refused else ""
+        note = f"described as recorded, its friction not identified: {found.refused}" if found.refused else ""
     elif config_path is not None:
         config, text = load_any(config_path)
     elif resume and out is not None and (out / "manifest.json").is_file():

@@ -296,7 +296,8 @@ def beside_recorded(stage: StageInput, loop: FrictionLoop, step: Real) -> dict[s
 
 
 def recorded_loop(stage: StageInput, loop: FrictionLoop) -> FrictionLoop | None:
-    """The controller that made the logs in the place of the loop's; None where they do not tell it."""
+    """The controller that made the logs in the place of the loop's, its command not limited; None where they
+    do not tell it."""
     records = stage.results.records.fitted(stage.config.control_channel)
     law = controller_of(records)
     if law is None:
