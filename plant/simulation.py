@@ -332,6 +332,8 @@ class SampledArm(Simulator):
             limited,
         )
         run(np.zeros((1, 4)), np.empty((1, state.x.size)), *state, *self.plan.arguments, *loop)
+        if not np.all(np.isfinite(command)):
+            raise ValueError("the loop ran away: its command is not finite")
         return output, command, limited
 
 

@@ -8,18 +8,19 @@ from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import control
+import numba
 import numpy as np
 import numpy.typing as npt
 
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Boolean, Complex, Real
-from ident.data.arrays import lock
+from ident.data.arrays import COMPILED, INSIDE, kernel_array, lock
 from ident.data.shown import Shown
 
 
 class SampledMachine(Protocol):
-    """A machine sampled every dt_s: measure at t_k, then hold the input until t_{k+1}. `plant.SampledArm` is
-    one; it has the whole loop compiled too, as `in_loop`, which `simulate` then calls."""
+    """A machine sampled every dt_s: measure at t_k, then hold the input until t_{k+1}. `plant.SampledArm` and
+    `LinearMachine` are; they have the whole loop compiled too, as `in_loop`, which `simulate` then calls."""
 
     @property
     def dt_s(self) -> float: ...
@@ -31,8 +32,8 @@ class SampledMachine(Protocol):
 class LinearMachine:
     """A discrete `control.StateSpace` as a SampledMachine.
 
-    Inputs: command, and optionally a second one driven by `hub_torque_Nm`; any number of outputs. The first
-    column of D must be zero: a sampled machine cannot answer at t_k to a command that is applied from t_k on.
+    Inputs: the commands, and optionally one more driven by `hub_torque_Nm`; any number of outputs. D must be
+    zero: a sampled machine cannot answer at t_k to a command that is applied from t_k on.
     """
 
     def __init__(self, system: control.StateSpace) -> None:
@@ -40,15 +41,17 @@ class LinearMachine:
             raise ValueError(
                 f"LinearMachine needs a discrete system with dt in seconds; got dt = {system.dt}"
             )
-        if system.ninputs not in (1, 2):
-            raise ValueError(f"LinearMachine needs one or two inputs; got {system.ninputs}")
         if np.any(np.asarray(system.D) != 0):
             raise ValueError(
                 "LinearMachine needs D = 0: the measurement at t_k comes before the command at t_k"
             )
-        self._a, self._b, self._c = (np.array(getattr(system, m), dtype=np.float64) for m in "ABC")
+        self._a, self._b, self._c = (np.array(getattr(system, m), dtype=np.float64, order="C") for m in "ABC")
         self._dt_s = float(system.dt)
         self.reset()
+
+    def __init_subclass__(cls) -> None:
+        if {"measure", "advance"} & vars(cls).keys():  # the compiled loop would not know of it
+            cls.in_loop = None  # type: ignore[assignment]
 
     @property
     def dt_s(self) -> float:
@@ -61,17 +64,113 @@ class LinearMachine:
         """Outputs (Y,) at t_k."""
         return np.asarray(self._c @ self._x, dtype=np.float64)
 
-    def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
-        """Hold the command for one sample.
+    def advance(self, u: npt.ArrayLike, /, *, hub_torque_Nm: float = 0.0) -> None:
+        """Hold the command, or commands (U,), for one sample.
 
-        Raises ValueError if a disturbance torque is given and the system has no second input for it.
+        Raises ValueError if a disturbance torque is given and the system has no input for it.
         """
-        if self._b.shape[1] == 1:
-            if hub_torque_Nm != 0.0:
-                raise ValueError("this LinearMachine has one input; a hub torque needs a second one")
-            self._x = self._a @ self._x + self._b[:, 0] * u
-        else:
-            self._x = self._a @ self._x + self._b @ np.array([u, hub_torque_Nm])
+        drive = np.append(u, hub_torque_Nm)[: self._b.shape[1]]
+        self._refuse_torque(hub_torque_Nm)
+        self._x = self._a @ self._x + self._b @ drive
+
+    def in_loop(
+        self,
+        signals: Real,
+        law: Real,
+        limits: Real,
+        steps: Real,
+        delay: int,
+        measured: int,
+        clip: float = np.inf,
+    ) -> tuple[Real, Real, Boolean]:
+        """Outputs (T, Y), commands (T,) and whether they were limited (T,) of a loop, from rest; arguments as
+        of `plant.simulation.SampledArm.in_loop`."""
+        self._refuse_torque(signals[:, 4])
+        added = signals[:, 3 : 3 + self._b.shape[1]]
+        y, u, limited = self.joints_in_loop(
+            signals[:, :3], added, law, limits, steps, delay, np.array([measured]), clip
+        )
+        return y, u[:, 0], limited
+
+    def joints_in_loop(
+        self,
+        given: Real,
+        added: Real,
+        law: Real,
+        limits: Real,
+        steps: Real,
+        delay: int,
+        measured: npt.NDArray[np.int64],
+        clip: float = np.inf,
+    ) -> tuple[Real, Real, Boolean]:
+        """The same of a law (`law_arrays`) of errors at the outputs `measured` (M,). given (T, 2 M + U): set
+        points, what joins the commands, what joins the measurements. added (T, inputs)."""
+        n, commands = len(given), limits.size // 2
+        found = np.empty((n, len(self._c))), np.empty((n, commands)), np.zeros(n, dtype=np.bool_)
+        drive = np.hstack([added, np.zeros((n, self._b.shape[1] - added.shape[1]))])
+        machine = self._a, self._b, self._c
+        _run(*map(kernel_array, (given, drive, *machine, law, limits, steps)), delay, measured, clip, *found)
+        return found
+
+    def _refuse_torque(self, torque_Nm: npt.ArrayLike) -> None:
+        if self._b.shape[1] == 1 and np.any(torque_Nm):
+            raise ValueError("this LinearMachine has one input; a hub torque needs a second one")
+
+
+@numba.njit(**INSIDE)
+def _along(rows: Any, i: int, values: Any) -> float:
+    total = 0.0
+    for j in range(values.size):
+        total += rows[i, j] * values[j]
+    return total
+
+
+@numba.njit(**COMPILED)
+def _run(
+    given: Any,
+    added: Any,
+    a: Any,
+    b: Any,
+    c: Any,
+    law: Any,
+    limits: Any,
+    steps: Any,
+    delay: int,
+    measured: Any,
+    clip: float,
+    output: Any,
+    command: Any,
+    limited: Any,
+) -> None:
+    """Fill output, command and limited of `LinearMachine.joints_in_loop`."""
+    n, n_u, n_y = law.shape[0] - command.shape[1], command.shape[1], measured.size
+    x, new, drive = np.zeros(a.shape[0]), np.zeros(a.shape[0]), np.zeros(b.shape[1])
+    own, later, last = np.zeros(law.shape[1]), np.zeros(n), np.zeros(n_u)
+    queue = np.zeros((delay + 1, n_u))
+    for k in range(len(given)):
+        for i in range(len(c)):
+            output[k, i] = _along(c, i, x)
+        for i in range(n_y):
+            y = output[k, measured[i]] + given[k, n_y + n_u + i]
+            output[k, measured[i]] = y = y if steps[0] == 0 else steps[0] * np.rint(y / steps[0])
+            own[n + i] = given[k, i] - y
+        for i in range(n_u):
+            wanted = _along(law, n + i, own) + given[k, n_y + i]
+            u = min(max(wanted, last[i] - limits[n_u + i]), last[i] + limits[n_u + i])
+            last[i] = min(max(u, -limits[i]), limits[i])
+            limited[k] |= last[i] != wanted
+            own[n + n_y + i] = last[i] - wanted
+            queue[k % (delay + 1), i] = last[i] if steps[1] == 0 else steps[1] * np.rint(last[i] / steps[1])
+            command[k, i] = queue[(k + 1) % (delay + 1), i]
+            drive[i] = min(max(command[k, i] + added[k, i], -clip), clip)
+        for i in range(n):
+            later[i] = _along(law, i, own)
+        own[:n] = later
+        for i in range(n_u, drive.size):
+            drive[i] = added[k, i]
+        for i in range(x.size):
+            new[i] = _along(a, i, x) + _along(b, i, drive)
+        x[:] = new
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -113,6 +212,7 @@ def simulate(
     output_disturbance: npt.ArrayLike | None = None,
     measurement_step: float = 0.0,
     command_step: float = 0.0,
+    clip: float = np.inf,
 ) -> ClosedLoopTrajectory:
     """Run u = K (r - y), with the controller's feed-forward if it has one, on a machine from rest.
 
@@ -126,6 +226,8 @@ def simulate(
         Torque handed to the machine; added to the applied command; added to the measured output.
     measurement_step, command_step : float
         Quantisation (mid-tread rounding) in output and input units; 0 = none.
+    clip : float
+        The machine clips its input there without telling the controller; inf = nowhere.
 
     Raises ValueError if sampling times or lengths do not match, or a value is not finite.
     """
@@ -148,9 +250,7 @@ def simulate(
             joins = controller.feedforward.signal(wanted, controller.dt_s)
         delay, steps = controller.computational_delay_samples, np.array([measurement_step, command_step])
         signals = np.column_stack([wanted, joins, shift, added, torque])
-        y, u, at_limit = in_loop(signals, *law_arrays(controller), steps, delay, measured_index)
-        if not np.all(np.isfinite(u)):
-            raise ValueError("the loop ran away: its command is not finite")
+        y, u, at_limit = in_loop(signals, *law_arrays(controller), steps, delay, measured_index, clip)
         return ClosedLoopTrajectory(time_s, wanted, y, u, at_limit, controller.dt_s, measured_index)
     machine.reset()
     stepper = controller.stepper()
@@ -164,29 +264,27 @@ def simulate(
         if measurement_step > 0:
             y[measured_index] = np.round(y[measured_index] / measurement_step) * measurement_step
         u = stepper.step(float(wanted[k] - y[measured_index]), float(wanted[k]))
-        limited[k] = stepper.limited
+        limited[k] = stepper.limited[0]
         if command_step > 0:
             u = float(np.round(u / command_step) * command_step)
         queue.append(u)
         applied = queue.pop(0)
         output.append(y)
         command[k] = applied
-        if torque[k] != 0.0:
-            machine.advance(applied + added[k], hub_torque_Nm=float(torque[k]))
-        else:
-            machine.advance(applied + added[k])
+        machine.advance(min(max(applied + added[k], -clip), clip), hub_torque_Nm=float(torque[k]))
     return ClosedLoopTrajectory(
         time_s, wanted, np.array(output), command, limited, controller.dt_s, measured_index
     )
 
 
 def law_arrays(controller: Controller) -> tuple[Real, Real]:
-    """For compiled loops: (n + 1, n + 2), columns A, B, M and C, D, -; limits (2,) of the command and of its
-    change in a sample."""
+    """For compiled loops of U commands and Y errors: (n + U, n + Y + U), columns A, B, M and C, D, -; limits
+    (2 U,) of the commands and of their changes in a sample."""
     assert controller.anti_windup_gain is not None
-    law = np.zeros((controller.order + 1, controller.order + 2))
-    law[:-1] = np.hstack([controller.A, controller.B, controller.anti_windup_gain])
-    law[-1:, :-1] = np.hstack([controller.C, controller.D])
+    n, (commands, errors) = controller.order, controller.D.shape
+    law = np.zeros((n + commands, n + errors + commands))
+    law[:n] = np.hstack([controller.A, controller.B, controller.anti_windup_gain])
+    law[n:, : n + errors] = np.hstack([controller.C, controller.D])
     change = controller.limits("rate_limit") * controller.dt_s
     return law, np.concatenate([controller.limits("input_limit"), change])
 
@@ -216,8 +314,13 @@ def simulate_joints(
         raise ValueError(f"reference must be (T, {outputs}); got {reference.shape}")
     n = reference.shape[0]
     added = np.zeros((n, inputs)) if input_disturbance is None else input_disturbance
+    if isinstance(machine, LinearMachine):
+        given, delay = np.zeros((n, 2 * outputs + inputs)), controller.computational_delay_samples
+        given[:, :outputs] = reference
+        law, limits = law_arrays(controller)
+        return machine.joints_in_loop(given, added, law, limits, np.zeros(2), delay, np.arange(outputs))[:2]
     machine.reset()
-    stepper = controller.matrix_stepper()
+    stepper = controller.stepper()
     queue = [np.zeros(inputs)] * controller.computational_delay_samples
     output, command = np.empty((n, outputs)), np.empty((n, inputs))
     for k in range(n):
@@ -281,6 +384,7 @@ def measure_sensitivity(
     measured_index: int = 0,
     measurement_step: float = 0.0,
     command_step: float = 0.0,
+    clip: float = np.inf,
     **excitation: Any,
 ) -> MeasuredSensitivity:
     """S measured on a machine: excitation as of `sensitivity_of`, the other keywords as of `simulate`."""
@@ -293,6 +397,7 @@ def measure_sensitivity(
             measured_index=measured_index,
             measurement_step=measurement_step,
             command_step=command_step,
+            clip=clip,
         )
 
     return sensitivity_of(run, rng, dt_s=controller.dt_s, **excitation)

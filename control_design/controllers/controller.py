@@ -144,76 +144,45 @@ class Controller(Law):
         return super().from_dict({"signals": "", **data, "feedforward": made})
 
     def stepper(self) -> ControllerStepper:
-        """A fresh machine-side instance of one loop at rest."""
+        """A fresh machine-side instance at rest."""
         return ControllerStepper(self)
-
-    def matrix_stepper(self) -> MatrixStepper:
-        """The same of several commands: `step` takes Y errors."""
-        return MatrixStepper(self)
 
 
 class ControllerStepper:
-    """One running controller: feed the error at t_k, get the limited command computed at t_k.
+    """One running controller: feed the error at t_k, get the limited command computed at t_k; of several
+    commands the errors (Y,) and commands (U,), each limited by itself, without a friction feed-forward.
 
     The computational delay belongs to whoever applies the command (`closed_loop.simulate` queues it): a
     real-time loop has it by itself.
     """
 
     def __init__(self, controller: Controller) -> None:
-        assert controller.anti_windup_gain is not None
-        self._controller = controller
-        self._a, self._b = np.array(controller.A), np.array(controller.B[:, 0])
-        self._c, self._d = np.array(controller.C[0]), float(controller.D[0, 0])
-        self._m = np.array(controller.anti_windup_gain[:, 0])
-        self._limit = float(controller.limits("input_limit")[0])
-        self._change = float(controller.limits("rate_limit")[0]) * controller.dt_s
-        self._given = controller.feedforward
-        self._share = 0.0 if self._given is None else self._given.share(controller.dt_s)
+        self._k, self._given = controller, controller.feedforward
+        self._limit = controller.limits("input_limit")
+        self._change = controller.limits("rate_limit") * controller.dt_s
         self.reset()
 
     def reset(self) -> None:
         """Back to rest: zero state, previous command zero."""
-        self._x = np.zeros(self._controller.order)
-        self._last = 0.0
+        self._x, self._last = np.zeros(self._k.order), np.zeros(self._k.D.shape[0])
         self._reference, self._smoothed = 0.0, 0.0
-        self.limited = False
+        self.limited = np.zeros(self._last.size, dtype=bool)
 
-    def step(self, error: float, reference: float = 0.0) -> float:
-        """Command for the error at this sample; `limited` tells whether a limit was active.
+    def step(self, error: Any, reference: float = 0.0) -> Any:
+        """Command for the error at this sample, a number for a number; `limited` (U,) tells where a limit was
+        active.
 
         reference: the set point, which the feed-forward (if any) looks at; it rested at zero before. An error
         that is not finite gives NaN, whatever the limits; states keep it until `reset`.
         """
+        k, errors = self._k, np.atleast_1d(np.asarray(error, dtype=np.float64))
+        assert k.anti_windup_gain is not None
         if self._given is not None:
             moved = reference - self._reference
-            friction = float(self._given.friction(np.asarray(moved), self._controller.dt_s)) if moved else 0.0
-            self._smoothed += self._share * (friction - self._smoothed)
+            friction = float(self._given.friction(np.asarray(moved), k.dt_s)) if moved else 0.0
+            self._smoothed += self._given.share(k.dt_s) * (friction - self._smoothed)
         self._reference = reference
-        wanted = float(self._c @ self._x) + self._d * error + (error - error) + self._smoothed
-        command = min(max(wanted, self._last - self._change), self._last + self._change)
-        command = min(max(command, -self._limit), self._limit)
-        self.limited = command != wanted
-        self._x = self._a @ self._x + self._b * error + self._m * (command - wanted)
-        self._last = command
-        return command
-
-
-class MatrixStepper:
-    """`ControllerStepper` of Y errors and U commands, without a friction feed-forward; each command is
-    limited by itself."""
-
-    def __init__(self, controller: Controller) -> None:
-        self._k = controller
-        self._limit = controller.limits("input_limit")
-        self._change = controller.limits("rate_limit") * controller.dt_s
-        self._x, self._last = np.zeros(controller.order), np.zeros(controller.D.shape[0])
-        self.limited = np.zeros(self._last.size, dtype=bool)
-
-    def step(self, error: Real) -> Real:
-        """Commands (U,) for the errors (Y,) at this sample."""
-        k = self._k
-        assert k.anti_windup_gain is not None
-        wanted = k.C @ self._x + k.D @ error + np.sum(error - error)  # NaN, as of one loop
+        wanted = k.C @ self._x + k.D @ errors + np.sum(errors - errors) + self._smoothed
         command = wanted  # compared as the code in C compares, also what is not a number
         for low, high in (
             (self._last - self._change, self._last + self._change),
@@ -221,9 +190,9 @@ class MatrixStepper:
         ):
             command = np.where(command > high, high, np.where(command < low, low, command))
         self.limited = command != wanted
-        self._x = k.A @ self._x + k.B @ error + k.anti_windup_gain @ (command - wanted)
+        self._x = k.A @ self._x + k.B @ errors + k.anti_windup_gain @ (command - wanted)
         self._last = command
-        return np.asarray(command)
+        return command if np.ndim(error) else float(command[0])
 
 
 def observer_gain(A: Real, B: Real, C: Real, D: Real) -> Real:

@@ -69,7 +69,7 @@ def _drawn(rng):
     reference = np.cumsum(rng.choice([0.0, 1.0], _SAMPLES) * 0.03 * rng.standard_normal(_SAMPLES))
     number = rng.choice([float, np.float64])  # as they are, or of numpy
     plain = Controller(*_system(rng, *shape, dt), dt)
-    options, stepper = {}, plain.matrix_stepper()
+    options, stepper = {}, plain.stepper()
     command = np.array([stepper.step(e) for e in errors])
     for name, signal in (("input_limit", command), ("rate_limit", np.diff(command, axis=0) / dt)):
         most = np.quantile(np.abs(signal), 0.7, axis=0) + 1e-6 * np.max(np.abs(signal)) + 1e-3
@@ -202,12 +202,11 @@ class _Stepper:
     """The product's own, with the same bits."""
 
     def __init__(self, law):
-        self.one, self.flags = law.D.size == 1, []
-        self.own = law.stepper() if self.one else law.matrix_stepper()
+        self.own, self.flags = law.stepper(), []
 
     def step(self, error, reference):
-        command = self.own.step(float(error[0]), reference) if self.one else self.own.step(error)
-        self.flags.append(np.atleast_1d(self.own.limited) @ (1 << np.arange(np.size(command))))
+        command = self.own.step(error, reference)
+        self.flags.append(self.own.limited @ (1 << np.arange(command.size)))
         return command
 
 

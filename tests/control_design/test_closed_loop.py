@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from control_design import ClosedLoopTrajectory, Controller, LinearMachine, simulate, step_metrics
-from control_design.analysis.closed_loop import measure_sensitivity
+from control_design.analysis.closed_loop import measure_sensitivity, simulate_joints
 
 from .plants import hub_arm
 
@@ -78,6 +78,36 @@ def test_limits_and_quantisation_are_where_they_belong():
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
     assert trajectory.limited.mean() > 0.5
     assert trajectory.command[0] == 0  # one sample of delay
+
+
+class _Stepped(LinearMachine):
+    """The same, sample by sample."""
+
+    def measure(self):
+        return super().measure()
+
+
+def test_whole_loop_compiled_is_the_stepped_one():
+    rng = np.random.default_rng(3)
+    a, b, c = (rng.standard_normal(shape) for shape in ((4, 4), (4, 2), (2, 4)))
+    two = control.ss(0.9 * a / np.max(np.abs(np.linalg.eigvals(a))), b, c, np.zeros((2, 2)), _DT)
+    law = _controller(2, input_limit=0.4, rate_limit=30.0)
+    signals = {f"{name}_disturbance": 0.2 * rng.standard_normal(300) for name in ("input", "output")}
+    others = {"hub_torque_Nm": rng.standard_normal(300), "measurement_step": 1e-2, "command_step": 1e-2}
+    runs = [
+        simulate(law, kind(two), np.ones(300), measured_index=1, clip=0.3, **signals, **others)
+        for kind in (LinearMachine, _Stepped)
+    ]
+    assert 0 < runs[0].limited.mean() < 1
+    for name in ("output", "command", "limited"):
+        np.testing.assert_allclose(*(getattr(run, name) for run in runs), rtol=1e-9, atol=1e-12)
+    both = Controller(
+        rng.standard_normal((3, 3)) / 4, rng.standard_normal((3, 2)), rng.standard_normal((2, 3)),
+        rng.standard_normal((2, 2)) / 9, _DT, input_limit=(1.0, None), rate_limit=(60.0, 90.0),
+        computational_delay_samples=1,
+    )  # fmt: skip
+    joints = [simulate_joints(both, kind(two), np.ones((300, 2))) for kind in (LinearMachine, _Stepped)]
+    np.testing.assert_allclose(*joints, rtol=1e-9, atol=1e-12)
 
 
 def test_bad_signals_are_refused():

@@ -100,7 +100,7 @@ def test_a_law_of_two_joints_in_other_units():
     )  # fmt: skip
     other = law.in_units(error, command)
     assert (other.input_limit, other.rate_limit) == ((2.0, None), (None, 75.0))
-    steppers = law.matrix_stepper(), other.matrix_stepper()
+    steppers = law.stepper(), other.stepper()
     for given in rng.standard_normal((50, 2)):
         wanted = steppers[0].step(given)
         np.testing.assert_allclose(command * steppers[1].step(given / error), wanted, atol=1e-12)

@@ -32,13 +32,6 @@ def test_json_and_mat_keep_everything():
     assert given.to_control().ninputs == 2
 
 
-def test_the_stepper_of_one_loop_and_of_a_matrix_agree():
-    one = Controller([[0.9]], [[0.5]], [[1.0]], [[2.0]], 0.01, input_limit=1.5, rate_limit=80.0)
-    single, matrix = one.stepper(), one.matrix_stepper()
-    for error in np.random.default_rng(1).standard_normal(200):
-        assert matrix.step(np.array([error]))[0] == pytest.approx(single.step(float(error)), abs=1e-14)
-
-
 @pytest.mark.parametrize("limit", [(24.0,), 24.0, (24.0, -1.0)])
 def test_limits_that_do_not_fit_are_refused(limit):
     with pytest.raises(ValueError, match="input_limit"):

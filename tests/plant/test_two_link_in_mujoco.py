@@ -121,7 +121,7 @@ def test_a_controller_designed_for_ours_settles_the_other() -> None:
     joint = Specification(bandwidth_rad_s=5.0, modulus_margin=0.4, effort_limit=100.0, input_limit=24.0)
     asked = MultivariableSpecification(joints=(joint, joint), controller_order=4)
     law = synthesise_multivariable(MultivariablePlant("arm", nominal), asked).controller
-    machine, stepper = Segmented(arm, ELBOW_RAD), law.matrix_stepper()
+    machine, stepper = Segmented(arm, ELBOW_RAD), law.stepper()
     wanted, command = np.array([0.2, -0.3]), np.zeros(2)
     angles = np.empty((750, 2))
     for k in range(len(angles)):

@@ -10,7 +10,7 @@ from control_design.analysis.closed_loop import LinearMachine, simulate
 from control_design.controllers.controller import Controller
 from ident.basis.poles import Poles
 from ident.uncertainty import ResponsePosterior
-from workflow.tasks.sampled_plant import FINITE, ClippedMachine, realise, simulate_draw
+from workflow.tasks.sampled_plant import FINITE, realise, simulate_draw
 
 DT_S = 0.01
 
@@ -79,17 +79,13 @@ def test_direct_term_without_a_delay_is_refused():
 def test_loop_that_runs_away_stays_finite():
     """Far too much gain on an integrator: the clipped machine keeps every number a number."""
     machine = LinearMachine(control.ss([[1.0]], [[1.0]], [[1.0]], [[0.0]], DT_S))
-    run = simulate(law(50.0, 1), ClippedMachine(machine, FINITE), np.ones(3000))
+    run = simulate(law(50.0, 1), machine, np.ones(3000), clip=FINITE)
     assert np.all(np.isfinite(run.measured))
     assert np.max(np.abs(run.measured)) > 1e8
 
 
 def test_clipping_is_clipping():
     machine = LinearMachine(control.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], DT_S))
-    clipped = ClippedMachine(machine, 2.0)
-    seen = []
-    for value in (1.0, 5.0, -7.0):
-        clipped.advance(value)
-        seen.append(float(clipped.measure()[0]))
-    assert seen == [1.0, 2.0, -2.0]
-    assert clipped.dt_s == DT_S
+    load = np.array([1.0, 5.0, -7.0, 0.0])
+    run = simulate(law(0.0, 0), machine, np.zeros(4), input_disturbance=load, clip=2.0)
+    np.testing.assert_array_equal(run.measured, [0.0, 1.0, 2.0, -2.0])

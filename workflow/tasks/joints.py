@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from control_design.analysis.closed_loop import simulate_joints
+from control_design.analysis.closed_loop import LinearMachine, simulate_joints
 from control_design.analysis.multivariable_certificate import MultivariableCertificate, certify_multivariable
 from control_design.controllers.controller import Controller
 from control_design.plants.multivariable import MultivariablePlant, ResponseBall
@@ -29,7 +29,7 @@ from ident.several_outputs import identify_mimo
 from ident.uncertainty.matrix_response import MatrixUncertainty, matrix_posterior
 from plant import TwoLinkMachine, multisine, multisine_lines, two_link_arm
 from workflow.config.joints_config import JointsConfig, OperatingPoint, TwoJointSource
-from workflow.engine.errors import InputError, naming
+from workflow.engine.errors import naming
 from workflow.engine.randomness import stage_rng
 from workflow.tasks.records import read_records, refuse_constant_input, with_common_sampling_time
 from workflow.tasks.results import RecordsResult, RunRecord, StageResult, StageResults
@@ -361,7 +361,8 @@ def run_loops(stage: StageInput) -> JointsLoopResult:
     machines = _machines(config, results, stage)
     for number, (point, condition, machine) in enumerate(machines):
         stage.progress.update("closed_loop", number / len(machines), f"{point}, {condition}")
-        output, command = simulate_joints(law, machine(), reference)
+        with naming("closed loop"):
+            output, command = simulate_joints(law, machine(), reference)
         runs.append(_judged(point, condition, output, command, step, law))
     kind: Literal["simulated", "identified"] = (
         "simulated" if isinstance(source, TwoJointSource) else "identified"
@@ -389,7 +390,7 @@ def _machines(
     source, options = config.source, config.closed_loop
     if not isinstance(source, TwoJointSource):
         return [
-            (point.name, "identified model", partial(_ModelMachine, point.plant(0.0).nominal))
+            (point.name, "identified model", partial(LinearMachine, point.plant(0.0).nominal))
             for point in results.identify.points
         ]
     found: list[tuple[str, str, Callable[[], Any]]] = []
@@ -403,25 +404,6 @@ def _machines(
             words = f"dry friction {options.coulomb_Nm[0]:g} and {options.coulomb_Nm[1]:g} N m"
             found.append((point.name, words, partial(at, coulomb_Nm=options.coulomb_Nm)))
     return found
-
-
-class _ModelMachine:
-    """An identified model as a machine."""
-
-    def __init__(self, system: Any) -> None:
-        if np.any(system.D):
-            raise InputError("a model with a direct term cannot run in a loop of sampled commands")
-        self._a, self._b, self._c, self.dt_s = system.A, system.B, system.C, system.dt
-        self.reset()
-
-    def reset(self) -> None:
-        self._x = np.zeros(len(self._a))
-
-    def measure(self) -> Real:
-        return np.asarray(self._c @ self._x)
-
-    def advance(self, u: Real) -> None:
-        self._x = self._a @ self._x + self._b @ u
 
 
 JOINT_STAGES: tuple[Stage, ...] = (

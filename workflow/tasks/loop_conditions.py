@@ -23,7 +23,7 @@ from plant.rig import Rig
 from plant.simulation import simulate as simulate_arm
 from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
 from workflow.tasks.results import ConditionRun, Real
-from workflow.tasks.sampled_plant import FINITE, ClippedMachine, simulate_draw
+from workflow.tasks.sampled_plant import FINITE, simulate_draw
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, UNITS, encoded_arm
 from workflow.text.templates import said
 
@@ -101,7 +101,7 @@ class ConditionBench:
         *,
         law: Controller | None = None,
         output_disturbance: Real | None = None,
-        clip: float | None = None,
+        clip: float = np.inf,
     ) -> ClosedLoopTrajectory:
         """The loop on the posterior mean, which has no friction for a feed-forward to meet."""
         return simulate_draw(
@@ -231,7 +231,7 @@ class ConditionBench:
         reference: Real | None = None,
         *,
         law: Controller | None = None,
-        clip: float | None = None,
+        clip: float = np.inf,
         output_disturbance: Real | None = None,
         effects: Mapping[str, Mapping[str, Any]] | None = None,
         rig: Rig | None = None,
@@ -248,11 +248,12 @@ class ConditionBench:
         measurement, command = steps or (self.options.measurement_step, self.options.quantisation)
         achieved = simulate(
             law or self.controller,
-            ClippedMachine(arm, FINITE if clip is None else clip),
+            arm,
             self._filtered(reference),
             measured_index=self.measured,
             measurement_step=measurement,
             command_step=command,
+            clip=min(clip, FINITE),
         )
         size = float(reference[-1]) or float(np.max(np.abs(predicted.measured)))
         return condition_run(name, words, reference, predicted, achieved, size)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial, reduce
+from functools import reduce
 from operator import add
-from typing import Any
 
 import control
 import numpy as np
 import numpy.typing as npt
 
-from control_design.analysis.closed_loop import ClosedLoopTrajectory, LinearMachine, SampledMachine, simulate
+from control_design.analysis.closed_loop import ClosedLoopTrajectory, LinearMachine, simulate
 from control_design.controllers.controller import Controller
 from ident.basis.functions import inverse_all_pass
 from ident.basis.model import GobfModel
@@ -66,10 +64,10 @@ def simulate_draw(
     output_disturbance: Real | None = None,
     measurement_step: float = 0.0,
     command_step: float = 0.0,
-    clip: float | None = None,
+    clip: float = np.inf,
 ) -> ClosedLoopTrajectory:
-    """The loop on the plant of one draw of coefficients (P,); signals (T,) and steps as of `simulate`; clip:
-    of the plant's input, behind the controller's back.
+    """The loop on the plant of one draw of coefficients (P,); signals (T,), steps and clip as of
+    `simulate`.
 
     A direct term answers to the input of the same instant, which a sampled machine cannot do: it is measured
     before the input is known. There the machine keeps one sample of the loop's computational delay itself.
@@ -87,43 +85,15 @@ def simulate_draw(
         plant = plant * control.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], plant.dt)
         if input_disturbance is not None:
             input_disturbance = np.append(input_disturbance[1:], input_disturbance[-1])
-    machine: SampledMachine = LinearMachine(plant)
     run = simulate(
         controller,
-        machine if clip is None else ClippedMachine(machine, clip),
+        LinearMachine(plant),
         reference,
         input_disturbance=input_disturbance,
         output_disturbance=output_disturbance,
         measurement_step=measurement_step,
         command_step=command_step,
+        clip=clip,
     )
     # With a direct term the machine acted on each command one sample after it was handed over.
     return replace(run, command=np.concatenate([[0.0], run.command[:-1]])) if direct else run
-
-
-class ClippedMachine:
-    """A machine that clips its input without telling the controller."""
-
-    def __init__(self, machine: SampledMachine, limit: float) -> None:
-        self._machine, self._limit = machine, limit
-
-    @property
-    def dt_s(self) -> float:
-        return self._machine.dt_s
-
-    @property
-    def in_loop(self) -> Callable[..., Any] | None:
-        """The machine's, where it has one (`plant.simulation.SampledArm.in_loop`)."""
-        whole = getattr(self._machine, "in_loop", None)
-        return None if whole is None else partial(whole, clip=self._limit)
-
-    def reset(self) -> None:
-        self._machine.reset()
-
-    def measure(self) -> Real:
-        """Outputs (Y,) at t_k."""
-        return self._machine.measure()
-
-    def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
-        """Hold the clipped input for one sample."""
-        self._machine.advance(min(max(u, -self._limit), self._limit), hub_torque_Nm=hub_torque_Nm)

@@ -26,7 +26,7 @@ from workflow.config.settings import Section, check
 from workflow.engine import documents
 from workflow.engine.randomness import stage_rng
 from workflow.tasks.results import IdentifiedChannel
-from workflow.tasks.sampled_plant import FINITE, ClippedMachine
+from workflow.tasks.sampled_plant import FINITE
 
 INPUT_NAME, REFERENCE_NAME = "voltage_V", "reference_rad"
 OUTPUT_NAMES = SampledArm.output_names
@@ -117,7 +117,8 @@ def loop_of_arm(
     further effects, which output is measured, and the steps of the converters."""
     assert isinstance(config.source, SimulatedSource)  # or the configuration had been refused
     return {
-        "machine": ClippedMachine(encoded_arm(config.source, effects, rng, rig=rig), FINITE),
+        "machine": encoded_arm(config.source, effects, rng, rig=rig),
+        "clip": FINITE,
         "measured_index": OUTPUT_NAMES.index(config.control_channel.output),
         **converter_steps(config.closed_loop),
     }
