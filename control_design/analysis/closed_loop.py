@@ -51,7 +51,7 @@ class LinearMachine:
 
     def __init_subclass__(cls) -> None:
         if {"measure", "advance"} & vars(cls).keys():  # the compiled loop would not know of it
-            cls.in_loop = None  # type: ignore[assignment]
+            cls.in_loop = cls.joints_in_loop = None  # type: ignore[assignment]
 
     @property
     def dt_s(self) -> float:
@@ -314,11 +314,12 @@ def simulate_joints(
         raise ValueError(f"reference must be (T, {outputs}); got {reference.shape}")
     n = reference.shape[0]
     added = np.zeros((n, inputs)) if input_disturbance is None else input_disturbance
-    if isinstance(machine, LinearMachine):
+    if (in_loop := getattr(machine, "joints_in_loop", None)) is not None:
         given, delay = np.zeros((n, 2 * outputs + inputs)), controller.computational_delay_samples
         given[:, :outputs] = reference
         law, limits = law_arrays(controller)
-        return machine.joints_in_loop(given, added, law, limits, np.zeros(2), delay, np.arange(outputs))[:2]
+        output, command, _ = in_loop(given, added, law, limits, np.zeros(2), delay, np.arange(outputs))
+        return output, command
     machine.reset()
     stepper = controller.stepper()
     queue = [np.zeros(inputs)] * controller.computational_delay_samples
