@@ -11,6 +11,7 @@ import control
 import numba
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse
 
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Boolean, Complex, Real
@@ -108,7 +109,8 @@ class LinearMachine:
         n, commands = len(given), limits.size // 2
         found = np.empty((n, len(self._c))), np.empty((n, commands)), np.zeros(n, dtype=np.bool_)
         drive = np.hstack([added, np.zeros((n, self._b.shape[1] - added.shape[1]))])
-        machine = self._a, self._b, self._c
+        rows = scipy.sparse.csr_array(self._a)  # a kernel of many taps is a shift register
+        machine = rows.data, rows.indices, rows.indptr, self._b, self._c
         _run(*map(kernel_array, (given, drive, *machine, law, limits, steps)), delay, measured, clip, *found)
         return found
 
@@ -129,7 +131,9 @@ def _along(rows: Any, i: int, values: Any) -> float:
 def _run(
     given: Any,
     added: Any,
-    a: Any,
+    values: Any,
+    columns: Any,
+    starts: Any,
     b: Any,
     c: Any,
     law: Any,
@@ -142,9 +146,10 @@ def _run(
     command: Any,
     limited: Any,
 ) -> None:
-    """Fill output, command and limited of `LinearMachine.joints_in_loop`."""
+    """Fill output, command and limited of `LinearMachine.joints_in_loop`; values, columns, starts: rows of the
+    machine's A, as of `scipy.sparse.csr_array`."""
     n, n_u, n_y = law.shape[0] - command.shape[1], command.shape[1], measured.size
-    x, new, drive = np.zeros(a.shape[0]), np.zeros(a.shape[0]), np.zeros(b.shape[1])
+    x, new, drive = np.zeros(len(b)), np.zeros(len(b)), np.zeros(b.shape[1])
     own, later, last = np.zeros(law.shape[1]), np.zeros(n), np.zeros(n_u)
     queue = np.zeros((delay + 1, n_u))
     for k in range(len(given)):
@@ -169,7 +174,9 @@ def _run(
         for i in range(n_u, drive.size):
             drive[i] = added[k, i]
         for i in range(x.size):
-            new[i] = _along(a, i, x) + _along(b, i, drive)
+            new[i] = _along(b, i, drive)
+            for j in range(starts[i], starts[i + 1]):
+                new[i] += values[j] * x[columns[j]]
         x[:] = new
 
 
