@@ -31,8 +31,7 @@ _OVER = 8.0  # speeds, in units of `fall`, from which on the excess is gone
 _TINY = np.finfo(np.float64).tiny
 
 
-# A step waits for the sum before it: sums in any order are a fifth faster.
-@numba.njit(**INSIDE, fastmath={"reassoc", "contract", "arcp", "nsz"})
+@numba.njit(**INSIDE)
 def advance(
     drive: float,
     state: Any,
