@@ -34,7 +34,7 @@ from workflow.text.templates import said
 
 DT_S = 0.005
 LOW_EFFORT = SynthesisOptions(
-    starts=2, agreeing_starts=1, exchange_rounds=2, dense_points=3000, iterations=120, grid_points=80
+    starts=2, agreeing_starts=1, exchange_rounds=2, dense_points=3000, grid_points=80
 )
 SAMPLED = 60
 RADIUS = float(np.sqrt(-2 * np.log(0.05)))

@@ -146,8 +146,8 @@ def _run(
     command: Any,
     limited: Any,
 ) -> None:
-    """Fill output, command and limited of `LinearMachine.joints_in_loop`; values, columns, starts: the rows of
-    the machine's A, as of `scipy.sparse.csr_array`."""
+    """Fill output, command, limited of `LinearMachine.joints_in_loop`; values, columns, starts: rows of the
+    machine's A, as of `scipy.sparse.csr_array`."""
     n, n_u, n_y = law.shape[0] - command.shape[1], command.shape[1], measured.size
     x, new, drive = np.zeros(len(b)), np.zeros(len(b)), np.zeros(b.shape[1])
     own, later, last = np.zeros(law.shape[1]), np.zeros(n), np.zeros(n_u)

@@ -1,1 +1,1 @@
-"""Structured synthesis over ellipses: fits of the Youla bound's controllers, descent, CasADi/IPOPT."""
+"""Structured synthesis over ellipses: fits of the Youla bound's controllers, a descent by CasADi's slopes."""

@@ -20,9 +20,8 @@ from control_design.synthesis.youla_starts import FreeControllers, fitted
 Told = Callable[[float, str], None]
 
 _DRAWS = 200  # shaped loops drawn; each costs 1 ms
-_EASED = 4  # with tracking: low-gain starts given to the interior point first
-_SHAPED_TRACKING = 3  # with tracking: best shaped loops that are started from, as many as are carried
-_CARRIED = 3  # candidates carried through the exchange
+_LOW_GAIN = 4  # with tracking: starts of little gain
+_CARRIED = 3  # candidates carried through the exchange, and shaped loops that are started from
 _HOPS, _LATER_HOPS = 4, 2
 _HALVINGS = 20  # natural units of a section far from the loop's crossover are far too large
 _RETRIEVALS = 3  # rounds for ends that are good on the grid and not robustly stable between its points
@@ -177,8 +176,8 @@ class OrderSearch:
         if any(plant.unstable_poles for plant in self.problem.plants):
             return []
         maker = self._maker()
-        shaped = [x for x, _ in maker.shaped(_ROUGH_DRAWS, _SHAPED_TRACKING)]
-        return shaped + [maker.low_gain() for _ in range(min(self.options.starts, _SHAPED_TRACKING))]
+        shaped = [x for x, _ in maker.shaped(_ROUGH_DRAWS, _CARRIED)]
+        return shaped + [maker.low_gain() for _ in range(min(self.options.starts, _CARRIED))]
 
     def _nearest(self, ends: Sequence[TriedController]) -> Real:
         """Parameters that are stable on the grid, the smallest worst case first; else nearest to the
@@ -229,10 +228,10 @@ class OrderSearch:
     def _enough(self, found: Sequence[TriedController]) -> bool:
         return min((c.gamma for c in found), default=np.inf) <= self.options.sufficient_gamma
 
-    def _task(self, parameters: Real, *, eased: bool = False, steps: int | None = None) -> StartTask:
+    def _task(self, parameters: Real, *, steps: int | None = None) -> StartTask:
         """steps: without the dense check."""
         grids = tuple(self.problem.grids)
-        return StartTask(self.cascade, parameters, grids, eased, steps or STEPS, checked=steps is None)
+        return StartTask(self.cascade, parameters, grids, steps or STEPS, checked=steps is None)
 
     def _done(self, tasks: Sequence[StartTask]) -> Iterator[TriedController]:
         """Where they ended, one after the other; what was run is noted."""
@@ -256,20 +255,14 @@ class OrderSearch:
 
     def _starts(self) -> list[StartTask]:
         maker = self._maker()
-        tracking = self.problem.asks_tracking
         given = [self._task(x) for x in self.given]
         if any(plant.unstable_poles for plant in self.problem.plants):
-            stable = maker.stabilising(self._radius, max(self.options.starts, _SHAPED_TRACKING))
-            # The second half as they are: the interior point leaves some valleys the descent stays in.
-            half = (len(stable) + 1) // 2
-            tasks = [self._task(x, eased=tracking and at < half) for at, x in enumerate(stable)]
-            return [*given, *tasks]
+            stable = maker.stabilising(self._radius, max(self.options.starts, _CARRIED))
+            return [*given, *map(self._task, stable)]
         shaped = [self._task(x) for x, _ in maker.shaped(_DRAWS, self.options.starts)]
-        random = [self._task(maker.low_gain(), eased=tracking) for _ in range(self.options.starts)]
-        if tracking:
-            # The interior point finds valleys the descent alone does not: its starts come first, so that no
-            # agreement of the others ends the search before them.
-            return [*given, *random[:_EASED], *shaped[:_SHAPED_TRACKING]]
+        random = [self._task(maker.low_gain()) for _ in range(self.options.starts)]
+        if self.problem.asks_tracking:
+            return [*given, *random[:_LOW_GAIN], *shaped[:_CARRIED]]
         mixed = [start for pair in zip_longest(shaped, random) for start in pair if start is not None]
         return [*given, *mixed]
 

@@ -16,7 +16,7 @@ from control_design.plants.guards import GUARD_MODULUS, Guard, sorted_by_plant
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction
-from control_design.synthesis.angle_program import Rows
+from control_design.synthesis.rows import Rows
 from control_design.synthesis.synthesis_options import SynthesisOptions
 
 EXCHANGE_TOLERANCE = 5e-4  # accepted relative excess of the dense check over the programme
@@ -54,36 +54,28 @@ class Problem(Grids):
         """Rows of the optimisers on the lean grids, as they are now or as given."""
         rows: list[Rows] = []
         for data in self.lean(grids):
-            plant, ellipses, asked = data.plant, data.ellipses, data.sensitivity
-            rows.append(self._rows(plant, ellipses, data.delay, data.row_weights(), asked))
+            ellipses = data.ellipses
+            rows.append(Rows(ellipses, data.delay, data.row_weights()))
             if self.spec.delay_margin_s is not None:
                 late = data.delay * np.exp(-1j * ellipses.omega_rad_s * self.spec.delay_margin_s)
-                modulus = _modulus(_DELAY_COPY_MODULUS, ellipses)
-                # A fractional delay makes the loop complex at Nyquist: its phase there is not tied to zero.
-                rows.append(self._rows(plant, ellipses, late, modulus, asked, reaches_nyquist=False))
+                rows.append(Rows(ellipses, late, _modulus(_DELAY_COPY_MODULUS, ellipses)))
         for guard in self.guards:
-            plant = self.plants[guard.plant]
             points = guard.ellipses((self.grids if grids is None else grids)[guard.plant])
-            omega = points.omega_rad_s
-            delay = self.delay(omega)
-            asked = self.spec.magnitude(plant, omega, LoopFunction.SENSITIVITY)
-            rows.append(self._rows(plant, points, delay, _modulus(GUARD_MODULUS, points), asked))
+            rows.append(Rows(points, self.delay(points.omega_rad_s), _modulus(GUARD_MODULUS, points)))
         return rows
 
-    def gamma(self, cascade: Cascade, parameters: Real, *, eased: bool = False) -> float:
+    def gamma(self, cascade: Cascade, parameters: Real) -> float:
         """Weighted worst case on the dense grids; inf if some nominal loop is unstable, an ellipse
-        reaches -1 or the controller rings by itself more than it may. eased: without what is asked of
-        disturbances at the input."""
+        reaches -1 or the controller rings by itself more than it may."""
         asked = self.spec.controller_damping
         if asked is not None and not cascade.least_damping(parameters) >= asked * (1 - SOLVER_SLACK):
-            return float("inf")  # a start that IPOPT left infeasible
+            return float("inf")
         if not self.usable(cascade, parameters):
             return float("inf")
         worst = 0.0
         for _, data in self.checks(cascade, parameters):
             values = data.weighted(cascade.response(parameters, data.ellipses.omega_rad_s))
-            weighted = [each.requirement for each in data.weightings]
-            names = [each.name for each in weighted if not (eased and each.function.of_plant)]
+            names = [each.requirement.name for each in data.weightings]
             worst = max(worst, float(np.max([np.max(values[name]) for name in names])))
         return worst
 
@@ -199,39 +191,6 @@ class Problem(Grids):
         before, after = self.grids[position], with_violations(self.grids[position], omega, value, limit, most)
         self.grids[position] = after
         return after.size - before.size
-
-    def _rows(
-        self,
-        plant: UncertainPlant,
-        ellipses: Ellipses,
-        delay: Complex,
-        weights: tuple[tuple[LoopFunction, Real], ...],
-        sensitivity: Real,
-        *,
-        reaches_nyquist: bool = True,
-    ) -> Rows:
-        """Rows scaled by positive factors that keep them of one size where 1 + L grows: integrators and steep
-        tracking weights.
-
-        A positive factor on |D_L + N_L| instead of |1 + L| leaves the angles alone; (omega/scale)^i is |D_L|
-        of i integrators.
-        """
-        integrators = plant.n_integrators + int(self.spec.integrator)
-        slope = np.minimum(1.0, ellipses.omega_rad_s / self.scale_rad_s) ** integrators
-        scale = np.asarray(np.minimum(slope, 1.0 / np.maximum(sensitivity, 1.0)), dtype=np.float64)
-        return Rows(ellipses, delay, weights, scale, self._start_window(plant), reaches_nyquist)
-
-    def _start_window(self, plant: UncertainPlant) -> tuple[float, float]:
-        """Range of the first angle: arg(1 + L) of a stable loop starts at -pi (P + i/2), see
-        `stability.nyquist_count`.
-
-        The angle of a supporting normal may differ from arg(1 + L) by up to pi/2; windows are narrower than
-        pi, so that they cannot take the next branch. With integrators there is more room towards lead: at the
-        lowest frequency the loop may have come some way from its limit already.
-        """
-        integrators = plant.n_integrators + int(self.spec.integrator)
-        centre = -np.pi * (plant.unstable_poles + integrators / 2.0)
-        return (centre - 1.4, centre + 1.4) if integrators == 0 else (centre - 0.63, centre + 1.87)
 
 
 def _modulus(value: float, ellipses: Ellipses) -> tuple[tuple[LoopFunction, Real], ...]:

@@ -27,12 +27,6 @@ class SynthesisOptions(GridOptions):
         description="stop as soon as a stable design reaches this gamma; 0 = look for the best",
     )
     exchange_rounds: int = Field(default=4, ge=0, le=20, description="rounds of adding violated frequencies")
-    iterations: int = Field(
-        default=100,
-        ge=10,
-        le=5000,
-        description="IPOPT iterations per start; a descent then finishes it",
-    )
 
 
 class MultivariableOptions(Settings):

@@ -56,7 +56,7 @@ def test_a_bandwidth_that_is_met_stays():
 def test_nothing_is_lowered_unless_it_is_asked_for():
     asked = _asked(lowest_bandwidth_rad_s=None, bandwidth_rad_s=6.0, controller_order=1)
     plant = _inertia(20)
-    few = SynthesisOptions(starts=1, grid_points=40, mode_points=0, dense_points=800, iterations=20)
+    few = SynthesisOptions(starts=1, grid_points=40, mode_points=0, dense_points=800)
     used, result = synthesise_widest([plant], asked, few, rng=np.random.default_rng(1))
     assert used == asked
     assert result.gamma == synthesise([plant], asked, few, rng=np.random.default_rng(1)).gamma

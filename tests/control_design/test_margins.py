@@ -159,9 +159,7 @@ def test_units_of_time_input_and_output_do_not_matter(time, input_unit, output_u
 
 
 def test_units_do_not_matter_to_a_design():
-    options = SynthesisOptions(
-        starts=2, grid_points=60, mode_points=30, dense_points=1000, exchange_rounds=1, iterations=40
-    )
+    options = SynthesisOptions(starts=2, grid_points=60, mode_points=30, dense_points=1000, exchange_rounds=1)
 
     def gamma(t: float, g: float) -> float:
         base = _system([0.2], [0.995, 0.97 * np.exp(0.3j), 0.97 * np.exp(-0.3j)], 0.002, _DT * t)

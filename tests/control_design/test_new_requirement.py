@@ -19,8 +19,8 @@ from control_design import (
 )
 from control_design.controllers.biquads import Cascade
 from control_design.specification import WeightedRequirement, specification
-from control_design.synthesis.descent import MinimaxDescent
 from control_design.synthesis.problem import Problem
+from control_design.synthesis.rows import LoopRows
 from validation.example_plants import flexible_link
 
 from .plants import RelativeDisc, tip_acceleration
@@ -84,13 +84,14 @@ def test_slopes_and_curvature_of_its_rows_are_derivatives():
     problem = Problem((plant,), Specification(controller_order=2), SynthesisOptions())
     cascade = Cascade(("second_order",), problem.dt_s, problem.scale_rad_s)
     x = np.array([0.03, 0.04, 0.05, 0.3, 0.4])
-    (rows,) = MinimaxDescent(cascade, problem.rows(), lambda _: True)._plants
-    log, slope = rows.rows(x, gradient=True)
+    rows = LoopRows(cascade, problem.rows())
+    log, slope = rows.rows(x), rows.slopes(x)
     step = 1e-5
-    moved = [[rows.rows(x + s * step * unit, gradient=True) for s in (1, -1)] for unit in np.eye(x.size)]
-    central = np.stack([(up[0] - down[0]) / (2 * step) for up, down in moved], axis=1)
+    moved = [(x + step * unit, x - step * unit) for unit in np.eye(x.size)]
+    central = np.stack([(rows.rows(up) - rows.rows(down)) / (2 * step) for up, down in moved], axis=1)
     # Worst members are refined to about 1e-9 of log, which central differences magnify by 1/step.
     np.testing.assert_allclose(slope, central, atol=2e-3 * np.max(np.abs(slope)))
     share = np.random.default_rng(1).random(log.size)
-    bend = np.stack([share @ (up[1] - down[1]) / (2 * step) for up, down in moved], axis=1)
+    bends = [share @ (rows.slopes(up) - rows.slopes(down)) / (2 * step) for up, down in moved]
+    bend = np.stack(bends, axis=1)
     np.testing.assert_allclose(rows.curvature(x, share), bend, atol=1e-2 * np.max(np.abs(bend)))

@@ -10,8 +10,9 @@ from control_design import Specification, SynthesisOptions, UncertainPlant, cert
 from control_design.controllers.biquads import Cascade
 from control_design.plants.ellipses import distance_to_minus_one, largest_disturbance_gain
 from control_design.specification.requirement import LoopFunction
-from control_design.synthesis.descent import MinimaxDescent, _Boundary
+from control_design.synthesis.descent import MinimaxDescent
 from control_design.synthesis.problem import Problem
+from control_design.synthesis.rows import LoopRows
 from control_design.synthesis.starts import StartMaker, with_cancelling_section
 from validation.example_plants import flexible_link, flexible_link_specification
 
@@ -113,22 +114,16 @@ def test_slope_and_curvature_of_the_descent_agree_with_finite_differences(fields
     specification = problem.spec.model_copy(update=fields | {"mode_peak_ratio": 0.5})
     problem = Problem(problem.plants, specification, SynthesisOptions())
     cascade = Cascade(specification.sections(), problem.dt_s, problem.scale_rad_s)
-    boundary = _Boundary(cascade, problem.rows()[0])
+    boundary = LoopRows(cascade, problem.rows())
     rng = np.random.default_rng(0)
     x = 0.3 * rng.standard_normal(cascade.parameters)
-    multipliers = rng.random(boundary.rows(x, gradient=False)[0].size)
+    multipliers = rng.random(boundary.rows(x).size)
     bends = []
     for h in (2e-6, 1e-6):
-        ends = [
-            [multipliers @ boundary.rows(x + sign * h * e, gradient=True)[1] for sign in (1, -1)]
-            for e in np.eye(x.size)
-        ]
+        ends = [[multipliers @ boundary.slopes(x + sign * h * e) for sign in (1, -1)] for e in np.eye(x.size)]
         bends.append(np.stack([(up - down) / (2 * h) for up, down in ends]))
-    values = [
-        [multipliers @ boundary.rows(x + sign * 1e-6 * e, gradient=False)[0] for sign in (1, -1)]
-        for e in np.eye(x.size)
-    ]
-    slope = multipliers @ boundary.rows(x, gradient=True)[1]
+    values = [[multipliers @ boundary.rows(x + sign * 1e-6 * e) for sign in (1, -1)] for e in np.eye(x.size)]
+    slope = multipliers @ boundary.slopes(x)
     np.testing.assert_allclose(-np.diff(values)[:, 0] / 2e-6, slope, atol=1e-5 * np.abs(slope).max())
     exact = boundary.curvature(x, multipliers)
     np.testing.assert_allclose(exact, exact.T, atol=1e-9 * np.abs(exact).max())
@@ -154,9 +149,7 @@ def test_a_cancelling_section_does_not_change_the_controller():
 def test_active_damping_agrees_between_seeds_and_gains_with_order():
     """Orders 2 and 4 from two seeds with a short search; both beat doing nothing (1/0.3) by far."""
     gammas: dict[int, list[float]] = {2: [], 4: []}
-    quick = SynthesisOptions(
-        starts=3, exchange_rounds=0, dense_points=800, grid_points=60, mode_points=40, iterations=60
-    )
+    quick = SynthesisOptions(starts=3, exchange_rounds=0, dense_points=800, grid_points=60, mode_points=40)
     for seed in (1, 2):
         for order, values in gammas.items():
             result = synthesise([_plant()], _damping(order), quick, rng=np.random.default_rng(seed))

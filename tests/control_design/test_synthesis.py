@@ -129,7 +129,7 @@ def test_a_requirement_out_of_reach_names_how_far_and_where():
     result = synthesise(
         [plant],
         specification,
-        SynthesisOptions(starts=1, exchange_rounds=0, iterations=40, dense_points=2000),
+        SynthesisOptions(starts=1, exchange_rounds=0, dense_points=2000),
         rng=np.random.default_rng(1),
     )
     assert result.outcome is Outcome.NOT_MET
@@ -142,7 +142,7 @@ def test_a_requirement_out_of_reach_names_how_far_and_where():
     assert not certify(result.controller, [plant], specification).certified
 
 
-_FRUITLESS = SynthesisOptions(starts=1, exchange_rounds=0, iterations=30)
+_FRUITLESS = SynthesisOptions(starts=1, exchange_rounds=0)
 
 
 def test_without_a_stable_design_the_unstable_pole_is_named():

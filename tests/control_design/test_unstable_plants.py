@@ -14,9 +14,7 @@ from control_design.plants.weights import RationalWeight
 from control_design.synthesis.synthesis import synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
 
-_FEW = SynthesisOptions(
-    starts=2, grid_points=60, mode_points=30, dense_points=1500, exchange_rounds=1, iterations=40
-)
+_FEW = SynthesisOptions(starts=2, grid_points=60, mode_points=30, dense_points=1500, exchange_rounds=1)
 
 
 def _plant(numerator: Any, denominator: Any, dt_s: float, delay: int = 0) -> UncertainPlant:

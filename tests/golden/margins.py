@@ -28,7 +28,7 @@ HEADER = """\
 # Made by:  FLEXLINK_DATA=/path/to/data python -m tests.golden.margins
 #
 # `tolerance` is relative. On one machine a run repeats to the last digit. Between machines the libraries
-# round differently, IPOPT ends elsewhere on a flat optimum, and margins that no requirement holds move with
+# round differently, searches end elsewhere on a flat optimum, and margins that no requirement holds move with
 # it: the tolerances are two to ten times what three other sets of starts were seen to do (0.05 % in gamma,
 # 0.1 % in modulus, 0.1 % of dB, 0.4 % in phase, 0.5 % in delay, 0.4 % in damping).
 """
