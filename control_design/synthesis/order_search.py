@@ -128,15 +128,9 @@ class OrderSearch:
         gamma = result.best.gamma
         return result, self._enough([result.best]) or near(gamma) or agreed(gamma)
 
-    def fits_only(self, free: FreeControllers, enough: float) -> OrderResult:
-        """From one fit of each controller of any order; without exchange where that leaves more than
-        `enough`."""
-        found = list(self._done([self._task(x) for x in self._fits(free, 0)]))
-        if min((c.gamma_grid for c in found), default=np.inf) > enough:
-            found = [c for c in found if np.isfinite(c.gamma)]
-            best = min(found, key=lambda c: c.gamma, default=None)
-            return OrderResult(best, tuple(self.reports), () if best is None else (best.gamma,))
-        ends = self._retrieved(found)
+    def fits_only(self, free: FreeControllers) -> OrderResult:
+        """From one fit of each controller of any order, and what is given of a lower order: a race."""
+        ends = self._retrieved(self._checked(self._raced([*self.given, *self._fits(free, 0)])))
         return self._exchange(ends, hops=False) if ends else OrderResult(None, tuple(self.reports), ())
 
     def _raced(self, starts: Sequence[Real]) -> list[TriedController]:

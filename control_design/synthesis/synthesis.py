@@ -78,9 +78,8 @@ def synthesise(
     tell = progress or (lambda fraction, message: None)
     problem = Problem(tuple(plants), specification, options, tuple(guards))
     if specification.controller_order == "auto":
-        found = _of_lowest_order(problem, int(rng.integers(2**63)), tell)
+        found = _of_lowest_order(problem, int(rng.integers(2**63)), tell, thorough=thorough)
         return replace(found, plants=problem.plants, specification=asked)
-    own_damping = max(0.8, 1.01 * (specification.controller_damping or 0.0))
     root = int(rng.integers(2**63))
     cascade = Cascade(specification.sections(), problem.dt_s, problem.scale_rad_s)
     ladder = _ladder(specification.sections(), _LOWEST_TRACKING if problem.asks_tracking else _LOWEST_ORDER)
@@ -92,20 +91,21 @@ def synthesise(
     reports += search.reports
     if thorough and not settled:
         problem.grids[:] = grids  # what the fits violated may be of no concern to other starts
-        climbed = _climbed(workshop, ladder, root, own_damping, result.best, part_of(tell, 1, 2), reports)
+        climbed = _climbed(workshop, ladder, root, result.best, part_of(tell, 1, 2), reports)
         worse = result.best is None or (climbed.best and climbed.best.gamma <= result.best.gamma)
         result = climbed if worse else result
     found = _told(problem, cascade, result, tuple(reports), tell)
     return replace(found, plants=problem.plants, specification=asked)
 
 
-def _of_lowest_order(problem: Problem, root: int, tell: Progress) -> SynthesisResult:
+def _of_lowest_order(problem: Problem, root: int, tell: Progress, *, thorough: bool) -> SynthesisResult:
     """The lowest order within `_WITHIN` of the Youla bound, as far as fits of the bound's controllers tell.
 
-    Orders are tried from a middle one upwards, or downwards where that is enough, each from these fits alone:
-    a longer search may reach the bound with one state less. Where none reaches it, the lowest within as much
-    of the best order tried. Several plants may have bounds that no common controller reaches; a damping asked
-    of the controller is not part of the bound.
+    Orders are tried from a middle one upwards, or downwards where that is enough, each from these fits and
+    from the result of two states fewer: a longer search may reach the bound with one state less. States are
+    added as long as two of them gain, or while a specification is missed that the bound meets. Where none
+    reaches the bound, the lowest order nearly as good as the best one tried. Several plants may have bounds
+    that no common controller reaches; a damping asked of the controller is not part of the bound.
     """
     specification, limit = problem.spec, problem.options.sufficient_gamma
     tell(0.0, "bound for any order")
@@ -116,42 +116,43 @@ def _of_lowest_order(problem: Problem, root: int, tell: Progress) -> SynthesisRe
         )
     enough = max(_WITHIN * free.gamma if np.isfinite(free.gamma) else 0.0, limit)
     workshop, reports = Workshop(problem), list[StartReport]()
-    found: dict[int, tuple[float, OrderResult]] = {}
-
-    def search(order: int) -> OrderSearch:
-        sections = specification.model_copy(update={"controller_order": order}).sections()
-        cascade = Cascade(sections, problem.dt_s, problem.scale_rad_s)
-        part = part_of(tell, len(found), _HIGHEST, f"order {order}: ")
-        return OrderSearch(workshop, cascade, np.random.default_rng([root, order]), part)
+    found: dict[int, tuple[float, OrderResult, OrderSearch]] = {}
 
     def gamma(order: int) -> float:
-        own = search(order)
-        own.tell(0.0, "fits of the bound")
-        result = own.fits_only(free, enough)
-        reports.extend(own.reports)
-        found[order] = np.inf if result.best is None else result.best.gamma, result
+        sections = specification.model_copy(update={"controller_order": order}).sections()
+        cascade, given = Cascade(sections, problem.dt_s, problem.scale_rad_s), list[Real]()
+        part = part_of(tell, len(found), _HIGHEST, f"order {order}: ")
+        part(0.0, "fits of the bound")
+        own = np.random.default_rng([root, order])
+        if order - 2 in found and (lower := found[order - 2][1].best) is not None:
+            given = _embedded(problem, replace(cascade, sections=sections[:-1]), lower, cascade, own)
+        search = OrderSearch(workshop, cascade, own, part, given)
+        result = search.fits_only(free)
+        reports.extend(search.reports)
+        found[order] = np.inf if result.best is None else result.best.gamma, result, search
         return found[order][0]
 
     def within() -> float:
-        return max(enough, _WITHIN * min(value for value, _ in found.values()))
+        return max(enough, min(value for value, *_ in found.values()) / _GAINS)
 
     order = _MIDDLE
-    while gamma(order) > enough and order < _HIGHEST:
-        if order - 2 in found and found[order][0] > _GAINS * found[order - 2][0]:
+    while gamma(order) > enough and order + 2 <= _HIGHEST:
+        met = found[order][0] <= 1.0 or free.gamma > 1.0
+        if (met or not thorough) and order > _MIDDLE and found[order][0] > _GAINS * found[order - 2][0]:
             break
-        order += 1
+        order += 2
     if found[order][0] > enough:
-        order = min(number for number, (value, _) in found.items() if value <= within())
-    if order == _MIDDLE:
-        while order > 1 and gamma(order - 1) <= within():
-            order -= 1
-    own = search(order)
-    result = found[order][1]
-    if found[order][0] > enough:
-        result, _ = own.quick(free)
-        reports += own.reports
-    cascade = own.cascade
-    return _told(problem, cascade, result, tuple(reports), tell)
+        order = min(number for number, (value, *_) in found.items() if value <= within())
+    while order > 1 and order - 1 not in found and gamma(order - 1) <= within():
+        order -= 1
+    reached, result, search = found[order]
+    if reached > enough:
+        search.reports = []
+        again, _ = search.quick(free)
+        reports += search.reports
+        if again.best is not None and again.best.gamma < reached:
+            result = again
+    return _told(problem, search.cascade, result, tuple(reports), tell)
 
 
 def synthesise_near(
@@ -178,7 +179,7 @@ def synthesise_near(
     cascade, workshop = Cascade(problem.spec.sections(), problem.dt_s, problem.scale_rad_s), Workshop(problem)
     omega = problem.grids[0]
     known = FreeController(omega, controller.response(omega, with_delay=False))
-    result = OrderSearch(workshop, cascade, rng, tell).fits_only(FreeControllers((known,), np.inf), np.inf)
+    result = OrderSearch(workshop, cascade, rng, tell).fits_only(FreeControllers((known,), np.inf))
     return _told(problem, cascade, result, result.reports, tell)
 
 
@@ -205,7 +206,6 @@ def _climbed(
     workshop: Workshop,
     ladder: Sequence[tuple[SectionKind, ...]],
     root: int,
-    own_damping: float,
     fitted: TriedController | None,
     tell: Progress,
     reports: list[StartReport],
@@ -219,16 +219,24 @@ def _climbed(
         own = np.random.default_rng([root, cascade.order])
         given: list[Real] = []
         if lower is not None and result.best is not None:
-            given = [
-                with_cancelling_section(lower, result.best.parameters, cascade, own, damping=own_damping)
-                for _ in range(_EMBEDDINGS)
-            ]
+            given = _embedded(problem, lower, result.best, cascade, own)
         if number == len(ladder) - 1 and fitted is not None:
             given.append(fitted.parameters)
         part = part_of(tell, number, len(ladder), f"order {cascade.order}: ")
         result = OrderSearch(workshop, cascade, own, part, given).run()
         reports += result.reports
     return result
+
+
+def _embedded(
+    problem: Problem, lower: Cascade, best: TriedController, higher: Cascade, rng: np.random.Generator
+) -> list[Real]:
+    """The best of a lower order with a section more that cancels itself, in several ways."""
+    damping = max(0.8, 1.01 * (problem.spec.controller_damping or 0.0))
+    return [
+        with_cancelling_section(lower, best.parameters, higher, rng, damping=damping)
+        for _ in range(_EMBEDDINGS)
+    ]
 
 
 def _seen_by_the_data(specification: Specification, plants: Sequence[UncertainPlant]) -> Specification:
