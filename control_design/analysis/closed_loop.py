@@ -107,6 +107,8 @@ class LinearMachine:
         """The same of a law (`law_arrays`) of errors at the outputs `measured` (M,). given (T, 2 M + U): set
         points, what joins the commands, what joins the measurements. added (T, inputs)."""
         n, commands = len(given), limits.size // 2
+        if max(measured) >= len(self._c) or commands > self._b.shape[1]:  # compiled code would not see it
+            raise ValueError(f"the machine has {len(self._c)} outputs and {self._b.shape[1]} inputs only")
         found = np.empty((n, len(self._c))), np.empty((n, commands)), np.zeros(n, dtype=np.bool_)
         drive = np.hstack([added, np.zeros((n, self._b.shape[1] - added.shape[1]))])
         rows = scipy.sparse.csr_array(self._a)  # a kernel of many taps is a shift register

@@ -83,8 +83,7 @@ def test_limits_and_quantisation_are_where_they_belong():
 class _Stepped(LinearMachine):
     """The same, sample by sample."""
 
-    def measure(self):
-        return super().measure()
+    measure = LinearMachine.measure
 
 
 def test_whole_loop_compiled_is_the_stepped_one():
@@ -118,6 +117,8 @@ def test_bad_signals_are_refused():
         simulate(controller, machine, np.ones(3), input_disturbance=np.ones(2))
     with pytest.raises(ValueError, match="differ in dt_s"):
         simulate(controller, LinearMachine(hub_arm(0.01)), np.ones(3))
+    with pytest.raises(ValueError, match="1 outputs and 1 inputs only"):
+        simulate(controller, machine, np.ones(3), measured_index=1)
     with pytest.raises(ValueError, match="needs D = 0"):
         LinearMachine(control.ss(0.5, 1, 1, 1, 0.1))
 
