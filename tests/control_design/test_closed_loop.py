@@ -100,11 +100,8 @@ def test_whole_loop_compiled_is_the_stepped_one():
     assert 0 < runs[0].limited.mean() < 1
     for name in ("output", "command", "limited"):
         np.testing.assert_allclose(*(getattr(run, name) for run in runs), rtol=1e-9, atol=1e-12)
-    both = Controller(
-        rng.standard_normal((3, 3)) / 4, rng.standard_normal((3, 2)), rng.standard_normal((2, 3)),
-        rng.standard_normal((2, 2)) / 9, _DT, input_limit=(1.0, None), rate_limit=(60.0, 90.0),
-        computational_delay_samples=1,
-    )  # fmt: skip
+    parts = [rng.standard_normal(shape) / 4 for shape in ((3, 3), (3, 2), (2, 3), (2, 2))]
+    both = Controller(*parts, _DT, input_limit=(1.0, None), rate_limit=(60.0, 90.0))
     joints = [simulate_joints(both, kind(two), np.ones((300, 2))) for kind in (LinearMachine, _Stepped)]
     np.testing.assert_allclose(*joints, rtol=1e-9, atol=1e-12)
 
