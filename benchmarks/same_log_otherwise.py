@@ -70,8 +70,9 @@ def answer(logs: list[Path], way: str, work: Path) -> tuple[bool, float | None, 
     """Whether it is certified, the first mode, Hz, and the last words."""
     for log in logs:
         german = ";" in log.read_text(encoding="utf-8").splitlines()[0]
-        style = {"sep": ";", "decimal": ","} if german else {"sep": ",", "decimal": "."}
-        WAYS[way](pd.read_csv(log, **style)).to_csv(work / log.name, index=False, **style)
+        sep, point = (";", ",") if german else (",", ".")
+        table = WAYS[way](pd.read_csv(log, sep=sep, decimal=point))
+        table.to_csv(work / log.name, index=False, sep=sep, decimal=point)
     call = ["run", *map(str, sorted(work.glob("*.csv"))), "--out", str(work / "out"), "--json"]
     ended = subprocess.run(
         [sys.executable, "-m", "flexlink", *call], capture_output=True, text=True, check=False
