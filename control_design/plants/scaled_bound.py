@@ -13,12 +13,14 @@ for one or two blocks (with the performance three), an upper bound beyond (Packa
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
 from control_design.plants.ellipses import Boolean, Integer
+from ident.data.arrays import COMPILED, INSIDE
 
 Array = npt.NDArray[Any]  # real or complex
 
@@ -90,69 +92,28 @@ def structured_norm(M: Array) -> Array:
     return stability_bound(rows, M)
 
 
-class _Point(NamedTuple):
-    """At given scalings: log gamma^2 (R,), its slope in log t (R, N), x = S s (R, Y), s the vector with
-    d gamma^2 = s^H dA s, and 1 / gamma^2."""
-
-    value: Array
-    slope: Array
-    x: Array
-    share: Array
-
-    def take(self, index: Integer, new: _Point, t: Array, trial: Array) -> Boolean:
-        """Put the new ones that are lower in place, and their scalings; which these are."""
-        lower = new.value < self.value[index]
-        at = index[lower]
-        for own, other in zip(self, new, strict=True):
-            own[at] = other[lower]
-        t[at] = trial[lower]
-        return np.asarray(lower)
-
-
-def scaled_bound(
-    rows: BoundRows, K: Array, log_t: Array | None = None, *, accuracy: float = 1e-9, within: float = np.inf
-) -> Bound:
+def scaled_bound(rows: BoundRows, K: Array, log_t: Array | None = None, *, accuracy: float = 1e-9) -> Bound:
     """Smallest bound over the scalings for controller values K (R, U, Y), to a relative accuracy of gamma.
 
-    log_t (R, N): where to begin; None: from the sizes of the blocks. within: rows whose log gamma^2 stays by
-    more than this below the largest keep a bound that is not the smallest. Neglected: rounding.
+    log_t (R, N): where to begin; None: from the sizes of the blocks. Neglected: rounding.
     """
-    S = np.linalg.inv(np.eye(K.shape[2]) + rows.G @ K)
+    eye = np.eye(K.shape[2])
+    S = np.linalg.inv(eye + rows.G @ K)
     KS = K @ S
     seen = conjugate(KS)[:, None] @ rows.seen @ KS[:, None]  # (R, N, Y, Y)
     own = conjugate(KS) @ rows.V_u @ KS + conjugate(S) @ rows.V_y @ S
-    problem = _Problem(rows, S, seen, own)
-    if seen.shape[1] == 0:
-        t = np.zeros((K.shape[0], 0))
-        point = problem.at(t)
-    else:
-        t = problem.begin() if log_t is None else log_t.copy()
-        point = problem.at(t)
-        lost = ~np.isfinite(point.value)
-        if log_t is not None and np.any(lost):
-            t[lost] = problem.begin()[lost]
-            point = problem.at(t)
-        left = np.isfinite(point.value)
-        while np.any(left):
-            most = np.max(point.value, where=np.isfinite(point.value), initial=-np.inf)
-            index = np.flatnonzero(left & (point.value > most - within))
-            if not index.size:
-                break
-            few = _Point(point.value[index], point.slope[index], point.x[index], point.share[index])
-            lowest, few = problem.part(index).lower(t[index], few, accuracy)
-            for whole, part in zip((t, *point), (lowest, *few), strict=True):
-                whole[index] = part
-            left[index] = False
-    gamma = np.sqrt(np.exp(point.value))
-    x = point.x
+    base = np.broadcast_to(eye, S.shape) if rows.base is None else rows.base
+    given = (np.ascontiguousarray(each, dtype=np.complex128) for each in (own, seen, rows.entering, base))
+    t = np.full(seen.shape[:2], np.nan) if log_t is None else np.array(log_t, dtype=np.float64)
+    value, s = _lowest(*given, rows.together, accuracy, t)
+    x, share = apply(S, s), np.exp(-value)[:, None]
     y = apply(K, x)
     with np.errstate(over="ignore", invalid="ignore"):
         V = rows.V_u + np.sum(rows.seen / np.exp(t)[:, :, None, None], axis=1)
         pulled = apply(V, y)
         back = apply(conjugate(K), pulled) + apply(rows.V_y, x)
-        left = pulled - apply(conjugate(rows.G), apply(conjugate(S), back))
-        left = left * point.share[:, None]
-    return Bound(gamma, t, np.where(np.isfinite(left), left, 0.0), x)
+        left = (pulled - apply(conjugate(rows.G), apply(conjugate(S), back))) * share
+    return Bound(np.sqrt(np.exp(value)), t, np.where(np.isfinite(left), left, 0.0), x)
 
 
 def largest_channel(rows: BoundRows, K: Array, right: Array) -> Integer:
@@ -196,142 +157,285 @@ def expansion(rows: BoundRows, K: Array, log_t: Array) -> Expansion:
     return Expansion(0.5 * (H + conjugate(H)), left, right, rises - falls)
 
 
-class _Problem:
-    def __init__(self, rows: BoundRows, S: Array, seen: Array, own: Array) -> None:
-        self.rows, self.S, self.seen, self.own = rows, S, seen, own
-        self.eye = np.eye(own.shape[-1])
-
-    def begin(self) -> Array:
-        """Scalings of stationarity for blocks and performance that have one direction each."""
-        seen = np.sqrt(np.trace(self.seen, axis1=-2, axis2=-1).real)
-        enter = np.sqrt(np.trace(self.rows.entering, axis1=-2, axis2=-1).real)
-        own = np.trace(self.own, axis1=-2, axis2=-1).real[:, None]
-        t: Array = np.log(np.maximum(seen, 1e-150) / np.maximum(enter * own, 1e-150))
-        if self.rows.together:
-            return t
-        total = np.sum(seen * enter, axis=1)[:, None]
-        t += np.log(np.maximum(1.0 - total, 0.05))
-        for _ in range(12):  # towards small t, where robust stability alone counts
-            lost = ~np.isfinite(self.at(t).value)
-            if not np.any(lost):
-                break
-            t[lost] -= 3.0
-        return t
-
-    def lower(self, t: Array, point: _Point, accuracy: float) -> tuple[Array, _Point]:
-        """The smallest value of each row by itself."""
-        best = _Point(point.value.copy(), point.slope.copy(), point.x.copy(), point.share.copy())
-        lowest = (self._bracketed if t.shape[1] == 1 else self._newton)(t, best, accuracy)
-        return lowest, best
-
-    def _bracketed(self, t: Array, best: _Point, accuracy: float) -> Array:
-        """One scaling: steps of the secant of the slope, within a bracket of its sign: kinks (two eigenvalues
-        that cross) do no harm."""
-        t = t.copy()
-        low, high = np.full(t.size, -np.inf), np.full(t.size, np.inf)
-        active = np.flatnonzero(np.isfinite(best.value))
-        slope = best.slope[:, 0].copy()
-        bend = np.full(t.size, 0.5)
-        here = t[:, 0].copy()
-        for _ in range(_STEPS):
-            rises = ~(slope[active] < 0)
-            high[active[rises]], low[active[~rises]] = here[active[rises]], here[active[~rises]]
-            step = np.clip(
-                np.where(np.isfinite(slope[active]), -slope[active] / bend[active], -1.0), -3.0, 3.0
-            )
-            trial = here[active] + step
-            width = high[active] - low[active]
-            out = (trial <= low[active] + 0.05 * np.minimum(width, 1.0)) | (
-                trial >= high[active] - 0.05 * np.minimum(width, 1.0)
-            )
-            middle = np.isfinite(width) & out
-            trial[middle] = 0.5 * (low[active[middle]] + high[active[middle]])
-            gain = np.where(np.isfinite(slope[active]), np.abs(slope[active]), 1.0) * np.minimum(
-                np.abs(trial - here[active]), width
-            )
-            keep = gain > accuracy
-            active, trial = active[keep], trial[keep]
-            if not active.size:
-                break
-            new = self.part(active).at(trial[:, None])
-            moved = trial - here[active]
-            with np.errstate(invalid="ignore", divide="ignore"):
-                found = (new.slope[:, 0] - slope[active]) / moved
-            bend[active] = np.where(np.isfinite(found), np.clip(found, 0.02, 1e6), bend[active])
-            here[active] = trial
-            slope[active] = np.where(np.isfinite(new.value), new.slope[:, 0], np.inf)
-            best.take(active, new, t, trial[:, None])
-        return t
-
-    def _newton(self, t: Array, best: _Point, accuracy: float) -> Array:
-        """Several scalings: Newton's method with a curvature from differences of slopes."""
-        t = t.copy()
-        n = t.shape[1]
-        active = np.flatnonzero(np.isfinite(best.value))
-        for _ in range(_STEPS):
-            if not active.size:
-                break
-            here, slope = self.part(active), best.slope[active]
-            bent = np.empty((active.size, n, n))
-            for i in range(n):
-                moved = t[active]
-                moved[:, i] -= _FINE
-                bent[:, :, i] = (slope - here.at(moved).slope) / _FINE
-            bent = np.where(np.isfinite(bent), 0.5 * (bent + np.swapaxes(bent, 1, 2)), 0.0)
-            sizes, axes = np.linalg.eigh(bent)
-            along = np.einsum("rji,rj->ri", axes, slope)
-            step = -np.einsum("rij,rj->ri", axes, along / np.maximum(np.abs(sizes), 1e-3))
-            length = np.max(np.abs(step), axis=1)
-            step *= np.minimum(1.0, _LONGEST / np.maximum(length, 1e-300))[:, None]
-            promised = -np.einsum("ri,ri->r", step, slope)
-            left, better = np.arange(active.size), np.zeros(active.size, dtype=bool)
-            for _ in range(8):
-                index = active[left]
-                trial = t[index] + step[left]
-                good = best.take(index, self.part(index).at(trial), t, trial)
-                better[left[good]] = True
-                left = left[~good]
-                step[left] *= 0.3
-                promised[left] *= 0.3
-                left = left[promised[left] > accuracy]
-                if not left.size:
+@numba.njit(**COMPILED)
+def _lowest(
+    own: Array, seen: Array, entering: Array, base: Array, together: bool, accuracy: float, log_t: Array
+) -> tuple[Array, Array]:
+    """log gamma^2 (R,) at the best scalings, which log_t (R, N) holds afterwards (nan: look for a start), and
+    s (R, Y) with d gamma^2 = s^H dA s. Row by row: numpy's calls would cost more than the arithmetic."""
+    count, n = log_t.shape
+    value, s = np.full(count, np.inf), np.zeros((count, own.shape[1]), dtype=np.complex128)
+    work = np.empty((8, own.shape[1], own.shape[1]), dtype=np.complex128)
+    p, slope = np.empty(own.shape[1], dtype=np.complex128), np.empty(n)
+    for r in range(count):
+        of = own[r], seen[r], entering[r], base[r], together
+        value[r] = _at(log_t[r], *of, work, s[r], p, slope)
+        if n and not np.isfinite(value[r]):
+            _begin(*of, log_t[r])
+            value[r] = _at(log_t[r], *of, work, s[r], p, slope)
+            for _ in range(12):  # towards small t, where robust stability alone counts
+                if together or np.isfinite(value[r]):
                     break
-            active = active[better & (promised > accuracy)]
-        return t
+                log_t[r] -= 3.0
+                value[r] = _at(log_t[r], *of, work, s[r], p, slope)
+        if not np.isfinite(value[r]):
+            continue
+        if n == 1:
+            value[r] = _bracketed(log_t[r], value[r], slope, accuracy, of, work, s[r], p)
+        elif n:
+            value[r] = _newton(log_t[r], value[r], slope, accuracy, of, work, s[r], p)
+    return value, s
 
-    def part(self, index: Integer) -> _Problem:
-        return _Problem(self.rows.part(index), self.S[index], self.seen[index], self.own[index])
 
-    def at(self, log_t: Array) -> _Point:
-        """Everything at scalings log_t (R, N)."""
-        t = np.exp(np.clip(log_t, -300, 300))[:, :, None, None]
-        seen, entering = self.seen / t, t * self.rows.entering
-        A, C = self.own + np.sum(seen, axis=1), np.sum(entering, axis=1)
-        if self.rows.together:
-            base = self.eye if self.rows.base is None else self.rows.base
-            L = np.linalg.cholesky(C + base)
-            size, vectors = np.linalg.eigh(conjugate(L) @ A @ L)
-            top = np.maximum(size[:, -1], 1e-300)
-            u = vectors[:, :, -1]
-            s, p = apply(L, u), apply(np.linalg.inv(conjugate(L)), u) * np.sqrt(top)[:, None]
-            good = np.ones(top.size, dtype=bool)
+@numba.njit(**INSIDE)
+def _begin(own: Array, seen: Array, entering: Array, base: Array, together: bool, log_t: Array) -> None:
+    """Scalings of stationarity for blocks and performance that have one direction each."""
+    whole, total = _trace(own), 0.0
+    for i in range(log_t.size):
+        sees, enters = np.sqrt(_trace(seen[i])), np.sqrt(_trace(entering[i]))
+        total += sees * enters
+        log_t[i] = np.log(max(sees, 1e-150) / max(enters * whole, 1e-150))
+    if not together:
+        log_t += np.log(max(1.0 - total, 0.05))
+
+
+@numba.njit(**INSIDE)
+def _bracketed(
+    log_t: Array, least: float, slope: Array, accuracy: float, of: Any, work: Array, s: Array, p: Array
+) -> float:
+    """One scaling: steps of the secant of the slope, within a bracket of its sign: kinks (two eigenvalues
+    that cross) do no harm."""
+    low, high, here, bend, rise = -np.inf, np.inf, log_t[0], 0.5, slope[0]
+    trial, tried = log_t.copy(), s.copy()
+    for _ in range(_STEPS):
+        if rise < 0:
+            low = here
         else:
-            half = np.linalg.cholesky(
-                A + 1e-14 * np.trace(A, axis1=1, axis2=2).real[:, None, None] * self.eye
-            )
-            # I - C A > 0 on its spectrum: the loop is stable for all blocks of size one.
-            inside = self.eye - conjugate(half) @ C @ half
-            size, vectors = np.linalg.eigh(inside)
-            good = size[:, 0] > 1e-12
-            root = half @ (vectors / np.sqrt(np.where(good[:, None], size, 1.0))[:, None, :])
-            size, vectors = np.linalg.eigh(root @ conjugate(root))
-            top = np.maximum(size[:, -1], 1e-300)
-            u = vectors[:, :, -1]
-            p = top[:, None] * u
-            s = u + apply(C, p)
-        x = apply(self.S, s)
-        share = 1.0 / top
-        falls = np.einsum("ri,rnij,rj->rn", np.conj(s), seen, s).real
-        rises = np.einsum("ri,rnij,rj->rn", np.conj(p), entering, p).real
-        value = np.where(good, np.log(top), np.inf)
-        return _Point(value, (rises - falls) * share[:, None], x, share)
+            high = here
+        width = high - low
+        step = min(max(-rise / bend, -3.0), 3.0) if np.isfinite(rise) else -1.0
+        edge = 0.05 * min(width, 1.0)
+        trial[0] = here + step
+        if np.isfinite(width) and not (low + edge < trial[0] < high - edge):
+            trial[0] = 0.5 * (low + high)
+        gain = (abs(rise) if np.isfinite(rise) else 1.0) * min(abs(trial[0] - here), width)
+        if gain <= accuracy:
+            break
+        value = _at(trial, *of, work, tried, p, slope)
+        new = slope[0] if np.isfinite(value) else np.inf
+        bent = (new - rise) / (trial[0] - here)
+        bend = min(max(bent, 0.02), 1e6) if np.isfinite(bent) else bend
+        here, rise = trial[0], new
+        if value < least:
+            least, log_t[0] = value, here
+            s[:] = tried
+    return least
+
+
+@numba.njit(**INSIDE)
+def _newton(
+    log_t: Array, least: float, slope: Array, accuracy: float, of: Any, work: Array, s: Array, p: Array
+) -> float:
+    """Several scalings: Newton's method with a curvature from differences of slopes."""
+    n = log_t.size
+    bent, axes = np.empty((n, n), dtype=np.complex128), np.empty((n, n), dtype=np.complex128)
+    moved, step, trial, tried = np.empty(n), np.empty(n), log_t.copy(), s.copy()
+    for _ in range(_STEPS):
+        for i in range(n):
+            trial[:] = log_t
+            trial[i] -= _FINE
+            near = _at(trial, *of, work, tried, p, moved)
+            for j in range(n):
+                bent[j, i] = (slope[j] - moved[j]) / _FINE if np.isfinite(near) else 0.0
+        for i in range(n):
+            for j in range(i):
+                bent[i, j] = bent[j, i] = 0.5 * (bent[i, j] + bent[j, i])
+        _diagonalise(bent, axes)
+        step[:] = 0.0
+        for i in range(n):
+            along = 0.0
+            for j in range(n):
+                along += axes[j, i].real * slope[j]
+            for j in range(n):
+                step[j] -= axes[j, i].real * along / max(abs(bent[i, i].real), 1e-3)
+        step *= min(1.0, _LONGEST / max(np.max(np.abs(step)), 1e-300))
+        promised = -np.sum(step * slope)
+        better = False
+        for _ in range(8):
+            trial[:] = log_t + step
+            value = _at(trial, *of, work, tried, p, moved)
+            if value < least:
+                least, better = value, True
+                log_t[:], slope[:], s[:] = trial, moved, tried
+                break
+            step *= 0.3
+            promised *= 0.3
+            if promised <= accuracy:
+                break
+        if not better or promised <= accuracy:
+            break
+    return least
+
+
+@numba.njit(**INSIDE)
+def _at(
+    log_t: Array, own: Array, seen: Array, entering: Array, base: Array, together: bool,
+    work: Array, s: Array, p: Array, slope: Array,
+) -> float:  # fmt: skip
+    """log gamma^2 at scalings log_t (N,), its slope there (N,), and s (Y,); inf where they show no stability
+    (nan among them: too)."""
+    size = own.shape[0]
+    A, C, root, inside, other, H, axes = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
+    A[:], C[:] = own, 0.0
+    for i in range(log_t.size):
+        if not np.isfinite(log_t[i]):
+            return np.inf
+        t = np.exp(min(max(log_t[i], -300.0), 300.0))
+        for j in range(size):
+            for k in range(size):
+                A[j, k] += seen[i, j, k] / t
+                C[j, k] += t * entering[i, j, k]
+    if together:
+        inside[:] = C + base
+        if not _factored(inside, root, 0.0):
+            return np.inf
+        _congruence(root, A, other, H)
+    else:
+        inside[:] = A
+        jitter = 1e-14 * _trace(A) + 1e-290
+        for j in range(size):
+            inside[j, j] += jitter
+        if not _factored(inside, root, 0.0):
+            return np.inf
+        # I - R^H C R > 0: the loop is stable for all blocks of size one.
+        _congruence(root, C, other, inside)
+        for j in range(size):
+            for k in range(size):
+                inside[j, k] = (1.0 if j == k else 0.0) - inside[j, k]
+        if not _factored(inside, other, 1e-12):
+            return np.inf
+        # H = R (I - R^H C R)^-1 R^H, by T = M^-1 R^H.
+        for k in range(size):
+            for j in range(size):
+                total = np.conj(root[k, j])
+                for m in range(j):
+                    total -= other[j, m] * axes[m, k]
+                axes[j, k] = total / other[j, j]
+        for j in range(size):
+            for k in range(size):
+                H[j, k] = 0.0
+                for m in range(size):
+                    H[j, k] += np.conj(axes[m, j]) * axes[m, k]
+    _diagonalise(H, axes)
+    best = 0
+    for j in range(1, size):
+        if H[j, j].real > H[best, best].real:
+            best = j
+    top = max(H[best, best].real, 1e-300)
+    if together:
+        for j in range(size):
+            s[j] = 0.0
+            for k in range(size):
+                s[j] += root[j, k] * axes[k, best]
+        for j in range(size - 1, -1, -1):
+            total = axes[j, best] * np.sqrt(top)
+            for k in range(j + 1, size):
+                total -= np.conj(root[k, j]) * p[k]
+            p[j] = total / root[j, j]
+    else:
+        for j in range(size):
+            p[j] = top * axes[j, best]
+        for j in range(size):
+            s[j] = axes[j, best]
+            for k in range(size):
+                s[j] += C[j, k] * p[k]
+    for i in range(log_t.size):
+        t = np.exp(min(max(log_t[i], -300.0), 300.0))
+        slope[i] = (t * _form(entering[i], p) - _form(seen[i], s) / t) / top
+    return float(np.log(top))
+
+
+@numba.njit(**INSIDE)
+def _trace(matrix: Array) -> float:
+    total = 0.0
+    for j in range(matrix.shape[0]):
+        total += matrix[j, j].real
+    return total
+
+
+@numba.njit(**INSIDE)
+def _form(matrix: Array, vector: Array) -> float:
+    """vector^H matrix vector, matrix Hermitian."""
+    total = 0.0
+    for j in range(vector.size):
+        for k in range(vector.size):
+            total += (np.conj(vector[j]) * matrix[j, k] * vector[k]).real
+    return total
+
+
+@numba.njit(**INSIDE)
+def _congruence(root: Array, matrix: Array, product: Array, found: Array) -> None:
+    """found = root^H matrix root, root lower triangular."""
+    size = root.shape[0]
+    for j in range(size):
+        for k in range(size):
+            product[j, k] = 0.0
+            for m in range(k, size):
+                product[j, k] += matrix[j, m] * root[m, k]
+    for j in range(size):
+        for k in range(size):
+            found[j, k] = 0.0
+            for m in range(j, size):
+                found[j, k] += np.conj(root[m, j]) * product[m, k]
+
+
+@numba.njit(**INSIDE)
+def _factored(matrix: Array, root: Array, least: float) -> bool:
+    """Cholesky's factor, lower triangular; false where a pivot is not above `least`."""
+    size = matrix.shape[0]
+    for j in range(size):
+        for k in range(j + 1):
+            total = matrix[j, k]
+            for m in range(k):
+                total -= root[j, m] * np.conj(root[k, m])
+            if k < j:
+                root[j, k], root[k, j] = total / root[k, k], 0.0
+            elif not total.real > least:
+                return False
+            else:
+                root[j, j] = np.sqrt(total.real)
+    return True
+
+
+@numba.njit(**INSIDE)
+def _diagonalise(matrix: Array, axes: Array) -> None:
+    """Jacobi's rotations of a Hermitian matrix, in place to its eigenvalues, and axes (columns) to them."""
+    size = matrix.shape[0]
+    for j in range(size):
+        for k in range(size):
+            axes[j, k] = 1.0 if j == k else 0.0
+    for _ in range(30):  # sweeps; three to six are usual
+        off = 0.0
+        for j in range(size):
+            for k in range(j + 1, size):
+                part = abs(matrix[j, k])
+                sizes = abs(matrix[j, j].real) + abs(matrix[k, k].real)
+                if part <= 1e-16 * sizes or part < 1e-290:
+                    continue
+                off = max(off, part / sizes)
+                phase = matrix[j, k] / part
+                lean = (matrix[k, k].real - matrix[j, j].real) / (2 * part)
+                tangent = (1.0 if lean >= 0 else -1.0) / (abs(lean) + np.sqrt(1 + lean * lean))
+                c = 1 / np.sqrt(1 + tangent * tangent)
+                turn = tangent * c * phase
+                for m in range(size):
+                    first, second = matrix[m, j], matrix[m, k]
+                    matrix[m, j], matrix[m, k] = c * first - np.conj(turn) * second, turn * first + c * second
+                    first, second = axes[m, j], axes[m, k]
+                    axes[m, j], axes[m, k] = c * first - np.conj(turn) * second, turn * first + c * second
+                for m in range(size):
+                    first, second = matrix[j, m], matrix[k, m]
+                    matrix[j, m], matrix[k, m] = c * first - turn * second, np.conj(turn) * first + c * second
+                matrix[j, k] = matrix[k, j] = 0.0
+        if off < 1e-15:
+            break

@@ -32,7 +32,6 @@ from ident.data.shown import Shown
 
 _LIGHT = 0.3  # poles of loop and controller damped less have frequencies of their own in every check
 _AROUND = np.array([-3, -1.5, -0.7, -0.3, 0, 0.3, 0.7, 1.5, 3])  # in half-widths of such a pole
-_SEEN = 0.5  # log gamma^2 below the largest within which the dense check is exact
 _EXCESS = 5e-4  # accepted of the dense check over the programme
 _AT = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1)  # of the scale: where a static gain inverts the plant
 _SAME = 1e-3  # relative difference of worst cases below which two static gains count as one
@@ -297,10 +296,8 @@ class Programme:
         return checked
 
     @staticmethod
-    def _gamma(form: ModalForm, x: Real, stack: StackedRows, within: float = _SEEN) -> Real:
-        return scaled_bound(
-            stack.rows, form.response(x[None], stack.s)[0], accuracy=1e-6, within=within
-        ).gamma
+    def _gamma(form: ModalForm, x: Real, stack: StackedRows) -> Real:
+        return scaled_bound(stack.rows, form.response(x[None], stack.s)[0], accuracy=1e-6).gamma
 
     def stack(self, form: ModalForm, x: Real) -> StackedRows:
         """On the lean grid and around light poles."""

@@ -125,7 +125,7 @@ class MatrixDescent:
         if not self.stable(x):
             return None
         K = self.form.response(x[None], self.stack.s)[0]
-        found = scaled_bound(self.stack.rows, K, log_t, accuracy=_ACCURACY, within=_FAR_BELOW)
+        found = scaled_bound(self.stack.rows, K, log_t, accuracy=_ACCURACY)
         return found if np.all(np.isfinite(found.gamma)) else None
 
     def run(self, start: Real, steps: int, *, curved: bool = False) -> tuple[Real, float, int]:
