@@ -244,7 +244,7 @@ def two_joints(case: str) -> Answer:
     from control_design import MultivariableOptions, certify_multivariable, synthesise_multivariable
 
     plant, specification = (make() for make in CASES[case])
-    options = MultivariableOptions(starts=1, renewals=1)
+    options = MultivariableOptions()
     result = synthesise_multivariable(plant, specification, options)
     certificate, kept = certify_multivariable(result.controller, plant, specification), Kept()
     verdict = certificate.verdicts[0]

@@ -15,6 +15,7 @@ import numpy as np
 from control_design.plants.ellipses import Boolean, Complex, Real
 
 _FASTEST = 60.0  # corner of a block, in units of the scale
+_SMOOTH = 0.7  # damping ratio of blocks to begin with: no peak
 _MOST_DAMPED = 50.0  # two real poles (2 zeta)^2 = 10^4 apart: any pair of real poles, nearly
 
 
@@ -77,37 +78,20 @@ class ModalForm:
         """Parameters (n,) of one controller; what the pattern forbids is left out."""
         return np.concatenate([log_w, log_z, C[self._c], B[self._b], D[self._d], C_0[self._i]])
 
-    def no_blocks(self) -> tuple[Real, Real]:
-        """C and B of a form without modal blocks."""
-        return np.zeros((0, self.inputs, 2)), np.zeros((0, 2, self.outputs))
-
-    def no_input(self) -> Real:
-        """B of a block without effect."""
-        return np.zeros((2, self.outputs))
-
-    def extended(self, smaller: ModalForm, x: Real) -> Real:
-        """The controller x of a smaller form, its further blocks without effect: their C and B are zero."""
-        parts = [part[0] for part in smaller.split(x[None])]
-        more = self.blocks - smaller.blocks
-        shapes = [(more,), (more,), (more, self.inputs, 2), (more, 2, self.outputs)]
-        grown = [
-            np.concatenate([part, np.zeros(shape)]) for part, shape in zip(parts[:4], shapes, strict=True)
-        ]
-        return self.join(*grown, *parts[4:])
-
-    def replaced(self, x: Real, block: int, omega_rad_s: float, zeta: float, B: Real) -> Real:
-        """The controller x with one block replaced by another, B (2, Y), that does nothing yet: its C is
-        zero."""
-        log_w, log_z, C, inputs, D, C_0 = (part[0].copy() for part in self.split(x[None]))
-        log_w[block], log_z[block], C[block], inputs[block] = np.log(omega_rad_s), np.log(zeta), 0.0, B
-        return self.join(log_w, log_z, C, inputs, D, C_0)
-
-    def masks(self, block: int) -> tuple[Boolean, Boolean]:
-        """Rows (U,) and columns (Y,) of K that a block may reach."""
-        return (
-            np.isin(np.arange(self.inputs), self._c[1][self._c[0] == block]),
-            np.isin(np.arange(self.outputs), self._b[2][self._b[0] == block]),
-        )
+    def spread(self, lowest: float, highest: float) -> tuple[Real, Real, Real, Real]:
+        """log w, log zeta, C, B of blocks from lowest to highest times the scale, one for each actuator at a
+        corner where they belong to one, that do nothing yet: C is zero."""
+        turns = 1 if self.pattern.all() else self.inputs
+        corners = np.geomspace(lowest, highest, max(-(-self.blocks // turns), 1)) * self.scale
+        B = np.zeros((self.blocks, 2, self.outputs))
+        for block, state in np.ndindex(self.blocks, 2):
+            if turns == 1:
+                B[block, state, (block + state) % self.outputs] = 1.0
+            elif state == 0:
+                B[block, state] = 1.0
+        log_w = np.log(np.repeat(corners, turns)[: self.blocks])
+        log_z = np.full(self.blocks, np.log(max(_SMOOTH, self.damping)))
+        return log_w, log_z, np.zeros((self.blocks, self.inputs, 2)), B
 
     def bounds(self) -> tuple[Real, Real]:
         low, high = np.full(self.parameters, -np.inf), np.full(self.parameters, np.inf)
@@ -180,6 +164,43 @@ class ModalForm:
         inputs[np.arange(i), self.integrates] = 1.0
         outputs[:, :i] = C_0
         return A, inputs, outputs, D
+
+    def realised(self, A: Real, B: Real, C: Real, D: Real) -> Real | None:
+        """Parameters (n,) of a full controller of as many states, unstable poles mirrored and its slowest
+        real ones as the integrators; None where real ones do not pair or two poles are the same. Every block
+        has unit norm at its input."""
+        poles, axes = np.linalg.eig(A)
+        inverse = np.linalg.inv(axes)
+        paired = np.flatnonzero(poles.imag > 1e-9 * np.abs(poles))
+        real = sorted(np.flatnonzero(np.abs(poles.imag) <= 1e-9 * np.abs(poles)), key=lambda k: abs(poles[k]))
+        slow, real = real[: self.integrates.size], real[self.integrates.size :]
+        if len(real) % 2 or len(slow) < self.integrates.size:
+            return None
+        poles = -np.abs(poles.real) + 1j * poles.imag
+        pairs = [np.array([k, np.argmin(np.abs(poles - np.conj(poles[k])))]) for k in paired]
+        pairs += [np.array(real[k : k + 2]) for k in range(0, len(real), 2)]
+        log_w, log_z, C_b, B_b = self.spread(1.0, 1.0)
+        for block, pair in enumerate(pairs):
+            w = float(np.sqrt(np.prod(poles[pair]).real))
+            a = np.diag(poles[pair]) / max(w, np.finfo(float).tiny)
+            found = []
+            for angle in np.linspace(0, np.pi, 24, endpoint=False):
+                # T M = a T for T = [v, -a v] with any v, real or of conjugates: what is small at both ends.
+                turn = np.exp(1j * angle)
+                v = np.array([turn, np.conj(turn)] if block < paired.size else [turn.real, turn.imag])
+                T = np.column_stack([v, -a @ v])
+                if np.linalg.cond(T) < 1e9:
+                    found.append(
+                        (np.linalg.solve(T, inverse[pair] @ B / w).real, (C @ axes[:, pair] @ T).real)
+                    )
+            if not found:
+                return None
+            b, c = min(found, key=lambda each: float(np.linalg.norm(each[0]) * np.linalg.norm(each[1])))
+            size = float(np.linalg.norm(b)) or 1.0
+            log_w[block], log_z[block] = np.log(w), np.log(-np.sum(poles[pair]).real / (2 * w))
+            C_b[block], B_b[block] = c * size, b / size
+        C_0 = (C @ axes[:, slow] @ inverse[slow] @ B).real[:, self.integrates]
+        return np.clip(self.join(log_w, log_z, C_b, B_b, D, C_0), *self.bounds())
 
     def discrete(self, x: Real) -> tuple[Real, Real, Real, Real]:
         """A, B, C, D of K at the sampling time, by Tustin's rule: the same K at the same frequencies."""

@@ -1,15 +1,14 @@
 """Synthesis of one controller for plants with several inputs and outputs: fixed order and structure.
 
-A stable static gain is grown by modal blocks whose output matrix is zero at first: those with the steepest
-predicted fall of the worst case (`next_block`). Every order is taken down to a local minimum of the worst
-case (`MatrixDescent`), with the frequencies that a dense check finds violated added as it goes. Nothing is
-random.
+A start is a reduced H-infinity controller (`riccati_starts`), or a stable static gain with modal blocks that
+are spread over frequency and do nothing yet. It is taken down to a local minimum of the worst case
+(`MatrixDescent`), with the frequencies that a dense check finds violated added as it goes. Nothing is random.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,8 +22,8 @@ from control_design.plants.scaled_bound import largest_channel, scaled_bound
 from control_design.specification.multivariable import MultivariableSpecification
 from control_design.specification.specification import SpecificationError
 from control_design.synthesis.modal_controller import ModalForm
-from control_design.synthesis.multivariable_descent import MatrixDescent, Pull, StackedRows, stacked_rows
-from control_design.synthesis.next_block import best_blocks
+from control_design.synthesis.multivariable_descent import MatrixDescent, StackedRows, stacked_rows
+from control_design.synthesis.riccati_starts import central_controller, reduced, weighted_plant
 from control_design.synthesis.synthesis import part_of
 from control_design.synthesis.synthesis_options import MultivariableOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome
@@ -35,6 +34,9 @@ _AROUND = np.array([-3, -1.5, -0.7, -0.3, 0, 0.3, 0.7, 1.5, 3])  # in half-width
 _EXCESS = 5e-4  # accepted of the dense check over the programme
 _AT = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1)  # of the scale: where a static gain inverts the plant
 _SAME = 1e-3  # relative difference of worst cases below which two static gains count as one
+_SCALINGS = (0.03, 0.1, 0.3, 1.0)  # what the ball puts in, over the references
+_SPREAD = 0.03, 3.0  # of the scale: corners of blocks that do nothing yet
+_STABLE = 0.1  # of the lowest frequency: how far the poles on the axis are moved for a start
 _MOST = 15  # violated frequencies added in a round
 
 
@@ -74,17 +76,16 @@ def synthesise_multivariable(
     listed = (plants,) if isinstance(plants, MultivariablePlant) else tuple(plants)
     programme = Programme(listed, specification, options)
     tell = progress or (lambda fraction, message: None)
-    best: tuple[float, ModalForm, Real] | None = None
-    static = programme.static()[: options.starts]
-    for start, (_, gains) in enumerate(static):
-        gamma, form, x = programme.grown(gains, part_of(tell, start, len(static)))
-        if best is None or gamma < best[0]:
-            best = gamma, form, x
+    gamma, best = np.inf, np.zeros(0)
+    starts = programme.starts()[: options.starts]
+    for number, start in enumerate(starts):
+        x, reached = programme.improved(start, part_of(tell, number, len(starts)))
+        if reached < gamma or not best.size:
+            gamma, best = reached, x
         if gamma <= options.sufficient_gamma:
             break
-    assert best is not None
     tell(1.0, "synthesis")
-    return programme.result(*best)
+    return programme.result(gamma, best)
 
 
 class Programme:
@@ -122,7 +123,8 @@ class Programme:
         self.dense = stacked_rows(plants, specification, dense)
         self.scale_rad_s = self._scale()
         self.steps = 0
-        self.form(specification.controller_order)  # refuses an order that no form has
+        # Refuses an order that no form has.
+        self.form = self._form(specification.controller_order)
 
     def _grid(self, plant: MultivariablePlant, points: int, around: int) -> Real:
         if plant.own_grid is not None:
@@ -145,7 +147,7 @@ class Programme:
                 found.append(float(omega[above][-1]))
         return float(np.exp(np.mean(np.log(found)))) if found else 0.1 * float(np.pi / self.dt_s)
 
-    def form(self, order: int) -> ModalForm:
+    def _form(self, order: int) -> ModalForm:
         """Parameters of a controller with so many states."""
         integrates = np.array([joint.integrator for joint in self.spec.joints[: self.plants[0].outputs]])
         return ModalForm(
@@ -153,10 +155,27 @@ class Programme:
             self.spec.controller_damping,
         )  # fmt: skip
 
+    def starts(self) -> list[Real]:
+        """Parameters to begin with, those of the lowest worst case first: reduced H-infinity controllers of
+        the first plant, or static gains with blocks that do nothing yet where structure or plants refuse
+        them, or channels have errors of their own: one scaling does not stand for theirs (problem D of
+        mimo_designs: 1.10 for .99)."""
+        found: list[tuple[float, Real]] = []
+        if self.pattern.all() and not any(each.input_error or each.output_error for each in self.plants):
+            plant, slowest = self.plants[0], _STABLE * self.lowest_rad_s
+            plain = weighted_plant(replace(plant, ball=None), self.spec, 1.0, self.scale_rad_s, slowest)
+            for scaling in _SCALINGS:
+                K = central_controller(weighted_plant(plant, self.spec, scaling, self.scale_rad_s, slowest))
+                if K is not None and K[0].shape[0] >= self.form.order:
+                    K = reduced(K, plain, self.form.order, self.lowest_rad_s, 2 / self.dt_s)
+                    found += [(self.worst(x), x) for x in (self.form.realised(*K),) if x is not None]
+        found = [each for each in found if np.isfinite(each[0])] or self.static()
+        return [x for _, x in sorted(found, key=lambda each: each[0])]
+
     def static(self) -> list[tuple[float, Real]]:
-        """Worst cases and parameters of static gains of the lowest order, best first: the real part of a
-        pseudo-inverse of the plant at a frequency around the scale, with the best factor that is stable."""
-        form = self.lowest_form()
+        """Worst cases and parameters of static gains, best first: the real part of a pseudo-inverse of the
+        plant at a frequency around the scale, with the best factor that is stable."""
+        form, blocks = self.form, self.form.spread(*_SPREAD)
         descent = MatrixDescent(form, stacked_rows(self.plants, self.spec, self.lean), self.loops)
         found: list[tuple[float, Real]] = []
         for omega in self.scale_rad_s * np.array(_AT):
@@ -167,7 +186,7 @@ class Programme:
                 best: tuple[float, Real] | None = None
                 for gain in 2.0 ** np.arange(4.0, -14.0, -1.0):
                     slow = 0.1 * omega * gain * D[:, form.integrates]
-                    x = form.join(*(np.zeros(0),) * 2, *form.no_blocks(), gain * D, slow)
+                    x = form.join(*blocks, gain * D, slow)
                     bound = descent.bound(x, None)
                     if bound is None and best is None:
                         continue
@@ -185,75 +204,22 @@ class Programme:
         before = [0.0, *(gamma for gamma, _ in found)]  # one gain may be found at several frequencies
         return [each for each, last in zip(found, before, strict=False) if each[0] > (1 + _SAME) * last]
 
-    def lowest_form(self) -> ModalForm:
-        """Of a controller with integrators only."""
-        return self.form(sum(joint.integrator for joint in self.spec.joints[: self.plants[0].outputs]))
-
-    def grown(
-        self, start: Real, tell: Callable[[float, str], None] = lambda fraction, message: None
-    ) -> tuple[float, ModalForm, Real]:
-        """(worst case on the dense grid, form, parameters) of the asked order, or a lower one that suffices,
-        from a static gain."""
-        options, target = self.options, self.spec.controller_order
-        form, x = self.lowest_form(), start
-        x, gamma = self.improved(form, x, options.growth_rounds if form.order < target else options.rounds)
-        while form.order < target and gamma > options.sufficient_gamma:
-            tell(0.5 * form.order / target, f"order {form.order}: worst case {gamma:.3g}")
-            larger = self.form(form.order + 2)
-            pull = MatrixDescent(form, self.stack(form, x), self.loops).pull(x)
-            x = self._with_block(larger, larger.extended(form, x), larger.blocks - 1, pull)
-            form = larger
-            more = options.growth_rounds if form.order < target else options.rounds
-            x, gamma = self.improved(form, x, more)
-        tell(0.8, f"order {form.order}: worst case {gamma:.3g}")
-        gamma, x = self.renewed(gamma, form, x)
-        return gamma, form, x
-
-    def renewed(self, gamma: float, form: ModalForm, x: Real) -> tuple[float, Real]:
-        """Better, if one of the blocks that matter least has a better one in its place."""
-        without = [form.replaced(x, block, form.scale, 1.0, form.no_input()) for block in range(form.blocks)]
-        worst = [self.worst(form, less) for less in without]
-        for block in np.argsort(worst, kind="stable")[: self.options.renewals]:
-            if gamma <= max(1.0, self.options.sufficient_gamma) or not np.isfinite(worst[block]):
-                break
-            less, _ = self.improved(form, without[block], 1)
-            pull = MatrixDescent(form, self.stack(form, less), self.loops).pull(less)
-            tried = self._with_block(form, less, int(block), pull)
-            other, reached = self.improved(form, tried, self.options.rounds)
-            if reached < gamma:
-                gamma, x = reached, other
-        return gamma, x
-
-    def _with_block(self, form: ModalForm, x: Real, block: int, pull: Pull | None) -> Real:
-        """The best of several blocks in one place, after a few steps; as it is where none is stable on the
-        dense grid: a candidate may hide an unstable plant of the set between the points of the lean one."""
-        if pull is None:
-            return x
-        stack = self.stack(form, x)
-        tried = []
-        for each in best_blocks(form, block, pull, self.options.candidates):
-            start = form.replaced(x, block, each.omega_rad_s, each.zeta, each.B)
-            end, reached, steps = MatrixDescent(form, stack, self.loops).run(start, self.options.growth_steps)
-            self.steps += steps
-            tried.append((reached, end))
-        tried.sort(key=lambda each: each[0])
-        return next((end for _, end in tried if np.isfinite(self.worst(form, end))), x)
-
-    def improved(self, form: ModalForm, x: Real, rounds: int) -> tuple[Real, float]:
+    def improved(
+        self, x: Real, tell: Callable[[float, str], None] = lambda fraction, message: None
+    ) -> tuple[Real, float]:
         """Descents in rounds, with violated frequencies added: best parameters and their worst case on the
         dense grid."""
         grids = list(self.lean)
-        best, least = x, self.worst(form, x)
-        # Not while it grows: the plain descent leads on to better ends (problem D of mimo_designs).
-        curved = form.order == self.spec.controller_order
-        for _ in range(rounds):
-            grids = [np.union1d(grid, light) for grid, light in zip(grids, self._light(form, x), strict=True)]
-            descent = MatrixDescent(form, stacked_rows(self.plants, self.spec, grids), self.loops)
-            end, reached, steps = descent.run(x, self.options.steps, curved=curved)
+        best, least = x, self.worst(x)
+        for number in range(self.options.rounds):
+            tell(number / self.options.rounds, f"worst case {least:.3g}")
+            grids = [np.union1d(grid, light) for grid, light in zip(grids, self._light(x), strict=True)]
+            descent = MatrixDescent(self.form, stacked_rows(self.plants, self.spec, grids), self.loops)
+            end, reached, steps = descent.run(x, self.options.steps)
             self.steps += steps
             if not np.isfinite(reached):
                 break
-            checked = self.check(form, end)
+            checked = self.check(end)
             worst = max(float(np.max(value)) for _, value in checked)
             gain = least / worst - 1.0 if np.isfinite(least) else np.inf
             if worst < least:
@@ -271,20 +237,20 @@ class Programme:
                     self.lean[i] = np.union1d(self.lean[i], violated)
         return best, least
 
-    def worst(self, form: ModalForm, x: Real) -> float:
+    def worst(self, x: Real) -> float:
         """Worst case on the dense grid; inf for an unstable nominal loop."""
-        a, b, c, d = form.discrete(x)
+        a, b, c, d = self.form.discrete(x)
         if not all(np.all(np.abs(loop.poles(a, b, c, d)) < 1.0) for loop in self.loops):
             return float("inf")
-        return max(float(np.max(value)) for _, value in self.check(form, x))
+        return max(float(np.max(value)) for _, value in self.check(x))
 
-    def check(self, form: ModalForm, x: Real) -> list[tuple[Real, Real]]:
+    def check(self, x: Real) -> list[tuple[Real, Real]]:
         """Of every plant: frequencies (F,) of the dense check and of light poles, worst case (F,) there."""
-        light = self._light(form, x)
-        found = [(self.dense, self._gamma(form, x, self.dense))]
+        light = self._light(x)
+        found = [(self.dense, self._gamma(x, self.dense))]
         if any(each.size for each in light):
             more = stacked_rows(self.plants, self.spec, light)
-            found.append((more, self._gamma(form, x, more)))
+            found.append((more, self._gamma(x, more)))
         checked = []
         for number in range(len(self.plants)):
             omega = np.concatenate([stack.omega_rad_s[stack.plant == number] for stack, _ in found])
@@ -295,19 +261,12 @@ class Programme:
             checked.append((unique, worst))
         return checked
 
-    @staticmethod
-    def _gamma(form: ModalForm, x: Real, stack: StackedRows) -> Real:
-        return scaled_bound(stack.rows, form.response(x[None], stack.s)[0], accuracy=1e-6).gamma
+    def _gamma(self, x: Real, stack: StackedRows) -> Real:
+        return scaled_bound(stack.rows, self.form.response(x[None], stack.s)[0], accuracy=1e-6).gamma
 
-    def stack(self, form: ModalForm, x: Real) -> StackedRows:
-        """On the lean grid and around light poles."""
-        light = self._light(form, x)
-        grids = [np.union1d(grid, more) for grid, more in zip(self.lean, light, strict=True)]
-        return stacked_rows(self.plants, self.spec, grids)
-
-    def _light(self, form: ModalForm, x: Real) -> list[Real]:
+    def _light(self, x: Real) -> list[Real]:
         """Frequencies around lightly damped poles of every loop and of the controller."""
-        abcd = form.discrete(x)
+        abcd = self.form.discrete(x)
         own = np.linalg.eigvals(abcd[0])
         found = []
         for plant, loop in zip(self.plants, self.loops, strict=True):
@@ -318,9 +277,9 @@ class Programme:
             found.append(omega[inside])
         return found
 
-    def result(self, gamma: float, form: ModalForm, x: Real) -> MultivariableResult:
+    def result(self, gamma: float, x: Real) -> MultivariableResult:
         """The controller and what is known of it."""
-        stack, K = self.dense, form.response(x[None], self.dense.s)[0]
+        stack, K = self.dense, self.form.response(x[None], self.dense.s)[0]
         found = scaled_bound(stack.rows, K, accuracy=1e-6)
         value, joint = found.gamma, largest_channel(stack.rows, K, found.right)
         worst, blocking = {}, []
@@ -332,8 +291,8 @@ class Programme:
                 plant = self.plants[int(stack.plant[at])].name
                 omega = float(stack.omega_rad_s[at])
                 blocking.append(BlockingPoint(plant, name, omega, float(value[at]), int(joint[at])))
-        limits, rates = self.spec.limits(form.inputs)
-        a, b, c, d = form.discrete(x)
+        limits, rates = self.spec.limits(self.form.inputs)
+        a, b, c, d = self.form.discrete(x)
         controller = Controller(
             a, b, c, d, self.dt_s,
             computational_delay_samples=self.spec.computational_delay_samples,

@@ -29,8 +29,6 @@ _LEAST_GAIN = 2e-6  # predicted fall of log gamma^2 that is not worth a step
 _FAR_BELOW = 2.0  # rows so far below the worst (log gamma^2) cannot become it within one step
 _REACH = 0.5  # of the sum of all slopes: how far a row is taken to rise in a box
 _SCALING_BOX = 3.0  # box of log t in that of the parameters
-_SMALL_BOX = 0.02  # of the step whose multipliers weigh the rows
-_NEAR = 0.3  # log gamma^2 below the worst, of the rows that a new block must not raise
 _CUTS, _MISSED = 4, 0.05  # rounds of adding directions; share of the predicted fall that may be missed
 _ACTIVE = 1e-4  # share of the largest multiplier below which a row bends nothing
 
@@ -91,18 +89,6 @@ class _NearWorst:
     top: Real
 
 
-@dataclass(frozen=True, eq=False)
-class Pull:
-    """What a change dK of the controller does to first order where a descent ended, at r frequencies s (r,):
-    the worst log gamma^2 changes by the sum of 2 Re tr(on_K dK), on_K (r, Y, U), and that of one row by
-    2 Re(left^H dK right), left (r, U), right (r, Y)."""
-
-    s: Complex
-    on_K: Complex
-    left: Complex
-    right: Complex
-
-
 class MatrixDescent:
     """From any controller with stable nominal loops to a local minimum of the worst case on a grid.
 
@@ -128,9 +114,9 @@ class MatrixDescent:
         found = scaled_bound(self.stack.rows, K, log_t, accuracy=_ACCURACY)
         return found if np.all(np.isfinite(found.gamma)) else None
 
-    def run(self, start: Real, steps: int, *, curved: bool = False) -> tuple[Real, float, int]:
+    def run(self, start: Real, steps: int) -> tuple[Real, float, int]:
         """At most `steps` steps: parameters where it ended, worst case on the grid (inf: unstable start),
-        steps taken. curved: a step that falls short is corrected to second order, for one evaluation more."""
+        steps taken. A step that falls short is corrected to second order, for one evaluation more."""
         x = np.clip(np.asarray(start, dtype=np.float64), self._low, self._high)
         bound = self.bound(x, None)
         if bound is None:
@@ -155,7 +141,7 @@ class MatrixDescent:
             trial = np.clip(x + move * unit, self._low, self._high)
             after = self.bound(trial, bound.log_t)
             actual = -np.inf if after is None else best - 2 * float(np.log(np.max(after.gamma)))
-            if curved and after is not None and actual < 0.7 * predicted:
+            if after is not None and actual < 0.7 * predicted:
                 again = self._step(x, self._bent(local, move * unit, after, box), curvature, unit, box)
                 if again is not None:
                     other = np.clip(x + again[0] * unit, self._low, self._high)
@@ -174,24 +160,6 @@ class MatrixDescent:
             elif actual < 0.25 * predicted:
                 box *= 0.35
         return x, float(np.exp(0.5 * best)), taken
-
-    def pull(self, x: Real) -> Pull | None:
-        """Multipliers of a small step give the weights of the rows; None without stability or a step."""
-        bound = self.bound(x, None)
-        if bound is None:
-            return None
-        local = self._local(x, bound)
-        steepest = np.max(np.abs(local.slope[:, 0]), axis=0)
-        unit = np.minimum(self.form.units(x), 1.0 / np.maximum(steepest, 1e-12))
-        step = self._step(x, local, np.zeros((x.size, x.size)), unit, _SMALL_BOX)
-        if step is None:
-            return None
-        rows, s = self.stack.rows.part(local.index), self.stack.s[local.index]
-        found = expansion(rows, self.form.response(x[None], s)[0], bound.log_t[local.index])
-        left, right = found.left @ local.basis, found.right @ local.basis / local.top[:, None, None]
-        on_K = right @ step[2] @ conjugate(left)
-        near = local.value[:, 0] > np.max(local.value[:, 0]) - _NEAR
-        return Pull(s[near], on_K[near], left[near, :, 0], right[near, :, 0])
 
     def _local(self, x: Real, bound: Bound) -> _NearWorst:
         log = 2 * np.log(bound.gamma)

@@ -32,17 +32,8 @@ class SynthesisOptions(GridOptions):
 class MultivariableOptions(Settings):
     """The same for several joints."""
 
-    starts: int = Field(default=1, ge=1, le=50, description="static gains to grow from; the best counts")
-    candidates: int = Field(default=3, ge=1, le=20, description="blocks tried wherever the order grows")
-    growth_steps: int = Field(default=12, ge=1, le=200, description="steps of each candidate")
-    growth_rounds: int = Field(default=4, ge=1, le=100, description="rounds of descent at each lower order")
-    renewals: int = Field(
-        default=1,
-        ge=0,
-        le=100,
-        description="blocks replaced at the full order, while the worst case is above 1",
-    )
-    rounds: int = Field(default=40, ge=1, le=100, description="rounds of the last descent, with exchange")
+    starts: int = Field(default=1, ge=1, le=50, description="starts to go down from; the best counts")
+    rounds: int = Field(default=40, ge=1, le=100, description="rounds of descent, with exchange")
     steps: int = Field(default=12, ge=1, le=200, description="steps of a round")
     grid_points: int = Field(default=60, ge=20, le=2000, description="logarithmic points of the programme")
     mode_points: int = Field(
@@ -51,6 +42,4 @@ class MultivariableOptions(Settings):
     dense_points: int = Field(
         default=600, ge=100, le=20_000, description="logarithmic points of the dense check"
     )
-    sufficient_gamma: float = Field(
-        default=0.0, ge=0, description="stop at this worst case, at a lower order too; 0 = the best"
-    )
+    sufficient_gamma: float = Field(default=0.0, ge=0, description="stop at this worst case; 0 = the best")

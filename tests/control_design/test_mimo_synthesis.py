@@ -9,6 +9,7 @@ from pathlib import Path
 import control
 import numpy as np
 import pytest
+import scipy.linalg
 
 from benchmarks.mimo_designs import judged, plant_t, specification_t
 from control_design import (
@@ -20,13 +21,12 @@ from control_design import (
     certify_multivariable,
     synthesise_multivariable,
 )
+from control_design.synthesis import riccati_starts
 from control_design.synthesis.modal_controller import ModalForm
-from control_design.synthesis.multivariable import Programme
-from control_design.synthesis.multivariable_descent import MatrixDescent
-from control_design.synthesis.next_block import best_blocks
+from control_design.synthesis.riccati_starts import central_controller, reduced, weighted_plant
 
-QUICK = MultivariableOptions(rounds=4, candidates=2, growth_steps=6, growth_rounds=2, steps=6, renewals=0)
-LEAST = MultivariableOptions(rounds=2, candidates=1, growth_steps=2, growth_rounds=1, steps=2, renewals=0)
+QUICK = MultivariableOptions(rounds=4, steps=6)
+LEAST = MultivariableOptions(rounds=2, steps=2)
 
 
 @cache
@@ -60,52 +60,64 @@ def test_values_and_slopes_of_the_modal_form(pattern):
         np.testing.assert_allclose(slopes[:, k], expected, rtol=1e-6, atol=1e-7 * np.max(np.abs(slopes)))
 
 
-def test_blocks_do_nothing_until_they_have_an_output():
+@pytest.mark.parametrize("pattern", [np.ones((2, 2), bool), np.eye(2, dtype=bool)])
+def test_blocks_do_nothing_until_they_have_an_output(pattern):
     rng = np.random.default_rng(4)
-    small = ModalForm(np.ones((2, 2), bool), 2, np.zeros(2, bool), 10.0, 1e-3, 0.01, 0.02)
-    large = ModalForm(np.ones((2, 2), bool), 6, np.zeros(2, bool), 10.0, 1e-3, 0.01, 0.02)
-    x = rng.standard_normal(small.parameters)
-    before = x.copy()
+    form = ModalForm(pattern, 8, np.zeros(2, bool), 10.0, 1e-3, 0.01, 0.02)
+    D = np.where(pattern, rng.standard_normal((2, 2)), 0.0)
+    log_w, log_z, C, B = form.spread(0.1, 10.0)
+    assert np.all(np.any(B != 0, axis=(1, 2)))
+    assert np.ptp(log_w) == pytest.approx(np.log(100))
     s = 1j * np.geomspace(0.1, 100, 9)
-    grown = large.replaced(large.extended(small, x), 2, 3.0, 0.5, rng.standard_normal((2, 2)))
-    np.testing.assert_allclose(large.response(grown[None], s), small.response(x[None], s), rtol=1e-12)
-    bare = large.replaced(grown, 0, 3.0, 0.5, large.no_input())
-    direct = small.split(x[None])[4][0]
-    np.testing.assert_allclose(large.response(bare[None], s)[0], np.tile(direct, (9, 1, 1)), rtol=1e-12)
-    np.testing.assert_array_equal(x, before)
+    idle = form.join(log_w, log_z, C, B, D, np.zeros((2, 0)))
+    np.testing.assert_allclose(form.response(idle[None], s)[0], np.tile(D, (9, 1, 1)), rtol=1e-12)
+    driven = form.join(log_w, log_z, np.ones_like(C), B, D, np.zeros((2, 0)))
+    each = form.slopes(driven[None], s, *(np.ones((1, 9, 2), complex),) * 2)[0]
+    assert np.linalg.matrix_rank(each[:, : form.blocks]) == min(9, form.blocks // (1 if pattern.all() else 2))
 
 
-@pytest.mark.parametrize("structure", ["full", "decentralised"])
-def test_new_blocks_change_rows_as_said_and_the_list_is_in_order(structure):
-    """Left and right of every row near the worst, against a difference quotient of its value."""
-    plant, specification = plant_t(), specification_t(4, structure)
-    programme = Programme((plant,), specification, QUICK)
-    form, x = programme.lowest_form(), programme.static()[0][1]
-    x, _ = programme.improved(form, x, 20)
-    stack = programme.stack(form, x)
-    pull = MatrixDescent(form, stack, programme.loops).pull(x)
-    larger = programme.form(2)
-    blocks = best_blocks(larger, 0, pull, 3)
-    merits = [each.merit for each in blocks]
-    assert merits == sorted(merits, reverse=True)
-    assert 0 < merits[0] <= 1 + 1e-9  # the worst changes by no more than the row that changes most
-    corners = np.log([each.omega_rad_s for each in blocks])
-    assert np.min(np.abs(np.subtract.outer(corners, corners))[np.triu_indices(3, 1)]) > 0.3
+def test_the_modal_form_of_a_controller_is_that_controller():
+    """Light and heavy pairs, real poles, an integrator; an unstable pole is mirrored."""
+    rng = np.random.default_rng(6)
+    form = ModalForm(np.ones((2, 2), bool), 7, np.array([True, False]), 10.0, 1e-3, 0.01, 0.001)
+    turn = rng.standard_normal((7, 7))
+    blocks = [[[0.0]], [[-0.4, 9.0], [-9.0, -0.4]], [[-20.0, 5.0], [-5.0, -20.0]], [[-3.0]], [[-40.0]]]
+    A = turn @ scipy.linalg.block_diag(*blocks) @ np.linalg.inv(turn)
+    B, C, D = rng.standard_normal((7, 2)), rng.standard_normal((2, 7)), rng.standard_normal((2, 2))
+    B[:, 1] -= turn[:, 0] * (np.linalg.inv(turn) @ B)[0, 1]  # the integrator adds up the first output alone
+    x = form.realised(A, B, C, D)
+    s = 1j * np.geomspace(0.1, 100, 9)
+    expected = C @ np.linalg.solve(s[:, None, None] * np.eye(7) - A, B + 0j) + D
+    np.testing.assert_allclose(form.response(x[None], s)[0], expected, rtol=1e-6, atol=1e-8)
+    mirrored = form.realised(A + 0.9 * np.eye(7), B, C, D)
+    poles = np.linalg.eigvals(form.continuous(mirrored)[0])
+    assert np.max(poles.real) <= 0
+    assert np.min(np.abs(poles - (-0.5 + 9j))) < 1e-6
 
-    descent = MatrixDescent(larger, stack, programme.loops)
-    start = larger.replaced(larger.extended(form, x), 0, blocks[0].omega_rad_s, blocks[0].zeta, blocks[0].B)
-    log = 2 * np.log(descent.bound(start, None).gamma)
-    near = np.flatnonzero(log > log.max() - 0.3)
-    assert near.size == pull.s.size > 2
-    outputs = larger.split(start[None])[2][0] != 0  # C is zero: no entry
-    assert not outputs.any()
-    step = np.random.default_rng(0).standard_normal((1, 2, 2)) * programme.pattern[:, [0], None]
-    parts = [part[0] for part in larger.split(start[None])]
-    moved = larger.join(*parts[:2], 1e-6 * step, *parts[3:])
-    change = (2 * np.log(descent.bound(moved, None).gamma)[near] - log[near]) / 1e-6
-    dK = (larger.response(moved[None], pull.s)[0] - larger.response(start[None], pull.s)[0]) / 1e-6
-    said = 2 * np.einsum("ru,ruy,ry->r", pull.left.conj(), dK, pull.right).real
-    np.testing.assert_allclose(said, change, rtol=1e-2, atol=1e-2 * np.max(np.abs(change)))
+
+@pytest.mark.parametrize("scaling", [0.03, 0.3])
+def test_central_controllers_reach_their_norm_and_no_smaller_one_is_found(scaling):
+    """Against the closed loop's largest singular value, by python-control; reduced to all its states, K is
+    itself."""
+    P = weighted_plant(plant_t(), specification_t(6), scaling, 6.0, 1e-5)
+    A, B, C, D = central_controller(P)
+    whole = control.ss(
+        P.A, np.hstack([P.B1, P.B2]), np.vstack([P.C1, P.C2]),
+        np.block([[P.D11, P.D12], [P.D21, P.D22]]),
+    )  # fmt: skip
+    loop = whole.lft(control.ss(A, B, C, D))
+    assert np.max(loop.poles().real) < 0
+    omega = np.geomspace(1e-4, 1e5, 2000)
+    reached = np.max(np.linalg.norm(np.moveaxis(loop(1j * omega), 2, 0), 2, axis=(1, 2)))
+    smaller = next(g for g in np.geomspace(10, 0.01, 700) if riccati_starts._central(P, g) is None)
+    assert 0.9 * smaller < reached < 1.05 * smaller
+    a, b, c, d = reduced((A, B, C, D), P, A.shape[0], 1e-4, 1e5)
+    near = 1j * np.geomspace(0.1, 100, 9)[:, None, None]
+    np.testing.assert_allclose(
+        c @ np.linalg.solve(near * np.eye(len(a)) - a, b + 0j) + d,
+        C @ np.linalg.solve(near * np.eye(len(A)) - A, B + 0j) + D,
+        rtol=1e-3,
+    )
 
 
 @pytest.mark.slow
