@@ -381,8 +381,7 @@ def left_of(case: CaseOfMachine, residuals: Mapping[str, Real]) -> tuple[Real, R
     white = 1.0 + (0.0 if rounding is None else rounding.variances / case.noise**2)
     energy = np.sum([np.sum(residuals[e.name] ** 2, axis=0) for e in held], axis=0)
     rms = case.noise * _beyond(energy / samples, white, samples)
-    motion = np.sqrt(sum(len(e.output) * np.var(e.output, axis=0) for e in held) / samples)
-    return rms / motion, rms
+    return rms / np.sqrt(sum(len(e.output) * np.var(e.output, axis=0) for e in held) / samples), rms
 
 
 def _beyond(mean_square: Real, white: Real | float, samples: int) -> Real:

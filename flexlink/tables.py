@@ -83,15 +83,13 @@ def _model(model: GobfModel) -> pd.DataFrame:
 
 
 def _modes(poles: Poles, dt_s: float, unstable: ComplexArray | tuple[()] = ()) -> pd.DataFrame:
-    omega = poles.omega_rad_s(dt_s)
-    modes = pd.DataFrame({"kind": "mode", "omega_rad_s": omega, "zeta": poles.zeta()})
+    modes = pd.DataFrame({"kind": "mode", "omega_rad_s": poles.omega_rad_s(dt_s), "zeta": poles.zeta()})
     decays = pd.DataFrame({"kind": "real pole", "decay_per_s": poles.decay_per_s(dt_s)})
     outside = np.log(np.asarray(unstable, complex)) / dt_s
     growing = pd.DataFrame(
         {"kind": "unstable pole", "omega_rad_s": np.abs(outside.imag), "decay_per_s": -outside.real}
     )
-    parts = [part for part in (modes, decays, growing) if len(part)]
-    rows = pd.concat(parts or [modes], ignore_index=True)
+    rows = pd.concat([part for part in (modes, decays, growing) if len(part)] or [modes], ignore_index=True)
     rows = rows.reindex(columns=["kind", "omega_rad_s", "frequency_Hz", "zeta", "decay_per_s"])
     return rows.assign(frequency_Hz=rows["omega_rad_s"] / (2 * np.pi))
 

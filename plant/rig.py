@@ -235,8 +235,7 @@ def one_line(error: ValidationError, known: Collection[str] = ()) -> str:
     if kind == "missing":
         text = f"{key}: missing, expected a value"
     elif kind == "extra_forbidden":
-        names = known or (*parameter_keys(), *Rig.model_fields)
-        close = get_close_matches(key, names, n=1, cutoff=0.7)
+        close = get_close_matches(key, known or (*parameter_keys(), *Rig.model_fields), n=1, cutoff=0.7)
         hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}" if known else ""
         text = f"{key}: unknown key" + (f" ({hint})" if hint else "")
     elif kind == "value_error":

@@ -312,8 +312,7 @@ def _model_error(loop: _Loop, controller: Controller, omega: Real) -> float:
         rows = np.stack([[major.real, minor.real], [major.imag, minor.imag]]).transpose(2, 0, 1)
         shape = rows @ np.swapaxes(rows, 1, 2)
         size = np.trace(shape, axis1=1, axis2=2) + 1e-12 * np.abs(given.centre) ** 2 + 1e-300
-        off = np.max(np.abs(expansion.gram() - shape), axis=(1, 2))
-        largest = max(largest, float(np.max(off / size)))
+        largest = max(largest, float(np.max(np.max(np.abs(expansion.gram() - shape), axis=(1, 2)) / size)))
     return largest
 
 
@@ -342,8 +341,7 @@ def _bisect(
         if used + _PARTS * int(np.sum(wide)) > _MOST_INTERVALS:
             wide[:] = False
         accepted.append(_Bounds._make(value[..., ~wide] for value in found))
-        step = (high[wide] - low[wide]) / _PARTS
-        starts = low[wide][:, None] + step[:, None] * np.arange(_PARTS)
+        starts = low[wide][:, None] + ((high[wide] - low[wide]) / _PARTS)[:, None] * np.arange(_PARTS)
         ends = np.concatenate([starts[:, 1:], high[wide][:, None]], axis=1)
         low, high = starts.reshape(-1), ends.reshape(-1)
     together = [np.concatenate(parts, axis=-1) for parts in zip(*accepted, strict=True)]

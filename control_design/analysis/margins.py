@@ -93,8 +93,7 @@ def nominal_margins(
         found.append((0.0, complex(at_zero, 0.0)))
     ends = [x for omega, x in found if omega == 0.0 and x.real < 0 and abs(x) != 1.0]
     places = np.array([omega for omega, _ in found if omega > 0.0])
-    crossings = np.array([x for omega, x in found if omega > 0.0], complex)
-    inner = crossing_margins(crossings, places, modulus)
+    inner = crossing_margins(np.array([x for omega, x in found if omega > 0.0], complex), places, modulus)
     return inner.worse(
         Margins(
             min((-1 / x.real for x in ends if x.real > -1), default=np.inf),

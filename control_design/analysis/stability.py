@@ -161,8 +161,7 @@ def half_turns(value: Complex, integrators: int) -> Real:
 def winds(loop_gain: Complex, *, integrators: int, unstable_poles: int) -> tuple[Boolean, Boolean]:
     """(1 + L turns as a stable loop's, some phase step is wider than pi/3), each (D,), for L (D, F) from
     near zero frequency to Nyquist; see `nyquist_count`."""
-    turns = half_turns(1.0 + loop_gain, integrators)
-    right = np.abs(turns - (unstable_poles + integrators / 2.0)) < 0.25
+    right = np.abs(half_turns(1.0 + loop_gain, integrators) - (unstable_poles + integrators / 2.0)) < 0.25
     return right, np.max(np.abs(_steps(1.0 + loop_gain)), axis=1) > np.pi / 3
 
 

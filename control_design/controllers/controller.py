@@ -208,8 +208,7 @@ def observer_gain(A: Real, B: Real, C: Real, D: Real) -> Real:
     output_unit = float(np.linalg.norm(C)) * state_unit or float(np.linalg.norm(D)) or 1.0
     B, C, D = B / state_unit, C * (state_unit / output_unit), D / output_unit
     state_noise = B @ B.T + 1e-6 * (float(np.linalg.norm(B)) ** 2 or 1.0) * np.eye(n)
-    scale = float(np.trace(C @ state_noise @ C.T)) or 1.0
-    output_noise = D @ D.T + 1e-4 * scale * np.eye(C.shape[0])
+    output_noise = D @ D.T + 1e-4 * (float(np.trace(C @ state_noise @ C.T)) or 1.0) * np.eye(C.shape[0])
     # In companion form poles that are close together leave nothing of the equation but rounding.
     own, there, back = in_sections(A)
     seen = C @ there

@@ -162,8 +162,7 @@ class BracketProblem:
             lean = self.grids.lean()[0]
             if region == "ellipse":
                 return self._ellipse(lean, begin)
-            rows = self._rows(lean, region, self._loop(lean))
-            return self._smallest(self._basis(lean), rows, begin)
+            return self._smallest(self._basis(lean), self._rows(lean, region, self._loop(lean)), begin)
 
         found = exchanged(
             solve,

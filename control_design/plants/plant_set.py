@@ -295,8 +295,7 @@ class UncertainPlant(Shown):
     @property
     def _other_poles(self) -> Complex:
         """Poles without the integrators."""
-        nearest_first = np.argsort(np.abs(self.poles - 1.0), kind="stable")
-        return self.poles[nearest_first][self.n_integrators :]
+        return self.poles[np.argsort(np.abs(self.poles - 1.0), kind="stable")][self.n_integrators :]
 
     @property
     def modes(self) -> tuple[Mode, ...]:

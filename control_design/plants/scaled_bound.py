@@ -62,12 +62,11 @@ class BoundRows:
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """gamma (R,), inf where no scaling shows stability; log_t (R, N) of the scalings. left (R, U) and right
-    (R, Y): log gamma changes by Re(left^H dK right) with the controller, scalings at their optimum."""
+    """gamma (R,), inf where no scaling shows stability; log_t (R, N) of the scalings; right (R, Y): the worst
+    output, which the controller answers with K right."""
 
     gamma: Array
     log_t: Array
-    left: Array
     right: Array
 
 
@@ -106,14 +105,7 @@ def scaled_bound(rows: BoundRows, K: Array, log_t: Array | None = None, *, accur
     given = (np.ascontiguousarray(each, dtype=np.complex128) for each in (own, seen, rows.entering, base))
     t = np.full(seen.shape[:2], np.nan) if log_t is None else np.array(log_t, dtype=np.float64)
     value, s = _lowest(*given, rows.together, accuracy, t)
-    x, share = apply(S, s), np.exp(-value)[:, None]
-    y = apply(K, x)
-    with np.errstate(over="ignore", invalid="ignore"):
-        V = rows.V_u + np.sum(rows.seen / np.exp(t)[:, :, None, None], axis=1)
-        pulled = apply(V, y)
-        back = apply(conjugate(K), pulled) + apply(rows.V_y, x)
-        left = (pulled - apply(conjugate(rows.G), apply(conjugate(S), back))) * share
-    return Bound(np.sqrt(np.exp(value)), t, np.where(np.isfinite(left), left, 0.0), x)
+    return Bound(np.sqrt(np.exp(value)), t, apply(S, s))
 
 
 def largest_channel(rows: BoundRows, K: Array, right: Array) -> Integer:
@@ -253,11 +245,8 @@ def _newton(
         _diagonalise(bent, axes)
         step[:] = 0.0
         for i in range(n):
-            along = 0.0
-            for j in range(n):
-                along += axes[j, i].real * slope[j]
-            for j in range(n):
-                step[j] -= axes[j, i].real * along / max(abs(bent[i, i].real), 1e-3)
+            axis = axes[:, i].real
+            step -= axis * np.sum(axis * slope) / max(abs(bent[i, i].real), 1e-3)
         step *= min(1.0, _LONGEST / max(np.max(np.abs(step)), 1e-300))
         promised = -np.sum(step * slope)
         better = False
@@ -327,28 +316,19 @@ def _at(
                 for m in range(size):
                     H[j, k] += np.conj(axes[m, j]) * axes[m, k]
     _diagonalise(H, axes)
-    best = 0
-    for j in range(1, size):
-        if H[j, j].real > H[best, best].real:
-            best = j
+    best = np.argmax(np.diag(H).real)
     top = max(H[best, best].real, 1e-300)
     if together:
-        for j in range(size):
-            s[j] = 0.0
-            for k in range(size):
-                s[j] += root[j, k] * axes[k, best]
         for j in range(size - 1, -1, -1):
-            total = axes[j, best] * np.sqrt(top)
+            s[j] = np.sum(root[j] * axes[:, best])
+            p[j] = axes[j, best] * np.sqrt(top)
             for k in range(j + 1, size):
-                total -= np.conj(root[k, j]) * p[k]
-            p[j] = total / root[j, j]
+                p[j] -= np.conj(root[k, j]) * p[k]
+            p[j] /= root[j, j]
     else:
+        p[:] = top * axes[:, best]
         for j in range(size):
-            p[j] = top * axes[j, best]
-        for j in range(size):
-            s[j] = axes[j, best]
-            for k in range(size):
-                s[j] += C[j, k] * p[k]
+            s[j] = axes[j, best] + np.sum(C[j] * p)
     for i in range(log_t.size):
         t = np.exp(min(max(log_t[i], -300.0), 300.0))
         slope[i] = (t * _form(entering[i], p) - _form(seen[i], s) / t) / top

@@ -311,8 +311,7 @@ class ModePeak(WeightedRequirement):
                 )
             band = modes[0].omega_rad_s / 1.5, modes[0].omega_rad_s * 1.5
         peak = _nominal_peak(plant.damped, band[0], min(band[1], plant.nyquist_rad_s))
-        weight = constant_weight(1.0 / (spec.mode_peak_ratio * peak))
-        return cls(weight, band, channel=plant.performance)
+        return cls(constant_weight(1.0 / (spec.mode_peak_ratio * peak)), band, channel=plant.performance)
 
 
 @lru_cache(maxsize=32)  # every grid of a synthesis asks for the requirements of its plant
@@ -452,8 +451,7 @@ def _refuse_zeros(spec: Specification, plant: UncertainPlant) -> None:
         low, high = 0.0, spec.bandwidth_rad_s
         for _ in range(60):
             middle = 0.5 * (low + high)
-            trial = spec.model_copy(update={"bandwidth_rad_s": max(middle, 1e-300)})
-            weight = trial.tracking_weight(plant)
+            weight = spec.model_copy(update={"bandwidth_rad_s": max(middle, 1e-300)}).tracking_weight(plant)
             possible = weight is not None and bool(np.all(np.abs(weight.at(w)) <= 1.0))
             low, high = (middle, high) if possible else (low, middle)
         message += (

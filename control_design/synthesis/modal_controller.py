@@ -15,7 +15,6 @@ import numpy as np
 from control_design.plants.ellipses import Boolean, Complex, Real
 
 _FASTEST = 60.0  # corner of a block, in units of the scale
-_SMOOTH = 0.7  # damping ratio of blocks to begin with: no peak
 _MOST_DAMPED = 50.0  # two real poles (2 zeta)^2 = 10^4 apart: any pair of real poles, nearly
 
 
@@ -55,8 +54,7 @@ class ModalForm:
         self._b = np.nonzero(np.repeat(column_mask[:, None, :], 2, axis=1))
         self._d = np.nonzero(pattern)
         self._i = np.nonzero(pattern[:, self.integrates])
-        sizes = [m, m, self._c[0].size, self._b[0].size, self._d[0].size, self._i[0].size]
-        self.ends = np.cumsum(sizes)
+        self.ends = np.cumsum([m, m, self._c[0].size, self._b[0].size, self._d[0].size, self._i[0].size])
         self.parameters = int(self.ends[-1])
 
     def split(self, x: Real) -> tuple[Real, Real, Real, Real, Real, Real]:
@@ -78,7 +76,7 @@ class ModalForm:
         """Parameters (n,) of one controller; what the pattern forbids is left out."""
         return np.concatenate([log_w, log_z, C[self._c], B[self._b], D[self._d], C_0[self._i]])
 
-    def spread(self, lowest: float, highest: float) -> tuple[Real, Real, Real, Real]:
+    def spread(self, lowest: float, highest: float, zeta: float) -> tuple[Real, Real, Real, Real]:
         """log w, log zeta, C, B of blocks from lowest to highest times the scale, one for each actuator at a
         corner where they belong to one, that do nothing yet: C is zero."""
         turns = 1 if self.pattern.all() else self.inputs
@@ -90,7 +88,7 @@ class ModalForm:
             elif state == 0:
                 B[block, state] = 1.0
         log_w = np.log(np.repeat(corners, turns)[: self.blocks])
-        log_z = np.full(self.blocks, np.log(max(_SMOOTH, self.damping)))
+        log_z = np.full(self.blocks, np.log(max(zeta, self.damping)))
         return log_w, log_z, np.zeros((self.blocks, self.inputs, 2)), B
 
     def bounds(self) -> tuple[Real, Real]:
@@ -179,7 +177,7 @@ class ModalForm:
         poles = -np.abs(poles.real) + 1j * poles.imag
         pairs = [np.array([k, np.argmin(np.abs(poles - np.conj(poles[k])))]) for k in paired]
         pairs += [np.array(real[k : k + 2]) for k in range(0, len(real), 2)]
-        log_w, log_z, C_b, B_b = self.spread(1.0, 1.0)
+        log_w, log_z, C_b, B_b = self.spread(1.0, 1.0, 1.0)
         for block, pair in enumerate(pairs):
             w = float(np.sqrt(np.prod(poles[pair]).real))
             a = np.diag(poles[pair]) / max(w, np.finfo(float).tiny)

@@ -35,8 +35,7 @@ _EXCESS = 5e-4  # accepted of the dense check over the programme
 _AT = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1)  # of the scale: where a static gain inverts the plant
 _SAME = 1e-3  # relative difference of worst cases below which two static gains count as one
 _SCALINGS = (0.03, 0.1, 0.3, 1.0)  # what the ball puts in, over the references
-_SPREAD = 0.03, 3.0  # of the scale: corners of blocks that do nothing yet
-_STABLE = 0.1  # of the lowest frequency: how far the poles on the axis are moved for a start
+_SPREAD = 0.1, 30.0, 0.7  # of blocks that do nothing yet: corners over the scale, damping ratio
 _MOST = 15  # violated frequencies added in a round
 
 
@@ -162,7 +161,7 @@ class Programme:
         mimo_designs: 1.10 for .99)."""
         found: list[tuple[float, Real]] = []
         if self.pattern.all() and not any(each.input_error or each.output_error for each in self.plants):
-            plant, slowest = self.plants[0], _STABLE * self.lowest_rad_s
+            plant, slowest = self.plants[0], self.lowest_rad_s
             plain = weighted_plant(replace(plant, ball=None), self.spec, 1.0, self.scale_rad_s, slowest)
             for scaling in _SCALINGS:
                 K = central_controller(weighted_plant(plant, self.spec, scaling, self.scale_rad_s, slowest))
@@ -185,8 +184,7 @@ class Programme:
                 D = D / (np.linalg.norm(G @ D, 2) or 1.0)
                 best: tuple[float, Real] | None = None
                 for gain in 2.0 ** np.arange(4.0, -14.0, -1.0):
-                    slow = 0.1 * omega * gain * D[:, form.integrates]
-                    x = form.join(*blocks, gain * D, slow)
+                    x = form.join(*blocks, gain * D, 0.1 * omega * gain * D[:, form.integrates])
                     bound = descent.bound(x, None)
                     if bound is None and best is None:
                         continue

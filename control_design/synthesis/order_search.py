@@ -216,8 +216,7 @@ class OrderSearch:
     def _agree(self, found: Sequence[TriedController], enough: int | None = None) -> bool:
         """Enough descents ended at the best value: more of them would hardly find another."""
         stable = [c.gamma_grid for c in found if np.isfinite(c.gamma_grid)]
-        agreeing = sum(g <= min(stable) * _AGREE for g in stable)
-        return agreeing >= (enough or self.options.agreeing_starts)
+        return sum(g <= min(stable) * _AGREE for g in stable) >= (enough or self.options.agreeing_starts)
 
     def _enough(self, found: Sequence[TriedController]) -> bool:
         return min((c.gamma for c in found), default=np.inf) <= self.options.sufficient_gamma

@@ -10,7 +10,7 @@ Gramians by quadrature. All of it in Tustin's s.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -20,6 +20,9 @@ from control_design.plants.multivariable import MultivariablePlant
 from control_design.plants.scaled_bound import conjugate
 from control_design.plants.weights import RationalWeight
 from control_design.specification.multivariable import MultivariableSpecification
+
+if TYPE_CHECKING:
+    import control
 
 System = tuple[Real, Real, Real, Real]  # A, B, C, D, continuous
 _CLOSE = 1.02  # of gamma, above the smallest
@@ -56,10 +59,8 @@ def weighted_plant(
     the left than they do, so that none is on the axis. Neglected: a ball that is known on its own frequencies
     only, errors of channels.
     """
-    G = plant.delayed(specification.computational_delay_samples)
-    A, B, C, D = continuous(G.A, G.B, G.C, G.D, plant.dt_s)
-    s = np.array([1j * scale_rad_s])
-    there = C @ np.linalg.solve(s[0] * np.eye(A.shape[0]) - A, B) + D
+    A, B, C, D = continuous(plant.delayed(specification.computational_delay_samples))
+    there = C @ np.linalg.solve(1j * scale_rad_s * np.eye(A.shape[0]) - A, B) + D
     asked = specification.weights(plant.inputs, plant.outputs)
     none = ("", (None,) * max(plant.inputs, plant.outputs))
     tracking, modulus, effort = (asked.get(name, none)[1] for name in ("tracking", "modulus", "effort"))
@@ -69,8 +70,7 @@ def weighted_plant(
     on_u = [effort[i] or of_u for i in range(plant.inputs)]
     put, wy, wu = np.eye(plant.outputs), _diagonal(on_y), _diagonal(on_u)
     if plant.ball is not None and plant.ball.omega_rad_s is None:
-        li, size = plant.ball.Li, plant.ball.radius / scaling
-        a, b, c, d = continuous(li.A, li.B, li.C, li.D, plant.dt_s)
+        size, (a, b, c, d) = plant.ball.radius / scaling, continuous(plant.ball.Li)
         put = np.hstack([put, scaling * plant.ball.Lo])
         wu = (
             scipy.linalg.block_diag(wu[0], a),
@@ -163,8 +163,7 @@ def _stabilising(A: Real, B: Real, Q: Real, R: Real, S: Real) -> Real | None:
         return None
     X = np.linalg.solve(basis[:n, :n].T, basis[n:, :n].T)
     X = 0.5 * (X + X.T)
-    lowest = np.linalg.eigvalsh(X)[0]
-    return X if lowest > -_NONE * (1.0 + np.max(np.abs(X))) else None
+    return X if np.linalg.eigvalsh(X)[0] > -_NONE * (1.0 + np.max(np.abs(X))) else None
 
 
 def reduced(K: System, P: WeightedPlant, order: int, low_rad_s: float, high_rad_s: float) -> System:
@@ -192,13 +191,12 @@ def reduced(K: System, P: WeightedPlant, order: int, low_rad_s: float, high_rad_
     return inverse @ A @ T, inverse @ B, C @ T, D
 
 
-def continuous(A: Real, B: Real, C: Real, D: Real, dt_s: float) -> System:
-    """The system in Tustin's s of a discrete one without a pole at z = -1."""
-    A, B, C, D = (np.asarray(each, dtype=np.float64) for each in (A, B, C, D))
-    inverse = np.linalg.inv(A + np.eye(A.shape[0]))
-    root = 2.0 / np.sqrt(dt_s)
-    return (2.0 / dt_s * (A - np.eye(A.shape[0])) @ inverse, root * inverse @ B, root * C @ inverse,
-            D - C @ inverse @ B)  # fmt: skip
+def continuous(system: control.StateSpace) -> System:
+    """In Tustin's s, of a discrete system without a pole at z = -1."""
+    A, B, C, D = (np.asarray(getattr(system, each), dtype=np.float64) for each in "ABCD")
+    inverse, eye = np.linalg.inv(A + np.eye(A.shape[0])), np.eye(A.shape[0])
+    root = 2.0 / np.sqrt(system.dt)
+    return 2.0 / system.dt * (A - eye) @ inverse, root * inverse @ B, root * C @ inverse, D - C @ inverse @ B
 
 
 def _resolvent(A: Real, B: Real, s: Complex) -> Complex:

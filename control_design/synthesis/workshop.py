@@ -63,8 +63,7 @@ class Workshop:
 
     def do(self, task: StartTask) -> TriedController:
         """Improve one start."""
-        descent = self.descent(task.cascade, task.grids)
-        end, gamma, steps = descent.run(task.parameters, task.steps)
+        end, gamma, steps = self.descent(task.cascade, task.grids).run(task.parameters, task.steps)
         checked = task.checked and np.isfinite(gamma)
         dense = self.problem.gamma(task.cascade, end) if checked else float("inf")
         seen = min(gamma, LARGEST_GAMMA), dense if np.isfinite(dense) else None

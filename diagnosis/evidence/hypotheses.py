@@ -97,8 +97,7 @@ def disagreement_gain(fit: Descent, left: Discrepancy) -> float:
 
     Its size has a half-normal prior, cut off beyond three deviations: more than that is no disagreement.
     """
-    solvers = [DISAGREEMENT["smooth"], *(DISAGREEMENT[c.dependence] for c in fit.candidates)]
-    z = left.size / max(solvers)
+    z = left.size / max([DISAGREEMENT["smooth"], *(DISAGREEMENT[c.dependence] for c in fit.candidates)])
     # Something unknown may have any size over four decades; this one is known to a factor of three: the log
     # of the ratio of these ranges (in their logarithms).
     expected = SUBSTANTIAL if fit.non_smooth else 0.0

@@ -198,8 +198,7 @@ def _loudest(records: RecordsToFit, around: Descent, lines: Real, response: Real
     found = np.abs(
         czt(correlation, len(lines), np.exp(-turn * (lines[1] - lines[0])), np.exp(turn * lines[0]))
     )
-    power = np.interp(lines, np.fft.rfftfreq(size, dt_s), np.sum(np.abs(transfer) ** 2, axis=1))
-    gain = found**2 / power
+    gain = found**2 / np.interp(lines, np.fft.rfftfreq(size, dt_s), np.sum(np.abs(transfer) ** 2, axis=1))
     gain[:SLOW_LINES] = np.inf
     return np.asarray(lines[np.sort(np.argsort(gain)[-BEST_LINES:])])
 

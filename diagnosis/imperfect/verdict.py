@@ -390,8 +390,7 @@ def _tolerances_off(search: Search, explanation: Explanation, k: int) -> float |
     if key is None or key not in machine.tolerances or not machine.description.value(key) > 0:
         return None
     tolerance, stated = machine.tolerances[key], machine.description.value(key)
-    deviation = float(end.deviations[search.records.nominal.keys.index(key)])
-    moved = stated * np.exp(tolerance * deviation)
+    moved = stated * np.exp(tolerance * float(end.deviations[search.records.nominal.keys.index(key)]))
     size = next(iter(end.effects[k].parameters().values()))
     moved = moved * size if kind.multiplies else moved + size
     return abs(float(moved / stated) - 1) / tolerance

@@ -149,8 +149,7 @@ class Drive:
         def changed(command: Real) -> Real:
             now = command
             for acts, values in acting:
-                before = 0.0 if self.at_rest_before else float(now[0])
-                now = acts.change(now, values, self.dt_s, before)
+                now = acts.change(now, values, self.dt_s, 0.0 if self.at_rest_before else float(now[0]))
             return np.asarray(now - command)
 
         def simulated(inputs: Real) -> Real:

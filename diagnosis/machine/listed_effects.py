@@ -58,8 +58,7 @@ def _lagged(signal: Real, values: Values, dt_s: float, before: float) -> Real:
     T = values["time_constant_s"]
     decay = np.exp(-dt_s / T)
     state, _ = scipy.signal.lfilter([1 - decay], [1.0, -decay], signal, zi=[decay * before])
-    start = np.concatenate([[before], state[:-1]])
-    return np.asarray(signal + (start - signal) * T / dt_s * (1 - decay))
+    return np.asarray(signal + (np.concatenate([[before], state[:-1]]) - signal) * T / dt_s * (1 - decay))
 
 
 def _lagged_sensor(signal: Real, values: Values, dt_s: float, before: float) -> Real:

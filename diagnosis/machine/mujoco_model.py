@@ -106,8 +106,7 @@ class MujocoModel:
     def __post_init__(self) -> None:
         object.__setattr__(self, "outputs", tuple(self.outputs))
         spec = self.spec
-        steps = max(int(np.ceil(self.dt_s / spec.option.timestep - 1e-6)), 1)
-        spec.option.timestep = self.dt_s / steps
+        spec.option.timestep = self.dt_s / max(int(np.ceil(self.dt_s / spec.option.timestep - 1e-6)), 1)
         every = {"body": spec.bodies, "joint": spec.joints, "actuator": spec.actuators}
         for what in every:
             for k, one in enumerate(every[what]):

@@ -177,8 +177,7 @@ class MujocoSimulation:
         for j, (k, _, inertia) in enumerate(arm.tracked if omega else ()):
             late = float(model.sensor_delay[model.sensor(arm.outputs[k]).id])
             path, speed = self._path(inputs[:, U + k], h, late, model.opt.integrator)
-            target = omega**2 * (path - offset[k]) + 2 * omega * speed
-            control[:, U + j] = inertia / gain[k] * target
+            control[:, U + j] = inertia / gain[k] * (omega**2 * (path - offset[k]) + 2 * omega * speed)
         for u in range(U):
             n = model.actuator_history[u, 0]
             if n:
@@ -236,8 +235,7 @@ class MujocoSimulation:
 
         def compute() -> _Start:
             arm, U = self.arm, len(self.arm.inputs)
-            h = arm.nominal.opt.timestep
-            late = 0.0 if _MET[arm.nominal.opt.integrator] == (0.5, 0.5) else 0.5 * h
+            late = 0.0 if _MET[arm.nominal.opt.integrator] == (0.5, 0.5) else 0.5 * arm.nominal.opt.timestep
             begun = [_begun(inputs[:, U + k], arm.dt_s, self.noise[k], late) for k, *_ in arm.tracked]
             guess, spread = np.array(begun).reshape(-1, 2, 2).transpose(2, 1, 0).reshape(2, -1)
             for u in arm.filtered:
@@ -256,8 +254,7 @@ class MujocoSimulation:
         start = self._start(inputs)
         if not start.state.size:
             return outputs
-        shift = start.shift(inputs[:, len(self.arm.inputs) :] - outputs)
-        return np.asarray(outputs + start.adds(shift))
+        return np.asarray(outputs + start.adds(start.shift(inputs[:, len(self.arm.inputs) :] - outputs)))
 
     def commanded(self, stated: Mapping[str, float], experiments: Sequence[PlantExperiment]) -> float:
         """Share of the motion that the forces of the actuators make beside the tracking; 1 in a free run of

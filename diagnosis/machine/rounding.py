@@ -63,5 +63,4 @@ def leads_over(
 ) -> bool:
     """Whether rounding makes more of the gap than what the accepted effects take away."""
     before = np.mean([np.mean(refit[e.name] ** 2) for e in case.estimation])
-    behind = np.mean([np.mean(after[e.name] ** 2) for e in case.estimation])
-    return bool(rounding.energy >= before - behind)
+    return bool(rounding.energy >= before - np.mean([np.mean(after[e.name] ** 2) for e in case.estimation]))

@@ -134,5 +134,4 @@ def _replacing(gram: Real, j: int, others: Sequence[int]) -> tuple[list[int], fl
 def _left(gram: Real, j: int, chosen: Sequence[int]) -> float:
     """Of the j-th column of length one where the chosen ones make up for it."""
     inner = gram[np.ix_(chosen, chosen)] + 1e-9 * np.eye(len(chosen))
-    explained = float(gram[chosen, j] @ np.linalg.solve(inner, gram[chosen, j]))
-    return float(np.sqrt(max(1 - explained, 0.0)))
+    return float(np.sqrt(max(1 - float(gram[chosen, j] @ np.linalg.solve(inner, gram[chosen, j])), 0.0)))

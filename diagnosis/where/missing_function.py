@@ -184,11 +184,9 @@ def _solve(gram: Real, moment: Real) -> tuple[float, int, Real, Real]:
     values, errors = np.zeros(scale.size), np.zeros(scale.size)
     if not np.any(used):
         return 0.0, 0, values, errors
-    unit = gram[np.ix_(used, used)] / np.outer(scale[used], scale[used])
-    eigenvalues, vectors = np.linalg.eigh(unit)
+    eigenvalues, vectors = np.linalg.eigh(gram[np.ix_(used, used)] / np.outer(scale[used], scale[used]))
     kept = eigenvalues > 1e-9 * eigenvalues[-1]
-    projected = vectors[:, kept].T @ (moment[used] / scale[used])
-    explained = float(np.sum(projected**2 / eigenvalues[kept]))
+    explained = float(np.sum((vectors[:, kept].T @ (moment[used] / scale[used])) ** 2 / eigenvalues[kept]))
     inverse = (vectors[:, kept] / eigenvalues[kept]) @ vectors[:, kept].T
     values[used] = inverse @ (moment[used] / scale[used]) / scale[used]
     errors[used] = np.sqrt(np.diag(inverse)) / scale[used]

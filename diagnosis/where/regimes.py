@@ -73,8 +73,7 @@ def motions(case: Case, residuals: Mapping[str, Real]) -> dict[str, Motion]:
 
 def _near_reversal(speed: Real, dt_s: float) -> npt.NDArray[np.bool_]:
     """Samples within 30 ms of a change of sign of the hub speed between stretches that really move."""
-    moving = np.abs(speed) > 1e-3 * max(float(np.max(np.abs(speed))), 1e-12)
-    sign = np.where(moving, np.sign(speed), 0.0)
+    sign = np.where(np.abs(speed) > 1e-3 * max(float(np.max(np.abs(speed))), 1e-12), np.sign(speed), 0.0)
     index = np.flatnonzero(sign)
     near = np.zeros(speed.size, dtype=bool)
     width = max(round(_REVERSAL_S / dt_s), 1)

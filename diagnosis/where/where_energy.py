@@ -100,8 +100,7 @@ def band_edges_Hz(shortest_s: float, dt_s: float) -> tuple[float, ...]:
     transform) and the highest reaches from no later than 60 % of Nyquist.
     """
     nyquist = 0.5 / dt_s
-    inner = [f for f in _EDGES_HZ if _LEAST_LINES / (2 * shortest_s) <= f <= 0.6 * nyquist]
-    return (0.0, *inner, nyquist)
+    return (0.0, *[f for f in _EDGES_HZ if _LEAST_LINES / (2 * shortest_s) <= f <= 0.6 * nyquist], nyquist)
 
 
 def band_gaps(

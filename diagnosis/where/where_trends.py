@@ -166,8 +166,7 @@ def common_findings(case: Case, residuals: Mapping[str, Real], level: float) -> 
         energy = np.einsum("ki,ij,kj->k", signs, products, signs) / n
         gap = float(np.trace(products)) - n * length
         p_value = float(chi2.sf(energy[0], length))
-        beyond_noise = gap > 3 * np.sqrt(2.0 * n * length)
-        share = (energy - length) / gap if beyond_noise else np.zeros(energy.size)
+        share = (energy - length) / gap if (gap > 3 * np.sqrt(2.0 * n * length)) else np.zeros(energy.size)
         chance = float(np.max(share[1:]))
         yes = bool(
             p_value < level / len(case.outputs) and share[0] >= _LEAST_SHARE and share[0] > max(chance, 0.0)
@@ -231,5 +230,4 @@ def linear_correction(case: Case, residuals: Mapping[str, Real]) -> LinearCorrec
 def _columns(poles: Poles, voltage: Real) -> Real:
     """(T, B + 2): basis functions driven by the voltage, and the voltage summed once and twice."""
     once = np.concatenate([[0.0], np.cumsum(voltage)[:-1]])
-    twice = np.concatenate([[0.0], np.cumsum(once)[:-1]])
-    return np.column_stack([regressor(poles, voltage), once, twice])
+    return np.column_stack([regressor(poles, voltage), once, np.concatenate([[0.0], np.cumsum(once)[:-1]])])
