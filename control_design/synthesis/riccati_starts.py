@@ -64,8 +64,10 @@ def weighted_plant(
     asked = specification.weights(plant.inputs, plant.outputs)
     none = ("", (None,) * max(plant.inputs, plant.outputs))
     tracking, modulus, effort = (asked.get(name, none)[1] for name in ("tracking", "modulus", "effort"))
-    cheap = _CHEAP, _CHEAP * float(np.linalg.svd(there, compute_uv=False)[-1])
-    of_y, of_u = (RationalWeight(numerator=(size,), denominator=(1.0,)) for size in cheap)
+    of_y, of_u = (
+        RationalWeight(numerator=(_CHEAP * size,), denominator=(1.0,))
+        for size in (1.0, float(np.linalg.svd(there, compute_uv=False)[-1]))
+    )
     on_y = [tracking[i] or modulus[i] or of_y for i in range(plant.outputs)]
     on_u = [effort[i] or of_u for i in range(plant.inputs)]
     put, wy, wu = np.eye(plant.outputs), _diagonal(on_y), _diagonal(on_u)
