@@ -124,11 +124,13 @@ SECTIONS = {
         Row(
             "Fresh machines of these kinds, `flexlink run LOG...` with a reference in the logs, two batches",
             "closed_loop_machines_12",
-            r"^all +\| (\d+) of (\d+) \| - \| (\d+) of (\d+).*?^all +\| (\d+) of (\d+) \| - \| (\d+) of (\d+)",
+            r"^all +\| (\d+) of (\d+) \| - \| (\d+) of (\d+)"
+            r".*?^all +\| (\d+) of (\d+) \| - \| (\d+) of (\d+)",
             "{0} of {1}, {4} of {5}; {2} of {3}, {6} of {7} certificates exceeded",
         ),
         Row(
-            "Six machines, their logs rounded, thinned, shortened, in other units: certificate or first mode differs",
+            "Six machines, their logs rounded, thinned, shortened, in other units: certificate or first mode "
+            "differs",
             "same_log_otherwise",
             r"^(\d+) of (\d+) flipped",
             "{} of {}",
