@@ -87,9 +87,8 @@ class ModalForm:
                 B[block, state, (block + state) % self.outputs] = 1.0
             elif state == 0:
                 B[block, state] = 1.0
-        log_w = np.log(np.repeat(corners, turns)[: self.blocks])
-        log_z = np.full(self.blocks, np.log(max(zeta, self.damping)))
-        return log_w, log_z, np.zeros((self.blocks, self.inputs, 2)), B
+        log_w, log_z = np.log(np.repeat(corners, turns)[: self.blocks]), np.log(max(zeta, self.damping))
+        return log_w, np.full(self.blocks, log_z), np.zeros((self.blocks, self.inputs, 2)), B
 
     def bounds(self) -> tuple[Real, Real]:
         low, high = np.full(self.parameters, -np.inf), np.full(self.parameters, np.inf)
@@ -179,13 +178,16 @@ class ModalForm:
         pairs += [np.array(real[k : k + 2]) for k in range(0, len(real), 2)]
         log_w, log_z, C_b, B_b = self.spread(1.0, 1.0, 1.0)
         for block, pair in enumerate(pairs):
-            w = float(np.sqrt(np.prod(poles[pair]).real))
-            a = np.diag(poles[pair]) / max(w, np.finfo(float).tiny)
+            w = max(float(np.sqrt(np.prod(poles[pair]).real)), np.finfo(float).tiny)
+            a = np.diag(poles[pair]) / w
             found = []
             for angle in np.linspace(0, np.pi, 24, endpoint=False):
                 # T M = a T for T = [v, -a v] with any v, real or of conjugates: what is small at both ends.
-                turn = np.exp(1j * angle)
-                v = np.array([turn, np.conj(turn)] if block < paired.size else [turn.real, turn.imag])
+                v = (
+                    np.exp([1j * angle, -1j * angle])
+                    if block < paired.size
+                    else np.array([np.cos(angle), np.sin(angle)])
+                )
                 T = np.column_stack([v, -a @ v])
                 if np.linalg.cond(T) < 1e9:
                     found.append(

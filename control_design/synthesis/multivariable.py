@@ -156,10 +156,10 @@ class Programme:
         )  # fmt: skip
 
     def starts(self) -> list[Real]:
-        """Parameters to begin with, those of the lowest worst case first: reduced H-infinity controllers of
-        the first plant, or static gains with blocks that do nothing yet where structure or plants refuse
-        them, or channels have errors of their own: one scaling does not stand for theirs (problem D of
-        mimo_designs: 1.10 for .98)."""
+        """Parameters to begin with, those of the lowest worst case first: static gains with blocks that do
+        nothing yet, and reduced H-infinity controllers of the first plant; not of a structure, nor where
+        channels have errors of their own: one scaling does not stand for theirs (problem D of mimo_designs:
+        1.10 for .98)."""
         found: list[tuple[float, Real]] = []
         if self.pattern.all() and not any(each.input_error or each.output_error for each in self.plants):
             plant, slowest = self.plants[0], self.lowest_rad_s
@@ -170,8 +170,10 @@ class Programme:
                     if (K := central_controller(P)) is not None and K[0].shape[0] >= self.form.order:
                         K = reduced(K, plain, self.form.order, self.lowest_rad_s, 2 / self.dt_s)
                         found += [(self.worst(x), x) for x in (self.form.realised(*K),) if x is not None]
-        stable = [each for each in found if np.isfinite(each[0])]
-        return [x for _, x in sorted(stable or self.static(), key=lambda each: each[0])]
+        found = [each for each in found if np.isfinite(each[0])]
+        with suppress(*([SpecificationError] if found else [])):
+            found += self.static()
+        return [x for _, x in sorted(found, key=lambda each: each[0])]
 
     def static(self) -> list[tuple[float, Real]]:
         """Worst cases and parameters of static gains, best first: the real part of a pseudo-inverse of the
