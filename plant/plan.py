@@ -139,7 +139,7 @@ def make_plan(
     if whole:
         # Only where an element may switch are its parts ever taken.
         lengths, substeps = ((dt_s, *lengths), [1, *substeps]) if n_elements else ((dt_s,), [1])
-    tables = len(lengths), len(state_matrices), halvings + 1, (n + held_columns.shape[1] + 3 * n_channels)
+    tables = len(lengths), len(state_matrices), halvings + 1, n + held_columns.shape[1] + 3 * n_channels
     step, reach = (np.zeros((*tables, -(-columns // 4) * 4)) for columns in (n, 2 * n_channels))
     for part, (length, count) in enumerate(zip(lengths, substeps, strict=True)):
         for q, a in enumerate(state_matrices):

@@ -184,7 +184,7 @@ def law_in(number: Number, controller: Controller) -> Controller:
 def _radius(law: Controller) -> float:
     """Of the poles, with a limit active or not."""
     assert law.anti_windup_gain is not None
-    return float(np.max(np.abs(np.linalg.eigvals([law.A, (law.A - law.anti_windup_gain @ law.C)]))))
+    return float(np.max(np.abs(np.linalg.eigvals([law.A, law.A - law.anti_windup_gain @ law.C]))))
 
 
 def _filled(template: str, controller: Controller, **values: object) -> str:

@@ -30,7 +30,7 @@ def chosen_poles(plant: UncertainPlant, scale_rad_s: float, options: YoulaOption
     more."""
     dt = plant.dt_s
     decay = np.abs(np.log(np.maximum(np.abs(plant.poles), 1e-6))) / dt
-    lowest = min(float(np.min(decay[(decay > 1e-3 * scale_rad_s)], initial=np.inf)), 0.02 * scale_rad_s)
+    lowest = min(float(np.min(decay[decay > 1e-3 * scale_rad_s], initial=np.inf)), 0.02 * scale_rad_s)
     fastest, pairs, found = 0.95 * plant.nyquist_rad_s, options.pairs_per_mode, []
     real = np.exp(-dt * np.geomspace(lowest, fastest, options.real_poles))
     mirrored = -np.exp(-dt * np.geomspace(_NEAREST * fastest, fastest, options.mirrored_poles))

@@ -157,7 +157,7 @@ def _lowest(
     s (R, Y) with d gamma^2 = s^H dA s. Row by row: numpy's calls would cost more than the arithmetic."""
     count, n = log_t.shape
     value, s = np.full(count, np.inf), np.zeros((count, own.shape[1]), dtype=np.complex128)
-    work = np.empty((8, own.shape[1], own.shape[1]), dtype=np.complex128)
+    work = np.empty((7, own.shape[1], own.shape[1]), dtype=np.complex128)
     p, slope = np.empty(own.shape[1], dtype=np.complex128), np.empty(n)
     for r in range(count):
         of = own[r], seen[r], entering[r], base[r], together

@@ -4,8 +4,9 @@
     with      f + F d <= s,  A d <= b,  low <= d <= high.
 
 A primal-dual interior point (Mehrotra's predictor and corrector) in n + 1 unknowns: the rows enter only
-through an (n + 1) x (n + 1) matrix. H = 0 makes it a linear programme. Compiled: numpy's calls cost three
-times as much for so few rows, qpoases behind casadi.conic, the only one there that is as exact, twice.
+through an (n + 1) x (n + 1) matrix. H = 0 makes it a linear programme. Compiled: for so few rows a call of
+numpy would cost more than the arithmetic. A QP solver that begins anew each time costs more still; one that
+begins at the last problem makes the result depend on it.
 """
 
 from __future__ import annotations

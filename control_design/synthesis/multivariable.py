@@ -157,9 +157,8 @@ class Programme:
 
     def starts(self) -> list[Real]:
         """Parameters to begin with, those of the lowest worst case first: static gains with blocks that do
-        nothing yet, and reduced H-infinity controllers of the first plant; not of a structure, nor where
-        channels have errors of their own: one scaling does not stand for theirs (problem D of mimo_designs:
-        1.10 for .98)."""
+        nothing yet, and reduced H-infinity controllers of the first plant: not for a structure, nor where
+        channels have errors of their own, which `weighted_plant` neglects."""
         found: list[tuple[float, Real]] = []
         if self.pattern.all() and not any(each.input_error or each.output_error for each in self.plants):
             plant, slowest = self.plants[0], self.lowest_rad_s
@@ -172,7 +171,7 @@ class Programme:
                         found += [(self.worst(x), x) for x in (self.form.realised(*K),) if x is not None]
         found = [each for each in found if np.isfinite(each[0])]
         with suppress(*([SpecificationError] if found else [])):
-            found += self.static()
+            found += [(self.worst(x), x) for _, x in self.static()]
         return [x for _, x in sorted(found, key=lambda each: each[0])]
 
     def static(self) -> list[tuple[float, Real]]:
@@ -214,7 +213,10 @@ class Programme:
         grids = list(self.lean)
         best, least = x, self.worst(x)
         for number in range(self.options.rounds):
-            tell(number / self.options.rounds, f"worst case {least:.3g}")
+            tell(
+                number / self.options.rounds,
+                f"worst case {least:.3g}" if np.isfinite(least) else "looking for robust stability",
+            )
             grids = [np.union1d(grid, light) for grid, light in zip(grids, self._light(x), strict=True)]
             descent = MatrixDescent(self.form, stacked_rows(self.plants, self.spec, grids), self.loops)
             end, reached, steps = descent.run(x, self.options.steps)

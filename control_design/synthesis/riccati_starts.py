@@ -1,10 +1,10 @@
 """Starts for several joints: central H-infinity controllers of the weighted plant, reduced.
 
 d = (references, what the ball puts in) is carried to z = (weighted outputs, weighted actuators, what the ball
-sees). One constant scaling stands for those of all frequencies and one gain for
-requirements that count by themselves: a start, no worst case. Central controller: Glover and Doyle, Systems &
-Control Letters 11 (1988). Reduction: balanced, weighted as the error of K moves z (Enns, CDC 1984), with
-Gramians by quadrature. All of it in Tustin's s.
+sees). One constant scaling stands for those of all frequencies, and one gain for requirements that count by
+themselves: a start, no worst case. Central controller: Glover and Doyle, Systems & Control Letters 11 (1988).
+Reduction: balanced, weighted as the error of K moves z (Enns, CDC 1984), Gramians by quadrature. All of it in
+Tustin's s.
 """
 
 from __future__ import annotations

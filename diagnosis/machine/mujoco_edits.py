@@ -214,7 +214,7 @@ def _behind(name: str, what: str, spec: Any) -> Any:
 def put_backlash(name: str, spec: Any, gap: float) -> None:
     """Free within the gap."""
     joint = _behind(name, "backlash", spec)
-    gap = np.rad2deg(gap) if (spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE) else gap
+    gap = np.rad2deg(gap) if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE else gap
     joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, np.array([-0.5, 0.5]) * gap
     joint.solref_limit = np.array([2 * spec.option.timestep, 1.0])
 

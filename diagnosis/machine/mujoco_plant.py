@@ -185,7 +185,7 @@ class MujocoArm(MujocoModel):
         def seen(parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]]) -> bool:
             for e, before in zip(records, as_stated, strict=True):
                 moved = simulation({**stated, **parameters}, effects, e.input) - before
-                large = np.sqrt(np.mean(moved**2, axis=0)) > (_INTERESTS * share * np.std(e.output, axis=0))
+                large = np.sqrt(np.mean(moved**2, axis=0)) > _INTERESTS * share * np.std(e.output, axis=0)
                 if np.any(large & (np.max(np.abs(moved), axis=0) > _SEEN * noise)):
                     return True
             return False

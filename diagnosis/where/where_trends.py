@@ -166,7 +166,7 @@ def common_findings(case: Case, residuals: Mapping[str, Real], level: float) -> 
         energy = np.einsum("ki,ij,kj->k", signs, products, signs) / n
         gap = float(np.trace(products)) - n * length
         p_value = float(chi2.sf(energy[0], length))
-        share = (energy - length) / gap if (gap > 3 * np.sqrt(2.0 * n * length)) else np.zeros(energy.size)
+        share = (energy - length) / gap if gap > 3 * np.sqrt(2.0 * n * length) else np.zeros(energy.size)
         chance = float(np.max(share[1:]))
         yes = bool(
             p_value < level / len(case.outputs) and share[0] >= _LEAST_SHARE and share[0] > max(chance, 0.0)
