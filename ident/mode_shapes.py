@@ -407,9 +407,7 @@ def _unpacked(mode: ShapedMode, x: RealArray) -> tuple[complex, ComplexArray, li
     slopes: list[ComplexArray] = []
     if not mode.rank_one:
         residue: ComplexArray = values.reshape(outputs, inputs)
-        for turn in turns:
-            for k in range(values.size):
-                slopes.append(turn * np.eye(values.size)[k].reshape(outputs, inputs))
+        slopes += [turn * unit.reshape(outputs, inputs) for turn in turns for unit in np.eye(values.size)]
         return complex(pole), residue, slopes
     fixed = _largest(mode)
     c, b = values[:outputs], np.insert(values[outputs:], fixed, 1.0)

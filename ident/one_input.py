@@ -56,14 +56,14 @@ def identify(
     options = options or IdentOptions()
     report = progress or silent
     if options.noise == "auto":
-
-        def in_white_noise(
-            part: Sequence[Record], asked: IdentOptions, start: float, end: float
-        ) -> Identification:
-            return _identified(part, asked, lambda f, message: report(start + (end - start) * f, message))
-
         refuse_unusable(records, prepare(records, options.structure()), least_order(options))
-        return identify_in_noise(records, options, in_white_noise)
+        return identify_in_noise(
+            records,
+            options,
+            lambda part, asked, start, end: _identified(
+                part, asked, lambda f, message: report(start + (end - start) * f, message)
+            ),
+        )
     return _identified(records, options, report)
 
 

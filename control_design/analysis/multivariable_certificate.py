@@ -251,12 +251,8 @@ def _grid(
 
 
 def _in_s(system: Any, dt_s: float) -> StateSpace:
-    A, B, C, D = (np.asarray(getattr(system, each), dtype=np.float64) for each in "ABCD")
-    return in_s(A, B, C, D, dt_s)
-
-
-def in_s(A: Real, B: Real, C: Real, D: Real, dt_s: float) -> StateSpace:
     """State space in Tustin's s with the values of the discrete one: the inverse of Tustin's rule."""
+    A, B, C, D = (np.asarray(getattr(system, each), dtype=np.float64) for each in "ABCD")
     inverse = np.linalg.inv(A + np.eye(A.shape[0]))
     return (
         2 / dt_s * (A - np.eye(A.shape[0])) @ inverse,

@@ -179,8 +179,10 @@ def _harmonic(records: RecordsToFit, around: Descent, candidate: Candidate) -> l
         coordinates = np.column_stack([np.log(amplitudes), some, np.arctan2(ab[:, 1], ab[:, 0])])
         losses = around.loss + 0.5 * np.sum(slopes * ab, axis=1)
         changes = np.einsum("nlk,lk->ln", columns.reshape(len(columns), -1, 2), ab)
-        for loss, x, change in zip(losses, coordinates, changes, strict=True):
-            found.append(StartPoint(float(loss), x, around.deviations, around.start, records.size_of(change)))
+        found += [
+            StartPoint(float(loss), x, around.deviations, around.start, records.size_of(change))
+            for loss, x, change in zip(losses, coordinates, changes, strict=True)
+        ]
     return found
 
 

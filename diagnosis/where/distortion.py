@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import detrend
 from scipy.stats import chi2, f as fisher
 
 from diagnosis.machine.case import Case, Experiment
@@ -41,7 +42,8 @@ def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> P
     count = x.voltage_V.size // period
     # Orthonormal lines 1 .. below Nyquist: a mean square modulus of 1 is white noise of unit variance.
     lines = np.arange(1, (period + 1) // 2)
-    spectra = _lines(_without_trend(e), period, count, lines)
+    # A drift is a ramp in every period, yet no answer.
+    spectra = _lines(detrend(e, axis=0), period, count, lines)
     model = _lines((x.output - e * case.noise) / case.noise, period, count, lines)[-1]
     drive = np.abs(np.fft.rfft(x.voltage_V[:period])[lines])
     excited = drive > _EXCITED * drive.max()
@@ -97,12 +99,6 @@ def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> P
                 )
             )
     return PeriodicFinding(x.name, period, count, tuple(bands), tuple(shown), separable)
-
-
-def _without_trend(e: Real) -> Real:
-    """Residuals without their straight line: a drift is a ramp in every period, yet no answer."""
-    time = np.linspace(-1.0, 1.0, e.shape[0])[:, None]
-    return np.asarray(e - e.mean(axis=0) - time * (np.sum(time * e, axis=0) / np.sum(time**2)))
 
 
 def _lines(signal: Real, period: int, count: int, lines: npt.NDArray[np.int64]) -> ComplexArray:

@@ -105,15 +105,10 @@ class FrictionFit:
         """The level is more than three of its standard deviations above zero."""
         return self.level > 3 * self.level_std
 
-    def motion(self, record: Record) -> tuple[RealArray, RealArray]:
-        """Simulated position (T,) and friction in units of the input (T,), held over each sample."""
-        return self._run(record, self.law)
-
-    def friction_of(self, record: Record, law: FrictionLaw) -> RealArray:
-        """(T,) friction of the same motion under another law."""
-        return self._run(record, law)[1]
-
-    def _run(self, record: Record, law: FrictionLaw) -> tuple[RealArray, RealArray]:
+    def motion(self, record: Record, law: FrictionLaw | None = None) -> tuple[RealArray, RealArray]:
+        """Simulated position (T,) and friction in units of the input (T,), held over each sample. law: not
+        the fit's."""
+        law = law or self.law
         if self.correction is None:
             return self.arm.run(self.coefficients, record.input[:, 0], law)
         delay, position = self.arm.structure.input_delay_samples, self.observed_position(record)
@@ -256,7 +251,7 @@ def driven_by_law(found: FrictionFit, record: Record) -> RealArray:
         change = np.zeros(parameters.size)
         change[k] = size = _CHANGE_OF_LOG if k % 2 else _CHANGE_OF_LEVEL * found.level
         law = law_of(parameters + change)
-        columns.append((found.friction_of(record, law) - friction) / size)
+        columns.append((found.motion(record, law)[1] - friction) / size)
         if found.spring is not None and np.isfinite(found.law.fall):
             columns[-1] = columns[-1] + (found.force_beyond(record, found.beyond, law) - beyond) / size
     if found.lag:

@@ -56,6 +56,7 @@ from ident.friction.inverse_dynamics import (
     highest_Hz,
     presliding_of,
     rms_speed,
+    speed_classes,
     with_measured_direction,
 )
 from ident.friction.observer import NEARBY, ObserverFilter, observed, prediction_errors
@@ -64,6 +65,7 @@ from ident.identification import Identification
 from ident.one_input import identify, untested_model
 from ident.search.pole_search import PoleSearch
 from ident.uncertainty.autoregression import fit_autoregression
+from ident.uncertainty.embedding_algebra import by_class, sandwiched
 from ident.uncertainty.pole_intervals import laurent_rows
 from ident.unstable import find_unstable
 
@@ -204,16 +206,16 @@ def fit_friction_in_loop(
 
     records: one input, and the position of the shaft that the friction acts on. options: of the search for
     the arm's poles; a delay that is not stated is sought. Raises ValueError as `identify`, where the logs
-    excite few frequencies, or no observer follows them. What parts of the logs differ in widens all widths.
+    excite few frequencies, or no observer follows them. What parts of the logs differ in widens all widths;
+    what speeds differ in, those that it moves.
     """
     report = progress or (lambda fraction, message: None)
     refuse_few_lines(records)
     logs = _Logs.of(records)
     report(0.0, "friction: level and a simple arm in turns")
     starts = _of_structure(logs, _above_noise(logs.records, options))
-    least = _WORSE_AT_FIRST * min(logs.worth(found) for _, found in starts)
-    starts = [start for start in starts if logs.worth(start[1]) <= least]
-    ends = list[FrictionFit]()
+    best, ends = min(logs.worth(found) for _, found in starts), list[FrictionFit]()
+    starts = [start for start in starts if logs.worth(start[1]) <= _WORSE_AT_FIRST * best]
     for k, start in enumerate(starts):
         with suppress(LostError):
             ends.append(
@@ -224,8 +226,16 @@ def fit_friction_in_loop(
     if not ends:
         raise LostError
     found = min(ends, key=logs.worth)
-    spread = heterogeneity(found, logs.records, ObserverFilter.of(found))
-    return replace(found, covariance_factor=np.sqrt(spread) * found.covariance_factor)
+    whiten = ObserverFilter.of(found)
+    wider = np.sqrt(heterogeneity(found, logs.records, whiten)) * found.covariance_factor
+    blocks, targets = _equations(found, logs.records, whiten)
+    change, *_, rest = least_squares(blocks, targets, np.zeros((0, blocks[0].shape[1] + 1)))
+    scores = sum(
+        by_class(target - block @ change, speed_classes(record)).T @ block
+        for record, block, target in zip(logs.records, blocks, targets, strict=True)
+    )
+    scores = scores @ found.covariance_factor * sum(target.size for target in targets) / rest
+    return replace(found, covariance_factor=sandwiched(wider, scores))
 
 
 def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: Report) -> FrictionFit:
@@ -312,8 +322,8 @@ def _kept_if_better(
             errors, left = logs.errors(best), left - 1
             best = _stepped(logs, observed(best, logs.records))
         # An excess that has gone to nothing is none.
-        ends = best, _in_turns(logs, best, options)
-        return min((found, *(e for e in ends if np.isinf(e.law.fall) or e.law.excess)), key=logs.worth)
+        ends = (e for e in (best, _in_turns(logs, best, options)) if np.isinf(e.law.fall) or e.law.excess)
+        return min((found, *ends), key=logs.worth)
     return found
 
 
@@ -403,8 +413,8 @@ def _beyond(found: FrictionFit, options: IdentOptions) -> IdentOptions:
 def _with_more_poles(logs: _Logs, found: FrictionFit, options: IdentOptions) -> FrictionFit:
     """The same with as many poles as the data ask for, where they are worth it."""
     delay = {"input_delay_samples": found.arm.structure.input_delay_samples}
-    more = _in_turns(logs, found, _beyond(found, options.model_copy(update=delay)))
-    return min(found, more, key=logs.worth)
+    options = _beyond(found, options.model_copy(update=delay))
+    return min(found, _in_turns(logs, found, options), key=logs.worth)
 
 
 def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: int = _ROUNDS) -> FrictionFit:

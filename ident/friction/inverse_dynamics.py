@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from ident.data.arrays import COMPILED, ComplexArray, RealArray
+from ident.data.arrays import COMPILED, ComplexArray, IntArray, RealArray
 from ident.data.record import Record
 from ident.friction.arm import less_friction
 
@@ -21,6 +21,8 @@ _LEAST_NOISE = 1e-6  # of the motion: a sensor of 20 bits
 _BANDS, _PERIODS, _STEEP = 8, 8, 8
 # Deflection before slipping, as a share of the rms motion; the start takes more.
 _PRESLIDING, _COARSE = 1e-5, 10.0
+# Errors of a law of friction show between speeds: parts of the rows, as many as tell a trend from chance.
+_CLASSES = 8
 _DERIVATIVES = 3  # stiffness, damping, inertia, and the lag of a drive behind them
 
 
@@ -57,6 +59,12 @@ def noise_of(y: RealArray) -> float:
     power = np.abs(_spectrum(y).values) ** 2
     white = np.sqrt(np.median(power[power.size // 2 :]) / np.log(2) / (2 * y.size))
     return float(max(white, _LEAST_NOISE * np.std(y)))
+
+
+def speed_classes(record: Record) -> IntArray:
+    """(T,) of eight classes of as many rows, by the speed of the position, in either direction."""
+    speed = np.abs(np.gradient(smoothed(record.output[:, 0])))
+    return np.asarray(np.argsort(np.argsort(speed)) * _CLASSES // speed.size)
 
 
 def rms_speed(records: Sequence[Record]) -> float:

@@ -21,7 +21,7 @@ from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
 from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, linearised
 from ident.friction.in_loop import NOISE_ORDER, heterogeneity
-from ident.friction.inverse_dynamics import smoothed
+from ident.friction.inverse_dynamics import smoothed, speed_classes
 from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
 
@@ -30,14 +30,15 @@ _SHAPE = 0.05
 # Grid of what is put onto the basis.
 _FREQUENCIES, _LENGTHS, _LEVEL = 400, 100, 0.95
 # Normals along which the response is bent, points of an arc, its parts that are kept as a share of the
-# largest, singular values of the basis that are left out.
-_MOST_CURVED, _STEPS, _SMALL, _RANK = 3, 17, 1e-3, 1e-8
+# largest.
+_MOST_CURVED, _STEPS, _SMALL = 3, 17, 1e-3
 _MOST_GAIN = 3.0  # of an arc, over the centre: a damping that is not told from none has no end
 # Size of an ellipse over the rms of even points of the arc it holds (1.7 of a line); at most, where the sign
 # of the gain is known, as a share of it.
 _REACH, _LARGEST = 1.7, 0.9
-# Rates of further real poles, as multiples of the slowest one's, which the force may move so far.
-_AROUND = (0.1, 0.4, 2.0, 5.0)
+# Further real poles over the grid, which bent gains stand on: to 2 %, where four about the slowest left 6 %;
+# with 20 their coefficients grow, and certificates between grid points fail.
+_FURTHER = 10
 # Lowest missing mode, over the highest of the model: a nearer one the search would have found.
 _BEYOND = 1.1
 
@@ -112,7 +113,13 @@ def _behind_observed(
     swinging = model.poles.pairs if model.poles.pairs.size else model.poles.real[model.poles.real > 0]
     above = _BEYOND * float(np.max(np.abs(np.log(swinging)), initial=0.0))
     response, change, factor = tangent_beside(
-        less, model, beside, options.model_copy(update=coloured), n_known=known, missed_above=above
+        less,
+        model,
+        beside,
+        options.model_copy(update=coloured),
+        n_known=known,
+        missed_above=above,
+        classes=[speed_classes(record) for record in records],
     )
     whitening = np.array([1.0, *(response.report.ar_coefficients if response.report else ())])
     wider = np.sqrt(
@@ -143,15 +150,19 @@ def of_force(
     a circle. Along the normals that move the gain below the first light mode most, ellipses about the middle
     of the arc's ends hold the arc as far as the level's radius goes. Where the arm would be turned against
     its command at the lowest frequency, which no passive arm is, the arc ends before. Neglected: gains more
-    than `_MOST_GAIN` times the centre's.
+    than `_MOST_GAIN` times the centre's; the bends of an unstable arm, which no stable poles follow.
     """
+    if response.unstable.order:
+        return response, response, np.eye(response.covariance_factor.shape[1])
     omega = _frequencies(response, longest_s)
     rows = response.frequency_rows(omega)
     gain, moved = rows @ response.mean, rows @ response.covariance_factor
-    modes = poles.omega_rad_s(response.dt_s)[poles.zeta() < LARGEST_DAMPING]
     change = moved / gain[:, None]
     # Above the frequency where the gain is known best it is no longer the force of a slow motion.
-    low = omega < np.min(modes, initial=omega[np.argmin(np.linalg.norm(change, axis=1))])
+    low = omega < np.min(
+        poles.omega_rad_s(response.dt_s)[poles.zeta() < LARGEST_DAMPING],
+        initial=omega[np.argmin(np.linalg.norm(change, axis=1))],
+    )
     along = np.linalg.svd(real_rows(np.where(low[:, None], change, 0.0)), full_matrices=False)[2][
         :_MOST_CURVED
     ]
@@ -162,7 +173,7 @@ def of_force(
     for k, direction in enumerate(along):
         x = change @ direction
         ends = np.array([-radius, radius])
-        if not response.unstable.order and abs(x[0].real) > least:
+        if abs(x[0].real) > least:
             turns = (1 - least) / x[0].real if upright else (1 + least) / x[0].real
             if upright:
                 ends = np.clip(ends, *sorted((-np.sign(turns) * np.inf, turns)))
@@ -175,15 +186,20 @@ def of_force(
         middle = (arc[:, 0] + arc[:, -1]) / 2
         parts = _parts_of(np.asarray(arc - middle[:, None], np.complex128), np.asarray(middle))
         centre += middle - 1
-        columns += [gain[:, None] * parts]
+        columns += [parts]
         # Of its parts the first takes the normal's place.
         onto += [np.vstack([direction, np.zeros((parts.shape[1] - 1, direction.size))])]
-    # Real poles well below and above the slowest one, where that lies if more or less damps the arm.
-    slowest = np.sort(poles.real)[-1:].clip(1e-9, 1 - 1e-9)
-    slow = Poles(np.ravel(np.power.outer(slowest, _AROUND)))
-    wanted = np.hstack([moved @ onto[0], *columns]).T
-    bent = _with_poles(response, poles.appended(slow), omega, gain * centre, [*wanted], _RANK)
-    normals = np.vstack(onto)
+    # On more poles, which take up all of it: real ones, and those of the arm once more.
+    poles = poles.appended(
+        Poles(np.exp(-np.geomspace(10 * omega[0], omega[-1] / 3, _FURTHER) * response.dt_s))
+    )
+    nothing = np.zeros((response.mean.size + poles.order, 1))
+    bent = replace(
+        response, poles=response.poles.appended(poles), mean=nothing[:, 0], covariance_factor=nothing
+    )
+    wanted = np.column_stack([centre, (moved @ onto[0]) / gain[:, None], *columns])
+    found = np.linalg.lstsq(real_rows(bent.frequency_rows(omega) / gain[:, None]), real_rows(wanted))[0]
+    bent, normals = replace(bent, mean=found[:, 0], covariance_factor=found[:, 1:]), np.vstack(onto)
     return bent, replace(response, covariance_factor=response.covariance_factor @ normals.T), normals
 
 
@@ -207,29 +223,6 @@ def _frequencies(response: ResponsePosterior, longest_s: float) -> RealArray:
     )
 
 
-def _with_poles(
-    response: ResponsePosterior,
-    poles: Poles,
-    omega: RealArray,
-    gain: ComplexArray,
-    columns: Sequence[ComplexArray],
-    rank: float | None = None,
-) -> ResponsePosterior:
-    """On more poles, which take up these columns (F,) of the factor, as of the gain. rank: singular values of
-    the basis below this share are left out, for of a kernel's many taps some do nearly the same."""
-    size = response.mean.size + poles.order
-    more = replace(
-        response,
-        poles=response.poles.appended(poles),
-        mean=np.zeros(size),
-        covariance_factor=np.zeros((size, 1)),
-    )
-    basis = real_rows(more.frequency_rows(omega) / gain[:, None])
-    wanted = real_rows(np.column_stack([gain, *columns]) / gain[:, None])
-    found = np.asarray(np.linalg.lstsq(basis, wanted, rcond=rank)[0], np.float64)
-    return replace(more, mean=found[:, 0], covariance_factor=found[:, 1:])
-
-
 def _by_linear_force(
     friction: FrictionFit, records: Sequence[Record], less: Sequence[Record], response: ResponsePosterior
 ) -> RealArray:
@@ -244,20 +237,13 @@ def _by_linear_force(
     columns = list[RealArray]()
     for i in range(3):
         if i >= response.integrators:
-            size = _SHAPE * np.sqrt(_mean_square(force) / _mean_square(moved))
+            size = _SHAPE * np.sqrt(sum(map(np.var, force)) / sum(map(np.var, moved)))
             change = size * (1j * omega) ** i * gain / friction.drive_response(omega)
             # On the doubled poles, which hold G^2 s^i but for the delay, relative to G.
             basis = real_rows(rows[:, : response.poles.order] / gain[:, None])
             columns.append(np.asarray(np.linalg.lstsq(basis, real_rows(change), rcond=None)[0]))
         moved = [np.gradient(one, response.dt_s) for one in moved]
-    found = np.zeros((response.mean.size, len(columns)))
-    found[: response.poles.order] = np.column_stack(columns)
-    return found
-
-
-def _mean_square(signals: Sequence[RealArray]) -> float:
-    """About their means."""
-    return float(np.mean([np.var(signal) for signal in signals]))
+    return np.pad(np.column_stack(columns), ((0, response.mean.size - response.poles.order), (0, 0)))
 
 
 def other_output_without_friction(

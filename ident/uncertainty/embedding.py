@@ -18,7 +18,7 @@ from ident.basis.options import EmbeddingOptions
 from ident.basis.poles import Poles
 from ident.basis.posterior import EmbeddingReport, ResponsePosterior
 from ident.basis.structure import Structure
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import ComplexArray, IntArray, RealArray
 from ident.data.record import Record
 from ident.fit.frf_regression import FrfRegression
 from ident.uncertainty.autoregression import fit_autoregression
@@ -36,6 +36,7 @@ from ident.uncertainty.embedding_algebra import (
     kernel_grid,
     reduce_regression,
     reduce_stacked,
+    sandwiched,
     stack_blocks,
     tc_factor,
     total_log_evidence,
@@ -88,14 +89,17 @@ def tangent_beside(
     *,
     n_known: int = 0,
     missed_above: float = 0.0,
+    classes: Sequence[IntArray] = (),
 ) -> tuple[ResponsePosterior, RealArray, RealArray]:
     """The tangent posterior with q columns beside the basis functions, in every record, and their
     coefficients: mean (q,) and factor (q, P') on the same unit normals as the response's covariance_factor.
 
     The last n_known coefficients are independent unknowns of zero mean and unit variance, the others free.
-    missed_above: least frequency of a mode that may be missing, radians a sample. Errors as `tangent`.
+    missed_above: least frequency of a mode that may be missing, radians a sample. classes: of the rows (T,)
+    of each record, by what errors of the model may depend on; where they differ the covariance is wider
+    (`sandwiched`). Errors as `tangent`.
     """
-    known = {"n_known": n_known, "missed_above": missed_above}
+    known = {"n_known": n_known, "missed_above": missed_above, "classes": tuple(classes)}
     return _embed(records, model, options or EmbeddingOptions(), beside=beside, **known)
 
 
@@ -143,6 +147,12 @@ def _embed(
     # The columns beside the basis functions are no part of the response.
     after = solved.rows.poles.order + int(rows.structure.feedthrough)
     joint, beside_rows = joint_factor(reduced, kernel), slice(after + n_off, after + rows.n_beside)
+    if rows.classes:
+        # The kernel's normals stay: what it leaves open above the excitation would drown everything.
+        own, rest = np.split(joint[1], [reduced.n_regressors], axis=1)
+        scores = solved.rows.scores(joint_factor(solved.reduced, solved.kernel)[0])
+        scores = scores @ own[: reduced.n_columns] / kernel.noise_variance
+        joint = joint[0], np.hstack([sandwiched(own, scores), rest])
     mean, factor = (np.delete(part, slice(after, after + rows.n_beside), axis=0) for part in joint)
     if missed is not None and missed.poles.size:
         mean, factor = (

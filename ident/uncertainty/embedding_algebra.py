@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import lapack, qr, solve_triangular, svd
 
 from ident.basis.posterior import EmbeddingReport
-from ident.data.arrays import RealArray
+from ident.data.arrays import IntArray, RealArray
 
 # Rows of a record that stand in memory with all their columns: some hundred megabytes.
 _PIECE = 65536
@@ -447,6 +447,19 @@ def joint_factor(reduced: ReducedRegression, posterior: KernelPosterior) -> tupl
         posterior.kernel_factor,
     )
     return mean, factor
+
+
+def by_class(rest: RealArray, classes: IntArray) -> RealArray:
+    """What is left of the last rows (T,), in a column for each class of the rows."""
+    return rest[:, None] * (classes[-rest.size :, None] == np.arange(1 + classes.max()))
+
+
+def sandwiched(factor: RealArray, scores: RealArray) -> RealArray:
+    """Factor (P,P') of a covariance, wider where scores (M,P') of classes of rows, in its unit normals, are
+    larger than the noise makes them: H^-1 S H^-1 with S their sum of squares (White, Econometrica 50(1),
+    1982), never below what the noise leaves open."""
+    size, along = np.linalg.eigh(scores.T @ scores * len(scores) / (len(scores) - 1))
+    return np.asarray(factor @ (along * np.sqrt(np.maximum(size, 1.0))) @ along.T)
 
 
 def symmetric_factor(covariance: RealArray) -> RealArray:

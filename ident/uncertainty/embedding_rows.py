@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from ident.basis.functions import all_pass_signal, nuisance_columns, regressor
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure, answered, driving_input, level_before, stabilised
-from ident.data.arrays import RealArray
+from ident.data.arrays import IntArray, RealArray
 from ident.data.record import Record
 from ident.uncertainty.autoregression import Absorbed, first_rows, whitened
 from ident.uncertainty.embedding_algebra import (
@@ -20,7 +20,9 @@ from ident.uncertainty.embedding_algebra import (
     KernelPosterior,
     ReducedRegression,
     RegressionBlock,
+    by_class,
     joint_factor,
+    nuisance_basis,
 )
 
 # Directions of the nuisance (columns of unit length) below this are left out, as in the fit.
@@ -60,7 +62,8 @@ class EmbeddingRows:
     poles: of the regressors (doubled for the tangent method); fir_length: of the kernel; whitening: A(q), [1]
     for white noise. beside: one per record, or none, whose last n_known columns have coefficients known to
     one; known_std: of the (whitened) noise, as far as known. missed_above: least frequency of a mode that
-    may be missing, radians a sample.
+    may be missing, radians a sample. classes: of the rows (T,) of each record, by what errors of the model
+    may depend on.
     """
 
     records: tuple[Record, ...]
@@ -72,6 +75,7 @@ class EmbeddingRows:
     n_known: int = 0
     known_std: float | None = None
     missed_above: float = 0.0
+    classes: tuple[IntArray, ...] = ()
 
     @property
     def n_beside(self) -> int:
@@ -95,6 +99,17 @@ class EmbeddingRows:
             kernel = Delays(rows.input, self.fir_length, rows.first @ head[:], dropped)
             used = slice(dropped, None)
             yield RegressionBlock(rows.nuisance[used], rows.regressors[used], kernel, rows.output[used])
+
+    def scores(self, mean: RealArray) -> RealArray:
+        """(M, P): sums over the rows of each class of regressors times what the mean (P+L,) leaves, behind
+        the nuisance."""
+        total = np.zeros(())
+        for block, classes in zip(self.record_blocks(), self.classes, strict=True):
+            p, basis = block.regressors.shape[1], nuisance_basis(block.nuisance)
+            rest = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
+            own = by_class(rest - basis @ (basis.T @ rest), classes)
+            total = total + (own - basis @ (basis.T @ own)).T @ block.regressors
+        return total
 
     def known_blocks(self) -> Iterator[RegressionBlock]:
         """What is known of the shared coefficients: as many measurements of them, each off by one."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from benchmarks import durations
 
 NOTED = '<properties><property name="cpu_s" value="{}"/></properties>'
@@ -39,22 +37,3 @@ def test_rooms_and_the_slowest(tmp_path, capsys):
         "    7.50  failure  tests/ident/test_a.py::test_two[x]",
         "    2.00  passed   tests/ident/test_a.py::test_one",
     ]
-
-
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda folder: {"junit": "none.xml"}, "`make test` writes one"),
-        (lambda folder: {"junit": junit(folder / "a.xml", [])}, "holds no tests"),
-        (
-            lambda folder: {
-                "junit": junit(folder / "a.xml", CASES),
-                "against": junit(folder / "b.xml", CASES, "elsewhere"),
-            },
-            "another machine",
-        ),
-    ],
-)
-def test_times_that_say_nothing_are_refused_in_one_line(tmp_path, make, said):
-    with pytest.raises(SystemExit, match=said):
-        durations.run(lambda line="": None, **make(tmp_path))

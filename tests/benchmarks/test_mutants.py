@@ -1,11 +1,10 @@
 """Mutants: one change each, of code inside functions, in a copy only."""
 
-import contextlib
 from pathlib import Path
 
 import pytest
 
-from benchmarks.mutants import Copy, Judge, changed, drawn, mutants_of
+from benchmarks.mutants import Copy, Judge, drawn, mutants_of
 
 SOURCE = b'''"""Docs with 3 * 4."""
 from dataclasses import dataclass
@@ -122,32 +121,3 @@ def test_what_tests_see_and_what_survives_and_the_checkout_stays_as_it_is(checko
     assert texts(checkout) == before
     assert copy.left_behind() == []
     assert not (copy.path / ".git").exists()
-
-
-def test_a_mutant_left_behind_in_the_copy_is_seen_before_the_next(checkout, tmp_path):
-    copy, mutant = Copy(checkout, tmp_path / "copies"), by_function(checkout, "twice")
-    with contextlib.suppress(KeyboardInterrupt), copy.holding(mutant):
-        assert copy.left_behind() == ["plant/shape.py"]
-        raise KeyboardInterrupt
-    assert copy.left_behind() == []
-    (copy.path / "plant/shape.py").write_bytes(changed(mutant, CODE.encode()))
-    with (
-        pytest.raises(RuntimeError, match=r"left behind by an earlier mutant: plant/shape\.py"),
-        copy.holding(mutant),
-    ):
-        pass
-
-
-def test_compiled_kernels_are_those_of_the_mutant_and_then_those_of_the_checkout(checkout, tmp_path):
-    kernel = checkout / "plant/kernel.py"
-    kernel.write_text("from numba import njit\n\n\n@njit\ndef f(x):\n    return x + 1\n")
-    cache = "plant/__pycache__/kernel.f-6.nbi"
-    (checkout / cache).parent.mkdir()
-    (checkout / cache).write_bytes(b"compiled")
-    copy = Copy(checkout, tmp_path / "copies")
-    with copy.holding(by_function(checkout, "f")) as root:
-        assert not (root / cache).exists()
-        (root / cache).write_bytes(b"wrong")
-    assert (copy.path / cache).read_bytes() == b"compiled"
-    with copy.holding(by_function(checkout, "twice")) as root:
-        assert (root / cache).exists()

@@ -14,7 +14,7 @@ from ident.data.signal_filter import band_limited
 from ident.one_input import identify
 from ident.uncertainty import embedding
 from ident.uncertainty.autoregression import fit_autoregression
-from ident.uncertainty.embedding import tangent
+from ident.uncertainty.embedding import tangent, tangent_beside
 from tests.ident.test_embedding_algebra import dense_posterior
 from validation.paper.classical import classical
 
@@ -75,6 +75,25 @@ def test_a_damped_mode_that_nobody_asked_for_is_inside():
     # 91, 93 and 96 % measured; 77, 87 and 90 where half of the prior says that nothing is left out.
     assert min(shares) > 0.86
     assert np.mean(shares) > 0.9
+
+
+@pytest.mark.parametrize("share", [0.0, 0.04])
+def test_what_classes_of_rows_differ_in_widens_the_ellipses(share):
+    """A gain that is larger in the faster half of the rows; without it the classes add little."""
+    pole, n, widths = 0.9 * np.exp(0.3j), 3000, []
+    model = GobfModel(Poles(np.zeros(0), np.array([pole])), np.zeros(2), DT)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        u = rng.standard_normal(n)
+        y = signal.lfilter([0, 0.1], np.poly([pole, np.conj(pole)]).real, u)
+        fast = np.argsort(np.argsort(np.abs(np.gradient(y)))) * 8 // n
+        y = y * (1 + share * (fast >= 4)) + 0.01 * rng.standard_normal(n)
+        records, nothing = [Record("", u[:, None], y[:, None], DT, ("u",), ("y",))], np.zeros((n, 0))
+        beside = [embedding.Beside(nothing, nothing)]
+        found = [tangent_beside(records, model, beside, classes=given)[0] for given in ([], [fast])]
+        widths.append([np.median(one.at(OMEGA).ellipse(0.95).semi_major) for one in found])
+    plain, wider = np.median(widths, axis=0)
+    assert plain <= wider < 1.6 * plain if share == 0 else wider > 2.5 * plain
 
 
 def test_coloured_noise_needs_the_noise_model():

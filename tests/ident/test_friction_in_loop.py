@@ -11,14 +11,17 @@ from benchmarks.closed_loop_machines.logs import Machine, machine
 from benchmarks.closed_loop_machines.simulator import Law, response
 from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
-from ident.basis.poles import Poles
+from ident.basis.poles import NO_POLES, Poles
+from ident.basis.posterior import ResponsePosterior
 from ident.checks.validation import fit_in_windows, fit_on_fresh_data
+from ident.data.arrays import real_rows
 from ident.data.record import Record
 from ident.friction import FrictionFit, fit_friction, identify_behind, without_friction
 from ident.friction.arm import FrictionLaw
 from ident.friction.gauss_newton import LostError, least_squares
 from ident.friction.in_loop import recorded_in_loop, with_commands_in_time
 from ident.friction.inverse_dynamics import direction_of, level_of, smoothed
+from ident.friction.posterior import of_force
 from ident.friction.spring import Spring
 
 
@@ -219,3 +222,24 @@ def test_equations_that_are_not_finite_lose_the_log():
     rows[3, 1] = np.inf
     with pytest.raises(LostError, match="no model of the arm with dry friction follows"):
         least_squares([rows], [np.arange(6.0)], np.zeros((0, 3)))
+
+
+@pytest.mark.parametrize("unstable", [False, True])
+def test_small_changes_of_the_force_are_inside_the_bent_ellipses(unstable: bool) -> None:
+    """What an arm with 4 % less or more force answers, exactly: 1 / D in the changed D."""
+    away, omega = Poles(np.array([np.exp(-0.03)])) if unstable else NO_POLES, np.geomspace(0.1, 20.0, 60)
+    poles = Poles(np.array([np.exp(-0.04)]), np.array([0.9 * np.exp(0.4j)])).appended(away)
+    mean = np.random.default_rng(1).standard_normal(poles.doubled().order)
+    mean = np.append(mean, np.zeros(away.order))
+    plain = ResponsePosterior(
+        poles.doubled(), mean, np.eye(mean.size), 0.01, integrators=int(not unstable), unstable=away
+    )
+    # A force k + d s that is added to D moves G by -G^2 (k + d s): within the doubled poles.
+    gain, rows = plain.centre(omega)[:, None], plain.frequency_rows(omega)
+    wanted = (1j * omega[:, None]) ** [0, 1][int(not unstable) :] * gain**2
+    factor = np.linalg.lstsq(real_rows(rows / gain), real_rows(wanted / gain))[0]
+    factor = factor * 0.04 / np.max(np.abs(rows @ factor / gain), axis=0)
+    bent = of_force(replace(plain, covariance_factor=factor), poles, 30.0)[0].at(omega)
+    for change in (rows @ factor / gain).T:
+        for t in (-1.0, -0.5, 0.0, 0.5, 1.0):
+            assert np.mean(bent.contains(gain[:, 0] / (1 - t * change))) > 0.95

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib import metadata
 from math import copysign
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,10 +20,9 @@ from diagnosis.where.where import motion_of, over_levels, where, where_in_record
 from plant.effects import EFFECTS
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.controller_check import ControllerCheck
-from workflow.diagnose.following import Following, following
+from workflow.diagnose.following import Following
 from workflow.diagnose.stick_figures import moving_figures
 from workflow.diagnose.words import FILTERS
-from workflow.engine import storage
 from workflow.report.rendering import render_page
 from workflow.text.templates import RunSummary
 
@@ -87,11 +85,6 @@ def plant_page(
         "numbers": json.dumps(numbers, indent=1),
     }
     return _rendered("diagnosis/plant.html.j2", found, page=page)
-
-
-def write_plant_page(found: Diagnosis, path: str | Path) -> None:
-    """`plant_page` as a file."""
-    storage.write_bytes(Path(path), plant_page(found, following(found)).encode())
 
 
 def _rendered(

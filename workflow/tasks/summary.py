@@ -43,7 +43,11 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
         numbers={
             "channels": [channel_numbers(found, spread) for found, spread in pairs],
             "design": {
-                **design_numbers(design),
+                "met": design.met,
+                "reason": design.reason,
+                "gamma": design.gamma,
+                "outcome": "IMPOSSIBLE" if design.synthesis is None else design.synthesis.outcome.name,
+                "blocking": [] if design.synthesis is None else codec.plain(design.synthesis.blocking),
                 "bandwidth_rad_s": bandwidth_numbers(design, certify, config.specification),
             },
             "signals": signals,
@@ -188,18 +192,6 @@ def channel_numbers(found: IdentifiedChannel, spread: UncertainChannel) -> dict[
     return {
         **model,
         **{key: ellipses[key] for key in ("bands", "intervals", "tests", "advice", "repeat_scatter")},
-    }
-
-
-def design_numbers(design: DesignResult) -> dict[str, Any]:
-    """Outcome of a design without its controller."""
-    found = design.synthesis
-    return {
-        "met": design.met,
-        "reason": design.reason,
-        "gamma": design.gamma,
-        "outcome": "IMPOSSIBLE" if found is None else found.outcome.name,
-        "blocking": [] if found is None else codec.plain(found.blocking),
     }
 
 
