@@ -106,8 +106,8 @@ class FrictionFit:
         return self.level > 3 * self.level_std
 
     def motion(self, record: Record, law: FrictionLaw | None = None) -> tuple[RealArray, RealArray]:
-        """Simulated position (T,) and friction in units of the input (T,), held over each sample. law: not
-        the fit's."""
+        """Simulated position (T,) and friction in units of the input (T,), held over each sample, under the
+        fit's law or the one given."""
         law = law or self.law
         if self.correction is None:
             return self.arm.run(self.coefficients, record.input[:, 0], law)

@@ -30,15 +30,14 @@ _SHAPE = 0.05
 # Grid of what is put onto the basis.
 _FREQUENCIES, _LENGTHS, _LEVEL = 400, 100, 0.95
 # Normals along which the response is bent, points of an arc, its parts that are kept as a share of the
-# largest.
+# largest; of powers its square.
 _MOST_CURVED, _STEPS, _SMALL = 3, 17, 1e-3
 _MOST_GAIN = 3.0  # of an arc, over the centre: a damping that is not told from none has no end
 # Size of an ellipse over the rms of even points of the arc it holds (1.7 of a line); at most, where the sign
 # of the gain is known, as a share of it.
 _REACH, _LARGEST = 1.7, 0.9
-# Further real poles over the grid, which bent gains stand on: to 2 %, where four about the slowest left 6 %;
-# with 20 their coefficients grow, and certificates between grid points fail.
-_FURTHER = 10
+# Further real poles over the grid, which bent gains stand on: to .1 %, where four about the slowest left 16.
+_FURTHER = 20
 # Lowest missing mode, over the highest of the model: a nearer one the search would have found.
 _BEYOND = 1.1
 
@@ -198,7 +197,9 @@ def of_force(
         response, poles=response.poles.appended(poles), mean=nothing[:, 0], covariance_factor=nothing
     )
     wanted = np.column_stack([centre, (moved @ onto[0]) / gain[:, None], *columns])
-    found = np.linalg.lstsq(real_rows(bent.frequency_rows(omega) / gain[:, None]), real_rows(wanted))[0]
+    # Nearly equal poles would get large coefficients, and proofs between grid points fail.
+    basis = real_rows(bent.frequency_rows(omega) / gain[:, None])
+    found = np.linalg.lstsq(basis, real_rows(wanted), rcond=_SMALL**2)[0]
     bent, normals = replace(bent, mean=found[:, 0], covariance_factor=found[:, 1:]), np.vstack(onto)
     return bent, replace(response, covariance_factor=response.covariance_factor @ normals.T), normals
 
