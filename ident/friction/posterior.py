@@ -198,8 +198,9 @@ def of_force(
     )
     wanted = np.column_stack([centre, (moved @ onto[0]) / gain[:, None], *columns])
     # Nearly equal poles would get large coefficients, and proofs between grid points fail.
-    basis = real_rows(bent.frequency_rows(omega) / gain[:, None])
-    found = np.linalg.lstsq(basis, real_rows(wanted), rcond=_SMALL**2)[0]
+    found = np.linalg.lstsq(
+        real_rows(bent.frequency_rows(omega) / gain[:, None]), real_rows(wanted), rcond=_SMALL**2
+    )[0]
     bent, normals = replace(bent, mean=found[:, 0], covariance_factor=found[:, 1:]), np.vstack(onto)
     return bent, replace(response, covariance_factor=response.covariance_factor @ normals.T), normals
 
