@@ -129,6 +129,13 @@ SECTIONS = {
             "{0} of {1}, {4} of {5}; {2} of {3}, {6} of {7} certificates exceeded",
         ),
         Row(
+            "Machines of these kinds drawn after that, each kind twice, in two lots of five kinds",
+            "closed_loop_machines_13",
+            r"^all +\| (\d+) of (\d+) \| - \| (\d+) of (\d+)"
+            r".*?^all +\| (\d+) of (\d+) \| - \| (\d+) of (\d+)",
+            "{0} of {1}, {4} of {5}; {2} of {3}, {6} of {7} certificates exceeded",
+        ),
+        Row(
             "Six machines, their logs rounded, thinned, shortened, in other units: certificate or first mode "
             "differs",
             "same_log_otherwise",
