@@ -21,7 +21,7 @@ _LEAST_NOISE = 1e-6  # of the motion: a sensor of 20 bits
 _BANDS, _PERIODS, _STEEP = 8, 8, 8
 # Deflection before slipping, as a share of the rms motion; the start takes more.
 _PRESLIDING, _COARSE = 1e-5, 10.0
-# Errors of a law of friction show between speeds: parts of the rows, as many as tell a trend from chance.
+# Classes of the rows by speed, where errors of a law of friction show; with twice as many they widen less.
 _CLASSES = 8
 _DERIVATIVES = 3  # stiffness, damping, inertia, and the lag of a drive behind them
 
