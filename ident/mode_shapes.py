@@ -407,7 +407,11 @@ def _unpacked(mode: ShapedMode, x: RealArray) -> tuple[complex, ComplexArray, li
     slopes: list[ComplexArray] = []
     if not mode.rank_one:
         residue: ComplexArray = values.reshape(outputs, inputs)
-        slopes += [turn * unit.reshape(outputs, inputs) for turn in turns for unit in np.eye(values.size)]
+        slopes += [
+            turn * unit
+            for turn in turns
+            for unit in np.eye(values.size, dtype=np.complex128).reshape(-1, outputs, inputs)
+        ]
         return complex(pole), residue, slopes
     fixed = _largest(mode)
     c, b = values[:outputs], np.insert(values[outputs:], fixed, 1.0)

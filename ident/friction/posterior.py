@@ -200,7 +200,7 @@ def of_force(
     # Nearly equal poles would get large coefficients, and proofs between grid points fail.
     found = np.linalg.lstsq(
         real_rows(bent.frequency_rows(omega) / gain[:, None]), real_rows(wanted), rcond=_SMALL**2
-    )[0]
+    )[0].astype(np.float64)
     bent, normals = replace(bent, mean=found[:, 0], covariance_factor=found[:, 1:]), np.vstack(onto)
     return bent, replace(response, covariance_factor=response.covariance_factor @ normals.T), normals
 

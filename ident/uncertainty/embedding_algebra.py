@@ -451,7 +451,7 @@ def joint_factor(reduced: ReducedRegression, posterior: KernelPosterior) -> tupl
 
 def by_class(rest: RealArray, classes: IntArray) -> RealArray:
     """What is left of the last rows (T,), in a column for each class of the rows."""
-    return rest[:, None] * (classes[-rest.size :, None] == np.arange(1 + classes.max()))
+    return np.where(classes[-rest.size :, None] == np.arange(1 + classes.max()), rest[:, None], 0.0)
 
 
 def sandwiched(factor: RealArray, scores: RealArray) -> RealArray:
