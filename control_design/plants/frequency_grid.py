@@ -74,14 +74,19 @@ def frequency_grid(
     n_log: int,
     n_mode: int,
     extra: npt.ArrayLike = (),
+    further: Sequence[Mode] = (),
 ) -> Real:
     """Ascending grid from omega_min to Nyquist; `n_mode` points are shared out over the modes (at least 20
-    each)."""
+    each), and as many for each of `further` that has fewer than two of these points in its bandwidth."""
+    each = max(20, n_mode // max(len(modes), 1))
     parts = [np.geomspace(omega_min_rad_s, nyquist_rad_s, n_log), np.asarray(extra, dtype=np.float64)]
-    if modes:
-        each = max(20, n_mode // len(modes))
-        parts += [mode_points(mode, each) for mode in modes]
-    grid = np.concatenate(parts)
+    grid = np.concatenate([*parts, *(mode_points(mode, each) for mode in modes)])
+    hidden = [
+        mode
+        for mode in further
+        if np.count_nonzero(np.abs(grid / mode.omega_rad_s - 1.0) < max(abs(mode.zeta), 1e-6)) < 2
+    ]
+    grid = np.concatenate([grid, *(mode_points(mode, each) for mode in hidden)])
     grid = np.unique(grid[(grid >= omega_min_rad_s) & (grid <= nyquist_rad_s)])
     grid[-1] = nyquist_rad_s
     # Points closer than 1e-9 relative carry no information and make unwrapping rows singular.
@@ -101,7 +106,9 @@ def checked_grid(
     """Grid that a design is checked on: from `lowest_rad_s` of the plant and the further `roots`."""
     low = lowest_rad_s(plant.dt_s, np.concatenate([plant.poles, np.asarray(roots, dtype=np.complex128)]))
     n_mode, top = per_mode * len(modes), plant.nyquist_rad_s
-    return frequency_grid(top, modes, omega_min_rad_s=low, n_log=n_log, n_mode=n_mode, extra=extra)
+    return frequency_grid(
+        top, modes, omega_min_rad_s=low, n_log=n_log, n_mode=n_mode, extra=extra, further=plant.ellipse_modes
+    )
 
 
 def programme_grid(
@@ -118,8 +125,9 @@ def programme_grid(
         points = int(0.7 * options.dense_points), int(0.3 * options.dense_points)
     low = options.omega_min_rad_s or lowest_rad_s(plant.dt_s, plant.poles)
     grid = frequency_grid(
-        plant.nyquist_rad_s, modes, omega_min_rad_s=low, n_log=points[0], n_mode=points[1], extra=extra
-    )
+        plant.nyquist_rad_s, modes, omega_min_rad_s=low, n_log=points[0], n_mode=points[1], extra=extra,
+        further=plant.ellipse_modes if dense else (),
+    )  # fmt: skip
     return (with_own_grid if dense else plant_grid)(plant, grid)
 
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from control_design.plants.ellipses import Complex, Ellipses, EvaluableUncertainty, Real, ResponseSet
 from ident.data.shown import Shown
+from ident.uncertainty import ResponsePosterior
 
 if TYPE_CHECKING:
     import control
@@ -301,6 +302,14 @@ class UncertainPlant(Shown):
     def modes(self) -> tuple[Mode, ...]:
         """Flexible modes of the nominal, below the Nyquist frequency."""
         return self.channel.modes
+
+    @property
+    def ellipse_modes(self) -> tuple[Mode, ...]:
+        """Flexible modes of the poles that ellipses stand on, which the nominal need not have."""
+        known = [
+            c.uncertainty for c in (self.channel, self.damped) if isinstance(c.uncertainty, ResponsePosterior)
+        ]
+        return tuple(mode for each in known for mode in modes_of(each.poles.values, self.dt_s))
 
     @property
     def own_grid(self) -> npt.NDArray[np.float64] | None:

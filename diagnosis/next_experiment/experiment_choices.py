@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import sawtooth
 
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
@@ -97,7 +98,11 @@ def excitations(
         _multisine(voltage_V, T, dt_s, 0.06 * nyquist, "odd_random", rng),
         _doublet(voltage_V, T, dt_s, T // 40),
         _doublet(voltage_V, T, dt_s, T // 6),
-        _triangle(voltage_V, T, dt_s, 3),
+        Excitation(
+            "triangle",
+            {"period_s": round(T * dt_s / 3, 6)},
+            voltage_V * sawtooth(2 * np.pi * (np.arange(T) * 3 / T) + np.pi / 2, 0.5),
+        ),
         _steps(voltage_V, T, dt_s, 8, rng),
         _chirp(voltage_V, T, dt_s, 1 / duration, 0.6 * nyquist),
         _chirp(voltage_V, T, dt_s, 0.5 / duration, 0.05 * nyquist),
@@ -177,11 +182,6 @@ def _two_periods(lines: Integer, T: int, rng: np.random.Generator) -> Real:
 def _doublet(voltage: float, T: int, dt: float, pulse: int) -> Excitation:
     pulse = max(pulse, 2)
     return Excitation("doublet", {"pulse_s": round(pulse * dt, 6)}, doublet(voltage, 0.0, pulse * dt, T, dt))
-
-
-def _triangle(voltage: float, T: int, dt: float, cycles: int) -> Excitation:
-    signal = voltage * 2 / np.pi * np.arcsin(np.sin(2 * np.pi * (np.arange(T) * cycles / T)))
-    return Excitation("triangle", {"period_s": round(T * dt / cycles, 6)}, signal)
 
 
 def _steps(voltage: float, T: int, dt: float, count: int, rng: np.random.Generator) -> Excitation:

@@ -20,21 +20,6 @@ from workflow.engine.run_directory import CONTROLLER_SUFFIXES
 from workflow.tasks.results import RecordsResult
 from workflow.text.templates import render_text, said
 
-
-def _as_law(found: ReferenceFilter) -> Controller:
-    """The controller's generator serves: a state space without limits, from reference to filtered one."""
-    return Controller(
-        A=found.A,
-        B=found.B,
-        C=found.C,
-        D=found.D,
-        dt_s=found.dt_s,
-        computational_delay_samples=0,
-        anti_windup_gain=np.zeros_like(found.B),
-        name="reference_filter",
-    )
-
-
 SUFFIXES = (".json", ".mat", ".c")
 
 
@@ -55,7 +40,12 @@ def law_bytes(law: Controller | ReferenceFilter, suffix: str, dialect: Dialect =
         return code(law, dialect.prefix, dialect.number).encode("ascii")
     names = dialect.beside("reference_filter")
     note = render_text("reference_filter_note.h.j2", prefix=names.prefix).rstrip()
-    return f"{note}\n{code(_as_law(law), names.prefix, names.number)}".encode("ascii")
+    # The controller's generator serves: a state space without limits, from reference to filtered one.
+    law = Controller(
+        A=law.A, B=law.B, C=law.C, D=law.D, dt_s=law.dt_s,
+        computational_delay_samples=0, anti_windup_gain=np.zeros_like(law.B), name="reference_filter",
+    )  # fmt: skip
+    return f"{note}\n{code(law, names.prefix, names.number)}".encode("ascii")
 
 
 @dataclass(frozen=True)
