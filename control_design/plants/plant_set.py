@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from control_design.plants.ellipses import Complex, Ellipses, EvaluableUncertainty, Real, ResponseSet
 from ident.data.shown import Shown
-from ident.uncertainty import ResponsePosterior
 
 if TYPE_CHECKING:
     import control
@@ -306,6 +305,8 @@ class UncertainPlant(Shown):
     @property
     def ellipse_modes(self) -> tuple[Mode, ...]:
         """Flexible modes of the poles that ellipses stand on, which the nominal need not have."""
+        from ident.uncertainty import ResponsePosterior  # here, because it brings compiled kernels with it
+
         known = [
             c.uncertainty for c in (self.channel, self.damped) if isinstance(c.uncertainty, ResponsePosterior)
         ]
