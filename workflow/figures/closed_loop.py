@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,7 @@ def draw_run(run: RunView) -> Figure:
         disturbance=loop.disturbance,
         command_limit=loop.input_limit,
         model=loop.model_answer,
-        sticking=loop.with_friction,
+        with_friction=loop.with_friction,
     )
 
 
@@ -54,15 +54,15 @@ def draw_closed_loop(
     disturbance: Real | None = None,
     command_limit: float | None = None,
     model: Real | None = None,
-    sticking: Real | None = None,
+    with_friction: Sequence[Real] = (),
 ) -> Figure:
     """Rows: what `labels` names of output, performance and command. Left: the reference step. Right: the
     disturbance.
 
     time_s, reference, disturbance and model (the answer of the model that a reference filter makes the loop
     follow) are (T,). labels: (name, unit) of each row. others: runs on `machine`, in words; without one, of
-    plants drawn from the uncertainty. sticking: the output with friction, as far as it goes. The first run is
-    drawn as a line, all of them as the band between their extremes.
+    plants drawn from the uncertainty. with_friction: outputs of the lines `FRICTION`, as far as they go. The
+    first run is drawn as a line, all of them as the band between their extremes.
     """
     both = (predicted,) if others is None else (predicted, others)
     onset, windows = _windows(time_s, disturbance, labels, both)
@@ -81,16 +81,15 @@ def draw_closed_loop(
             axes.plot(*outline(time, line[part], 180), **_PREDICTED, **hold)
             if kind == "output":
                 axes.plot(time, reference[part], **_REFERENCE)
-                if sticking is not None and start == time_s[0]:
-                    held = sticking[part]
-                    axes.plot(*outline(time[: held.size], held, 180), **style.MODEL_LINE, label=FRICTION)
+                for held, look in zip(with_friction, FRICTION, strict=False) if start == time_s[0] else ():
+                    axes.plot(*outline(time[: held[part].size], held[part], 180), **look)
                 if model is not None:
                     axes.plot(time, model[part], **style.MODEL_LINE, ls=":", label="model to follow")
             axes.set_xlim(start, stop)
             if onset is not None and start <= onset <= stop:
                 axes.axvline(onset, color="#888888", lw=0.8, ls=":")
         row[0].set_ylabel(style.two_lines(*label))
-        asked = np.append(line, reference) if kind == "output" else line
+        asked = np.concatenate([line, reference, *with_friction]) if kind == "output" else line
         low, high = _height(asked, None if others is None else getattr(others, kind), 3.0)
         if kind == "command" and command_limit is not None:
             low, high = _saturation(row, low, high, command_limit, label[1])

@@ -43,8 +43,8 @@ def draw_overview(run: RunView) -> Figure:
     label = f"{machine}: all {achieved.shape[0]} runs"
     step.fill_between(*envelope(time_s, achieved), **style.ACHIEVED_BAND, label=label)
     step.plot(*outline(time_s, achieved[0], 180), **style.ACHIEVED_LINE, label=f"{machine}: first run")
-    if loop.with_friction is not None:
-        step.plot(*outline(time_s, loop.with_friction, 180), **style.MODEL_LINE, label=FRICTION)
+    for held, look in zip(loop.with_friction, FRICTION, strict=False):
+        step.plot(*outline(time_s, held, 180), **look)
     predicted = loop.predicted_runs.output[0, half]
     step.plot(time_s, predicted, **style.PREDICTED_LINE, label="predicted, nominal model")
     step.plot(time_s, loop.reference[half], **style.REFERENCE_STEPS, label="reference")

@@ -26,6 +26,7 @@ from ident.data.record import Record
 from ident.data.repeats import repeats_of
 from ident.friction import FrictionFit
 from workflow.config.run_config import Channel, RunConfig
+from workflow.figures import style
 from workflow.figures.bands import Complex, Real
 from workflow.figures.style import ratio_unit
 from workflow.tasks.design import joint_numbers
@@ -35,7 +36,10 @@ from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.results import IdentifiedChannel, ModelMode, RunResults, UncertainChannel
 
 MACHINE = {"simulated": "simulated arm", "identified": "plants drawn from the identified uncertainty"}
-FRICTION = "identified arm with friction"
+FRICTION = (
+    style.MODEL_LINE | {"label": "identified arm with friction"},
+    style.MEASURED_LINE | {"label": "the same arm in the recorded loop"},
+)
 LIGHT = 0.3  # damping ratio below which a pole pair is called lightly damped
 
 

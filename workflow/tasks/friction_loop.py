@@ -291,8 +291,8 @@ def beside_recorded(stage: StageInput, loop: FrictionLoop, step: Real) -> dict[s
         return {}
     reference = first.reference[:, 0] - first.reference[0, 0]
     runs = (float(np.std(reference - one.run(reference).measured)) for one in (own, loop))
-    errors = float(np.std(first.reference - first.output)), *runs
-    return {"recorded": step_metrics(own.answer(step)), "errors": errors}
+    errors, run = (float(np.std(first.reference - first.output)), *runs), own.answer(step)
+    return {"recorded": step_metrics(run), "recorded_output": run.measured[: step.size], "errors": errors}
 
 
 def recorded_loop(stage: StageInput, loop: FrictionLoop) -> FrictionLoop | None:

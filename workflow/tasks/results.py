@@ -485,7 +485,7 @@ class FrictionCheck:
     does not leave its pre-sliding; error_at_rest: largest error with which it may rest, 0 with integral
     action. step: of the reference step on the arm as it was fitted, without noise, watched for `watched_s`
     after the step; left: the largest error in the last half of that time; output (T,): as long as the trial's
-    step.
+    step. recorded, recorded_output: the same of the loop that made the logs, None where they do not tell it.
     """
 
     level: float
@@ -510,6 +510,7 @@ class FrictionCheck:
     output: Real
     tracking: SlowSine
     recorded: StepMetrics | None = field(default=None, metadata={"since": 9})
+    recorded_output: Real | None = field(default=None, metadata={"since": 9})
     errors: tuple[float, ...] = field(default=(), metadata={"since": 9})
 
     @property
@@ -576,9 +577,11 @@ class LoopCheck:
     friction: FrictionCheck | None = None
 
     @property
-    def with_friction(self) -> Real | None:
-        """Output of the reference step with the identified friction, where the runs are of linear plants."""
-        return None if self.friction is None or self.machine == "simulated" else self.friction.output
+    def with_friction(self) -> tuple[Real, ...]:
+        """Outputs of the reference step with the identified friction, where the runs are of linear plants: of
+        the loop, and of the recorded one where the logs tell it."""
+        known = () if self.machine == "simulated" or self.friction is None else (self.friction,)
+        return tuple(y for each in known for y in (each.output, each.recorded_output) if y is not None)
 
     @property
     def waits_for_friction(self) -> bool:
