@@ -363,7 +363,7 @@ def loop_check(settings: RunConfig, settled: int, draws: int = 3) -> LoopCheck:
 def friction_check(sensitivity: SensitivityCheck) -> FrictionCheck:
     """Three sizes, made up; the smallest is measured outside its interval."""
     sizes, peak = np.array([0.2, 0.02, 0.002]), sensitivity.nominal_peak
-    error = 0.01 * np.sin(np.linspace(0, 6, 500))
+    error, step = 0.01 * np.sin(np.linspace(0, 6, 500)), 0.2 - 0.2 * np.exp(-np.linspace(0, 6, 100))
     return FrictionCheck(
         level=0.04, level_interval=(0.039, 0.041), presliding=1e-5, sizes=sizes,
         low=peak * np.array([0.99, 0.95, 0.9]), high=peak * np.array([1.01, 0.98, 0.95]),
@@ -371,8 +371,7 @@ def friction_check(sensitivity: SensitivityCheck) -> FrictionCheck:
         certified_peak=sensitivity.certified_peak, tolerance_percent=5.0, certified_from=0.002,
         linear_from=0.01, sticking_step=0.0013, sticking_interval=(0.0012, 0.0014), error_at_rest=0.006,
         error_interval=(0.0058, 0.0062), step=StepMetrics(0.2, 0.1, 10.0, 0.0, 1.5, 0.001, 3.0, 0.0),
-        watched_s=20.0, left=0.002, output=0.2 - 0.2 * np.exp(-np.linspace(0, 6, 100)),
-        recorded_output=0.2 - 0.2 * np.exp(-np.linspace(0, 3, 100)),
+        watched_s=20.0, left=0.002, output=step, recorded_output=0.1 + 0.5 * step,
         tracking=SlowSine(0.05, 0.1, 0.001, error, 0.2 * error, moves_from=0.02),
     )  # fmt: skip
 
