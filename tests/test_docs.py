@@ -38,7 +38,7 @@ ELSEWHERE = {
 CONSOLE = ["c_code.md", "margins_in_ci.md", "which_data.md"]
 # Run as notebooks: what their pages must say, in this order.
 NOTEBOOKS = {
-    "closed_loop": r"reference_rad|first mode *│ 4|out friction|0.18\d* V|certified: e|!\[|controller_step",
+    "closed_loop": r"reference_rad|first mode *│ 4|without friction|0.18\d*|certified: e|!\[|controller_step",
     "engineer": r"tip_m|mode *│ 7.6|mode *│ 3[23]|no warnings|certified|float hub_step|runs/mine|!\[",
     "student": r"!\[|dry \(Coulomb\) friction|torque_Nm = 0.040|!\[|repaired</th>\s*<td>0.0004|= 0.04$",
     "lecturer": r"!\[|32.2 Hz|order 4|!\[|half axis|!\[|<b>Certified|tracking|is not met",

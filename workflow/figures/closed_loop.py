@@ -89,8 +89,8 @@ def draw_closed_loop(
             if onset is not None and start <= onset <= stop:
                 axes.axvline(onset, color="#888888", lw=0.8, ls=":")
         row[0].set_ylabel(style.two_lines(*label))
-        asked = np.concatenate([line, reference, *with_friction]) if kind == "output" else line
-        low, high = _height(asked, None if others is None else getattr(others, kind), 3.0)
+        runs = *(with_friction if kind == "output" else ()), *([getattr(others, kind)] if others else ())
+        low, high = height(np.append(line, reference) if kind == "output" else line, runs, 3.0)
         if kind == "command" and command_limit is not None:
             low, high = _saturation(row, low, high, command_limit, label[1])
         row[0].set_ylim(*style.pad_limits(low, high, 0.08))
@@ -154,15 +154,14 @@ def _quiet_from(time_s: Real, runs: Real, tolerance: float) -> float:
     return float(time_s[np.flatnonzero(moving)[-1]] if moving.any() else time_s[0])
 
 
-def _height(asked: Real, runs: Real | None, most: float) -> tuple[float, float]:
+def height(asked: Real, runs: Sequence[Real], most: float) -> tuple[float, float]:
     """Range of a row: all runs, but a run that leaves the scene by more than `most` times the range asked for
     does not flatten the others."""
     low, high = float(asked.min()), float(asked.max())
     span = high - low if high > low else max(abs(high), 1e-12)
-    if runs is not None:
-        low = max(min(low, float(runs.min())), low - most * span)
-        high = min(max(high, float(runs.max())), high + most * span)
-    return low, high
+    every = np.nan_to_num(np.concatenate([asked, *(np.ravel(run) for run in runs)]), nan=low)
+    shown = np.clip(every, low - most * span, high + most * span)
+    return float(shown.min()), float(shown.max())
 
 
 def _saturation(row: Any, low: float, high: float, limit: float, unit: str) -> tuple[float, float]:
@@ -259,7 +258,7 @@ def draw_conditions(run: RunView) -> Figure | None:
         axes.plot(*outline(time_s, found.predicted, 120), **_PREDICTED)
         axes.plot(time_s, found.reference, **_REFERENCE)
         axes.set_title(found.name)
-        low, high = _height(np.append(found.reference, found.predicted), found.achieved, 1.0)
+        low, high = height(np.append(found.reference, found.predicted), [found.achieved], 1.0)
         axes.set_ylim(*style.pad_limits(low, high, 0.08))
         axes.set_xlim(float(time_s[0]), float(time_s[-1]))
     for axes in panels[::columns]:

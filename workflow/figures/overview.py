@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 
 from workflow.figures import style
 from workflow.figures.bands import enlargement, envelope, outline, response_band
+from workflow.figures.closed_loop import height
 from workflow.figures.nyquist import draw_around_minus_one, loop_of
 from workflow.figures.subjects import FRICTION, MACHINE, RunView
 from workflow.text.formats import share
@@ -40,8 +41,9 @@ def draw_overview(run: RunView) -> Figure:
     half = slice(0, loop.time_s.size // 2)
     time_s, achieved = loop.time_s[half], loop.achieved_runs.output[:, half]
     machine = MACHINE[loop.machine]
-    label = f"{machine}: all {achieved.shape[0]} runs"
-    step.fill_between(*envelope(time_s, achieved), **style.ACHIEVED_BAND, label=label)
+    step.fill_between(
+        *envelope(time_s, achieved), **style.ACHIEVED_BAND, label=f"{machine}: all {achieved.shape[0]} runs"
+    )
     step.plot(*outline(time_s, achieved[0], 180), **style.ACHIEVED_LINE, label=f"{machine}: first run")
     for held, look in zip(loop.with_friction, FRICTION, strict=False):
         step.plot(*outline(time_s, held, 180), **look)
@@ -50,4 +52,6 @@ def draw_overview(run: RunView) -> Figure:
     step.plot(time_s, loop.reference[half], **style.REFERENCE_STEPS, label="reference")
     name, unit = style.plain(run.config.control_channel.output, 24), style.plain(run.output_unit, 16)
     step.set(xlabel="time [s]", ylabel=f"{name} [{unit or 'as logged'}]", title="Checked in closed loop")
+    asked = np.append(predicted, loop.reference[half])
+    step.set_ylim(*style.pad_limits(*height(asked, (achieved, *loop.with_friction), 3.0), 0.08))
     return figure
