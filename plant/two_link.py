@@ -15,7 +15,7 @@ the section, motor inductance.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -118,9 +118,10 @@ class TwoLinkArm:
             self.links[0].kelvin_voigt_s * (first.spring @ da),
             self.links[1].kelvin_voigt_s * (second.spring @ db),
         )
-        mass = ca.hessian(kinetic, v)[0]
-        return ca.Function("rates", [q, v, u], [ca.solve(mass, force - losses)])
+        mass = ca.ldl(ca.hessian(kinetic, v)[0])  # a third of the operations of a general solution
+        return ca.Function("rates", [q, v, u], ca.cse([ca.ldl_solve(force - losses, *mass)]))
 
+    @lru_cache(maxsize=16)  # a run makes a machine of the same arm several times
     def sampled(self, dt_s: float) -> Any:
         """CasADi function (x, u) -> x one sample later, u held; x = (q, q'), by Runge-Kutta steps."""
         import casadi as ca
@@ -191,11 +192,15 @@ class TwoLinkMachine:
     ) -> None:
         self.dt_s, self._noise, self._rng = dt_s, noise_rad, rng
         self._rest, self._hold = arm.rest(angles_rad)
-        self._sample = arm.sampled(dt_s)
-        self.reset()
+        # Arrays of its own: to convert them at every sample would take as long as the integration.
+        self._x, self._u, self._next = self._rest.copy(), np.zeros(2), np.empty(self._rest.size)
+        self._buffer, self._sample = arm.sampled(dt_s).buffer()
+        self._buffer.set_arg(0, self._x.data)
+        self._buffer.set_arg(1, self._u.data)
+        self._buffer.set_res(0, self._next.data)
 
     def reset(self) -> None:
-        self._x = self._rest
+        self._x[:] = self._rest
 
     def measure(self) -> Real:
         """Joint angles (2,) from the operating point."""
@@ -203,7 +208,9 @@ class TwoLinkMachine:
 
     def advance(self, u: Real) -> None:
         """Hold the voltages (2,) for one sample."""
-        self._x = np.asarray(self._sample(self._x, self._hold + u).full())[:, 0]
+        self._u[:] = self._hold + u
+        self._sample()
+        self._x[:] = self._next
 
     def run(self, u: Real) -> Real:
         """Joint angles (T, 2) as measured, before each of the voltages (T, 2) is applied, from rest."""

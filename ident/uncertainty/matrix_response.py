@@ -125,7 +125,7 @@ class MatrixPosterior(Shown):
         flat = turned.reshape(omega.size, -1, turned.shape[-1])
         weights = np.linalg.svd(np.concatenate([flat.real, flat.imag], axis=1), compute_uv=False) ** 2
         squares = np.random.default_rng(0).standard_normal((_DRAWS, weights.shape[1])) ** 2
-        radius: RealArray = np.sqrt(np.quantile(squares @ weights.T, self.level, axis=0)).astype(np.float64)
+        radius: RealArray = np.sqrt(np.quantile(weights @ squares.T, self.level, axis=1)).astype(np.float64)
         centre = model.frequency_response(omega)
         return MatrixUncertainty(omega, centre, self.output_factor, upper, radius, model.dt_s, self.level)
 
