@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from ident.basis.functions import basis_state_space, nuisance_columns
-from ident.basis.model import GobfModel
+from ident.basis.model import GobfModel, MisoModel
 from ident.basis.posterior import ResponsePosterior
 from ident.basis.structure import answered, level_before, stabilised
 from ident.data.arrays import BoolArray, RealArray, lock, real_rows
@@ -41,20 +41,21 @@ class FreshFit:
 
 
 def fit_on_fresh_data(
-    model: GobfModel | ResponsePosterior,
+    model: GobfModel | MisoModel | ResponsePosterior,
     record: Record,
     *,
     estimate_initial_state: bool = True,
     estimate_offset: bool = True,
 ) -> FreshFit:
-    """Free-run simulation of a SISO record, no output fed back.
+    """Free-run simulation of a record of one output, no output fed back.
 
     estimate_initial_state: the free response of poles and integrators at the start is fitted to the record;
     estimate_offset: a constant. Of an unstable model the free run is that of B G to B y
     (`ident.basis.structure.stabilised`), and simulated what it predicts from sample to sample. Raises
-    ValueError for another sampling time, more than one channel, or a constant output.
+    ValueError for another sampling time, other inputs than the model's, several outputs, or a constant one.
     """
-    record.refuse_several(model.dt_s)
+    several = isinstance(model, MisoModel)
+    record.refuse_several(model.dt_s, model.n_inputs if several else 1)
     unstable, delay = model.unstable, model.input_delay_samples
     try:
         measured = answered(record.output[:, 0], delay)
@@ -65,8 +66,8 @@ def fit_on_fresh_data(
     if spread == 0:
         raise ValueError(f"{record.label}: the output is constant")
     unknown = estimate_offset and estimate_initial_state and not model.integrators
-    level = level_before(record.input[:, 0]) if unknown else 0.0
-    simulated = answered(model.stable_part.simulate(record.input[:, 0] - level), delay)
+    u = record.input - np.array([level_before(column) if unknown else 0.0 for column in record.input.T])
+    simulated = answered(model.simulate(u) if several else model.stable_part.simulate(u[:, 0]), delay)
     without = y
     degrees = max(int(estimate_offset), model.integrators if estimate_initial_state else 0)
     nuisance = nuisance_columns(model.poles, y.size, degrees, estimate_initial_state)
@@ -85,7 +86,7 @@ def fit_on_fresh_data(
     return FreshFit(record.name, 100 * (1 - left / spread), simulated, residual, answers)
 
 
-def fit_in_windows(model: GobfModel | ResponsePosterior, record: Record) -> FreshFit:
+def fit_in_windows(model: GobfModel | MisoModel | ResponsePosterior, record: Record) -> FreshFit:
     """`fit_on_fresh_data` over windows one after the other, each from its own start: for arms that drift.
     Spread and residual are those of the windows; one in which the output stands still counts as simulated."""
     delay, shortest = model.input_delay_samples, _SHORTEST * (model.poles.order + 1)

@@ -122,12 +122,12 @@ class Record(Shown):
         """Whether the sampling times are one but for the clocks of hosts, to 0.1 %."""
         return abs(self.dt_s - other.dt_s) <= _SAME_CLOCK * other.dt_s
 
-    def refuse_several(self, dt_s: float | None = None) -> None:
-        """Raise ValueError unless there are one input and one output, sampled at dt_s where that is given."""
-        if self.input.shape[1] != 1 or self.output.shape[1] != 1:
+    def refuse_several(self, dt_s: float | None = None, inputs: int = 1) -> None:
+        """Raise ValueError unless there are so many inputs and one output, sampled at dt_s where given."""
+        if self.input.shape[1] != inputs or self.output.shape[1] != 1:
             raise ValueError(
-                f"{self.label}: need one input and one output, got {list(self.input_names)} and "
-                f"{list(self.output_names)}; choose with Record.siso"
+                f"{self.label}: need {'one input' if inputs == 1 else f'{inputs} inputs'} and one output, got "
+                f"{list(self.input_names)} and {list(self.output_names)}; choose with Record.siso"
             )
         if dt_s is not None and not abs(self.dt_s - dt_s) <= 1e-9 * dt_s:
             raise ValueError(f"{self.label}: dt_s = {self.dt_s}, the model has {dt_s}")

@@ -163,9 +163,25 @@ def _from_log(folder: Path, log: Path, source: str = 'time = "time_s"') -> Path:
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_logs_give_the_same_model_as_the_arm(logs, run_of_the_arm, tmp_path, capsys):
+    """Records that are kept back change nothing, and say which of them is not of this arm."""
+    config = _written(tmp_path, _SOURCE.replace('"two"', '"two"\nseed = 7') + _JOINTS)
+    assert main(["simulate", "--config", str(config), "--out", str(tmp_path / "csv")]) == 0
+    capsys.readouterr()
+    log = next((tmp_path / "csv").glob("*.csv"))
+    table = pd.read_csv(log)
+    table.assign(elbow_V=-table["elbow_V"]).to_csv(tmp_path / "wrong.csv", index=False)
     config = _from_log(tmp_path, logs)
+    fresh = [
+        f'{{ path = "{p}", condition = "bent", role = "validation" }}' for p in (log, tmp_path / "wrong.csv")
+    ]
+    config.write_text(config.read_text().replace('"bent" }]', '"bent" }, ' + ", ".join(fresh) + "]"))
     assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["numbers"]
+    (point,) = JointsResults(RunDirectory(tmp_path / "run")).identify.points
+    kept, wrong = ([fit.fit_percent for fit in fits] for fits in point.fresh)
+    np.testing.assert_allclose(kept, point.fit_percent[0], atol=3)
+    assert wrong[1] < 0 < wrong[0] < kept[0] - 10
+    assert "wrong, elbow_rad" in json.dumps([each.values for each in point.warnings])
     assert main(["report", str(run_of_the_arm), "--quiet", "--json"]) == 0
     own = json.loads(capsys.readouterr().out)["numbers"]
     assert found["points"][0]["radius"] == pytest.approx(own["points"][0]["radius"], rel=1e-3)
@@ -229,7 +245,7 @@ def test_logs_that_are_not_taken_say_why(source, words, logs, tmp_path, capfd):
     text = config.read_text().replace('condition = "bent"', 'condition = "bent", role = "validation"')
     config.write_text(text.replace(source, 'time = "time_s"'), encoding="utf-8")
     assert _run(config) == 2
-    assert "each record is fitted" in capfd.readouterr().err
+    assert "no record with condition 'bent' is fitted" in capfd.readouterr().err
     _from_log(tmp_path, logs)
     with config.open("a", encoding="utf-8") as file:
         file.write("\n[closed_loop]\ncoulomb_Nm = [0.1, 0.1]\n")

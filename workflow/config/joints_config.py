@@ -132,11 +132,18 @@ class JointsConfig(Section):
                     "closed_loop.extra_payload_kg and closed_loop.coulomb_Nm act on the simulated arm only: "
                     "where records are logs, the loop runs on the identified models"
                 )
-            for number, record in enumerate(self.source.records):
-                if record.role != "estimation":
+            records = self.source.records
+            fitted = {record.condition for record in records if record.role == "estimation"}
+            for number, record in enumerate(records):
+                if record.role == "repeat":
                     raise ValueError(
-                        f"source.records[{number}] has role {record.role!r}: with several joints each record "
-                        "is fitted; leave role out"
+                        f"source.records[{number}] has role 'repeat': with several joints a record is fitted, "
+                        "or kept back with role = 'validation'"
+                    )
+                if record.condition not in fitted:
+                    raise ValueError(
+                        f"source.records[{number}] is kept back, but no record with condition "
+                        f"{record.condition!r} is fitted: give one of that condition role = 'estimation'"
                     )
         if len(self.dead_times) != len(self.joints):
             raise ValueError(

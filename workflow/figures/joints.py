@@ -1,4 +1,5 @@
-"""Pictures of a run for several joints: steps, matrix response with its balls, worst cases, mode shapes."""
+"""Pictures of a run for several joints: steps, matrix response with its balls, worst cases, records that were
+kept back, mode shapes."""
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ from control_design.specification.multivariable import gram
 from workflow.config.joints_config import JointsConfig
 from workflow.figures import style
 from workflow.figures.bands import Real, envelope, outline
+from workflow.figures.validation import draw_free_run
 from workflow.tasks.joints import JointsResults
 
 _LOW = 1e-3  # smallest frequency of the singular values, of the Nyquist frequency
@@ -179,6 +181,24 @@ def draw_joint_requirements(run: JointsView) -> Figure | None:
     axes.set(xscale="log", xlim=(omega[0], omega[-1]), ylim=(0, None))
     axes.set_xlabel("frequency [rad/s]")
     axes.set_ylabel("worst case [1]")
+    return figure
+
+
+@style.drawing("joint-validation")
+def draw_joint_validation(run: JointsView) -> Figure | None:
+    """Of all records that were kept back the one that is met worst: every output, measured and simulated."""
+    records = [(point, fits) for point in run.results.identify.points for fits in point.fresh]
+    if not records:
+        return None
+    point, fits = min(records, key=lambda each: min(fit.fit_percent for fit in each[1]))
+    figure, grid = style.panels(4.2, 2, len(fits), squeeze=False, sharex="col", height_ratios=[1.5, 1.0])
+    for k, (fit, name) in enumerate(zip(fits, run.joint_names, strict=True)):
+        time_s = np.arange(fit.residual.size) * point.model.dt_s
+        draw_free_run(grid[:, k], time_s, fit, 2 * point.noise_std[k])
+        grid[0, k].set_title(f"{style.plain(name, 20)}: fit {fit.fit_percent:.1f} %")
+        unit = run.results.records.unit(name)
+        for axes, words in zip(grid[:, k], (name, "residual"), strict=True):
+            axes.set_ylabel(style.two_lines(words, unit))
     return figure
 
 

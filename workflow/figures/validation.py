@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from ident.checks.validation import FreshFit, ScatterRow
 from workflow.figures import style
-from workflow.figures.bands import liveliest, outline
+from workflow.figures.bands import Real, liveliest, outline
 from workflow.figures.subjects import ChannelView
 from workflow.text.formats import share
 
@@ -36,26 +37,32 @@ def draw_validation(channel: ChannelView) -> Figure:
         fit = FreshFit(record.name, float(found.identification.fit_percent[0]), simulated, residual)
     else:
         record, role, fit = channel.fresh_records[shown], found.fresh_roles[shown], found.fresh[shown]
-    answering = slice(record.n_samples - fit.residual.size, None)  # a delayed answer begins later
-    measured, time_s = record.output[answering, 0], record.time_s[answering]
+    time_s = record.time_s[record.n_samples - fit.residual.size :]  # a delayed answer begins later
     noise = 2 * found.identification.noise_std
     figure, grid = style.panels(4.7, 2, 2, sharex="col", height_ratios=[1.5, 1.0], width_ratios=[1.7, 1.0])
     length = min(400, max(time_s.size // 4, min(100, time_s.size)))
-    for (upper, lower), part in zip(grid.T, (slice(None), liveliest(measured, length)), strict=True):
-        time = time_s[part]
-        upper.plot(*outline(time, measured[part]), **_THICK, label="measured")
-        upper.plot(*outline(time, fit.simulated[part]), **_THIN, label="model, simulated")
-        lower.plot(*outline(time, fit.residual[part]), **style.MEASURED_LINE | {"lw": 0.7}, label="residual")
-        label = "±2 standard deviations of the noise"
-        lower.axhspan(-noise, noise, **style.BAND, zorder=0, label=label)
-        lower.set_xlabel("time [s]")
-        upper.set_xlim(time[0], time[-1])
+    close = liveliest(fit.simulated + fit.residual, length)
+    for panels, part in zip(grid.T, (slice(None), close), strict=True):
+        draw_free_run(panels, time_s, fit, noise, part)
     grid[0, 0].set_title(f"{style.plain(record.name, 34)} ({_WORDS[role]}): fit {fit.fit_percent:.1f} %")
     grid[0, 1].set_title("Close-up")
     unit = record.output_units[0] if record.output_units else ""
     grid[0, 0].set_ylabel(style.two_lines(record.output_names[0], unit))
     grid[1, 0].set_ylabel(style.two_lines("residual", unit))
     return figure
+
+
+def draw_free_run(panels: Any, time_s: Real, fit: FreshFit, noise: float, part: slice = slice(None)) -> None:
+    """Into two panels, at the times of the fit (T,) or a part of them: measured and simulated; the residual,
+    with +-noise."""
+    upper, lower = panels
+    time, simulated, residual = time_s[part], fit.simulated[part], fit.residual[part]
+    upper.plot(*outline(time, simulated + residual), **_THICK, label="measured")
+    upper.plot(*outline(time, simulated), **_THIN, label="model, simulated")
+    lower.plot(*outline(time, residual), **style.MEASURED_LINE | {"lw": 0.7}, label="residual")
+    lower.axhspan(-noise, noise, **style.BAND, zorder=0, label="±2 standard deviations of the noise")
+    lower.set_xlabel("time [s]")
+    upper.set_xlim(time[0], time[-1])
 
 
 @style.drawing("residuals")

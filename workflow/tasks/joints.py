@@ -4,7 +4,7 @@ the loop on the nonlinear machine at every operating point."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -21,14 +21,16 @@ from control_design.synthesis.multivariable import MultivariableResult, synthesi
 from ident.basis.mimo_model import MimoModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
+from ident.checks.validation import FreshFit, fit_in_windows, fit_on_fresh_data
 from ident.closed_loop import two_stage_several
-from ident.data.finding import Finding, FindingKind
+from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.identification import MimoIdentification
 from ident.several_outputs import identify_mimo
 from ident.uncertainty.matrix_response import MatrixUncertainty, matrix_posterior
 from plant import TwoLinkMachine, multisine, multisine_lines, two_link_arm
 from workflow.config.joints_config import JointsConfig, OperatingPoint, TwoJointSource
+from workflow.config.run_config import Role
 from workflow.engine.errors import naming
 from workflow.engine.randomness import stage_rng
 from workflow.tasks.records import read_records, refuse_constant_input, with_common_sampling_time
@@ -45,7 +47,8 @@ _SHOWN = 400  # frequencies of the pictures
 class PointModel:
     """What the records of one operating point say: model, ball (the factor Li as a state space of Li_a to
     Li_d, radius), fits in per cent (records, outputs), whether each mode has one shape, balls for pictures.
-    later: samples by which each input acts later than in model and ball; their sizes are the same.
+    later: samples by which each input acts later than in model and ball; their sizes are the same. fresh:
+    of every record that was kept back, how the model simulates each output.
     """
 
     name: str
@@ -62,6 +65,7 @@ class PointModel:
     shown: MatrixUncertainty
     warnings: tuple[Finding, ...] = ()
     later: tuple[int, ...] = ()
+    fresh: tuple[tuple[FreshFit, ...], ...] = field(default=(), metadata={"since": 9})
 
     @property
     def shaped(self) -> bool:
@@ -251,6 +255,13 @@ def identify_points(stage: StageInput) -> PointModels:
     )
     items = results.records.of_role("estimation")
     names = list(dict.fromkeys(item.condition or "arm" for item in items))
+    prepared: dict[tuple[str, Role], list[Record]] = {}
+    for item in results.records.records:
+        record = _with_later_inputs(item.record, later)
+        record = record.each(partial(np.diff, axis=0)) if options.increments else record
+        prepared.setdefault((item.condition or "arm", item.role), []).append(record)
+    # A free run of joints that turn freely drifts away, that of differences does not.
+    again = fit_on_fresh_data if options.increments else fit_in_windows
     found: list[PointModel] = []
     start: Poles | None = None
     for number, name in enumerate(names):
@@ -258,11 +269,7 @@ def identify_points(stage: StageInput) -> PointModels:
         def report(fraction: float, message: str, number: int = number, name: str = name) -> None:
             stage.progress.update("identify", (number + fraction) / len(names), f"{name}: {message}")
 
-        records = [
-            _with_later_inputs(item.record, later) for item in items if (item.condition or "arm") == name
-        ]
-        if options.increments:
-            records = [record.each(partial(np.diff, axis=0)) for record in records]
+        records, fresh = prepared[name, "estimation"], prepared.get((name, "validation"), [])
         remarks: tuple[Finding, ...] = ()
         with naming(f"operating point {name!r}"):
             if any(record.reference is not None for record in records):
@@ -271,7 +278,16 @@ def identify_points(stage: StageInput) -> PointModels:
                 remarks = stages.finding, *stages.warnings
             one = identify_mimo(records, asked, start=start, progress=report)
             point = _described(name, records, one, options.level, options.lowest_rad_s)
-        found.append(replace(point, warnings=(*remarks, *point.warnings), later=later))
+            outputs = list(enumerate(one.model.outputs))
+            fits = [tuple(again(own, record.only(k)) for k, own in outputs) for record in fresh]
+        remarks += tuple(
+            finding(FindingKind.NO_ANSWER_THERE, record=f"{fit.name}, {output}", fit_percent=fit.fit_percent)
+            for each in fits
+            for fit, output in zip(each, one.model.output_names, strict=True)
+            if not fit.answers
+        )
+        warnings = (*remarks, *point.warnings)
+        found.append(replace(point, warnings=warnings, later=later, fresh=tuple(fits)))
         start = one.model.poles
     return PointModels(tuple(found))
 
