@@ -98,7 +98,8 @@ Scheduler = Annotated[
 Resume = Annotated[
     bool, typer.Option("--resume", help="Continue what is in --out; what is finished there is kept.")
 ]
-Replace = Annotated[bool, typer.Option("--replace", help="Delete what an earlier call left in --out first.")]
+Replace = Annotated[bool, typer.Option("--replace", help="Delete what an earlier call left at --out first.")]
+Verbose = Annotated[bool, typer.Option("--verbose", help="Print every row of the table.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")]
 
 
@@ -204,6 +205,7 @@ def run(
     c_prefix: CPrefix = None,
     c_float: CFloat = None,
     time_limit: TimeLimit = None,
+    verbose: Verbose = False,
     quiet: Quiet = False,
     as_json: Json = False,
     **of_fields: Any,
@@ -227,7 +229,7 @@ def run(
             c_code=_c_code(c_prefix, c_float),
             progress=progress,
         )
-    _show(summary, as_json)
+    _show(summary, as_json, verbose=verbose)
     _leave(summary)
 
 
@@ -335,7 +337,7 @@ def look(
 def init(
     log: Logs,
     out: Annotated[Path, typer.Option(help="Write the configuration here (TOML), for `flexlink run`.")],
-    replace: Annotated[bool, typer.Option("--replace", help="Write over what is at --out.")] = False,
+    replace: Replace = False,
     time_limit: TimeLimit = None,
     as_json: Json = False,
     **of_fields: Any,
@@ -548,6 +550,7 @@ def report(
         typer.Option(help="Further kind of file for every picture in figures/, beside SVG; may be repeated."),
     ] = None,
     time_limit: TimeLimit = None,
+    verbose: Verbose = False,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -558,7 +561,7 @@ def report(
 
         kinds = [kind.value for kind in pictures or ()]
         summary = rebuild_report(RunDirectory.open(directory), kinds, progress)
-    _show(summary, as_json)
+    _show(summary, as_json, verbose=verbose)
 
 
 @app.command(short_help="Many designs for one plant: table, Pareto plot.")
@@ -786,13 +789,13 @@ def _show_files(files: Sequence[Path], as_json: bool) -> None:
             typer.echo(str(path))
 
 
-def _show(summary: RunSummary, as_json: bool) -> None:
+def _show(summary: RunSummary, as_json: bool, *, verbose: bool = False) -> None:
     from workflow.console import print_summary
 
     if as_json:
         print_json(summary.to_document())
     else:
-        print_summary(summary)
+        print_summary(summary, verbose=verbose)
 
 
 def _leave(summary: RunSummary) -> None:

@@ -154,8 +154,9 @@ class TerminalProgress(progress.Progress):
             self._bar.console.print(f"  {escape(stage):<12} {words}", highlight=False)
 
 
-def print_summary(summary: RunSummary) -> None:
-    """The table of numbers on standard output, and the verdict where it is no complaint on standard error."""
+def print_summary(summary: RunSummary, *, verbose: bool = False) -> None:
+    """The table of numbers on standard output, and the verdict where it is no complaint on standard error.
+    verbose: every row."""
     # A pipe has no width; 120 columns keep the rows on one line there, where COLUMNS does not say less.
     told = sys.stdout.isatty() or "COLUMNS" in os.environ
     console = Console(file=sys.stdout, width=None if told else 120)
@@ -163,7 +164,7 @@ def print_summary(summary: RunSummary) -> None:
     table.add_column("section", style="bold")
     table.add_column("quantity")
     table.add_column("value")
-    for section in summary.sections:
+    for section in (not verbose and summary.brief) or summary.sections:
         for index, row in enumerate(section.rows):
             label = _text(section.title) if index == 0 else ""
             table.add_row(

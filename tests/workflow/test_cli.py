@@ -150,13 +150,14 @@ def test_an_option_of_another_name_is_said_to_be_replaced(refused):
 
 
 def test_run_prints_a_table_and_the_page(flexlink, fast_run):
-    answer = flexlink("run", "--config", FAST_ARM, "--out", fast_run[0], "--resume")
-    assert answer.code == 0, answer.err
-    words = (
-        "Hz, damping|fit, validation|95 % radius|γ|margins, worst case|predicted|achieved|certified|report."
-    )
-    assert [word for word in words.split("|") if word not in answer.out] == []
-    assert answer.err == ""  # no progress where nobody watches
+    always = "bandwidth|modulus|overshoot|settling time|peak command|margins|predicted|certified|report."
+    more = "Hz, damping|fit, validation|95 % radius|γ|margins, worst case|rise time"
+    for options, lines in (([], 15), (["--verbose"], 60)):
+        answer = flexlink("run", "--config", FAST_ARM, "--out", fast_run[0], "--resume", *options)
+        assert (answer.code, answer.err) == (0, "")  # no progress where nobody watches
+        assert [word for word in always.split("|") if word not in answer.out] == []
+        assert [word in answer.out for word in more.split("|")] == [bool(options)] * 6
+        assert len(answer.out.splitlines()) <= lines
 
 
 def test_run_json_is_only_json(flexlink, fast_run):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from control_design.analysis.stability import ModeChange, closed_loop_poles
+from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller
 from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
@@ -267,29 +267,6 @@ class RunView:
         """Of the records of the fit."""
         fitted = self.results.records.fitted(self.config.control_channel)
         return max(float(np.max(np.abs(record.input))) for record in fitted)
-
-    @property
-    def lasting_error(self) -> float:
-        """Largest error that the constant disturbance leaves, predicted or in a run."""
-        loop = self.results.closed_loop.check
-        if loop is None:
-            return 0.0
-        return max(abs(row.disturbance_left) for row in (loop.predicted, *loop.achieved))
-
-    @property
-    def lasting_error_share(self) -> float:
-        """Of the reference step that a constant disturbance leaves as error; 0 without tracking."""
-        loop = self.results.closed_loop.check
-        return 0.0 if loop is None or not loop.tracking else self.lasting_error / loop.reference_step
-
-    @property
-    def damped_mode(self) -> ModeChange | None:
-        """The mode of the nominal that the loop takes most damping from, else the slowest; None without."""
-        plants = () if self.results.certify.certificate is None else self.results.certify.certificate.plants
-        changes = [change for p in plants if p.plant == self.plant.name for change in p.mode_changes]
-        lost = [change for change in changes if change.loses_damping]
-        ratio = {change: change.closed_loop.zeta / change.open_loop.zeta for change in lost}
-        return min(lost, key=ratio.__getitem__, default=next(iter(changes), None))
 
     @cached_property
     def loop_grid(self) -> Real:

@@ -22,7 +22,7 @@ from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.results import ReportResult, RunRecord, RunResults
 from workflow.tasks.stage import Stage, StageInput
 from workflow.tasks.stages import STAGES
-from workflow.tasks.summary import summarise
+from workflow.tasks.summary import summarise, title_of
 
 
 def write_report(
@@ -44,7 +44,7 @@ def write_report(
         "report.html.j2",
         progress,
         also=also,
-        title=config.run.title or config.run.name,
+        title=title_of(config, run),
         run=view,
         study=study,
         certified=summarise(results, config).certified,
@@ -87,7 +87,7 @@ def write_joints_page(stage: StageInput, also: Iterable[str] = ()) -> ReportResu
         "joints.html.j2",
         partial(stage.progress.update, "report"),
         also=also,
-        title=config.run.title or config.run.name,
+        title=title_of(config, run),
         run=JointsView(config, results, _text_of(run), run.manifest()),
     )
     return ReportResult(storage.sha256_of_file(_write(run, page)))

@@ -598,6 +598,11 @@ class LoopCheck:
     def settled_draws(self) -> int:
         return sum(row.settled for row in self.achieved)
 
+    @property
+    def lasting_error(self) -> float:
+        """Largest error that the constant disturbance leaves, predicted or in a run."""
+        return max(abs(row.disturbance_left) for row in (self.predicted, *self.achieved))
+
     def spread_of(self, metric: str) -> tuple[float | None, float | None, float | None]:
         """First, smallest and largest of a metric over the runs; None (never reached) is larger than all."""
         values = [getattr(row, metric) for row in self.achieved]

@@ -10,9 +10,10 @@ import numpy as np
 from control_design.specification import Specification
 from ident.data.finding import Finding
 from ident.uncertainty import FrequencyUncertainty
-from workflow.config.joints_config import JointsConfig
+from workflow.config.joints_config import AnyConfig, JointsConfig
 from workflow.config.run_config import RunConfig
 from workflow.engine import codec
+from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.design import bracket_numbers, joint_numbers
 from workflow.tasks.exports import Logged
 from workflow.tasks.joints import JointsResults
@@ -38,8 +39,9 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
     conditions = results.uncertainty.conditions(config)
     settles = loop.check is not None and loop.check.settled_draws == loop.check.draws
     return RunSummary(
-        title=config.run.title or config.run.name,
+        title=title_of(config, results.run),
         sections=rows_of("summary/run.j2", config=config, results=results, shares=shares, signals=signals),
+        brief=rows_of("summary/brief.j2", config=config, results=results),
         numbers={
             "channels": [channel_numbers(found, spread) for found, spread in pairs],
             "design": {
@@ -78,7 +80,7 @@ def summarise_joints(results: JointsResults, config: JointsConfig) -> RunSummary
     design, certify, loop = results.design, results.certify, results.closed_loop
     settled, points = loop.settled_points()
     return RunSummary(
-        title=config.run.title or config.run.name,
+        title=title_of(config, results.run),
         sections=rows_of("summary/joints.j2", config=config, results=results),
         numbers={
             "points": [codec.plain(point, arrays=False) for point in results.identify.points],
@@ -93,6 +95,12 @@ def summarise_joints(results: JointsResults, config: JointsConfig) -> RunSummary
         verdict=said("joints_verdict", design, certify, settled, points),
         report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
     )
+
+
+def title_of(config: AnyConfig, run: RunDirectory) -> str:
+    """Headline of a run: what the configuration calls it, else its folder."""
+    named = config.run.name != type(config.run).model_fields["name"].default
+    return config.run.title or (config.run.name if named else run.path.resolve().name)
 
 
 def verdict_of(

@@ -93,7 +93,8 @@ class RunSummary:
     """Rows to read, `numbers` (JSON-able) to compute with, and the verdict in one line.
 
     `certified` is False when the specification is missed or the certificate fails; the verdict then says by
-    how much and at which frequencies. None: nothing was to be certified.
+    how much and at which frequencies. None: nothing was to be certified. brief: what a terminal shows of
+    `sections` unless all is asked for; everything where there is none.
     """
 
     title: str
@@ -102,6 +103,7 @@ class RunSummary:
     certified: bool | None = None
     verdict: str = ""
     report_path: str | None = None
+    brief: Sequence[TableSection] = ()
 
     def to_document(self) -> dict[str, Any]:
         """JSON-able."""
