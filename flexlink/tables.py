@@ -64,9 +64,7 @@ def _record(record: Record) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-@table.register(Simulation)
-def _simulation(simulation: Simulation) -> pd.DataFrame:
-    return pd.DataFrame(vars(simulation))
+table.register(Simulation, lambda simulation: pd.DataFrame(vars(simulation)))
 
 
 @table.register(ClosedLoopTrajectory)
@@ -94,14 +92,10 @@ def _modes(poles: Poles, dt_s: float, unstable: ComplexArray | tuple[()] = ()) -
     return rows.assign(frequency_Hz=rows["omega_rad_s"] / (2 * np.pi))
 
 
-@table.register(Identification)
-def _identification(found: Identification) -> pd.DataFrame:
-    return _model(found.model)
+table.register(Identification, lambda found: _model(found.model))
 
 
-@table.register(MimoIdentification)
-def _mimo(found: MimoIdentification) -> pd.DataFrame:
-    return _modes(found.model.poles, found.model.dt_s)
+table.register(MimoIdentification, lambda found: _modes(found.model.poles, found.model.dt_s))
 
 
 @table.register(ErrorSurface)
@@ -111,9 +105,7 @@ def _surface(surface: ErrorSurface) -> pd.DataFrame:
     return pd.DataFrame({**columns, "mean_square": surface.mean_square.ravel()})
 
 
-@table.register(YoulaBracket)
-def _bracket(bracket: YoulaBracket) -> pd.DataFrame:
-    return pd.DataFrame([vars(plant) for plant in bracket.plants])
+table.register(YoulaBracket, lambda bracket: pd.DataFrame([vars(plant) for plant in bracket.plants]))
 
 
 @table.register(MultivariableCertificate)
@@ -131,9 +123,7 @@ def _response(found: ResponsePosterior | FrequencyUncertainty) -> pd.DataFrame:
     return pd.DataFrame(vars(response_band(as_response(found))))
 
 
-@table.register(Certificate)
-def _certificate(certificate: Certificate) -> pd.DataFrame:
-    return pd.DataFrame([vars(item) for item in certificate.items])
+table.register(Certificate, lambda certificate: pd.DataFrame([vars(item) for item in certificate.items]))
 
 
 @table.register(SynthesisResult)

@@ -330,13 +330,6 @@ def test_a_run_that_leaves_the_scene_does_not_flatten_the_others():
     assert high - low < 10 * np.ptp(loop.predicted_runs.output)
 
 
-def test_saturation_far_away_is_said_in_words():
-    loop = example.loop_check(example.config(), 3)
-    figure = loop_figure(loop, loop.achieved_runs)
-    words = [text.get_text() for axes in figure.axes for text in axes.texts]
-    assert any("saturation at ±24 V" in word for word in words)
-
-
 def test_loop_without_disturbance_or_performance():
     loop = example.loop_check(example.config(), 3)
     labels = {kind: LABELS[kind] for kind in ("output", "command")}

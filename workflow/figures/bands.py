@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -53,6 +53,14 @@ def response_band(uncertainty: FrequencyUncertainty) -> ResponseBand:
         phase_low_deg=phase + np.where(holds_origin, -180.0, swing.min(axis=1)),
         phase_high_deg=phase + np.where(holds_origin, 180.0, swing.max(axis=1)),
     )
+
+
+def times(response: FrequencyUncertainty, gain: Complex) -> FrequencyUncertainty:
+    """A response multiplied by an exactly known one (F,): its ellipses turned and scaled."""
+    gain = np.asarray(gain, dtype=np.complex128)
+    turn = np.moveaxis(np.array([[gain.real, -gain.imag], [gain.imag, gain.real]]), 2, 0)
+    covariance = turn @ response.covariance @ turn.transpose(0, 2, 1)
+    return replace(response, centre=gain * response.centre, covariance=covariance)
 
 
 def enlargement(band: ResponseBand) -> int:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+import control
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
@@ -13,8 +16,15 @@ from ident.basis.model import GobfModel
 from ident.data.distortion import Distortion
 from ident.uncertainty import FrequencyUncertainty
 from workflow.figures import style
-from workflow.figures.bands import Complex, Real, degrees_near, enlargement, response_band
-from workflow.figures.subjects import ChannelView
+from workflow.figures.bands import (
+    Real,
+    ResponseBand,
+    degrees_near,
+    enlargement,
+    response_band,
+)
+from workflow.figures.nyquist import loop_of
+from workflow.figures.subjects import ChannelView, RunView
 from workflow.text.formats import share
 
 _DOTS: dict[str, Any] = {
@@ -46,33 +56,39 @@ def draw_channel(channel: ChannelView, name: str) -> Figure:
 def draw_response(channel: ChannelView) -> Figure:
     """Gain and phase side by side with the band of the ellipses, lightly damped modes marked.
 
-    The band of the gain is drawn enlarged where it is too narrow to be seen.
+    The bands are drawn enlarged where that of the gain is too narrow to be seen.
     """
     found, spread = channel.found, channel.spread
-    band = response_band(spread.frequency)
-    omega, factor = band.omega_rad_s, enlargement(band)
     figure, (gain, phase) = style.panels(4.4, 1, 2, width_in=12.0)
-    floor = _gain_floor(band.gain, np.empty(0))
-    label = f"{share(spread.frequency.level)} band" + (f", enlarged {factor} times" if factor > 1 else "")
-    for axes, centre, low, high in (
-        (gain, band.gain, band.gain_low, band.gain_high),
-        (phase, band.phase_deg, band.phase_low_deg, band.phase_high_deg),
-    ):
-        ends = [centre + factor * (end - centre) for end in (low, high)]
-        if axes is gain:
-            ends[0] = np.maximum(ends[0], floor)
-        axes.fill_between(omega, *ends, **style.BAND, label=label)
-        axes.plot(omega, centre, **style.MODEL_LINE, label="identified response (centre)")
+    for axes, quantity in ((gain, "gain{}"), (phase, "phase{}_deg")):
+        band = draw_enlarged(axes, spread.frequency, quantity)
         for number, (_, mode) in enumerate(channel.light, 1):
-            if omega[0] < mode.omega_rad_s < omega[-1]:
+            if band.omega_rad_s[0] < mode.omega_rad_s < band.omega_rad_s[-1]:
                 style.tag_below(axes, mode.omega_rad_s, f"mode {number}")
-        axes.set(xscale="log", xlabel="frequency [rad/s]", xlim=(omega[0], omega[-1]))
     unit = style.plain(style.ratio_unit(channel.units[1], channel.units[0]), 24)
-    gain.set(yscale="log", ylabel=f"gain [{unit}]", ylim=(floor, 3 * band.gain.max()))
+    gain.set(yscale="log", ylabel=f"gain [{unit}]", ylim=(_gain_floor(band.gain), 3 * band.gain.max()))
     phase.set_ylabel("phase [deg]")
     phase.set_ylim(*style.pad_limits(float(band.phase_deg.min()), float(band.phase_deg.max()), 0.15))
     gain.set_title(f"{style.plain(found.input, 26)} to {style.plain(found.output, 26)}")
     return figure
+
+
+def draw_enlarged(axes: Axes, response: FrequencyUncertainty, quantity: str = "gain{}") -> ResponseBand:
+    """Gain or phase over rad/s with its band, enlarged where that of the gain is too narrow to be seen.
+
+    quantity: names of fields of the band, with a place for _low and _high.
+    """
+    band = response_band(response)
+    factor = enlargement(band)
+    centre, *ends = (getattr(band, quantity.format(end)) for end in ("", "_low", "_high"))
+    low, high = (centre + factor * (end - centre) for end in ends)
+    if quantity == "gain{}":  # where the ellipse holds the origin its lower end is 0
+        low = np.maximum(low, 1e-3 * centre)
+    label = f"{share(response.level)} band" + (f", enlarged {factor} times" if factor > 1 else "")
+    axes.fill_between(band.omega_rad_s, low, high, **style.BAND, label=label)
+    axes.plot(band.omega_rad_s, centre, **style.MODEL_LINE, label="identified response (centre)")
+    axes.set(xscale="log", xlabel="frequency [rad/s]", xlim=(band.omega_rad_s[0], band.omega_rad_s[-1]))
+    return band
 
 
 @style.finished
@@ -83,86 +99,173 @@ def draw_bode(
     *,
     model: GobfModel | None = None,
     empirical: FrequencyUncertainty | None = None,
+    ax: Any = None,
+    dB: bool = False,
+    Hz: bool = False,
 ) -> Figure:
     """Gain [unit], phase and relative size of the ellipses over frequency; `empirical` as dots.
 
-    The band is the range of gain and phase over each frequency's ellipse, not over all of them jointly.
+    The band is the range of gain and phase over each frequency's ellipse, not over all of them jointly. ax,
+    dB, Hz: as of `draw_comparison`, with a third panel.
     """
-    band = response_band(uncertainty)
-    omega = band.omega_rad_s
-    figure, (gain, phase, size) = style.panels(7.0, 3, 1, sharex=True, height_ratios=[1.5, 1.1, 0.8])
-    floor = _gain_floor(band.gain, np.abs(empirical.centre) if empirical else np.empty(0))
-    if empirical is not None:
-        inside = (empirical.omega_rad_s >= omega[0]) & (empirical.omega_rad_s <= omega[-1])
-        at, response = _thinned(empirical.omega_rad_s[inside], empirical.centre[inside])
-        label = "straight from the records, no model"
-        gain.plot(at, np.maximum(np.abs(response), floor), **_DOTS, label=label)
-        phase.plot(at, degrees_near(response, np.interp(at, omega, band.phase_deg)), **_DOTS)
+    figure, (gain, phase, size) = style.panels(7.0, 3, 1, ax=ax, sharex=True, height_ratios=[1.5, 1.1, 0.8])
+    x, y = _units(dB, Hz)
     label = f"{share(uncertainty.level)} ellipses"
-    gain.fill_between(omega, np.maximum(band.gain_low, floor), band.gain_high, **style.BAND, label=label)
-    phase.fill_between(omega, band.phase_low_deg, band.phase_high_deg, **style.BAND)
-    gain.plot(omega, band.gain, **style.MODEL_LINE, label="identified response (centre)")
-    phase.plot(omega, band.phase_deg, **style.MODEL_LINE)
+    look = style.MODEL_LINE | {"label": "identified response (centre)"}
+    measured = np.abs(empirical.centre) if empirical else None
+    band = _draw(gain, phase, uncertainty, look, style.BAND | {"label": label}, measured, dB=dB, Hz=Hz)
+    omega = band.omega_rad_s
+    if empirical is not None:
+        # Evenly spread on the log axis: the thousands of a long record hide each other.
+        first, last = np.searchsorted(empirical.omega_rad_s, [omega[0], np.nextafter(omega[-1], np.inf)])
+        spread = np.searchsorted(empirical.omega_rad_s, np.geomspace(omega[0], omega[-1], 300))
+        index = np.unique(np.clip(spread, first, max(last - 1, first)))
+        at, response = empirical.omega_rad_s[index], empirical.centre[index]
+        seen = y(np.maximum(np.abs(response), _gain_floor(band.gain, measured)))
+        gain.plot(x(at), seen, **_DOTS, label="straight from the records, no model", zorder=1)
+        phase.plot(x(at), degrees_near(response, np.interp(at, omega, band.phase_deg)), **_DOTS, zorder=1)
     if model is not None:
         response = model.frequency_response(omega)
-        gain.plot(omega, np.abs(response), **_NOMINAL, label="nominal model")
-        phase.plot(omega, degrees_near(response, band.phase_deg), **_NOMINAL)
-    gain.set(xscale="log", yscale="log", ylabel=f"gain [{style.plain(unit, 24)}]")
-    gain.set_ylim(bottom=floor)
+        gain.plot(x(omega), y(np.abs(response)), **_NOMINAL, label="nominal model")
+        phase.plot(x(omega), degrees_near(response, band.phase_deg), **_NOMINAL)
+    _frame(gain, phase, style.plain(unit, 24), band, dB=dB, Hz=Hz)
     gain.set_title(title)
-    phase.set_ylabel("phase [deg]")
-    span = np.ptp(band.phase_deg)
-    phase.yaxis.set_major_locator(MultipleLocator(90 if span < 400 else 180 if span < 1000 else 360))
-    phase.set_ylim(*style.pad_limits(float(band.phase_deg.min()), float(band.phase_deg.max()), 0.15))
     relative = 100 * uncertainty.ellipse().semi_major[uncertainty.omega_rad_s > 0] / band.gain
-    size.fill_between(omega, np.full_like(relative, 1e-12), relative, **style.BAND)
-    size.plot(omega, relative, color=style.UNCERTAIN, lw=1.3)
+    size.fill_between(x(omega), np.full_like(relative, 1e-12), relative, **style.BAND)
+    size.plot(x(omega), relative, color=style.UNCERTAIN, lw=1.3)
     size.axhline(100, **style.LIMIT_LINE, label="ellipse as large as the response itself")
     size.set_yscale("log")
     finite = relative[np.isfinite(relative) & (relative > 0)]
     if finite.size:
         size.set_ylim(10 ** np.floor(np.log10(finite.min())), max(200.0, 2 * float(finite.max())))
-    size.set(xlabel="frequency [rad/s]", ylabel="ellipse / gain [%]")
-    gain.set_xlim(omega[0], omega[-1])
-    style.hertz_axis(gain)
+    size.set(xlabel=phase.get_xlabel(), ylabel="ellipse / gain [%]")
+    phase.set_xlabel("")
     return figure
 
 
 @style.finished
-def draw_comparison(responses: Mapping[str, FrequencyUncertainty]) -> Figure:
-    """Gain and phase of several responses by name, with bands where they have ellipses."""
-    figure, (gain, phase) = style.panels(6.0, 2, 1, sharex=True, height_ratios=[1.4, 1.0])
+def draw_comparison(
+    responses: Mapping[str, FrequencyUncertainty],
+    *,
+    ax: Any = None,
+    dB: bool = False,
+    Hz: bool = False,
+) -> Figure:
+    """Gain and phase of several responses by name, with bands where they have ellipses.
+
+    ax: two axes, for gain and phase, in place of a new figure. dB, Hz: one scale, in place of absolute gain
+    and rad/s with dB and Hz on the far sides.
+    """
+    figure, (gain, phase) = style.panels(6.0, 2, 1, ax=ax, sharex=True, height_ratios=[1.4, 1.0])
     colours = (style.MODEL, style.ACHIEVED, style.PREDICTED, style.LIMIT, style.HIGHLIGHT, style.MEASURED)
     lines = ("-", (0, (5, 2)), (0, (1, 1.5)))
+    bands = []
     for k, (name, response) in enumerate(responses.items()):
-        band, colour = response_band(response), colours[k % len(colours)]
-        drawn: dict[str, Any] = {"color": colour, "lw": 1.4, "ls": lines[k // len(colours) % len(lines)]}
-        gain.plot(band.omega_rad_s, band.gain, **drawn, label=style.plain(name, 40))
-        phase.plot(band.omega_rad_s, band.phase_deg, **drawn)
-        if np.any(response.covariance):
-            filled: dict[str, Any] = {"color": colour, "alpha": 0.25, "lw": 0}
-            floor = _gain_floor(band.gain, np.empty(0))
-            gain.fill_between(band.omega_rad_s, np.maximum(band.gain_low, floor), band.gain_high, **filled)
-            phase.fill_between(band.omega_rad_s, band.phase_low_deg, band.phase_high_deg, **filled)
-    gain.set(xscale="log", yscale="log", ylabel="gain [as logged]", title="Responses compared")
-    phase.set(ylabel="phase [deg]", xlabel="frequency [rad/s]")
-    style.hertz_axis(gain)
+        colour, dashes = colours[k % len(colours)], lines[k // len(colours) % len(lines)]
+        drawn: dict[str, Any] = {"color": colour, "lw": 1.4, "ls": dashes, "label": style.plain(name, 40)}
+        filled: dict[str, Any] = {"color": colour, "alpha": 0.25, "lw": 0}
+        bands.append(_draw(gain, phase, response, drawn, filled, dB=dB, Hz=Hz))
+    _frame(gain, phase, "as logged", *bands, dB=dB, Hz=Hz)
+    gain.set_title("Responses compared")
     return figure
 
 
-def _thinned(omega_rad_s: Real, response: Complex, most: int = 300) -> tuple[Real, Complex]:
-    """Points evenly spread on the log axis: the thousands of a long record hide each other."""
-    if omega_rad_s.size <= most:
-        return omega_rad_s, response
-    wanted = np.geomspace(omega_rad_s[0], omega_rad_s[-1], most)
-    index = np.unique(np.minimum(np.searchsorted(omega_rad_s, wanted), omega_rad_s.size - 1))
-    return omega_rad_s[index], response[index]
+@style.drawing("bode-loop")
+def draw_loop(run: RunView) -> Figure:
+    """Controller and loop gain of a run, the loop with its ellipses, crossovers and margins."""
+    loop = loop_of(run)
+    law = replace(
+        loop, centre=run.controller.response(loop.omega_rad_s), covariance=np.zeros_like(loop.covariance)
+    )
+    unit = style.plain(style.ratio_unit(run.input_unit, run.output_unit), 24)
+    figure, grid = style.panels(6.4, 2, 2, sharex=True, height_ratios=[1.3, 1.0])
+    filled = style.BAND | {"label": f"{share(loop.level)} ellipses"}
+    for (gain, phase), response, of, title in zip(
+        grid.T, (law, loop), (unit, "1"), ("Controller K", "Loop K G"), strict=True
+    ):
+        band = _draw(gain, phase, response, style.PREDICTED_LINE | {"label": "nominal"}, filled)
+        _frame(gain, phase, of, band)
+        gain.set_title(title)
+    _mark_margins(gain, phase, band)
+    return figure
 
 
-def _gain_floor(gain: Real, empirical: Real) -> float:
+def _mark_margins(gain: Axes, phase: Axes, loop: ResponseBand) -> None:
+    """Crossovers of a nominal loop, with its gain and phase margin as python-control finds them."""
+    found = control.stability_margins((loop.gain, loop.phase_deg, loop.omega_rad_s))
+    factor, degrees, _, at_phase, at_gain, _ = (float(value) for value in found)
+    limits: dict[str, Any] = {"color": style.MEASURED, "lw": 0.8, "ls": ":"}
+    gain.axhline(1, **limits)
+    look: dict[str, Any] = {"lw": 1.6, "marker": "o", "ms": 4}
+    if np.isfinite(at_gain):
+        here = float(np.interp(at_gain, loop.omega_rad_s, loop.phase_deg))
+        phase.axhline(here - degrees, **limits)
+        label = f"gain crossover at {at_gain:.3g} rad/s: phase margin {degrees:.3g} deg"
+        phase.plot([at_gain] * 2, [here - degrees, here], color=style.ACHIEVED, label=label, **look)
+        gain.plot([at_gain], [1], color=style.ACHIEVED, ls="none", **look)
+    if np.isfinite(at_phase):
+        label = f"phase crossover at {at_phase:.3g} rad/s: gain margin {style.decibels(factor):.3g} dB"
+        gain.plot([at_phase] * 2, [1 / factor, 1], color=style.LIMIT, label=label, **look)
+
+
+def _units(dB: bool, Hz: bool) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+    """What a frequency [rad/s] and an absolute gain become on the axes."""
+    return (lambda w: w / (2 * np.pi) if Hz else w), (style.decibels if dB else np.asarray)
+
+
+def _draw(
+    gain: Axes,
+    phase: Axes,
+    response: FrequencyUncertainty,
+    look: Mapping[str, Any],
+    filled: Mapping[str, Any],
+    measured: Real | None = None,
+    *,
+    dB: bool = False,
+    Hz: bool = False,
+) -> ResponseBand:
+    """Line and, of an uncertain response, band of gain and phase. measured: gains that are in view too."""
+    band, (x, y) = response_band(response), _units(dB, Hz)
+    at = x(band.omega_rad_s)
+    floor = _gain_floor(band.gain, measured)
+    if np.any(response.covariance):
+        gain.fill_between(at, y(np.maximum(band.gain_low, floor)), y(band.gain_high), **filled)
+        phase.fill_between(at, band.phase_low_deg, band.phase_high_deg, **filled)
+    gain.plot(at, y(band.gain), **look)
+    phase.plot(at, band.phase_deg, **look)
+    gain.set_ylim(bottom=min(float(y(floor)), gain.get_ylim()[0]) if len(gain.lines) > 1 else float(y(floor)))
+    return band
+
+
+def _frame(
+    gain: Axes,
+    phase: Axes,
+    unit: str,
+    *bands: ResponseBand,
+    dB: bool = False,
+    Hz: bool = False,
+) -> None:
+    """Scales and labels of gain and phase: absolute and rad/s, dB and Hz on the far sides, or one alone."""
+    x, _ = _units(dB, Hz)
+    every = np.concatenate([band.phase_deg for band in bands])
+    ends = [float(x(end)) for band in bands for end in (band.omega_rad_s[0], band.omega_rad_s[-1])]
+    gain.set(xscale="log", yscale="linear" if dB else "log", ylabel=f"gain [{'dB' if dB else unit}]")
+    phase.set(xscale="log", ylabel="phase [deg]", xlabel=f"frequency [{'Hz' if Hz else 'rad/s'}]")
+    for axes in (gain, phase):
+        axes.set_xlim(min(ends), max(ends))
+    span = np.ptp(every)
+    phase.yaxis.set_major_locator(MultipleLocator(90 if span < 400 else 180 if span < 1000 else 360))
+    phase.set_ylim(*style.pad_limits(float(every.min()), float(every.max()), 0.15))
+    if not Hz:
+        style.hertz_axis(gain)
+    if not dB:
+        style.decibel_axis(gain)
+
+
+def _gain_floor(gain: Real, empirical: Real | None = None) -> float:
     """Bottom of the gain axis: below the response, above the noise of an empirical response at a notch."""
     smallest = float(gain[gain > 0].min())
-    positive = empirical[empirical > 0]
+    positive = gain if empirical is None else empirical[empirical > 0]
     return min(smallest, float(np.percentile(positive, 2)) if positive.size else smallest) / 3
 
 

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 
 from workflow.figures import style
 from workflow.figures.bands import Real, envelope, outline
-from workflow.figures.sensitivity import curves_of
+from workflow.figures.sensitivity import curves_of, draw_curve
 from workflow.figures.subjects import FRICTION, MACHINE, RunView
 from workflow.tasks.results import LoopRuns
-from workflow.text.formats import share, si
+from workflow.text.formats import si
 
 _PREDICTED: dict[str, Any] = style.PREDICTED_LINE | {"label": "predicted, nominal model"}
 _REFERENCE: dict[str, Any] = style.REFERENCE_STEPS | {"label": "reference"}
@@ -42,8 +42,7 @@ def draw_run(run: RunView) -> Figure:
     )
 
 
-@style.finished
-def draw_closed_loop(
+def draw_signals(
     time_s: Real,
     reference: Real,
     predicted: LoopRuns,
@@ -55,6 +54,7 @@ def draw_closed_loop(
     command_limit: float | None = None,
     model: Real | None = None,
     with_friction: Sequence[Real] = (),
+    ax: Any = None,
 ) -> Figure:
     """Rows: what `labels` names of output, performance and command. Left: the reference step. Right: the
     disturbance.
@@ -62,12 +62,13 @@ def draw_closed_loop(
     time_s, reference, disturbance and model (the answer of the model that a reference filter makes the loop
     follow) are (T,). labels: (name, unit) of each row. others: runs on `machine`, in words; without one, of
     plants drawn from the uncertainty. with_friction: outputs of the lines `FRICTION`, as far as they go. The
-    first run is drawn as a line, all of them as the band between their extremes.
+    first run is drawn as a line, all of them as the band between their extremes. ax: axes in place of a new
+    figure, one for each panel.
     """
     both = (predicted,) if others is None else (predicted, others)
     onset, windows = _windows(time_s, disturbance, labels, both)
     figure, grid = style.panels(
-        2.1 * len(labels) + 0.9, len(labels), len(windows), squeeze=False, sharex="col", sharey="row"
+        2.1 * len(labels) + 0.9, len(labels), len(windows), ax=ax, squeeze=False, sharex="col", sharey="row"
     )
     for (kind, label), row in zip(labels.items(), grid, strict=True):
         hold = {"drawstyle": "steps-post"} if kind == "command" else {}
@@ -91,14 +92,21 @@ def draw_closed_loop(
         row[0].set_ylabel(style.two_lines(*label))
         runs = *(with_friction if kind == "output" else ()), *([getattr(others, kind)] if others else ())
         low, high = height(np.append(line, reference) if kind == "output" else line, runs, 3.0)
-        if kind == "command" and command_limit is not None:
-            low, high = _saturation(row, low, high, command_limit, label[1])
+        limits = () if kind != "command" or command_limit is None else (-command_limit, command_limit)
+        for limit in limits:
+            if 0.4 * abs(limit) < np.sign(limit) * (low if limit < 0 else high):  # near enough to matter
+                low, high = min(low, limit), max(high, limit)
+                for axes in row:
+                    axes.axhline(limit, **style.LIMIT_LINE, label="saturation")
         row[0].set_ylim(*style.pad_limits(low, high, 0.08))
     for axes, (_, _, title) in zip(grid[0], windows, strict=True):
         axes.set_title(title)
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")
     return figure
+
+
+draw_closed_loop = style.finished(draw_signals)
 
 
 def _draw_runs(axes: Axes, time_s: Real, runs: Real, machine: str, hold: Mapping[str, Any]) -> None:
@@ -164,28 +172,6 @@ def height(asked: Real, runs: Sequence[Real], most: float) -> tuple[float, float
     return float(shown.min()), float(shown.max())
 
 
-def _saturation(row: Any, low: float, high: float, limit: float, unit: str) -> tuple[float, float]:
-    """Limits of the command drawn where they are near enough to matter to the picture, else said in words."""
-    if limit > 2.5 * max(abs(low), abs(high)):
-        row[0].text(
-            0.985,
-            0.95,
-            f"saturation at ±{limit:.4g} {unit} is beyond this axis",
-            transform=row[0].transAxes,
-            ha="right",
-            va="top",
-            fontsize=8.5,
-            color=style.LIMIT,
-            bbox={"facecolor": "white", "alpha": 0.75, "lw": 0, "pad": 0.8},
-        )
-        return low, high
-    for axes in row:
-        for value in (-limit, limit):
-            axes.axhline(value, **style.LIMIT_LINE, label="saturation")
-    # The nearer limit is shown; the other one only if the command comes anywhere near it.
-    return min(low, -limit) if low < -0.4 * limit else low, max(high, limit) if high > 0.4 * limit else high
-
-
 _MARKERS = (
     {"color": style.ACHIEVED, "marker": "o", "ms": 3.0},
     {"color": style.HIGHLIGHT, "marker": "^", "ms": 3.0},
@@ -195,49 +181,20 @@ _MARKERS = (
 
 @style.drawing("measured-sensitivity")
 def draw_measured_sensitivity(run: RunView) -> Figure | None:
-    """|S| as measured on the arm, beside nominal and worst case; nothing where it was not measured.
-
-    Left: over the measured band. Right: around its peak, with two standard deviations.
-    """
-    if run.results.closed_loop.check is None or run.results.closed_loop.check.sensitivity is None:
+    """|S| as measured on the arm with two standard deviations, beside nominal and worst case; nothing where
+    it was not measured."""
+    loop = run.results.closed_loop.check
+    if loop is None or loop.sensitivity is None:
         return None
-    measured, (low, high) = (
-        run.results.closed_loop.check.sensitivity.measured,
-        run.results.closed_loop.check.sensitivity.band_rad_s,
-    )
-    omega = np.geomspace(0.9 * low, min(1.1 * high, run.plant.nyquist_rad_s), 900)
-    curve = curves_of(run, omega)[0]
-    low = min(float(m.omega_rad_s[0]) for m in measured)
-    high = max(float(m.omega_rad_s[-1]) for m in measured)
-    at = omega[np.argmax(curve.worst)]
-    start, stop = max(low, at / 3), min(high, at * 3)
-    figure, (whole, near) = style.panels(3.9, 1, 2)
-    for axes in (whole, near):
-        axes.fill_between(omega, curve.nominal, curve.worst, **style.BAND)
-        label = f"worst case over the {share(run.level)} ellipses"
-        axes.plot(omega, curve.worst, color=style.UNCERTAIN, lw=1.2, label=label)
-        axes.plot(omega, curve.nominal, **_PREDICTED)
-        for m, look in zip(measured, _MARKERS, strict=False):
-            if axes is whole:
-                axes.plot(m.omega_rad_s, m.magnitude, ls="none", label=m.name, **look)
-                continue
-            bars, part = {"elinewidth": 0.6, "capsize": 0}, (m.omega_rad_s >= start) & (m.omega_rad_s <= stop)
-            values = m.omega_rad_s[part], m.magnitude[part], 2 * m.std[part]
-            axes.errorbar(*values, ls="none", label=m.name, **look, **bars)
-        axes.set(xscale="log", xlabel="frequency [rad/s]")
-    whole.set(yscale="log", ylabel="|S| [1]", title="Sensitivity, reference to error")
-    whole.set_xlim(low / 1.1, high * 1.1)
-    inside = (omega >= low) & (omega <= high)
-    whole.set_ylim(0.7 * float(curve.nominal[inside].min()), 1.6 * float(curve.worst.max()))
-    peak = float(curve.worst.max())
-    shown = np.concatenate(
-        [m.magnitude[(m.omega_rad_s >= start) & (m.omega_rad_s <= stop)] for m in measured]
-    )
-    part = (omega >= start) & (omega <= stop)
-    top = min(float(np.max(shown, initial=peak)), 1.5 * peak)
-    near.set_xlim(start, stop)
-    near.set_ylim(*style.pad_limits(float(curve.nominal[part].min()), top, 0.08))
-    near.set_title("Around its peak (bars: two standard deviations)")
+    low, high = loop.sensitivity.band_rad_s
+    curve = curves_of(run, np.geomspace(0.9 * low, min(1.1 * high, run.plant.nyquist_rad_s), 900))[0]
+    figure, axes = style.panels(4.4)
+    draw_curve(axes, curve, run.level)
+    for m, look in zip(loop.sensitivity.measured, _MARKERS, strict=False):
+        bars = {"elinewidth": 0.6, "capsize": 0, "ls": "none", "label": m.name}
+        axes.errorbar(m.omega_rad_s, m.magnitude, np.minimum(2 * m.std, 0.9 * m.magnitude), **look, **bars)
+    axes.set(title="Sensitivity, reference to error (bars: two standard deviations)")
+    axes.set_xlabel("frequency [rad/s]")
     return figure
 
 

@@ -1,140 +1,131 @@
-"""Nyquist picture of the uncertain loop: ellipses of K G, the forbidden disc around -1, the nearest point."""
+"""Nyquist and Nichols pictures of an uncertain loop K G: its ellipses, the disc around -1 to keep out of."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
+import control
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.ticker import MultipleLocator
 
 from control_design.plants.ellipses import nearest_distance
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from workflow.figures import style
-from workflow.figures.bands import Complex, Real
+from workflow.figures.bands import Complex, Real, times, unwrapped_degrees
 from workflow.figures.subjects import RunView
 from workflow.text.formats import at_least, share
 
 _MOST_ELLIPSES = 220  # more fill the panel, and the file
-_SEEN = 0.01  # of the panel's width: two pixels
+_LOWEST_DB = -30.0  # below it a loop does nothing, and its phase takes all the width
 
 
-@dataclass(frozen=True, eq=False)
-class UncertainLoop:
-    """Loop gain over its ellipses: L = K G with G in {centre + ...}; all (F,).
-
-    outline (F, P): boundary points of each ellipse of L; distance (F,): exact distance of the filled ellipse
-    from -1.
-    """
-
-    omega_rad_s: Real
-    centre: Complex
-    outline: Complex
-    distance: Real
-
-    @property
-    def nearest(self) -> int:
-        """Index of the ellipse that comes nearest to -1."""
-        return int(np.argmin(self.distance))
-
-
-def uncertain_loop(plant: FrequencyUncertainty, controller: Complex) -> UncertainLoop:
-    """Ellipses of the plant multiplied by the controller's response (F,); frequency 0 is left out."""
-    keep = plant.omega_rad_s > 0
-    gain = np.asarray(controller, dtype=np.complex128)[keep]
-    ellipse = plant.ellipse()
-    centre = gain * plant.centre[keep]
-    offset = gain[:, None] * ellipse.boundary(40)[keep]
-    size = np.abs(gain)
-    axis = ellipse.direction[keep] * np.where(size > 0, gain / np.where(size > 0, size, 1.0), 1.0)
-    distance = nearest_distance(
-        (-1.0 - centre) * np.conj(axis), size * ellipse.semi_major[keep], size * ellipse.semi_minor[keep]
-    )
-    return UncertainLoop(plant.omega_rad_s[keep], centre, centre[:, None] + offset, distance)
-
-
-def loop_of(run: RunView) -> UncertainLoop:
+def loop_of(run: RunView) -> FrequencyUncertainty:
     """The certified loop of a run, fine enough for what its controller does to the modes."""
     frequency, plant = run.control.spread.frequency, run.plant
     if isinstance(plant.uncertainty, ResponsePosterior):
         frequency = plant.uncertainty.at(run.loop_grid, plant.level)
-    return uncertain_loop(frequency, run.controller.response(frequency.omega_rad_s))
+    return times(frequency, run.controller.response(frequency.omega_rad_s))
 
 
 @style.drawing("nyquist")
-def draw_nyquist(run: RunView) -> Figure:
-    """Whole curve of a run's loop (as far as it fits) and the surroundings of -1."""
-    loop, margin = loop_of(run), run.specification.modulus_margin
-    figure, (whole, near) = style.panels(6.0, 1, 2)
-    size = np.abs(loop.centre)
-    # Of the whole view: all that the loop does after it first falls below 1, no integrator.
-    below = np.flatnonzero(size < 1)
-    reach = float(np.clip(1.25 * (size[below[0] :] if below.size else size).max(), 1.8, 6.0))
-    _draw_loop(whole, loop, (-reach, reach), (-reach, reach), run.level)
-    _mark_forbidden(whole, margin)
-    draw_around_minus_one(near, loop, level=run.level, modulus_margin=margin)
-    whole.set_title(f"Loop K G: {style.plain(run.control.name, 34)}")
-    slow = size > reach
-    if slow.any():
-        beyond = f"beyond the frame below {loop.omega_rad_s[slow].max():.3g} rad/s"
-        words = beyond if slow[0] and not slow[-1] else "partly beyond the frame"
-        box = {"facecolor": "white", "lw": 0, "alpha": 0.8, "pad": 1}
-        whole.text(0.02, 0.02, words, transform=whole.transAxes, fontsize=8.5, color="#555555", bbox=box)
+def draw_run(run: RunView) -> Figure:
+    """Nyquist curve of a run's loop, as far as it fits, beside its Nichols chart."""
+    loop, (figure, (whole, chart)) = loop_of(run), style.panels(6.2, 1, 2)
+    draw_nyquist(whole, loop, run.specification.modulus_margin)
+    draw_nichols(chart, loop)
     return figure
 
 
-def draw_around_minus_one(axes: Axes, loop: UncertainLoop, *, level: float, modulus_margin: float) -> None:
-    """The surroundings of -1 on given axes: ellipses, the disc to keep out of, the nearest point."""
-    nearest = loop.nearest
-    closest = loop.distance[nearest]
-    side = float(np.clip(1.35 * max(closest, modulus_margin, 0.35), 0.5, 1.3))
-    _draw_loop(axes, loop, (-1 - side, -1 + 1.25 * side), (-1.12 * side, 1.12 * side), level)
-    _mark_forbidden(axes, modulus_margin)
-    touch = _nearest_point(loop.outline[nearest])
-    label = f"nearest: {at_least(closest)} at {loop.omega_rad_s[nearest]:.4g} rad/s"
-    axes.plot([-1, touch.real], [0, touch.imag], color=style.ACHIEVED, lw=1.2)
-    axes.plot([touch.real], [touch.imag], marker="o", ms=6, color=style.ACHIEVED, ls="none", label=label)
-    axes.set_title("Around -1")
+@style.finished
+def draw_alone(draw: Callable[..., None], loop: FrequencyUncertainty, *, ax: Any = None) -> Figure:
+    """A Nyquist curve or a Nichols chart, as `draw` has it, on a figure of its own or on given axes."""
+    figure, axes = style.panels(6.2, ax=ax)
+    draw(axes, loop)
+    return figure
 
 
-def _mark_forbidden(axes: Axes, modulus_margin: float) -> None:
-    disc = Circle((-1, 0), modulus_margin, fill=False, label="specification: keep out of here")
-    disc.set(edgecolor=style.LIMIT, linewidth=1.3, linestyle=style.LIMIT_LINE["ls"])
-    axes.add_patch(disc)
-    axes.plot([-1], [0], marker="P", ms=8, color=style.REFERENCE, ls="none", label="-1")
-
-
-def _draw_loop(
-    axes: Axes, loop: UncertainLoop, real: tuple[float, float], imag: tuple[float, float], level: float
+def draw_nyquist(
+    axes: Axes, loop: FrequencyUncertainty, modulus_margin: float = 0.0, *, near: bool = False
 ) -> None:
-    edges = loop.outline
-    inside = (
-        (edges.real.max(axis=1) > real[0])
-        & (edges.real.min(axis=1) < real[1])
-        & (edges.imag.max(axis=1) > imag[0])
-        & (edges.imag.min(axis=1) < imag[1])
+    """Ellipses of a loop as far as they fit, or near -1; the disc to keep out of and the nearest point where
+    a modulus margin is asked for."""
+    centre, ellipse = loop.centre, loop.ellipse()
+    edges, size = centre[:, None] + ellipse.boundary(40), np.abs(centre)
+    distance = nearest_distance(
+        (-1.0 - centre) * np.conj(ellipse.direction), ellipse.semi_major, ellipse.semi_minor
     )
-    index = np.flatnonzero(inside)
-    if index.size > _MOST_ELLIPSES:
-        index = index[np.linspace(0, index.size - 1, _MOST_ELLIPSES).round().astype(int)]
-    index = np.union1d(index, [loop.nearest])
-    polygons = np.stack([edges[index].real, edges[index].imag], axis=-1)
-    look: Any = {"facecolors": style.UNCERTAIN, "edgecolors": style.MODEL, "linewidths": 0.4, "alpha": 0.2}
-    # Ellipses thinner than a line cannot be seen: no entry of the legend. Enlarged they might seem to reach
-    # into the disc.
-    width = np.median(np.ptp(polygons, axis=1).max(axis=-1))
-    label = f"{share(level)} ellipses" if width > _SEEN * (real[1] - real[0]) else "_ellipses"
-    dense = polygons.shape[0] * polygons.shape[1] > 6000
-    axes.add_collection(PolyCollection(list(polygons), **look, label=label, rasterized=dense))
-    axes.plot(loop.centre.real, loop.centre.imag, **style.PREDICTED_LINE, label="loop at the centres")
-    _arrow(axes, loop.centre, real, imag)
-    axes.axhline(0, color="#999999", lw=0.7)
-    axes.axvline(0, color="#999999", lw=0.7)
+    nearest = int(np.argmin(distance))
+    # Of the whole view: all that the loop does after it first falls below 1, no integrator.
+    below = np.flatnonzero(size < 1)
+    reach = float(np.clip(1.25 * (size[below[0] :] if below.size else size).max(), 1.8, 6.0))
+    real = imag = (-reach, reach)
+    if near:
+        side = float(np.clip(1.35 * max(distance[nearest], modulus_margin, 0.35), 0.5, 1.3))
+        real, imag = (-1 - side, -1 + 1.25 * side), (-1.12 * side, 1.12 * side)
+    inside = (edges.real.max(axis=1) > real[0]) & (edges.real.min(axis=1) < real[1])
+    inside &= (edges.imag.max(axis=1) > imag[0]) & (edges.imag.min(axis=1) < imag[1])
+    seen = edges[np.append(np.flatnonzero(inside), nearest)]  # the last one is always drawn
     axes.set(xlim=real, ylim=imag, aspect="equal")
     axes.set(xlabel="real part of K G [1]", ylabel="imaginary part of K G [1]")
+    _fill(axes, np.stack([seen.real, seen.imag], axis=-1), loop.level)
+    axes.plot(centre.real, centre.imag, **style.PREDICTED_LINE, label="loop at the centres")
+    _arrow(axes, centre, real, imag)
+    axes.axhline(0, color="#999999", lw=0.7)
+    axes.axvline(0, color="#999999", lw=0.7)
+    axes.plot([-1], [0], marker="P", ms=8, color=style.REFERENCE, ls="none", label="-1")
+    if modulus_margin:
+        disc = Circle((-1, 0), modulus_margin, fill=False, label="specification: keep out of here")
+        disc.set(edgecolor=style.LIMIT, linewidth=1.3, linestyle=style.LIMIT_LINE["ls"])
+        axes.add_patch(disc)
+        touch = edges[nearest, np.argmin(np.abs(edges[nearest] + 1))]
+        label = f"nearest: {at_least(distance[nearest])} at {loop.omega_rad_s[nearest]:.4g} rad/s"
+        axes.plot([-1, touch.real], [0, touch.imag], color=style.ACHIEVED, lw=1.2)
+        axes.plot([touch.real], [touch.imag], marker="o", ms=6, color=style.ACHIEVED, ls="none", label=label)
+    beyond = "" if near or size.max() < reach else " (partly beyond the frame)"
+    axes.set_title(f"Loop{' around -1' if near else ' K G'}{beyond}")
+
+
+def draw_nichols(axes: Axes, loop: FrequencyUncertainty) -> None:
+    """Gain over phase of a loop with its ellipses, on the Nichols chart of python-control."""
+    phase, level = unwrapped_degrees(loop.centre), style.decibels(np.abs(loop.centre))
+    edges, shown = loop.centre[:, None] + loop.ellipse().boundary(40), level > _LOWEST_DB
+    turned = phase[:, None] + np.degrees(np.angle(edges / loop.centre[:, None]))
+    axes.plot(phase, level, **style.PREDICTED_LINE, label="loop at the centres")
+    axes.plot([-180], [0], marker="P", ms=8, color=style.REFERENCE, ls="none", label="-1")
+    ends = np.append(phase[shown], [-360.0, 0.0])
+    view: Any = {"xlim": (ends.min(), ends.max()), "ylim": (_LOWEST_DB, max(float(level.max()), 12.0))}
+    axes.set(**view)
+    _fill(axes, np.stack([turned, style.decibels(np.abs(edges))], axis=-1)[shown], loop.level)
+    *_, gains, phases = control.nichols_grid(ax=axes)
+    for text in (*gains, *phases):
+        x, y = text.get_position()
+        inside = view["xlim"][0] < x < view["xlim"][1] and _LOWEST_DB < y < view["ylim"][1]
+        text.set(color="#666666", fontsize=8, visible=inside)
+    axes.grid(visible=False)
+    axes.set(**view, xlabel="phase of K G [deg]", ylabel="gain of K G [dB]")
+    axes.xaxis.set_major_locator(MultipleLocator(90))
+    axes.set_title("Nichols chart (dotted: closed loop)")
+
+
+def _fill(axes: Axes, polygons: Real, level: float) -> None:
+    """Outlines (F, P, 2) of ellipses, as many as fill a panel; those too thin to be seen stay unnamed.
+    Enlarged they might seem to reach into the disc."""
+    if not len(polygons):
+        return
+    polygons = polygons[
+        np.linspace(0, len(polygons) - 1, min(len(polygons), _MOST_ELLIPSES)).round().astype(int)
+    ]
+    look: Any = {"facecolors": style.UNCERTAIN, "edgecolors": style.MODEL, "linewidths": 0.4, "alpha": 0.2}
+    # Two pixels are a hundredth of a panel's width.
+    wide = np.median(np.ptp(polygons, axis=1)[:, 0]) > 0.01 * np.ptp(axes.get_xlim())
+    dense = polygons.shape[0] * polygons.shape[1] > 6000
+    label = f"{share(level)} ellipses" if wide else "_ellipses"
+    axes.add_collection(PolyCollection(list(polygons), **look, label=label, rasterized=dense))
 
 
 def _arrow(axes: Axes, centre: Complex, real: tuple[float, float], imag: tuple[float, float]) -> None:
@@ -146,12 +137,3 @@ def _arrow(axes: Axes, centre: Complex, real: tuple[float, float], imag: tuple[f
         k = min(int(np.searchsorted(np.cumsum(steps), 0.35 * steps.sum())), centre.size - 2)
         look = {"arrowstyle": "-|>", "color": style.PREDICTED, "lw": 1.4, "mutation_scale": 14}
         axes.annotate("", xy=(x[k + 1], y[k + 1]), xytext=(x[k], y[k]), arrowprops=look)
-
-
-def _nearest_point(boundary: Complex) -> complex:
-    """Point of a polygonal outline nearest to -1."""
-    a, b = boundary, np.roll(boundary, -1)
-    edge = b - a
-    length = np.abs(edge) ** 2
-    points = a + np.clip(((-1 - a) * np.conj(edge)).real / np.where(length > 0, length, 1.0), 0, 1) * edge
-    return complex(points[np.argmin(np.abs(points + 1))])

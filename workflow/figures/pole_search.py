@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
@@ -80,7 +79,9 @@ def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str 
     left.set(xscale=scale, yscale=scale, xlim=(first[0], first[-1]), ylim=(second[0], second[-1]))
     left.set(xlabel=labels[0], ylabel=labels[1])
     left.set_title(f"Error surface: {name}" if name else "Error surface")
-    _round_ticks(figure.colorbar(filled, cax=bar), levels)
+    # Its own log ticks run into each other.
+    figure.colorbar(filled, cax=bar).set_ticks(list(levels[::7]), labels=[f"{v:.3g}" for v in levels[::7]])
+    bar.minorticks_off()
     right.plot(first, ratio.min(axis=0), **style.MODEL_LINE)
     right.axvline(surface.pole[0], color=style.HIGHLIGHT, lw=1.4)
     right.set(xscale=scale, yscale="log", xlim=(first[0], first[-1]))
@@ -121,19 +122,6 @@ def searched_pairs(stages: Sequence[SearchStage], omega_rad_s: float) -> Real:
                 away = abs(float(np.log(points[int(np.argmin(stage.log_cost)), 0] / omega_rad_s)))
                 nearest = min(nearest, (away, points), key=lambda entry: entry[0])
     return nearest[1]
-
-
-def _round_ticks(bar: Colorbar, levels: Real) -> None:
-    """Round values at least a fifteenth of the bar apart: its own log ticks run into each other."""
-    ticks: list[float] = []
-    step = np.log(levels[-1] / levels[0]) / 15
-    for value in (1, 1.02, 1.05, 1.1, 1.2, 1.5, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000):
-        if value <= levels[-1] and (not ticks or np.log(value / ticks[-1]) > step):
-            ticks.append(value)
-    if len(ticks) < 3:
-        ticks = [float(f"{value:.4g}") for value in np.linspace(levels[0], levels[-1], 5)]
-    bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
-    bar.ax.minorticks_off()
 
 
 # Below this a difference of the criterion is drawn linearly, above logarithmically: a factor exp(5) = 150 in

@@ -1,4 +1,4 @@
-"""Pole map in the z-plane, with lines of constant damping and of constant frequency."""
+"""Pole-zero map in the z-plane, with lines of constant damping and of constant frequency."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from ident.basis.model import GobfModel
 from workflow.figures import style
-from workflow.figures.bands import Complex, Real
+from workflow.figures.bands import Complex
+from workflow.tasks.results import Intervals
+from workflow.text.formats import share
 
 _DAMPINGS = (0.02, 0.1, 0.3, 0.6)
 _HOLLOW: dict[str, Any] = {"ls": "none", "mfc": "none"}
@@ -18,46 +21,62 @@ _HOLLOW: dict[str, Any] = {"ls": "none", "mfc": "none"}
 
 @style.drawing("poles")
 def draw_poles(
-    model: GobfModel, name: str = "", closed_loop: Complex | None = None, zeros: Complex | None = None
+    model: GobfModel,
+    name: str = "",
+    closed_loop: Complex | None = None,
+    intervals: Intervals | None = None,
 ) -> Figure:
-    """Poles of a model, its known ones at z = 1, those of a loop around it (n,): whole circle and near z = 1.
+    """Poles and zeros of a model, its known poles at z = 1: whole circle and near z = 1.
 
-    zeros (k,): the model's, drawn as circles where given.
+    closed_loop (n,): poles of a loop around it. intervals: of the poles; the area that frequency and damping
+    of a mode leave is filled.
     """
-    poles = np.concatenate([model.stable_poles.values, model.unstable_poles])
-    figure, (whole, near) = style.panels(5.6, 1, 2)
-    turn = np.linspace(0, 2 * np.pi, 361)
-    angle = np.concatenate([np.linspace(0, 0.3, 120), np.linspace(0.301, np.pi, 160)])
-    for axes in (whole, near):
-        axes.plot(np.cos(turn), np.sin(turn), color="#333333", lw=1.0)
-        for zeta in _DAMPINGS:
-            z = _constant_damping(zeta, angle)
-            for side in (z, z.conj()):
-                axes.plot(side.real, side.imag, color="#b5b5b5", lw=0.7, ls=(0, (3, 2)))
-        if closed_loop is not None:
-            squares = {"marker": "s", "ms": 5.5, "mec": style.PREDICTED, "mew": 1.4}
-            label = "closed loop, nominal plant"
-            axes.plot(closed_loop.real, closed_loop.imag, **_HOLLOW, **squares, label=label)
-        if zeros is not None:
-            circles = {"marker": "o", "ms": 7, "mec": style.MEASURED, "mew": 1.3}
-            axes.plot(zeros.real, zeros.imag, **_HOLLOW, **circles, label="zeros")
-        crosses = {"ls": "none", "marker": "x", "ms": 7, "mew": 1.8, "color": style.MODEL}
-        axes.plot(poles.real, poles.imag, **crosses, label="identified basis poles")
+    poles, zeros = np.concatenate([model.stable_poles.values, model.unstable_poles]), model.zeros()
+    figure, panels = style.panels(5.6, 1, 2)
+    whole, near = panels
+    corner = _near_corner(poles)
+    whole.set(xlim=(-1.1, 1.1), ylim=(-1.1, 1.1))
+    near.set(xlim=(1 - corner, 1 + 0.12 * corner), ylim=(-0.12 * corner, corner))
+    turn = np.exp(1j * np.linspace(0, 2 * np.pi, 361))
+    for axes in panels:
+        axes.set(aspect="equal", xlabel="real part of z [1]", ylabel="imaginary part of z [1]")
+        axes.grid(visible=False)
+        axes.plot(turn.real, turn.imag, color="#333333", lw=1.0)
+        _grid(axes, model.dt_s, named=axes is near)
+        if intervals is not None:
+            label = f"{share(intervals.level)} intervals of a pole"
+            for area in _areas(intervals, model.dt_s):
+                axes.fill(area.real, area.imag, **style.BAND | {"lw": 1.5}, label=label)
+        for at, marker, colour, label in (
+            (closed_loop, "s", style.PREDICTED, "closed loop, nominal plant"),
+            (zeros, "o", style.MEASURED, "zeros"),
+            (poles, "x", style.MODEL, "identified basis poles"),
+        ):
+            if at is not None:
+                look = {"marker": marker, "ms": 6.5, "mec": colour, "mew": 1.5, "label": label}
+                axes.plot(at.real, at.imag, **_HOLLOW, **look)
         if model.integrators:
             label = f"integrator (x {model.integrators})"
             axes.plot([1], [0], ls="none", marker="*", ms=10, color=style.REFERENCE, label=label)
-        axes.set_aspect("equal")
-        axes.set(xlabel="real part of z [1]", ylabel="imaginary part of z [1]")
-    whole.set(xlim=(-1.1, 1.1), ylim=(-1.1, 1.1))
-    what = "Poles" if zeros is None else "Poles, zeros"
     where = f": {style.plain(name, 13)}" if name else ""
-    whole.set_title(f"{what}{where} (sampled every {model.dt_s * 1e3:.4g} ms)")
-    corner = _near_corner(poles)
-    near.set(xlim=(1 - corner, 1 + 0.12 * corner), ylim=(-0.12 * corner, corner))
+    whole.set_title(f"Poles, zeros{where} (sampled every {model.dt_s * 1e3:.4g} ms)")
     near.set_title("Near z = 1 (dashed: damping, dotted: frequency)")
-    _frequency_arcs(near, corner, model.dt_s)
-    _name_dampings(near, corner)
     return figure
+
+
+def _areas(intervals: Intervals, dt_s: float) -> list[Complex]:
+    """Outlines in z of what the intervals of modes and real poles leave, those that the records tell."""
+    along, ones = np.linspace(0, 1, 25), np.ones(25)
+    found = []
+    for mode in intervals.modes:
+        if mode.told:
+            (w0, w1), (d0, d1) = mode.omega_rad_s, mode.damping
+            omega = np.concatenate([w0 + along * (w1 - w0), w1 * ones, w1 - along * (w1 - w0), w0 * ones])
+            zeta = np.concatenate([d0 * ones, d0 + along * (d1 - d0), d1 * ones, d1 - along * (d1 - d0)])
+            upper = np.exp((-zeta + 1j * np.sqrt(np.maximum(1 - zeta**2, 0.0))) * omega * dt_s)
+            found += [upper, upper.conj()]
+    real = [np.exp(-np.array(ends) * dt_s) for ends in intervals.real_poles_per_s]
+    return found + [ends.astype(np.complex128) for ends in real if np.all(np.isfinite(ends))]
 
 
 def _near_corner(poles: Complex) -> float:
@@ -70,34 +89,16 @@ def _near_corner(poles: Complex) -> float:
     return float(np.clip(1.7 * away.min(), 0.02, 0.9)) if away.size else 0.5
 
 
-def _constant_damping(zeta: float, angle: Real) -> Complex:
-    return np.asarray(np.exp((-zeta / np.sqrt(1 - zeta**2) + 1j) * angle))
-
-
-def _name_dampings(axes: Axes, corner: float) -> None:
-    """Damping ratios where their lines leave the close-up."""
-    angle = np.linspace(1e-4, np.pi, 6000)
-    for number, zeta in enumerate(_DAMPINGS):
-        z = _constant_damping(zeta, angle)
-        # Neighbouring lines lie close together: their labels stand at two heights.
-        share = 0.93 - 0.07 * (number % 2)
-        inside = (z.real > 1 - 0.93 * corner) & (z.imag < share * corner) & (z.imag >= 0)
-        leaves = int(np.argmin(inside)) if not inside.all() else angle.size - 1
-        _label(axes, z[max(leaves - 1, 0)], f"{zeta:g}", fontsize=8.5, color="#555555")
-
-
-def _frequency_arcs(axes: Axes, corner: float, dt_s: float) -> None:
-    """Lines of constant undamped frequency at round numbers of rad/s."""
-    most = corner / dt_s / 3
-    power = 10.0 ** np.floor(np.log10(most))
-    step = float(max(step for step in (1, 2, 5) if step * power <= most * (1 + 1e-12)) * power)
-    zeta = np.linspace(0, 0.999, 200)
-    for omega in (step, 2 * step, 3 * step):
-        z = np.exp((-zeta + 1j * np.sqrt(1 - zeta**2)) * omega * dt_s)
-        axes.plot(z.real, z.imag, color="#b5b5b5", lw=0.7, ls=(0, (1, 2)))
-        _label(axes, z[int(0.78 * zeta.size)], f"{omega:.4g} rad/s", fontsize=8, color="#666666")
-
-
-def _label(axes: Axes, z: complex, text: str, **look: Any) -> None:
-    box = {"facecolor": "white", "lw": 0, "pad": 0.7, "alpha": 0.85}
-    axes.annotate(text, (z.real, z.imag), ha="center", va="center", bbox=box, **look)
+def _grid(axes: Axes, dt_s: float, *, named: bool) -> None:
+    """Lines of constant damping and of constant undamped frequency [rad/s] inside the circle, as contours."""
+    x, y = np.meshgrid(*(np.linspace(*ends, 150) for ends in (axes.get_xlim(), axes.get_ylim())))
+    z = np.where(np.hypot(x, y) < 1, x + 1j * np.abs(y) + 1e-12j, np.nan)
+    s = np.log(z) / dt_s
+    rounds = MaxNLocator(5, steps=[1, 2, 5]).tick_values(0, float(np.nanmax(np.abs(s[:, :75]))))[1:4]
+    for value, levels, dashes, words in (
+        (-s.real / np.abs(s), _DAMPINGS, "--", "{:g}"),
+        (np.abs(s), rounds, ":", "{:.4g} rad/s"),
+    ):
+        lines = axes.contour(x, y, value, levels, colors="#b5b5b5", linewidths=0.7, linestyles=dashes)
+        if named:
+            axes.clabel(lines, fmt=words.format, fontsize=8, colors="#666666")

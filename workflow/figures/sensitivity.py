@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from control_design.controllers.controller import Controller
@@ -115,23 +116,29 @@ def draw_sensitivities(
     """One panel per closed-loop gain; `marks` are frequencies [rad/s] with a word, e.g. the first mode."""
     figure, panels = style.small_multiples(len(curves), 2, 2.7, 0.8, sharex=True)
     for axes, curve in zip(panels, curves, strict=True):
-        omega = curve.omega_rad_s
-        finite = np.where(np.isfinite(curve.worst) & (curve.worst < 1e200), curve.worst, np.nan)
-        axes.fill_between(omega, curve.nominal, finite, **style.BAND)
-        axes.plot(omega, finite, color=style.UNCERTAIN, lw=1.2, label=f"over the {share(level)} ellipses")
-        axes.plot(omega, curve.nominal, **style.PREDICTED_LINE, label="nominal (ellipse centres)")
-        if np.any(np.isfinite(curve.limit)):
-            axes.plot(omega, curve.limit, **style.LIMIT_LINE, label="specification: stay below")
-        axes.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]), ylim=_range(curve))
+        draw_curve(axes, curve, level)
         note = "" if curve.exact else " (band: upper bound)"
         axes.set_title(f"{curve.symbol}: {curve.meaning}{note}", fontsize=9.5)
-        axes.set_ylabel(f"{curve.symbol} [{style.plain(curve.unit, 16)}]")
+        omega = curve.omega_rad_s
         for at, word in marks:
             if omega[0] < at < omega[-1]:
                 style.tag_below(axes, at, word)
     for axes in panels[-2:]:
         axes.set_xlabel("frequency [rad/s]")
     return figure
+
+
+def draw_curve(axes: Axes, curve: SensitivityCurve, level: float) -> None:
+    """Nominal, worst case over the ellipses of `level`, and limit of a closed-loop gain."""
+    omega = curve.omega_rad_s
+    finite = np.where(np.isfinite(curve.worst) & (curve.worst < 1e200), curve.worst, np.nan)
+    axes.fill_between(omega, curve.nominal, finite, **style.BAND)
+    axes.plot(omega, finite, color=style.UNCERTAIN, lw=1.2, label=f"over the {share(level)} ellipses")
+    axes.plot(omega, curve.nominal, **style.PREDICTED_LINE, label="nominal (ellipse centres)")
+    if np.any(np.isfinite(curve.limit)):
+        axes.plot(omega, curve.limit, **style.LIMIT_LINE, label="specification: stay below")
+    axes.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]), ylim=_range(curve))
+    axes.set_ylabel(f"{curve.symbol} [{style.plain(curve.unit, 16)}]")
 
 
 def _range(curve: SensitivityCurve) -> tuple[float, float]:

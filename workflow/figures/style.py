@@ -24,11 +24,18 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import (
+    FixedLocator,
+    FuncFormatter,
+    LogLocator,
+    MaxNLocator,
+    NullFormatter,
+    NullLocator,
+)
 from matplotlib.transforms import ScaledTranslation
 
 from workflow.engine import interrupts
-from workflow.figures.layout import POINT, lay_out, titles
+from workflow.figures.layout import POINT, Real, lay_out, titles
 from workflow.figures.reading import draw_minor_ticks, marked
 
 MEASURED = "#6b6b6b"  # what sensors said
@@ -132,9 +139,23 @@ def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
 
 
 def panels(
-    height_in: float, rows: int = 1, columns: int = 1, *, width_in: float = WIDTH_IN, **options: Any
+    height_in: float,
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    width_in: float = WIDTH_IN,
+    ax: Any = None,
+    **options: Any,
 ) -> tuple[Figure, Any]:
-    """An empty figure with its axes, as `Figure.subplots` gives them."""
+    """An empty figure with its axes, as `Figure.subplots` gives them; or axes that the caller has, `ax`.
+
+    Raises ValueError where these are not as many as there are panels.
+    """
+    if ax is not None:
+        if np.size(ax) != rows * columns:
+            raise ValueError(f"ax: expected {rows * columns} axes, one for each panel; got {np.size(ax)}")
+        grid = np.array(ax, dtype=object).reshape(rows, columns)
+        return grid[0, 0].figure, grid if options.get("squeeze") is False else grid.squeeze()[()]
     figure = new_figure(height_in, width_in)
     return figure, figure.subplots(rows, columns, **options)
 
@@ -233,13 +254,16 @@ def finish(figure: Figure) -> None:
 
 
 def finished(draw: D) -> D:
-    """Decorator of what draws a figure: the house style around it, and `finish` once at its end."""
+    """Decorator of what draws a figure: the house style around it, and `finish` once at its end; on axes of
+    the caller's (`ax`) a legend inside the first."""
 
     @wraps(draw)
     def styled(*what: Any, **more: Any) -> Figure | None:
         with house_style():
             figure = draw(*what, **more)
-            if figure is not None and not figure.legends:
+            if more.get("ax") is not None:
+                np.ravel(more["ax"])[0].legend()
+            elif figure is not None and not figure.legends:
                 finish(figure)
         return figure
 
@@ -341,10 +365,30 @@ def hertz_axis(axes: Axes) -> None:
     """A second frequency axis on top, in Hz, for axes whose x is in rad/s."""
     turn: Any = 2 * np.pi
     top = axes.secondary_xaxis("top", functions=(lambda omega: omega / turn, lambda hertz: hertz * turn))
-    top.xaxis.set_major_formatter(FuncFormatter(_power_of_ten))
-    top.xaxis.set_minor_formatter(NullFormatter())
-    top.tick_params(labelsize=8.5, colors="#666666")
-    top.set_xlabel("frequency [Hz]", fontsize=8.5, color="#666666")
+    _second(top.xaxis, "frequency [Hz]").set_major_formatter(FuncFormatter(_power_of_ten))
+
+
+def decibel_axis(axes: Axes) -> None:
+    """A second gain axis on the right, in dB, for axes whose y is an absolute gain on a log scale."""
+    factor: Any = 1 / 20
+    right = axes.secondary_yaxis("right", functions=(decibels, lambda level: 10 ** (level * factor)))
+    right.set_yscale("linear")  # levels are even where gains are logarithmic
+    axis = _second(right.yaxis, "[dB]")
+    axis.set_major_locator(MaxNLocator(6, steps=[1, 2, 4, 10]))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda level, _: f"{level:g}".replace("-", "\u2212")))
+
+
+def decibels(gain: Any) -> Real:
+    """20 log10 of gains above 0."""
+    return np.asarray(20 * np.log10(np.maximum(gain, 1e-300)))
+
+
+def _second(axis: Axis, label: str) -> Axis:
+    axis.set_minor_formatter(NullFormatter())
+    axis.set_tick_params(labelsize=8.5, colors="#666666")
+    axis.set_label_text(label, fontsize=8.5, color="#666666")
+    return axis
 
 
 def pad_limits(low: float, high: float, share: float = 0.06) -> tuple[float, float]:
