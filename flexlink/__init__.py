@@ -19,7 +19,7 @@ Joints      `MultivariablePlant`, `ResponseBall`, `MultivariableSpecification`, 
             `MultivariableCertificate`: several sensors and actuators, after `identify_mimo`
 Machines    `Rig`, `paper_link`, `effect`, `simulate`, `linear_arm`, `SampledArm`, `prbs`, `multisine`
 Causes      `Case`, `Experiment`, `load_case`, `diagnose`, `Diagnosis`
-Pictures    `plot`, `bode`, `compare`
+Pictures    `plot`, `bode`, `compare`, `nyquist`, `nichols`, `step`
 Tables      `table`
 
 `LoopRun`, `Simulation` and `SynthesisResult` are what `simulate_loop`, `simulate` and `synthesise` return.

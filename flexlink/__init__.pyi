@@ -64,5 +64,12 @@ from .models import (
     regressor as regressor,
     uncertainty as uncertainty,
 )
-from .pictures import bode as bode, compare as compare, plot as plot
+from .pictures import (
+    bode as bode,
+    compare as compare,
+    nichols as nichols,
+    nyquist as nyquist,
+    plot as plot,
+    step as step,
+)
 from .tables import table as table

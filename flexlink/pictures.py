@@ -14,7 +14,6 @@ from control_design.analysis.certificate import Certificate
 from control_design.analysis.closed_loop import ClosedLoopTrajectory
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant, frequency_response
-from control_design.specification import Specification
 from control_design.synthesis.synthesis_result import SynthesisResult
 from diagnosis.answer import Diagnosis
 from flexlink.design import measured_response, state_space
@@ -29,7 +28,7 @@ from ident.uncertainty import ResponsePosterior
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["bode", "compare", "plot"]
+__all__ = ["bode", "compare", "nichols", "nyquist", "plot", "step"]
 
 
 @singledispatch
@@ -54,9 +53,15 @@ def unknown(what: str, result: object, of: Any) -> str:
     return f"no {what} of {type(result).__name__}; there is one of {', '.join(known)}"
 
 
-def bode(result: Any) -> Figure:
+def bode(
+    result: Any, *, ax: Any = None, dB: bool = False, Hz: bool = False, omega_rad_s: Any = None
+) -> Figure:
     """Gain, phase and size of the ellipses of one response: an identification, a model, an uncertainty, a
-    measured response, an uncertain plant, a controller, or a discrete system of python-control (ss, tf, frd).
+    measured response, an uncertain plant, a controller, a discrete system of python-control (ss, tf, frd), or
+    the loop of a design or a certificate.
+
+    ax: three axes to draw on (two: without the ellipses' size) in place of a new figure. dB, Hz: gain in dB,
+    frequency in Hz. omega_rad_s (F,): frequencies; a measured response has its own.
 
     Examples
     --------
@@ -64,21 +69,34 @@ def bode(result: Any) -> Figure:
     >>> [axes.get_ylabel() for axes in flexlink.bode(found).axes[:3]]
     ['gain [as logged]', 'phase [deg]', 'ellipse / gain [%]']
     """
-    model = getattr(result, "model", result)
-    return _bode(as_response(result), getattr(model, "input_name", "u"), getattr(model, "output_name", "y"))
+    from workflow.figures.bode import draw_bode, draw_comparison
+
+    found, model = as_response(result, omega_rad_s), getattr(result, "model", result)
+    name = f"{getattr(model, 'input_name', 'u')} to {getattr(model, 'output_name', 'y')}"
+    if ax is not None and np.size(ax) < 3:
+        return draw_comparison({name: found}, ax=ax, dB=dB, Hz=Hz)
+    return draw_bode(found, name, "as logged", ax=ax, dB=dB, Hz=Hz)
 
 
-def compare(*results: Any, names: str | Sequence[str] = ()) -> Figure:
+def compare(
+    *results: Any,
+    names: str | Sequence[str] = (),
+    ax: Any = None,
+    dB: bool = False,
+    Hz: bool = False,
+    omega_rad_s: Any = None,
+) -> Figure:
     """Several responses on one plot, each as for `bode`; ellipses as bands where there are any.
 
-    names: of the curves, in the same order; one may stand by itself. Raises ValueError for another
-    number of names, TypeError for what has no response.
+    names: of the curves, in the same order; one may stand by itself. ax: two axes, gain and phase. dB, Hz,
+    omega_rad_s: as of `bode`. Raises ValueError for another number of names or axes, TypeError for what has
+    no response.
 
     Examples
     --------
     >>> found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
     >>> rough = flexlink.identify(example_record(), n_pairs=0, n_real=2)
-    >>> figure = flexlink.compare(found, rough, names=["one mode", "two lags"])
+    >>> figure = flexlink.compare(found, rough, names=["one mode", "two lags"], dB=True)
     >>> [text.get_text() for text in figure.legends[0].get_texts()]
     ['one mode', 'two lags']
     """
@@ -88,30 +106,117 @@ def compare(*results: Any, names: str | Sequence[str] = ()) -> Figure:
     chosen = given or [f"{k + 1}: {type(result).__name__}" for k, result in enumerate(results)]
     if not results or len(chosen) != len(results):
         raise ValueError(f"expected a name for each response; got {len(results)} and {len(chosen)} names")
-    return draw_comparison(dict(zip(chosen, map(as_response, results), strict=True)))
+    found = (as_response(result, omega_rad_s) for result in results)
+    return draw_comparison(dict(zip(chosen, found, strict=True)), ax=ax, dB=dB, Hz=Hz)
 
 
-def as_response(result: Any) -> FrequencyUncertainty:
-    """The response of a result over three decades up to its Nyquist frequency, or where it was measured, with
-    its ellipses; without size where it is taken as exact."""
+def nyquist(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: Any = None) -> Figure:
+    """Nyquist curve of a loop with its ellipses: of a design or a certificate, or of a plant with a
+    controller, each as for `bode`. ax: axes to draw on.
+
+    Examples
+    --------
+    >>> law = flexlink.Controller.proportional(0.5, 0.01)
+    >>> figure = flexlink.nyquist(example_plant(), law)
+    >>> figure.axes[0].get_title(loc="left")
+    'Loop K G'
+    """
+    from workflow.figures.nyquist import draw_alone, draw_nyquist
+
+    return draw_alone(draw_nyquist, _loop_of(loop, controller, omega_rad_s), ax=ax)
+
+
+def nichols(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: Any = None) -> Figure:
+    """The same on a Nichols chart: gain [dB] over phase, with lines of constant closed-loop gain and phase.
+
+    Examples
+    --------
+    >>> law = flexlink.Controller.proportional(0.5, 0.01)
+    >>> figure = flexlink.nichols(example_plant(), law)
+    >>> figure.axes[0].get_xlabel()
+    'phase of K G [deg]'
+    """
+    from workflow.figures.nyquist import draw_alone, draw_nichols
+
+    return draw_alone(draw_nichols, _loop_of(loop, controller, omega_rad_s), ax=ax)
+
+
+def step(result: Any, controller: Any = None, *, ax: Any = None, time_s: Any = None) -> Figure:
+    """Step response of a plant or model as it is, or of its loop with a controller; of a design's or a
+    certificate's nominal loop. A loop has a second panel with its command.
+
+    ax: as many axes. time_s (T,): evenly sampled; if left out, until nothing moves. Raises TypeError for what
+    has no poles.
+
+    Examples
+    --------
+    >>> law = flexlink.Controller.proportional(0.5, 0.01)
+    >>> figure = flexlink.step(example_plant(), law)
+    >>> [axes.get_ylabel() for axes in figure.axes]
+    ['output\\n[as logged]', 'command\\n[as logged]']
+    """
+    from workflow.figures.closed_loop import draw_closed_loop
+    from workflow.tasks.results import LoopRuns
+
+    plant, controller = _parts(result, controller)
+    plant = state_space(getattr(plant, "nominal", getattr(plant, "model", plant)), "the plant")
+    law = None if controller is None else _law(controller)
+    found = control.step_response(plant if law is None else control.feedback(plant * law), time_s)
+    output, command, names = found.outputs[None], found.inputs[None], {"output": ("output", "")}
+    if law is not None:
+        command = control.forced_response(law, found.time, 1 - found.outputs).outputs[None]
+        names |= {"command": ("command", "")}
+    runs = LoopRuns(output, command, None, np.zeros_like(output, dtype=bool))
+    return draw_closed_loop(found.time, np.ones_like(found.time), runs, names, ax=ax)
+
+
+def _parts(result: Any, controller: Any) -> tuple[Any, Any]:
+    """Plant and controller of a design or a certificate, or those that were given."""
+    if isinstance(result, SynthesisResult):
+        return result.plants[0], result.controller
+    if isinstance(result, Certificate):
+        return result.uncertain_plants[0], result.controller
+    return result, controller
+
+
+def _loop_of(result: Any, controller: Any, omega_rad_s: Any) -> FrequencyUncertainty:
+    from workflow.figures.bands import times
+
+    plant, controller = _parts(result, controller)
+    found = as_response(plant, omega_rad_s)
+    if controller is None:
+        return found
+    return times(found, frequency_response(_law(controller), found.omega_rad_s))
+
+
+def _law(controller: Any) -> control.StateSpace:
+    """A controller with its computational delay."""
+    own = isinstance(controller, Controller)
+    return controller.to_control(include_delay=True) if own else state_space(controller, "the controller")
+
+
+def as_response(result: Any, omega_rad_s: Any = None) -> FrequencyUncertainty:
+    """The response of a result at omega (F,) or over three decades up to its Nyquist frequency, or where it
+    was measured, with its ellipses; without size where it is taken as exact. Of a design its loop."""
+    if isinstance(result, (SynthesisResult, Certificate)):
+        return _loop_of(result, None, omega_rad_s)
     found = getattr(result, "model", result)
     if isinstance(found, FrequencyUncertainty):
         return found
     if isinstance(found, UncertainPlant):
         if isinstance(found.uncertainty, (FrequencyUncertainty, ResponsePosterior)):
-            return as_response(found.uncertainty)
+            return as_response(found.uncertainty, omega_rad_s)
         found = found.nominal
     if isinstance(found, control.FrequencyResponseData):
         return measured_response(found)
+    if not isinstance(found, (ResponsePosterior, GobfModel)):
+        found = state_space(found, f"a {type(result).__name__}")
+    dt_s = float(found.dt if isinstance(found, control.StateSpace) else found.dt_s)
+    omega = _grid(dt_s) if omega_rad_s is None else np.asarray(omega_rad_s, dtype=np.float64)
     if isinstance(found, ResponsePosterior):
-        return found.at(_grid(found.dt_s))
-    if isinstance(found, GobfModel):
-        omega, dt_s = _grid(found.dt_s), found.dt_s
-        centre = found.frequency_response(omega)
-    else:
-        system = state_space(found, f"a {type(result).__name__}")
-        omega, dt_s = _grid(float(system.dt)), float(system.dt)
-        centre = frequency_response(system, omega)
+        return found.at(omega)
+    given = isinstance(found, GobfModel)
+    centre = found.frequency_response(omega) if given else frequency_response(found, omega)
     return FrequencyUncertainty(omega, centre, np.zeros((omega.size, 2, 2)), dt_s)
 
 
@@ -141,32 +246,20 @@ def _poles(found: Identification) -> Figure:
     return draw_poles(found.model)
 
 
-@plot.register(GobfModel)
-def _model(model: GobfModel) -> Figure:
-    return bode(model)
-
-
-@plot.register(ResponsePosterior)
-def _response(uncertainty: ResponsePosterior) -> Figure:
-    return bode(uncertainty)
-
-
-@plot.register(FrequencyUncertainty)
-def _bode(response: FrequencyUncertainty, input_name: str = "u", output_name: str = "y") -> Figure:
-    from workflow.figures.bode import draw_bode
-
-    return draw_bode(response, f"{input_name} to {output_name}", "as logged")
+for kind in (GobfModel, ResponsePosterior, FrequencyUncertainty):
+    plot.register(kind, bode)
 
 
 @plot.register(Certificate)
-def _certificate(certificate: Certificate) -> Figure:
-    assert certificate.controller is not None
-    return _loop(certificate.uncertain_plants[0], certificate.controller, certificate.specification)
-
-
 @plot.register(SynthesisResult)
-def _synthesis(result: SynthesisResult) -> Figure:
-    return _loop(result.plants[0], result.controller, result.specification)
+def _loop(result: Any) -> Figure:
+    from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
+
+    plant, controller = _parts(result, None)
+    assert result.specification is not None
+    omega = _grid(plant.dt_s) if plant.own_grid is None else plant.own_grid[plant.own_grid > 0]
+    curves = sensitivity_curves(plant, controller, result.specification, omega)
+    return draw_sensitivities(curves, level=plant.level)
 
 
 @plot.register(ClosedLoopTrajectory)
@@ -191,15 +284,6 @@ def _causes(found: Diagnosis) -> Figure:
     from workflow.figures.gap_answer import draw_probabilities
 
     return draw_probabilities(found)
-
-
-def _loop(plant: UncertainPlant, controller: Controller, specification: Specification | None) -> Figure:
-    from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
-
-    assert specification is not None
-    own = plant.own_grid
-    omega = _grid(plant.dt_s) if own is None else own[own > 0]
-    return draw_sensitivities(sensitivity_curves(plant, controller, specification, omega), level=plant.level)
 
 
 def _grid(dt_s: float) -> npt.NDArray[np.float64]:

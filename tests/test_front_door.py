@@ -313,6 +313,25 @@ def test_responses_of_any_origin_on_one_plot():
         flexlink.bode(control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]))
 
 
+def test_pictures_take_axes_scales_and_frequencies():
+    axes, omega = Figure().subplots(2, 3), np.array([1.0, 10.0, 40.0])
+    law, plant, z = flexlink.Controller.proportional(0.5, 0.01), example_plant(), np.exp(0.01j * omega)
+    loop = 0.5 / z * 0.1 / (z - 0.9)  # a sample of computational delay
+    more = {"omega_rad_s": omega}
+    flexlink.compare(plant, law, ax=axes[:, 0], dB=True, Hz=True, **more)
+    flexlink.nyquist(plant, law, ax=axes[0, 1], **more)
+    flexlink.nichols(flexlink.certify(law, plant, example_specification()), ax=axes[1, 1], **more)
+    flexlink.step(plant, law, ax=axes[:, 2])
+    bode, nyquist, nichols, step = (at.lines[0].get_xydata().T for at in axes.T.ravel()[[0, 2, 3, 4]])
+    np.testing.assert_allclose(bode, [omega / (2 * np.pi), 20 * np.log10(abs(loop * 2))])
+    np.testing.assert_allclose(nyquist, [loop.real, loop.imag])
+    np.testing.assert_allclose(nichols, [np.degrees(np.angle(loop)), 20 * np.log10(abs(loop))])
+    assert step[1, -1] == pytest.approx(1 / 3, rel=0.02)  # 0.5 / (1 + 0.5)
+    assert flexlink.bode(law, **more).axes[0].lines[0].get_ydata() == pytest.approx(0.5)
+    with pytest.raises(ValueError, match="expected 2 axes, one for each panel; got 3"):
+        flexlink.compare(plant, ax=axes[0])
+
+
 TF = control.tf([0.1, 0.05], [1.0, -1.5, 0.6], 0.01)
 OMEGA = np.array([20.0, 1.0, 5.0])
 

@@ -214,11 +214,10 @@ def build_run(
     impossible: bool = False,
     settled: int = 3,
     scatter: bool = True,
-    config_text: str = "# as given\n[run]\nname = 'example'\n",
 ) -> RunDirectory:
     """Write every stage but the report, through the same types and words as the real stages."""
     run = RunDirectory(path).begin_run(
-        config_text=config_text,
+        config_text="# as given\n[run]\nname = 'example'\n",
         config=settings.to_document(),
         seed=settings.run.seed,
         inputs={"log.csv": "ab" * 32},

@@ -255,11 +255,11 @@ def test_design_writes_what_the_ending_asks_for(flexlink, fast_run, tmp_path, mo
     assert ".json, .mat, .c" in refused.err
 
 
-def test_version_and_module_entry():
-    process = start_flexlink("--version")
+@pytest.mark.parametrize(("arguments", "words"), [(["--version"], "flexlink "), ([], "Exit codes")])
+def test_version_and_help_of_the_module_entry(arguments, words):
+    process = start_flexlink(*arguments)
     out, err = process.communicate()
-    assert process.returncode == 0, err.decode()
-    assert out.decode().startswith("flexlink ")
+    assert (process.returncode, err, words in out.decode()) == (0, b"", True)
 
 
 def test_every_command_takes_a_time_limit(flexlink, monkeypatch, tmp_path):
@@ -306,13 +306,6 @@ def test_what_nobody_expected_is_one_line(flexlink, monkeypatch, tmp_path, comma
     assert answer.err.startswith(f"flexlink: {line}")
     assert answer.err.count("\n") == 1
     assert ("Traceback" in flexlink("--debug", *call).err) == (code == 1)
-
-
-def test_main_without_arguments_shows_help(capsys):
-    assert main([]) == 0
-    captured = capsys.readouterr()
-    assert "Exit codes" in captured.out
-    assert captured.err == ""
 
 
 @pytest.mark.parametrize(

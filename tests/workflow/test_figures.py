@@ -11,12 +11,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
+import control
 import matplotlib as mpl
 import numpy as np
 import pytest
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from control_design.controllers.controller import Controller
 from ident.data.distortion import distortion_of
 from ident.data.record import Record
 from ident.uncertainty import FrequencyUncertainty
@@ -57,7 +59,7 @@ def pictures(name: str = "hub", unit: str = "V") -> Mapping[str, Figure]:
         run = RunResults(example.build_run(Path(folder) / "run", settings))
         patch.setattr(rendering, "render", lambda figure, also: figure)
         patch.setattr(rendering, "embedded", lambda name, *_: rendering.Drawn(name, Markup("<img>")))
-        view = RunView(settings, run, "", run.run.manifest())
+        view = RunView(settings, run, run.run.manifest())
         page = rendering.render_page(
             "report.html.j2", title="", run=view, study=False, certified=summarise(run, settings).certified
         )
@@ -216,9 +218,6 @@ def test_hostile_text_is_drawn_as_it_is():
     assert "$very$" in text  # no formula: the house style parses none
     assert "漢" not in text  # not in the font: a box, no warning
     assert len(text) == 60
-
-
-def test_units_are_never_guessed():
     assert style.two_lines("torque_Nm", "") == "torque_Nm\n[as logged]"
     assert style.two_lines("torque_Nm", "N m") == "torque_Nm\n[N m]"
 
@@ -265,26 +264,34 @@ def test_phase_starts_where_engineers_expect_it():
     assert phase[-1] == pytest.approx(-270, abs=5)
 
 
-@pytest.mark.parametrize("samples", [5, 2100, 2101, 12345])
-def test_outline_keeps_extremes_and_ends(samples):
-    rng = np.random.default_rng(samples)
-    time, signal = np.arange(samples) * 0.1, rng.standard_normal(samples)
-    t, s = outline(time, signal)
-    assert s.max() == signal.max()
-    assert s.min() == signal.min()
-    assert (t[0], t[-1]) == (time[0], time[-1])
-    assert np.all(np.diff(t) > 0)
-    assert t.size <= max(3 * 700, 2)
+@pytest.mark.parametrize("samples", [5, 600, 1777, 2100, 2101, 12345])
+def test_outline_and_envelope_keep_extremes_and_ends(samples):
+    time, signals = np.arange(samples) * 0.1, np.random.default_rng(samples).standard_normal((4, samples))
+    for (t, *ends), every in ((outline(time, signals[0]), signals[0]), (envelope(time, signals), signals)):
+        assert (t[0], t[-1]) == (time[0], time[-1])
+        assert (ends[0].min(), ends[-1].max()) == (every.min(), every.max())
+        assert np.all(np.diff(t) > 0)
+        assert t.size <= 3 * 700
 
 
-@pytest.mark.parametrize("samples", [10, 600, 1777])
-def test_envelope_covers_every_signal(samples):
-    rng = np.random.default_rng(2)
-    time, signals = np.arange(samples) * 1.0, rng.standard_normal((4, samples))
-    t, low, high = envelope(time, signals)
-    assert (t[0], t[-1]) == (time[0], time[-1])
-    assert low.min() == signals.min()
-    assert high.max() == signals.max()
+def test_margins_in_the_picture_are_those_of_the_loop():
+    known = example.plant().nominal * example.controller().to_control(include_delay=True)
+    gain, phase, *_ = control.stability_margins(control.frd(known, np.geomspace(0.3, 300, 2000)))
+    words = " ".join(text.get_text() for text in pictures()["bode-loop"].legends[0].get_texts())
+    said = [float(re.search(f"{name} margin ([-.0-9]+)", words)[1]) for name in ("phase", "gain")]
+    assert said == pytest.approx([phase, 20 * np.log10(gain)], rel=0.02)
+
+
+@pytest.mark.parametrize(("n", "D"), [(1, 0.0), (4, 0.0), (4, 2.0), (7, -1.0)])
+def test_a_law_to_copy_is_the_law(n, D):
+    rng, z = np.random.default_rng(n), np.exp(1j * np.array([0.01, 0.3, 2.0]))
+    A, *BC = (rng.standard_normal(shape) for shape in ((n, n), (n, 1), (1, n)))
+    law = Controller(A / (1.5 * np.sqrt(n)), *BC, [[D]], 0.01)
+    found, known = RunView.forms(law), law.to_control()(z)
+    rows = found["sos"] @ np.kron(np.eye(2), z ** -np.arange(3)[:, None])
+    np.testing.assert_allclose(np.prod(rows[:, :3] / rows[:, 3:], axis=0), known, rtol=1e-8)
+    np.testing.assert_allclose(control.tf(found["num"], found["den"], 0.01)(z), known, rtol=1e-8)
+    np.testing.assert_allclose(control.zpk(found["z"], found["p"], found["k"], 0.01)(z), known, rtol=1e-8)
 
 
 def test_sensitivity_curves_bound_every_member():
@@ -328,12 +335,6 @@ def test_a_run_that_leaves_the_scene_does_not_flatten_the_others():
     wild = LoopRuns(runs.output * 1e6, runs.command * 1e6, runs.performance * 1e6, runs.limited)
     low, high = loop_figure(loop, wild).axes[0].get_ylim()
     assert high - low < 10 * np.ptp(loop.predicted_runs.output)
-
-
-def test_loop_without_disturbance_or_performance():
-    loop = example.loop_check(example.config(), 3)
-    labels = {kind: LABELS[kind] for kind in ("output", "command")}
-    assert len(draw_closed_loop(loop.time_s, loop.reference, loop.predicted_runs, labels).axes) == 2
 
 
 def test_missing_records_are_refused():

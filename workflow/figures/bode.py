@@ -119,7 +119,7 @@ def draw_bode(
         # Evenly spread on the log axis: the thousands of a long record hide each other.
         first, last = np.searchsorted(empirical.omega_rad_s, [omega[0], np.nextafter(omega[-1], np.inf)])
         spread = np.searchsorted(empirical.omega_rad_s, np.geomspace(omega[0], omega[-1], 300))
-        index = np.unique(np.clip(spread, first, max(last - 1, first)))
+        index = np.unique(np.clip(spread, first, last - 1))
         at, response = empirical.omega_rad_s[index], empirical.centre[index]
         seen = y(np.maximum(np.abs(response), _gain_floor(band.gain, measured)))
         gain.plot(x(at), seen, **_DOTS, label="straight from the records, no model", zorder=1)
@@ -128,7 +128,7 @@ def draw_bode(
         response = model.frequency_response(omega)
         gain.plot(x(omega), y(np.abs(response)), **_NOMINAL, label="nominal model")
         phase.plot(x(omega), degrees_near(response, band.phase_deg), **_NOMINAL)
-    _frame(gain, phase, style.plain(unit, 24), band, dB=dB, Hz=Hz)
+    _frame(gain, phase, style.plain(unit, 24), band, measured=measured, dB=dB, Hz=Hz)
     gain.set_title(title)
     relative = 100 * uncertainty.ellipse().semi_major[uncertainty.omega_rad_s > 0] / band.gain
     size.fill_between(x(omega), np.full_like(relative, 1e-12), relative, **style.BAND)
@@ -177,14 +177,17 @@ def draw_loop(run: RunView) -> Figure:
     law = replace(
         loop, centre=run.controller.response(loop.omega_rad_s), covariance=np.zeros_like(loop.covariance)
     )
-    unit = style.plain(style.ratio_unit(run.input_unit, run.output_unit), 24)
     figure, grid = style.panels(6.4, 2, 2, sharex=True, height_ratios=[1.3, 1.0])
     filled = style.BAND | {"label": f"{share(loop.level)} ellipses"}
     for (gain, phase), response, of, title in zip(
-        grid.T, (law, loop), (unit, "1"), ("Controller K", "Loop K G"), strict=True
+        grid.T,
+        (law, loop),
+        (style.ratio_unit(run.input_unit, run.output_unit), "1"),
+        ("Controller K", "Loop K G"),
+        strict=True,
     ):
         band = _draw(gain, phase, response, style.PREDICTED_LINE | {"label": "nominal"}, filled)
-        _frame(gain, phase, of, band)
+        _frame(gain, phase, style.plain(of, 24), band)
         gain.set_title(title)
     _mark_margins(gain, phase, band)
     return figure
@@ -233,7 +236,6 @@ def _draw(
         phase.fill_between(at, band.phase_low_deg, band.phase_high_deg, **filled)
     gain.plot(at, y(band.gain), **look)
     phase.plot(at, band.phase_deg, **look)
-    gain.set_ylim(bottom=min(float(y(floor)), gain.get_ylim()[0]) if len(gain.lines) > 1 else float(y(floor)))
     return band
 
 
@@ -242,17 +244,19 @@ def _frame(
     phase: Axes,
     unit: str,
     *bands: ResponseBand,
+    measured: Real | None = None,
     dB: bool = False,
     Hz: bool = False,
 ) -> None:
     """Scales and labels of gain and phase: absolute and rad/s, dB and Hz on the far sides, or one alone."""
-    x, _ = _units(dB, Hz)
+    x, y = _units(dB, Hz)
     every = np.concatenate([band.phase_deg for band in bands])
     ends = [float(x(end)) for band in bands for end in (band.omega_rad_s[0], band.omega_rad_s[-1])]
     gain.set(xscale="log", yscale="linear" if dB else "log", ylabel=f"gain [{'dB' if dB else unit}]")
     phase.set(xscale="log", ylabel="phase [deg]", xlabel=f"frequency [{'Hz' if Hz else 'rad/s'}]")
     for axes in (gain, phase):
         axes.set_xlim(min(ends), max(ends))
+    gain.set_ylim(bottom=float(y(min(_gain_floor(band.gain, measured) for band in bands))))
     span = np.ptp(every)
     phase.yaxis.set_major_locator(MultipleLocator(90 if span < 400 else 180 if span < 1000 else 360))
     phase.set_ylim(*style.pad_limits(float(every.min()), float(every.max()), 0.15))
@@ -264,7 +268,7 @@ def _frame(
 
 def _gain_floor(gain: Real, empirical: Real | None = None) -> float:
     """Bottom of the gain axis: below the response, above the noise of an empirical response at a notch."""
-    smallest = float(gain[gain > 0].min())
+    smallest = float(np.min(gain, where=gain > 0, initial=gain.max() or 1.0))
     positive = gain if empirical is None else empirical[empirical > 0]
     return min(smallest, float(np.percentile(positive, 2)) if positive.size else smallest) / 3
 

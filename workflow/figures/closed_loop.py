@@ -113,12 +113,12 @@ def _draw_runs(axes: Axes, time_s: Real, runs: Real, machine: str, hold: Mapping
     """Runs (R, T) of a machine as a band with the first as a line, those of other plants as a band."""
     count = runs.shape[0]
     if not machine:
-        label = f"{count} plants from the uncertainty"
-        axes.fill_between(*envelope(time_s, runs), **style.BAND, label=label)
+        axes.fill_between(*envelope(time_s, runs), **style.BAND, label=f"{count} plants from the uncertainty")
         return
     if count > 1:
-        label = f"{machine}: all {count} runs"
-        axes.fill_between(*envelope(time_s, runs), **style.ACHIEVED_BAND, label=label)
+        axes.fill_between(
+            *envelope(time_s, runs), **style.ACHIEVED_BAND, label=f"{machine}: all {count} runs"
+        )
     label = f"{machine}: first run" if count > 1 else machine
     axes.plot(*outline(time_s, runs[0], 180), **style.ACHIEVED_LINE, **hold, label=label)
 

@@ -29,7 +29,6 @@ class JointsView:
 
     config: JointsConfig
     results: JointsResults
-    config_text: str
     manifest: Mapping[str, Any]
 
     @property

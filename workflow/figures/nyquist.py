@@ -67,12 +67,13 @@ def draw_nyquist(
     if near:
         side = float(np.clip(1.35 * max(distance[nearest], modulus_margin, 0.35), 0.5, 1.3))
         real, imag = (-1 - side, -1 + 1.25 * side), (-1.12 * side, 1.12 * side)
-    inside = (edges.real.max(axis=1) > real[0]) & (edges.real.min(axis=1) < real[1])
-    inside &= (edges.imag.max(axis=1) > imag[0]) & (edges.imag.min(axis=1) < imag[1])
-    seen = edges[np.append(np.flatnonzero(inside), nearest)]  # the last one is always drawn
+    low, high = np.array([real, imag]).T
+    both = np.stack([edges.real, edges.imag], axis=-1)
+    inside = np.all((both.max(axis=1) > low) & (both.min(axis=1) < high), axis=1)
     axes.set(xlim=real, ylim=imag, aspect="equal")
     axes.set(xlabel="real part of K G [1]", ylabel="imaginary part of K G [1]")
-    _fill(axes, np.stack([seen.real, seen.imag], axis=-1), loop.level)
+    # The last one is always drawn.
+    _fill(axes, both[np.append(np.flatnonzero(inside), nearest)], loop.level)
     axes.plot(centre.real, centre.imag, **style.PREDICTED_LINE, label="loop at the centres")
     _arrow(axes, centre, real, imag)
     axes.axhline(0, color="#999999", lw=0.7)
@@ -86,8 +87,8 @@ def draw_nyquist(
         label = f"nearest: {at_least(distance[nearest])} at {loop.omega_rad_s[nearest]:.4g} rad/s"
         axes.plot([-1, touch.real], [0, touch.imag], color=style.ACHIEVED, lw=1.2)
         axes.plot([touch.real], [touch.imag], marker="o", ms=6, color=style.ACHIEVED, ls="none", label=label)
-    beyond = "" if near or size.max() < reach else " (partly beyond the frame)"
-    axes.set_title(f"Loop{' around -1' if near else ' K G'}{beyond}")
+    beyond = " K G" if size.max() < reach else " K G (partly beyond the frame)"
+    axes.set_title(f"Loop{' around -1' if near else beyond}")
 
 
 def draw_nichols(axes: Axes, loop: FrequencyUncertainty) -> None:
@@ -132,8 +133,8 @@ def _arrow(axes: Axes, centre: Complex, real: tuple[float, float], imag: tuple[f
     """Direction of rising frequency, half-way along the longest visible run."""
     x, y = centre.real, centre.imag
     seen = (x > real[0]) & (x < real[1]) & (y > imag[0]) & (y < imag[1])
-    steps = np.where(seen[:-1] & seen[1:], np.abs(np.diff(centre)), 0.0)
-    if steps.sum() > 0:
-        k = min(int(np.searchsorted(np.cumsum(steps), 0.35 * steps.sum())), centre.size - 2)
+    length = np.cumsum(np.where(seen[:-1] & seen[1:], np.abs(np.diff(centre)), 0.0))
+    if length.size and length[-1] > 0:
+        k = min(int(np.searchsorted(length, 0.35 * length[-1])), centre.size - 2)
         look = {"arrowstyle": "-|>", "color": style.PREDICTED, "lw": 1.4, "mutation_scale": 14}
         axes.annotate("", xy=(x[k + 1], y[k + 1]), xytext=(x[k], y[k]), arrowprops=look)

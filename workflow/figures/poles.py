@@ -58,8 +58,7 @@ def draw_poles(
         if model.integrators:
             label = f"integrator (x {model.integrators})"
             axes.plot([1], [0], ls="none", marker="*", ms=10, color=style.REFERENCE, label=label)
-    where = f": {style.plain(name, 13)}" if name else ""
-    whole.set_title(f"Poles, zeros{where} (sampled every {model.dt_s * 1e3:.4g} ms)")
+    whole.set_title(f"Poles, zeros: {style.plain(name or 'model', 13)} ({model.dt_s * 1e3:.4g} ms)")
     near.set_title("Near z = 1 (dashed: damping, dotted: frequency)")
     return figure
 

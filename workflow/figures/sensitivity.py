@@ -119,9 +119,8 @@ def draw_sensitivities(
         draw_curve(axes, curve, level)
         note = "" if curve.exact else " (band: upper bound)"
         axes.set_title(f"{curve.symbol}: {curve.meaning}{note}", fontsize=9.5)
-        omega = curve.omega_rad_s
         for at, word in marks:
-            if omega[0] < at < omega[-1]:
+            if curve.omega_rad_s[0] < at < curve.omega_rad_s[-1]:
                 style.tag_below(axes, at, word)
     for axes in panels[-2:]:
         axes.set_xlabel("frequency [rad/s]")

@@ -12,9 +12,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy import signal
 
 from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller
+from control_design.controllers.law import Law
 from control_design.plants.frequency_grid import frequency_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification
@@ -160,7 +162,6 @@ class RunView:
 
     config: RunConfig
     results: RunResults
-    config_text: str
     manifest: Mapping[str, Any]
 
     @property
@@ -221,6 +222,24 @@ class RunView:
         """As the run's files have it."""
         return Logged.of(self.config, self.results.records).law(self.controller)
 
+    @staticmethod
+    def forms(law: Law) -> dict[str, Any]:
+        """Zeros, poles and gain in z of a law with one input and output, its numerator and denominator with
+        the highest power first, and its second-order sections, as lists of scipy.signal."""
+        system, here = law.to_control(), np.exp(1j)
+        found = [system.zeros(), system.poles()]
+        # Rounding leaves pairs that are not quite conjugate, and zeros at infinity that are not quite there.
+        found = [each[(each.imag >= 0) & (np.abs(each) < 1e9)] for each in found]
+        zeros, poles = (
+            np.concatenate([part, part[part.imag > 1e-9].conj()]) for part in (np.round(f, 13) for f in found)
+        )
+        gain = float(np.real(system(here) * np.prod(here - poles) / np.prod(here - zeros)))
+        above, below = signal.zpk2tf(zeros, poles, gain)
+        # scipy's sections hold powers of 1/z: each zero fewer than there are poles is a delay of one sample.
+        delays = [[0.0, 1.0, 0.0, 1.0, 0.0, 0.0]] * (poles.size - zeros.size)
+        sections = np.vstack([signal.zpk2sos(zeros, poles, gain), *delays])
+        return {"z": zeros, "p": poles, "k": gain, "num": above, "den": below, "sos": sections}
+
     @property
     def plant(self) -> UncertainPlant:
         return self.results.uncertainty.plant(self.config)
@@ -237,30 +256,9 @@ class RunView:
         return self.level if joint is None else max(self.level, joint.level)
 
     @property
-    def proved(self) -> bool:
-        """Whether the certificate speaks for every frequency between the grid's points too."""
-        certificate = self.results.certify.certificate
-        return certificate is not None and all(v.all_frequencies.proved for v in certificate.plants)
-
-    @property
     def shares(self) -> Mapping[str, Any]:
         """Shares of sampled responses that hold and are stable, with their 95 % intervals."""
         return joint_numbers(self.results.certify.sampled)
-
-    @property
-    def requirements(self) -> list[tuple[str, Any, str, str]]:
-        """Name, value, unit and meaning of what the specification asks for."""
-        asked = self.specification
-        rows = []
-        for name, field in type(asked).model_fields.items():
-            value = getattr(asked, name)
-            if name in _NOT_A_REQUIREMENT or value is None or value is False:
-                continue
-            if name == "low_frequency_rejection" and (asked.bandwidth_rad_s is None or asked.integrator):
-                continue
-            unit = unit_of(name, self.input_unit, self.output_unit)
-            rows.append((name, value, unit, field.description or ""))
-        return rows
 
     @property
     def largest_recorded_input(self) -> float:
@@ -297,7 +295,6 @@ class RunView:
         return np.asarray(every[(every > 0) & (every <= omega[-1])])
 
 
-_NOT_A_REQUIREMENT = {"structure", "controller_order", "computational_delay_samples"}
 _ENDINGS = (("_rad_s", "rad/s"), ("_s", "s"))
 
 

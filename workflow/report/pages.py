@@ -12,50 +12,40 @@ from typing import Any
 
 from workflow.config.joints_config import JointsConfig
 from workflow.config.run_config import RunConfig
-from workflow.engine import documents, storage
+from workflow.engine import storage
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.joints import JointsView
 from workflow.figures.subjects import RunView, log_channel
 from workflow.report.rendering import RenderedPage, render_page
 from workflow.tasks.joints import JOINT_STAGES
 from workflow.tasks.log_identification import LogIdentification
-from workflow.tasks.results import ReportResult, RunRecord, RunResults
+from workflow.tasks.results import ReportResult, RunRecord
 from workflow.tasks.stage import Stage, StageInput
 from workflow.tasks.stages import STAGES
 from workflow.tasks.summary import summarise, title_of
 
 
 def write_report(
-    results: RunResults,
-    config: RunConfig,
+    results: Any,
+    config: RunConfig | JointsConfig,
     progress: Callable[[float, str], None] | None = None,
     also: Iterable[str] = (),
 ) -> Path:
     """Draw every picture into `figures/`, and write `report.html`: all of them or none.
 
-    also: kinds of file beside SVG, pdf or png.
+    results: RunResults or JointsResults, as the configuration is. also: kinds of file beside SVG, pdf or png.
     Pictures of an earlier report that this run no longer has are removed. Returns the path of the page.
     Raises InputError when a stage the report cannot do without is missing, or the disk refuses.
     """
-    run = results.run
-    view = RunView(config, results, _text_of(run), run.manifest())
-    study = (run.path.parent.parent / "study.html").is_file()  # of which this run is a point
-    page = render_page(
-        "report.html.j2",
-        progress,
-        also=also,
-        title=title_of(config, run),
-        run=view,
-        study=study,
-        certified=summarise(results, config).certified,
-    )
-    return _write(run, page)
-
-
-def _text_of(run: RunDirectory) -> str:
-    """The configuration as the user wrote it."""
-    text = run.path / "config.toml"
-    return documents.read_text(text) if text.is_file() else ""
+    run, template = results.run, "joints.html.j2"
+    view: Any = JointsView
+    more: dict[str, Any] = {}
+    if isinstance(config, RunConfig):
+        view, template = RunView, "report.html.j2"
+        more = {"study": (run.path.parent.parent / "study.html").is_file()}  # of which this run is a point
+        more["certified"] = summarise(results, config).certified
+    shown = {"title": title_of(config, run), "run": view(config, results, run.manifest())}
+    return _write(run, render_page(template, progress, also=also, **shown, **more))
 
 
 def _write(run: RunDirectory, page: RenderedPage) -> Path:
@@ -78,28 +68,10 @@ def write_page(stage: StageInput, also: Iterable[str] = ()) -> ReportResult:
     return ReportResult(storage.sha256_of_file(path))
 
 
-def write_joints_page(stage: StageInput, also: Iterable[str] = ()) -> ReportResult:
-    """The same of a run for several joints."""
-    config: Any = stage.config
-    results: Any = stage.results
-    run = results.run
-    page = render_page(
-        "joints.html.j2",
-        partial(stage.progress.update, "report"),
-        also=also,
-        title=title_of(config, run),
-        run=JointsView(config, results, _text_of(run), run.manifest()),
-    )
-    return ReportResult(storage.sha256_of_file(_write(run, page)))
-
-
 def page_of(config: RunConfig | JointsConfig, also: Iterable[str] = ()) -> Stage:
     """The stage that writes the page of a run. also: kinds of file for its pictures beside SVG."""
-    if isinstance(config, JointsConfig):
-        return (
-            JOINTS_REPORT if not also else replace(JOINTS_REPORT, run=partial(write_joints_page, also=also))
-        )
-    return REPORT if not also else replace(REPORT, run=partial(write_page, also=also))
+    stage = JOINTS_REPORT if isinstance(config, JointsConfig) else REPORT
+    return replace(stage, run=partial(write_page, also=also)) if also else stage
 
 
 REPORT = Stage(
@@ -115,7 +87,7 @@ REPORT = Stage(
 JOINTS_REPORT = Stage(
     "report",
     tuple(stage.name for stage in JOINT_STAGES),
-    write_joints_page,
+    write_page,
     expected_s=5.0,
     uses={"run": True, "joints": True},
     also_writes=lambda run: (run.report_path,),
