@@ -89,7 +89,7 @@ def test_a_run_ends_with_a_certified_controller_and_a_page(run_of_the_arm):
     np.testing.assert_array_equal(mat["A"], law.A)
     np.testing.assert_array_equal(mat["input_limit"], [[24.0, 24.0]])
     page = (run_of_the_arm / "report.html").read_text()
-    assert "Certified: every requirement is met, and the loop settles at 1 of 1 operating point" in page
+    assert "Certified: every requirement is met" in page
     for picture in ("joint-steps", "joint-requirements", "matrix-response", "mode-shapes"):
         assert (run_of_the_arm / "figures" / f"{picture}.svg").is_file()
     status = json.loads((run_of_the_arm / "manifest.json").read_text())["status"]

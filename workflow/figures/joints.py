@@ -31,11 +31,6 @@ class JointsView:
     results: JointsResults
     manifest: Mapping[str, Any]
 
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Outputs, as the columns are called."""
-        return tuple(joint.output for joint in self.config.joints)
-
     @cached_property
     def worst(self) -> tuple[Real, dict[str, Real]]:
         """Frequencies (F,) [rad/s], and by requirement the largest worst case over the plants there (F,)."""
@@ -212,7 +207,7 @@ def draw_mode_shapes(run: JointsView) -> Figure | None:
     for axes, (omega, zeta, moved) in zip(panels, shaped, strict=True):
         axes.bar(np.arange(moved.size), moved, color=style.MODEL, width=0.5)
         axes.axhline(0.0, color="#444444", lw=0.8)
-        axes.set_xticks(np.arange(moved.size), [style.plain(name, 16) for name in run.joint_names])
+        axes.set_xticks(np.arange(moved.size), [style.plain(joint.output, 16) for joint in run.config.joints])
         axes.set_title(f"{omega / (2 * np.pi):.3g} Hz, damping {zeta:.2g}", fontsize=9.5)
         axes.set_ylim(-1.15, 1.15)
     panels[0].set_ylabel("motion [largest = 1]")

@@ -69,7 +69,12 @@ def marked(figure: Figure, reaches: list[tuple[float, float]]) -> dict[str, Any]
                 ],
             }
         )
-    columns = sorted((low / figure.dpi * POINT, high / figure.dpi * POINT) for low, high in reaches)
+    # A colour bar stays with what is left of it.
+    bars = [hasattr(axes, "_colorbar") for axes in figure.axes if axes.get_visible()]
+    columns = sorted(
+        (0.0 if bar else low / figure.dpi * POINT, high / figure.dpi * POINT)
+        for bar, (low, high) in zip(bars, reaches, strict=True)
+    )
     above = [legend.get_window_extent(renderer).y1 / figure.dpi * POINT for legend in figure.legends]
     return {
         "axes": described,

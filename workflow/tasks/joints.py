@@ -340,10 +340,11 @@ def design_joints(stage: StageInput) -> JointsDesignResult:
         except SpecificationError as impossible:
             return JointsDesignResult(None, str(impossible))
     first = found.blocking[0]
+    joint = config.joints[first.joint or 0]
     return JointsDesignResult(
         found,
-        f"worst case {found.gamma:.3f} (at most 1 is needed), of {first.weight} of joints[{first.joint}], "
-        f"{first.plant}, at "
+        f"worst case {found.gamma:.3f} (at most 1 is needed), of {first.weight} of "
+        f"{joint.input if first.weight == 'effort' else joint.output}, {first.plant}, at "
         f"{first.omega_rad_s:.3g} rad/s",
     )
 

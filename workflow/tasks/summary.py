@@ -82,6 +82,7 @@ def summarise_joints(results: JointsResults, config: JointsConfig) -> RunSummary
     return RunSummary(
         title=title_of(config, results.run),
         sections=rows_of("summary/joints.j2", config=config, results=results),
+        brief=rows_of("summary/joints_brief.j2", config=config, results=results),
         numbers={
             "points": [codec.plain(point, arrays=False) for point in results.identify.points],
             "design": {
