@@ -31,15 +31,15 @@ from control_design.plants.ellipses import (
     quotient,
     secular_root,
 )
-from control_design.plants.first_order import FirstOrder, FrequencyIntervals, RationalResponse
+from control_design.plants.first_order import FrequencyIntervals, RationalResponse
 from control_design.plants.frequency_grid import starting_edges
 from control_design.plants.plant_set import Mode, UncertainPlant, frequency_response
 from control_design.plants.set_expansion import Expand, SetExpansion, expandable
 from control_design.specification import Specification
 from control_design.specification.requirement import WeightedRequirement
 
-_EXCESS = 0.002  # asked of every bound over the dense maximum; 0.005 is promised
-_LEAST_EXCESS = 1e-5  # where a dense maximum lies this close under its limit
+EXCESS = 0.002  # asked of every bound over the dense maximum; 0.005 is promised
+LEAST_EXCESS = 1e-5  # where a dense maximum lies this close under its limit
 _MOST_INTERVALS = 60_000  # limit of work, and of memory: a proof that needs more is given up
 _PARTS = 3  # an interval that is not good enough is cut in so many
 _MODEL_ERROR = 1e-6  # largest relative disagreement of zeros and poles with the state space
@@ -153,7 +153,15 @@ class _Loop:
             numerator = weight.expand(intervals, i_plant).times(self.controller.expand(intervals, own))
         else:
             numerator = weight.expand(intervals, own + i_plant)
-        upper, middle = _quotient(numerator, ends), quotient(np.abs(numerator.value), at_middle, np.inf)
+        # Convex over concave is largest at an end.
+        at_ends = [
+            quotient(np.abs(numerator.end(side)) + numerator.remainder, low, np.inf)
+            for side, low in ends.items()
+        ]
+        upper, middle = (
+            np.maximum(np.maximum(*at_ends), 0.0),
+            quotient(np.abs(numerator.value), at_middle, np.inf),
+        )
         if each.channel is not None:
             channel = each.channel(intervals, 0)
             largest = np.maximum(_farthest(channel, -1), _farthest(channel, 1)) + channel.remainder()
@@ -190,14 +198,6 @@ class _Loop:
         if each.requirement.function.of_controller:
             factor = factor.times(k)
         return np.where(good, factor.largest() * bound, np.inf), np.abs(factor.value) * most
-
-
-def _quotient(numerator: FirstOrder, ends: dict[int, Real]) -> Real:
-    """Upper bound of |numerator|/denominator: convex over concave is largest at an end."""
-    result = np.zeros(numerator.value.size)
-    for side, low in ends.items():
-        result = np.maximum(result, quotient(np.abs(numerator.end(side)) + numerator.remainder, low, np.inf))
-    return result
 
 
 def _normal(point: Complex, shape: Real) -> Complex:
@@ -278,9 +278,9 @@ def bound_all_frequencies(
         return AllFrequencies.ended_by(Obstacle.INEXACT, difference)
     names = [each.requirement.name for each in loop.asked]
     most = np.array([worst.peak(name)[0] for name in names])
-    targets = most * (1.0 + _EXCESS)
+    targets = most * (1.0 + EXCESS)
     close = (most <= 1.0) & (targets > 1.0)
-    targets[close] = np.maximum(1.0, most[close] * (1.0 + _LEAST_EXCESS))
+    targets[close] = np.maximum(1.0, most[close] * (1.0 + LEAST_EXCESS))
     found, used = _bisect(loop.bounds, edges, plant.dt_s, targets)
     result = _verdict(found, names, used, own + plant.n_integrators, unstable)
     if result.distance > 0:  # the modulus was bisected, the distance only came along
@@ -334,7 +334,7 @@ def _bisect(
         found = evaluate(FrequencyIntervals(0.5 * (low + high), 0.5 * (high - low), dt_s))
         used += low.size
         seen = np.max(found.middle, axis=1, initial=0.0, where=np.isfinite(found.middle))
-        targets = np.maximum(targets, (1.0 + _EXCESS) * seen)
+        targets = np.maximum(targets, (1.0 + EXCESS) * seen)
         wide = ~(found.distance > 0) | np.any(found.upper > targets[:, None], axis=0)
         # An interval at the limit of double precision is as good as it gets.
         wide &= high - low > 1e-11 * high

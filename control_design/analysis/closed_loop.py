@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, Protocol
 
 import control
@@ -19,14 +20,19 @@ from ident.data.arrays import COMPILED, INSIDE, kernel_array, lock
 from ident.data.shown import Shown
 
 
-class SampledMachine(Protocol):
-    """A machine sampled every dt_s: measure at t_k, then hold the input until t_{k+1}. `plant.SampledArm` and
-    `LinearMachine` are; they have the whole loop compiled too, as `in_loop`, which `simulate` then calls."""
+class MeasuredMachine(Protocol):
+    """A machine that is measured every dt_s."""
 
     @property
     def dt_s(self) -> float: ...
     def reset(self) -> None: ...
     def measure(self) -> Real: ...
+
+
+class SampledMachine(MeasuredMachine, Protocol):
+    """A machine sampled every dt_s: measure at t_k, then hold the input until t_{k+1}. `plant.SampledArm` and
+    `LinearMachine` are; they have the whole loop compiled too, as `in_loop`, which `simulate` then calls."""
+
     def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None: ...
 
 
@@ -47,16 +53,12 @@ class LinearMachine:
                 "LinearMachine needs D = 0: the measurement at t_k comes before the command at t_k"
             )
         self._a, self._b, self._c = (np.array(getattr(system, m), dtype=np.float64, order="C") for m in "ABC")
-        self._dt_s = float(system.dt)
+        self.dt_s = float(system.dt)
         self.reset()
 
     def __init_subclass__(cls) -> None:
         if {"measure", "advance"} & vars(cls).keys():  # the compiled loop would not know of it
             cls.in_loop = cls.joints_in_loop = None  # type: ignore[assignment]
-
-    @property
-    def dt_s(self) -> float:
-        return self._dt_s
 
     def reset(self) -> None:
         self._x = np.zeros(self._a.shape[0])
@@ -254,9 +256,8 @@ def simulate(
         raise ValueError("measurement_step and command_step must not be negative")
     time_s = np.asarray(np.arange(n) * controller.dt_s, dtype=np.float64)
     if (in_loop := getattr(machine, "in_loop", None)) is not None:
-        joins = np.zeros(n)
-        if controller.feedforward is not None:
-            joins = controller.feedforward.signal(wanted, controller.dt_s)
+        own = controller.feedforward
+        joins = np.zeros(n) if own is None else own.signal(wanted, controller.dt_s)
         delay, steps = controller.computational_delay_samples, np.array([measurement_step, command_step])
         signals = np.column_stack([wanted, joins, shift, added, torque])
         y, u, at_limit = in_loop(signals, *law_arrays(controller), steps, delay, measured_index, clip)
@@ -298,13 +299,9 @@ def law_arrays(controller: Controller) -> tuple[Real, Real]:
     return law, np.concatenate([controller.limits("input_limit"), change])
 
 
-class JointsMachine(Protocol):
+class JointsMachine(MeasuredMachine, Protocol):
     """A machine with several commands and measurements, as `SampledMachine` has one command."""
 
-    @property
-    def dt_s(self) -> float: ...
-    def reset(self) -> None: ...
-    def measure(self) -> Real: ...
     def advance(self, u: Real, /) -> None: ...
 
 
@@ -398,18 +395,15 @@ def measure_sensitivity(
     **excitation: Any,
 ) -> MeasuredSensitivity:
     """S measured on a machine: excitation as of `sensitivity_of`, the other keywords as of `simulate`."""
-
-    def run(reference: Real) -> ClosedLoopTrajectory:
-        return simulate(
-            controller,
-            machine,
-            reference,
-            measured_index=measured_index,
-            measurement_step=measurement_step,
-            command_step=command_step,
-            clip=clip,
-        )
-
+    run = partial(
+        simulate,
+        controller,
+        machine,
+        measured_index=measured_index,
+        measurement_step=measurement_step,
+        command_step=command_step,
+        clip=clip,
+    )
     return sensitivity_of(run, rng, dt_s=controller.dt_s, **excitation)
 
 

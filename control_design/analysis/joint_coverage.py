@@ -93,9 +93,8 @@ def joint_coverage(
     if not plants:
         raise ValueError("joint coverage needs at least one plant")
     loops = [SampledLoop(controller, plant, specification) for plant in plants]
-    found = [loop.gamma(rng, draws) for loop in loops]
-    gamma = np.max([one.gamma for one in found], axis=0)
-    outside = np.max([one.distance for one in found], axis=0)
+    gammas, stable, distances = zip(*(loop.gamma(rng, draws) for loop in loops), strict=True)
+    gamma, outside = np.max(gammas, axis=0), np.max(distances, axis=0)
     # The worst case at a radius is compared in standard deviations, common to all plants.
     wanted = float(np.quantile(gamma, coverage, method="higher"))
     given = [radius_of(loop.plant.level) for loop in loops]
@@ -118,29 +117,17 @@ def joint_coverage(
         gamma_given=at_given,
         coverage_given=float(np.mean(gamma <= at_given)),
         simultaneous_given=float(
-            np.mean(np.all([one.distance <= r for one, r in zip(found, given, strict=True)], axis=0))
+            np.mean(np.all([one <= r for one, r in zip(distances, given, strict=True)], axis=0))
         ),
         simultaneous_level=_level(float(np.quantile(outside, coverage))),
-        stable_share=float(np.mean(np.all([one.stable for one in found], axis=0))),
+        stable_share=float(np.mean(np.all(stable, axis=0))),
     )
 
 
 def at_level(plant: UncertainPlant, level: float) -> UncertainPlant:
     """The plant with ellipses of another level, its performance channel with it."""
-    performance = plant.performance
-    if performance is not None:
-        performance = replace(performance, level=level)
+    performance = plant.performance and replace(plant.performance, level=level)
     return replace(plant, level=level, performance=performance)
-
-
-@dataclass(frozen=True, eq=False)
-class SampledGamma:
-    """Per draw, (D,): gamma(G) (inf where 1 + K G does not wind as a stable loop's), stable, and the largest
-    normalised distance of the measured response from the centre, in standard deviations."""
-
-    gamma: Real
-    stable: Boolean
-    distance: Real
 
 
 class SampledLoop:
@@ -207,8 +194,10 @@ class SampledLoop:
             stable[wide], _ = winds(responses(fine)[wide] * loop, **self._required)
         return stable
 
-    def gamma(self, rng: np.random.Generator, draws: int) -> SampledGamma:
-        """Draw posterior samples and evaluate them (a Monte Carlo check)."""
+    def gamma(self, rng: np.random.Generator, draws: int) -> tuple[Real, Boolean, Real]:
+        """Of posterior samples (a Monte Carlo check), (D,) each: gamma(G) (inf where 1 + K G does not wind as
+        a stable loop's), stable, and the largest normalised distance of the measured response from the
+        centre, in standard deviations."""
         other = None if self.plant.performance is None else drawn(self.plant.performance)
         asked = any(each.channel is not None and np.any(each.own > 0) for each in self.data.weightings)
         gamma, stable, distance = np.zeros(draws), np.zeros(draws, dtype=bool), np.zeros(draws)
@@ -219,7 +208,7 @@ class SampledLoop:
             stable[here] = self.stable_of(responses, members)
             gamma[here] = np.where(stable[here], self.gamma_of(members, performance), np.inf)
             distance[here] = self.distance_of(members)
-        return SampledGamma(gamma, stable, distance)
+        return gamma, stable, distance
 
 
 def unstable_draws(

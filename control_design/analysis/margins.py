@@ -15,11 +15,11 @@ import numpy as np
 from scipy.optimize import brentq
 
 from control_design.plants.ellipses import Complex, Ellipses, Real
-from control_design.plants.frequency_grid import local_maxima
+from control_design.plants.frequency_grid import around_maxima
 
 _TOUCHES = 1e-9  # relative distance from the real axis or the unit circle that counts as a crossing without
 # a change of sign: the finest the search between the points resolves
-_ROUNDS, _MINIMA, _INSERTED = 4, 16, 9  # each round divides the neighbourhood of every minimum by ten
+_ROUNDS, _MINIMA = 4, 16  # each round divides the neighbourhood of every minimum by ten
 _ROUNDED = 1e-6  # relative; what the search may miss of a smallest value, taken off the margins of ellipses
 
 
@@ -123,7 +123,6 @@ def _crossings(
 
         omega, parts = _refined(lambda w: sizes(loop_gain(w)), omega, sizes(value), (2, 3, 4))
         value = parts[0] + 1j * parts[1]
-    found: list[tuple[float, complex]] = []
 
     def refine(function: Callable[[complex], float], k: int) -> tuple[float, complex]:
         low, high = float(omega[k]), float(omega[k + 1])
@@ -142,18 +141,14 @@ def _crossings(
         return low + share * (high - low), complex(value[k] + share * (value[k + 1] - value[k]))
 
     imag, size = np.imag(value), np.abs(value) - 1.0
-    for k in np.flatnonzero(np.sign(imag[:-1]) * np.sign(imag[1:]) < 0):
-        if min(value[k].real, value[k + 1].real) < 0:
-            place, x = refine(lambda v: v.imag, int(k))
-            found.append((place, complex(x.real, 0.0)))
-    for k in np.flatnonzero(size[:-1] * size[1:] < 0):
-        place, x = refine(lambda v: abs(v) - 1.0, int(k))
-        found.append((place, x / abs(x)))
-    inner = slice(1, -1)
-    for k in np.flatnonzero(_off_axis(value)[inner] <= _TOUCHES) + 1:
-        found.append((float(omega[k]), complex(value[k].real, 0.0)))
-    for k in np.flatnonzero(np.abs(size[inner]) <= _TOUCHES) + 1:
-        found.append((float(omega[k]), complex(value[k] / abs(value[k]))))
+    turns = np.flatnonzero(np.sign(imag[:-1]) * np.sign(imag[1:]) < 0)
+    turns = turns[np.minimum(value.real[turns], value.real[turns + 1]) < 0]
+    on_axis = [refine(lambda v: v.imag, int(k)) for k in turns]
+    on_axis += [(float(omega[k]), value[k]) for k in np.flatnonzero(_off_axis(value)[1:-1] <= _TOUCHES) + 1]
+    on_circle = [refine(lambda v: abs(v) - 1.0, int(k)) for k in np.flatnonzero(size[:-1] * size[1:] < 0)]
+    on_circle += [(float(omega[k]), value[k]) for k in np.flatnonzero(np.abs(size[1:-1]) <= _TOUCHES) + 1]
+    found = [(place, complex(x.real, 0.0)) for place, x in on_axis]
+    found += [(place, complex(x / abs(x))) for place, x in on_circle]
     return found, float(np.min(np.abs(1 + value)))
 
 
@@ -293,16 +288,7 @@ def _refined(
     """Grid and values with more points between the neighbours of the smallest local minima of the values
     sought."""
     for _ in range(_ROUNDS):
-        finer = []
-        for which in sought:
-            value = values[which]
-            for index in local_maxima(-value)[:_MINIMA]:
-                if np.isfinite(value[index]):
-                    low, high = omega[max(index - 1, 0)], omega[min(index + 1, omega.size - 1)]
-                    finer.append(np.linspace(low, high, _INSERTED + 2)[1:-1])
-        if not finer:
-            break
-        new = np.setdiff1d(np.concatenate(finer), omega)
+        new = around_maxima(omega, [-values[which] for which in sought], _MINIMA)
         if not new.size:
             break
         omega, values = _joined(omega, values, new, evaluate(new))

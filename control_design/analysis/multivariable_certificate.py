@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
+from control_design.analysis.between_grid_points import EXCESS, LEAST_EXCESS
 from control_design.analysis.stability import NominalLoop, NyquistCount, nyquist_count
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Real
@@ -32,7 +33,6 @@ from control_design.plants.weights import RationalWeight
 from control_design.specification.multivariable import MultivariableSpecification, gram
 from ident.data.shown import Shown
 
-_EXCESS = 0.002  # of a bound for all frequencies over the dense maximum
 _PIECES = 3000  # at most, of one requirement
 _CROSSES = 1e-6  # relative real part below which an eigenvalue counts as imaginary
 _AT_ONE = 1e-7  # distance from z = 1 of an integrator
@@ -200,9 +200,9 @@ def _verdict(
             if not np.isfinite(worst[name]):
                 obstacle = f"{name}: some member of the uncertainty is unstable at {worst_at[name]:.4g} rad/s"
                 continue
-            level = worst[name] * (1 + _EXCESS)
+            level = worst[name] * (1 + EXCESS)
             if worst[name] <= 1.0 < level:
-                level = max(1.0, worst[name] * (1 + 1e-5))
+                level = max(1.0, worst[name] * (1 + LEAST_EXCESS))
             system, sizes = _scaled_loop(controller, plant, of, each)
             stopped = _covered(system, sizes, level, np.abs(s), scalings[name], start)
             bounds[name] = level if stopped is None else float("inf")

@@ -20,13 +20,12 @@ from control_design.plants.ellipses import (
     largest_disturbance_gain,
     quotient,
 )
-from control_design.plants.frequency_grid import GridOptions, local_maxima, programme_grid
+from control_design.plants.frequency_grid import GridOptions, around_maxima, programme_grid
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction, WeightedRequirement
 
-# Local maxima that a round refines, and the points it puts between the neighbours of each.
-_PEAKS, _INSERTED = 8, 9
+_PEAKS = 8  # local maxima that a round refines
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,13 +194,8 @@ def worst_case(
 
     found = found_at(np.asarray(start, dtype=np.float64))
     for _ in range(rounds if plant.own_grid is None else 0):
-        omega, finer = found.omega_rad_s, list[Real]()
-        for name, value in found.values.items():
-            if name != "distance" and np.any(value > 0):
-                for index in local_maxima(value)[:_PEAKS]:
-                    low, high = omega[max(index - 1, 0)], omega[min(index + 1, omega.size - 1)]
-                    finer.append(np.linspace(low, high, _INSERTED + 2)[1:-1])
-        new = np.setdiff1d(np.concatenate(finer), omega) if finer else omega[:0]
+        sizes = [value for name, value in found.values.items() if name != "distance" and np.any(value > 0)]
+        new = around_maxima(found.omega_rad_s, sizes, _PEAKS)
         if not new.size:
             break
         found = found.joined(found_at(new))

@@ -23,7 +23,7 @@ from control_design.plants.frequency_grid import with_violations
 _ROUND_NUMERATOR = 1e-3
 _ROUND_REACH = 1e-4  # denominators are about one: off by at most 1e-4, at the kink alone
 _ROUND_FEASIBILITY = 1e-2  # while denominators are being made positive: their maximum may sit on the kink
-_EXCESS = 5e-4  # relative; accepted of the dense check over the programme
+EXCHANGE_TOLERANCE = 5e-4  # relative; accepted of the dense check over the programme
 _MOST_STEPS = 200  # of the interior point in one round; 5 to 40 are usual
 # Singular values of the basis below this fraction are no directions of the search: rounding. The best Q of an
 # unstable plant with a resonance has a part at 1e-13.
@@ -154,7 +154,7 @@ def exchanged(
         values = check(start)
         found = Exchanged(start, values, point.gamma)
         best = found if found.worst < best.worst else replace(best, gamma=point.gamma)
-        limit = point.gamma * (1.0 + _EXCESS)
+        limit = point.gamma * (1.0 + EXCHANGE_TOLERANCE)
         if found.worst <= limit:
             break
         for number, (omega, value) in enumerate(zip(dense, values, strict=True)):

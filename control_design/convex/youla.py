@@ -162,7 +162,8 @@ class BracketProblem:
             lean = self.grids.lean()[0]
             if region == "ellipse":
                 return self._ellipse(lean, begin)
-            return self._smallest(self._basis(lean), self._rows(lean, region, self._loop(lean)), begin)
+            rows = self._rows(lean, region, self._loop(lean))
+            return smallest_ratio(self._basis(lean), rows, begin, accuracy=self.accuracy)
 
         found = exchanged(
             solve,
@@ -176,15 +177,13 @@ class BracketProblem:
         x = start if found.x is None else found.x
         return found.worst, np.zeros(self.dense_basis.shape[1]) if x is None else x
 
-    def _smallest(self, basis: Complex, rows: PlaneRows, start: Real | None) -> MinimaxPoint:
-        return smallest_ratio(basis, rows, start, accuracy=self.accuracy)
-
     def _ellipse(self, data: PlantData, start: Real | None) -> MinimaxPoint:
         basis, loop = self._basis(data), self._loop(data)
         point = MinimaxPoint(np.zeros(basis.shape[1]), np.inf)
         for _ in range(_ELLIPSE_ROUNDS):
             angles = None if start is None else _best_angles(loop, data, basis @ start)
-            new = self._smallest(basis, self._rows(data, "ellipse", loop, angles), start)
+            rows = self._rows(data, "ellipse", loop, angles)
+            new = smallest_ratio(basis, rows, start, accuracy=self.accuracy)
             before = point.gamma
             if new.gamma < before:
                 point, start = new, new.x

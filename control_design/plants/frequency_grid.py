@@ -120,9 +120,8 @@ def programme_grid(
     dense: bool = False,
 ) -> Real:
     """Frequencies of a programme, to begin with, or of its dense check."""
-    points = options.grid_points, options.mode_points
-    if dense:
-        points = int(0.7 * options.dense_points), int(0.3 * options.dense_points)
+    checked = int(0.7 * options.dense_points), int(0.3 * options.dense_points)
+    points = checked if dense else (options.grid_points, options.mode_points)
     low = options.omega_min_rad_s or lowest_rad_s(plant.dt_s, plant.poles)
     grid = frequency_grid(
         plant.nyquist_rad_s, modes, omega_min_rad_s=low, n_log=points[0], n_mode=points[1], extra=extra,
@@ -159,6 +158,18 @@ def local_maxima(value: Real) -> Integer:
     padded = np.concatenate([[-np.inf], value, [-np.inf]])
     index = np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:]))
     return np.asarray(index[np.argsort(-value[index], kind="stable")], dtype=np.int64)
+
+
+def around_maxima(omega: Real, values: Sequence[Real], most: int) -> Real:
+    """New frequencies, nine of them between the neighbours of each of the `most` largest local maxima
+    of each of the values (F,) at omega (F,); none at those of minus infinity."""
+    ends = [
+        (omega[max(at - 1, 0)], omega[min(at + 1, omega.size - 1)])
+        for value in values
+        for at in local_maxima(value)[:most]
+        if value[at] > -np.inf
+    ]
+    return np.setdiff1d([np.linspace(*both, 11)[1:-1] for both in ends], omega)
 
 
 def with_violations(grid: Real, omega: Real, value: Real, limit: float, most: int) -> Real:

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 
 from control_design.plants.ellipses import Complex, Real
-from control_design.plants.plant_set import Mode, delayed, matrix_response, modes_of
+from control_design.plants.plant_set import NominalPlant, delayed, matrix_response
 from control_design.plants.scaled_bound import conjugate
 from control_design.plants.weights import RationalWeight
 from ident.data.arrays import lock
@@ -103,7 +103,7 @@ class ResponseBall:
 
 
 @dataclass(frozen=True, eq=False)
-class MultivariablePlant:
+class MultivariablePlant(NominalPlant):
     """Nominal plant (discrete `control.StateSpace`, dt in seconds) and its uncertainty: U inputs, Y outputs,
     u = -K y.
 
@@ -160,23 +160,9 @@ class MultivariablePlant:
         return int(self.nominal.noutputs)
 
     @property
-    def dt_s(self) -> float:
-        return float(self.nominal.dt)
-
-    @property
     def own_grid(self) -> Real | None:
         """Frequencies where alone the uncertainty is known, or None."""
         return None if self.ball is None else self.ball.omega_rad_s
-
-    @cached_property
-    def poles(self) -> Complex:
-        """Nominal poles in z, (n,)."""
-        return np.asarray(np.linalg.eigvals(self.nominal.A), dtype=np.complex128)
-
-    @cached_property
-    def modes(self) -> tuple[Mode, ...]:
-        """Flexible modes of the nominal."""
-        return tuple(m for m in modes_of(self.poles, self.dt_s) if m.omega_rad_s < np.pi / self.dt_s)
 
     @cached_property
     def zeros(self) -> Complex:

@@ -16,8 +16,28 @@ if TYPE_CHECKING:
     import control
 
 
+class NominalPlant:
+    """What follows from a discrete nominal `control.StateSpace` alone."""
+
+    nominal: control.StateSpace
+
+    @property
+    def dt_s(self) -> float:
+        return float(self.nominal.dt)
+
+    @cached_property
+    def poles(self) -> Complex:
+        """Nominal poles in z, (n,)."""
+        return np.asarray(np.linalg.eigvals(self.nominal.A), dtype=np.complex128)
+
+    @cached_property
+    def modes(self) -> tuple[Mode, ...]:
+        """Flexible modes of the nominal, below the Nyquist frequency."""
+        return tuple(m for m in modes_of(self.poles, self.dt_s) if m.omega_rad_s < np.pi / self.dt_s)
+
+
 @dataclass(frozen=True, eq=False)
-class PlantChannel:
+class PlantChannel(NominalPlant):
     """One response with its uncertainty. nominal: SISO discrete `control.StateSpace`. uncertainty: an object
     with `at(omega, level)` (any frequency), a record with omega_rad_s, centre, covariance, level (its own
     frequencies only), or None (the nominal response is exact)."""
@@ -69,25 +89,11 @@ class PlantChannel:
                 )
 
     @property
-    def dt_s(self) -> float:
-        return float(self.nominal.dt)
-
-    @property
     def own_grid(self) -> Real | None:
         """Frequencies (F,) where alone the uncertainty is known, or None if it can be evaluated anywhere."""
         if self.uncertainty is None or hasattr(self.uncertainty, "at"):
             return None
         return np.asarray(self.uncertainty.omega_rad_s, dtype=np.float64)
-
-    @cached_property
-    def poles(self) -> Complex:
-        """Nominal poles in z, (n,)."""
-        return np.asarray(np.linalg.eigvals(self.nominal.A), dtype=np.complex128)
-
-    @cached_property
-    def modes(self) -> tuple[Mode, ...]:
-        """Flexible modes of the nominal, below the Nyquist frequency."""
-        return tuple(m for m in modes_of(self.poles, self.dt_s) if m.omega_rad_s < np.pi / self.dt_s)
 
     def nominal_response(self, omega_rad_s: Real) -> Complex:
         """G_nom(e^{j omega dt}), (F,); see `frequency_response`."""
@@ -201,7 +207,7 @@ def modes_of(poles_z: Complex, dt_s: float, *, zeta_below: float = 0.4) -> tuple
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class UncertainPlant(Shown):
+class UncertainPlant(NominalPlant, Shown):
     """Input -> measured output with ellipses (`PlantChannel`), one plant per load or operating point.
 
     integrators: poles at z = 1, None = counted; a number that contradicts the nominal is refused.
@@ -247,10 +253,6 @@ class UncertainPlant(Shown):
         return PlantChannel(self.nominal, self.uncertainty, self.level)
 
     @property
-    def dt_s(self) -> float:
-        return float(self.nominal.dt)
-
-    @property
     def nyquist_rad_s(self) -> float:
         return float(np.pi / self.dt_s)
 
@@ -258,11 +260,6 @@ class UncertainPlant(Shown):
     def damped(self) -> PlantChannel:
         """The channel whose |Gp S| the damping requirement bounds."""
         return self.channel if self.performance is None else self.performance
-
-    @property
-    def poles(self) -> Complex:
-        """Nominal poles in z, (n,)."""
-        return self.channel.poles
 
     @cached_property
     def zeros(self) -> Complex:
@@ -296,11 +293,6 @@ class UncertainPlant(Shown):
     def _other_poles(self) -> Complex:
         """Poles without the integrators."""
         return self.poles[np.argsort(np.abs(self.poles - 1.0), kind="stable")][self.n_integrators :]
-
-    @property
-    def modes(self) -> tuple[Mode, ...]:
-        """Flexible modes of the nominal, below the Nyquist frequency."""
-        return self.channel.modes
 
     @property
     def ellipse_modes(self) -> tuple[Mode, ...]:

@@ -210,12 +210,9 @@ class Specification(Settings):
 
     def on_controller(self) -> tuple[Requirement, ...]:
         """Requirements on the controller alone."""
-        found: list[Requirement] = []
-        if self.controller_damping is not None:
-            found.append(ControllerDamping(self.controller_damping))
-        if self.integrator:
-            found.append(ControllerIntegrator())
-        return tuple(found)
+        damping = self.controller_damping
+        rings = () if damping is None else (ControllerDamping(damping),)
+        return (*rings, *([ControllerIntegrator()] if self.integrator else []))
 
     def magnitude(self, plant: UncertainPlant, omega_rad_s: Real, function: LoopFunction) -> Real:
         """|W| (F,) on one closed-loop function, all requirements on it together; zeros where none is."""

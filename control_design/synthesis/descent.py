@@ -40,7 +40,16 @@ class MinimaxDescent:
     ) -> None:
         self.cascade, self.stable = cascade, stable
         self.rows = LoopRows(cascade, plants)
-        self._low, self._high = parameter_bounds(cascade)
+        # Logarithms kept within a few decades of the scale: exp() never overflows in a wild step.
+        low: list[float] = []
+        for kind in cascade.sections:
+            low += {
+                "integrator": [-np.inf] * 2,
+                "first_order": [-np.inf] * 2 + [-12.0],
+                "second_order": [-np.inf] * 3 + [-12.0, -20.0],
+                "notch": [-12.0, -12.0, -20.0],
+            }[kind]
+        self._low, self._high = np.array(low), -np.array(low)
         slack = [] if controller_damping is None else list(cascade.pair_positions)
         self._damping_rows = np.zeros((len(slack), cascade.parameters))
         for row, at in enumerate(slack):
@@ -102,9 +111,8 @@ class MinimaxDescent:
 
     def _logs(self, x: Real) -> Real | None:
         """Logarithms (R,) of all weighted values; None for an unstable loop or an ellipse over -1."""
-        if not self.stable(x) or self.rows.covers_minus_one(x):
-            return None
-        return self.rows.rows(x)
+        inside = self.stable(x) and not self.rows.covers_minus_one(x)
+        return self.rows.rows(x) if inside else None
 
     def _local(self, x: Real, multipliers: Real | None) -> _Local:
         """Rows, slopes and (with multipliers of the rows) their common curvature, made semi-definite."""
@@ -158,16 +166,3 @@ def natural_units(cascade: Cascade, x: Real) -> Real:
         units += (gain * powers).tolist()
         units += [] if kind == "integrator" else [1.0] * degree
     return np.array(units)
-
-
-def parameter_bounds(cascade: Cascade) -> tuple[Real, Real]:
-    """Logarithms kept within a few decades of the scale: exp() never overflows in a wild step."""
-    low: list[float] = []
-    for kind in cascade.sections:
-        low += {
-            "integrator": [-np.inf] * 2,
-            "first_order": [-np.inf] * 2 + [-12.0],
-            "second_order": [-np.inf] * 3 + [-12.0, -20.0],
-            "notch": [-12.0, -12.0, -20.0],
-        }[kind]
-    return np.array(low), -np.array(low)

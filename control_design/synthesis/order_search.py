@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import zip_longest
+from operator import attrgetter
 
 import numpy as np
 
 from control_design.controllers.biquads import Cascade
+from control_design.convex.minimax import EXCHANGE_TOLERANCE
 from control_design.plants.ellipses import Real
 from control_design.synthesis.descent import MinimaxDescent, natural_units
-from control_design.synthesis.problem import EXCHANGE_TOLERANCE
+from control_design.synthesis.problem import Problem
 from control_design.synthesis.starts import StartMaker, with_gain
-from control_design.synthesis.synthesis_result import StartReport
-from control_design.synthesis.workshop import STEPS, StartTask, TriedController, Workshop
+from control_design.synthesis.synthesis_result import LARGEST_GAMMA, StartReport
 from control_design.synthesis.youla_starts import FreeControllers, fitted
 
 Told = Callable[[float, str], None]
 
+_STEPS = 100  # of the descent
 _DRAWS = 200  # shaped loops drawn; each costs 1 ms
 _LOW_GAIN = 4  # with tracking: starts of little gain
 _CARRIED = 3  # candidates carried through the exchange, and shaped loops that are started from
@@ -40,6 +43,16 @@ _NEAR, _FAIR, _FINER = 1.03, 1.05, 1.1
 
 
 @dataclass(frozen=True, eq=False)
+class TriedController:
+    """Where a start ended: parameters, worst case on the lean grid it came from and on the dense grid (inf:
+    unstable, or not checked)."""
+
+    parameters: Real
+    gamma_grid: float
+    gamma: float
+
+
+@dataclass(frozen=True, eq=False)
 class OrderResult:
     """Best candidate of one order (None: nothing stable), how the starts did, gamma after every round.
 
@@ -57,16 +70,16 @@ class OrderSearch:
 
     def __init__(
         self,
-        workshop: Workshop,
+        problem: Problem,
         cascade: Cascade,
         rng: np.random.Generator,
         tell: Told,
         given: Sequence[Real] = (),
     ) -> None:
-        self.workshop, self.problem = workshop, workshop.problem
-        self.cascade, self.rng, self.tell, self.given = cascade, rng, tell, given
-        self.options, self.spec = self.problem.options, self.problem.spec
+        self.problem, self.cascade, self.rng, self.tell, self.given = problem, cascade, rng, tell, given
+        self.options, self.spec = problem.options, problem.spec
         self.reports: list[StartReport] = []
+        self._known: tuple[list[Real], MinimaxDescent] | None = None
 
     def run(self) -> OrderResult:
         """Starts, descent from each, exchange with hops."""
@@ -76,12 +89,12 @@ class OrderSearch:
         ]
         if self._enough(found):
             return OrderResult(found[0], (), (found[0].gamma,))
-        tasks = self._starts()
-        drawn = len(tasks) - len(self.given)
+        starts = self._starts()
+        drawn = len(starts) - len(self.given)
         least = len(self.given) + max((drawn + 1) // 2, min(drawn, 3))
         ends: list[TriedController] = []
-        for number, end in enumerate(self._done(tasks)):
-            self.tell(0.5 * (number + 1) / len(tasks), f"start {number + 1} of {len(tasks)}")
+        for number, end in enumerate(map(self._end, starts)):
+            self.tell(0.5 * (number + 1) / len(starts), f"start {number + 1} of {len(starts)}")
             ends.append(end)
             found.append(end)
             if self._enough(found):
@@ -136,12 +149,10 @@ class OrderSearch:
     def _raced(self, starts: Sequence[Real]) -> list[TriedController]:
         """Where `_TRIAL` steps lead from each start, the best first and from there to its end; not checked
         between the points of the grid unless it may be enough."""
-        tried = list(self._done([self._task(x, steps=_TRIAL) for x in starts]))
-        tried.sort(key=lambda c: c.gamma_grid)
+        tried = sorted((self._end(x, _TRIAL, checked=False) for x in starts), key=lambda c: c.gamma_grid)
         if tried and np.isfinite(tried[0].gamma_grid):
-            limit = self.options.sufficient_gamma
-            tried[:1] = self._done([self._task(tried[0].parameters, steps=STEPS)])
-            if tried[0].gamma_grid <= limit:
+            tried[0] = self._end(tried[0].parameters, checked=False)
+            if tried[0].gamma_grid <= self.options.sufficient_gamma:
                 tried[:1] = self._checked(tried[:1])
         return tried
 
@@ -200,7 +211,7 @@ class OrderSearch:
             for c in lost:
                 self.problem.add_violated(self.cascade, c.parameters, c.gamma_grid)
             retreats = [self._retreat(c.parameters) for c in lost]
-            lost = list(self._done([self._task(x) for x in retreats if x is not None]))
+            lost = [self._end(x) for x in retreats if x is not None]
             kept += [c for c in lost if np.isfinite(c.gamma)]
             lost = [c for c in lost if np.isfinite(c.gamma_grid) and not np.isfinite(c.gamma)]
         return sorted(kept, key=lambda c: c.gamma)
@@ -213,27 +224,32 @@ class OrderSearch:
                 return trial
         return None
 
-    def _agree(self, found: Sequence[TriedController], enough: int | None = None) -> bool:
+    def _agree(self, found: Sequence[TriedController]) -> bool:
         """Enough descents ended at the best value: more of them would hardly find another."""
         stable = [c.gamma_grid for c in found if np.isfinite(c.gamma_grid)]
-        return sum(g <= min(stable) * _AGREE for g in stable) >= (enough or self.options.agreeing_starts)
+        return sum(g <= min(stable) * _AGREE for g in stable) >= self.options.agreeing_starts
 
     def _enough(self, found: Sequence[TriedController]) -> bool:
         return min((c.gamma for c in found), default=np.inf) <= self.options.sufficient_gamma
 
-    def _task(self, parameters: Real, *, steps: int | None = None) -> StartTask:
-        """steps: without the dense check."""
-        grids = tuple(self.problem.grids)
-        return StartTask(self.cascade, parameters, grids, steps or STEPS, checked=steps is None)
-
-    def _done(self, tasks: Sequence[StartTask]) -> Iterator[TriedController]:
-        """Where they ended, one after the other; what was run is noted."""
-        for end in map(self.workshop.do, tasks):
-            self.reports += end.reports
-            yield end
+    def _end(self, start: Real, steps: int = _STEPS, *, checked: bool = True) -> TriedController:
+        """Where the descent from a start ends; checked: on the dense grid, too. What was run is noted."""
+        x, gamma, taken = self._descent().run(start, steps)
+        dense = self.problem.gamma(self.cascade, x) if checked and np.isfinite(gamma) else np.inf
+        seen = min(gamma, LARGEST_GAMMA), dense if np.isfinite(dense) else None
+        self.reports.append(StartReport("descent", taken, *seen))
+        return TriedController(x, gamma, dense)
 
     def _descent(self) -> MinimaxDescent:
-        return self.workshop.descent(self.cascade, tuple(self.problem.grids))
+        """On the lean grids as they are now; kept until they change."""
+        problem, cascade, grids = self.problem, self.cascade, list(self.problem.grids)
+        if self._known is None or not all(map(np.array_equal, self._known[0], grids)):
+            damping = self.spec.controller_damping
+            descent = MinimaxDescent(
+                cascade, problem.rows(grids), partial(problem.stable, cascade), controller_damping=damping
+            )
+            self._known = grids, descent
+        return self._known[1]
 
     def _maker(self) -> StartMaker:
         return StartMaker(
@@ -246,18 +262,16 @@ class OrderSearch:
             keeps_sign=self.problem.asks_tracking or self.problem.integrators > 0,
         )
 
-    def _starts(self) -> list[StartTask]:
+    def _starts(self) -> list[Real]:
         maker = self._maker()
-        given = [self._task(x) for x in self.given]
         if any(plant.unstable_poles for plant in self.problem.plants):
-            stable = maker.stabilising(self._radius, max(self.options.starts, _CARRIED))
-            return [*given, *map(self._task, stable)]
-        shaped = [self._task(x) for x, _ in maker.shaped(_DRAWS, self.options.starts)]
-        random = [self._task(maker.low_gain()) for _ in range(self.options.starts)]
+            return [*self.given, *maker.stabilising(self._radius, max(self.options.starts, _CARRIED))]
+        shaped = [x for x, _ in maker.shaped(_DRAWS, self.options.starts)]
+        random = [maker.low_gain() for _ in range(self.options.starts)]
         if self.problem.asks_tracking:
-            return [*given, *random[:_LOW_GAIN], *shaped[:_CARRIED]]
-        mixed = [start for pair in zip_longest(shaped, random) for start in pair if start is not None]
-        return [*given, *mixed]
+            return [*self.given, *random[:_LOW_GAIN], *shaped[:_CARRIED]]
+        mixed = (start for pair in zip_longest(shaped, random) for start in pair if start is not None)
+        return [*self.given, *mixed]
 
     def _exchange(self, found: list[TriedController], *, hops: bool = True) -> OrderResult:
         """Add violated frequencies of the best candidates, improve them on the finer grid, and again.
@@ -284,7 +298,7 @@ class OrderSearch:
             count = min(_HOPS if number == 0 else _LATER_HOPS, self.options.starts) if hops else 0
             starts += [self._hop(pool[0].parameters) for _ in range(count)]
             fresh = []
-            for at, end in enumerate(self._done([self._task(x) for x in starts])):
+            for at, end in enumerate(map(self._end, starts)):
                 fresh.append(end)
                 if number == 0 and at >= len(pool) and self._agree(fresh):
                     break
@@ -309,8 +323,7 @@ class OrderSearch:
             if agreed or self._enough([best]):
                 break
             self.problem.add_violated(self.cascade, current.parameters, current.gamma_grid)
-            current = self.workshop.do(self._task(current.parameters))
-            self.reports += current.reports
+            current = self._end(current.parameters)
             if not np.isfinite(current.gamma):
                 break
             best = min(best, current, key=lambda c: c.gamma)
@@ -333,9 +346,7 @@ def different(
     """Best candidates that differ in gamma (on_grid: of their lean grid) by more than 0.1 %: the same optimum
     twice teaches nothing."""
 
-    def gamma(candidate: TriedController) -> float:
-        return candidate.gamma_grid if on_grid else candidate.gamma
-
+    gamma = attrgetter("gamma_grid" if on_grid else "gamma")
     kept: list[TriedController] = []
     for candidate in sorted(candidates, key=gamma):
         if all(abs(gamma(candidate) / gamma(other) - 1) > _AGREE - 1 for other in kept):

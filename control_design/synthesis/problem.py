@@ -10,6 +10,7 @@ from control_design.analysis.stability import NominalLoop, winds
 from control_design.analysis.worst_case import Grids, PlantData, worst_of
 from control_design.controllers.biquads import SOLVER_SLACK, Cascade
 from control_design.controllers.controller import Controller
+from control_design.convex.minimax import EXCHANGE_TOLERANCE
 from control_design.plants.ellipses import Complex, Ellipses, Real, scale_to_minus_one
 from control_design.plants.frequency_grid import lowest_rad_s, mode_points, with_violations
 from control_design.plants.guards import GUARD_MODULUS, Guard, sorted_by_plant
@@ -19,7 +20,6 @@ from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.rows import Rows
 from control_design.synthesis.synthesis_options import SynthesisOptions
 
-EXCHANGE_TOLERANCE = 5e-4  # accepted relative excess of the dense check over the programme
 _LIGHT = 0.05  # damping ratio; wider resonances do not fit between the points of a dense grid
 _PER_DECADE = 10  # of points below the grids, where nothing but slow real poles and zeros is
 _DELAY_COPY_MODULUS = 0.1  # distance from -1 asked of the delayed copies: stability with something to spare

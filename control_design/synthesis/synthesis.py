@@ -16,12 +16,11 @@ from control_design.plants.frequency_grid import local_maxima
 from control_design.plants.guards import Guard
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification, SpecificationError
-from control_design.synthesis.order_search import OrderResult, OrderSearch
+from control_design.synthesis.order_search import OrderResult, OrderSearch, TriedController
 from control_design.synthesis.problem import Problem
 from control_design.synthesis.starts import with_cancelling_section
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
-from control_design.synthesis.workshop import TriedController, Workshop
 from control_design.synthesis.youla_starts import FreeController, FreeControllers, free_controllers
 
 Progress = Callable[[float, str], None]
@@ -84,14 +83,13 @@ def synthesise(
     cascade = Cascade(specification.sections(), problem.dt_s, problem.scale_rad_s)
     ladder = _ladder(specification.sections(), _LOWEST_TRACKING if problem.asks_tracking else _LOWEST_ORDER)
     reports: list[StartReport] = []
-    workshop = Workshop(problem)
     grids = list(problem.grids)
-    search = OrderSearch(workshop, cascade, np.random.default_rng([root, 0]), part_of(tell, 0, 2))
+    search = OrderSearch(problem, cascade, np.random.default_rng([root, 0]), part_of(tell, 0, 2))
     result, settled = search.quick(free_controllers(problem.plants, specification))
     reports += search.reports
     if thorough and not settled:
         problem.grids[:] = grids  # what the fits violated may be of no concern to other starts
-        climbed = _climbed(workshop, ladder, root, result.best, part_of(tell, 1, 2), reports)
+        climbed = _climbed(problem, ladder, root, result.best, part_of(tell, 1, 2), reports)
         worse = result.best is None or (climbed.best and climbed.best.gamma <= result.best.gamma)
         result = climbed if worse else result
     found = _told(problem, cascade, result, tuple(reports), tell)
@@ -115,7 +113,7 @@ def _of_lowest_order(problem: Problem, root: int, tell: Progress, *, thorough: b
             "controller_order = 'auto' needs the Youla bound, which this plant has not; give a number"
         )
     enough = max(_WITHIN * free.gamma if np.isfinite(free.gamma) else 0.0, limit)
-    workshop, reports = Workshop(problem), list[StartReport]()
+    reports = list[StartReport]()
     found: dict[int, tuple[float, OrderResult, OrderSearch]] = {}
 
     def gamma(order: int) -> float:
@@ -126,7 +124,7 @@ def _of_lowest_order(problem: Problem, root: int, tell: Progress, *, thorough: b
         own = np.random.default_rng([root, order])
         if order - 2 in found and (lower := found[order - 2][1].best) is not None:
             given = _embedded(problem, replace(cascade, sections=sections[:-1]), lower, cascade, own)
-        search = OrderSearch(workshop, cascade, own, part, given)
+        search = OrderSearch(problem, cascade, own, part, given)
         result = search.fits_only(free)
         reports.extend(search.reports)
         found[order] = np.inf if result.best is None else result.best.gamma, result, search
@@ -176,10 +174,10 @@ def synthesise_near(
     specification.check_against(plants)
     tell = progress or (lambda fraction, message: None)
     problem = Problem(tuple(plants), _seen_by_the_data(specification, plants), options or SynthesisOptions())
-    cascade, workshop = Cascade(problem.spec.sections(), problem.dt_s, problem.scale_rad_s), Workshop(problem)
+    cascade = Cascade(problem.spec.sections(), problem.dt_s, problem.scale_rad_s)
     omega = problem.grids[0]
     known = FreeController(omega, controller.response(omega, with_delay=False))
-    result = OrderSearch(workshop, cascade, rng, tell).fits_only(FreeControllers((known,), np.inf))
+    result = OrderSearch(problem, cascade, rng, tell).fits_only(FreeControllers((known,), np.inf))
     return _told(problem, cascade, result, result.reports, tell)
 
 
@@ -203,7 +201,7 @@ def _told(
 
 
 def _climbed(
-    workshop: Workshop,
+    problem: Problem,
     ladder: Sequence[tuple[SectionKind, ...]],
     root: int,
     fitted: TriedController | None,
@@ -212,7 +210,7 @@ def _climbed(
 ) -> OrderResult:
     """Result of the last of the ladder's orders, each started from the one before and of its own; the last
     from the fitted one, too. What was run is added to the reports."""
-    problem, result = workshop.problem, OrderResult(None, (), ())
+    result = OrderResult(None, (), ())
     cascade: Cascade | None = None
     for number, sections in enumerate(ladder):
         lower, cascade = cascade, Cascade(sections, problem.dt_s, problem.scale_rad_s)
@@ -223,7 +221,7 @@ def _climbed(
         if number == len(ladder) - 1 and fitted is not None:
             given.append(fitted.parameters)
         part = part_of(tell, number, len(ladder), f"order {cascade.order}: ")
-        result = OrderSearch(workshop, cascade, own, part, given).run()
+        result = OrderSearch(problem, cascade, own, part, given).run()
         reports += result.reports
     return result
 
@@ -287,11 +285,12 @@ def _blocking(problem: Problem, cascade: Cascade, best: TriedController) -> tupl
     for _, data in problem.checks(cascade, best.parameters):
         omega = data.ellipses.omega_rad_s
         values = data.weighted(cascade.response(best.parameters, omega))
-        for name in (each.requirement.name for each in data.weightings):
-            for index in local_maxima(values[name])[:10]:
-                value = float(values[name][index])
-                if value >= _STILL_BLOCKING * best.gamma:
-                    points.append(BlockingPoint(data.plant.name, name, float(omega[index]), value))
+        points += [
+            BlockingPoint(data.plant.name, name, float(omega[at]), float(values[name][at]))
+            for name in (each.requirement.name for each in data.weightings)
+            for at in local_maxima(values[name])[:10]
+            if values[name][at] >= _STILL_BLOCKING * best.gamma
+        ]
     return tuple(sorted(points, key=lambda p: -p.value))
 
 
@@ -316,9 +315,11 @@ def what_destabilises(problem: Problem, cascade: Cascade, parameters: Real) -> t
             late.append((DELAYED, np.exp(-1j * omega * problem.spec.delay_margin_s)))
         for word, delay in late:
             scale = scale_to_minus_one(k * data.delay * delay, data.ellipses)
-            for at in local_maxima(-scale)[:_PLACES]:
-                if scale[at] <= 1.0:
-                    found.append((1, float(scale[at]), BlockingPoint(name, word, float(omega[at]), np.inf)))
+            found += [
+                (1, float(scale[at]), BlockingPoint(name, word, float(omega[at]), np.inf))
+                for at in local_maxima(-scale)[:_PLACES]
+                if scale[at] <= 1.0
+            ]
     points = [point for *_, point in sorted(found, key=lambda entry: entry[:2])]
     return tuple(points or _guards(problem, cascade, parameters) or _ringing(problem, cascade, parameters))
 
