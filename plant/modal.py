@@ -85,10 +85,7 @@ class Equations:
         return np.concatenate([np.zeros(direction.size), self._mobility @ direction])
 
     def position_row(self, direction: Real) -> Real:
-        return np.concatenate([direction, np.zeros(direction.size)])
-
-    def speed_row(self, direction: Real) -> Real:
-        return np.concatenate([np.zeros(direction.size), direction])
+        return np.pad(direction, (0, direction.size))
 
 
 def default_n_modes(rig: Rig) -> int:

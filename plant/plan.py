@@ -185,9 +185,7 @@ def _split_delay(delay_s: float, dt_s: float) -> tuple[int, float]:
     fraction = samples - whole
     if fraction < _SMALLEST_PART:
         return whole, 0.0
-    if fraction > 1 - _SMALLEST_PART:
-        return whole + 1, 0.0
-    return whole, fraction
+    return (whole + 1, 0.0) if fraction > 1 - _SMALLEST_PART else (whole, fraction)
 
 
 class _Builder:
@@ -207,17 +205,14 @@ class _Builder:
         self.oscillators = size
         self.n = size + 2 * len(machine.joint.disturbance)
 
-    def _row(self, mechanical_row: Real) -> Real:
-        return np.concatenate([mechanical_row, np.zeros(self.n - self.mechanical)])
-
     def _column(self, direction: Real) -> Real:
-        return self._row(self.equations.input_column(direction))
+        return np.pad(self.equations.input_column(direction), (0, self.n - self.mechanical))
 
     def _position(self, direction: Real) -> Real:
-        return self._row(self.equations.position_row(direction))
+        return np.pad(direction, (0, self.n - direction.size))
 
     def _speed(self, direction: Real) -> Real:
-        return self._row(self.equations.speed_row(direction))
+        return np.pad(direction, (direction.size, self.n - self.mechanical))
 
     def _motor_column(self) -> Real:
         return self.machine.rig.motor.torque_per_volt_Nm_V * self._column(self.equations.shaft)
@@ -299,36 +294,26 @@ class _Builder:
     def channels(self) -> tuple[Integer, Real, Real, Real]:
         """Smooth forces: kinds (J,), parameters (J, 3), position rows (J, N), force columns (N, J)."""
         machine, eq = self.machine, self.equations
-        kinds: list[int] = []
-        parameters: list[tuple[float, ...]] = []
-        rows: list[Real] = []
-        columns: list[Real] = []
-
-        def add(kind: int, values: tuple[float, ...], row: Real, column: Real) -> None:
-            kinds.append(kind)
-            parameters.append((*values, 0.0, 0.0, 0.0)[:3])
-            rows.append(row)
-            columns.append(column)
-
+        found: list[tuple[int, tuple[float, ...], Real, Real]] = []
         for e, (_, _, excess, velocity) in enumerate(self._friction()):
             if excess != 0:
-                add(STRIBECK, (excess, velocity, e), self._speed(eq.shaft), self._column(eq.shaft))
+                both = self._speed(eq.shaft), self._column(eq.shaft)
+                found.append((STRIBECK, (excess, velocity, e), *both))
         # By law: sums of two of them are the same to the last digit for either order of the effects.
         for torque in sorted(machine.joint.torques, key=lambda t: t.law):
             if torque.values[0] != 0:
                 place = eq.shaft if torque.at == "shaft" else eq.motor
                 row = self._position(place) if torque.of == "angle" else self._speed(place)
-                add(torque.law, torque.values, row, self._column(place))
+                found.append((torque.law, torque.values, row, self._column(place)))
         if machine.gravity_m_s2 != 0:
             values = machine.gravity_m_s2, static_moment_kg_m(machine.rig), machine.gravity_direction_rad
-            add(GRAVITY, values, self._position(eq.root), self._column(eq.root))
-            for direction in np.eye(eq.mass.shape[0])[eq.first_mode :]:
-                add(GRAVITY, values, self._position(direction), self._column(direction))
+            for direction in (eq.root, *np.eye(eq.mass.shape[0])[eq.first_mode :]):
+                found.append((GRAVITY, values, self._position(direction), self._column(direction)))
         return (
-            np.array(kinds, dtype=np.int64),
-            np.array(parameters).reshape(-1, 3),
-            np.array(rows).reshape(-1, self.n),
-            np.array(columns).reshape(-1, self.n).T,
+            np.array([kind for kind, *_ in found], dtype=np.int64),
+            np.array([(*values, 0.0, 0.0, 0.0)[:3] for _, values, *_ in found]).reshape(-1, 3),
+            np.array([row for *_, row, _ in found]).reshape(-1, self.n),
+            np.array([column for *_, column in found]).reshape(-1, self.n).T,
         )
 
     def gravity(self) -> tuple[Real, Real]:
@@ -431,9 +416,8 @@ class _Builder:
             mobility = abs(element_rows[e, 1] @ held_columns[:, 4 + e])
             if element[e, 0] == FRICTION and element[e, 3] != 0:
                 longest = min(longest, _GROWTH_PER_STEP * element[e, 4] / (element[e, 3] * mobility))
-            phase = _PHASE_PER_STEP_RAD
-            if element[e, 0] == CONTACT:
-                phase = min(phase, _CONTACT_PHASE_RAD * coarse)
+            most = _CONTACT_PHASE_RAD * coarse if element[e, 0] == CONTACT else np.inf
+            phase = min(_PHASE_PER_STEP_RAD, most)
             longest = min(longest, phase / np.sqrt(stiffness * mobility))
         return float(longest)
 
