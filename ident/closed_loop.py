@@ -34,7 +34,7 @@ from ident.uncertainty.embedding import tangent
 from ident.unstable import quick_poles
 
 # A first stage that explains less of the input than this has gone wrong.
-_EXPLAINED_PERCENT = 50.0
+EXPLAINED_PERCENT = 50.0
 # The same for balls: with 89 % they held a response at .90 of the frequencies, not .95, with 70 % at .40.
 _ENOUGH_FOR_BALLS = 90.0
 # The controller of a log: states that are sought; what it leaves of the command's rms, beyond which it is
@@ -51,7 +51,7 @@ class TwoStage:
     records: tuple[Record, ...]
     fit_percent: tuple[float, ...]
     plant: GobfModel | MimoModel
-    enough_percent: float = _EXPLAINED_PERCENT
+    enough_percent: float = EXPLAINED_PERCENT
 
     @property
     def finding(self) -> Finding:

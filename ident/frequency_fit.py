@@ -14,7 +14,7 @@ from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.plausible_modes import pairs_outside, pole_warnings
 from ident.data.arrays import RealArray, lock
-from ident.data.finding import Finding, FindingKind, distinct, finding
+from ident.data.finding import TEST_LEVEL, Finding, FindingKind, distinct, finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.fit.frf_regression import FrfRegression, fit_response, prepare_response
 from ident.fit.refinement import pole_system
@@ -22,9 +22,6 @@ from ident.one_input import in_order
 from ident.search.order_selection import OrderSelection, OrderStep
 from ident.search.pole_search import PoleSearch, SearchTrace
 from ident.uncertainty.embedding import embed_response
-
-# The covariances explain the residual if chi-square is no less probable than this.
-_LEVEL = 0.99
 
 __all__ = ["FrfIdentification", "identify_frf"]
 
@@ -130,8 +127,8 @@ def identify_frf(
         FindingKind.CHI_SQUARE,
         chi_square=fit.rss,
         degrees_of_freedom=freedom,
-        expected_low=chi2.ppf(1 - _LEVEL, freedom),
-        expected_high=chi2.ppf(_LEVEL, freedom),
+        expected_low=chi2.ppf(1 - TEST_LEVEL, freedom),
+        expected_high=chi2.ppf(TEST_LEVEL, freedom),
     )
     band_rad_s = float(response.omega_rad_s[0]), float(response.omega_rad_s[-1])
     return FrfIdentification(

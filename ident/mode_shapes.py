@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -91,16 +92,14 @@ def one_shape_each(
     sizes = [np.linalg.svd(mode.residue * best.sizes(mode), compute_uv=False) for mode in modes]
     for k in np.argsort([one[1] / max(one[0], 1e-300) for one in sizes]):
         trial = [
-            replace(mode, rank_one=mode.rank_one or at == int(k))
-            for at, mode in enumerate(best.modes_found())
+            replace(mode, pole=pole, residue=residue, rank_one=mode.rank_one or at == int(k))
+            for at, (mode, (pole, residue)) in enumerate(zip(best.modes, best.found(), strict=True))
         ]
         problem = ModalFit(data, trial)
         problem.solve()
         if not refused(problem.rss, sum(mode.saved() for mode in trial)):
             best = problem
-    if not any(mode.rank_one for mode in best.modes):
-        return None
-    return best.shaped(poles)
+    return best.shaped(poles) if any(mode.rank_one for mode in best.modes) else None
 
 
 def modes_of(
@@ -171,12 +170,8 @@ class ModalFit:
 
     def _linearised(self, x: RealArray, *, linear: bool = True) -> tuple[RealArray, RealArray]:
         """Residual (Y N,) and its Jacobian (Y N, P), off the nuisances and every output's linear columns."""
-        model, columns, at = np.zeros_like(self.y), list[RealArray](), 0
-        poles = []
-        for mode in self.modes:
-            count = _count(mode)
-            pole, residue, slopes = _unpacked(mode, x[at : at + count])
-            at += count
+        model, columns, poles = np.zeros_like(self.y), list[RealArray](), list[complex]()
+        for mode, (pole, residue), slopes in self._unpacked(x):
             poles.append(pole)
             state = self._filtered(pole, self.u)
             model += _shown(residue @ state, mode)
@@ -273,7 +268,7 @@ class ModalFit:
         seen: list[
             tuple[int, ComplexArray, bool]
         ] = []  # first state, change (Y, U), whether it has a conjugate
-        for mode, (pole, residue), slopes in self._unpacked():
+        for mode, (pole, residue), slopes in self._unpacked(self.x):
             turn = np.array([[0.0, -pole.imag], [pole.imag, 0.0]]) if mode.is_pair else np.zeros((1, 1))
             own, size, at = pole.real * np.eye(len(turn)) + turn, len(turn), len(drive)
             blocks.append(np.block([[own, np.zeros_like(own)], [np.eye(size), own]]))
@@ -290,28 +285,23 @@ class ModalFit:
             columns.append(column)
         parts = [0] if self.structure.integrators else []
         parts += [at] if self.structure.feedthrough else []
-        for k in range(n_outputs):
-            for part in parts:
-                for j in range(n_inputs):
-                    column = np.zeros((n_outputs, n_inputs, at + 1))
-                    column[k, j, part] = 1.0
-                    columns.append(column)
+        for k, part, j in product(range(n_outputs), parts, range(n_inputs)):
+            column = np.zeros((n_outputs, n_inputs, at + 1))
+            column[k, j, part] = 1.0
+            columns.append(column)
         return np.asarray(block_diag(*blocks)), np.array(drive)[:, None], np.array(columns)
 
-    def _unpacked(self) -> Iterator[tuple[ShapedMode, tuple[complex, ComplexArray], list[ComplexArray]]]:
-        at = 0
-        for mode in self.modes:
-            pole, residue, slopes = _unpacked(mode, self.x[at : at + _count(mode)])
-            at += _count(mode)
+    def _unpacked(
+        self, x: RealArray
+    ) -> Iterator[tuple[ShapedMode, tuple[complex, ComplexArray], list[ComplexArray]]]:
+        parts = np.split(x, np.cumsum([_count(mode) for mode in self.modes])[:-1])
+        for mode, part in zip(self.modes, parts, strict=True):
+            pole, residue, slopes = _unpacked(mode, part)
             yield mode, (pole, residue), slopes
 
     def found(self) -> list[tuple[complex, ComplexArray]]:
         """Pole and residue (Y, U) of every mode."""
-        return [both for _, both, _ in self._unpacked()]
-
-    def modes_found(self) -> list[ShapedMode]:
-        """The modes as they are now."""
-        return [replace(mode, pole=pole, residue=residue) for mode, (pole, residue), _ in self._unpacked()]
+        return [both for _, both, _ in self._unpacked(self.x)]
 
     def shaped(self, before: Poles) -> Shaped:
         """Coefficients on the basis of the poles as they are now."""

@@ -117,8 +117,7 @@ def searched(
     where the data ask for it. `data` are the records made ready for a fit from rest."""
     part, in_mid_record = thinned(records, options.search_samples)
     structure = options.structure()
-    if in_mid_record:
-        structure = replace(structure, estimate_initial_state=True)
+    structure = replace(structure, estimate_initial_state=True) if in_mid_record else structure
     if in_mid_record or len(part) < len(records):
         data = prepare(part, structure)
     outcome = _searched(data, options, lambda f, message: report(0.4 * f, message))
@@ -142,11 +141,12 @@ def _behind_dead_time(
     found = seek(records, plain, starts) if plain.search.options.delay_left_to_data else None
     if found is None:
         return plain, at_once
-    search = found.fitted.search
+    best, told = found
+    search = best.fitted.search
     search.minima = [*plain.search.minima, *search.minima]
     search.stages = [*plain.search.stages, *search.stages]
     search.evaluations += plain.search.evaluations
-    return SearchOutcome(search, found.fitted.end, found.selection, dead_time=found.finding), False
+    return SearchOutcome(search, best.fitted.end, best.selection, dead_time=told), False
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,7 @@ from ident.uncertainty.nominal import NominalAgreement, nominal_near
 # Frequencies over which a low-order nominal model is fitted to a posterior.
 _NOMINAL_POINTS = 400
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
-_NOISE_ORDERS = (8, 32)
+NOISE_ORDERS = (8, 32)
 # Factor on the odds: Bayes factor of "positive" evidence (Kass and Raftery, 1995).
 _POSITIVE = 3.0
 T = TypeVar("T")
@@ -116,7 +116,7 @@ def with_noise_model(
         plain = options.model_copy(update={"coloured_noise": False})
         return found_with(plain), plain
     tried = []
-    for order in _NOISE_ORDERS:
+    for order in NOISE_ORDERS:
         asked = options.model_copy(update={"coloured_noise": True, "max_ar_order": order})
         found = found_with(asked)
         whiteness, _ = found[1]

@@ -124,8 +124,7 @@ def _searched(
     """Poles from a search on the records, or a part of long ones; polished on all of them."""
     part, in_mid_record = thinned(records, options.search_samples)
     structure = options.structure()
-    if in_mid_record:
-        structure = replace(structure, estimate_initial_state=True)
+    structure = replace(structure, estimate_initial_state=True) if in_mid_record else structure
     search = PoleSearch(prepare_outputs(part, structure), options)
     selection = OrderSelection(search, report)
     end = selection.with_real(

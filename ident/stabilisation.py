@@ -143,7 +143,20 @@ def _compared(
         there = zeta_before[match[known]]
         same[known] = np.abs(zeta[known] - there) < DAMPING_TOLERANCE * there
         previous = np.where(known, match + start - omega_before.size, -1)
-        columns.append((np.full(omega.size, count), omega, zeta, previous, same, _needed(data, end, order)))
+        # Whether the data miss each pair when it is taken out and the other poles stay where they are.
+        worth = data.colour(data.residual(end.poles)).effective_samples
+        floor = max(EXPLAINED * float(data.y @ data.y), float(np.finfo(np.float64).tiny))
+        without = [max(fit(data, end.poles.without_pair(index)).rss, floor) for index in order]
+        columns.append(
+            (
+                np.full(omega.size, count),
+                omega,
+                zeta,
+                previous,
+                same,
+                np.asarray(worth * np.log(np.array(without) / max(end.rss, floor)) > 4 * np.log(worth)),
+            )
+        )
         start, omega_before, zeta_before = start + omega.size, omega, zeta
     rss = np.array([end.rss for end in fits])
     return Stabilisation(rss, n_real, chosen, *map(np.concatenate, zip(*columns, strict=True)))
@@ -162,11 +175,3 @@ def _counterparts(omega: RealArray, before: RealArray) -> IntArray:
         if match[i] < 0 and j not in match:
             match[i] = j
     return match
-
-
-def _needed(data: Regression, end: Refined, pairs: IntArray) -> BoolArray:
-    """Whether the data miss each pair when it is taken out and the other poles stay where they are."""
-    worth = data.colour(data.residual(end.poles)).effective_samples
-    floor = max(EXPLAINED * float(data.y @ data.y), float(np.finfo(np.float64).tiny))
-    without = [max(fit(data, end.poles.without_pair(index)).rss, floor) for index in pairs]
-    return np.asarray(worth * np.log(np.array(without) / max(end.rss, floor)) > 4 * np.log(worth))

@@ -18,6 +18,7 @@ from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import NO_POLES, Poles
 from ident.basis.structure import Structure, filter_input
+from ident.checks.prior_tests import ROUGH
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
 from ident.fit.least_squares import Regression, project
@@ -28,7 +29,6 @@ from ident.search.pole_search import PoleSearch
 # Numbers of real poles and pairs that are tried; the criterion of the order chooses.
 _STRUCTURES = ((2, 0), (2, 1), (2, 2), (2, 3), (2, 4))
 _ROUNDS = 10  # limit of work: the best one counts
-_ROUGH = 1e-4  # a share of J: these poles are a start, or are judged with five deviations to spare
 # Standard deviations beyond the circle: one in a million stable plants.
 _BEYOND = 5.0
 # Slower than one time constant in the longest record, growth is no other than an integrator and drift.
@@ -48,7 +48,7 @@ def find_unstable(records: Sequence[Record], options: IdentOptions | None = None
     both = [_with_output(record, options.input_delay_samples) for record in records]
     poles = _predictor_poles(_prepared(thinned(both, options.search_samples)[0]))
     data = _prepared(both)
-    return _significant(data, PoleSearch(data, IdentOptions()).descend(poles, "predictor", _ROUGH).poles)
+    return _significant(data, PoleSearch(data, IdentOptions()).descend(poles, "predictor", ROUGH).poles)
 
 
 def quick_poles(records: Sequence[Record], options: IdentOptions | None = None) -> Poles:
@@ -59,13 +59,13 @@ def quick_poles(records: Sequence[Record], options: IdentOptions | None = None) 
     start = _inside(_predictor(data, _predictor_poles(data))[0].zeros())
     structure = Structure(feedthrough=True, estimate_offset=True, estimate_initial_state=True)
     search = PoleSearch(prepare(part, structure), IdentOptions(feedthrough=True))
-    return OrderSelection(search).pruned(search.descend(start, "loop", _ROUGH)).poles
+    return OrderSelection(search).pruned(search.descend(start, "loop", ROUGH)).poles
 
 
 def _predictor_poles(data: Regression) -> Poles:
     """Poles of the basis: of the structure that the criterion of the order chooses."""
     starts = [_mirrored_often(data, n_real, n_pairs) for n_real, n_pairs in _STRUCTURES]
-    ends = [PoleSearch(data, IdentOptions()).descend(poles, "predictor", _ROUGH) for poles in starts]
+    ends = [PoleSearch(data, IdentOptions()).descend(poles, "predictor", ROUGH) for poles in starts]
     worth = float(np.log(data.n_samples))
     return min(
         ends, key=lambda end: data.n_samples * np.log(end.rss) + data.n_parameters(end.poles.order) * worth

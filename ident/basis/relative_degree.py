@@ -30,16 +30,6 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
 
-def refuse_without_counterpart(poles: Poles, integrators: int) -> None:
-    """Raise ValueError if a pole (but those at 0 of integrators) has no continuous-time counterpart."""
-    for a in poles.real[integrators:]:
-        if not a > 0:
-            raise ValueError(
-                f"relative_degree needs poles with a continuous-time counterpart; the real pole {a:.6g} in "
-                "the z plane has none (expected 0 < pole < 1)"
-            )
-
-
 def conditions(poles: Poles, integrators: int, relative_degree: int) -> RealArray:
     """Rows R (r - 1, B) with R c = 0 for coefficients c of a plant of relative degree r.
 
@@ -61,7 +51,12 @@ def conditions_with_sensitivities(
         raise ValueError(f"relative_degree must be at least 1; got {relative_degree}")
     if relative_degree == 1:
         return np.zeros((0, poles.order)), np.zeros((0, sum(block.order for block in blocks)))
-    refuse_without_counterpart(poles, integrators)
+    for a in poles.real[integrators:]:
+        if not a > 0:
+            raise ValueError(
+                f"relative_degree needs poles with a continuous-time counterpart; the real pole {a:.6g} in "
+                "the z plane has none (expected 0 < pole < 1)"
+            )
     if np.any(poles.real[:integrators] != 0):
         raise ValueError("the first real poles must be the zeros that the integrators bring")
     if poles.order < relative_degree:

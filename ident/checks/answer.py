@@ -39,23 +39,17 @@ def explains_nothing(data: Regression, poles: Poles, fixed: Poles, residual: Rea
     return [finding(FindingKind.NO_ANSWER, explained_percent=100 * max(1 - np.sqrt(rest / power), 0.0))]
 
 
-def zero_is_inside(posterior: ResponsePosterior, omega_rad_s: RealArray, *, doubted: bool) -> bool:
-    """Whether a response of zero lies inside all ellipses at omega (F,), at 99.9 %: frequency by frequency,
-    or where the fit is `doubted` over all of the N / 2 frequencies at which noise may have led the search to
-    put a pole (Bonferroni)."""
-    ellipses = posterior.at(omega_rad_s)
-    squared = ellipses.normalised_distance(np.zeros(ellipses.centre.size)) ** 2 * chi2.ppf(ellipses.level, 2)
-    n_rows = 2 if posterior.report is None else max(posterior.report.n_rows, 2)
-    return bool(np.all(squared <= chi2.isf((1 - _LEVEL) / (n_rows / 2 if doubted else 1.0), 2)))
-
-
 def refuse_unanswered(
     posterior: ResponsePosterior, omega_rad_s: RealArray, warnings: Iterable[Finding], *, why: str = ""
 ) -> None:
     """Raises ValueError, one line, where a response of zero lies inside all ellipses at omega (F,): no number
     of such a model means anything. warnings: of the fit; why: what else is known."""
     doubts = {FindingKind.NO_POLE, FindingKind.NO_ANSWER} & {warning.kind for warning in warnings}
-    if zero_is_inside(posterior, omega_rad_s, doubted=bool(doubts)):
+    # At 99.9 %; where the fit is doubted, over the N / 2 frequencies at which noise may have put a pole.
+    ellipses = posterior.at(omega_rad_s)
+    squared = ellipses.normalised_distance(np.zeros(ellipses.centre.size)) ** 2 * chi2.ppf(ellipses.level, 2)
+    n_rows = 2 if posterior.report is None else max(posterior.report.n_rows, 2)
+    if np.all(squared <= chi2.isf((1 - _LEVEL) / (n_rows / 2 if doubts else 1.0), 2)):
         unknown = "no response at all explains the log as well as any model; check columns, wiring and unit"
         names = f"the output '{posterior.output_name}' does not answer to the input '{posterior.input_name}'"
         raise ValueError(f"{names}: {why or unknown}")

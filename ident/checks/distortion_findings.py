@@ -129,18 +129,15 @@ def _verdict(levels: Distortion, all_levels: Sequence[Distortion], unit: str) ->
 
 def _kind(levels: Distortion, distorted: Sequence[BandLevel]) -> str:
     """odd, even or both, by the detection lines; unknown without them."""
-    power = {"odd": 0.0, "even": 0.0}
-    for name, lines in (("odd", levels.odd), ("even", levels.even)):
-        if lines is None:
-            return "unknown"
-        for band in distorted:
-            level = lines.within(band.from_rad_s, band.to_rad_s)
-            if level is not None:
-                power[name] += level.distortion**2
+    if levels.odd is None or levels.even is None:
+        return "unknown"
+    found = (
+        [lines.within(band.from_rad_s, band.to_rad_s) for band in distorted]
+        for lines in (levels.odd, levels.even)
+    )
+    odd, even = (sum(one.distortion**2 for one in each if one is not None) for each in found)
     # Even lines are the only place of even distortion where only odd lines are excited.
-    if power["odd"] > _CLEARLY * power["even"]:
-        return "odd"
-    return "even" if power["even"] > _CLEARLY * power["odd"] else "both"
+    return "odd" if odd > _CLEARLY * even else "even" if even > _CLEARLY * odd else "both"
 
 
 def _trend(levels: Distortion, every: Sequence[Distortion], distorted: Sequence[BandLevel]) -> str:
@@ -148,12 +145,10 @@ def _trend(levels: Distortion, every: Sequence[Distortion], distorted: Sequence[
     other = every[0] if levels is every[-1] else every[-1]
     if other is levels:
         return "unknown"
-    ratios = []
-    for band in distorted:
-        lines = other.excited or other.odd
-        there = None if lines is None else lines.within(band.from_rad_s, band.to_rad_s)
-        if there is not None and there.distortion > 0:
-            ratios.append(there.distortion / band.distortion)
+    lines = other.excited or other.odd
+    there = [] if lines is None else [lines.within(one.from_rad_s, one.to_rad_s) for one in distorted]
+    both = zip(there, distorted, strict=False)
+    ratios = [found.distortion / band.distortion for found, band in both if found and found.distortion > 0]
     if not ratios:
         return "unknown"
     ratio = float(np.median(ratios)) if other.rms > levels.rms else 1 / float(np.median(ratios))

@@ -41,8 +41,6 @@ _SLOW_STARTS = {
 }
 # Two freed integrators may also have become a slow oscillation: turns over the whole record.
 _SLOW_TURNS = (0.3, 1.0, 3.0)
-# A nuisance left to the data stays if dropping it would be this improbable for records that do not need it.
-NUISANCE_LEVEL = 0.99
 # A score below this part of the limit, every sample counted as independent, leaves the descent out.
 _CLEARLY_BELOW = 0.6
 
@@ -106,9 +104,7 @@ def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -
     structure = given.data.structure
     delay = structure.input_delay_samples
     best, chosen = 0.0, delay + 1
-    for other in (delay - 1, delay + 1):
-        if other < 0:
-            continue
+    for other in (delay - 1, delay + 1) if delay else (1,):
         shifted = given.refitted(records, given.poles, input_delay_samples=other)
         if relative_degree > 1:
             shifted = replace(shifted, end=best_under_relative_degree(shifted, relative_degree))
@@ -122,9 +118,8 @@ def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -
         ours = _power_from(residuals[0], given.data, common - delay)
         theirs = _power_from(residuals[1], shifted.data, common - other)
         worth = shifted.data.colour(residuals[1]).effective_samples
-        value = worth * float(np.log(max(ours, 1e-300) / max(theirs, 1e-300)))
-        if ours <= 1e-18 * float(given.data.y @ given.data.y):
-            value = 0.0
+        seen = ours > 1e-18 * float(given.data.y @ given.data.y)
+        value = worth * float(np.log(max(ours, 1e-300) / max(theirs, 1e-300))) if seen else 0.0
         if value > best:
             best, chosen = value, other
     return judged(FindingKind.DELAY, f"input_delay_samples = {delay}", best, 1, other_delay=chosen)
@@ -311,7 +306,7 @@ class NuisanceTest:
 
     @property
     def limit(self) -> float:
-        return float(chdtri(self.columns, 1 - NUISANCE_LEVEL))
+        return float(chdtri(self.columns, 1 - TEST_LEVEL))
 
     @property
     def needed(self) -> bool:
@@ -326,7 +321,7 @@ class NuisanceTest:
             columns=self.columns,
             statistic=self.statistic,
             limit=self.limit,
-            level=NUISANCE_LEVEL,
+            level=TEST_LEVEL,
         )
 
 

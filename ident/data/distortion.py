@@ -31,7 +31,7 @@ _REPEATS = 1e-4
 # Power of a line over the strongest: excited above the first, without excitation below the second.
 _EXCITED, _SILENT = 1e-2, 1e-4
 # Records whose input differs by less in rms are of one amplitude, in itself of one realisation.
-_SAME = 0.02
+SAME = 0.02
 # Noise is averaged over this many harmonics to each side, fewer next to zero.
 _SMOOTHING = 10
 _ROUNDS = 6  # of weights and distortion in turns: more move it by less than 2 % of its interval
@@ -261,7 +261,7 @@ class _Steady:
         return (
             self.period == other.period
             and np.array_equal(self.excited, other.excited)
-            and abs(self.rms / other.rms - 1) < _SAME
+            and abs(self.rms / other.rms - 1) < SAME
         )
 
 
@@ -269,7 +269,7 @@ def _levels(group: Sequence[_Steady]) -> Distortion:
     first = group[0]
     realisations = in_groups(
         group,
-        lambda one, its: bool(np.linalg.norm(one.input - its.input) < _SAME * np.linalg.norm(one.input)),
+        lambda one, its: bool(np.linalg.norm(one.input - its.input) < SAME * np.linalg.norm(one.input)),
     )
     outputs = [np.vstack([steady.output for steady in same]) for same in realisations]
     inputs = np.stack([same[0].input for same in realisations])

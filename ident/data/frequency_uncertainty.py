@@ -13,9 +13,8 @@ from ident.data.arrays import BoolArray, ComplexArray, RealArray, lock, readonly
 from ident.data.ellipses import EllipseAxes, chi2_radius, ellipse_distance, relative_deficit, standard_axes
 from ident.data.record_files import read_table
 from ident.data.response_columns import read_response
+from ident.data.table import LARGEST
 
-# Of a gain in any units; its square is still a number.
-_LARGEST = 1e100
 # A product of factors can miss symmetry or semidefiniteness by rounding, not by more.
 _PSD_TOLERANCE = 1e-9
 
@@ -61,9 +60,7 @@ class FrequencyUncertainty:
         _refuse_first(omega < 0, omega, "omega must not be negative")
         nyquist = np.pi / self.dt_s
         _refuse_first(omega > nyquist * (1 + 1e-9), omega, f"omega is above pi / dt_s = {nyquist:.6g} rad/s")
-        _refuse_first(
-            ~(np.abs(centre) < _LARGEST), omega, f"the centre is not finite, or beyond {_LARGEST:g}"
-        )
+        _refuse_first(~(np.abs(centre) < LARGEST), omega, f"the centre is not finite, or beyond {LARGEST:g}")
         _refuse_first(~np.all(np.isfinite(covariance), axis=(1, 2)), omega, "the covariance is not finite")
         skew = np.abs(covariance[:, 0, 1] - covariance[:, 1, 0])
         largest = np.abs(covariance).max(axis=(1, 2))

@@ -16,11 +16,10 @@ import numpy as np
 from scipy.stats import f
 
 from ident.data.arrays import ComplexArray, RealArray
+from ident.data.distortion import SAME
 from ident.data.nonparametric import spectra_of
 from ident.data.record import Record, in_groups
 
-# Excitations of one course, or of one size, differ by no more than this share.
-_SAME = 0.02
 # Power of the excitation over its strongest, where the response is looked at.
 _EXCITED = 1e-2
 # Lines averaged for one estimate: five.
@@ -156,14 +155,14 @@ def _alike(one: tuple[Record, RealArray], another: tuple[Record, RealArray]) -> 
     (record, course), (other, its) = one, another
     if course.size != its.size or record.dt_s != other.dt_s:
         return False
-    return bool(np.linalg.norm(course / np.linalg.norm(course) - its / np.linalg.norm(its)) < _SAME)
+    return bool(np.linalg.norm(course / np.linalg.norm(course) - its / np.linalg.norm(its)) < SAME)
 
 
 def _experiment(form: Sequence[tuple[Record, RealArray]]) -> Repeats | None:
     sized = sorted(((float(np.std(course)), record) for record, course in form), key=lambda pair: pair[0])
     amplitudes: list[list[tuple[float, Record]]] = []
     for size, record in sized:
-        if amplitudes and size < (1 + _SAME) * amplitudes[-1][0][0]:
+        if amplitudes and size < (1 + SAME) * amplitudes[-1][0][0]:
             amplitudes[-1].append((size, record))
         else:
             amplitudes.append([(size, record)])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from datetime import date
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import numpy as np
 
@@ -49,11 +49,8 @@ def seconds_since_first(cells: Sequence[str]) -> RealArray:
             raise StampError(f"is '{shown(cells[row])}', no possible date or time ({error})", row) from None
     if not any(found[1] or found[5] for found in matches):
         around = _MINUTES_NS if minutes else _DAY_NS
-        passed, since = 0, [nanoseconds[0]]
-        for before, now in pairwise(nanoseconds):
-            passed += around if before - now > around // 2 else 0
-            since.append(now + passed)
-        nanoseconds = since
+        turns = accumulate((a - b > around // 2 for a, b in pairwise(nanoseconds)), initial=0)
+        nanoseconds = [now + around * turn for now, turn in zip(nanoseconds, turns, strict=True)]
     # The difference in whole nanoseconds first: doubles hold dates to a fraction of a microsecond only.
     return np.array([now - nanoseconds[0] for now in nanoseconds], dtype=np.float64) / 1e9
 
@@ -112,9 +109,7 @@ def _nanoseconds(found: re.Match[str], month_first: bool, days: dict[str, int], 
     # What passed since the start, without a day, may be more than one.
     if (hour > 23 and (found[1] or found[5])) or minute > 59 or second > 60:
         raise ValueError("hours to 23, minutes and seconds to 59")
-    zone = 0
-    if found[14]:
-        zone = (60 * int(found[15]) + int(found[16])) * (1 if found[14] == "+" else -1)
+    zone = int(f"{found[14]}1") * (60 * int(found[15]) + int(found[16])) if found[14] else 0
     whole = 3600 * hour + 60 * (minute - zone) + second
     day = found[0][: found.start(9)] if found[9] else found[0]
     if day not in days:
@@ -127,7 +122,5 @@ def _ordinal(found: re.Match[str], month_first: bool) -> int:
         return date(int(found[1]), int(found[3]), int(found[4])).toordinal()
     if not found[5]:
         return 0
-    day, month = int(found[5]), int(found[7])
-    if found[6] == "/" and month_first:
-        day, month = month, day
+    month, day = (int(found[k]) for k in ((5, 7) if found[6] == "/" and month_first else (7, 5)))
     return date(int(found[8]), month, day).toordinal()

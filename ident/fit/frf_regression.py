@@ -20,12 +20,11 @@ from ident.basis.structure import front_response
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.ellipses import standard_axes
 from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.fit.least_squares import RANK_TOLERANCE
 from ident.fit.problem import CandidateCost, Linearisation, ResidualColour, residual_colour
 
 # A minor axis below this part of the major one would let one direction of one frequency overrule the rest.
 _THINNEST = 1e-4
-# Directions of the columns weaker than this fraction of the strongest are left at zero: nothing shows them.
-_RANK_TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +203,7 @@ def fit_response(data: FrfRegression, poles: Poles) -> FrfFit:
     q, triangle = np.linalg.qr(data.whiten(responses))
     projected = q.T @ data.y
     residual = data.y - q @ projected
-    theta = np.linalg.lstsq(triangle, projected, rcond=_RANK_TOLERANCE)[0]
+    theta = np.linalg.lstsq(triangle, projected, rcond=RANK_TOLERANCE)[0]
     return FrfFit(
         coefficients=np.asarray(theta[: poles.order], dtype=np.float64),
         feedthrough=float(theta[-1]) if data.feedthrough else 0.0,

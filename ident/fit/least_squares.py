@@ -22,7 +22,7 @@ from ident.fit.kernels import cost_of_point, driven_rows, linearise
 from ident.fit.problem import CandidateCost, Linearisation, PoleProblem, ResidualColour, residual_colour
 
 # Directions weaker than this share of the strongest are left at zero: the data do not show them.
-_RANK_TOLERANCE = 1e-12
+RANK_TOLERANCE = 1e-12
 # Residual this small relative to the output (in power) is rounding: no further pole can be seen.
 EXPLAINED = 1e-18
 
@@ -179,7 +179,7 @@ class Projection:
     def coefficients(self, y: RealArray) -> RealArray:
         """Least-squares coefficients (Qs,) of the shared columns for the output y (N,)."""
         # Q is orthogonal to the local part of y, so that needs no subtraction here.
-        theta = np.linalg.lstsq(self.triangle, self.shared_q @ y, rcond=_RANK_TOLERANCE)[0]
+        theta = np.linalg.lstsq(self.triangle, self.shared_q @ y, rcond=RANK_TOLERANCE)[0]
         return np.asarray(theta, dtype=np.float64)
 
 

@@ -16,11 +16,10 @@ import numpy as np
 from ident.basis.poles import Poles
 from ident.basis.relative_degree import conditions, conditions_with_sensitivities, null_space
 from ident.data.arrays import ComplexArray, RealArray
-from ident.fit.least_squares import LinearFit, Projection, Regression, block_states, project
+from ident.fit.least_squares import RANK_TOLERANCE, LinearFit, Projection, Regression, block_states, project
 from ident.fit.problem import Linearisation
 from ident.fit.refinement import Bounds, Refined, free_optimality, refine
 
-_RANK_TOLERANCE = 1e-12  # rounding of doubles, times the condition of a basis of close poles
 # Fastest real pole: decayed to this part within a sample. One at 0 or below has no continuous counterpart.
 _FASTEST = 0.01
 
@@ -58,7 +57,7 @@ def _solve(data: Regression, poles: Poles, relative_degree: int) -> _Constrained
     basis, inverse = null_space(rows, np.linalg.norm(projection.triangle, axis=0))
     target = projection.shared_q @ data.y
     left, values, right = np.linalg.svd(projection.triangle @ basis, full_matrices=False)
-    kept = values > _RANK_TOLERANCE * values[0]
+    kept = values > RANK_TOLERANCE * values[0]
     reachable = left[:, kept]
     along = reachable.T @ target
     coefficients = basis @ (right[kept].T @ (along / values[kept]))

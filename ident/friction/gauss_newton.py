@@ -173,18 +173,6 @@ class FrictionFit:
         return np.asarray(1 / (1 + self.lag * (1 - np.exp(-1j * omega_rad_s * self.arm.dt_s))))
 
 
-@dataclass(frozen=True, eq=False)
-class LinearisedRecord:
-    """The simulation of one record to first order: position, friction (T,); by_coefficients (T, P), by_law
-    (T, Q) derivatives of the position, friction_by (T, P + Q) those of the friction."""
-
-    position: RealArray
-    friction: RealArray
-    by_coefficients: RealArray
-    by_law: RealArray
-    friction_by: RealArray
-
-
 def parameters_of(law: FrictionLaw) -> RealArray:
     """(Q,) level, logarithm of the pre-sliding deflection; of Stribeck friction excess, logarithm of its
     speed."""
@@ -198,8 +186,11 @@ def law_of(parameters: RealArray) -> FrictionLaw:
     return replace(law, excess=max(falling[0], 0.0), fall=float(np.exp(falling[1]))) if falling else law
 
 
-def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray) -> LinearisedRecord:
-    """Differences of the simulation with input u (T,): the friction follows every change."""
+def linearised(
+    arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray
+) -> tuple[RealArray, RealArray, RealArray, RealArray]:
+    """The simulation with input u (T,) to first order: position and friction (T,), and the derivatives of
+    both (T, P + Q) with respect to the coefficients and the law; the friction follows every change."""
     position, friction = arm.run(coefficients, u, law)
     structure = arm.structure
     effort = filter_input(u, 0, structure.input_delay_samples) - friction
@@ -217,26 +208,21 @@ def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: Re
         change = np.zeros(coefficients.size)
         change[j] = _CHANGE * speed / max(float(np.std(np.diff(column))), np.finfo(np.float64).tiny)
         differentiate(j, change[j], coefficients + change, law)
-    n = columns.shape[1]
     for k in range(parameters.size):
         change = np.zeros(parameters.size)
         # An excess has no size of its own before it is known, and cannot be negative.
         change[k] = _CHANGE if k % 2 else _CHANGE * law.level
-        differentiate(n + k, change[k], coefficients, law_of(parameters + change))
-    return LinearisedRecord(position, friction, by[:, :n], by[:, n:], friction_by)
+        differentiate(columns.shape[1] + k, change[k], coefficients, law_of(parameters + change))
+    return position, friction, by, friction_by
 
 
 def equations(found: FrictionFit, records: Sequence[Record]) -> tuple[list[RealArray], list[RealArray]]:
     """Of every record the derivatives (T - delay, P + Q) of the simulated position, and what it leaves."""
     delay = found.arm.structure.input_delay_samples
     local = [linearised(found.arm, found.coefficients, found.law, record.input[:, 0]) for record in records]
-    return (
-        [answered(np.column_stack([part.by_coefficients, part.by_law]), delay) for part in local],
-        [
-            answered(record.output[:, 0] - part.position, delay)
-            for record, part in zip(records, local, strict=True)
-        ],
-    )
+    both = zip(records, local, strict=True)
+    left = [answered(record.output[:, 0] - position, delay) for record, (position, *_) in both]
+    return [answered(by, delay) for _, _, by, _ in local], left
 
 
 def driven_by_law(found: FrictionFit, record: Record) -> RealArray:

@@ -249,10 +249,11 @@ def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: R
         simple = min(simple, _with_law(logs, found, options), key=logs.worth)
     if simple is not shifted:
         simple = _with_shift(logs, simple, options, left_open=left_open)
-    found = simple
-    with suppress(LostError):
-        found = _with_more_poles(logs, simple, options)
-    return _with_law(logs, found, options)
+    delay = {"input_delay_samples": simple.arm.structure.input_delay_samples}
+    with suppress(LostError):  # with as many poles as the data ask for, where they are worth it
+        more = _in_turns(logs, simple, _beyond(simple, options.model_copy(update=delay)))
+        simple = min(simple, more, key=logs.worth)
+    return _with_law(logs, simple, options)
 
 
 def _with_shift(logs: _Logs, found: FrictionFit, options: IdentOptions, *, left_open: bool) -> FrictionFit:
@@ -359,7 +360,13 @@ def _simple(
             options = options.with_unstable(find_unstable(used, options))
         if thrown_over and not options.unstable_poles:
             return None
-        few = _simplest(options)
+        # One real pole and one pair, one more where a spring or weight holds: more are led by a wrong level.
+        pairs = 1 + int(not options.integrators and not options.fixed().order)
+        given = (
+            ("n_real", options.n_real, min(1, options.max_real)),
+            ("n_pairs", options.n_pairs, min(pairs, options.max_pairs)),
+        )
+        few = options.model_copy(update={key: most if known is None else known for key, known, most in given})
         model = untested_model([prewhitened(r, long_arx_filter(used, few)) for r in used], _moving(few))
         start = started(model, few.structure(), FrictionLaw(level, logs.presliding))
         found = _in_turns(logs, replace(start, centre=logs.centre, bias=bias), few)
@@ -368,17 +375,6 @@ def _simple(
         # Once more with a better friction, which the growth depends on.
         level, bias, used = found.level, found.bias, [found.forced(record) for record in logs.records]
     return options, found
-
-
-def _simplest(options: IdentOptions) -> IdentOptions:
-    """One real pole and one pair, and one more where a spring or weight holds the arm, unless numbers are
-    given: with more, a wrong level is taken for poles."""
-    pairs = 1 + int(not options.integrators and not options.fixed().order)
-    given = (
-        ("n_real", options.n_real, min(1, options.max_real)),
-        ("n_pairs", options.n_pairs, min(pairs, options.max_pairs)),
-    )
-    return options.model_copy(update={key: most if known is None else known for key, known, most in given})
 
 
 def _moving(options: IdentOptions) -> IdentOptions:
@@ -408,13 +404,6 @@ def _beyond(found: FrictionFit, options: IdentOptions) -> IdentOptions:
             least = float(np.sqrt(spring.omega_rad_s * modes[modes > spring.omega_rad_s].min()))
         update["omega_min_rad_s"] = max(least, options.omega_min_rad_s or 0.0)
     return options.model_copy(update=update)
-
-
-def _with_more_poles(logs: _Logs, found: FrictionFit, options: IdentOptions) -> FrictionFit:
-    """The same with as many poles as the data ask for, where they are worth it."""
-    delay = {"input_delay_samples": found.arm.structure.input_delay_samples}
-    options = _beyond(found, options.model_copy(update=delay))
-    return min(found, _in_turns(logs, found, options), key=logs.worth)
 
 
 def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: int = _ROUNDS) -> FrictionFit:

@@ -74,17 +74,17 @@ def without_friction(
         return _behind_observed(records, found, model or found.model, options)
     if model is not None:
         found = moved_to(found, records, model)
-    corrected, beside = [], []
+    corrected, beside, n = [], [], found.coefficients.size
     for k, record in enumerate(records):
-        local = linearised(found.arm, found.coefficients, found.law, record.input[:, 0])
+        position, friction, by, _ = linearised(found.arm, found.coefficients, found.law, record.input[:, 0])
         # To first order y = y0 + D (c - c0) + d (level - level0): rows for the coefficients c themselves.
-        target = record.output[:, 0] - local.position + local.by_coefficients @ found.coefficients
-        less = less_friction(record, local.friction, found.arm.structure.input_delay_samples)
+        target = record.output[:, 0] - position + by[:, :n] @ found.coefficients
+        less = less_friction(record, friction, found.arm.structure.input_delay_samples)
         corrected.append(replace(less, output=target[:, None]))
         # Known beforehand, to one: logarithms in the law, and how far this record's level is off.
-        plain, logs = local.by_law[:, ::2], STD_LOG * local.by_law[:, 1::2]
+        plain, logs = by[:, n::2], STD_LOG * by[:, n + 1 :: 2]
         own = np.outer(found.between * plain[:, 0], np.arange(len(records)) == k)
-        beside.append(Beside(local.by_coefficients, np.hstack([plain, logs, own])))
+        beside.append(Beside(by[:, :n], np.hstack([plain, logs, own])))
     n_known = logs.shape[1] + len(records)
     response, change, factor = tangent_beside(corrected, found.model, beside, options, n_known=n_known)
     return BehindFriction(response, response, found.level + float(change[0]), factor[0], found)
@@ -259,10 +259,9 @@ def other_output_without_friction(
     undelayed = replace(model, input_delay_samples=0)
     less, beside, n = list[Record](), list[Beside](), found.coefficients.size
     for k, record in enumerate(records):
-        local = linearised(found.arm, found.coefficients, found.law, record.input[:, 0])
-        less.append(less_friction(record, local.friction, found.arm.structure.input_delay_samples))
-        columns = -local.friction_by @ found.covariance_factor
-        columns = np.column_stack([columns, -found.between * local.friction_by[:, n]])
+        _, friction, _, by = linearised(found.arm, found.coefficients, found.law, record.input[:, 0])
+        less.append(less_friction(record, friction, found.arm.structure.input_delay_samples))
+        columns = np.column_stack([-by @ found.covariance_factor, -found.between * by[:, n]])
         driven = np.column_stack([undelayed.simulate(column) for column in columns.T])
         own = np.outer(driven[:, -1], np.arange(len(records)) == k)
         beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([driven[:, :-1], own])))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import correlate
@@ -40,18 +39,9 @@ _STRONG = 6.0
 _LEVEL = 0.95
 
 
-@dataclass(frozen=True, eq=False)
-class DeadTime:
-    """A model behind a delay that was found, and the finding that says so."""
-
-    fitted: Fitted
-    selection: OrderSelection
-    finding: Finding
-
-
-def seek(records: Sequence[Record], plain: Fitted, starts: Sequence[int]) -> DeadTime | None:
+def seek(records: Sequence[Record], plain: Fitted, starts: Sequence[int]) -> tuple[Selected, Finding] | None:
     """The model behind a delay that the criterion of the order prefers to `plain`, the end of a search
-    without one on these records; None where there is none.
+    without one on these records, and the finding that says so; None where there is none.
 
     records: one input each. starts: where the search begins, as of `first_answer`.
     """
@@ -82,40 +72,29 @@ def seek(records: Sequence[Record], plain: Fitted, starts: Sequence[int]) -> Dea
     # The poles that were left may also do without a delay, in a place that the first search has missed.
     if best.gain_over(_behind(records, found, 0).fitted) <= _STRONG:
         return None
-    return DeadTime(
-        found,
-        best.selection,
-        finding(
-            FindingKind.DEAD_TIME,
-            delay=_delay(found),
-            delay_ms=1e3 * _delay(found) * found.data.dt_s,
-            low=min(likely),
-            high=max(likely),
-            partial=bool(np.any(np.abs(found.poles.real[found.search.fixed.real.size :]) < DEADBEAT)),
-            order=found.poles.order,
-            order_without=plain.poles.order,
-            gain=best.gain_over(plain),
-        ),
+    return best, finding(
+        FindingKind.DEAD_TIME,
+        delay=_delay(found),
+        delay_ms=1e3 * _delay(found) * found.data.dt_s,
+        low=min(likely),
+        high=max(likely),
+        partial=bool(np.any(np.abs(found.poles.real[found.search.fixed.real.size :]) < DEADBEAT)),
+        order=found.poles.order,
+        order_without=plain.poles.order,
+        gain=best.gain_over(plain),
     )
 
 
-class FirstAnswer(NamedTuple):
-    """starts: how many of the latest inputs the output may not miss, nothing where it misses the latest.
-    at_once: it misses that of the very sample."""
-
-    starts: tuple[int, ...]
-    at_once: bool
-
-
-def first_answer(records: Sequence[Record]) -> FirstAnswer:
-    """Where the response begins, as a long ARX model says; nothing is missed where records are too short for
-    it. The inputs stand last in one factorisation, the latest at its end: the sum of the last squares is what
+def first_answer(records: Sequence[Record]) -> tuple[tuple[int, ...], bool]:
+    """Where the response begins, as a long ARX model says: how many of the latest inputs the output may not
+    miss, and whether it misses that of the very sample; nothing is missed where records are too short for it.
+    The inputs stand last in one factorisation, the latest at its end: the sum of the last squares is what
     leaving out the latest inputs costs. What answers beyond its lags shows in the correlation of changes."""
     shortest = min(record.n_samples for record in records)
     lags = min(_INPUT_LAGS, shortest // _ROWS_PER_LAG)
     own = min(_OUTPUT_LAGS, lags)
     if lags < 2:
-        return FirstAnswer((), False)
+        return (), False
     blocks, targets = [], []
     for record in records:
         u, y = (signal[:, 0] - signal[0, 0] for signal in (record.input, record.output))
@@ -129,12 +108,12 @@ def first_answer(records: Sequence[Record]) -> FirstAnswer:
     freedom = columns.shape[0] - columns.shape[1] + 1
     noise = float(triangle[-1, -1] ** 2) / max(freedom, 1)
     if freedom < 1 or not noise > 0:
-        return FirstAnswer((), False)
+        return (), False
     squares = triangle[-2 : -lags - 3 : -1, -1] ** 2 / noise
     missed = np.asarray(chi2.sf(np.cumsum(squares[1:]), np.arange(1, lags + 1)) < _MISSED)
     at_once = bool(chi2.sf(squares[0], 1) < _MISSED)
     if missed[0]:
-        return FirstAnswer((), at_once)
+        return (), at_once
     starts = [int(np.argmax(missed))] if missed.any() else []
     total = np.zeros(shortest // 2)
     for record in records:
@@ -143,11 +122,11 @@ def first_answer(records: Sequence[Record]) -> FirstAnswer:
     # A peak that lags of nothing but chance would show once in a thousand such records.
     peak, usual = int(np.argmax(np.abs(total))), float(np.sqrt(np.mean(total**2)))
     late = max(peak - 1, 0) if (abs(total[peak]) > usual * np.sqrt(2 * np.log(total.size / _MISSED))) else 0
-    return FirstAnswer((*starts, *([late] if late > lags or (late and not starts) else [])), at_once)
+    return (*starts, *([late] if late > lags or (late and not starts) else [])), at_once
 
 
 @dataclass(frozen=True, eq=False)
-class _Selected:
+class Selected:
     """An order selected behind a delay."""
 
     fitted: Fitted
@@ -162,17 +141,17 @@ class _Selected:
         return gain(found, other) + fewer * float(np.log(found.worth())) - 2 * longer
 
 
-def _behind(records: Sequence[Record], near: Fitted, delay: int, again: bool = False) -> _Selected:
+def _behind(records: Sequence[Record], near: Fitted, delay: int, again: bool = False) -> Selected:
     """Order and poles selected behind a delay, from the poles of a model with another one or from the
     start."""
     search = _search(records, near, max(delay, 0))
     selection = OrderSelection(search)
     known = near.poles.order > search.fixed.order and not again
     start = search.descend(near.poles, f"delay {delay}") if known else None
-    return _Selected(Fitted(search, selection.run(start)), selection)
+    return Selected(Fitted(search, selection.run(start)), selection)
 
 
-def _better_neighbour(records: Sequence[Record], best: _Selected) -> _Selected | None:
+def _better_neighbour(records: Sequence[Record], best: Selected) -> Selected | None:
     """The order selected again, at neighbours and from the start: a pole too many stands for what is wrong
     with the number of samples. None where nothing is better."""
     found = best.fitted

@@ -26,22 +26,15 @@ from ident.uncertainty.embedding_algebra import nuisance_basis, triangle_of
 _TIME_CONSTANTS, _LONGEST_WINDOW = 3.0, 0.1
 
 
-def group_posteriors(
-    groups: Sequence[Sequence[Record]], model: GobfModel, options: EmbeddingOptions | None = None
-) -> list[ResponsePosterior]:
-    """`tangent` for every group of records, all with the model's poles and one fir_length, fit to be
-    combined: averaging over a missed mode is off, for it would give each its own further poles."""
-    options = options or EmbeddingOptions()
-    length = min(common_fir_length(group, model.poles.doubled(), options) for group in groups)
-    shared = options.model_copy(update={"fir_length": length, "prior_missed_mode": 0.0})
-    return [tangent(group, model, shared) for group in groups]
-
-
 def record_posteriors(
     records: Sequence[Record], model: GobfModel, options: EmbeddingOptions | None = None
 ) -> list[ResponsePosterior]:
-    """`group_posteriors` with every record a group of its own."""
-    return group_posteriors([[record] for record in records], model, options)
+    """`tangent` for every record, all with the model's poles and one fir_length, fit to be combined:
+    averaging over a missed mode is off, for it would give each its own further poles."""
+    options = options or EmbeddingOptions()
+    length = min(common_fir_length([record], model.poles.doubled(), options) for record in records)
+    shared = options.model_copy(update={"fir_length": length, "prior_missed_mode": 0.0})
+    return [tangent([record], model, shared) for record in records]
 
 
 def repeat_posteriors(

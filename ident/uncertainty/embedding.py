@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -99,35 +98,9 @@ def tangent_beside(
     of each record, by what errors of the model may depend on; where they differ the covariance is wider
     (`sandwiched`). Errors as `tangent`.
     """
-    known = {"n_known": n_known, "missed_above": missed_above, "classes": tuple(classes)}
-    return _embed(records, model, options or EmbeddingOptions(), beside=beside, **known)
-
-
-def common_fir_length(records: Sequence[Record], poles: Poles, options: EmbeddingOptions) -> int:
-    """Taps of the kernel: as given, else 150 or a third of the rows that the regressors leave over."""
-    if options.fir_length is not None:
-        return options.fir_length
-    spare = sum(record.n_samples for record in records) - (len(records) + 1) * (poles.order + 2)
-    return max(1, min(_DEFAULT_FIR_LENGTH, spare // 3))
-
-
-def tangent_rows(
-    records: Sequence[Record], model: GobfModel, options: EmbeddingOptions | None = None
-) -> EmbeddingRows:
-    """Rows of the regression behind `tangent`, not yet whitened, without modes that it would add."""
-    return _rows(records, model, model.poles.doubled(), options or EmbeddingOptions())
-
-
-def _embed(
-    records: Sequence[Record],
-    model: GobfModel,
-    options: EmbeddingOptions,
-    *,
-    beside: Sequence[Beside] = (),
-    **known: Any,
-) -> tuple[ResponsePosterior, RealArray, RealArray]:
-    rows, n_off = _rows(records, model, model.poles.doubled(), options, beside), model.unstable.order
-    rows = replace(rows, **known)
+    options = options or EmbeddingOptions()
+    rows, n_off = tangent_rows(records, model, options, beside), model.unstable.order
+    rows = replace(rows, n_known=n_known, missed_above=missed_above, classes=tuple(classes))
     # Coloured noise taken for white passes for modes: none are added before it has been whitened.
     first = options.model_copy(update={"prior_missed_mode": 0.0}) if options.coloured_noise else options
     solved = _solve(rows, first)
@@ -171,6 +144,14 @@ def _embed(
     )
     posterior = _posterior(model, poles, rows.structure.feedthrough, rows.fir_length, mean, factor, report)
     return posterior, joint[0][beside_rows], joint[1][beside_rows]
+
+
+def common_fir_length(records: Sequence[Record], poles: Poles, options: EmbeddingOptions) -> int:
+    """Taps of the kernel: as given, else 150 or a third of the rows that the regressors leave over."""
+    if options.fir_length is not None:
+        return options.fir_length
+    spare = sum(record.n_samples for record in records) - (len(records) + 1) * (poles.order + 2)
+    return max(1, min(_DEFAULT_FIR_LENGTH, spare // 3))
 
 
 def embed_response(
@@ -247,13 +228,10 @@ def _noise_std(rows: EmbeddingRows, stacked: StackedBlocks) -> float:
     return float(np.sqrt(reduced.rest / max(reduced.degrees_of_freedom - reduced.fir_length, 1)))
 
 
-def _rows(
-    records: Sequence[Record],
-    model: GobfModel,
-    poles: Poles,
-    options: EmbeddingOptions,
-    beside: Sequence[Beside] = (),
+def tangent_rows(
+    records: Sequence[Record], model: GobfModel, options: EmbeddingOptions, beside: Sequence[Beside] = ()
 ) -> EmbeddingRows:
+    """Rows of the regression behind `tangent`, not yet whitened, without modes that it would add."""
     if not records:
         raise ValueError("need at least one record")
     for record in records:
@@ -266,6 +244,7 @@ def _rows(
         estimate_initial_state=options.estimate_initial_state,
         unstable=model.unstable,
     )
+    poles = model.poles.doubled()
     length = common_fir_length(records, poles, options)
     if model.unstable.order:
         # A change of the unstable poles changes B(q) y: dB y on the other side, before the other columns.

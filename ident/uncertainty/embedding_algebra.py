@@ -24,7 +24,7 @@ _PIECE = 65536
 # Columns of the QR decomposition that are done at a time.
 _PANEL = 32
 # Nuisance columns whose part orthogonal to the earlier ones is below this are the same column twice.
-_NUISANCE_RANK = 1e-10
+NUISANCE_RANK = 1e-10
 # Below this entry of R11 (columns of unit length) records cannot tell a column from the earlier ones.
 _EXCITATION = 1e-10
 # Share of the largest prior variance below which a tap is none: rounding, even ten orders above the noise.
@@ -138,7 +138,7 @@ def nuisance_basis(nuisance: RealArray) -> RealArray:
     if scaled.shape[1] == 0:
         return scaled
     q, r, _ = qr(scaled, mode="economic", pivoting=True)
-    rank = int(np.count_nonzero(np.abs(np.diag(r)) > _NUISANCE_RANK))
+    rank = int(np.count_nonzero(np.abs(np.diag(r)) > NUISANCE_RANK))
     return np.asarray(q[:, :rank])
 
 

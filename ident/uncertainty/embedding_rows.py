@@ -16,6 +16,7 @@ from ident.data.arrays import IntArray, RealArray
 from ident.data.record import Record
 from ident.uncertainty.autoregression import Absorbed, first_rows, whitened
 from ident.uncertainty.embedding_algebra import (
+    NUISANCE_RANK,
     Delays,
     KernelPosterior,
     ReducedRegression,
@@ -24,9 +25,6 @@ from ident.uncertainty.embedding_algebra import (
     joint_factor,
     nuisance_basis,
 )
-
-# Directions of the nuisance (columns of unit length) below this are left out, as in the fit.
-_NUISANCE_RANK = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +178,7 @@ def gls_residuals(
         if nuisance.shape[1]:
             # Fitted where it was estimated, in the whitened rows, and taken off the plain ones.
             u, d, vt = np.linalg.svd(whitened(nuisance, rows.whitening), full_matrices=False)
-            rank = int(np.count_nonzero(d > _NUISANCE_RANK * d[0]))
+            rank = int(np.count_nonzero(d > NUISANCE_RANK * d[0]))
             local = nuisance @ (vt[:rank].T / d[:rank])
             fitted = local @ (u[:, :rank].T @ whitened(np.column_stack([rest, shared]), rows.whitening))
             rest = rest - fitted[:, 0]

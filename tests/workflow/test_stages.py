@@ -27,7 +27,7 @@ from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.identification import as_bounded, as_fitted
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.records import make_records, read_record, with_common_sampling_time
-from workflow.tasks.results import RunRecord, RunResults
+from workflow.tasks.results import RunResults
 from workflow.tasks.simulated_rig import encoded_arm, rig_of
 from workflow.tasks.stage import StageInput
 from workflow.tasks.stages import STAGES, design_filter
@@ -280,26 +280,14 @@ def test_scatter_between_records_needs_four_and_widens_the_ellipses():
     found = identify(records, IdentOptions(n_real=1, n_pairs=0))
     result, some = found.model, tuple(records)
     omega = np.array([1.0, 10.0, 100.0])
-    apart = posterior_of(result, some, channel.uncertainty, []).at(omega)
-    noise = posterior_of(result, some, channel.uncertainty.model_copy(update={"method": "tangent"}), []).at(
-        omega
-    )
+    apart = posterior_of(result, some, channel.uncertainty).at(omega)
+    noise = posterior_of(result, some, channel.uncertainty.model_copy(update={"method": "tangent"})).at(omega)
     truth = 0.3 * np.exp(-1j * omega * 0.01) / (1 - 0.7 * np.exp(-1j * omega * 0.01))
     for gain in (0.8, 1.2):
         assert np.all(apart.contains(gain * truth))
         assert not np.any(noise.contains(gain * truth))
-    # One record per condition is the same thing said in other words; two records of one condition are one.
-    by_condition = channel.uncertainty.model_copy(update={"method": "conditions"})
-    labels = ["a", "b", "c", "d"]
-    labelled = [RunRecord(r, "estimation", c, "") for r, c in zip(records, labels, strict=True)]
-    np.testing.assert_array_equal(
-        posterior_of(result, some, by_condition, labelled).at(omega).covariance, apart.covariance
-    )
-    alike = [*labelled[:3], replace(labelled[3], condition="c")]
-    with pytest.raises(ValueError, match="at least four conditions of estimation records; found 3"):
-        posterior_of(result, some, by_condition, alike)
     with pytest.raises(ValueError, match="at least four estimation records; found 3"):
-        posterior_of(result, some[:3], channel.uncertainty, [])
+        posterior_of(result, some[:3], channel.uncertainty)
 
 
 def test_sampling_times_that_differ_are_refused_and_jitter_is_not():

@@ -25,11 +25,10 @@ class UncertaintyOptions(EmbeddingOptions):
         description="whiten with an AR model of the residuals, three rounds; auto: where they are not white, "
         "or where max_ar_order is given",
     )
-    method: Literal["tangent", "records", "conditions"] = Field(
+    method: Literal["tangent", "records"] = Field(
         "tangent",
         description="tangent: noise; records: also the scatter between records, for arms that differ "
-        "from run to run or with amplitude (four records or more); conditions: the same "
-        "between records of different condition",
+        "from run to run or with amplitude (four records or more)",
     )
     level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse taken alone")
     response: Literal["as recorded", "without friction", "this amplitude"] = Field(

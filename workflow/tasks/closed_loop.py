@@ -89,9 +89,8 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
         else:
             # Control and performance channel are drawn independently.
             own = posterior.sample(stage.rng("closed_loop", "control"), options.draws)
-            shown = None
-            if tip is not None:
-                shown = tip, tip.sample(stage.rng("closed_loop", "performance"), options.draws)
+            rng = stage.rng("closed_loop", "performance")
+            shown = None if tip is None else (tip, tip.sample(rng, options.draws))
             achieved = run_on_draws(controller, (posterior, own), shown, trial, **converter_steps(options))
         if options.sensitivity and results.identify.friction is not None:
             stage.progress.update("closed_loop", 0.95, "friction")
@@ -99,9 +98,9 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
             friction = check_friction(
                 stage, controller, trial.reference[first], trial.given[first], sensitivity
             )
-    model = None
-    if reference_filter is not None and config.reference_filter is not None:
-        model = model_answer(config.reference_filter.reference_model, trial.reference, controller.dt_s)
+    followed = None if reference_filter is None else config.reference_filter
+    dt_s = controller.dt_s
+    model = None if followed is None else model_answer(followed.reference_model, trial.reference, dt_s)
     return ClosedLoopResult(
         check=LoopCheck(
             machine=config.machine,
@@ -144,11 +143,9 @@ def make_trial(
     if options.duration_s is not None:
         samples = min(max(round(options.duration_s / dt_s), _SHORTEST), longest)
     step = options.reference_step or 0.5 * rms_of([record.output for record in used])
-    disturbance = options.disturbance
+    disturbance, k, half = options.disturbance, np.arange(samples), samples // 2
     if disturbance is None:
         disturbance = 0.1 * rms_of([record.input for record in used])
-    k = np.arange(samples)
-    half = samples // 2
     reference = np.where(k >= round(_LEAD_IN * samples), step, 0.0)
     return Trial(
         time_s=np.asarray(k * dt_s, dtype=np.float64),

@@ -134,9 +134,7 @@ def motion_of(limits: ExperimentLimits) -> Callable[[Real], Real] | None:
         from plant.simulation import simulate
 
         return lambda voltage: simulate(rig, voltage, dt_s=limits.dt_s).hub_angle_true_rad
-    if gain is not None:
-        return lambda voltage: gain * limits.dt_s * np.cumsum(voltage)
-    return None
+    return None if gain is None else lambda voltage: gain * limits.dt_s * np.cumsum(voltage)
 
 
 def plan_experiment(limits: ExperimentLimits, *, seed: int, **settings: object) -> PlannedExperiment:

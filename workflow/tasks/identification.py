@@ -14,7 +14,7 @@ from ident.checks.input_checks import clipped
 from ident.checks.plausible_modes import pairs_outside
 from ident.checks.residual_tests import fed_back, independence_test
 from ident.checks.validation import fit_in_windows, fit_on_fresh_data
-from ident.closed_loop import TwoStage, two_stage, with_controller
+from ident.closed_loop import EXPLAINED_PERCENT, TwoStage, two_stage, with_controller
 from ident.data.finding import Finding, FindingKind, distinct, finding
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, increments, settling_time_s
@@ -26,6 +26,7 @@ from ident.friction import (
     refuse_unseen_shaft,
 )
 from ident.one_input import identify
+from ident.response_uncertainty import NOISE_ORDERS
 from ident.stabilisation import stabilisation
 from ident.uncertainty.embedding import tangent
 from workflow.config.run_config import Channel, ClosedLoopData, FileSource, Role
@@ -36,11 +37,8 @@ from workflow.text.templates import said
 
 Report = Callable[[float, str], None]
 _OF_THE_FIT = 0.6  # share of the time; the stabilisation plot takes the rest
-# A reference that explains less of the input than this is no way to open the loop.
-_EXPLAINED_PERCENT = 50.0
 # Samples of a record that tell whether its command follows its output.
 _TELLING = 50_000
-_NOISE_ORDER = 32  # of ellipses against which what a loop feeds back is held
 
 
 def as_fitted(record: Record, channel: Channel, friction: FrictionFit | None = None) -> Record:
@@ -219,7 +217,7 @@ def identify_channel(
         known = measured if way == "two_stage" else with_stated_controller(measured, loop, units)
         opened = two_stage([as_bounded(record, channel) for record in known], options)
         explained = min(opened.fit_percent)
-        if explained >= _EXPLAINED_PERCENT or loop.method != "auto":
+        if explained >= EXPLAINED_PERCENT or loop.method != "auto":
             kind = FindingKind.TWO_STAGE if way == "two_stage" else FindingKind.INDIRECT
             return fitted(opened, finding(kind, **opened.finding.values))
     assert given is not None
@@ -255,7 +253,7 @@ def _direct(found: IdentifiedChannel, explained: float | None, *, stated: bool) 
     inputs = [record.input[: record.n_samples - delay, 0] for record in found.used]
     why, times = "clean", 0.0
     if independence_test(inputs, residuals).precedes_input:
-        bounds = EmbeddingOptions(coloured_noise=True, max_ar_order=_NOISE_ORDER)
+        bounds = EmbeddingOptions(coloured_noise=True, max_ar_order=NOISE_ORDERS[-1])
         times = fed_back(tangent(found.bounded, model, bounds), found.bounded)
         why = "small" if times <= 1 else "spoilt"
     told = {} if explained is None else {"explained_percent": explained}
@@ -309,11 +307,13 @@ def identified_channel(
     ]
     # All of its warnings are looked for now, so that it is a plain value.
     found = replace(found, search=replace(found.search, warnings=(*found.warnings, *unseen)), advise=tuple)
-    plot = None
-    if with_plot:
-        plot = stabilisation(
+    plot = (
+        stabilisation(
             used, found, options, progress=lambda done, what: report(share + (1 - share) * done, what)
         )
+        if with_plot
+        else None
+    )
     return IdentifiedChannel(
         name=name,
         identification=found,

@@ -33,7 +33,7 @@ from ident.friction import (
 )
 from ident.response_uncertainty import with_noise_model
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
-from ident.uncertainty.conditions import combine_posteriors, group_posteriors, repeat_posteriors
+from ident.uncertainty.conditions import combine_posteriors, record_posteriors, repeat_posteriors
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.nominal import MOST_INSIDE_PERCENT, NominalAgreement, nominal_near
 from ident.uncertainty.pole_intervals import growth_intervals, pole_intervals
@@ -85,7 +85,6 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
                 friction=friction,
                 at_shaft=k == control,
                 equivalent=equivalent,
-                records=records.records,
             )
             bands = [(band.from_rad_s, band.to_rad_s) for band in found.bands]
             scatter = scatter_of(channel, result, records.records, bands, friction)
@@ -102,14 +101,13 @@ def uncertainty_of(
     friction: FrictionFit | None = None,
     at_shaft: bool = True,
     equivalent: EquivalentFriction | None = None,
-    records: Sequence[RunRecord] = (),
 ) -> tuple[UncertainChannel, EquivalentFriction | None]:
     """Ellipses of one channel, as `flexlink run` and `flexlink identify` have them, and the viscous friction
     that acts like the dry one where they are about an amplitude.
 
     measured: SISO estimation records as recorded; friction: of the shaft, whose position the channel's output
-    is where at_shaft; equivalent: where it is known from the shaft; records: with their conditions. Raises
-    ValueError, one line, where the model explains nothing.
+    is where at_shaft; equivalent: where it is known from the shaft. Raises ValueError, one line,
+    where the model explains nothing.
     """
     poles, options = result.model.poles, channel.embedding
     if friction is None:
@@ -122,7 +120,7 @@ def uncertainty_of(
         if options.method == "tangent" or options.coloured_noise == "auto":
             (posterior, tests), options = with_noise_model(options, white, posterior_behind)
         if options.method != "tangent":
-            posterior = posterior_of(result.model, result.bounded, options, records)
+            posterior = posterior_of(result.model, result.bounded, options)
             tests = residual_tests(posterior, result.bounded)
         linear = posterior
     else:
@@ -254,22 +252,17 @@ def refuse_unexplained(
 
 
 def posterior_of(
-    model: GobfModel, bounded: Sequence[Record], options: UncertaintyOptions, records: Sequence[RunRecord]
+    model: GobfModel, bounded: Sequence[Record], options: UncertaintyOptions
 ) -> ResponsePosterior:
     """One library call, by method."""
     if options.method == "tangent":
         return tangent(bounded, model, options)
-    condition = {item.record.name: item.condition for item in records}
-    groups: dict[str, list[Record]] = {}
-    for record in bounded:
-        known = condition.get(record.name) if options.method == "conditions" else None
-        groups.setdefault(known or record.name, []).append(record)
-    if len(groups) < 4:
-        what = "estimation records" if options.method == "records" else "conditions of estimation records"
+    if len(bounded) < 4:
         raise ValueError(
-            f"uncertainty.method = {options.method!r} needs at least four {what}; found {len(groups)}"
+            f"uncertainty.method = {options.method!r} needs at least four estimation records; found "
+            f"{len(bounded)}"
         )
-    each = group_posteriors(list(groups.values()), model, options)
+    each = record_posteriors(bounded, model, options)
     return combine_posteriors(each, small_sample_level=options.level)
 
 
