@@ -71,3 +71,15 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def unbuilt(undrawn: None, monkeypatch: pytest.MonkeyPatch) -> None:
     build_nothing(monkeypatch)
+
+
+@pytest.fixture
+def unidentified(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`flexlink init` writes what it makes of the logs before it identifies them, within a second."""
+    from workflow.commands import init
+
+    def decided(command, logs, file, stated, progress):
+        config, text, found = init.drafted(command, logs, file, stated)
+        return config, text, {}, found
+
+    monkeypatch.setattr(init, "decided", decided)

@@ -118,7 +118,7 @@ GAIN, MODE = 8.0, np.exp((-3 + 30j) * 0.01)
 def noisy_loop(seed: int) -> tuple[np.ndarray, ...]:
     """u = 8 (r - y) at once, y a mode of 30 rad/s with as much coloured noise as motion."""
     rng = np.random.default_rng(seed)
-    n, a1, a2 = 4000, 2 * MODE.real, -(abs(MODE) ** 2)
+    n, a1, a2 = 2000, 2 * MODE.real, -(abs(MODE) ** 2)
     noise = lfilter([1.0], [1.0, -0.9], 0.05 * rng.standard_normal(n))
     r = 0.3 * np.repeat(rng.choice([-1.0, 1.0], n // 4), 4)
     x, u = np.zeros(n), np.zeros(n)

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workflow.commands import init
 from workflow.config.run_config import RunConfig, load_config
 from workflow.config.settings import check
 from workflow.engine.run_directory import RunDirectory
@@ -97,17 +96,6 @@ def write(folder, signals, names, units=(1.0, 1.0, 1.0, 1.0), separator=","):
         )
         paths.append(path)
     return paths
-
-
-@pytest.fixture
-def unidentified(monkeypatch):
-    """What is written before the logs are identified, within a second."""
-
-    def decided(command, logs, file, stated, progress):
-        config, text, found = init.drafted(command, logs, file, stated)
-        return config, text, {}, found
-
-    monkeypatch.setattr(init, "decided", decided)
 
 
 def drafted(flexlink, logs, *options):
@@ -267,6 +255,7 @@ def test_one_log_is_split_or_nothing_validates(flexlink, tmp_path, signals):
     assert "nothing validates" in text
 
 
+@pytest.mark.usefixtures("unidentified")
 def test_refused_in_a_line_that_says_what_to_type(refused, flexlink, tmp_path, signals):
     out = tmp_path / "my.toml"
     logs = write(tmp_path, [(t, r, u, y) for t, r, u, y in signals[:2]], ("t_s", "ref_rad", "u_V", "y_rad"))

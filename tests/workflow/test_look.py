@@ -86,6 +86,7 @@ def test_what_is_said_of_text(name, words, flexlink, tmp_path):
     assert words in " ".join(answer.out.split())
 
 
+@pytest.mark.usefixtures("unidentified")
 @pytest.mark.parametrize("cell", ["nan", "", "overflow"])
 def test_a_cell_without_a_number_is_taken_out_and_filled_in(cell, flexlink, refused, tmp_path):
     rng, path = np.random.default_rng(1), tmp_path / "log.csv"
@@ -110,6 +111,7 @@ def test_a_cell_without_a_number_is_taken_out_and_filled_in(cell, flexlink, refu
     assert flexlink("look", path).out.splitlines()[-1].endswith("100 rows are missing, split the file there")
 
 
+@pytest.mark.usefixtures("unidentified")
 @pytest.mark.parametrize("marks", [(0, 1), ("up", "down"), (0.5, 2.5)])
 def test_runs_in_one_table_are_records_and_a_counter_does_not_wrap(marks, flexlink, refused, tmp_path):
     t, count, path = 0.01 * (np.arange(6000) % 3000), np.arange(6000) % 3000, tmp_path / "a.csv"
