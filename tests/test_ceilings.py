@@ -1,7 +1,5 @@
 """What a reader has to hold in mind only grows less: figures of the code, held below their ceilings."""
 
-from __future__ import annotations
-
 import json
 import math
 import subprocess
@@ -12,18 +10,21 @@ import pytest
 
 from benchmarks import concepts
 
-FIGURES = concepts.figures()
+
+@pytest.fixture(scope="module")
+def figures():
+    return concepts.figures()
 
 
-def test_no_figure_stands_above_its_ceiling():
-    assert concepts.above(FIGURES, concepts.ceilings()) == []
+def test_no_figure_stands_above_its_ceiling(figures):
+    assert concepts.above(figures, concepts.ceilings()) == []
 
 
-def test_a_figure_above_its_ceiling_is_named_and_no_ceiling_is_raised(monkeypatch):
-    held = {"product": {"classes": FIGURES["product"]["classes"] - 1}}
-    assert concepts.above(FIGURES, held)[0].startswith("product: ")
+def test_a_figure_above_its_ceiling_is_named_and_no_ceiling_is_raised(monkeypatch, figures):
+    held = {"product": {"classes": figures["product"]["classes"] - 1}}
+    assert concepts.above(figures, held)[0].startswith("product: ")
     monkeypatch.setattr(concepts, "ceilings", lambda: held)
-    monkeypatch.setattr(concepts, "figures", lambda: FIGURES)
+    monkeypatch.setattr(concepts, "figures", lambda: figures)
     before = concepts.CEILINGS.read_text()
     with pytest.raises(SystemExit, match="no ceiling is raised: product: "):
         concepts.run(lambda line="": None, lower=True)
@@ -62,7 +63,7 @@ def test_what_is_counted():
     assert names == {"One", "Settings2"}
 
 
-def test_the_other_program_that_counts_finds_the_same():
+def test_the_other_program_that_counts_finds_the_same(figures):
     """An independent program beside the project, where it is at hand."""
     other = concepts.ROOT.parent / "shared" / "tools" / "concepts.py"
     if not other.is_file():
@@ -73,7 +74,7 @@ def test_the_other_program_that_counts_finds_the_same():
     done = subprocess.run(
         [sys.executable, str(other), "--json"], cwd=concepts.ROOT, capture_output=True, check=True
     )
-    assert json.loads(done.stdout)["product"] == dict(FIGURES["product"])
+    assert json.loads(done.stdout)["product"] == dict(figures["product"])
 
 
 def test_reference_computation():
