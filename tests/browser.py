@@ -1,7 +1,5 @@
 """What a reader's browser makes of a page: Chromium without a screen, over a pipe (DevTools protocol)."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os

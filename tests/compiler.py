@@ -1,7 +1,5 @@
 """C code of the product, compiled as a library."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Paths to data that never enters the repository, and the command line called in this process."""
 
-from __future__ import annotations
-
 import functools
 import os
 import shutil

@@ -1,7 +1,5 @@
 """What the import contracts of pyproject.toml (`lint-imports`) do not see; and that they hold."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

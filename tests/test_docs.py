@@ -1,7 +1,5 @@
 """The documents: every snippet runs, every key has a meaning, the site needs no network."""
 
-from __future__ import annotations
-
 import contextlib
 import doctest
 import glob

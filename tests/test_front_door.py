@@ -1,7 +1,5 @@
 """The front door: every example in it runs, everything it names is there, and importing it costs nothing."""
 
-from __future__ import annotations
-
 import doctest
 import inspect
 import os

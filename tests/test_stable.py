@@ -1,7 +1,5 @@
 """The page of what is stable says what the code does."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Times of tests: whose they are, and what is not compared."""
 
-from __future__ import annotations
-
 from benchmarks import durations
 
 CELL = '<properties><property name="cpu_s" value="{}"/></properties>'

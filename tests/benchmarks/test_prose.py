@@ -1,7 +1,5 @@
 """The words of README, documents and pages stay short."""
 
-from __future__ import annotations
-
 import pytest
 
 from benchmarks import prose

@@ -1,7 +1,5 @@
 """Small plants of the tests; built with python-control only."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import control

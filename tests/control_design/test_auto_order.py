@@ -1,7 +1,5 @@
 """`controller_order = "auto"`: the lowest order near what a controller of any order reaches."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import control

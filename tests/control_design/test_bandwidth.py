@@ -1,7 +1,5 @@
 """The bandwidth that a specification leaves open."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 
 import control

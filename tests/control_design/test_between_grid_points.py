@@ -1,7 +1,5 @@
 """Bounds for all frequencies: never below what sampling finds, close to it, honest where none is had."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Cascades against scipy's bilinear transform and python-control; the symbolic programme against numpy."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The generated C, compiled by the machine's compiler, against the Python controller over every option."""
 
-from __future__ import annotations
-
 import ctypes
 import ctypes.util
 import math

@@ -1,7 +1,5 @@
 """The certificate: honest about instability, exact against sampled plants, clear about its limits."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Time domain against python-control's feedback of the same functions; limits, quantisation, metrics."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The running controller against python-control, anti-windup against its limits, exact round trips."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Exact geometry of the ellipses against sampling of their boundary and against numpy's eigenvalues."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import chi2

@@ -1,7 +1,5 @@
 """First-order expansions with remainder hold at every sampled frequency of their intervals."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Joint coverage: exact where the answer is known by hand, honest on fresh draws, refused without draws."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

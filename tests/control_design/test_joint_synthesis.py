@@ -1,7 +1,5 @@
 """Guards are kept stable; a joint design is stable for the share of draws asked, by poles computed here."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

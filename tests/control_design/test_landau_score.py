@@ -1,8 +1,6 @@
 """Landau's score on loops whose items can be worked out by hand; the search's fast margins against the
 score's."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

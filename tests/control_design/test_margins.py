@@ -1,7 +1,5 @@
 """Margins whose limit is at zero frequency, at Nyquist, touched or narrow; and that units do not matter."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import control

@@ -1,7 +1,5 @@
 """The D-scaled bound against independent judges, the scalar ellipses and samples; certificate and margins."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import control

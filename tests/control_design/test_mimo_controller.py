@@ -1,7 +1,5 @@
 """The controller of several commands: files, limits."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Synthesis of matrix controllers: descents, structures, integrators, refusals."""
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Smallest worst ratio: problems with known answers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import linprog

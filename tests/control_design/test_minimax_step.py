@@ -1,7 +1,5 @@
 """One minimax step against linear programming (scipy) and against its own optimality conditions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import linprog

@@ -1,7 +1,5 @@
 """A requirement that the numerics have never heard of: one class, and everything takes it up."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

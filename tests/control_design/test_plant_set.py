@@ -1,7 +1,5 @@
 """Uncertain plants: integrators counted, responses against python-control, refusals in one line."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -5,8 +5,6 @@ test_joint_coverage and test_joint_synthesis, certificate in test_between_grid_p
 the transmission with three loads in test_landau_score.
 """
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Random plants of the benchmark are what they claim; a proved loop keeps its sampled plants stable."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Reference filter: independent evaluation of errors, known answers, round trips."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Why a controller is no design: nominal loops, ellipses over -1, extra delay, a controller that rings."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

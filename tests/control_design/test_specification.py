@@ -1,7 +1,5 @@
 """Weights by hand, and contradictions refused in one line with their numbers."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

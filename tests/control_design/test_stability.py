@@ -1,7 +1,5 @@
 """Nyquist count against closed-loop poles on random loops; margins by hand and by python-control."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

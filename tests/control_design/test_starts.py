@@ -1,7 +1,5 @@
 """Shaped starts, descent and cancelling sections on small plants built with python-control."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Stated discs: radius against the formula, bounds between frequencies against dense sampling."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Synthesis on the published link and on a hub: certified numbers, determinism, infeasible requirements."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import control

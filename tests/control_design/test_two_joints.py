@@ -1,7 +1,5 @@
 """The whole way of several joints: logs, model, ball, controller, certificate, the true arm, C code."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """Plants that are unstable in open loop: a low order stabilises them, and the design finds it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import control

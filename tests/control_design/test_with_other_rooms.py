@@ -1,7 +1,5 @@
 """The seams: an identified posterior as uncertain plant, the nonlinear arm as sampled machine."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Youla bracket: interpolation theory gives the answer of small problems exactly."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

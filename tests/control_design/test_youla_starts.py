@@ -1,7 +1,5 @@
 """Fits of the Youla bound's controllers: exact where K has the asked order, near the bound on the links."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Machines whose truth comes from scipy's integrator, event by event: not from what is on trial."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.integrate import solve_ivp
 

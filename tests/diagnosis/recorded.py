@@ -1,7 +1,5 @@
 """Cases of independent rigs: recorded ones, read without the project's own readers, and simulated ones."""
 
-from __future__ import annotations
-
 import tomllib
 
 import numpy as np

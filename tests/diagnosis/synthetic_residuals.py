@@ -1,7 +1,5 @@
 """A small case whose residuals are made to order: white noise plus a gap whose place is known."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from diagnosis import Case, Experiment

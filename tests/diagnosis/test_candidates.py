@@ -1,7 +1,5 @@
 """Spaces of effects: the one in place of a stated value, and what is an effect only by name."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cases and nominal parameters: what is refused, and what a deviation means."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Held-out records that do not confirm what the estimation records say; made by an independent simulator."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What is left over: white noise leaves nothing, a little in one band is seen, energies add up."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.signal

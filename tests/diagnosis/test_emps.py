@@ -1,7 +1,5 @@
 """EMPS, a measured axis that is no flexible link: the published effects are named, with published values."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Evidence against numerical integration, priors and probabilities that sum to one."""
 
-from __future__ import annotations
-
 from math import comb
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Descents in bent and flat valleys; records by an independent simulator."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """An FMU as a plant: compiled here from a source of our own, against the same equation in Python."""
 
-from __future__ import annotations
-
 import gc
 import subprocess
 import sys

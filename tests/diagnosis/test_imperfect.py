@@ -1,7 +1,5 @@
 """Diagnosis beside a model error: levels learned from the records, starts and zeros that nobody knows."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from pathlib import Path

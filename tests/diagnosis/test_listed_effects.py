@@ -1,7 +1,5 @@
 """Listed effects around simulations that know none of them, against scipy's integrator."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 

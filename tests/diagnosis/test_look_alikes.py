@@ -1,7 +1,5 @@
 """A spring to ground, which is not on the list, and gravity, which is; made by an independent simulator."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -3,8 +3,6 @@
 The truth is MuJoCo with another text, integrator and step, or with forces and commands changed by hand.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass

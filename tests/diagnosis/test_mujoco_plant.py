@@ -1,7 +1,5 @@
 """A MuJoCo model as a plant: against closed forms, and its repaired file against MuJoCo itself."""
 
-from __future__ import annotations
-
 import os
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The next experiment separates what differs, says when nothing does, and keeps the machine in its limits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

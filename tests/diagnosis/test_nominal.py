@@ -1,7 +1,5 @@
 """What is believed of stated values before any record."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

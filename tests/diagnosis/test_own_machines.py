@@ -4,8 +4,6 @@ Truth by scipy's integrator. Every stated value is off within its tolerance, and
 listed acts (2 % of the forces): a drag, a second harmonic of gravity, an uneven spring.
 """
 
-from __future__ import annotations
-
 import time
 import warnings
 from dataclasses import replace

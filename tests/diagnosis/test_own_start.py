@@ -1,7 +1,5 @@
 """A plant of one's own whose records start anywhere: truth by scipy's integrator."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 from scipy.integrate import solve_ivp

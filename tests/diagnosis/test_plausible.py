@@ -1,7 +1,5 @@
 """Units, signs, columns and sensors: every planted fault is named, no recorded case is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A machine that is no flexible link goes through the same diagnosis, by the protocol alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

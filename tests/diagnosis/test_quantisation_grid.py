@@ -1,7 +1,5 @@
 """Rounded outputs: the step is read off the values, cells weigh as their chance, quantisation is named."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Measured arms as plants of one's own: what stands whatever the details, and what the records show."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

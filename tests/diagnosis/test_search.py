@@ -1,7 +1,5 @@
 """Recorded gaps of an independent finite-element rig: the cause is named, its size found, the gap closed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

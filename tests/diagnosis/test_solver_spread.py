@@ -1,7 +1,5 @@
 """Drifting apart where contacts switch, against a simulator that shares no code with the diagnosed model."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

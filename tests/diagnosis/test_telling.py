@@ -1,7 +1,5 @@
 """What records can tell before a fit: sizes against closed forms, what acts alike, what does nothing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

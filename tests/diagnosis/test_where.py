@@ -1,7 +1,5 @@
 """Where the gap lies: places made on purpose are found, noise alone is not, recorded gaps are located."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace

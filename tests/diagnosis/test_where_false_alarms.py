@@ -1,7 +1,5 @@
 """Noise alone raises a finding as often as its level says, for every axis of `where`."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import binom

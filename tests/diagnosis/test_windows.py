@@ -1,7 +1,5 @@
 """Windows in which no drift grows: of machines that integrate, each from the state that fits it best."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid

@@ -5,8 +5,6 @@
 Run it only when a change is meant to move the margins, and say why in the commit and in CHANGELOG.md.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import tempfile

@@ -4,8 +4,6 @@ SNR = 20 log10(standard deviation of the noise-free output / standard deviation 
 with that reading the Cramer-Rao bounds of P1 come out as the published 0.97 and 0.063.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

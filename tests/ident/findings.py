@@ -1,7 +1,5 @@
 """What tests ask of findings; their sentences are those of tests/workflow/test_findings.py."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 from ident.data.finding import Finding, FindingKind, Value

@@ -2,15 +2,13 @@
 openpyxl and json put them there. No line is shared with the reader; `benchmarks/log_oracle.py` reads a
 thousand of them."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -71,7 +69,7 @@ class Log:
     end: str = "\n"
 
     @classmethod
-    def of(cls, rng: np.random.Generator) -> Log:
+    def of(cls, rng: np.random.Generator) -> Self:
         n, dt_s = int(rng.integers(60, 300)), float(rng.choice([5e-4, 1e-3, 2e-3, 5e-3, 0.01, 0.02, 0.1]))
         u, y = rng.choice([-2.5, 1.5, 3.0], n).repeat(3)[:n], np.round(np.cumsum(rng.normal(0, 0.3, n)), 6)
         unit = str(rng.choice(["s", "s", "ms", "ms", "us", "ns", "min"]))

@@ -1,7 +1,5 @@
 """Damage done to files, the same for the same seed, and what became of it."""
 
-from __future__ import annotations
-
 import contextlib
 import gzip
 import io

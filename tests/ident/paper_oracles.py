@@ -12,8 +12,6 @@ The all-pass factor that (13) writes out, (1 - conj(xi_{i-1}) z) on L_{i-1}, is 
 pair here.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.linalg
 

@@ -1,7 +1,5 @@
 """The basis against its own identities, its limits, and independent realisations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.signal

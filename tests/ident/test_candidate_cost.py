@@ -1,7 +1,5 @@
 """The cost of candidate poles on top of frozen ones against fits of all poles together."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Closed-loop logs: bias of the direct method, two-stage without it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Logs of several loops at once: what feedback does to a direct fit, and what two stages leave of it. The
 loops are run here sample by sample, by numpy."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import control

@@ -1,7 +1,5 @@
 """Poles behind coloured noise: modes under dry friction, and the same digits as before in white noise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.signal

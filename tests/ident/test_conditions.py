@@ -1,7 +1,5 @@
 """Scatter between conditions: coverage of the next one, the coefficient form frequency by frequency."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import signal

@@ -1,7 +1,5 @@
 """Dead time of plants by scipy: found where it is, with the order behind it, and not where there is none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import signal

@@ -3,8 +3,6 @@
 The first rows answer to inputs that nobody recorded. The generator makes them from inputs before the record.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import signal

@@ -1,7 +1,5 @@
 """The same input gives the same bytes, whatever ran before in the process and whichever process compiled."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import json

@@ -1,7 +1,5 @@
 """Levels of noise and distortion against systems of which both are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import signal

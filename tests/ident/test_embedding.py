@@ -1,7 +1,5 @@
 """Embedding from records: structure against dense formulas, coverage of known truth, coloured noise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import signal

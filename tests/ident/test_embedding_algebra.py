@@ -1,7 +1,5 @@
 """The reduced formulas against the same model written out with N x N matrices."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.linalg import toeplitz

@@ -3,8 +3,6 @@
 All hold the same experiment: 60 samples, u = +-1.5 V, y = 0.125 k rad, every 0.01 s unless said otherwise.
 """
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

@@ -1,7 +1,5 @@
 """GOBF models from measured frequency responses: known plants by scipy, derivatives, coverage, bad input."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Ellipses, distances, user's files and repeated measurements against known truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st

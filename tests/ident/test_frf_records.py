@@ -1,7 +1,5 @@
 """Repeated points of a frequency response: files, loops, means and regions of one more run."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Coulomb friction identified with the arm, on records of simulators that share no code with it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Friction and arm from logs of a loop, made by machines that share no code with the product."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

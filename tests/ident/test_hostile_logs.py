@@ -1,7 +1,5 @@
 """Damaged log files: columns or a ValueError of one line, whatever the bytes; no crash, no hang."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import os

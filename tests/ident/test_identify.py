@@ -1,7 +1,5 @@
 """The whole identification on data whose truth is known, and on data it must refuse."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

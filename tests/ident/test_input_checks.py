@@ -1,7 +1,5 @@
 """Each warning on a record made to deserve it; none on records that deserve none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.signal

@@ -1,7 +1,5 @@
 """Fits and their derivatives against dense linear algebra and finite differences."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """MATLAB files against scipy's writer, and files that once ended the process."""
 
-from __future__ import annotations
-
 import io
 import resource
 import struct

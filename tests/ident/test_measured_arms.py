@@ -1,7 +1,5 @@
 """Measured arms: what identification gets out of them, and its ellipses against measured repeats."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

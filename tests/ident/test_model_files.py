@@ -1,7 +1,5 @@
 """Models in files: bit-identical both ways, readable by others, damaged ones refused in one line."""
 
-from __future__ import annotations
-
 import json
 
 import control

@@ -1,7 +1,5 @@
 """Nominal model from a posterior: recovers a model in its span, weighs frequencies by the ellipses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Empirical responses against known systems, open and closed loop, and coherence."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import signal

@@ -5,8 +5,6 @@ Reading the printed text: (8) and (9) are about squared moduli, the first entry 
 (15) fails), and gamma of (29) is |xi|^2 in (0, 1), Fig. 1's axis being -gamma.
 """
 
-from __future__ import annotations
-
 import re
 import typing
 

@@ -1,7 +1,5 @@
 """Intervals of frequency and damping: exact to first order, and they hold the truth as often as they say."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

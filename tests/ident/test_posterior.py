@@ -1,7 +1,5 @@
 """Response posterior: formula, covariance, simulation, joint level, storage."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import signal

@@ -1,7 +1,5 @@
 """What users state as known is judged by the data: true statements pass, wrong ones are refused by name."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

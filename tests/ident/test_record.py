@@ -3,8 +3,6 @@
 Formats and layouts of files: `test_forty_logs.py`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

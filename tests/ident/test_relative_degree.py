@@ -1,7 +1,5 @@
 """Conditions of a relative degree against SciPy: sampled plants, matrix logarithm, contour integrals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.linalg

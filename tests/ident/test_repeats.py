@@ -1,7 +1,5 @@
 """Repeats at two amplitudes: how often a linear loop is accused, and what is said of others."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import signal

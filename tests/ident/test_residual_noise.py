@@ -1,7 +1,5 @@
 """Noise models from residuals: exact whitening, and the bias of a fit taken out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import signal

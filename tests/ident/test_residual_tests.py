@@ -1,7 +1,5 @@
 """Whiteness and independence: false alarms at the stated rate, real faults found."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import signal

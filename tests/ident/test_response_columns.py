@@ -1,7 +1,5 @@
 """Frequency responses under the names that analysers, programs and people give their columns."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Columns found by names and units, or a command to type."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Other units of input, output and time change nothing but the units: no constant here has one."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

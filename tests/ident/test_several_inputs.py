@@ -1,7 +1,5 @@
 """Several inputs with shared poles: limits, identities and plants made by SciPy alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import signal

@@ -1,7 +1,5 @@
 """Several inputs and outputs on shared poles: truth from modal sums by python-control."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import control

@@ -1,7 +1,5 @@
 """The stabilisation plot tells the modes of an independently simulated plant from peaks of its noise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

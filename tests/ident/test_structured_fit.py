@@ -1,7 +1,5 @@
 """Fit and descent under a relative degree: difference quotients, SciPy's optimiser, known truths."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.linalg

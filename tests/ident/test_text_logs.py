@@ -3,8 +3,6 @@
 The files are written here, as instruments and loggers write them; u = +-1.5 V, y = 0.125 k, every 5 ms.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stamps that jitter, or leave rows out, against a signal whose values on the grid are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

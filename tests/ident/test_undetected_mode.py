@@ -1,7 +1,5 @@
 """Averaging over a missed mode: every formula against dense matrices, and what it does to the ellipses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import signal

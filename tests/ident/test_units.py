@@ -1,7 +1,5 @@
 """Units in headers: what is recognised, what is refused, and that seconds come back with their very bits."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Logs of one set whose columns are in different units: one unit, and a word of it, or a refusal."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Plants with poles outside the unit circle: models, files, fits and ellipses against other arithmetic."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fresh-data fit and repeat scatter on systems whose answer is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Readings that wrap, made from a motion that is known."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Random plants of P2 with three modes, on the grid and in the bands of the benchmark of coverage."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

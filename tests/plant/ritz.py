@@ -5,8 +5,6 @@ coordinates relative to the hub, the energies of the rig description by quadratu
 integrators. Shares no code with `plant` but the record of nominal parameters.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.polynomial.legendre import leggauss

@@ -1,7 +1,5 @@
 """The simulation against an arm written down and integrated independently (see ritz.py)."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

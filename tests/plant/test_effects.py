@@ -1,7 +1,5 @@
 """The contract every registered effect keeps. An effect without an entry in EXAMPLES fails here."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Dry friction at rest and at its edges, where a law that is almost right shows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

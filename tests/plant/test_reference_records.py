@@ -1,8 +1,6 @@
 """The recorded arms: an independent finite-element rig with large rotations, its effects and parameters
 known."""
 
-from __future__ import annotations
-
 import tomllib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The nonlinear two-link arm against an independent linearisation, conserved energy and momentum."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 import pytest

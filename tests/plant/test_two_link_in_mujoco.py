@@ -1,8 +1,6 @@
 """The two-link arm against one in MuJoCo whose links are cut into rigid segments with springs between them,
 and a controller designed for ours in the loop around that one. They share sizes and no equation."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Cases, seal, opening: what a blind run promises; a quick stand-in diagnoses where it may."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import stat

@@ -1,7 +1,5 @@
 """Scores of answers whose quality is known by construction."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

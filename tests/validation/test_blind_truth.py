@@ -1,7 +1,5 @@
 """The two simulators of the house agree: the blind protocol's elastica and the plant's linear modes."""
 
-from __future__ import annotations
-
 import tomllib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Workshop cases: the truth begins anywhere, the nominal machine is its linear limit, answers hold."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections import Counter

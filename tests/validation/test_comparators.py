@@ -1,7 +1,5 @@
 """The comparison methods on data made with scipy.signal.lfilter, and OE on the one-mode plant P1."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

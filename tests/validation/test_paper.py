@@ -1,7 +1,5 @@
 """`flexlink paper`: whole files or none, figures that read, sentences that follow the numbers."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

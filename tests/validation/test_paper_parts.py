@@ -1,7 +1,5 @@
 """The rebuilt machines, the yardsticks, the usual starts and the counting, each against known truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.signal

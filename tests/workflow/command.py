@@ -1,7 +1,5 @@
 """Calling the command line from tests, in this process or in one that can be killed."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

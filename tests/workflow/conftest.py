@@ -1,7 +1,5 @@
 """What is computed once and looked at by many tests; of all workers the first one computes it."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

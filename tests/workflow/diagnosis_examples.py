@@ -1,7 +1,5 @@
 """Small cases on disk with a known answer, and an engine that knows it: no search, a second per case."""
 
-from __future__ import annotations
-
 import os
 import signal
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Files spoilt at random: by hand, by a failing disk, by a program with other ideas of the format."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Callable

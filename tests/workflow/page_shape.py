@@ -1,7 +1,5 @@
 """What a page shows before anything is unfolded: its height in screens, its words, and its first screen."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from html.parser import HTMLParser

@@ -1,7 +1,5 @@
 """A small made-up arm and a whole run of it, as typed objects and stage files like a real run's."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A small study on the fast arm, and ways to run it: six points, two of them impossible, some seconds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from tests.workflow.command import FAST_ARM

@@ -5,8 +5,6 @@ The machine is two inertias on a spring with dry friction, from the independent 
 `benchmarks.closed_loop_machines`. What is taken is run up to its design, and compared with the truth.
 """
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Any order's reach, whole responses and the reference filter: found, told, written beside the controller."""
 
-from __future__ import annotations
-
 import ctypes
 import re
 from dataclasses import replace

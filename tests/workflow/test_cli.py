@@ -1,7 +1,5 @@
 """The command line: exit codes, one-line errors that leave nothing behind, JSON that is only JSON."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The codec: every result comes back as it was, and nothing is guessed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum

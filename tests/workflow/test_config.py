@@ -1,7 +1,5 @@
 """The configuration: defaults, round trip, what contradicts itself, and the examples as they ship."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

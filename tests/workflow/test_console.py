@@ -1,7 +1,5 @@
 """What a terminal is told of a computation that takes long, and when."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """`flexlink design` on plants that were not identified here: files in, certificates and complaints out."""
 
-from __future__ import annotations
-
 import json
 
 import control

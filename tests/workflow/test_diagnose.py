@@ -1,7 +1,5 @@
 """`flexlink diagnose`: the answer as JSON and page, several cases, failures, resuming."""
 
-from __future__ import annotations
-
 import ast
 import json
 import re

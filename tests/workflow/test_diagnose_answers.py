@@ -4,8 +4,6 @@ Of every verdict and every proposal of a next experiment, for a rig, a rig besid
 simulation, with all that an answer may hold beside and without it. Nothing is searched.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Case files: column maps, and one line for everything that can be wrong with them."""
 
-from __future__ import annotations
-
 import tomllib
 
 import numpy as np

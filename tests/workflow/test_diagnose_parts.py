@@ -1,7 +1,5 @@
 """Parts of a diagnosis that can be checked against the simulator: linear machine, controller check, words."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

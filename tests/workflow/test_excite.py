@@ -1,7 +1,5 @@
 """`flexlink excite`: what is written keeps the limits; what cannot be kept is refused in one line."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

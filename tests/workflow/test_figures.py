@@ -1,7 +1,5 @@
 """Every picture: title, units on the axes, a legend that hides nothing, no text cut off, same bytes twice."""
 
-from __future__ import annotations
-
 import itertools
 import re
 import tempfile

@@ -1,7 +1,5 @@
 """The sentence of every finding, one line each: those of data/findings.txt, in the order of the kinds."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

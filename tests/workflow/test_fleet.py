@@ -1,7 +1,5 @@
 """Many machines at once: groups, trends, table, workers that die."""
 
-from __future__ import annotations
-
 import csv
 import io
 import os

@@ -1,7 +1,5 @@
 """Formats: every filter on its limiting cases. Templates: escaping, pictures by name, contents."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The loop on an arm with dry friction: linear limit, statics, and its feed-forward on an exact friction."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """The case that the README diagnoses has the logs that its machine makes (its answer: `test_readme.py`)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

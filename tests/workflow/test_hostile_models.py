@@ -1,7 +1,5 @@
 """Model files from strangers: damaged bytes, and wrong things in whole files. Every fault is one line."""
 
-from __future__ import annotations
-
 import copy
 import io
 import json

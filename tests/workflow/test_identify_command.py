@@ -1,7 +1,5 @@
 """`flexlink identify`: one line on a CSV file, one page in words and pictures, models for other programs."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

@@ -4,8 +4,6 @@ The machine is a motor and a load on a spring with dry friction at the motor, in
 Euler, 20 steps a sample) and shared with nothing of the product.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import shlex

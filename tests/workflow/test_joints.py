@@ -1,7 +1,5 @@
 """Runs for several joints: the simulated arm, its logs, and what cannot be used."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`flexlink look` against logs whose sampling, steps, limits and gaps are known."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

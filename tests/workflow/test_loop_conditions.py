@@ -1,7 +1,5 @@
 """Conditions of the closed-loop check: what is changed is what is said to be, and nothing else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import control

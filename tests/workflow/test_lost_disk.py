@@ -1,8 +1,6 @@
 """A disk that is full, a directory that is gone or somebody else's, a clock set back, another current folder:
 one line, exit 2, nothing half-written; what can be continued ends with the same bytes."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

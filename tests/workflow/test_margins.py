@@ -1,7 +1,5 @@
 """Regression test on closed-loop margins: an example, end to end, against `tests/golden/margins.toml`."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

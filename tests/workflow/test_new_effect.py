@@ -1,7 +1,5 @@
 """An effect that nobody has heard of, added by the recipe: every page has its words and is drawn whole."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """An output that does not answer to the input is refused in one line; one that answers a little is not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import signal

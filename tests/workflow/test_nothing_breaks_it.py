@@ -1,8 +1,6 @@
 """Spoilt files are refused in one short line that names the file, or they are read: never an internal error,
 never a wait. What would compute is cut off where it begins."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

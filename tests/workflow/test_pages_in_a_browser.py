@@ -3,8 +3,6 @@
 Kinds of pages that take long to compute are looked at where other tests compute them (`faults_seen`).
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """docs/own_plant.md runs as it stands, and the page it writes says what was found."""
 
-from __future__ import annotations
-
 import doctest
 import re
 from dataclasses import replace

@@ -4,8 +4,6 @@ Classes, gears, dampratio, fullinertia, general actuators, tendons, equalities, 
 name, models of one step per sample; a floating base is refused in one line.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Every command of README and docs/commands.md as written; your own model from your own table."""
 
-from __future__ import annotations
-
 import csv
 import glob
 import json

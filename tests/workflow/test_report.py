@@ -1,7 +1,5 @@
 """The page: its numbers are the stages', it fetches nothing, escapes everything, suits every outcome."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from html.parser import HTMLParser

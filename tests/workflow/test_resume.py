@@ -1,7 +1,5 @@
 """A run killed with SIGKILL at any point resumes and ends with the numbers of a run that was left alone."""
 
-from __future__ import annotations
-
 import shutil
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """What a run directory refuses, remembers and takes up again."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Drawn plants: state space, stepping and direct terms against responses computed elsewhere."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

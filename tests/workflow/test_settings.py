@@ -1,7 +1,5 @@
 """TOML errors: one line with the file, the dotted key as the user wrote it, and what was expected."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 import pytest

@@ -1,7 +1,5 @@
 """`flexlink diagnose` on models of other simulators: end to end, refusals, docs/simulators.md as it is."""
 
-from __future__ import annotations
-
 import doctest
 import re
 import shlex

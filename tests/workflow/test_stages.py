@@ -1,7 +1,5 @@
 """What the stages leave, against known truth and against what the libraries say when called alone."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 

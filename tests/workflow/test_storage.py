@@ -1,7 +1,5 @@
 """Files are whole or absent, bytes are reproducible, and no pickle gets in or out."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -1,7 +1,5 @@
 """The tuning study on processes of this machine."""
 
-from __future__ import annotations
-
 import csv
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The tuning study on a Dask cluster: loopback, real processes, killed in the middle."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

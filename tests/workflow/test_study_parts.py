@@ -1,7 +1,5 @@
 """Parts of the study: keys, TOML, ranges, fronts, the picture."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -1,7 +1,5 @@
 """True modes beside simulated logs, and pole pairs that are no modes by name."""
 
-from __future__ import annotations
-
 import json
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """`flexlink tune`: designs of the page are those of `flexlink design`; nobody but the page is served."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import re
