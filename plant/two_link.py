@@ -121,7 +121,6 @@ class TwoLinkArm:
         mass = ca.ldl(ca.hessian(kinetic, v)[0])  # a third of the operations of a general solution
         return ca.Function("rates", [q, v, u], ca.cse([ca.ldl_solve(force - losses, *mass)]))
 
-    @lru_cache(maxsize=16)  # a run makes a machine of the same arm several times
     def sampled(self, dt_s: float) -> Any:
         """CasADi function (x, u) -> x one sample later, u held; x = (q, q'), by Runge-Kutta steps."""
         import casadi as ca
@@ -178,6 +177,9 @@ class TwoLinkArm:
         return np.concatenate([angles, held[2:], np.zeros(n)]), held[:2]
 
 
+_sampler = lru_cache(maxsize=16)(TwoLinkArm.sampled)  # a run makes machines of the same arm
+
+
 class TwoLinkMachine:
     """The arm sampled every dt_s around rest at the given joint angles: commands are voltages beyond those
     that hold it, measurements joint angles from there, with normal noise of noise_rad."""
@@ -194,7 +196,7 @@ class TwoLinkMachine:
         self._rest, self._hold = arm.rest(angles_rad)
         # Arrays of its own: to convert them at every sample would take as long as the integration.
         self._x, self._u, self._next = self._rest.copy(), np.zeros(2), np.empty(self._rest.size)
-        self._buffer, self._sample = arm.sampled(dt_s).buffer()
+        self._buffer, self._sample = _sampler(arm, dt_s).buffer()
         self._buffer.set_arg(0, self._x.data)
         self._buffer.set_arg(1, self._u.data)
         self._buffer.set_res(0, self._next.data)

@@ -126,8 +126,8 @@ class Record(Shown):
         """Raise ValueError unless there are so many inputs and one output, sampled at dt_s where given."""
         if self.input.shape[1] != inputs or self.output.shape[1] != 1:
             raise ValueError(
-                f"{self.label}: need {'one input' if inputs == 1 else f'{inputs} inputs'} and one output, got "
-                f"{list(self.input_names)} and {list(self.output_names)}; choose with Record.siso"
+                f"{self.label}: need {inputs if inputs > 1 else 'one'} input{'s' * (inputs > 1)} and one "
+                f"output, got {list(self.input_names)} and {list(self.output_names)}; choose with Record.siso"
             )
         if dt_s is not None and not abs(self.dt_s - dt_s) <= 1e-9 * dt_s:
             raise ValueError(f"{self.label}: dt_s = {self.dt_s}, the model has {dt_s}")

@@ -137,7 +137,7 @@ class JointsConfig(Section):
             for number, record in enumerate(records):
                 if record.role == "repeat":
                     raise ValueError(
-                        f"source.records[{number}] has role 'repeat': with several joints a record is fitted, "
+                        f"source.records[{number}] has role 'repeat': with several joints a record is fitted "
                         "or kept back with role = 'validation'"
                     )
                 if record.condition not in fitted:
