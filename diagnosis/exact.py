@@ -39,8 +39,7 @@ def without_error(
     untried = search.untried
     left_out = [what for what in search.left_out if what not in untried]
     weighed = probabilities(every)
-    accepted = _accepted(every, weighed.answer)
-    unknown = weighed.answer == "unknown"
+    accepted, unknown = _accepted(every, weighed.answer), weighed.answer == "unknown"
     leading = max(every, key=lambda h: h.unknown_weight) if unknown else accepted
     late = search.late("confrontation with validation records")
     seen = None if late or (unknown and leading.is_answer) else confronted(model, every, leading)
@@ -163,7 +162,9 @@ def _fitted(
         energy, explained = gap_refit**2 - floor**2, min(without, default=np.nan) ** 2 - after**2
         share = float(np.clip(explained / energy, 0.0, 1.0)) if energy > 0 else float("nan")
         # What is left beyond the noise widens intervals in proportion, as does what solvers disagree about.
-        wider = max(1.0, end.rms**2) * _solver_variance(end, samples)
+        # Where contacts switch, that is correlated over a record; .674: median of a half-normal prior.
+        usual = 0.674 * DISAGREEMENT["non-smooth"] if end.non_smooth else 0.0
+        wider = max(1.0, end.rms**2) * (1 + usual**2 * samples)
         inverse = wider * np.asarray(np.linalg.pinv(end.hessian, hermitian=True), dtype=np.float64)
         rows = end.rows_of(k)
         return FittedEffect(
@@ -176,13 +177,3 @@ def _fitted(
         )
 
     return fitted
-
-
-def _solver_variance(end: Descent, samples_per_record: float) -> float:
-    """Variance of fitted values in units of what white noise gives, where contacts switch: the usual
-    disagreement of correct solvers, correlated over a record."""
-    if not end.non_smooth:
-        return 1.0
-    # median of the half-normal prior of the disagreement's size
-    usual = 0.674 * DISAGREEMENT["non-smooth"]
-    return 1.0 + usual**2 * samples_per_record

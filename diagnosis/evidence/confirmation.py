@@ -142,8 +142,7 @@ def _unpredicted(model: ResidualModel, end: Descent) -> tuple[Real, float]:
     A, gradient = H + J.T @ J, J.T @ e
     step = np.asarray(-np.linalg.solve(A, gradient))
     # A value that would leave its range stays where it is.
-    free = np.flatnonzero(_inside(end, step))
-    step = np.zeros(step.size)
+    free, step = np.flatnonzero(_inside(end, step)), np.zeros(step.size)
     step[free] = -np.linalg.solve(A[np.ix_(free, free)], gradient[free])
     cost = float(e @ e + gradient @ step)
     determinants = (

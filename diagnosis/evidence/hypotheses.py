@@ -125,8 +125,7 @@ class Probabilities:
 
         leads: it explains more than whatever else there is.
         """
-        certain = 1.0 - self.sets[_UNKNOWN]
-        cause = dict(self.cause)
+        certain, cause = 1.0 - self.sets[_UNKNOWN], dict(self.cause)
         if leads:
             cause = {**dict.fromkeys(cause, 0.0), "unknown": cause["unknown"], name: certain}
         else:
@@ -183,8 +182,7 @@ def probabilities(hypotheses: Sequence[Hypothesis]) -> Probabilities:
     if not hypotheses:
         raise ValueError("probabilities need at least one hypothesis")
     best = best_of_sets([h for h in hypotheses if h.is_answer])
-    unknown = max(h.unknown_weight for h in hypotheses)
-    keys = [*best, _UNKNOWN]
+    unknown, keys = max(h.unknown_weight for h in hypotheses), [*best, _UNKNOWN]
     logs = np.array([*(h.log_weight for h in best.values()), unknown])
     weight = np.exp(logs - np.max(logs))
     weight /= weight.sum()
@@ -207,8 +205,7 @@ def log_evidence(fit: Descent) -> float:
     Gaussian (or the slope down from the bound) is integrated over the inside only, given the others at their
     best. Constants common to all hypotheses of a case are left out.
     """
-    P = fit.deviations.size
-    H = fit.hessian
+    P, H = fit.deviations.size, fit.hessian
     scale = np.sqrt(np.maximum(np.diag(H), 1e-12))
     scaled = H / np.outer(scale, scale) + 1e-10 * np.eye(scale.size)
     _, logdet = np.linalg.slogdet(scaled)
@@ -219,8 +216,7 @@ def log_evidence(fit: Descent) -> float:
         return float(value)
     # Of the same matrix as the determinant: a coordinate that nothing depends on integrates to its range.
     spread = (np.sqrt(np.diag(np.linalg.inv(scaled))) / scale)[P:]
-    gradient = (fit.jacobian.T @ fit.left)[P:]
-    at = 0
+    gradient, at = (fit.jacobian.T @ fit.left)[P:], 0
     for k, candidate in enumerate(fit.candidates):
         x = fit.coordinates_of(k)
         value += candidate.log_density(x)

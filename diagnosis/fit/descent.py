@@ -215,8 +215,7 @@ def descend(
         normal = NormalEquations.of(records, records.likelihood.weights(e), jacobian, columns, d)
         H, g = normal.hessian, normal.gradient(start, e)
         held = ((x <= low) & (g[P : P + A] > 0)) | ((x >= high) & (g[P : P + A] < 0))
-        free = np.setdiff1d(np.arange(g.size), P + np.flatnonzero(held))
-        reached = None
+        free, reached = np.setdiff1d(np.arange(g.size), P + np.flatnonzero(held)), None
         for _ in range(7):
             damped = H + damping * np.diag(np.diag(H) + 1e-9)
             damped[range(P, P + A), range(P, P + A)] += 1e2 * damping
@@ -325,15 +324,13 @@ def best_following(
 def follow(records: RecordsToFit, around: Descent, e: Real, start: FittedStart) -> tuple[float, Real]:
     """What the loss of coefficients e (N,) becomes, and where the deviations go, once everything that
     `around` holds has followed linearly."""
-    P = around.deviations.size
-    normal = around.normal(records)
+    P, normal = around.deviations.size, around.normal(records)
     H = normal.hessian + np.diag(1e-9 * np.diag(normal.hessian) + 1e-12)
     step = -solved(H, normal.gradient(start, e))
     step[:P] = np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP)
     moved = e + np.column_stack([around.jacobian, around.columns.zeros]) @ step[: -start.states.size or None]
     d, start2 = around.deviations + step[:P], around.columns.moved(start, step[around.jacobian.shape[1] :])
-    S = start.states.shape[1]
-    first = step.size - start.states.size
+    S, first = start.states.shape[1], step.size - start.states.size
     for r, (part, own) in enumerate(zip(records.parts, around.columns.states, strict=True)):
         moved[part] += own @ step[first + r * S : first + (r + 1) * S]
     loss, _ = loss_at(records, moved, d, start2)

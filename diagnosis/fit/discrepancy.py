@@ -49,8 +49,7 @@ def discrepancy(residuals: Real, segments: Sequence[int], outputs: int = 2) -> D
             f"segments of {sum(segments)} samples of {outputs} outputs for {residuals.size} residuals"
         )
     energy = np.zeros((outputs, _OCTAVES + 1))
-    freedom = np.zeros_like(energy)
-    at = 0
+    freedom, at = np.zeros_like(energy), 0
     for T in segments:
         e = residuals[at : at + outputs * T].reshape(T, outputs)
         at += outputs * T

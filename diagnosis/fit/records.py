@@ -155,8 +155,7 @@ class RecordsToFit:
             ]
         zeros = []
         for e in self.experiments:
-            T = len(e.output)
-            shapes = self.case.machine.unknown_start.zero_outputs
+            T, shapes = len(e.output), self.case.machine.unknown_start.zero_outputs
             constant = [self.likelihood.changed(np.broadcast_to(shape, (T, outputs))) for shape in shapes]
             zeros.append(-np.array(constant).reshape(-1, T * outputs).T)
         return StartColumns.of(np.concatenate(zeros), states, self.case.machine.unknown_start.state_per_zero)

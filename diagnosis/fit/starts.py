@@ -126,8 +126,7 @@ def _harmonic(records: RecordsToFit, around: Descent, candidate: Candidate) -> l
     response, dt_s = known
     size = next_fast_len(2 * longest, real=True)
     # For points to descend from single precision will do, and takes half the time.
-    transfer = rfft(response.astype(np.float32), size, axis=0)
-    weights = around.weights
+    transfer, weights = rfft(response.astype(np.float32), size, axis=0), around.weights
     normal = around.normal(records)
     H, g = normal.hessian, normal.gradient(around.start, around.left)
     factor = cho_factor(H + np.diag(1e-9 * np.diag(H) + 1e-12))
@@ -150,8 +149,7 @@ def _harmonic(records: RecordsToFit, around: Descent, candidate: Candidate) -> l
     def columns_of(moved: Real) -> Real:
         return -records.likelihood.changed(moved).reshape(2 * len(moved), -1).T.astype(np.float64)
 
-    found = []
-    lines = lines[(lines >= low) & (lines <= high)]
+    found, lines = [], lines[(lines >= low) & (lines <= high)]
     if periodic and lines.size > MOST_LINES:
         lines = _loudest(records, around, lines, response, dt_s)
     for first in range(0, lines.size, _LINES_AT_ONCE):
@@ -165,8 +163,7 @@ def _harmonic(records: RecordsToFit, around: Descent, candidate: Candidate) -> l
             angles = [some[:, None] * (e.output[:, 0] - zero) for e in records.experiments]
             parts = [columns_of(moved(angle)[:, :, : angle.shape[1]]) for angle in angles]
         columns = np.concatenate(parts)
-        weighted = columns * weights[:, None]
-        cross = np.empty((g.size, columns.shape[1]))
+        weighted, cross = columns * weights[:, None], np.empty((g.size, columns.shape[1]))
         cross[:k] = shared.T @ weighted
         for r, (part, own) in enumerate(zip(records.parts, around.columns.states, strict=True)):
             cross[k + r * S : k + (r + 1) * S] = own.T @ weighted[part]
@@ -191,11 +188,9 @@ def _loudest(records: RecordsToFit, around: Descent, lines: Real, response: Real
     response (T, Y to a pulse) taken to be settled, and the lowest, at which it is not."""
     T, noise = len(response), records.case.noise
     size = next_fast_len(2 * T, real=True)
-    transfer = rfft(response / noise, size, axis=0)
-    correlation = np.zeros(T)
+    transfer, correlation = rfft(response / noise, size, axis=0), np.zeros(T)
     for part in records.residuals_of(around.left):
-        e = rfft(part / noise, size, axis=0)
-        correlation += irfft(np.sum(e * transfer.conj(), axis=1), size)[:T]
+        correlation += irfft(np.sum(rfft(part / noise, size, axis=0) * transfer.conj(), axis=1), size)[:T]
     turn = 2j * np.pi * dt_s
     found = np.abs(
         czt(correlation, len(lines), np.exp(-turn * (lines[1] - lines[0])), np.exp(turn * lines[0]))

@@ -83,8 +83,7 @@ class Windows:
         span, flat = self._spans[length], (part / self.noise).reshape(*part.shape[:-2], length * Y)
         own = flat @ span
         own[..., :kept, :] = 0.0
-        freed = (flat - own @ span.T).reshape(part.shape) * self.noise
-        return np.asarray(dct(freed, axis=-2, norm="ortho"))
+        return np.asarray(dct((flat - own @ span.T).reshape(part.shape) * self.noise, axis=-2, norm="ortho"))
 
     def unseen(self, seen: Real) -> Real:
         """The inverse, without what starts do."""

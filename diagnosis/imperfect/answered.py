@@ -78,8 +78,7 @@ def reaches_noise(search: Search) -> bool:
 def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
     """The answer of a search beside a model error; what a time limit left out is said."""
     case = search.case
-    listed = case.machine.weighing.listed
-    found = judging.judged(search)
+    listed, found = case.machine.weighing.listed, judging.judged(search)
     search.progress(1.0, "done")
     refit, best = found.nominal, found.judged[0]
     accepted, partial, looks_like = refit, tuple[str, ...](), False
@@ -98,6 +97,11 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
         # Values are re-estimated beside effects too only where that leaves less of the held-out records.
         accepted = min(accepted, search.stated(accepted), key=lambda e: e.pooled_held_out(case.noise))
     shares = shares_of(search, found.accepted or partial, accepted, refit, rng)
+    # Present in validation records as well, or not: what certainly makes these worse is something else.
+    worse = {n for n, (*_, most) in shares.carried.items() if most <= 0 and n in found.accepted}
+    if worse := worse - search.refuted - {*shares.silent}:
+        search.refuted |= worse
+        return beside_imperfections(search, rng)
 
     def model(of: Explanation) -> Model:
         return Model(of.end.deviations, _whitened(case, of))

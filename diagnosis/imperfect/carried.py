@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import combinations
 from math import factorial
 from typing import Any
@@ -39,8 +39,7 @@ def shares_of(
     what the model closes; intervals by bootstrap over blocks of samples. None where a time limit left no time
     for the parts of the model.
     """
-    held = search.held_out
-    fitted = [name for name in matter if name in accepted.names]
+    held, fitted = search.held_out, [name for name in matter if name in accepted.names]
     names = (*fitted, *(name for name in accepted.names if name not in fitted))
     parts = [chosen for count in range(len(names) + 1) for chosen in combinations(names, count)]
     known = {accepted.key, *(e.key for e in search.found)}
@@ -52,8 +51,7 @@ def shares_of(
         chosen: min(_blocks(search, explanation), nothing, key=np.sum)
         for chosen, explanation in subsets.items()
     }
-    drawn = rng.integers(0, blocks[()].size, (DRAWS, blocks[()].size))
-    carried = {}
+    drawn, carried = rng.integers(0, blocks[()].size, (DRAWS, blocks[()].size)), {}
     for name in names if in_time else ():
         value = _shapley(name, names, {c: b.sum(keepdims=True) for c, b in blocks.items()})[0]
         spread = _shapley(name, names, {c: b[drawn].sum(axis=1) for c, b in blocks.items()})
@@ -61,7 +59,15 @@ def shares_of(
         carried[name] = (float(value), min(float(low), 1.0), min(float(high), 1.0))
     ranked = sorted(search.found, key=lambda e: e.evidence)
     closed = {e.key: closed_by(search, e, nominal) for e in ranked if e.names}
-    told = sorted(((c, key) for key, c in closed.items() if _tells(key, closed)), reverse=True)[:SEVERAL]
+    # What closes more than any part of it does.
+    best = {
+        key: max([0.0, *(closed.get(rest, 0.0) for rest in combinations(key, len(key) - 1))])
+        for key in closed
+    }
+    told = sorted(
+        ((c, key) for key, c in closed.items() if c > best[key] + _CLOSES * (1 if len(key) < 3 else 2)),
+        reverse=True,
+    )[:SEVERAL]
     return Shares(
         names=tuple(search.case.machine.output_names),
         before=tuple(map(float, held.shares(nominal.left_held_out))),
@@ -82,12 +88,6 @@ def closed_by(search: Search, explanation: Explanation, nominal: Explanation) ->
     return min(1 - float(np.sum(_blocks(search, explanation)) / np.sum(_blocks(search, nominal))), 1.0)
 
 
-def _tells(key: tuple[str, ...], closed: Mapping[tuple[str, ...], float]) -> bool:
-    """Whether a set closes more than any part of it does."""
-    parts = [closed[rest] for rest in combinations(key, len(key) - 1) if rest in closed]
-    return closed[key] > max([0.0, *parts]) + (_CLOSES if len(key) < 3 else 2 * _CLOSES)
-
-
 def _over_horizon(search: Search, accepted: Explanation, nominal: Explanation) -> dict[str, Any]:
     if search.horizon is None:
         return {}
@@ -105,8 +105,7 @@ def _blocks(search: Search, explanation: Explanation) -> Real:
 
 
 def _shapley(name: str, names: Sequence[str], energy: dict[tuple[str, ...], Real]) -> Real:
-    others = [n for n in names if n != name]
-    total = np.zeros_like(energy[()])
+    others, total = [n for n in names if n != name], np.zeros_like(energy[()])
     for count in range(len(names)):
         weight = factorial(count) * factorial(len(names) - count - 1) / factorial(len(names))
         for before in combinations(others, count):

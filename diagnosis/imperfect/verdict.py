@@ -140,13 +140,12 @@ def score_of(explanation: Explanation, weighing: Weighing) -> float:
 def _gain(explanation: Explanation, listed: Sequence[str]) -> float:
     """Without what is left of the motion."""
     candidates = explanation.end.candidates
-    further = float(sum(len(c.axes) - 1 for c in candidates))
     return (
         explanation.log_likelihood / TEMPER
         + explanation.log_prior
         + explanation.log_volume / TEMPER
         + float(np.log(_PRIOR_COUNT[len(candidates)] / comb(len(listed), len(candidates))))
-        - further
+        - float(sum(len(c.axes) - 1 for c in candidates))
         + float(np.log(UNLISTED)) * sum(name not in listed for name in explanation.names)
     )
 
@@ -156,8 +155,7 @@ def judged(search: Search) -> Verdict:
     with simpler ones. What that finds is weighed with all others."""
     nominal = min(search.base, search.stated(), key=lambda e: e.pooled_held_out(search.case.noise))
     for _ in range(SEVERAL):
-        known = len(search.found)
-        sets = _weighed(search, nominal)
+        known, sets = len(search.found), _weighed(search, nominal)
         if late(search):
             break
         near_sets = [one for one in sets if one.score > sets[0].score - SUBSTANTIAL]
@@ -221,8 +219,7 @@ def _rounded(search: Search, rounding: Rounding) -> float:
 
 def _weighed(search: Search, nominal: Explanation) -> tuple[Judged, ...]:
     """The sets that take part, best first: none that leaves more of the held-out records than the nominal."""
-    weighing = search.case.machine.weighing
-    best = best_of_sets(search.found)
+    weighing, best = search.case.machine.weighing, best_of_sets(search.found)
     noise = search.case.noise
     farthest = nominal.pooled_held_out(noise)
     score = {
@@ -288,7 +285,7 @@ def _judged(
     answers = {
         name
         for name, effect in zip(explanation.names, explanation.end.effects, strict=True)
-        if name in weighing.listed and effect.as_listed
+        if name in weighing.listed and effect.as_listed and name not in search.refuted
     }
     for part in parts.values():
         complete *= 1.0 if part.name in answers else 1 - part.matters
@@ -342,6 +339,8 @@ def _part(
 ) -> Part:
     """What an effect carries within a set, or within the larger one in which it was seen before; rest: the
     set without it."""
+    if name in search.refuted:
+        return Part(name, 0.0, 0.0)
     k, weighing = explanation.names.index(name), search.case.machine.weighing
     model_error, listed = weighing.model_error, weighing.listed
     estimated, held_out = map(float, _carried(rest, explanation))
@@ -353,8 +352,7 @@ def _part(
         # Without it the others fit the records they were fitted to as well, with values that others refute.
         share = held_out
     share = max(share, seen.share if seen else 0.0)
-    matters = _soft(share / model_error)
-    off = _tolerances_off(search, explanation, k)
+    matters, off = _soft(share / model_error), _tolerances_off(search, explanation, k)
     if off is not None:
         # A stated value in itself: what it changes may be imitated by the others within their tolerances. Far
         # off is not enough: of a value that nobody stated anything is.
@@ -379,8 +377,7 @@ def share_beside(rest: Explanation, explanation: Explanation) -> float:
 
 def _carried(rest: Explanation, explanation: Explanation) -> Real:
     """(2,) the same of estimation records and of held-out ones, of the output that shows most of it."""
-    carried = np.sqrt(np.maximum(rest.mean_squares - explanation.mean_squares, 0.0))
-    return np.asarray(np.max(carried, axis=1))
+    return np.asarray(np.max(np.sqrt(np.maximum(rest.mean_squares - explanation.mean_squares, 0.0)), axis=1))
 
 
 def _tolerances_off(search: Search, explanation: Explanation, k: int) -> float | None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 import scipy
 
 from diagnosis.machine.machine_protocol import Real
@@ -107,20 +108,50 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredBody:
-    """A body whose motion is given, whose force is asked: inputs of position and speed, output of force."""
+    """A body whose motion is given, whose force is asked: inputs of position and speed, output of force.
+
+    It may be at rest where it is no faster than `slow`, or turns back before its speeds add up to `short`:
+    what friction holds there is anything up to its level, and such rows say nothing (`resting`).
+    """
 
     position: int
     speed: int
     force: int
+    slow: float
+    short: float
+
+    @classmethod
+    def of(cls, position: int, speed: int, force: int, inputs: Sequence[Real]) -> MeasuredBody:
+        """Inputs (T, U) of all records. Noise of the speed, white or not, is what it has on short ways."""
+        ways = np.concatenate([_ways(u[:, speed]) for u in inputs])
+        every = np.concatenate(inputs)[:, speed]
+        # Before a body slides, bearings and gears give way by thousandths of its longest way.
+        short = 5e-3 * float(np.max(ways))
+        rests = every[ways <= short]
+        # Of four deviations of the noise a sign is sure; a tenth of the usual speed is more than noise.
+        slow = min(4 * _norm(rests) / max(rests.size, 1) ** 0.5, 0.1 * _norm(every) / every.size**0.5)
+        return cls(position, speed, force, slow, short)
 
     def under(self, started: Started, forces: BodyForces) -> Run:
         def simulated(inputs: Real) -> Real:
             found = np.array(started.run(inputs))
-            force = found[:, self.force]
-            force += forces.overcome(inputs[:, self.position], inputs[:, self.speed], force)
+            speed = np.where(self.resting(inputs), 0.0, inputs[:, self.speed])
+            found[:, self.force] += forces.overcome(inputs[:, self.position], speed, found[:, self.force])
             return found
 
         return simulated
+
+    def resting(self, inputs: Real) -> npt.NDArray[np.bool_]:
+        """(T,) rows in which the body may be at rest, and those beside: it stops or starts between them."""
+        v = inputs[:, self.speed]
+        still = np.pad((np.abs(v) <= self.slow) | (_ways(v) <= self.short), 1)
+        return np.asarray(still[:-2] | still[1:-1] | still[2:])
+
+
+def _ways(speed: Real) -> Real:
+    """(T,) sum of the size of a speed (T,) over all neighbours with the sign that it has in a row."""
+    run = np.cumsum(np.diff(np.sign(speed), prepend=0.0) != 0)
+    return np.asarray(np.bincount(run, np.abs(speed))[run])
 
 
 AnyBody = Body | MeasuredBody
@@ -162,8 +193,7 @@ class Drive:
             asked = (started.key, inputs.shape)
             if asked not in self._kept:
                 self._kept[asked] = self._response(started.at_rest, inputs)
-            response = self._kept[asked]
-            extra = np.zeros(len(inputs))
+            response, extra = self._kept[asked], np.zeros(len(inputs))
             found, command = with_added(extra)
             for _ in range(_ROUNDS):
                 beyond = command - scipy.signal.fftconvolve(response, extra)[: extra.size]

@@ -20,8 +20,7 @@ def main() -> None:
     from fmpy.fmi2 import FMU2Slave
 
     path, folder, identifier, guid = sys.argv[1:]
-    answers = os.fdopen(os.dup(1), "wb")
-    nowhere = os.open(os.devnull, os.O_WRONLY)
+    answers, nowhere = os.fdopen(os.dup(1), "wb"), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
     asked = sys.stdin.buffer

@@ -106,8 +106,7 @@ def _logarithm(matrix: Real) -> Real:
     a few digits."""
     values, vectors = np.linalg.eig(matrix)
     if np.min(np.abs(values)) > 0 and np.linalg.cond(vectors) < _LOSES_LITTLE:
-        logarithms = np.log(values.astype(np.complex128))
-        return np.asarray(np.real(vectors * logarithms @ np.linalg.inv(vectors)))
+        return np.asarray(np.real(vectors * np.log(values.astype(np.complex128)) @ np.linalg.inv(vectors)))
     with warnings.catch_warnings():
         # It warns from a thousand roundings on, next to a double pole.
         warnings.simplefilter("ignore", RuntimeWarning)
@@ -175,8 +174,7 @@ class LinearBody:
         swing, gx, gv = self.turns
         stiffness = abs(forces.linear) + 3 * abs(forces.cubic) * largest**2 + abs(forces.weight)
         turned = np.hypot(swing, np.sqrt(2 * abs(gx) * stiffness))
-        rubbed = (abs(forces.viscous) + abs(forces.asymmetry)) * abs(gv)
-        finer = max(turned, rubbed, _TURNED) / _TURNED
+        finer = max(turned, (abs(forces.viscous) + abs(forces.asymmetry)) * abs(gv), _TURNED) / _TURNED
         return int(2 ** min(np.ceil(np.log2(finer)), _MOST_PARTS))
 
     def answer(
@@ -243,8 +241,7 @@ class PulseResponse:
         Raises NotFollowedError if the force does not move the body at once, or the motion is no number.
         """
         h = motion[1:]
-        at_once = abs(h[0]) > _AT_ONCE * abs(h[1])
-        corrections = np.zeros(2)
+        at_once, corrections = abs(h[0]) > _AT_ONCE * abs(h[1]), np.zeros(2)
         if of_speed:
             speed, position = h, np.cumsum(h) * dt_s
             position = position - 0.5 * dt_s * h
@@ -357,8 +354,7 @@ def with_forces(
     simulate : force (T,) -> outputs (T, Y), motion (T,). command : force (T,) without the forces; free : what
     it gives. placed : outputs with another motion in them; alone : whether there are no others.
     """
-    body = response.linear or response
-    held = np.zeros(command.size)
+    body, held = response.linear or response, np.zeros(command.size)
     outputs, now = free
     before, error = np.inf, np.inf
     for _ in range(_ROUNDS):

@@ -179,8 +179,7 @@ def put_shape(name: str, i: int, j: int, spec: Any, value: float) -> None:
     That multiplies the Cholesky factor L of its second moments S = L L^T by a triangular matrix: factors and
     shears are log-Cholesky coordinates, and any of them leave an inertia that a body can have.
     """
-    body = spec.body(name)
-    flat = np.zeros(9)
+    body, flat = spec.body(name), np.zeros(9)
     mujoco.mju_quat2Mat(flat, np.array(body.iquat))
     turn = flat.reshape(3, 3)
     inertia = turn @ np.diag(body.inertia) @ turn.T
@@ -212,7 +211,15 @@ def _behind(name: str, what: str, spec: Any) -> Any:
 
 
 def put_backlash(name: str, spec: Any, gap: float) -> None:
-    """Free within the gap."""
+    """Free within the gap. Where damping of a servo stops a motor without load within a step, Euler's steps
+    are not stable, implicit ones are."""
+    servos = (
+        one for one in spec.actuators if one.target == name and one.biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    )
+    damping = sum(-(one.gear[0] ** 2) * one.biasprm[2] for one in servos)
+    stops = damping * spec.option.timestep > spec.joint(name).armature
+    if stops and spec.option.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     joint = _behind(name, "backlash", spec)
     gap = np.rad2deg(gap) if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE else gap
     joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, np.array([-0.5, 0.5]) * gap
@@ -223,8 +230,7 @@ def put_spring(name: str, load: float, spec: Any, stiffness: float, damping_rati
     """load : inertia behind it; the damping is that of the load against the motor."""
     joint, motor = _behind(name, ELASTIC, spec), spec.joint(name).armature
     put_component(joint, "stiffness", 0, stiffness)
-    damping = 2 * damping_ratio * np.sqrt(stiffness * load * motor / (load + motor))
-    put_component(joint, "damping", 0, damping)
+    put_component(joint, "damping", 0, 2 * damping_ratio * np.sqrt(stiffness * load * motor / (load + motor)))
 
 
 def put_stribeck(name: str, spec: Any, level: float, share: float, velocity: float) -> None:

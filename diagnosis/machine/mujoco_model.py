@@ -44,11 +44,6 @@ def names(path: str) -> dict[str, list[str]]:
     return {**found, "joint": [name for name in found["joint"] if name not in read_by]}
 
 
-def step_of(path: str) -> float:
-    """The step [s] that an MJCF file states."""
-    return float(read(path).option.timestep)
-
-
 _FILES = re.compile(rb"""\b(file|(?:mesh|texture|asset)dir)\s*=\s*["']([^"'<]+)""")
 
 
@@ -189,6 +184,22 @@ class MujocoModel:
     def filtered(self) -> tuple[int, ...]:
         """Actuators with a state that follows the command."""
         return tuple(u for u, one in enumerate(self.spec.actuators) if one.dyntype in LAGS[1:])
+
+    @property
+    def reaches(self) -> dict[str, tuple[float, str]]:
+        """Command of a servo, or measured joint -> largest position in the range of the joint, and its unit.
+        A servo turns a joint without a range no more than once round."""
+        servos = {
+            one.name: one.target for one in self.spec.actuators if one.biasprm[1] == -one.gainprm[0] != 0
+        }
+        read = {self.outputs[k]: joint for k, joint, _ in self.tracked}
+        without = {joint: 2 * np.pi if joint in servos.values() else np.inf for joint in read.values()}
+        units = {joint: self.units[name] for name, joint in read.items()}
+        return {
+            name: (float(np.max(np.abs(self.nominal.joint(joint).range))) or without[joint], units[joint])
+            for name, joint in {**servos, **read}.items()
+            if joint in units
+        }
 
     def number(self, name: str, without: float) -> float:
         """A <numeric> of the file."""

@@ -182,19 +182,33 @@ class MujocoArm(MujocoModel):
         records = experiments[:_LOOKED_AT]
         as_stated = [simulation(stated, {}, e.input) for e in records]
 
-        def seen(parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]]) -> bool:
+        def seen(parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]]) -> float:
+            """Size over noise of what they change; 0 where that shows in no record."""
+            most = 0.0
             for e, before in zip(records, as_stated, strict=True):
                 moved = simulation({**stated, **parameters}, effects, e.input) - before
-                large = np.sqrt(np.mean(moved**2, axis=0)) > _INTERESTS * share * np.std(e.output, axis=0)
+                rms = np.sqrt(np.mean(moved**2, axis=0))
+                large = rms > _INTERESTS * share * np.std(e.output, axis=0)
                 if np.any(large & (np.max(np.abs(moved), axis=0) > _SEEN * noise)):
-                    return True
-            return False
+                    most = max(most, float(np.max(rms / noise)))
+            return most
 
+        moving = {self.nominal.body(k).name for k in set(self.nominal.body_weldid) - {0}}
+        needs = {f"{name}.payload": f"a <site> in the body {name}, where a load may be" for name in moving}
+        for one in self.spec.actuators:
+            needs[f"{one.name}.gain"] = "an actuator whose gain is fixed, affine or a muscle's"
+            needs[f"{one.name}.lag"] = "an actuator without dynamics or with those of a filter"
         missing = [one.effect for one in every.values() if one.value == 0.0]
         shown = {name for name, value in stated.items() if seen({name: _WRONG * value}, {})}
+        unstable = set[str]()
         for one in missing:
-            largest = {p.name: p.starts[-1 if one.grows else 0] for p in one.parameters}
-            shown |= {one.name} if seen({}, {one.name: largest}) else set()
+            size, *more = one.parameters
+            starts = {p.name: p.starts[-1 if one.grows else 0] for p in more}
+            least, largest = (size.low, size.starts[-1]) if one.grows else (size.high, size.starts[0])
+            if change := seen({}, {one.name: {size.name: largest, **starts}}):
+                # What changes as much at next to no size is the simulation: its steps are too coarse for it.
+                alike = seen({}, {one.name: {size.name: least, **starts}}) > 0.5 * change
+                (unstable if alike else shown).add(one.name)
         silent = [f"wrong_{name}" for name in stated if name not in shown and tolerances[name] > 0]
         return Plant(
             simulation,
@@ -206,10 +220,11 @@ class MujocoArm(MujocoModel):
             share,
             self.dt_s,
             inactive={
-                **self._untried(every),
+                **{name: need for name, need in sorted(needs.items()) if name not in every},
                 # Stated, and taken as exact: the damping of the joint does the same.
                 **{f"wrong_{n}": "its name in candidates" for n in {*there} - {*every} if n.endswith(".kv")},
                 **dict.fromkeys(silent, "records in which it shows"),
+                **dict.fromkeys(unstable, "smaller steps of the model (timestep)"),
             },
             settled=simulation.settled,
             untracked=MujocoSimulation(
@@ -217,11 +232,3 @@ class MujocoArm(MujocoModel):
             ),
             units=self.units,
         )
-
-    def _untried(self, every: Mapping[str, Quantity]) -> dict[str, str]:
-        moving = {self.nominal.body(k).name for k in set(self.nominal.body_weldid) - {0}}
-        needs = {f"{name}.payload": f"a <site> in the body {name}, where a load may be" for name in moving}
-        for one in self.spec.actuators:
-            needs[f"{one.name}.gain"] = "an actuator whose gain is fixed, affine or a muscle's"
-            needs[f"{one.name}.lag"] = "an actuator without dynamics or with those of a filter"
-        return {name: need for name, need in sorted(needs.items()) if name not in every}

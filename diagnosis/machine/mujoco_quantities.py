@@ -69,8 +69,7 @@ class Quantities:
     def by_name(self) -> dict[str, Quantity]:
         """Everything that may be off or missing, by name."""
         model, experiments, sizes = self.model, self.experiments, self.sizes
-        spec = model.spec
-        longest = 0.2 * max(len(e.input) for e in experiments)
+        spec, longest = model.spec, 0.2 * max(len(e.input) for e in experiments)
         swings = [max(float(np.ptp(e.output[:, k])) for e in experiments) for k in range(len(model.outputs))]
         found = [
             *(one for joint in spec.joints for one in self._of_joint(joint, *sizes[joint.name])),
@@ -217,8 +216,7 @@ class Quantities:
             turn, box = data.geom_xmat[g].reshape(3, 3), model.geom_aabb[g]
             centre = data.geom_xpos[g] + turn @ box[:3] - joint
             far = max(far, float(along @ centre + np.abs(along @ turn) @ box[3:]))
-        at = joint + far * along - data.xpos[k]
-        return model.body(k).name, tuple(data.xmat[k].reshape(3, 3).T @ at)
+        return model.body(k).name, tuple(data.xmat[k].reshape(3, 3).T @ (joint + far * along - data.xpos[k]))
 
     def _of_gravity(self) -> Iterator[Quantity]:
         """Its direction: the largest component follows from the others and the size, unless it is released by
@@ -245,14 +243,13 @@ class Quantities:
         put = partial(put_number, f"{name}.offset")
         yield Quantity(f"{name}.sensor_offset", offset, put, "offset", swing, signed=True, group="sensor")
         put = partial(put_delay, "sensor", name, self.model.spec.option.timestep)
-        late = ((0.02, 100.0), (0.2, 10.0))
         yield Quantity(
             f"{name}.sensor_delay",
             float(sensor.delay),
             put,
             "delay_s",
             self.model.dt_s,
-            *late,
+            *(((0.02, 100.0), (0.2, 10.0))),
             group="sensor",
         )
 

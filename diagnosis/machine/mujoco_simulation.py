@@ -231,7 +231,8 @@ class MujocoSimulation:
         return _remembered(self._paths, (y.tobytes(), late_s), compute)
 
     def _start(self, inputs: Real) -> _Start:
-        """Of a record: from its first samples, moved once by what the stated model leaves from there."""
+        """Of a record: from its first samples, moved once by what the stated model leaves from there;
+        one that asks for more than they leave open is wrong about something else."""
 
         def compute() -> _Start:
             arm, U = self.arm, len(self.arm.inputs)
@@ -245,7 +246,8 @@ class MujocoSimulation:
             runs = [self._run(model, inputs, state) for state in guess + np.diag(spread)]
             slopes = [(run - first) / size for run, size in zip(runs, spread, strict=True)]
             start = _Start(guess, guess, spread, np.array(slopes).reshape(-1, *first.shape), self.noise)
-            return replace(start, state=guess + start.shift(inputs[:, U:] - first))
+            move = start.shift(inputs[:, U:] - first)
+            return replace(start, state=guess + move) if np.all(np.abs(move) < spread) else start
 
         return _remembered(self._starts, inputs.tobytes(), compute)
 
@@ -403,8 +405,8 @@ def _begun(q: Real, dt_s: float, noise: float, early_s: float) -> list[tuple[flo
             break
         level = max(left, noise)
         off = _AS_NOISE * level * np.sqrt(np.diag(covariance))
-        found = [
-            (fit[2], min(off[2], level)),
-            (fit[1] - 2 * fit[0] * early_s, off[1] + abs(2 * fit[0]) * dt_s),
-        ]
+        speed, uncertain = fit[1] - 2 * fit[0] * early_s, off[1] + abs(2 * fit[0]) * dt_s
+        # What may have begun to move within a row has: a log that begins with its step is the usual one.
+        rests = abs(speed) < uncertain
+        found = [(q[0] if rests else fit[2], min(off[2], level)), (0.0 if rests else speed, uncertain)]
     return found

@@ -22,7 +22,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from diagnosis.machine.around import Started, around
+from diagnosis.machine.around import MeasuredBody, Started, around
 from diagnosis.machine.machine_protocol import (
     KNOWN_START,
     Real,
@@ -160,6 +160,12 @@ class Plant:
     def description(self) -> Plant:
         return self
 
+    @property
+    def body(self) -> MeasuredBody | None:
+        """Whose motion is among the inputs."""
+        bodies = (effect.acts.on for effect in self.effects if effect.acts is not None)
+        return next((body for body in bodies if isinstance(body, MeasuredBody)), None)
+
     def value(self, key: str) -> float:
         """Stated value of a parameter."""
         return self.parameters[key]
@@ -268,12 +274,13 @@ class Plant:
 @dataclass(frozen=True, eq=False)
 class PlantExperiment:
     """One record of a plant: input (T, U), output (T, Y) as measured, a single one as (T,) too; held-out
-    records fit no parameter."""
+    records fit no parameter. missing : rows whose outputs say nothing."""
 
     name: str
     role: Role
     input: Real
     output: Real
+    missing: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         lock(self, "input", "output")
@@ -298,6 +305,10 @@ class PlantCase(RecordedCase[PlantExperiment]):
         super().__post_init__()
         for e in self.experiments:
             check_record(e, self.plant.output_names)
+            still = self.plant.body.resting(e.input) if self.plant.body else np.zeros(1)
+            # Of a record that rests throughout all is kept.
+            if not np.all(still):
+                object.__setattr__(e, "missing", tuple(np.flatnonzero(still)))
         if not self.plant.effects:
             raise ValueError("plant: lists no effect that may be missing")
         run = self.plant.simulated(())

@@ -29,18 +29,17 @@ def doubts_about(case: PlantCase, deadline_s: float = np.inf) -> tuple[str, ...]
 
     Raises ValueError, one line: a simulation that is random beside its stated values.
     """
-    plant = case.plant
-    found = list(doubtful_columns(case))
+    plant, found = case.plant, list(doubtful_columns(case))
     inputs = [e.input for e in case.estimation[:_RECORDS]]
     moved = plant.scaled({key: np.exp(min(t, _FARTHEST)) for key, t in plant.tolerances.items()})
-    first, second = _outputs(moved, inputs[0]), _outputs(moved, inputs[0])
+    first, second = moved.simulator(())(inputs[0]), moved.simulator(())(inputs[0])
     if not np.array_equal(first, second):
         raise ValueError(
             f"case {case.name}: two simulations with the same parameters, not those stated, differ by up "
             f"to {np.max(np.abs(first - second)):.3g}; make simulate a function of its arguments alone "
             "(no random numbers, nothing kept between calls)"
         )
-    stated = [_outputs(plant, u) for u in inputs]
+    stated = [plant.simulator(())(u) for u in inputs]
     for key, tolerance in plant.tolerances.items():
         if time.monotonic() > deadline_s:
             return tuple(found)
@@ -52,6 +51,13 @@ def doubts_about(case: PlantCase, deadline_s: float = np.inf) -> tuple[str, ...]
             runs = zip(inputs, stated, strict=True)
             if all(np.array_equal(plant.simulator([change])(u), y) for u, y in runs):
                 found.append(f"{effect.name} changes no output: does simulate use its argument effects?")
+    if (body := plant.body) is not None:
+        moving = np.concatenate([e.input[~body.resting(e.input), body.speed] for e in case.experiments])
+        if np.ptp(np.sign(moving)) == 0:
+            found.append(
+                f"all records move one way: dry friction cannot be told from an offset of "
+                f"{case.outputs[body.force]} there; move both ways"
+            )
     for e in case.held_out:
         for other in case.estimation:
             if np.array_equal(e.output, other.output):
@@ -91,7 +97,9 @@ def doubtful_columns(case: PlantCase) -> tuple[str, ...]:
                 "turned?"
             )
         times = float(np.median(ratio[told, k]))
-        if not LESS < times < FARTHER:
+        # Friction makes any force of a motion that is given.
+        given = case.plant.body is not None and case.plant.body.force == k
+        if not (given or LESS < times < FARTHER):
             near = min(_FACTORS, key=lambda factor: abs(np.log(times / factor)))
             unit = f"in {_FACTORS[near]}" if 0.5 < times / near < 2 else "in another unit"
             found.append(f"{name} moves {times:.3g} times as far as in the simulation: is its column {unit}?")
@@ -128,7 +136,7 @@ def _of_value(plant: Plant, key: str, tolerance: float, inputs: list[Real], stat
     farthest = min(tolerance, _FARTHEST)
 
     def change(by: float, k: int = 0) -> Real:
-        return _outputs(plant.scaled({key: float(np.exp(by))}), inputs[k]) - stated[k]
+        return plant.scaled({key: float(np.exp(by))}).simulator(())(inputs[k]) - stated[k]
 
     ends = [change(farthest), change(-farthest)]
     lost = [
@@ -151,10 +159,6 @@ def _of_value(plant: Plant, key: str, tolerance: float, inputs: list[Real], stat
             f"the outputs are not smooth in {key}: its re-estimated value, and sizes beside it, may be wrong"
         ]
     return []
-
-
-def _outputs(plant: Plant, inputs: Real) -> Real:
-    return plant.simulator(())(inputs)
 
 
 def _rms(outputs: Real, plant: Plant) -> float:

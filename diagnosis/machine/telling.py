@@ -39,7 +39,8 @@ class Alike:
 @dataclass(frozen=True)
 class Telling:
     """least : candidate -> smallest size that shows: of a stated value relative, of an effect in its unit;
-    inf where it does nothing. hidden : candidates that show at no size that is searched. alike : groups.
+    of one that does less where it is larger, as a limit, the largest; inf where it does nothing.
+    hidden : candidates that show at no size that is searched. alike : groups.
     unlooked : candidates that a deadline left out."""
 
     least: Mapping[str, float]
@@ -73,6 +74,18 @@ def telling(case: PlantCase, deadline_s: float = np.inf) -> Telling:
     samples = [len(e.output) for e in records]
     shows = {name: _shown(column, samples) for name, column in columns.items()}
     least = {name: sizes[name] / shows[name] if shows[name] > 0 else np.inf for name in columns}
+    for effect in (one for one in plant.effects if not one.grows and one.name in columns):
+        (candidate, *_), first = effect.candidates(), effect.parameters[0].name
+        # Of a range of twenty to one, steps of an eighth.
+        grid = [np.array([x, *candidate.starts[0][1:]]) for x in np.linspace(*candidate.axes[0].box, 24)]
+        least[effect.name] = max(
+            (
+                abs(change.values[first])
+                for change in map(candidate.effect_at, grid)
+                if _shown(_over(_outputs(plant, (change,), records), stated, levels), samples) > 1
+            ),
+            default=np.inf,
+        )
     hidden = tuple(name for name in columns if not least[name] < most[name])
     told = {name: c / np.linalg.norm(c) for name, c in columns.items() if name not in hidden}
     return Telling(least, hidden, _alike(told), tuple(name for name in names if name not in columns))

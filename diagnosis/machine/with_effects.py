@@ -115,7 +115,7 @@ def with_effects(
             position=_largest(e.input[:, measured_motion[0]] for e in experiments),
             speed=_largest(e.input[:, measured_motion[1]] for e in experiments),
         )
-        body = MeasuredBody(*measured_motion, seen)
+        body = MeasuredBody.of(*measured_motion, seen, [e.input for e in experiments])
     else:
         sizes = Sizes()
     sizes = replace(

@@ -148,10 +148,9 @@ def tailored_excitations(
         "to_Hz": round(float(lines[-1] / (period * dt_s)), 3),
         "lines": int(lines.size),
     }
-    binary = voltage_V * np.where(signal >= 0, 1.0, -1.0)
     return [
         Excitation("tailored multisine", parameters, signal * (voltage_V / np.max(np.abs(signal)))),
-        Excitation("tailored binary", parameters, binary),
+        Excitation("tailored binary", parameters, voltage_V * np.where(signal >= 0, 1.0, -1.0)),
     ]
 
 

@@ -33,7 +33,8 @@ from plant.effects.search_space import Candidate
 class Search(SearchLoop[Explanation]):
     """All that was fitted to a case, the nominal alone first.
 
-    windows : that records are seen in, each from its own start; None: as they run freely.
+    windows : that records are seen in, each from its own start; None: as they run freely. refuted : effects
+    that validation records do not have, whatever the others say.
     """
 
     records: Records
@@ -47,6 +48,7 @@ class Search(SearchLoop[Explanation]):
     ) -> None:
         super().__init__(case, progress, deadline_s)
         self.windows = windows
+        self.refuted: set[str] = set()
         self.records = Records(case, case.estimation, windows)
         self.held_out = Records(case, case.held_out, windows)
 
@@ -83,7 +85,12 @@ class Search(SearchLoop[Explanation]):
         self.finish()
         self.tried(Enlarge.proposed(self, self.found), 0.45)
         for count in range(2, self.case.machine.weighing.most_effects + 1):
-            if count > 3 and not (self.unexplained and self._worth(count - 1)):
+            # Whether the likeliest set of so many effects is much likelier than that of one fewer.
+            largest, smaller = (
+                max((e.evidence for e in self.found if len(e.names) == n), default=-np.inf)
+                for n in (count - 1, count - 2)
+            )
+            if count > 3 and not (self.unexplained and largest > smaller + DECISIVE):
                 break
             self.tried(BesideSet.proposed(self, count), min(0.45 + 0.25 * (count - 2), 0.9), 0.1)
         if self.unexplained:
@@ -96,14 +103,6 @@ class Search(SearchLoop[Explanation]):
     def unexplained(self) -> bool:
         """Whether the likeliest leaves more of the motion than is stated not to interest."""
         return bool(np.max(self.likeliest.shares) > self.case.machine.weighing.model_error)
-
-    def _worth(self, count: int) -> bool:
-        """Whether the likeliest set of so many effects is much likelier than that of one fewer."""
-        largest, smaller = (
-            max((e.evidence for e in self.found if len(e.names) == n), default=-np.inf)
-            for n in (count, count - 1)
-        )
-        return largest > smaller + DECISIVE
 
     def looked_for(
         self, candidate: Candidate, points: list[StartPoint]

@@ -38,8 +38,7 @@ def periodic_findings(case: Case, residuals: Mapping[str, Real], level: float) -
 
 
 def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> PeriodicFinding:
-    dt = case.rig.sampling.dt_s
-    count = x.voltage_V.size // period
+    dt, count = case.rig.sampling.dt_s, x.voltage_V.size // period
     # Orthonormal lines 1 .. below Nyquist: a mean square modulus of 1 is white noise of unit variance.
     lines = np.arange(1, (period + 1) // 2)
     # A drift is a ramp in every period, yet no answer.
@@ -57,8 +56,7 @@ def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> P
     if not separable:
         groups = {"not excited": ~excited & near}
     groups = {name: chosen for name, chosen in groups.items() if np.count_nonzero(chosen) >= _LEAST_LINES}
-    edges = band_edges_Hz(period * dt, dt)
-    frequency = lines / (period * dt)
+    edges, frequency = band_edges_Hz(period * dt, dt), lines / (period * dt)
     banded = [(low, high, excited & (frequency >= low) & (frequency < high)) for low, high in pairwise(edges)]
     banded = [(low, high, chosen) for low, high, chosen in banded if np.count_nonzero(chosen) >= _LEAST_LINES]
     sensors = sensors_of(case)
@@ -87,13 +85,12 @@ def _finding(case: Case, x: Experiment, e: Real, period: int, level: float) -> P
             )
         for name, chosen in groups.items():
             p_value = _p_value(mean, rest, chosen, count)
-            beyond = float(np.mean(np.abs(mean[chosen]) ** 2)) - 1 / count
             shown.append(
                 LineGroup(
                     sensor,
                     name,
                     int(np.count_nonzero(chosen)),
-                    float(np.sqrt(max(beyond, 0.0))),
+                    float(np.sqrt(max(float(np.mean(np.abs(mean[chosen]) ** 2)) - 1 / count, 0.0))),
                     p_value,
                     bool(p_value < level / tests),
                 )
@@ -111,8 +108,7 @@ def _p_value(mean: ComplexArray, rest: Real, chosen: npt.NDArray[np.bool_], coun
     """Chance of the repeated part from the stated noise or from what the periods show: the larger one."""
     n = int(np.count_nonzero(chosen))
     repeated = 2 * count * float(np.sum(np.abs(mean[chosen]) ** 2))
-    varying = 2 * float(np.sum(rest[chosen]))
-    freedom = 2 * n * (count - 1)
+    varying, freedom = 2 * float(np.sum(rest[chosen])), 2 * n * (count - 1)
     by_stated = float(chi2.sf(repeated, 2 * n))
     by_periods = float(fisher.sf((repeated / (2 * n)) / max(varying / freedom, 1e-300), 2 * n, freedom))
     return max(by_stated, by_periods)

@@ -265,14 +265,6 @@ class PeriodicFinding:
     groups: tuple[LineGroup, ...]
     even_odd_separable: bool
 
-    @property
-    def worst_band(self) -> FrequencyResponseBand | None:
-        return max((b for b in self.bands if b.found), key=lambda b: b.distance, default=None)
-
-    @property
-    def worst_group(self) -> LineGroup | None:
-        return max((g for g in self.groups if g.found), key=lambda g: g.repeated_rms, default=None)
-
 
 Growth = Literal["offset", "saturating", "linear", "faster", "undecided"]
 
@@ -415,8 +407,7 @@ class Where:
             return None
         _, less, low, high = min(runs)
         halves = [np.ptp(b.gap.share_interval) / scale / 2 for b in bands if low <= b.low_Hz < high]
-        half = float(np.sqrt(np.sum(np.square(halves))))
-        share = min(-less, 1.0)
+        half, share = float(np.sqrt(np.sum(np.square(halves)))), min(-less, 1.0)
         return Concentration(low, high, share, half) if share - half >= 0.5 else None
 
     def even(self, sensor: str) -> bool:

@@ -70,8 +70,7 @@ def missing_functions(
     torque, sensors = response / case.noise, sensors_of(case)
     routes = [route for route in _ROUTES if route[0] in ("hub_torque", *sensors)]
     tests = sum(len(axes) for _, axes, _ in routes)
-    bases = {axis: _basis(axis, moved) for axis in _VARIABLES}
-    found = []
+    bases, found = {axis: _basis(axis, moved) for axis in _VARIABLES}, []
     for route, axes, value_unit in routes:
         at = sensors.index(route) if route in sensors else None
         for axis in axes:
@@ -166,8 +165,7 @@ def _normal_equations(
         if sensor is None:
             T = f.shape[0]
             n = next_fast_len(2 * T - 1, real=True)
-            spectrum = rfft(f.T, n)[None] * rfft(torque[:T].T, n)[:, None]
-            columns = irfft(spectrum, n)[:, :, :T]  # (Y, K, T)
+            columns = irfft(rfft(f.T, n)[None] * rfft(torque[:T].T, n)[:, None], n)[:, :, :T]  # (Y, K, T)
             for s in range(columns.shape[0]):
                 gram += columns[s] @ columns[s].T
                 moment += columns[s] @ e[:, s]

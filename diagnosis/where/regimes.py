@@ -154,8 +154,7 @@ def _quantiles(name: str, unit: str, values: Mapping[str, Real], bins: int) -> R
         # A cut on a value many samples share goes above it: the bin below keeps them together.
         cut = float(np.nextafter(cut + 1e-9 * span, np.inf))
         below = np.count_nonzero((everything >= last) & (everything < cut))
-        above = np.count_nonzero(everything >= cut)
-        if min(below, above) >= everything.size / (2 * bins):
+        if min(below, np.count_nonzero(everything >= cut)) >= everything.size / (2 * bins):
             inner.append(cut)
             last = cut
     if not inner:
@@ -206,8 +205,7 @@ def _shifted_energy(
         energy = np.fft.rfft(np.square(residuals[name]).T, axis=1)
         # correlation[s, b, k] = sum_t inside[b, t] energy[s, t + k]
         correlation = np.fft.irfft(np.conj(np.fft.rfft(inside, axis=1))[None] * energy[:, None], T, axis=2)
-        shift = np.concatenate([[0], rng.integers(0, T, _SHIFTS)])
-        sums += np.moveaxis(correlation[:, :, shift], 2, 0)
+        sums += np.moveaxis(correlation[:, :, np.concatenate([[0], rng.integers(0, T, _SHIFTS)])], 2, 0)
     return sums, counts
 
 

@@ -54,8 +54,7 @@ def fit_on_fresh_data(
     (`ident.basis.structure.stabilised`), and simulated what it predicts from sample to sample. Raises
     ValueError for another sampling time, other inputs than the model's, several outputs, or a constant one.
     """
-    several = isinstance(model, MisoModel)
-    record.refuse_several(model.dt_s, model.n_inputs if several else 1)
+    record.refuse_several(model.dt_s, model.n_inputs if isinstance(model, MisoModel) else 1)
     unstable, delay = model.unstable, model.input_delay_samples
     try:
         measured = answered(record.output[:, 0], delay)
@@ -67,8 +66,8 @@ def fit_on_fresh_data(
         raise ValueError(f"{record.label}: the output is constant")
     unknown = estimate_offset and estimate_initial_state and not model.integrators
     u = record.input - np.array([level_before(column) if unknown else 0.0 for column in record.input.T])
-    simulated = answered(model.simulate(u) if several else model.stable_part.simulate(u[:, 0]), delay)
-    without = y
+    simulated = model.simulate(u) if isinstance(model, MisoModel) else model.stable_part.simulate(u[:, 0])
+    simulated, without = answered(simulated, delay), y
     degrees = max(int(estimate_offset), model.integrators if estimate_initial_state else 0)
     nuisance = nuisance_columns(model.poles, y.size, degrees, estimate_initial_state)
     if nuisance.shape[1]:

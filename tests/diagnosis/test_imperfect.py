@@ -751,6 +751,7 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
     count = sum(e.output.size for e in case.estimation)
     found = {frozenset(names): fitted(names, *numbers) for names, numbers in sets.items()}
     return SimpleNamespace(
+        refuted=set(),
         found=list(found.values()),
         base=found[frozenset()],
         stated=lambda: found[frozenset()] if stated is None else fitted((), 0.0, stated, stated),
@@ -768,6 +769,16 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
         by_these=lambda names, whole: found[frozenset(names)],
         finished=lambda explanation: explanation,
     )
+
+
+def test_what_makes_validation_records_worse_is_not_there():
+    nothing, dry, both = (0.0, 0.5, 0.5), ("coulomb_friction",), ("coulomb_friction", "gravity")
+    sets = {(): nothing, ("gravity",): nothing, dry: (400.0, 0.1, 0.1), both: (900.0, 0.01, 0.01)}
+    search = _searched(sets)
+    assert judged(search).accepted == both
+    search.refuted.add("gravity")
+    assert judged(search).accepted == dry
+    assert judged(search).probabilities.presence["gravity"] == 0
 
 
 @pytest.mark.parametrize(("further_gain", "sought"), [(12.0, True), (0.0, False)])

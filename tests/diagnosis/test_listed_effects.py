@@ -8,7 +8,7 @@ import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
-from scipy.signal import lsim
+from scipy.signal import lfilter, lsim
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
 from diagnosis.machine.listed_effects import KINDS
@@ -347,6 +347,36 @@ def test_forces_that_a_known_motion_takes():
     # Of 5 that drive a fifth is lost on the way to 4; braking, friction helps: of 2 only 2/1.2 are needed.
     lost = BodyForces(load=0.2).overcome(x, v, rest)
     np.testing.assert_allclose(rest + lost, [5.0, -3.75, -2.0 / 1.2])
+
+
+@pytest.mark.filterwarnings("ignore:plant. all records move one way")
+@pytest.mark.parametrize("kind", ["exact", "white", "filtered", "quantised", "of an encoder", "one way"])
+def test_rows_in_which_a_known_motion_may_rest_say_nothing(kind):
+    """What rubs is known from all others, whatever the noise of the speed; of one way it is an offset."""
+    rng, swing, records = np.random.default_rng(0), np.sin(0.004 * np.pi * np.arange(3000)), []
+    v = 0.1 * np.where(np.abs(swing) > 0.3, np.abs(swing) if kind == "one way" else swing, 0.0)
+    x, noise = np.cumsum(v) * 0.02, rng.normal(0, 1e-3, v.size)
+    speed = {
+        "exact": v,
+        "filtered": v + lfilter([0.3], [1, -0.9], noise),
+        "quantised": 2e-3 * np.round((v + noise) / 2e-3),
+        "of an encoder": np.gradient(1e-4 * np.round(x / 1e-4), 0.02),
+    }.get(kind, v + noise)
+    held = np.where(v == 0, 0.1, 0.15 * np.sign(v) + 0.3 * v)  # at rest by friction
+    for role in ("estimation", "held_out"):
+        torque = held + rng.normal(0, 0.02, v.size)
+        records.append(PlantExperiment(role, role, np.column_stack([x, speed]), torque))
+    names = ("coulomb_friction", "output_offset", "viscous_friction")
+    plant = Plant(lambda p, e, u: 0.3 * u[:, 1:], {}, {}, ("torque",), np.array([0.02]), model_error=0.05)
+    plant = with_effects(plant, names, records, dt_s=0.02, measured_motion=(0, 1))
+    found = diagnose(PlantCase("joint", plant, records))
+    moving = np.setdiff1d(np.arange(v.size), found.case.experiments[0].missing)
+    assert np.all(v[moving] * speed[moving] > 0)
+    assert moving.size > 0.75 * v.size
+    assert found.combination == ("coulomb_friction",)
+    assert found.repair[0].values["force"] == pytest.approx(0.15, rel=0.03)
+    assert ("move both ways" in " ".join(found.doubts)) == (kind == "one way")
+    assert ("output_offset" in found.ambiguous_with) == (kind == "one way")
 
 
 def _looped(reference, added, command=lambda c, k: c[k]):

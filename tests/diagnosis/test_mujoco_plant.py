@@ -9,7 +9,6 @@ import pytest
 
 mujoco = pytest.importorskip("mujoco")
 
-from benchmarks import mujoco_cases as cases  # noqa: E402
 from diagnosis import PlantCase, PlantExperiment, diagnose  # noqa: E402
 from diagnosis.machine.mujoco_plant import MujocoArm  # noqa: E402
 from diagnosis.machine.mujoco_quantities import Quantities  # noqa: E402
@@ -109,6 +108,27 @@ def test_tracking_leaves_a_machine_that_is_the_model_where_it_is(tracking_rad_s)
     found = plant.simulated(())(inputs)[:, 0]
     assert np.std(angle) > 0.1
     np.testing.assert_allclose(found, angle, rtol=0, atol=0.01 * np.std(angle))
+
+
+def test_a_log_that_begins_with_its_step_begins_at_rest():
+    """Of a machine three times as heavy: what remains is the noise, and is no start."""
+    torque = np.repeat([0.8, -0.9, 0.3, -0.2], 50)
+    angle = turned(torque, 3 * INERTIA) + 1e-4 * np.random.default_rng(3).standard_normal(200)
+    plant, inputs = plant_of(rod(tracking_rad_s=3.0), torque, angle)
+    heavy = plant.scaled({"rod.mass": 3.0, "rod.inertia": 3.0, "hinge.armature": 3.0})
+    assert np.std(heavy.simulator(())(inputs)[:, 0] - angle) < 2e-4
+    model = heavy.untracked.edited(dict(heavy.parameters)).compile()
+    assert heavy.untracked.began(model, inputs).qvel == [0.0]
+
+
+def test_an_effect_that_changes_as_much_at_no_size_is_not_offered():
+    """Damping that stops a motor without load within a step: what is simulated are the steps."""
+    servo = ROD.replace('<motor name="motor"', '<position name="motor" kp="80" kv="5.5"')
+    for step, tried in (("0.0005", True), ("0.01", False)):
+        arm = MujocoArm(mujoco.MjSpec.from_string(servo.replace("0.001", step, 1)), ("hinge",), DT_S)
+        plant, _ = plant_of(arm, 0.5 * steps(), turned(steps(), 0.05))
+        assert ("hinge.backlash" in [effect.name for effect in plant.effects]) == tried
+        assert ("smaller steps" in plant.inactive.get("hinge.backlash", "")) != tried
 
 
 def as_begun(plant):
@@ -345,20 +365,6 @@ def test_the_repaired_file_does_in_mujoco_what_the_diagnosis_simulated():
     # What MJCF has no word for is read back from the file.
     again = MujocoArm(mujoco.MjSpec.from_string(text), ("hinge",), DT_S)
     assert again.number("hinge.offset", 0.0) == pytest.approx(0.1)
-
-
-def test_the_equations_of_the_benchmark_are_those_of_mujoco():
-    """Both truths of the same two-joint arm under the same torques; they share no line."""
-    masses, damping, armature = np.array([1.2, 0.8]), np.array([0.25, 0.12]), np.array([0.03, 0.015])
-    for effect, flat in (("payload", False), ("tilt", True)):
-        truth = cases.Truth(2, masses, damping, armature, effect, 1, 0.2, flat)
-        one, other = cases.InMujoco(truth), cases.ByEquations(truth)
-        for k in range(100):
-            torque = np.array([np.sin(0.1 * k), 0.4 * np.cos(0.13 * k)])
-            one.step(torque)
-            other.step(torque)
-        assert np.ptp(one.angle - cases.at_rest(truth)) > 0.02
-        np.testing.assert_allclose(one.angle, other.angle, rtol=0, atol=5e-3)
 
 
 @pytest.mark.parametrize(

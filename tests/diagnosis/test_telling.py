@@ -1,5 +1,7 @@
 """What records can tell before a fit: sizes against closed forms, what acts alike, what does nothing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -102,3 +104,18 @@ def test_a_deadline_says_what_was_not_looked_at():
     found = telling(case(lines, {"a": 2.0, "b": 0.5}, ("offset",)), deadline_s=0.0)
     assert found.unlooked == ("a", "b", "offset")
     assert not found.least
+
+
+def test_of_a_limit_the_largest_that_shows_is_told():
+    """Of a ramp to one, cut off: the energy beyond a limit is (1 - limit)^3 / 3."""
+    ramp = np.linspace(0, 1, SAMPLES)[:, None] * [1.0, 1.0]
+
+    def simulate(parameters, effects, inputs):
+        return lines(parameters, {}, np.minimum(inputs, effects.get("limit", {"size": 1.0})["size"]))
+
+    one = case(simulate, {"a": 1.0, "b": 1.0}, ("limit",), inputs=ramp)
+    limit = PlantEffect("limit", (EffectParameter("size", 0.05, 1.0),), grows=False)
+    found = telling(replace(one, plant=replace(one.plant, effects=(limit,))))
+    level = np.hypot(ERROR / np.sqrt(12), 3 * NOISE / np.sqrt(SAMPLES))
+    assert 0.85 < found.least["limit"] / (1 - (3 * level**2) ** (1 / 3)) <= 1
+    assert not found.hidden

@@ -1,5 +1,6 @@
 """`flexlink diagnose` on models of other simulators: end to end, refusals, docs/simulators.md as it is."""
 
+import contextlib
 import doctest
 import re
 import shlex
@@ -405,6 +406,26 @@ def test_what_a_log_lacks_is_asked_for_with_options_that_exist(tmp_path, refused
     model = ("--mjcf", tmp_path / "arm.xml", "--log", tmp_path / "one.csv")
     arguments = (tmp_path / "arm.toml",) if columns else model
     assert complaint in refused("diagnose", *arguments, "--out", tmp_path / "out")
+
+
+REACHES = [
+    ('range="-150 150"', 80.0, "motor and hinge in degrees (motor up to 80, the model 2.62 rad)?"),
+    ("", 80.0, "scale = 0.0174533}} (1: in the model's unit)"),
+    ('type="slide" range="0 0.5"', 400.0, "motor and hinge in millimetres"),
+    ('range="-150 150"', 2.0, ""),
+]
+
+
+@pytest.mark.parametrize(("joint", "size", "asked"), REACHES)
+def test_positions_far_out_of_reach_are_asked_for_before_anything_runs(tmp_path, joint, size, asked):
+    pytest.importorskip("mujoco")
+    servo = HINGE.replace('<motor name="motor" joint', '<position name="motor" kp="9" joint')
+    (tmp_path / "arm.xml").write_text(servo.replace('name="hinge"', f'name="hinge" {joint}', 1))
+    rows = [(DT_S * k, size * np.sin(0.05 * k), size * np.sin(0.05 * k)) for k in range(300)]
+    np.savetxt(tmp_path / "one.csv", rows, delimiter=",", header="time_s,motor,hinge", comments="")
+    settings = settings_of({"mjcf": "arm.xml", "log": "one.csv"}, "case.toml")
+    with pytest.raises(InputError, match=re.escape(asked)) if asked else contextlib.nullcontext():
+        load_simulator_case(settings, tmp_path, "case.toml")
 
 
 @pytest.mark.parametrize("model", ['mjcf = "arm.xml"', 'python = "gain.py"'], ids=["mjcf", "python"])

@@ -52,6 +52,8 @@ _DRIVES = ("N", "N m", "V", "A")
 # are taken at one to twenty steps; and the samples that one step may be.
 _MOST_STEPS, _MOST_SAMPLES = 500, 100
 _UNITS_OF_TIME = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
+# What positions are logged in beside the unit of the model.
+_OTHERS = {"rad": ("degrees", np.pi / 180), "m": ("millimetres", 1e-3)}
 _SLOWEST_S = 0.5  # machines are logged faster than twice a second
 # Third differences of white noise have twenty times its variance; no motion is left in them.
 _THIRD = 20.0
@@ -231,10 +233,10 @@ def _needs(package: str) -> None:
 
 def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_s: float) -> Any:
     _needs("mujoco")
-    from diagnosis.machine.mujoco_model import names, step_of
+    from diagnosis.machine.mujoco_model import names, read
     from diagnosis.machine.mujoco_plant import MujocoArm
 
-    _refuse_other_unit(tables, settings, dt_s, step_of(str(model)))
+    _refuse_other_unit(tables, settings, dt_s, float(read(str(model)).option.timestep))
     there = names(str(model))
     kinds: dict[str, list[str]] = {}
     for kind, several in there.items():
@@ -298,6 +300,23 @@ def _mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings, dt_
         doubts.append(f"no column measures {listing(loose)}: simulated from where the model rests")
 
     def finish(experiments: Sequence[PlantExperiment], noise: Real) -> Any:
+        largest = np.max([np.max(np.abs(e.input), axis=0) for e in experiments], axis=0)
+        asked = []
+        for name, one, size in zip((*commands, *labels), (*arm.inputs, *outputs), largest, strict=True):
+            (reach, unit), column = arm.reaches.get(one, (np.inf, "")), _column(name, tables[0], settings)
+            other, scale = _OTHERS.get(unit, ("", 1.0))
+            # Of a unit that is stated, and of what is not so far off, nobody need be asked.
+            known = column.scale is not None or tables[0].unit(column.column)
+            if size > 3 * reach > 3 * scale * size and not known:
+                said = f"up to {size:.3g}, the model {reach:.3g} {unit}"
+                asked.append(
+                    (column.column, other, said, f'{{column = "{column.column}", scale = {scale:.6g}}}')
+                )
+        for first, other, said, scaled in asked[:1]:
+            raise InputError(
+                f"{tables[0].path}: {listing([one[0] for one in asked])} in {other} ({first} {said})? Say of "
+                f"each, in a case file: columns = {{{json.dumps(first)} = {scaled}}} (1: in the model's unit)"
+            )
         stated = settings.tracking_rad_s
         tracking = arm.tracking(experiments) if stated is None else stated
         # A pattern for all of a place ("elbow.*") is no name.
@@ -364,11 +383,10 @@ def _with_all(
     """A simulation with the listed effects around inputs and outputs, and around its body where stated."""
 
     def finish(experiments: Sequence[PlantExperiment], noise: Real) -> tuple[Plant, None, tuple[str, ...]]:
-        every = {name: tolerances.get(name, _TOLERANCE) for name in parameters}
         plant = Plant(
             simulation,
             parameters,
-            every,
+            {name: tolerances.get(name, _TOLERANCE) for name in parameters},
             tuple(outputs),
             noise,
             effects,

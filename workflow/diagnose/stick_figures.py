@@ -53,8 +53,7 @@ def _flat(figures: Mapping[str, Real]) -> tuple[dict[str, Real], float, str]:
     """(F, L, 2, 3) [m] -> (F, L, 2, 2) in the picture, one scale [1/m] for all; axes across and up."""
     measured = figures["measured"]
     reach = np.ptp(measured.reshape(-1, 3), axis=0)
-    moves = np.ptp(measured.reshape(len(measured), -1, 3), axis=0).max(axis=0)
-    kept = sorted(np.argsort(reach + moves)[1:])
+    kept = sorted(np.argsort(reach + np.ptp(measured.reshape(len(measured), -1, 3), axis=0).max(axis=0))[1:])
     size = float(np.max(reach)) or 1.0
     low, high = measured.reshape(-1, 3).min(axis=0), measured.reshape(-1, 3).max(axis=0)
     # A free run may fall over, far away from what was measured.

@@ -109,8 +109,7 @@ def draw_regimes(where: Where, model_error: float = 0.0) -> Figure | None:
     for axes, finding in zip(panels, findings, strict=True):
         at, count = np.arange(len(finding.bins)), len(finding.bins)
         low, high = np.array([one.interval for one in finding.bins]).T
-        chance = "95 % of what chance gives"
-        axes.bar(at, high - low, bottom=low, width=0.8, color="#dddddd", label=chance)
+        axes.bar(at, high - low, bottom=low, width=0.8, color="#dddddd", label="95 % of what chance gives")
         name, colour = _LOOKS[finding.sensor]
         axes.plot(at, [one.energy for one in finding.bins], "o", ms=6, color=colour, label=name)
         # The label where there is room for words, else the range on two lines.

@@ -186,8 +186,8 @@ def draw_joint_validation(run: JointsView) -> Figure | None:
         return None
     point, fits = min(records, key=lambda each: min(fit.fit_percent for fit in each[1]))
     figure, grid = style.panels(4.2, 2, len(fits), squeeze=False, sharex="col", height_ratios=[1.5, 1.0])
-    for k, (fit, name) in enumerate(zip(fits, run.joint_names, strict=True)):
-        time_s = np.arange(fit.residual.size) * point.model.dt_s
+    for k, (fit, name) in enumerate(zip(fits, point.model.output_names, strict=True)):
+        time_s = np.asarray(np.arange(fit.residual.size) * point.model.dt_s)
         draw_free_run(grid[:, k], time_s, fit, 2 * point.noise_std[k])
         grid[0, k].set_title(f"{style.plain(name, 20)}: fit {fit.fit_percent:.1f} %")
         unit = run.results.records.unit(name)
