@@ -25,10 +25,6 @@ def recorded_case(folder, rig="rig.toml", without=()):
     return Case(folder.name, Rig.from_toml(folder / rig), tuple(experiments))
 
 
-def answer(folder):
-    return tomllib.loads((folder / "answer.toml").read_text(encoding="utf-8"))
-
-
 def simulated_case(folder, table, records, rng, *, samples=900, register=7, stated=None, tolerances=None):
     """A case by the blind protocol's simulator, which shares no code with the model that is diagnosed.
 

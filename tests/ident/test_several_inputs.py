@@ -188,19 +188,9 @@ def test_a_model_is_locked_and_gives_its_channels(fitted):
 
 def test_bad_input_is_refused():
     good = record(0, n=300)
-    same = Record("same", np.column_stack([good.input[:, 0]] * 2), good.output, DT_S, ("a", "b"), ("y",))
-    with pytest.raises(ValueError, match="linearly dependent"):
-        identify_mimo([same])
     still = Record("still", good.input * [1, 0], good.output, DT_S, ("a", "b"), ("y",))
     with pytest.raises(ValueError, match="'b' is constant in every record"):
         identify_mimo([still])
-    with pytest.raises(ValueError, match="too few"):
-        identify_mimo([good.slice(0, 12)], IdentOptions(n_real=1, n_pairs=2))
-    with pytest.raises(ValueError, match="relative_degree"):
-        identify_mimo([good], IdentOptions(relative_degree=2))
-    two = Record("two", good.input, np.repeat(good.output, 2, axis=1), DT_S, ("a", "b"), ("y", "z"))
-    with pytest.raises(ValueError, match="linearly dependent"):
-        identify_mimo([two])
     with pytest.raises(ValueError, match="at least one record"):
         identify_mimo([])
     with pytest.raises(ValueError, match="need coefficients"):
@@ -344,18 +334,3 @@ def test_two_link_example(tmp_path):
     picture = tmp_path / "bode.png"
     two_link_arm.figure(result, truth, bands).savefig(picture)
     assert picture.stat().st_size > 10_000
-
-
-@pytest.mark.long
-def test_balls_cover_the_truth():
-    """`test_several_outputs.py` has 14 records day by day."""
-    seeds, omega = 100, np.geomspace(0.5, 150.0, 20)
-    truth = response(sampled(), omega)[:, None]
-    hits = np.zeros(omega.size)
-    for seed in range(seeds):
-        item = record(seed, n=2000)
-        result = identify_mimo([item], IdentOptions(n_real=1, n_pairs=2))
-        hits += matrix_posterior([item], result).at(omega).holds(truth)
-    # Binomial at one frequency: sd 2.2 of 100, 4 sd for the least of 20.
-    assert np.all(hits >= 95 - 4 * 2.2)
-    assert hits.mean() >= 91

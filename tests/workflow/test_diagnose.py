@@ -6,7 +6,6 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 import tomllib
 from contextlib import closing
 from dataclasses import replace
@@ -15,11 +14,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from benchmarks.fleet import write_fleet
 from diagnosis.fit.residual import pooled_rms
 from plant import EFFECTS, Rig, parse_effects, simulate
 from plant.effects.joint import GroundSpring
-from tests.workflow.command import ROOT, build_nothing, finish, kill, start_flexlink, wait_until
+from tests.workflow.command import ROOT, build_nothing
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from tests.workflow.page_shape import shape_faults
 from workflow.config.run_config import SimulatedSource
@@ -470,24 +468,6 @@ def test_a_process_that_dies_is_that_cases_failure(cases, tmp_path):
     assert found.exit_code == 1
     assert [document["case"] for document in found.documents] == ["two"]
     assert "died" in found.failures[0][1].reason
-
-
-@pytest.mark.long
-def test_killed_and_resumed_ends_with_the_same_bytes(tmp_path):
-    short = {"records": 2, "samples": 160}
-    cases = *write_fleet(tmp_path / "fleet", 1, samples=90), write_case(tmp_path / "arm", FRICTION, **short)
-    quiet, killed = tmp_path / "quiet", tmp_path / "killed"
-    call = ("diagnose", *cases, "--jobs", 1, "--no-controller", "--out")
-    finish(start_flexlink(*call, quiet))
-    process = start_flexlink(*call, killed)
-    wait_until((killed / "unit-0000.json").exists, process)
-    time.sleep(2.0)  # the second case is being computed
-    kill(process)
-    assert not (killed / "arm.json").exists()
-    before = (killed / "unit-0000.json").stat().st_mtime_ns
-    finish(start_flexlink(*call, killed, "--resume"))
-    assert (killed / "unit-0000.json").stat().st_mtime_ns == before
-    assert everything(killed) == everything(quiet)
 
 
 @pytest.mark.long

@@ -1,17 +1,12 @@
-"""Many machines at once: groups, trends, table, workers that die."""
+"""Many machines at once: groups, trends, table."""
 
 import csv
 import io
-import os
-import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from benchmarks.fleet import write_fleet
-from tests.workflow.command import finish, start_flexlink, wait_until
-from tests.workflow.test_study_cluster import cluster  # noqa: F401
 from workflow.diagnose import command, fleet
 from workflow.engine import codec
 from workflow.engine.executor import Failure
@@ -145,25 +140,3 @@ def test_answers_are_written_one_after_another():
         for k in range(count):
             assert next(parts).count('case"') == 1
             assert answers.read == k + 1
-
-
-@pytest.mark.long
-def test_a_worker_killed_midway_changes_no_byte(cluster, tmp_path):  # noqa: F811
-    call = ("diagnose", *write_fleet(tmp_path / "cases", 3, samples=90))
-    finish(start_flexlink(*call, "--out", tmp_path / "near", "--jobs", "2"))
-    cluster.add_worker()
-    cluster.add_worker()
-    process = start_flexlink(*call, "--out", tmp_path / "far", "--scheduler", cluster.address)
-    wait_until(lambda: any((tmp_path / "far").glob("unit-*.json")), process)
-    os.kill(cluster.workers[0].pid, signal.SIGKILL)
-    finish(process)
-    near, far = (
-        {
-            path.name: path.read_bytes()
-            for path in (tmp_path / where).iterdir()
-            if path.name not in ("timings.json", "lock")
-        }
-        for where in ("near", "far")
-    )
-    assert len(far) > 3
-    assert near == far

@@ -135,13 +135,6 @@ def test_runs_in_one_table_are_records_and_a_counter_does_not_wrap(marks, flexli
     assert re.search(words, refused("identify", path))
 
 
-def test_a_log_that_is_none_is_one_line(flexlink, tmp_path):
-    (tmp_path / "a.npz").write_bytes(b"none")
-    answer = flexlink("look", tmp_path / "a.npz")
-    assert (answer.code, answer.err.count("\n")) == (2, 1)
-    assert "not a numpy .npz archive" in answer.err
-
-
 def test_sparkline():
     assert sparkline(np.arange(8.0)) == "▁▂▃▄▅▆▇█"
     assert sparkline(np.ones(5)) == ""

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from benchmarks.interruptions import INTERRUPTS, KILLS, stopped, undisturbed
 from control_design.controllers.controller import Controller
 from tests.workflow.command import FAST_ARM, ROOT, finish, start_flexlink, wait_until
 from workflow.commands.run import run_from_files
@@ -31,7 +30,6 @@ from workflow.tasks.results import ClosedLoopResult, RunResults
 from workflow.tasks.stage import StageInput
 from workflow.tasks.stages import STAGES
 
-RUN = ["run", "--config", str(FAST_ARM)]
 NAMES = [*(stage.name for stage in STAGES), REPORT.name]
 
 
@@ -47,7 +45,7 @@ def assert_same_run(left: Path, right: Path) -> None:
         assert first[name] == second[name], f"{name} differs"
 
 
-# SIGTERM comes while a command loads, SIGALRM at its time limit, SIGHUP where it is stopped again and again.
+# SIGTERM comes while a command loads, SIGALRM at its time limit.
 def test_interrupted_run_ends_at_once_and_says_how_to_go_on(tmp_path):
     out = tmp_path / "run"
     process = start_flexlink("run", "--config", FAST_ARM, "--out", out)
@@ -202,19 +200,6 @@ def test_c_code_stays_as_it_was_asked_for(fast_run, tmp_path):
     manifest.write_text(manifest.read_text().replace('"double"', '"half"'))
     with pytest.raises(InputError, match=r"manifest\.json: number must be 'double' or 'float'; got 'half'"):
         written()
-
-
-@pytest.mark.long
-def test_stopped_again_and_again_it_ends_with_the_same_files(tmp_path):
-    """A kill and an interrupt at random moments, continued as the line says: benchmarks/interruptions.py
-    makes many, of studies and diagnoses too."""
-    ways = (KILLS[1], INTERRUPTS[-1])
-    # In a process like those that are stopped: this one has other compiled variants of the kernels in memory.
-    whole = undisturbed(RUN, tmp_path / "whole")
-    found = stopped(print, RUN, tmp_path / "run", whole, ways, len(ways), len(ways), seed=15).values()
-    assert [line for one in found for line in one.bad] == []
-    assert sum(one.stops for one in found) >= len(ways)
-    assert sum(one.past_the_end for one in found) < len(ways)
 
 
 def test_a_run_leaves_its_controller(fast_run, tmp_path):

@@ -123,14 +123,6 @@ def test_every_design_is_compared_with_any_order_and_sampled_whole(run):
     assert joint.stable_share > 0.999
 
 
-def found_options(config, **uncertainty):
-    """The configuration with other options of the ellipses of its first channel."""
-    channel = config.channels[0]
-    options = channel.uncertainty.model_copy(update=uncertainty)
-    first = channel.model_copy(update={"uncertainty": options})
-    return config.model_copy(update={"channels": (first, *config.channels[1:])})
-
-
 def test_reference_filter_takes_the_reference_step_to_the_loop(run, tmp_path):
     shutil.copytree(run.run.path, tmp_path / "run")
     copy = RunResults(RunDirectory(tmp_path / "run"))

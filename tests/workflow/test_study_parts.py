@@ -27,7 +27,6 @@ from tests.workflow.command import FAST_ARM, ROOT, Imported
 from tests.workflow.report_examples import achievable, build_run, config as example_config, sampled_responses
 from workflow.config.run_config import RunConfig, built_in_config, load_config
 from workflow.config.settings import check
-from workflow.engine.errors import StageError
 from workflow.engine.executor import LocalProcesses
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import PREDICTED, render
@@ -281,12 +280,6 @@ def test_picture_of_nothing_is_drawn():
 
 
 NO_POINT = Point(1, "p", {}, cast(Any, None), {}, "", "", ())
-
-
-def test_other_code_on_the_worker_is_refused():
-    task = PointTask((NO_POINT,), {}, ("design",), "0" * 64)
-    with pytest.raises(StageError, match="code of the worker is not that of the study"):
-        task.run(lambda fraction, message: None)
 
 
 class Deadly:
