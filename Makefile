@@ -102,7 +102,7 @@ build/gallery/.drawn: $(STAMP)
 	$(BIN)/flexlink simulate --out build/gallery/logs
 	$(BIN)/flexlink look build/gallery/logs/09_prbs.csv --out build/gallery/look.html
 	$(BIN)/flexlink identify build/gallery/logs/0*_V_rms_*.csv --validation build/gallery/logs/09_prbs.csv \
-		--output hub_angle_rad --integrators 1 --delay 1 --real 1 --pairs 2 --report build/gallery/identify.html
+		--output hub_angle_rad --integrators 1 --delay 1 --real 1 --pairs 2 --response "without friction" --report build/gallery/identify.html
 	$(BIN)/flexlink run --out build/gallery/run --replace
 	$(BIN)/flexlink diagnose examples/gap_case --out build/gallery/diagnosis --replace
 	touch $@

@@ -40,7 +40,8 @@ SHOWN = {
     "look.html": ("What a log holds", "flexlink look logs/09_prbs.csv --out look.html"),
     "identify.html": (
         "A model from logs",
-        "flexlink identify logs/0*_V_rms_*.csv --output hub_angle_rad --report identify.html",
+        "flexlink identify logs/0*_V_rms_*.csv --output hub_angle_rad "
+        "--response 'without friction' --report identify.html",
     ),
     "run/report.html": ("From records to a certified controller", "flexlink run --out run"),
     "diagnosis/gap_case.html": (

@@ -44,7 +44,9 @@ def __getattr__(name: str) -> object:
     from flexlink.shown import Shown
 
     Shown.front = sys.modules[__name__]  # results say from now on what was found
-    found = _attribute(name)
+    found = globals()[name] = _attribute(name)
     if isinstance(found, FunctionType):
         found = globals()[name] = one_line(found)
+    elif isinstance(found, type) and "__init__" in vars(found) and not hasattr(found, "model_fields"):
+        found.__init__ = one_line(found.__init__)  # type: ignore[misc]
     return found

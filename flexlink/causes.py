@@ -6,8 +6,6 @@ import os
 from pathlib import Path
 from typing import Any
 
-from threadpoolctl import threadpool_limits
-
 from diagnosis import diagnosis as chain
 from diagnosis.answer import Diagnosis
 from diagnosis.machine.case import Case, Experiment
@@ -36,8 +34,7 @@ def diagnose(case: Any, **more: Any) -> Diagnosis:
     >>> found.verdict, found.effects[0].name
     ('effect', 'coulomb_friction')
     """
-    with threadpool_limits(1):
-        return chain.diagnose(case, **more)
+    return chain.diagnose(case, **more)
 
 
 def load_case(place: str | os.PathLike[str], rig: str | None = None) -> Case | PlantCase:

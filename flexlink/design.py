@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import control
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import threadpool_limits
 
 from control_design.analysis import certificate, closed_loop, multivariable_certificate
 from control_design.analysis.certificate import Certificate
 from control_design.analysis.closed_loop import (
     ClosedLoopTrajectory as LoopRun,
     LinearMachine,
-    SampledMachine,
     step_metrics,
 )
 from control_design.analysis.multivariable_certificate import MultivariableCertificate
@@ -24,7 +22,9 @@ from control_design.controllers.controller import Controller
 from control_design.convex import youla
 from control_design.convex.convex_options import YoulaOptions
 from control_design.plants import plant_set
+from control_design.plants.guards import Guard
 from control_design.plants.multivariable import MultivariablePlant, ResponseBall
+from control_design.plants.transfer import of_polynomials
 from control_design.plants.weights import RationalWeight
 from control_design.specification import Specification
 from control_design.specification.multivariable import MultivariableSpecification
@@ -32,7 +32,7 @@ from control_design.synthesis import joint_synthesis, multivariable, synthesis
 from control_design.synthesis.multivariable import MultivariableResult
 from control_design.synthesis.synthesis_options import MultivariableOptions, SynthesisOptions
 from control_design.synthesis.synthesis_result import SynthesisResult
-from flexlink.keywords import one_line
+from flexlink.keywords import WrongArgumentError, options_of, refuse_rate
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.response_uncertainty import Uncertainty
 from ident.uncertainty.matrix_response import MatrixPosterior
@@ -65,22 +65,18 @@ __all__ = [
 ]
 
 
-class WrongSystemError(ValueError, TypeError):
-    """A system of another package that has no place here; one line that says what to do."""
-
-
 def state_space(system: Any, what: str = "the system", *, several: bool = False) -> control.StateSpace:
     """A system of python-control (ss, tf, zpk) or scipy.signal (dlti), or anything with `to_control()`, as a
     discrete `control.StateSpace` with one input and one output (several: any number, of a state space).
 
-    what: its name in a refusal. Raises WrongSystemError (a ValueError) for a system in continuous time or
+    what: its name in a refusal. Raises WrongArgumentError (a ValueError) for a system in continuous time or
     without a sampling time, with several inputs or outputs, or with more zeros than poles; for a measured
     response (frd), which has no poles; and for anything else.
     """
     if hasattr(system, "to_control"):
         system = system.to_control()
     if isinstance(system, control.FrequencyResponseData):
-        raise WrongSystemError(
+        raise WrongArgumentError(
             f"{what} is a frequency response (frd), which has no poles: identify it with "
             "flexlink.identify_frf, or give a model beside it, UncertainPlant(model, uncertainty=frd)"
         )
@@ -88,49 +84,22 @@ def state_space(system: Any, what: str = "the system", *, several: bool = False)
         own = system.to_ss()
         system = control.ss(own.A, own.B, own.C, own.D, own.dt or 0, remove_useless_states=False)
     if isinstance(system, (MatrixPosterior, MultivariablePlant)):
-        raise WrongSystemError(
+        raise WrongArgumentError(
             f"{what} is a {type(system).__name__}, of several inputs and outputs: use "
             "flexlink.synthesise_multivariable and flexlink.certify_multivariable"
         )
     if not isinstance(system, (control.StateSpace, control.TransferFunction)):
-        raise WrongSystemError(
+        raise WrongArgumentError(
             f"{what} is a {type(system).__name__}; expected a discrete system of python-control: "
             "control.ss(A, B, C, D, dt_s) or control.tf(num, den, dt_s)"
         )
     _checked(system, what, several=several and isinstance(system, control.StateSpace))
     if isinstance(system, control.StateSpace):
         return system
-    above, below = (np.trim_zeros(np.atleast_1d(part[0][0]), "f") for part in (system.num, system.den))
-    if above.size > below.size:
-        raise WrongSystemError(
-            f"{what} has more zeros than poles, so it answers before it is asked: expected as many poles, "
-            "control.tf(num, den, dt_s) with num no longer than den"
-        )
-    return _in_sections(above, below, system.dt)
-
-
-def _in_sections(above: npt.NDArray[Any], below: npt.NDArray[Any], dt_s: float) -> control.StateSpace:
-    """above(z)/below(z) as sections of first and second order in a row: of slow poles that are close together
-    one companion form leaves nothing but rounding."""
-    if not above.size:
-        return control.ss([], [], [], 0.0, dt_s)
-    # Poles that the rounding of coefficients cannot tell from one are one.
-    integrators, rest = 0, below
-    while rest.size > 1 and abs(np.sum(rest)) <= rest.size * np.finfo(float).eps * np.sum(np.abs(rest)):
-        integrators, rest = integrators + 1, np.cumsum(rest)[:-1]
-    poles, zeros = _factors(np.append(np.roots(rest), np.ones(integrators))), _factors(np.roots(above))
-    zeros += [np.ones(1)] * (len(poles) - len(zeros))
-    found = control.ss([], [], [], above[0] / below[0], dt_s)
-    for pole, zero in zip(poles, zeros, strict=True):
-        found = control.series(found, control.tf2ss(control.tf(zero, pole, dt_s)))
-    return found
-
-
-def _factors(roots: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
-    """Factors of second order and, of an odd number of roots, one of first order."""
-    real = np.sort(roots[roots.imag == 0].real)[::-1]
-    pairs = [np.poly([root, root.conj()]).real for root in roots[roots.imag > 0]]
-    return pairs + [np.poly(real[at : at + 2]) for at in range(0, real.size, 2)]
+    try:
+        return of_polynomials(system.num[0][0], system.den[0][0], system.dt)
+    except ValueError as error:
+        raise WrongArgumentError(f"{what} {error}") from None
 
 
 def measured_response(system: control.FrequencyResponseData, what: str = "the frd") -> FrequencyUncertainty:
@@ -144,7 +113,7 @@ def measured_response(system: control.FrequencyResponseData, what: str = "the fr
 def _checked(system: Any, what: str, *, several: bool = False) -> None:
     """Refuses another number of signals than one (unless several), and a system without a sampling time."""
     if not several and (system.ninputs, system.noutputs) != (1, 1):
-        raise WrongSystemError(
+        raise WrongArgumentError(
             f"{what} has {system.ninputs} inputs and {system.noutputs} outputs; take one channel: "
             "system[output, input], as system[0, 0]; or design for all with "
             "flexlink.synthesise_multivariable(flexlink.MultivariablePlant(name, system), ...)"
@@ -156,9 +125,10 @@ def _checked(system: Any, what: str, *, several: bool = False) -> None:
             if measured
             else "sample it: control.sample_system(system, dt_s, 'zoh')"
         )
-        raise WrongSystemError(f"{what} is in continuous time, flexlink works in discrete time: {mend}")
+        raise WrongArgumentError(f"{what} is in continuous time, flexlink works in discrete time: {mend}")
+    refuse_rate(system.dt)
     if system.dt is None or system.dt is True:
-        raise WrongSystemError(
+        raise WrongArgumentError(
             f"{what} has no sampling time in seconds (dt = {system.dt}), which discrete time needs: "
             "state it, system.dt = dt_s"
         )
@@ -180,10 +150,9 @@ class UncertainPlant(plant_set.UncertainPlant):
     UncertainPlant 'motor': 1 state, dt = 0.01 s, no integrator, response taken as exact
     >>> flexlink.UncertainPlant(control.tf([0.1], [1.0, 0.5]), name="motor")
     Traceback (most recent call last):
-    flexlink.design.WrongSystemError: plant 'motor' is in continuous time, flexlink works in discrete ...
+    flexlink.keywords.WrongArgumentError: plant 'motor' is in continuous time, flexlink works in discrete ...
     """
 
-    @one_line
     def __init__(
         self,
         plant: Any = None,
@@ -214,25 +183,32 @@ def synthesise(
     options: SynthesisOptions | None = None,
     *,
     rng: np.random.Generator | int = 0,
-    **more: Any,
+    guards: Sequence[Guard] = (),
+    progress: synthesis.Progress | None = None,
+    thorough: bool = True,
+    **settings: Any,
 ) -> SynthesisResult:
     """Design one controller for one or several uncertain plants.
 
     plants: an `UncertainPlant` or what makes one (ss, tf, a model), or several. rng: a generator, or the seed
-    of one. more: as in `control_design.synthesise`. Raises SpecificationError where no controller can meet
-    the specification.
+    of one. settings: fields of `SynthesisOptions`, instead of `options`. Others as in
+    `control_design.synthesise`. Raises SpecificationError where no controller can meet the specification.
 
     Examples
     --------
-    >>> quick = flexlink.SynthesisOptions(starts=1, sufficient_gamma=0.99, dense_points=1000)
-    >>> designed = flexlink.synthesise(example_plant(), example_specification(), quick)
+    >>> designed = flexlink.synthesise(example_plant(), example_specification(), starts=1, dense_points=1000)
     >>> designed.outcome.name, designed.controller.order
     ('MET_ON_GRID', 2)
     """
-    chosen = _several(plants)
-    generator = np.random.default_rng(rng)
-    with threadpool_limits(1):
-        return synthesis.synthesise(chosen, specification, options, rng=generator, **more)
+    return synthesis.synthesise(
+        _several(plants),
+        specification,
+        options_of(SynthesisOptions, options, settings),
+        rng=np.random.default_rng(rng),
+        guards=guards,
+        progress=progress,
+        thorough=thorough,
+    )
 
 
 def synthesise_jointly(
@@ -241,50 +217,68 @@ def synthesise_jointly(
     options: SynthesisOptions | None = None,
     *,
     rng: np.random.Generator | int = 0,
-    **more: Any,
+    stable_share: float = 0.999,
+    draws: int = 10_000,
+    rounds: int = 3,
+    first: SynthesisResult | None = None,
+    progress: synthesis.Progress | None = None,
+    **settings: Any,
 ) -> joint_synthesis.JointDesign:
     """As `synthesise`, until the stated share of sampled responses is stable (Monte Carlo, not a bound).
 
-    Arguments as `control_design.synthesise_jointly` (`stable_share`, `draws`, `rounds`); `rng` as in
-    `synthesise`. The plants need an uncertainty that can be drawn from, as of `flexlink.uncertainty`.
+    Arguments as `control_design.synthesise_jointly`; `rng` and settings as in `synthesise`. The plants need
+    an uncertainty that can be drawn from, as of `flexlink.uncertainty`.
 
     Examples
     --------
     >>> spread = flexlink.uncertainty(flexlink.identify(example_record(), n_pairs=1, n_real=0))
     >>> asked = flexlink.Specification(modulus_margin=0.4, bandwidth_rad_s=0.5, controller_order=1)
-    >>> quick = flexlink.SynthesisOptions(starts=1, dense_points=1000)
-    >>> found = flexlink.synthesise_jointly(flexlink.UncertainPlant(spread), asked, quick, draws=2000)
+    >>> found = flexlink.synthesise_jointly(spread, asked, starts=1, dense_points=1000, draws=2000)
     >>> found.reached, found.unstable
     (True, (0,))
     """
-    chosen = _several(plants)
-    with threadpool_limits(1):
-        return joint_synthesis.synthesise_jointly(
-            chosen, specification, options, rng=np.random.default_rng(rng), **more
-        )
+    return joint_synthesis.synthesise_jointly(
+        _several(plants),
+        specification,
+        options_of(SynthesisOptions, options, settings),
+        rng=np.random.default_rng(rng),
+        stable_share=stable_share,
+        draws=draws,
+        rounds=rounds,
+        first=first,
+        progress=progress,
+    )
 
 
 def youla_bracket(
-    plants: Any, specification: Specification, options: YoulaOptions | None = None
+    plants: Any, specification: Specification, options: YoulaOptions | None = None, **settings: Any
 ) -> youla.YoulaBracket:
     """What no controller of any order can fall below (`floor`); `control_design.youla_bracket`.
 
+    settings: fields of `YoulaOptions`, instead of `options`.
+
     Examples
     --------
-    >>> coarse = flexlink.YoulaOptions(grid_points=60, dense_points=1000)
-    >>> bound = flexlink.youla_bracket(example_plant(), example_specification(), coarse)
+    >>> bound = flexlink.youla_bracket(
+    ...     example_plant(), example_specification(), grid_points=60, dense_points=1000
+    ... )
     >>> 0.0 < bound.floor <= 1.0
     True
     """
-    with threadpool_limits(1):
-        return youla.youla_bracket(_several(plants), specification, options)
+    return youla.youla_bracket(_several(plants), specification, options_of(YoulaOptions, options, settings))
 
 
 def certify(
     controller: Any,
     plants: Any = None,
     specification: Specification | None = None,
-    **more: Any,
+    *,
+    n_dense: int = 6000,
+    between_own_points: Literal["nothing", "linear"] = "linear",
+    joint_coverage: float | None = None,
+    rng: np.random.Generator | int = 0,
+    joint_draws: int = 4000,
+    joint_stable_share: float = 0.999,
 ) -> Certificate:
     """Certify a controller from any source, independently of the optimiser.
 
@@ -292,10 +286,10 @@ def certify(
     error to command, to which the computational delay of the specification is added. plants: as in
     `synthesise`. plants and specification default to those of a result of `synthesise`.
 
-    more: `n_dense` (points of the grid, 6000); `between_own_points` ("linear" or "nothing": the response
-    between measured frequencies); `joint_coverage` (probability that the worst case holds for a complete
-    posterior sample), with `rng` (a generator or the seed of one), `joint_draws`, `joint_stable_share`.
-    Raises ValueError where sampling times or delays do not match, or the loop is algebraic.
+    n_dense: points of the grid. between_own_points: the response between measured frequencies.
+    joint_coverage: probability that the worst case holds for a complete posterior sample, with `rng` (a
+    generator or the seed of one), `joint_draws`, `joint_stable_share`. Raises ValueError where sampling times
+    or delays do not match, or the loop is algebraic.
 
     Examples
     --------
@@ -309,23 +303,29 @@ def certify(
         controller = controller.controller
     if plants is None or specification is None:
         raise ValueError("certify needs plants and a specification for this controller")
-    chosen = _several(plants)
-    if controller is not None and not isinstance(controller, Controller):
-        controller = _as_controller(controller, specification.computational_delay_samples)
-    if "joint_coverage" in more:
-        more["rng"] = np.random.default_rng(more.get("rng", 0))
-    with threadpool_limits(1):
-        return certificate.certify(controller, chosen, specification, **more)
+    return certificate.certify(
+        _as_controller(controller, specification.computational_delay_samples),
+        _several(plants),
+        specification,
+        n_dense=n_dense,
+        between_own_points=between_own_points,
+        joint_coverage=joint_coverage,
+        rng=np.random.default_rng(rng),
+        joint_draws=joint_draws,
+        joint_stable_share=joint_stable_share,
+    )
 
 
 def synthesise_multivariable(
     plants: MultivariablePlant | Sequence[MultivariablePlant],
     specification: MultivariableSpecification,
     options: MultivariableOptions | None = None,
+    **settings: Any,
 ) -> MultivariableResult:
-    """Design one controller of all sensors and actuators; `control_design.synthesise_multivariable`."""
-    with threadpool_limits(1):
-        return multivariable.synthesise_multivariable(plants, specification, options)
+    """Design one controller of all sensors and actuators; `control_design.synthesise_multivariable`.
+    settings: fields of `MultivariableOptions`, instead of `options`."""
+    chosen = options_of(MultivariableOptions, options, settings)
+    return multivariable.synthesise_multivariable(plants, specification, chosen)
 
 
 def certify_multivariable(
@@ -340,13 +340,13 @@ def certify_multivariable(
     controller: a `Controller`, a result of `synthesise_multivariable`, or a discrete `control.StateSpace`
     from errors to commands, as in `certify`.
     """
-    law = getattr(controller, "controller", controller)
-    if not isinstance(law, Controller):
-        law = _as_controller(law, specification.computational_delay_samples, several=True)
-    with threadpool_limits(1):
-        return multivariable_certificate.certify_multivariable(
-            law, plants, specification, dense_points=dense_points
-        )
+    given = getattr(controller, "controller", controller)
+    return multivariable_certificate.certify_multivariable(
+        _as_controller(given, specification.computational_delay_samples, several=True),
+        plants,
+        specification,
+        dense_points=dense_points,
+    )
 
 
 def c_source(controller: Any, prefix: str = "controller", number: c_code.Number = "double") -> str:
@@ -356,9 +356,7 @@ def c_source(controller: Any, prefix: str = "controller", number: c_code.Number 
     python-control (ss, tf). prefix: start of every name. number: type of states and coefficients.
     """
     given = getattr(controller, "controller", controller)
-    return c_code.c_source(
-        given if isinstance(given, Controller) else _as_controller(given, 1), prefix, number
-    )
+    return c_code.c_source(_as_controller(given, 1), prefix, number)
 
 
 def simulate_loop(controller: Any, machine: Any, reference: npt.ArrayLike, **more: Any) -> LoopRun:
@@ -382,17 +380,17 @@ def simulate_loop(controller: Any, machine: Any, reference: npt.ArrayLike, **mor
     if isinstance(machine, control.lti.LTI):
         machine = LinearMachine(state_space(machine, "the machine"))
     if not all(hasattr(machine, part) for part in ("measure", "advance", "reset", "dt_s")):
-        raise WrongSystemError(
+        raise WrongArgumentError(
             f"the machine is a {type(machine).__name__}; expected flexlink.SampledArm(rig, effects, rng), a "
             "linear system or an UncertainPlant"
         )
-    chosen: SampledMachine = machine
-    if not isinstance(controller, Controller):
-        controller = _as_controller(controller, 1)
-    return closed_loop.simulate(controller, chosen, reference, **more)
+    return closed_loop.simulate(_as_controller(controller, 1), machine, reference, **more)
 
 
 def _as_controller(system: Any, delay_samples: int, *, several: bool = False) -> Controller:
+    """A `Controller` as it is, or a system with a delay."""
+    if isinstance(system, Controller):
+        return system
     found = state_space(system, "the controller", several=several)
     return Controller(
         found.A, found.B, found.C, found.D, float(found.dt), computational_delay_samples=delay_samples

@@ -87,7 +87,11 @@ def simulate(
     >>> arm.record("tip_m").output.shape
     (500, 1)
     """
-    given = (effects,) if isinstance(effects, Effect) else effects
-    noise = None if rng is None else np.random.default_rng(rng)
-    found = simulation.simulate(rig, voltage_V, given, rng=noise, **settings)
+    found = simulation.simulate(
+        rig,
+        voltage_V,
+        (effects,) if isinstance(effects, Effect) else effects,
+        rng=None if rng is None else np.random.default_rng(rng),
+        **settings,
+    )
     return Simulation(**{each.name: getattr(found, each.name) for each in fields(found)})

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import threadpool_limits
 
-from flexlink.keywords import one_line
+from flexlink.keywords import one_line, options_of
 from ident import response_uncertainty, several_outputs
 from ident.basis.functions import basis_response, regressor
 from ident.basis.model import GobfModel
@@ -22,7 +21,6 @@ from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record as PlainRecord, in_one_unit
-from ident.data.settings import Settings
 from ident.data.signal_filter import band_limited
 from ident.data.table import Table
 from ident.data.units import refuse_step
@@ -57,8 +55,6 @@ __all__ = [
     "uncertainty",
 ]
 
-Options = TypeVar("Options", bound=Settings)
-
 
 class Record(PlainRecord):
     """One uniformly sampled experiment, from arrays, pandas columns or (with `from_file`) a file.
@@ -90,7 +86,6 @@ class Record(PlainRecord):
     ValueError: u has 1 samples of 4 signals; expected one row per sample
     """
 
-    @one_line
     def __init__(
         self,
         u: Any = None,
@@ -267,13 +262,10 @@ def identify(
     GobfModel of order 2, u -> y, dt = 0.01 s: fits 99.0 % of record
       mode at 20 rad/s (3.18 Hz), damping ratio 0.0499
     """
-    chosen, used = _options(IdentOptions, options, settings), _records(records)
-    if chosen is None:
-        chosen = IdentOptions()
+    used, chosen = _records(records), options_of(IdentOptions, options, settings) or IdentOptions()
     if "noise" not in chosen.model_fields_set:
         chosen = chosen.model_copy(update={"noise": "auto"})
-    with threadpool_limits(1):
-        found = identify_records(used, chosen)
+    found = identify_records(used, chosen)
     return replace(found, records=used, order_given=chosen.n_pairs is not None)
 
 
@@ -291,9 +283,8 @@ def identify_mimo(
     no relative degree. free_shapes: leave every residue free, in place of one shape for every mode. start:
     poles where the search begins. Raises ValueError as `identify`.
     """
-    chosen, used = _options(IdentOptions, options, settings), _records(records)
-    with threadpool_limits(1):
-        found = several_outputs.identify_mimo(used, chosen, free_shapes=free_shapes, start=start)
+    chosen, used = options_of(IdentOptions, options, settings), _records(records)
+    found = several_outputs.identify_mimo(used, chosen, free_shapes=free_shapes, start=start)
     return replace(found, records=used)
 
 
@@ -301,8 +292,7 @@ def matrix_posterior(
     records: PlainRecord | Sequence[PlainRecord], identification: MimoIdentification, *, level: float = 0.95
 ) -> matrix_response.MatrixPosterior:
     """Uncertainty of a matrix response: balls that hold it with probability `level` at every frequency."""
-    with threadpool_limits(1):
-        return matrix_response.matrix_posterior(_records(records), identification, level=level)
+    return matrix_response.matrix_posterior(_records(records), identification, level=level)
 
 
 def uncertainty(
@@ -333,14 +323,13 @@ def uncertainty(
     for name, mend in _ELSEWHERE.items():
         if name in settings:
             raise ValueError(f"{name} is no setting of uncertainty: {mend}")
-    chosen = _options(EmbeddingOptions, options, settings) or EmbeddingOptions()
+    chosen = options_of(EmbeddingOptions, options, settings) or EmbeddingOptions()
     if "coloured_noise" not in chosen.model_fields_set:
         chosen = chosen.model_copy(update={"coloured_noise": "auto"})
     if chosen.order_given is None:
         chosen = chosen.model_copy(update={"order_given": getattr(identification, "order_given", False)})
     used = _records_of(identification, records)
-    with threadpool_limits(1):
-        return response_uncertainty.uncertainty(used, identification, chosen)
+    return response_uncertainty.uncertainty(used, identification, chosen)
 
 
 def error_surface(
@@ -366,8 +355,7 @@ def error_surface(
     used = _records_of(identification, records)
     for name in {"first", "second"} & set(settings):
         settings[name] = np.asarray(settings[name], dtype=np.float64)
-    with threadpool_limits(1):
-        return surface_of(used, identification.model, identification.structure, **settings)
+    return surface_of(used, identification.model, identification.structure, **settings)
 
 
 _ELSEWHERE = {
@@ -398,10 +386,3 @@ def _records_of(identification: Any, records: Any) -> tuple[PlainRecord, ...]:
     if not used:
         raise ValueError("give the records of the identification")
     return used
-
-
-def _options(kind: type[Options], options: Options | None, settings: dict[str, Any]) -> Options | None:
-    """The options, or those that the settings make."""
-    if options is not None and settings:
-        raise ValueError(f"give options or single settings, not both; got options and {', '.join(settings)}")
-    return kind(**settings) if settings else options

@@ -64,9 +64,6 @@ def _record(record: Record) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-table.register(Simulation, lambda simulation: pd.DataFrame(vars(simulation)))
-
-
 @table.register(ClosedLoopTrajectory)
 def _run(run: ClosedLoopTrajectory) -> pd.DataFrame:
     names = ("time_s", "reference", "measured", "command", "limited")
@@ -92,20 +89,11 @@ def _modes(poles: Poles, dt_s: float, unstable: ComplexArray | tuple[()] = ()) -
     return rows.assign(frequency_Hz=rows["omega_rad_s"] / (2 * np.pi))
 
 
-table.register(Identification, lambda found: _model(found.model))
-
-
-table.register(MimoIdentification, lambda found: _modes(found.model.poles, found.model.dt_s))
-
-
 @table.register(ErrorSurface)
 def _surface(surface: ErrorSurface) -> pd.DataFrame:
     first, second = np.meshgrid(surface.first, surface.second, indexing="ij")
     columns = {surface.names[0]: first.ravel(), surface.names[1]: second.ravel()}
     return pd.DataFrame({**columns, "mean_square": surface.mean_square.ravel()})
-
-
-table.register(YoulaBracket, lambda bracket: pd.DataFrame([vars(plant) for plant in bracket.plants]))
 
 
 @table.register(MultivariableCertificate)
@@ -115,15 +103,6 @@ def _joints(certificate: MultivariableCertificate) -> pd.DataFrame:
          "met": v.stable and bound <= 1, "omega_rad_s": v.worst_at[name]}
         for v in certificate.verdicts for name, bound in v.bounds.items()
     )  # fmt: skip
-
-
-@table.register(ResponsePosterior)
-@table.register(FrequencyUncertainty)
-def _response(found: ResponsePosterior | FrequencyUncertainty) -> pd.DataFrame:
-    return pd.DataFrame(vars(response_band(as_response(found))))
-
-
-table.register(Certificate, lambda certificate: pd.DataFrame([vars(item) for item in certificate.items]))
 
 
 @table.register(SynthesisResult)
@@ -142,3 +121,13 @@ def _diagnosis(found: Diagnosis) -> pd.DataFrame:
             sized = {"parameter": name, "value": value, "low": low, "high": high}
             rows.append({**about, **sized, "gap_after": effect.gap_after})
     return pd.DataFrame(rows)
+
+
+# Those whose rows are there already.
+table.register(Simulation, lambda found: pd.DataFrame(vars(found)))
+table.register(Identification, lambda found: _model(found.model))
+table.register(MimoIdentification, lambda found: _modes(found.model.poles, found.model.dt_s))
+table.register(YoulaBracket, lambda found: pd.DataFrame([vars(plant) for plant in found.plants]))
+table.register(Certificate, lambda found: pd.DataFrame([vars(item) for item in found.items]))
+for kind in (ResponsePosterior, FrequencyUncertainty):
+    table.register(kind, lambda found: pd.DataFrame(vars(response_band(as_response(found)))))

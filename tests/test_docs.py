@@ -84,11 +84,7 @@ def run_command(command: str, flexlink: Callable[..., Answer]) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize(
-    "name",
-    # The margins of the same run are held by test_margins.py.
-    [pytest.param(n, marks=pytest.mark.long) if n == "margins_in_ci.md" else n for n in CONSOLE],
-)
+@pytest.mark.parametrize("name", CONSOLE)
 @pytest.mark.usefixtures("examples_alone")
 def test_commands_of_a_page_print_what_it_says(name, flexlink):
     if name == "c_code.md" and shutil.which("gcc") is None:
@@ -194,12 +190,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_the_site_is_built_whole_and_asks_no_network(site):
     made = {str(page.relative_to(site)) for page in site.rglob("*.html")}
-    assert {
-        "index.html",
-        "tutorials/engineer.html",
-        "reference/python.html",
-        "reference/configuration.html",
-    } <= made
+    assert {"index.html", "reference/python.html", "reference/configuration.html"} <= made
     for page in site.rglob("*.html"):
         if "pages" in page.parts:
             continue  # drawn by flexlink, tested with it

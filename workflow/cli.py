@@ -1,7 +1,8 @@
 """The command line: every command parses, makes one library call, prints, and leaves an exit code.
 
 0 ok; 1 internal error; 2 something given is wrong (one line on standard error, nothing half-written); 3 the
-result is not certified or misses its specification (the report is written all the same).
+result is not certified or misses its specification (the report is written all the same; of `certify`, which
+is a check and leaves as pytest or diff, 1).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from enum import StrEnum
 from functools import cache
 from importlib import metadata
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -27,6 +29,7 @@ from typer.core import TyperGroup
 from workflow.engine import interrupts
 from workflow.engine.errors import (
     EXIT_BAD_INPUT,
+    EXIT_CHECK_FAILED,
     EXIT_INTERNAL,
     EXIT_INTERRUPTED,
     EXIT_NOT_CERTIFIED,
@@ -40,7 +43,7 @@ from workflow.engine.errors import (
     one_line,
 )
 from workflow.engine.threads import one_thread
-from workflow.field_options import completed, option_name, with_fields
+from workflow.field_options import SETTINGS, completed, option_name, with_fields
 
 if TYPE_CHECKING:
     from workflow.commands.logs import Reading
@@ -80,7 +83,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # markup would swallow every [unit], [section] and [default] in the help
     epilog="Exit codes: 0 done; 1 internal error; 2 something given is wrong (one line says what and where); "
-    "3 the result is not certified, the report says why; 130, 143, 129 interrupted by Ctrl-C, "
+    "3 the result is not certified, the report says why (of certify 1); 130, 143, 129 interrupted by Ctrl-C, "
     "SIGTERM, SIGHUP. Example: flexlink run --out "
     "runs/first",
 )
@@ -144,7 +147,7 @@ Config = Annotated[
 ]
 NewDirectory = Annotated[Path, typer.Option(help="Directory for what is written; new or empty.")]
 Source = Annotated[
-    list[Path] | None,
+    list[Path],
     typer.Argument(
         help="Run directory; npz of `flexlink identify --out`; JSON or MAT of its --export, or with A, B, C, "
         "D, dt_s of your own model; CSV with a measured frequency response. Several: one controller for all."
@@ -168,12 +171,7 @@ Cases = Annotated[
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Root of the random starts.")]
 
-
-class PictureFile(StrEnum):
-    PDF = "pdf"
-    PNG = "png"
-
-
+PictureFile = StrEnum("PictureFile", {"PDF": "pdf", "PNG": "png"})
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on standard output.")]
 
 
@@ -306,14 +304,9 @@ def excite(
     if "motion" in stated:
         raise InputError("--motion goes with --closed-loop; in open loop --angle bounds the motion")
     from workflow.commands.excite import write_experiment
-    from workflow.config.rig_settings import rig_called
     from workflow.tasks.experiment import ExperimentLimits
 
-    rig = stated.pop("rig", None)
-    limits = _settings(ExperimentLimits, stated)
-    if rig is not None:
-        limits = limits.model_copy(update={"rig": rig_called(rig)})
-    _show_files(write_experiment(limits, out, seed=seed, **given), as_json)
+    _show_files(write_experiment(_settings(ExperimentLimits, stated), out, seed=seed, **given), as_json)
 
 
 @app.command(short_help="What a log holds: columns, units, sampling, ranges.")
@@ -370,26 +363,10 @@ def init(
     ),
     channel=("band_rad_s",),
     ellipses=("level", "response", "max_ar_order"),
+    files=("validation", "report", "export"),
 )
 def identify(
     log: Logs,
-    report_page: Annotated[
-        Path | None,
-        typer.Option(
-            "--report",
-            help="Write a one-page report here (HTML, one file): findings first, then the pictures.",
-        ),
-    ] = None,
-    validation: Annotated[
-        list[Path] | None, typer.Option(help="Log kept for validation (repeatable).")
-    ] = None,
-    export: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write the model here for other programs: .json or .mat by the ending (state space, poles, "
-            "ellipses)."
-        ),
-    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Write model and posterior here (npz), for `flexlink design`.")
     ] = None,
@@ -400,10 +377,12 @@ def identify(
 ) -> None:
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
     given, degree = of_fields, of_fields["relative_degree"]
+    report_page, validation, export = (given.pop(name) for name in ("report", "validation", "export"))
     if degree and degree.isdigit():  # so that the settings' own complaint names what is allowed
         given["relative_degree"] = int(degree)
     need(*log, *(validation or []))
-    from workflow.commands.logs import are_responses, read_logs
+    from ident.data.frf_records import is_response
+    from workflow.commands.logs import read_logs
     from workflow.config.run_config import ClosedLoopData
     from workflow.config.uncertainty_options import FitOptions, UncertaintyOptions
     from workflow.engine.storage import refuse_in_the_way
@@ -412,15 +391,23 @@ def identify(
     with _watched(quiet) as progress:
         described = _settings(UncertaintyOptions, given)
         loop = _settings(ClosedLoopData, {"method": given["closed_loop_data_method"]})
-        written = [("--out", out), ("--report", report_page), ("--export", export)]
         # A log given twice would count its noise twice as well known, or validate what it was fitted to.
-        refuse_in_the_way([*log, *(validation or [])], [(name, path) for name, path in written if path])
-        columns = (given[name] for name in ("input_name", "output_name", "time"))
-        if not any(columns) and are_responses(log):
+        refuse_in_the_way(
+            [*log, *(validation or [])],
+            [
+                (name, path)
+                for name, path in (("--out", out), ("--report", report_page), ("--export", export))
+                if path
+            ],
+        )
+        if not any(given[name] for name in ("input_name", "output_name", "time")) and is_response(*log):
             from workflow.commands.identify_response import identify_response
 
-            of_logs = {option_name(key): given[key.replace(".", "_")] for key in _OF_LOGS}
-            of_logs |= {"--report": report_page, "--validation": validation}
+            of_logs = {
+                **{option_name(key): given[key.replace(".", "_")] for key in _OF_LOGS},
+                "--report": report_page,
+                "--validation": validation,
+            }
             summary = identify_response(
                 log,
                 given["dt_s"],
@@ -479,7 +466,7 @@ def _identified(summary: RunSummary, as_json: bool, export: Path | None, out: Pa
 
 @app.command()
 def design(
-    source: Source = None,
+    source: Source,
     specification: DesignFile = None,
     out: Annotated[
         Path | None,
@@ -497,8 +484,6 @@ def design(
     as_json: Json = False,
 ) -> None:
     """Design and certify one controller for one or several plants, identified here or brought along."""
-    if not source:
-        raise InputError("flexlink design needs a source: a run directory, a model or a measured response")
     need(*source, specification)
     with _watched(quiet) as progress:
         from control_design.controllers.c_code import Dialect
@@ -514,9 +499,34 @@ def design(
     _leave(summary)
 
 
+@app.command(short_help="Certify a controller that is there; hold its margins against a baseline.")
+@with_fields(files=("controller", "baseline", "write_baseline"))
+def certify(
+    source: Source,
+    specification: DesignFile = None,
+    time_limit: TimeLimit = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+    **of_fields: Any,
+) -> None:
+    """Certify a controller for one or several plants. Exit codes: 0 certified, and no worse than --baseline;
+    1 not; 2 something given is wrong."""
+    need(*source, specification)
+    with _watched(quiet) as progress:
+        from workflow.config.command_files import CommandFiles
+        from workflow.config.design_file import read_design_file
+
+        file = None if specification is None else read_design_file(specification)
+        from workflow.commands.certify import certify_controller
+
+        summary = certify_controller(source, file, _settings(CommandFiles, of_fields), progress=progress)
+    _show(summary, as_json)
+    _leave(summary, EXIT_CHECK_FAILED)
+
+
 @app.command(short_help="A page with sliders: designs as you move them.")
 def tune(
-    source: Source = None,
+    source: Source = None,  # type: ignore[assignment]
     specification: DesignFile = None,
     demo: Annotated[bool, typer.Option("--demo", help="Tune the built-in arm, identified first.")] = False,
     out: Annotated[Path, typer.Option(help="Saved designs go below this directory.")] = Path("runs/tuned"),
@@ -559,8 +569,7 @@ def report(
         from workflow.commands.run import rebuild_report
         from workflow.engine.run_directory import RunDirectory
 
-        kinds = [kind.value for kind in pictures or ()]
-        summary = rebuild_report(RunDirectory.open(directory), kinds, progress)
+        summary = rebuild_report(RunDirectory.open(directory), pictures or (), progress)
     _show(summary, as_json, verbose=verbose)
 
 
@@ -785,8 +794,7 @@ def _show_files(files: Sequence[Path], as_json: bool) -> None:
     if as_json:
         print_json({"files": [str(path) for path in files]})
     else:
-        for path in files:
-            typer.echo(str(path))
+        typer.echo("\n".join(map(str, files)))
 
 
 def _show(summary: RunSummary, as_json: bool, *, verbose: bool = False) -> None:
@@ -798,9 +806,9 @@ def _show(summary: RunSummary, as_json: bool, *, verbose: bool = False) -> None:
         print_summary(summary, verbose=verbose)
 
 
-def _leave(summary: RunSummary) -> None:
+def _leave(summary: RunSummary, code: int = EXIT_NOT_CERTIFIED) -> None:
     if summary.certified is False:
-        raise typer.Exit(_complain(summary.verdict, EXIT_NOT_CERTIFIED))
+        raise typer.Exit(_complain(summary.verdict, code))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -895,7 +903,8 @@ def _explain(error: Exception) -> tuple[str, int]:
     if replaced := _REPLACED.get(getattr(error, "option_name", "")):
         return f"No such option: {error.option_name}; it is now {replaced} ({_help(error)})", EXIT_BAD_INPUT  # type: ignore[attr-defined]
     called = getattr(getattr(error, "ctx", None), "info_name", "")
-    if called in ("check", "diagnose") and (key := _key_of_case(getattr(error, "option_name", ""))):
+    key = getattr(error, "option_name", "").removeprefix("--").replace("-", "_")
+    if called in ("check", "diagnose") and key in resolve_name(SETTINGS["simulator"]).model_fields:
         return (
             f"{called}: {key} has no option: write {key} = ... in a case file (.toml) with model "
             f"and log = [...], and call {called} on that (docs/simulators.md)"
@@ -909,14 +918,6 @@ def _explain(error: Exception) -> tuple[str, int]:
         return f"out of memory ({error}); shorter records, delays and searches need less", EXIT_INTERNAL
     cause = error.__cause__ if isinstance(error, typer.Abort) else error  # what typer makes of an EOFError
     return f"internal error: {type(cause).__name__}: {cause} (--debug shows where)", EXIT_INTERNAL
-
-
-def _key_of_case(option: str) -> str:
-    """The key of a simulator's case file that has the name of an option; empty without one."""
-    from workflow.diagnose.simulator_settings import SimulatorSettings
-
-    key = option.removeprefix("--").replace("-", "_")
-    return key if key in SimulatorSettings.model_fields else ""
 
 
 def _complain(message: str, code: int) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
+from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -57,6 +58,7 @@ SETTINGS = {
     "loop": "workflow.config.run_config:ClosedLoopData",
     "plan": "plant.experiment_plan:ExperimentPlan",
     "limits": "workflow.tasks.experiment:ExperimentLimits",
+    "files": "workflow.config.command_files:CommandFiles",
     "simulator": "workflow.diagnose.simulator_settings:SimulatorSettings",
 }
 
@@ -116,7 +118,7 @@ def _kind(annotation: Any) -> Any:
     pairs = [kind for kind in kinds if get_origin(kind) is tuple]
     if pairs:
         return list[get_args(pairs[0])[0]] if Ellipsis in get_args(pairs[0]) else pairs[0]  # type: ignore[misc]
-    plain = [kind for kind in kinds if kind in (bool, int, float)]
+    plain = [kind for kind in kinds if kind in (bool, int, float, Path)]
     choices = [choice for kind in kinds for choice in get_args(kind) if isinstance(choice, str)]
     return plain[0] if len(plain) == 1 and not choices else str
 

@@ -13,7 +13,7 @@ from ident.data.arrays import BoolArray, ComplexArray, IntArray, RealArray, fact
 from ident.data.ellipses import hotelling_widening
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record_files import read_table
-from ident.data.response_columns import read_response
+from ident.data.response_columns import has_response, read_response
 
 # Neighbours on either side that a hint may propose to pool.
 _MOST_NEIGHBOURS = 50
@@ -134,6 +134,14 @@ class FrfRepeats:
             self.response[keep],
             tuple(name for name, kept in zip(self.label, keep, strict=True) if kept),
         )
+
+
+def is_response(*paths: Path) -> bool:
+    """Whether the files are frequency responses; one that cannot be read is left to others."""
+    try:
+        return all(has_response(read_table(path)) for path in paths)
+    except ValueError:
+        return False
 
 
 def measured_response(

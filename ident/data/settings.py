@@ -4,13 +4,25 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
 
-class Settings(BaseModel):
+
+class _Fields(ModelMetaclass):
+    """`help` lists what a reader sets, which stands in the docstring, and nothing of pydantic's."""
+
+    def __dir__(self) -> list[str]:
+        return list(self.__annotations__)
+
+
+class Settings(BaseModel, metaclass=_Fields):
     """Frozen; an unknown key is refused by name."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -33,6 +45,11 @@ class Settings(BaseModel):
             for name, field in cls.model_fields.items()
         )
         cls.__doc__ = "\n    ".join([(cls.__doc__ or "").rstrip(), "", "Fields", "------", *fields])
+        plain = get_type_hints(cls)  # without what only pydantic reads
+        own = cls.__signature__
+        cls.__signature__ = own.replace(
+            parameters=[each.replace(annotation=plain[each.name]) for each in own.parameters.values()]
+        )
 
 
 def first_complaint(model: type[BaseModel], error: ValidationError) -> str:

@@ -259,11 +259,8 @@ def test_a_second_output_behind_the_friction_is_refused(flexlink, refused, tmp_p
 def test_what_is_taken_is_certified_and_holds_on_the_true_machine(flexlink, tmp_path):
     """Logged with the sign of its command turned: the controller's files are for the machine as logged."""
     machine = plant(limit=0.5)
-    made = [
-        log(1, machine=machine),
-        log(2, law=pid(1.5, 0.08), machine=machine),
-        log(3, 0.15, machine=machine),
-    ]
+    more = {"machine": machine}
+    made = [log(1, **more), log(2, law=pid(1.5, 0.08), **more), log(3, 0.15, **more)]
     paths = written(tmp_path, [{**one, "u": -one["u"]} for one in made])
     answer = flexlink("run", *paths, "--out", tmp_path / "out", "--json")
     assert answer.document()["certified"]

@@ -79,11 +79,7 @@ def test_a_log_in_place_of_a_configuration_and_a_missing_option_say_what_to_type
 
 
 BAD_CONFIGS = {
-    "unknown key": (
-        "+",
-        "[synthesis]\nstart = 3",
-        "own.toml: unknown key synthesis.start (did you mean starts?)",
-    ),
+    "unknown key": ("+", "[synthesis]\nstart = 3", "unknown key synthesis.start (did you mean starts?)"),
     "bad value": (
         "+",
         "[closed_loop]\ndraws = 0",
@@ -191,11 +187,7 @@ def test_impossible_specification_is_three_with_report(flexlink, tmp_path):
 def test_simulate_identify_design_hand_over_files(flexlink, tmp_path):
     made = flexlink("simulate", "--config", FAST_ARM, "--out", tmp_path / "logs", "--json")
     files = made.document()["files"]
-    assert [name.rsplit("/", 1)[1] for name in files] == [
-        "01_prbs.csv",
-        "02_fresh_b_prbs_b_.csv",
-        "truth.json",
-    ]
+    assert [name.split("/")[-1] for name in files] == ["01_prbs.csv", "02_fresh_b_prbs_b_.csv", "truth.json"]
     found = flexlink(
         *("identify", files[0], "--input", "voltage_V", "--output", "hub_angle_rad", "--time", "time_s"),
         *("--real", 1, "--pairs", 1, "--integrators", 1, "--validation", files[1]),

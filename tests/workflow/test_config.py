@@ -81,11 +81,7 @@ def test_contradictions(tmp_path, extra, complaint):
     [
         ('path = "log.csv"', 'path = "log.csv"\nrole = "validation"', "no record has role 'estimation'"),
         ('time = "t_s"', 'time = "t_s"\ndt_s = 0.1', "not both"),
-        (
-            'path = "log.csv"',
-            'path = "log.csv"\nstart_sample = 5\nstop_sample = 5',
-            "stop_sample must be above",
-        ),
+        ('path = "log.csv"', 'path = "log.csv"\nstart_sample = 5\nstop_sample = 5', "must be above"),
         ('name = "my_arm"', 'name = "../my_arm"', "run.name"),
         ('name = "my_arm"', "seed = -1", "run.seed"),
     ],

@@ -160,10 +160,7 @@ SPOILT = {
         ["case.toml", "suspected[0]", "colomb_friction", "did you mean coulomb_friction?"],
     ),
     "no such log": (_case("01_prbs.csv", "01_prbs.txt"), ["case.toml", "experiments[0].file", "01_prbs.txt"]),
-    "wrong number of rows": (
-        _case("samples = 240", "samples = 250"),
-        ["experiments[0].samples", "250", "240"],
-    ),
+    "wrong number of rows": (_case("samples = 240", "samples = 250"), ["[0].samples", "250", "240"]),
     "forbidden name": (_case('case = "arm"', 'case = "../arm"'), ["case.toml", "case", "../arm"]),
     "taken name": (_case('case = "arm"', 'case = "index"'), ["case.toml", "'index'"]),
     "no such column": (
@@ -195,10 +192,7 @@ SPOILT = {
     ),
     "not a number": (_nan, ["03_prbs.csv", "line 42", "'voltage_V'"]),
     "dead sensor": (_dead, ["02_prbs.csv", "tip_m is 0.25 throughout", "dead"]),
-    "another sampling": (
-        _rig("dt_s = 0.005", "dt_s = 0.004"),
-        ["01_prbs.csv", "0.005", "sampling.dt_s = 0.004"],
-    ),
+    "other sampling": (_rig("dt_s = 0.005", "dt_s = 0.004"), ["01_prbs.csv", "0.005", "sampling.dt_s"]),
     "no noise level": (_rig("tip_noise_m = 0.001", "tip_noise_m = 0.0"), ["case.toml", "noise level"]),
     "misspelt rig key": (_rig("inertia_kg_m2", "inerta_kg_m2"), ["rig.toml", "hub.inerta_kg_m2"]),
     "unreadable rig": (_rig("[hub]", "[hub"), ["rig.toml", "not valid TOML"]),

@@ -35,6 +35,20 @@ def test_files_keep_the_limits_and_the_plan_says_what_is_in_them(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("options", "noise_rad", "words"),
+    [([], 4.43e-4, "assumed: an encoder of 12 bits"), (["--rig", "paper_link"], 1e-3, "that of the rig")],
+)
+def test_the_radius_is_predicted_though_nobody_states_the_noise(tmp_path, options, noise_rad, words):
+    assert main(["excite", "--out", str(tmp_path / "plan"), *LIMITS, "--rms", "3", *options]) == 0
+    found = json.loads((tmp_path / "plan" / "plan.json").read_text())
+    own = found["plan"]
+    samples = own["period_samples"] * own["realisations"] * own["periods"]
+    v = 2 * len(found["lines_Hz"]) * noise_rad**2 / (samples * 3.0**2)
+    assert found["expected_radius_rad_per_V"] == [pytest.approx(np.sqrt(-np.log(0.05) * v), rel=1e-3)]
+    assert words in (tmp_path / "plan" / "plan.html").read_text()
+
+
+@pytest.mark.parametrize(
     ("options", "words"),
     [
         (["--duration", "10"], ["needs periods of 2 s", "10 s are allowed"]),

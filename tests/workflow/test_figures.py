@@ -225,10 +225,8 @@ def test_gain_and_phase_bands_hold_what_is_in_the_ellipse():
     found = frequency()
     band = response_band(found)
     ellipse = found.ellipse()
-    angle, radius = (
-        rng.uniform(0, 2 * np.pi, (2000, OMEGA.size)),
-        np.sqrt(rng.uniform(0, 1, (2000, OMEGA.size))),
-    )
+    angle = rng.uniform(0, 2 * np.pi, (2000, OMEGA.size))
+    radius = np.sqrt(rng.uniform(0, 1, (2000, OMEGA.size)))
     members = found.centre + ellipse.direction * radius * (
         ellipse.semi_major * np.cos(angle) + 1j * ellipse.semi_minor * np.sin(angle)
     )

@@ -283,10 +283,8 @@ def test_a_mode_of_several_plants_is_named_once_where_it_loses_most(tmp_path):
     run = example.build_run(tmp_path / "run", example.config())
     results = RunResults(run)
     certificate = results.certify.certificate
-    changes = [
-        ModeChange(Mode(2 * np.pi * 12.6, 0.02), Mode(2 * np.pi * 13.0, after))
-        for after in (0.015, 0.004, 0.01)
-    ]
+    before, after = Mode(2 * np.pi * 12.6, 0.02), 2 * np.pi * 13.0
+    changes = [ModeChange(before, Mode(after, zeta)) for zeta in (0.015, 0.004, 0.01)]
     plants = [
         replace(certificate.plants[0], plant=f"load {k}", mode_changes=(change, change))
         for k, change in enumerate(changes)

@@ -75,10 +75,8 @@ def test_changed_input_file_is_refused_naming_the_file(tmp_path):
 def test_directory_killed_before_its_manifest_is_begun_afresh(tmp_path):
     run = begin(tmp_path / "run")
     run.manifest_path.unlink()
-    assert (
-        begin(tmp_path / "run", config={"run": {"name": "b"}}, resume=True).config_document()["run"]["name"]
-        == "b"
-    )
+    again = begin(tmp_path / "run", config={"run": {"name": "b"}}, resume=True)
+    assert again.config_document()["run"]["name"] == "b"
 
 
 def test_open_refuses_what_is_no_run(tmp_path):
@@ -146,9 +144,5 @@ def test_streams_depend_on_seed_and_names_only():
     draw = stage_rng(1, "records", "prbs").standard_normal(4)
     stage_rng(1, "identify").standard_normal(100)
     np.testing.assert_array_equal(stage_rng(1, "records", "prbs").standard_normal(4), draw)
-    for other in (
-        stage_rng(2, "records", "prbs"),
-        stage_rng(1, "recordsprbs"),
-        stage_rng(1, "prbs", "records"),
-    ):
-        assert not np.array_equal(other.standard_normal(4), draw)
+    for other in ((2, "records", "prbs"), (1, "recordsprbs"), (1, "prbs", "records")):
+        assert not np.array_equal(stage_rng(*other).standard_normal(4), draw)

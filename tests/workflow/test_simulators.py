@@ -182,10 +182,7 @@ def test_a_load_and_friction_of_a_pendulum_without_a_site_are_found(
     [
         ('mjcf = "no.xml"\nlog = "one.csv"', "no such model file"),
         ('mjcf = "arm.xml"\nlog = "no.csv"', "no.csv: no such file"),
-        (
-            'mjcf = "arm.xml"\nfmu = "arm.fmu"\nlog = "one.csv"',
-            "expected one of mjcf, fmu, python; got mjcf and fmu",
-        ),
+        ('mjcf = "arm.xml"\nfmu = "arm.fmu"\nlog = "one.csv"', "one of mjcf, fmu, python; got mjcf and fmu"),
         ('mjcf = "one.csv"\nlog = "one.csv"', "one.csv: not a model that MuJoCo reads"),
         ('mjcf = "arm.xml"\nlog = "one.csv"\ncolumns = {hinge = "q"}', "is named after a joint or sensor"),
         ('mjcf = "arm.xml"\nlog = "other.csv"', 'columns = {hinge = "COLUMN"}; the log has t'),

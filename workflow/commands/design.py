@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 from control_design.controllers.c_code import Dialect
@@ -14,6 +14,7 @@ from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
+from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.design import (
     bracket_numbers,
     certify_asked,
@@ -23,20 +24,16 @@ from workflow.tasks.design import (
     find_filter,
     joint_numbers,
 )
-from workflow.tasks.design_source import load_sources
+from workflow.tasks.design_source import DesignSource, load_sources
 from workflow.tasks.exports import SUFFIXES, filter_file, targets, write_controller
-from workflow.tasks.results import AchievablePerformance, CertifyResult, DesignResult, ReferenceFilterResult
+from workflow.tasks.results import (
+    AchievablePerformance,
+    CertifyResult,
+    DesignResult,
+    ReferenceFilterResult,
+    RunResults,
+)
 from workflow.text.templates import RunSummary, rows_of, said
-
-
-@dataclass(frozen=True)
-class _Designed:
-    """Results of a design, of the same types as a run's stages."""
-
-    design: DesignResult
-    certify: CertifyResult
-    achievable: AchievablePerformance = field(default_factory=AchievablePerformance)
-    reference_filter: ReferenceFilterResult = field(default_factory=ReferenceFilterResult)
 
 
 def _design(
@@ -45,18 +42,20 @@ def _design(
     asked: DesignFile,
     seed: int,
     report: Callable[..., None],
-) -> _Designed:
+) -> tuple[DesignResult, CertifyResult, AchievablePerformance, ReferenceFilterResult]:
+    """Results of the types of a run's stages."""
+    nothing = AchievablePerformance(), ReferenceFilterResult()
     with naming("design"):
         design = find_design(
             plants, specification, asked.synthesis, asked.certificate, stage_rng(seed, "design"), report
         )
         specification = design.specification or specification
-        nothing = CertifyResult(None, certified=False, reason=design.reason)
+        none = CertifyResult(None, certified=False, reason=design.reason)
         if design.synthesis is None:
-            return _Designed(replace(design, reason=f"specification not met: {design.reason}"), nothing)
+            return replace(design, reason=f"specification not met: {design.reason}"), none, *nothing
         achievable = find_bracket(plants, specification, asked.achievable_performance)
         if (controller := design.controller) is None:
-            return _Designed(design, nothing, achievable)
+            return design, none, achievable, nothing[1]
         certified = certify_asked(
             controller,
             plants,
@@ -65,9 +64,40 @@ def _design(
             stage_rng(seed, "certify"),
             between_own_points=asked.plant.between_points,
         )
-        return _Designed(
-            design, certified, achievable, find_filter(controller, plants, asked.reference_filter)
-        )
+        return design, certified, achievable, find_filter(controller, plants, asked.reference_filter)
+
+
+def load_asked(
+    paths: Sequence[Path], file: DesignFile
+) -> tuple[list[DesignSource], DesignFile, Specification]:
+    """The plants, the design file completed by a run's own configuration, and the one specification; all runs
+    scale their columns alike. Raises InputError."""
+    sources = load_sources(paths, file)
+    asked, named = file.completed(sources[0].config), ", ".join(map(str, paths))
+    specification = (file if len(paths) > 1 else asked).specification
+    if specification is None:
+        raise InputError(f"{named}: no specification for all: give --spec FILE")
+    logged = [source.logged for source in sources if source.logged is not None]
+    if len({(one.error, one.command) for one in logged}) > 1:
+        raise InputError(f"{named}: the runs scale their columns differently: no controller fits all")
+    return sources, asked, specification
+
+
+def of_run(paths: Sequence[Path]) -> DesignResult | None:
+    """What the run has designed whose directory is the only plant."""
+    if len(paths) > 1 or not paths[0].is_dir():
+        return None
+    run = RunDirectory.open(paths[0])
+    return RunResults(run).design if run.stage_file("design") else None
+
+
+def at_one_bandwidth(specification: Specification, found: DesignResult | None) -> Specification:
+    """Of one that leaves the bandwidth open: that which its run has found, or the one to try first. A search
+    for it takes a dozen designs."""
+    known = specification.model_dump(include=set(Specification.model_fields))
+    if known.pop("lowest_bandwidth_rad_s") is not None and found is not None:
+        known["bandwidth_rad_s"] = (found.specification or specification).bandwidth_rad_s
+    return Specification.model_validate(known)
 
 
 def design_controller(
@@ -95,45 +125,25 @@ def design_controller(
     progress = progress or Progress()
     progress.plan([("plants", 5.0), ("design", 30.0)])
     with progress.stage("plants"):
-        sources_found = load_sources(paths, file)
-    asked = file.completed(sources_found[0].config)
-    specification = file.specification if len(paths) > 1 else asked.specification
-    if specification is None:
-        raise InputError(f"{', '.join(map(str, paths))}: no specification for all: give --spec FILE")
+        sources_found, asked, specification = load_asked(paths, file)
     plants = [source.plant for source in sources_found]
     logged = [source.logged for source in sources_found if source.logged is not None]
-    if len({(one.error, one.command) for one in logged}) > 1:
-        raise InputError(
-            f"{', '.join(map(str, paths))}: the runs scale their columns differently: no controller fits all"
-        )
     check_filter(asked.reference_filter, plants[0].dt_s, name)
     with progress.stage("design") as update:
-        done = _design(plants, specification, asked, seed, update)
-    certificate, certified = done.certify.certificate, done.certify.certified
-    controller = done.design.controller
-    order = (done.design.specification or specification).controller_order
+        design, certify, achievable, prefilter = _design(plants, specification, asked, seed, update)
+    controller, gamma = design.controller, design.gamma
+    order = (design.specification or specification).controller_order
     files: list[Path] = []
     if out is not None and controller is not None:
         law = logged[0].law(controller) if logged else controller
-        found = done.reference_filter.filter
         known = "; ".join(dict.fromkeys(source.certified_for for source in sources_found))
-        files = write_controller(out, law, found, certified=certified, about=known, dialect=dialect)
-    gamma, advice = done.design.gamma, None
-    if gamma is not None and gamma > 1:
-        advice = said("order_advice", done.achievable, gamma, order) or None
-    reason = said("design_verdict", done.design, certificate, advice, specification)
-    shares = joint_numbers(done.certify.sampled)
-    rows = rows_of(
-        "summary/design.j2",
-        sources=sources_found,
-        done=done,
-        order=order,
-        advice=advice,
-        verdict=done.certify,
-        shares=shares,
-        files=files,
-        signals=logged[0].signals if logged else "",
-    )
+        files = write_controller(
+            out, law, prefilter.filter, certified=certify.certified, about=known, dialect=dialect
+        )
+    missed = gamma is not None and gamma > 1
+    advice = (said("order_advice", achievable, gamma, order) or None) if missed else None
+    reason = said("design_verdict", design, certify.certificate, advice, specification)
+    shares = joint_numbers(certify.sampled)
     names = [plant.name for plant in plants]
     about = [
         {"file": str(path), "plant": source.plant.name, "origin": source.origin, "remarks": source.remarks}
@@ -141,19 +151,29 @@ def design_controller(
     ]
     return RunSummary(
         title=f"controller for {names[0]}" if len(names) == 1 else f"controller for {len(names)} plants",
-        sections=rows,
+        sections=rows_of(
+            "summary/design.j2",
+            sources=sources_found,
+            done={"design": design, "achievable": achievable, "reference_filter": prefilter},
+            order=order,
+            advice=advice,
+            verdict=certify,
+            shares=shares,
+            files=files,
+            signals=logged[0].signals if logged else "",
+        ),
         numbers={
             "plants": about,
-            "design": {**codec.plain(done.design), "order_advice": advice},
-            "achievable_performance": bracket_numbers(done.achievable, gamma),
-            "certificate": codec.plain(certificate),
-            "certified": certified,
+            "design": {**codec.plain(design), "order_advice": advice},
+            "achievable_performance": bracket_numbers(achievable, gamma),
+            "certificate": codec.plain(certify.certificate),
+            "certified": certify.certified,
             "reason": reason,
             "sampled_responses": shares,
-            "reference_filter": codec.plain(done.reference_filter.filter),
+            "reference_filter": codec.plain(prefilter.filter),
             "file": str(files[0]) if files else None,
             "files": [str(path) for path in files],
         },
-        certified=certified,
+        certified=certify.certified,
         verdict=reason,
     )

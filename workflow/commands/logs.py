@@ -12,7 +12,6 @@ from pydantic import Field
 
 from ident.data.record import Record, in_one_unit
 from ident.data.record_files import read_table
-from ident.data.response_columns import has_response
 from ident.data.roles import Roles, roles_of
 from ident.data.table import Table
 from workflow.config.log_reading import LogReading
@@ -85,14 +84,6 @@ class Logs:
     fresh: tuple[Record, ...]
     files: tuple[Path, ...]
     input_limit: float | None
-
-
-def are_responses(paths: Sequence[Path]) -> bool:
-    """Whether the files are frequency responses; one that cannot be read is left to who reads logs."""
-    try:
-        return all(has_response(read_table(path)) for path in paths)
-    except ValueError:
-        return False
 
 
 def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: Sequence[Path] = ()) -> Logs:

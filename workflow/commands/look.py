@@ -28,8 +28,10 @@ def look(
     if out is not None:
         from workflow.report.rendering import render_page  # loads matplotlib: a second
 
-        title = f"Log {log.name}"
-        storage.write_text(out, render_page("look.html.j2", title=title, found=found, next=_next(found)).html)
+        storage.write_text(
+            out,
+            render_page("look.html.j2", title=f"Log {log.name}", found=found, next=_next(found)).html,
+        )
     return RunSummary(
         title=str(log),
         sections=rows_of("summary/look.j2", found=found),
@@ -59,8 +61,8 @@ def _next(found: LogLook) -> str:
         return " ".join(["flexlink init", log, *doubted, "--out my.toml"])
     named = {"--input": roles.input, "--output": roles.output, "--time": roles.time}
     options = [f"{option} {shlex.quote(name)}" for option, name in named.items() if name]
-    options += [] if roles.time else ["--dt-s SECONDS"]
-    options += [found.time.option] if found.time and found.time.option.startswith("--") else []
+    mend = found.time.option if found.time and found.time.option.startswith("--") else ""
+    options += [one for one in ("" if roles.time else "--dt-s SECONDS", mend) if one]
     options += [
         f"--unwrap {shlex.quote(roles.output)}={doubt.values['period']:.17g}"
         for doubt in found.doubts

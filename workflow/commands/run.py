@@ -54,8 +54,7 @@ def run_from_files(
             f"{'--resume' if resume else '--replace'} needs --out DIR, the directory of the earlier run"
         )
     config: AnyConfig
-    note = ""
-    known: dict[str, bytes] = {}
+    note, known = "", dict[str, bytes]()
     if logs:
         out = out if out is not None else default_directory(logs[0].stem)
         RunDirectory(out).refuse_unless_free(resume=resume, replace=replace)

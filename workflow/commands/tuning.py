@@ -24,19 +24,17 @@ from control_design.plants.frequency_grid import checked_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification, SpecificationError
 from control_design.synthesis.synthesis import synthesise_near
-from control_design.synthesis.synthesis_result import SynthesisResult
-from workflow.commands.design import design_controller
+from workflow.commands.design import at_one_bandwidth, design_controller, load_asked, of_run
 from workflow.config.design_file import DesignFile, PlantSection, read_design_file
 from workflow.config.settings import check
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.randomness import stage_rng
-from workflow.engine.run_directory import RunDirectory
 from workflow.figures.sensitivity import sensitivity_curves
 from workflow.figures.subjects import unit_of
 from workflow.tasks.design import bracket_numbers, find_bracket, find_design
-from workflow.tasks.design_source import level_can_change, load_sources
-from workflow.tasks.results import DesignResult, RunResults
+from workflow.tasks.design_source import level_can_change
+from workflow.tasks.results import DesignResult
 from workflow.text.templates import said
 
 CONFIDENCE = "confidence"  # a setting beside those of the specification: level of the ellipses
@@ -69,15 +67,9 @@ class TuningSession:
 
     def __init__(self, paths: Sequence[Path], file: DesignFile, out: Path, seed: int) -> None:
         self.paths, self.out, self.seed = tuple(paths), out, seed
-        sources = load_sources(paths, file)
-        asked = file.completed(sources[0].config)
-        if len(paths) > 1:
-            asked = asked.model_copy(update={"specification": file.specification})
-        if asked.specification is None:
-            raise InputError(f"{', '.join(map(str, paths))}: no specification: give --spec FILE")
-        found = _of_run(self.paths)
-        self.specification = _at_one_bandwidth(asked.specification, found)
-        self.file = asked
+        sources, self.file, specification = load_asked(paths, file)
+        found = of_run(self.paths)
+        self.specification = at_one_bandwidth(specification, found)
         self._plants, self._units = [source.plant for source in sources], sources[0].units
         self.drawable = all(level_can_change(plant) for plant in self._plants)
         self._last = None if found is None else found.controller
@@ -178,7 +170,10 @@ class TuningSession:
             law, used = found.controller, found.specification or specification
             numbers: dict[str, Any] = {"certified": False, "gamma": None, "reason": found.reason}
             if found.synthesis is not None:
-                numbers |= _of_synthesis(found.synthesis)
+                active = next(iter(found.synthesis.blocking), None)
+                words = active and f"{active.weight} of {active.plant} at {active.omega_rad_s:.4g} rad/s"
+                numbers |= {"gamma": found.synthesis.gamma, "active": words or ""}
+                numbers["order"] = found.synthesis.controller.order
             if law is None:
                 return {**_finite(numbers), "plants": []}
             certificate = certify(law, plants, used, between_own_points=asked.plant.between_points)
@@ -237,8 +232,7 @@ class TuningSession:
             return {}
         needed = math.log(1e-3) / math.log(max(radius, 1e-3))
         n = min(max(256, 1 << math.ceil(math.log2(needed + 1))), _LONGEST)
-        omega = np.linspace(0.0, plant.nyquist_rad_s, n // 2 + 1)
-        omega[0] = 1e-6 * plant.nyquist_rad_s
+        omega = plant.nyquist_rad_s * np.linspace(0.0, 1.0, n // 2 + 1).clip(1e-6)
         loop = law.response(omega) * np.vstack([plant.channel.nominal_response(omega), self._drawn(plant, n)])
         steps = np.cumsum(np.fft.irfft(loop / (1.0 + loop), n, axis=1), axis=1)
         away = np.flatnonzero(np.abs(steps[0] - steps[0, -1]) > 0.01 * max(abs(steps[0, -1]), 1e-300))
@@ -260,8 +254,7 @@ class TuningSession:
 
 @lru_cache(maxsize=8)
 def _samples(plant: UncertainPlant, n: int, seed: int) -> Complex:
-    omega = np.linspace(0.0, plant.nyquist_rad_s, n // 2 + 1)
-    omega[0] = 1e-6 * plant.nyquist_rad_s
+    omega = plant.nyquist_rad_s * np.linspace(0.0, 1.0, n // 2 + 1).clip(1e-6)
     return np.asarray(drawn(plant.channel)(stage_rng(seed, "tune"), _SAMPLES)(omega))
 
 
@@ -334,29 +327,6 @@ def _of(certificate: Certificate) -> dict[str, Any]:
             for item in certificate.items
         ],
     }
-
-
-def _of_synthesis(result: SynthesisResult) -> dict[str, Any]:
-    active = result.blocking[0] if result.blocking else None
-    words = "" if active is None else f"{active.weight} of {active.plant} at {active.omega_rad_s:.4g} rad/s"
-    return {"gamma": result.gamma, "active": words, "order": result.controller.order}
-
-
-def _of_run(paths: Sequence[Path]) -> DesignResult | None:
-    """What the run has designed whose directory is the only plant."""
-    if len(paths) > 1 or not paths[0].is_dir():
-        return None
-    run = RunDirectory.open(paths[0])
-    return RunResults(run).design if run.stage_file("design") else None
-
-
-def _at_one_bandwidth(specification: Specification, found: DesignResult | None) -> Specification:
-    """Of one that leaves the bandwidth open: that which its run has found, or the one to try first. A search
-    for it takes a dozen designs, and the page has a slider for it."""
-    known = specification.model_dump(include=set(Specification.model_fields))
-    if known.pop("lowest_bandwidth_rad_s") is not None and found is not None:
-        known["bandwidth_rad_s"] = (found.specification or specification).bandwidth_rad_s
-    return Specification.model_validate(known)
 
 
 def _control(name: str, schema: Mapping[str, Any], value: Any) -> dict[str, Any] | None:

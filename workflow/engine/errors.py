@@ -9,6 +9,7 @@ from pathlib import Path
 
 EXIT_OK = 0  # all done
 EXIT_INTERNAL = 1  # as Python leaves after an exception
+EXIT_CHECK_FAILED = EXIT_INTERNAL  # as pytest, diff and grep leave where a check fails
 EXIT_BAD_INPUT = 2  # as shells and click leave for wrong usage
 EXIT_NOT_CERTIFIED = 3  # the first that means nothing elsewhere
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect

@@ -119,12 +119,11 @@ _TIME_S = 10.0  # a panel of more shows a band and no signal
 
 @style.drawing("excitation")
 def draw_excitation(found: PlannedExperiment) -> Figure:
-    """Left: first record at the highest amplitude, and its lines. Right: expected radius and gain, where
-    there is anything to expect."""
+    """Left: first record at the highest amplitude, and its lines. Right: expected radius, and gain where
+    known."""
     rms = np.array(found.plan.rms_V)
     loudest = int(np.argmax(rms))
-    known = found.radii is not None or found.gain is not None
-    figure, axes = style.panels(3.6, 1, 3 if known else 2)
+    figure, axes = style.panels(3.6, 1, 3)
     voltage = found.voltages_V[loudest, 0]
     time = np.arange(voltage.size) * found.limits.dt_s
     shown = time <= _TIME_S
@@ -152,12 +151,11 @@ def draw_excitation(found: PlannedExperiment) -> Figure:
     )
     axes[1].set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="amplitude of a line [V]")
     axes[1].set_title("Lines of every record")
-    if known:
-        if found.gain is not None:
-            axes[2].plot(found.lines_Hz, found.gain, **style.MODEL_LINE, label="expected gain")
-        for value, radius in zip(rms, found.radii or (), strict=False):
-            axes[2].axhline(radius, color=style.UNCERTAIN, lw=1.4, label="expected 95 % radius")
-            axes[2].annotate(f"{value:g} V rms", (found.lines_Hz[0], radius), fontsize=8, va="bottom")
-        axes[2].set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="hub angle / voltage [rad/V]")
-        axes[2].set_title("Response to be expected")
+    if found.gain is not None:
+        axes[2].plot(found.lines_Hz, found.gain, **style.MODEL_LINE, label="expected gain")
+    for value, radius in zip(rms, found.radii, strict=True):
+        axes[2].axhline(radius, color=style.UNCERTAIN, lw=1.4, label="expected 95 % radius")
+        axes[2].annotate(f"{value:g} V rms", (found.lines_Hz[0], radius), fontsize=8, va="bottom")
+    axes[2].set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="hub angle / voltage [rad/V]")
+    axes[2].set_title("Response to be expected")
     return figure

@@ -76,43 +76,39 @@ def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None)
     from workflow.engine.codec import plain
     from workflow.tasks.design import bracket_numbers
 
-    found: dict[str, Number] = dict.fromkeys(COLUMNS)
     gamma, certify = results.design.gamma, results.certify
-    found["design_gamma"] = plain(gamma)
-    if results.design.specification is not None:
-        found["design_bandwidth_rad_s"] = results.design.specification.bandwidth_rad_s
-    bracket = bracket_numbers(results.achievable_performance, gamma)
-    found["any_order_gamma"] = bracket["reached"]
-    found["above_any_order_percent"] = bracket["above_percent"]
-    joint = certify.sampled.joint
+    bracket, joint = bracket_numbers(results.achievable_performance, gamma), certify.sampled.joint
+    found: dict[str, Number] = {
+        **dict.fromkeys(COLUMNS),
+        "design_gamma": plain(gamma),
+        "any_order_gamma": bracket["reached"],
+        "above_any_order_percent": bracket["above_percent"],
+    }
+    if (used := results.design.specification) is not None:
+        found["design_bandwidth_rad_s"] = used.bandwidth_rad_s
     if joint is not None:
-        found["whole_held_percent"] = 100.0 * joint.coverage_given
-        found["whole_stable_percent"] = 100.0 * joint.stable_share
-    prefilter = results.reference_filter.filter
-    if prefilter is not None:
+        shares = 100.0 * joint.coverage_given, 100.0 * joint.stable_share
+        found["whole_held_percent"], found["whole_stable_percent"] = shares
+    if (prefilter := results.reference_filter.filter) is not None:
         found["matching_error"] = prefilter.error_after
         found["matching_error_unfiltered"] = prefilter.error_before
-    certificate = certify.certificate
-    if certificate is not None:
-        verdict = certificate.plants[0]
-        bound = certificate.gamma_bound
+    if (certificate := certify.certificate) is not None:
+        verdict, bound = certificate.plants[0], certificate.gamma_bound
+        found |= _margins("", verdict.worst_margins) | _margins("nominal_", verdict.nominal_margins)
         found["worst_gamma"] = plain(certificate.gamma if bound is None else bound)
         found["bandwidth_rad_s"] = verdict.bandwidth_rad_s
-        found |= _margins("", verdict.worst_margins) | _margins("nominal_", verdict.nominal_margins)
         low, high = mode_band_rad_s or (0.0, math.inf)
         modes = [mode for mode in verdict.closed_loop_modes if low <= mode.omega_rad_s <= high]
-        if modes:
-            least = min(modes, key=lambda mode: mode.zeta)
+        if least := min(modes, key=lambda mode: mode.zeta, default=None):
             found["mode_damping"], found["mode_omega_rad_s"] = least.zeta, least.omega_rad_s
-    check = results.closed_loop.check
-    if check is not None:
-        found["settled_draws"], found["draws"] = check.settled_draws, check.draws
+    if (check := results.closed_loop.check) is not None:
         # A run that never gets there has no time: neither has the point.
         worst = "settling_time_s", "rise_time_s", "overshoot_percent", "peak_command", "disturbance_peak"
         found |= {name: check.spread_of(name)[-1] for name in worst}
-        if check.sensitivity is not None:
-            found["predicted_peak_sensitivity"] = check.sensitivity.nominal_peak
-            found["measured_peak_sensitivity"] = check.sensitivity.measured[0].peak
+        found["settled_draws"], found["draws"] = check.settled_draws, check.draws
+        if (loop := check.sensitivity) is not None:
+            peaks = loop.nominal_peak, loop.measured[0].peak
+            found["predicted_peak_sensitivity"], found["measured_peak_sensitivity"] = peaks
     return found
 
 

@@ -61,31 +61,31 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
     if isinstance(point.config, JointsConfig):
         return _row_of_joints(point, JointsResults(run), point.config)
     results, specification = RunResults(run), point.config.specification
-    design, certify, loop = results.design, results.certify, results.closed_loop
-    state: State
-    if design.synthesis is None:
-        state = "impossible"
-    elif not certify.certified:
-        state = "not certified"
-    elif loop.check is None or loop.check.settled_draws != loop.check.draws:
-        state = "keeps moving"
-    elif loop.check.tracking and loop.check.spread_of("settling_time_s")[-1] is None:
-        state = "does not settle"  # at rest beside the reference
-    else:
-        state = "certified"
+    design, certify, check = results.design, results.certify, results.closed_loop.check
+    state: State = (
+        "impossible"
+        if design.synthesis is None
+        else "not certified"
+        if not certify.certified
+        else "keeps moving"
+        if check is None or check.settled_draws != check.draws
+        else "does not settle"  # at rest beside the reference
+        if check.tracking and check.spread_of("settling_time_s")[-1] is None
+        else "certified"
+    )
     numbers = numbers_of(results, specification.mode_band_rad_s)
     # The certificate is the judge and names every item that is missed; the optimiser only what blocks it.
     why = certify.reason
     if design.gamma is not None and design.gamma > 1:
-        achievable, order = results.achievable_performance, specification.controller_order
-        advice = said("order_advice", achievable, design.gamma, order)
+        reached, order = results.achievable_performance, specification.controller_order
+        advice = said("order_advice", reached, design.gamma, order)
         why = f"{why}; {advice}" if advice else why
     if certify.certified:
         conditions = results.uncertainty.conditions(point.config)
-        why = verdict_of(replace(design, met=True), certify, loop, conditions=conditions)
+        why = verdict_of(replace(design, met=True), certify, results.closed_loop, conditions=conditions)
     lowered = said("lowered", specification, design.specification, (), numbers["bandwidth_rad_s"] or 0)
     if state == "does not settle":
-        why = said("never_settles", loop.check)
+        why = said("never_settles", check)
     elif state == "certified" and lowered:
         state = "certified at a lower bandwidth"
     if lowered:
@@ -94,13 +94,15 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
 
 
 def _row_of_joints(point: Point, results: JointsResults, config: JointsConfig) -> PointRow:
-    state: State = "certified"
-    if results.design.found is None:
-        state = "impossible"
-    elif not results.certify.certified:
-        state = "not certified"
-    elif not all(run.settled for run in results.closed_loop.runs):
-        state = "does not settle"
+    state: State = (
+        "impossible"
+        if results.design.found is None
+        else "not certified"
+        if not results.certify.certified
+        else "certified"
+        if all(run.settled for run in results.closed_loop.runs)
+        else "does not settle"
+    )
     why = summarise_joints(results, config).verdict
     return PointRow(point.number, point.name, point.values, state, why, numbers_of_joints(results))
 
@@ -198,19 +200,20 @@ class StudyView:
     @property
     def best(self) -> list[tuple[StudyColumn, PointRow]]:
         """The best certified point by each of the columns one asks for first."""
-        found = []
         # Where requirements differ, so does what a gamma of 1 means.
         same = not any(row.lowered for row in self.rows) and not any(
             axis.key.startswith(_REQUIREMENTS) and axis.key not in _CONTROLLERS for axis in self.config.axes
         )
-        for column in (COLUMNS[name] for name in _BEST_BY if same or name != "worst_gamma"):
-            good = [row for row in self.rows if row.good and row.numbers[column.name]]
-            if good:
-                key = column.name
-                found.append(
-                    (column, min(good, key=lambda row: (column.badness(row.numbers[key] or 0), row.number)))
-                )
-        return found
+        columns = [COLUMNS[name] for name in _BEST_BY if same or name != "worst_gamma"]
+        ranked = {
+            column: [
+                (column.badness(number), row.number, row)
+                for row in self.rows
+                if row.good and (number := row.numbers[column.name])
+            ]
+            for column in columns
+        }
+        return [(column, min(rows)[-1]) for column, rows in ranked.items() if rows]
 
     @property
     def reasons(self) -> list[tuple[State, str, list[int]]]:

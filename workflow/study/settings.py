@@ -24,11 +24,6 @@ MOST_POINTS = 10_000  # a day and a half at 12 s a point
 _DIGITS = 6  # of a number in a range: enough for any tuning, and short in names and tables
 
 
-def _key(text: str) -> str:
-    parse_key(text)
-    return text
-
-
 def _judged(name: str) -> str:
     column = COLUMNS.get(name)
     if column is None or column.better is None:
@@ -37,7 +32,7 @@ def _judged(name: str) -> str:
     return name
 
 
-DottedKey = Annotated[str, AfterValidator(_key)]
+DottedKey = Annotated[str, AfterValidator(lambda text: parse_key(text) and text)]
 Judged = Annotated[str, AfterValidator(_judged)]
 
 

@@ -72,16 +72,10 @@ class PointTask:
         for stage in (stage for stage in point.kind.stages if stage.name in self.stages):
             started = time.monotonic()
             wanted = stage_input_hash(stage, point.config, run, point.inputs)
-            if not _take_over(run, stage.name, wanted, earlier):
+            there = (one.stage_file(stage.name) for one in earlier if one.is_done(stage.name, wanted))
+            if path := next(filter(None, there), None):
+                shutil.copyfile(path, run.stages_path / path.name)
+            else:
                 run.save_stage(stage.name, stage.run(StageInput(config, results, Progress())), wanted)
             seconds[stage.name], hashes[stage.name] = time.monotonic() - started, wanted
         return Done(run.stage_files(self.stages), seconds, hashes)
-
-
-def _take_over(run: RunDirectory, stage: str, wanted: str, earlier: Sequence[RunDirectory]) -> bool:
-    for other in earlier:
-        path = other.stage_file(stage)
-        if path is not None and other.is_done(stage, wanted):
-            shutil.copyfile(path, run.stages_path / path.name)
-            return True
-    return False

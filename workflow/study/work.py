@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -173,10 +173,9 @@ class _Work:
         shared = shared_stages(point.config, self.base_point.config)
         return self.directory.plant(self.base_point).stage_files(shared)
 
-    def _report(self, rows: Iterable[PointRow]) -> None:
-        for row in rows:
-            self.finished += 1
-            self.good += row.good
+    def _report(self, rows: Collection[PointRow]) -> None:
+        self.finished += len(rows)
+        self.good += sum(row.good for row in rows)
         message = f"{self.finished} of {self.count}, {self.good} certified"
         # The time left follows from the points computed now; those kept took none.
         share = (self.finished - self.taken_up) / max(self.count - self.taken_up, 1)
@@ -219,15 +218,12 @@ def _write_up(directory: StudyDirectory, file: StudyFile, base: Base, rows: Sequ
 
 def _units(directory: StudyDirectory, config: AnyConfig, rows: Sequence[PointRow]) -> dict[str, str]:
     """Units that the rig decides, from the records of any finished point; those of joints differ by joint."""
-    if isinstance(config, JointsConfig):
+    runs = (RunDirectory(directory.points_path / row.name) for row in rows)
+    run = next((run for run in runs if run.stage_file("records") is not None), None)
+    if run is None or isinstance(config, JointsConfig):
         return {}
-    control = config.control_channel
-    for row in rows:
-        run = RunDirectory(directory.points_path / row.name)
-        if run.stage_file("records") is not None:
-            units = RunResults(run).records.records[0].units
-            return {
-                "peak_command": units.get(control.input, ""),
-                "disturbance_peak": units.get(control.output, ""),
-            }
-    return {}
+    control, units = config.control_channel, RunResults(run).records.records[0].units
+    return {
+        "peak_command": units.get(control.input, ""),
+        "disturbance_peak": units.get(control.output, ""),
+    }

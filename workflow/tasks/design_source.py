@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import control
 import numpy as np
@@ -22,9 +21,8 @@ from control_design.plants.plant_set import UncertainPlant, count_integrators, f
 from control_design.plants.stated_uncertainty import StatedDiscs
 from ident.basis.model_files import FORMAT
 from ident.data.ellipses import chi2_radius
-from ident.data.frf_records import measured_response
-from ident.data.record_files import READERS, read_table
-from ident.data.response_columns import has_response
+from ident.data.frf_records import is_response, measured_response
+from ident.data.record_files import READERS
 from ident.frequency_fit import identify_frf
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.nominal import NominalAgreement
@@ -108,7 +106,7 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
     if _ending(path) in READERS and _ending(path) not in DOCUMENTS:
         return _measured(path, design)
     document = read_document(path)
-    if "A" not in document and _ending(path) in READERS and _holds_response(path):
+    if "A" not in document and _ending(path) in READERS and is_response(path):
         return _measured(path, design)
     with naming(str(path)):
         if codec.DOCUMENT in document:
@@ -122,7 +120,7 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
             if (ellipses := exported.ellipses) is None:
                 return _stated(name, nominal, design, "exported model")
             plant = UncertainPlant(name, nominal, ellipses, level=ellipses.level)
-            return DesignSource(plant, "exported model with ellipses", _grid_remarks(plant))
+            return DesignSource(plant, "exported model with ellipses", _inside(ellipses, plant.nominal))
         nominal = read_state_space(path, document)
         _refuse_untold_integrators(path, nominal, design)
         return _stated(path.stem, nominal, design, "state space")
@@ -131,13 +129,6 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
 def _ending(path: Path) -> str:
     """The ending that says the format; of a file packed by gzip that before .gz."""
     return Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
-
-
-def _holds_response(path: Path) -> bool:
-    try:
-        return has_response(read_table(path))
-    except ValueError:
-        return False  # whoever reads it as a model says what is wrong
 
 
 def _stated(name: str, nominal: control.StateSpace, design: DesignFile, origin: str) -> DesignSource:
@@ -201,7 +192,7 @@ def _measured(path: Path, design: DesignFile) -> DesignSource:
                 plant = UncertainPlant(path.stem, nominal, found.posterior, level=response.level)
                 return DesignSource(plant, "model fitted to a measured response", said)
         plant = UncertainPlant(path.stem, nominal, response, level=response.level)
-    return DesignSource(plant, origin, (*said, *_grid_remarks(plant)))
+    return DesignSource(plant, origin, (*said, *_inside(response, nominal)))
 
 
 def _read_response(path: Path, design: DesignFile) -> tuple[FrequencyUncertainty, bool]:
@@ -232,13 +223,6 @@ def _read_response(path: Path, design: DesignFile) -> tuple[FrequencyUncertainty
     deviation = size * np.abs(weight.at(tustin)) / chi2_radius(about.level)
     covariance = deviation[:, None, None] ** 2 * np.eye(2)
     return FrequencyUncertainty(grid, centre, covariance, about.dt_s, about.level, "stated"), True
-
-
-def _grid_remarks(plant: UncertainPlant) -> tuple[str, ...]:
-    """How well the nominal, which brings the poles, agrees with the ellipses on their own grid."""
-    own: Any = plant.uncertainty
-    assert isinstance(own, FrequencyUncertainty)
-    return _inside(own, plant.nominal)
 
 
 def _inside(own: FrequencyUncertainty, nominal: control.StateSpace) -> tuple[str, ...]:

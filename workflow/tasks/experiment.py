@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from plant.excitation import crest_factor
 from plant.experiment_plan import ExperimentPlan
 from plant.modal import linear_arm
 from plant.rig import Rig
+from workflow.config.rig_settings import rig_called
 from workflow.config.settings import Section
 from workflow.engine.errors import InputError
 
@@ -47,11 +49,14 @@ class ExperimentLimits(Section):
     gain_rad_per_Vs: float | None = Field(
         None, gt=0, description="rough speed of the hub per volt [rad/s per V], without a rig"
     )
-    rig: Rig | None = Field(
-        None, description="rig file or 'paper_link': predicts motion and response; default: none"
-    )
+    rig: Annotated[
+        Rig | None, BeforeValidator(lambda rig: rig_called(rig) if isinstance(rig, str) else rig)
+    ] = Field(None, description="rig file or 'paper_link': predicts motion and response; default: none")
     noise_std_rad: float | None = Field(
-        None, gt=0, description="sensor noise of the hub angle [rad]: predicts radii"
+        None,
+        gt=0,
+        description="sensor noise of the hub angle [rad], for the predicted radii; default: that of the rig, "
+        "else of an encoder of 12 bits, 0.00044",
     )
     lead_in_s: float = Field(1.0, ge=0, description="from rest to steady state [s]")
     motion: float | None = Field(
@@ -117,13 +122,18 @@ class PlannedExperiment:
             return np.asarray(np.abs(linear_arm(self.limits.rig)(1j * omega)[0, 0]))
         return None if self.limits.gain_rad_per_Vs is None else self.limits.gain_rad_per_Vs / omega
 
+    @property
+    def noise_std_rad(self) -> float:
+        """Of the hub angle: as stated, of the rig, or of the steps of an encoder of 12 bits."""
+        rig = self.limits.rig
+        known = self.limits.noise_std_rad or (rig and rig.sensors.hub_angle_noise_rad)
+        return known or 2 * np.pi / 2**12 / np.sqrt(12)
+
     @cached_property
-    def radii(self) -> tuple[float, ...] | None:
+    def radii(self) -> tuple[float, ...]:
         """Expected 95 % radius [rad/V] of the response at every line, per amplitude."""
-        noise = self.limits.noise_std_rad
-        if noise is None:
-            return None
-        return tuple(self.plan.radius(rms, self.limits.dt_s, noise) for rms in self.plan.rms_V)
+        noise_rad = self.noise_std_rad
+        return tuple(self.plan.radius(rms, self.limits.dt_s, noise_rad) for rms in self.plan.rms_V)
 
 
 def motion_of(limits: ExperimentLimits) -> Callable[[Real], Real] | None:
