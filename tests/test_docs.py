@@ -191,6 +191,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_site_is_built_whole_and_asks_no_network(site):
     made = {str(page.relative_to(site)) for page in site.rglob("*.html")}
     assert {"index.html", "reference/python.html", "reference/configuration.html"} <= made
+    assert "tutorials/engineer.html" in made
     for page in site.rglob("*.html"):
         if "pages" in page.parts:
             continue  # drawn by flexlink, tested with it

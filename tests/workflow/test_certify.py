@@ -12,12 +12,10 @@ import scipy.signal
 from control_design.controllers.controller import Controller
 from tests.test_docs import run_command
 
-FOLDER = Path("examples/margins_in_ci")
-
 
 @pytest.fixture
 def example(examples_alone, monkeypatch):
-    monkeypatch.chdir(FOLDER)
+    monkeypatch.chdir("examples/margins_in_ci")
     return ["certify", "arm.json", "--spec", "specification.toml", "--controller"]
 
 

@@ -154,7 +154,9 @@ def draw_excitation(found: PlannedExperiment) -> Figure:
     if found.gain is not None:
         axes[2].plot(found.lines_Hz, found.gain, **style.MODEL_LINE, label="expected gain")
     for value, radius in zip(rms, found.radii, strict=True):
-        axes[2].axhline(radius, color=style.UNCERTAIN, lw=1.4, label="expected 95 % radius")
+        axes[2].plot(
+            found.lines_Hz[[0, -1]], [radius] * 2, color=style.UNCERTAIN, lw=1.4, label="expected 95 % radius"
+        )
         axes[2].annotate(f"{value:g} V rms", (found.lines_Hz[0], radius), fontsize=8, va="bottom")
     axes[2].set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="hub angle / voltage [rad/V]")
     axes[2].set_title("Response to be expected")
