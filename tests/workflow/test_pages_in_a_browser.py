@@ -185,7 +185,7 @@ def test_report_of_a_run(browser, faults_seen, tmp_path):
     # Two channels of one made-up model say the same of themselves.
     settings = example.config(channels=1)
     path = write_report(RunResults(example.build_run(tmp_path / "one", settings)), settings)
-    assert shape_faults(browser, path, screens=5) == []
+    assert shape_faults(browser, path, screens=2.5, words=450) == []
 
 
 def test_the_shape_of_a_page_is_measured(browser, tmp_path):

@@ -95,7 +95,9 @@ def draw_nichols(axes: Axes, loop: FrequencyUncertainty) -> None:
     """Gain over phase of a loop with its ellipses, on the Nichols chart of python-control."""
     phase, level = unwrapped_degrees(loop.centre), style.decibels(np.abs(loop.centre))
     edges, shown = loop.centre[:, None] + loop.ellipse().boundary(40), level > _LOWEST_DB
-    turned = phase[:, None] + np.degrees(np.angle(edges / loop.centre[:, None]))
+    turned = phase[:, None] + np.degrees(
+        np.angle(edges / np.where(loop.centre == 0, 1.0, loop.centre)[:, None])
+    )
     axes.plot(phase, level, **style.PREDICTED_LINE, label="loop at the centres")
     axes.plot([-180], [0], marker="P", ms=8, color=style.REFERENCE, ls="none", label="-1")
     ends = np.append(phase[shown], [-360.0, 0.0])
