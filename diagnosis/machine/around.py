@@ -208,8 +208,7 @@ class Drive:
 
     def _response(self, run: Run, inputs: Real) -> Real:
         """(T,) of the signal to one that is added over the first sample, small beside what moves it."""
-        small = 1e-3 * max(float(np.std(run(inputs)[:, self.signal])), 1e-9)
-        pushed = np.array(inputs)
+        small, pushed = 1e-3 * max(float(np.std(run(inputs)[:, self.signal])), 1e-9), np.array(inputs)
         pushed[0, self.added] += small
         return np.asarray((run(pushed) - run(inputs))[:, self.signal] / small)
 

@@ -232,7 +232,7 @@ class MujocoSimulation:
 
     def _start(self, inputs: Real) -> _Start:
         """Of a record: from its first samples, moved once by what the stated model leaves from there;
-        one that asks for more than they leave open is wrong about something else."""
+        one that asks for more than rest and they leave open is wrong about something else."""
 
         def compute() -> _Start:
             arm, U = self.arm, len(self.arm.inputs)
@@ -247,7 +247,8 @@ class MujocoSimulation:
             slopes = [(run - first) / size for run, size in zip(runs, spread, strict=True)]
             start = _Start(guess, guess, spread, np.array(slopes).reshape(-1, *first.shape), self.noise)
             move = start.shift(inputs[:, U:] - first)
-            return replace(start, state=guess + move) if np.all(np.abs(move) < spread) else start
+            rests = not np.any(guess[len(arm.tracked) : 2 * len(arm.tracked)])
+            return start if rests and np.any(np.abs(move) > spread) else replace(start, state=guess + move)
 
         return _remembered(self._starts, inputs.tobytes(), compute)
 

@@ -22,7 +22,7 @@ _MISSING = {
     "input": "changes a command, and the stated input is none or zero in every record",
     "body": "needs motion=, the output that is the body's position or speed",
 }
-_NEEDS = {"input": "a command among the inputs", "body": "motion: the output that is the body's motion"}
+_NEEDS_MOTION = "motion: the output that is the body's motion"
 # What no record of one output can tell from its twin at the input where the machine is linear.
 _TWINS = ("output_lag", "output_delay", "output_gain")
 # A play of a force is rare, and one before friction; a mass off its axis needs an angle; friction one way
@@ -147,7 +147,8 @@ def with_effects(
     there = {effect.name for effect in found}
     inactive = dict(plant.inactive)
     if names == "all":
-        inactive |= {prefix + n: _NEEDS[WHERE[n]] for n in _of_all(plant) if places[WHERE[n]] is None}
+        # Of the actuator nothing applies where a motion is given: none drives it.
+        inactive |= {prefix + n: _NEEDS_MOTION for n in _of_all(plant) if WHERE[n] == "body" and body is None}
     inactive = {name: needs for name, needs in inactive.items() if name not in there}
     equipped = replace(plant, effects=tuple(found), dt_s=dt_s, inactive=inactive)
     _try(equipped, experiments[0], body)
