@@ -100,7 +100,7 @@ def identify_frf(
     fixed = options.fixed()
     searched = (options.n_real or 0) + 2 * (options.n_pairs or 0)
     needed = data.n_parameters(fixed.order + searched, fixed.order)
-    if not data.n_rows > needed:
+    if not data.n_samples > needed:
         raise ValueError(
             f"{response.omega_rad_s.size} frequencies are too few for order {fixed.order + searched}, which "
             f"has {needed} unknowns; expected at least {needed // 2 + 1}"
@@ -112,7 +112,7 @@ def identify_frf(
         best = selection.exchanged(best)
     poles = in_order(best.poles, fixed)
     fit = fit_response(data, poles)
-    freedom = data.n_rows - data.n_parameters(poles.order, fixed.order)
+    freedom = data.n_samples - data.n_parameters(poles.order, fixed.order)
     decay, omega, zeta = _pole_deviations(data, poles, fixed, max(1.0, fit.rss / freedom))
     model = GobfModel(
         poles=poles,

@@ -154,15 +154,9 @@ class ModalFit:
                 last[:] = [(x.copy(), self._linearised(x))]
             return last[-1][1]
 
-        def residual(x: RealArray) -> RealArray:
-            return both(x)[0]
-
-        def jacobian(x: RealArray) -> RealArray:
-            return both(x)[1]
-
-        given: dict[str, Any] = {"method": "lm", "x_scale": "jac", "max_nfev": _MOST_EVALUATIONS}
-        found = least_squares(residual, self.x, jacobian, ftol=_ENOUGH, xtol=_ENOUGH, **given)
-        self._set(found.x)
+        given: dict[str, Any] = {"method": "lm", "x_scale": "jac", "ftol": _ENOUGH, "xtol": _ENOUGH}
+        given |= {"fun": lambda x: both(x)[0], "jac": lambda x: both(x)[1], "max_nfev": _MOST_EVALUATIONS}
+        self._set(least_squares(x0=self.x, **given).x)
 
     def sizes(self, mode: ShapedMode) -> RealArray:
         """How much each input drives a mode, (U,): by that a residue's columns are weighed."""

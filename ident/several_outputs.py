@@ -171,10 +171,7 @@ def _described(
     def chance(rss: float, saved: int) -> float:
         return float(chi2.sf(max(rss - free, 0.0) / noise_power * worth, saved))
 
-    def refused(rss: float, saved: int) -> bool:
-        return chance(rss, saved) < _LEVEL
-
-    given = data, poles, coefficients, direct
+    given, refused = (data, poles, coefficients, direct), lambda rss, saved: chance(rss, saved) < _LEVEL
     shaped = None if free_shapes else one_shape_each(*given, n_fixed=search.fixed.counts, refused=refused)
     if shaped is not None:
         poles, coefficients, direct = shaped.poles, shaped.coefficients, shaped.direct

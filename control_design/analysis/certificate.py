@@ -22,7 +22,7 @@ from control_design.analysis.stability import (
 )
 from control_design.analysis.worst_case import worst_case
 from control_design.controllers.controller import Controller
-from control_design.plants.ellipses import Complex, Ellipses, Real
+from control_design.plants.ellipses import Complex, Real
 from control_design.plants.frequency_grid import checked_grid, near_the_circle, with_own_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, frequency_response, modes_of
 from control_design.plants.set_expansion import with_straight_between
@@ -233,9 +233,6 @@ def _check_plant(
     worst = worst_case(partial(controller.response, with_delay=False), seen, specification, grid)
     refinable = seen.own_grid is None
 
-    def between(omega: Real) -> tuple[Complex, Ellipses]:
-        return controller.response(omega), seen.at(omega)
-
     def loop_gain(omega: Real) -> Complex:
         return controller.response(omega) * seen.at(omega).centre
 
@@ -253,7 +250,7 @@ def _check_plant(
         worst.loop_factor,
         worst.ellipses,
         distance,
-        between=between if refinable else None,
+        between=(lambda omega: (controller.response(omega), seen.at(omega))) if refinable else None,
         at_zero=not integrators,
     ).worse(nominal)
     at = int(np.argmin(distance))

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from control_design.plants.ellipses import Complex, Ellipses, Real
-from control_design.plants.frequency_grid import around_maxima
+from control_design.plants.frequency_grid import around_maxima, joined
 
 _TOUCHES = 1e-9  # relative distance from the real axis or the unit circle that counts as a crossing without
 # a change of sign: the finest the search between the points resolves
@@ -179,7 +179,7 @@ def ellipse_margins(
         crossed = np.setdiff1d([w for w, _ in crossings], grid)
         values = _members(loop_gain, ellipses)
         if crossed.size:
-            grid, values = _joined(grid, values, crossed, _members(*between(crossed)))
+            grid, values = joined(grid, values, crossed, _members(*between(crossed)))
         grid, values = _refined(lambda w: _members(*between(w)), grid, values, (0, 1, 2, 3, 4, 5))
     up, down, phase, delay = (float(np.min(value)) for value in values[:4])
     ends = [(loop_gain[-1:], ellipses.subset(np.array([-1])))]
@@ -291,14 +291,5 @@ def _refined(
         new = around_maxima(omega, [-values[which] for which in sought], _MINIMA)
         if not new.size:
             break
-        omega, values = _joined(omega, values, new, evaluate(new))
+        omega, values = joined(omega, values, new, evaluate(new))
     return omega, values
-
-
-def _joined(
-    omega: Real, values: tuple[Real, ...], new: Real, added: tuple[Real, ...]
-) -> tuple[Real, tuple[Real, ...]]:
-    """Grid and values with others, at other frequencies."""
-    order = np.argsort(np.concatenate([omega, new]), kind="stable")
-    joined = tuple(np.concatenate([a, b])[order] for a, b in zip(values, added, strict=True))
-    return np.concatenate([omega, new])[order], joined

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from control_design.plants.ellipses import (
     largest_disturbance_gain,
     quotient,
 )
-from control_design.plants.frequency_grid import GridOptions, around_maxima, programme_grid
+from control_design.plants.frequency_grid import GridOptions, around_maxima, joined, programme_grid
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction, WeightedRequirement
@@ -156,17 +155,10 @@ class WorstCase:
 
     def joined(self, other: WorstCase) -> WorstCase:
         """This and another, at other frequencies."""
-        order = np.argsort(np.concatenate([self.omega_rad_s, other.omega_rad_s]))
-
-        def both(a: Any, b: Any) -> Any:
-            return np.concatenate([a, b])[order]
-
-        return WorstCase(
-            both(self.omega_rad_s, other.omega_rad_s),
-            self.ellipses.joined(other.ellipses),
-            both(self.loop_factor, other.loop_factor),
-            {name: both(value, other.values[name]) for name, value in self.values.items()},
-        )
+        own, new = ([one.loop_factor, *(one.values[name] for name in self.values)] for one in (self, other))
+        omega, (factor, *values) = joined(self.omega_rad_s, own, other.omega_rad_s, new)
+        ellipses = self.ellipses.joined(other.ellipses)
+        return WorstCase(omega, ellipses, factor, dict(zip(self.values, values, strict=True)))
 
     def peak(self, kind: str) -> tuple[float, float]:
         """(largest value, its frequency) of one kind."""

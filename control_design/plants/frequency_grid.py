@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -170,6 +171,15 @@ def around_maxima(omega: Real, values: Sequence[Real], most: int) -> Real:
         if value[at] > -np.inf
     ]
     return np.setdiff1d([np.linspace(*both, 11)[1:-1] for both in ends], omega)
+
+
+def joined(
+    omega: Real, values: Sequence[Any], new: Real, added: Sequence[Any]
+) -> tuple[Real, tuple[Any, ...]]:
+    """Grid and values with others, at other frequencies."""
+    order = np.argsort(np.concatenate([omega, new]), kind="stable")
+    both = tuple(np.concatenate([a, b])[order] for a, b in zip(values, added, strict=True))
+    return np.concatenate([omega, new])[order], both
 
 
 def with_violations(grid: Real, omega: Real, value: Real, limit: float, most: int) -> Real:

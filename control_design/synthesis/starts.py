@@ -205,9 +205,6 @@ class StartMaker:
                 left = min(left, float(np.min(back / (1.0 + reach / np.maximum(back, 1e-300)))))
             return 1.0 - left
 
-        def worst(x: Real) -> float:
-            return float(np.log(min(self.score(x), 1e6)))
-
         drawn = [self._around_unstable_poles() for _ in range(_DRAWN_UNSTABLE)]
         drawn = sorted(drawn, key=cost)[:_FOLLOWED]
         found: list[tuple[Real, float]] = []
@@ -216,7 +213,8 @@ class StartMaker:
             size = np.where(np.abs(x) > 1e-3, 0.2 * np.abs(x), 0.1)
             end = _simplex(cost, np.vstack([x, x + np.diag(size)]), 200 * x.size)
             if np.isfinite(self.score(end)):  # on towards what is asked, over valleys the descent stays in
-                end = _simplex(worst, np.vstack([end, end + np.diag(size)]), 60 * x.size)
+                around = np.vstack([end, end + np.diag(size)])
+                end = _simplex(lambda x: float(np.log(min(self.score(x), 1e6))), around, 60 * x.size)
             found.append((end, self.score(end)))
             if sum(np.isfinite(gamma) for _, gamma in found) >= most:
                 break

@@ -45,7 +45,7 @@ class FrfRegression:
     dt_s: float
 
     @cached_property
-    def n_rows(self) -> int:
+    def n_samples(self) -> int:
         """Number of real numbers that were measured: two per frequency, one at 0 and at pi/dt."""
         return int(np.count_nonzero(self.weight))
 
@@ -107,14 +107,14 @@ class FrfRegression:
         count = self.z.size
         found = residual_colour(residual, np.array([0, count, 2 * count], dtype=np.int64))
         share = found.effective_samples / residual.size
-        return ResidualColour(max(share * self.n_rows, 3.0), found.white)
+        return ResidualColour(max(share * self.n_samples, 3.0), found.white)
 
     def criterion(self, rss: float, order: int, worth: float) -> Callable[[float, int], float]:
         """J / scale + (free numbers) ln Ne, Ne = worth: a pole, of two numbers, is kept if J falls by more
         than 2 ln Ne (a pair: 4 ln Ne). J is a chi-square because the covariances are known; where
         it is larger than they explain, they are multiplied by its excess, the scale."""
-        scale = max(1.0, rss / max(self.n_rows - self.n_parameters(order), 1))
-        share, price = worth / self.n_rows, float(np.log(worth))
+        scale = max(1.0, rss / max(self.n_samples - self.n_parameters(order), 1))
+        share, price = worth / self.n_samples, float(np.log(worth))
         return lambda rss, order: share * rss / scale + self.n_parameters(order) * price
 
     def candidate_cost(self, space: SearchSpace, shared: Poles, local: Poles) -> CandidateCost:

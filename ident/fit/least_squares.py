@@ -79,15 +79,6 @@ class Regression:
         return int(self.y.size)
 
     @property
-    def n_rows(self) -> int:
-        """How many real numbers were measured: N."""
-        return int(self.y.size)
-
-    @property
-    def n_records(self) -> int:
-        return int(self.starts.size - 1)
-
-    @property
     def n_inputs(self) -> int:
         return int(self.u.shape[0])
 
@@ -104,7 +95,9 @@ class Regression:
     def n_parameters(self, order: int) -> int:
         """Free real numbers of a fit with `order` poles: coefficients of each input, poles, nuisances."""
         local = self.polynomials.shape[0] + (order if self.structure.estimate_initial_state else 0)
-        return int(order + self.n_inputs * (order + self.structure.feedthrough) + self.n_records * local)
+        return int(
+            order + self.n_inputs * (order + self.structure.feedthrough) + (self.starts.size - 1) * local
+        )
 
     def take_out_local(self, local_q: RealArray, rows: RealArray) -> None:
         """Project rows (R, N) off the columns local_q (Q, N) of each record, in place."""
@@ -155,7 +148,7 @@ def information_criterion(power: float, data: PoleProblem, worth: float) -> Call
     floor = max(EXPLAINED * power, np.finfo(np.float64).tiny)
 
     def value(rss: float, order: int) -> float:
-        fall = worth * np.log(max(rss, floor) / data.n_rows)
+        fall = worth * np.log(max(rss, floor) / data.n_samples)
         return float(fall + data.n_parameters(order) * np.log(worth))
 
     return value

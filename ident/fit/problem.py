@@ -97,7 +97,7 @@ class PoleProblem(Linearised, Protocol):
         """Samples of the longest record: what is slower cannot be told from a pole on the circle."""
 
     @property
-    def n_rows(self) -> int:
+    def n_samples(self) -> int:
         """How many real numbers were measured."""
 
     def n_parameters(self, order: int) -> int:

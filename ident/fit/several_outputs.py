@@ -53,10 +53,6 @@ class OutputRegressions:
         return sum(one.n_samples for one in self.each)
 
     @property
-    def n_rows(self) -> int:
-        return self.n_samples
-
-    @property
     def n_inputs(self) -> int:
         return self.each[0].n_inputs
 

@@ -218,7 +218,7 @@ class OrderSelection:
         return criterion(trial.rss, trial.poles.order) < criterion(best.rss, best.poles.order)
 
     def _visible(self, best: Refined) -> bool:
-        enough = self.search.data.n_rows > 2 * self.search.data.n_parameters(best.poles.order + 2)
+        enough = self.search.data.n_samples > 2 * self.search.data.n_parameters(best.poles.order + 2)
         return enough and best.rss > EXPLAINED * self.search.data.power
 
     def _counts(self, end: Refined) -> tuple[int, int]:

@@ -176,10 +176,10 @@ def embed_response(
     options = options or EmbeddingOptions()
     basis = model.poles.doubled(fixed.counts)
     regressors = data.columns(basis)
-    length = options.fir_length or max(1, min(_FRF_FIR_LENGTH, (data.n_rows - regressors.shape[1]) // 3))
+    length = options.fir_length or max(1, min(_FRF_FIR_LENGTH, (data.n_samples - regressors.shape[1]) // 3))
     taps = data.common[:, np.newaxis] * data.z[:, np.newaxis] ** -np.arange(1.0, length + 1)
     measured = data.weight.ravel() > 0
-    nothing = np.zeros((data.n_rows, 0))
+    nothing = np.zeros((data.n_samples, 0))
     block = RegressionBlock(nothing, regressors[measured], data.whiten(taps)[measured], data.y[measured])
     reduced = reduce_regression([block])
     grid = kernel_grid(reduced, _SHAPES, order_given=bool(options.order_given))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from operator import add, mul
 from types import MappingProxyType
 
 from pydantic import Field
 
-from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, register, with_voltage
+from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, alone, register
 from plant.effects.search_space import Sought
-from plant.machine import Machine
 
 
 @register
@@ -16,6 +16,7 @@ class InputDelay(Effect):
     """Pure delay of the held voltage by any fraction of the sampling period."""
 
     id = "input_delay"
+    acts = ("voltage", "delay_s", add)
     words = "a delay of the command"
     check = "log the voltage at the motor beside the command; the time between their steps is the delay"
     adds_to = "sampling.transport_delay_s"
@@ -23,23 +24,18 @@ class InputDelay(Effect):
 
     delay_s: float = Field(ge=0, le=60.0, description="delay of the voltage; every sample of it is stored")
 
-    def modify(self, machine: Machine) -> Machine:
-        return with_voltage(machine, delay_s=machine.voltage.delay_s + self.delay_s)
-
 
 @register
 class ActuatorGain(RatioEffect):
     """Voltage multiplied by a ratio; the back-EMF is not."""
 
     id = "actuator_gain"
+    acts = ("voltage", "gain", mul)
     words = "a wrong gain of the actuator"
     check = "hold two steady commands and compare the voltage at the motor with them"
     multiplies = "motor.torque_constant_Nm_A"
 
     ratio: Positive = Field(description="acting voltage over commanded voltage")
-
-    def modify(self, machine: Machine) -> Machine:
-        return with_voltage(machine, gain=machine.voltage.gain * self.ratio)
 
 
 @register
@@ -47,6 +43,7 @@ class ActuatorDeadZone(Effect):
     """Voltage becomes sign(V) max(|V| - w, 0)."""
 
     id = "actuator_dead_zone"
+    acts = ("voltage", "dead_zone_V", add)
     words = "a dead zone of the actuator"
     check = "raise the command slowly from zero and note where the voltage at the motor begins to follow"
     dependence = "continuous"
@@ -54,15 +51,13 @@ class ActuatorDeadZone(Effect):
 
     width_V: NotNegative = Field(description="half width of the zone without torque")
 
-    def modify(self, machine: Machine) -> Machine:
-        return with_voltage(machine, dead_zone_V=machine.voltage.dead_zone_V + self.width_V)
-
 
 @register
 class ActuatorSaturation(Effect):
     """Voltage clipped to +-limit."""
 
     id = "actuator_saturation"
+    acts = ("voltage", "limit_V", min)
     words = "saturation of the actuator"
     check = "command the largest voltage and measure what arrives at the motor"
     neutral = MappingProxyType({"limit_V": 1e6})
@@ -71,20 +66,15 @@ class ActuatorSaturation(Effect):
 
     limit_V: Positive = Field(description="largest voltage the driver delivers")
 
-    def modify(self, machine: Machine) -> Machine:
-        return with_voltage(machine, limit_V=min(machine.voltage.limit_V, self.limit_V))
-
 
 @register
 class ActuatorLag(Effect):
     """First-order lag 1 / (T s + 1) on the acting voltage, after every other voltage effect."""
 
     id = "actuator_lag"
+    acts = ("voltage", "lag_s", alone)
     words = "a lag of the actuator"
     check = "step the command and look at the voltage at the motor: it should step as well"
     sought = Sought((2e-4, 200), (0.02, 40, 10), "dt_s")
 
     time_constant_s: NotNegative = Field(description="time constant T; 0 is none")
-
-    def modify(self, machine: Machine) -> Machine:
-        return with_voltage(machine, lag_s=self.time_constant_s)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from operator import mul
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, cast
 
@@ -25,6 +25,7 @@ from plant.machine import Machine, Real, SmoothTorque
 from plant.rig import Rig
 
 Group = Literal["actuator", "joint", "link", "sensor"]
+Part = Literal["rig", "voltage", "joint", "sensor"]
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -34,7 +35,7 @@ NotNegative = Annotated[float, Field(ge=0)]
 _LEAST_TOLERANCES, USUAL_TOLERANCES = 3.0, 30.0
 
 
-class Effect(BaseModel, ABC):
+class Effect(BaseModel):
     """One deviation of a machine from its nominal rig.
 
     A subclass has its parameters as fields, SI units in their names, with bounds; its docstring states the
@@ -55,6 +56,7 @@ class Effect(BaseModel, ABC):
         It takes energy at the joint: closed loops are also tried without it and with twice its torques.
     multiplies : str or None
         Key of the stated value that its ratio multiplies, whose tolerance may explain it as well.
+    acts : (part of the machine, name of a value there, how the first parameter joins it) or None
     harmonic : str or None
         The torque is a sine of the hub angle or of time: amplitude and phase follow by linear least squares.
     look_alike_of : str or None
@@ -78,6 +80,7 @@ class Effect(BaseModel, ABC):
     environment: ClassVar[bool] = False
     friction: ClassVar[bool] = False
     multiplies: ClassVar[str | None] = None
+    acts: ClassVar[tuple[Part, str, Callable[[Any, float], float]] | None] = None
     harmonic: ClassVar[Harmonic | None] = None
     look_alike_of: ClassVar[str | None] = None
     beside: ClassVar[str | None] = None
@@ -86,9 +89,14 @@ class Effect(BaseModel, ABC):
     absolute_angle: ClassVar[bool] = False
     sought: ClassVar[Sought | None] = None
 
-    @abstractmethod
     def modify(self, machine: Machine) -> Machine:
-        """The machine with this effect."""
+        """The machine with this effect: its first parameter joined to the value that it `acts` on, or
+        multiplies."""
+        part, name, joined = self.acts or ("rig", str(self.multiplies), mul)
+        there, size = getattr(machine, part), next(iter(self.parameters().values()))
+        if part == "rig":
+            return with_parameters(machine, {name: joined(machine.rig.value(name), size)})
+        return replace(machine, **{part: replace(there, **{name: joined(getattr(there, name), size)})})
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
@@ -167,8 +175,8 @@ def register(kind: type[E]) -> type[E]:
     Raises TypeError for a ratio without a stated value that it multiplies or a `modify` of its own, and for
     an effect without id or words: the pages need them.
     """
-    if issubclass(kind, RatioEffect) and kind.multiplies is None and kind.modify is RatioEffect.modify:
-        raise TypeError(f"{kind.id} multiplies no stated value: it needs its own modify")
+    if kind.modify is Effect.modify and not (kind.acts or kind.multiplies):
+        raise TypeError(f"{kind.id} neither acts on a value nor multiplies one: it needs its own modify")
     if missing := [name for name in ("id", "words") if not hasattr(kind, name)]:
         raise TypeError(f"effect {kind.__name__}: state its {' and '.join(missing)} in the class")
     if not hasattr(kind, "group"):
@@ -184,10 +192,6 @@ class RatioEffect(Effect):
     largest_ratio: ClassVar[float] = 10.0
 
     ratio: NotNegative
-
-    def modify(self, machine: Machine) -> Machine:
-        assert self.multiplies is not None  # see `register`
-        return with_parameters(machine, {self.multiplies: machine.rig.value(self.multiplies) * self.ratio})
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
@@ -210,10 +214,6 @@ def ratio_candidates(kind: EffectKind, tolerance: float, largest: float) -> tupl
     return tuple(sides)
 
 
-def with_voltage(machine: Machine, **changes: Any) -> Machine:
-    return replace(machine, voltage=replace(machine.voltage, **changes))
-
-
 def with_joint(machine: Machine, **changes: Any) -> Machine:
     return replace(machine, joint=replace(machine.joint, **changes))
 
@@ -222,9 +222,10 @@ def with_torque(machine: Machine, torque: SmoothTorque) -> Machine:
     return with_joint(machine, torques=(*machine.joint.torques, torque))
 
 
-def with_sensor(machine: Machine, **changes: Any) -> Machine:
-    return replace(machine, sensor=replace(machine.sensor, **changes))
-
-
 def with_parameters(machine: Machine, values: Mapping[str, float]) -> Machine:
     return replace(machine, rig=machine.rig.perturbed(values))
+
+
+def alone(there: object, own: float) -> float:
+    """Of a value that the effect brings: whatever there is without it."""
+    return own

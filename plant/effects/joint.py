@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import product
+from operator import add
 from types import MappingProxyType
 from typing import Self
 
@@ -16,9 +17,9 @@ from plant.effects.base import (
     NotNegative,
     Positive,
     RatioEffect,
+    alone,
     register,
     with_joint,
-    with_parameters,
     with_torque,
 )
 from plant.effects.search_space import PHASE, Axis, Candidate, Scales, Sought, geometric, log_axis
@@ -121,16 +122,13 @@ class ViscousFriction(Effect):
     """Torque -c omega, added to the linear friction of the rig."""
 
     id = "viscous_friction"
+    acts = ("rig", "hub.viscous_friction_Nms", add)
     words = "additional viscous friction"
     check = "turn the hub at several steady speeds and note the voltage: it should grow in proportion"
     adds_to = "hub.viscous_friction_Nms"
     friction = True
 
     coefficient_Nms: NotNegative = Field(description="added to the rig's viscous friction")
-
-    def modify(self, machine: Machine) -> Machine:
-        total = machine.rig.hub.viscous_friction_Nms + self.coefficient_Nms
-        return with_parameters(machine, {"hub.viscous_friction_Nms": total})
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
@@ -298,14 +296,11 @@ class GroundSpring(Effect):
     """
 
     id = "ground_spring"
+    acts = ("joint", "ground_spring_Nm_rad", add)
     words = "a linear spring from hub to ground"
     look_alike_of = "gravity"
 
     stiffness_Nm_rad: NotNegative = Field(description="stiffness k")
-
-    def modify(self, machine: Machine) -> Machine:
-        total = machine.joint.ground_spring_Nm_rad + self.stiffness_Nm_rad
-        return with_joint(machine, ground_spring_Nm_rad=total)
 
     @classmethod
     def look_alike_scale(cls, rig: Rig) -> float:
@@ -389,6 +384,7 @@ class Backlash(Effect):
     """
 
     id = "backlash"
+    acts = ("joint", "backlash_gap_rad", alone)
     words = "backlash in the gear"
     check = "hold the motor shaft and turn the hub to and fro by hand: the free play is the backlash"
     neutral = None  # without a gap the contact is still elastic
@@ -396,6 +392,3 @@ class Backlash(Effect):
     sought = Sought((1e-5, 0.5), (3e-4, 0.2, 30), step=5e-3)
 
     gap_rad: Positive = Field(description="total gap")
-
-    def modify(self, machine: Machine) -> Machine:
-        return with_joint(machine, backlash_gap_rad=self.gap_rad)

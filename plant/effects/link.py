@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import add
 
 import numpy as np
 from pydantic import Field
 
-from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, register, with_parameters
+from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, register
 from plant.effects.search_space import Axis, Candidate, Scales, Sought
 from plant.machine import Machine
 
@@ -21,15 +22,13 @@ class TipPayload(Effect):
     """A point mass added to the payload of the rig."""
 
     id = "tip_payload"
+    acts = ("rig", "payload.mass_kg", add)
     words = "an additional mass at the tip"
     check = "weigh the tip with everything that is fixed to it"
     adds_to = "payload.mass_kg"
     sought = Sought((1e-6, 5), (1e-4, 1.5, 14), "link_mass_kg")
 
     mass_kg: NotNegative = Field(description="added point mass at the tip")
-
-    def modify(self, machine: Machine) -> Machine:
-        return with_parameters(machine, {"payload.mass_kg": machine.rig.payload.mass_kg + self.mass_kg})
 
 
 @register

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from operator import add, mul
 from typing import Self
 
 from pydantic import Field
 
-from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, register, with_sensor
+from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, alone, register
 from plant.effects.search_space import Candidate, Scales, Sought, geometric, log_axis
-from plant.machine import Machine
 
 
 @register
@@ -17,13 +17,11 @@ class SensorGain(RatioEffect):
     """tip_m (or tip acceleration, or deflection) multiplied by a ratio, before its noise."""
 
     id = "sensor_gain"
+    acts = ("sensor", "gain", mul)
     words = "a wrong gain of the tip sensor"
     check = "move the tip by a known length and compare the reading"
 
     ratio: Positive = Field(description="measured over true tip position")
-
-    def modify(self, machine: Machine) -> Machine:
-        return with_sensor(machine, gain=machine.sensor.gain * self.ratio)
 
 
 @register
@@ -31,13 +29,11 @@ class SensorDrift(Effect):
     """rate * time added to tip_m, time from the start of the record."""
 
     id = "sensor_drift"
+    acts = ("sensor", "drift_m_s", add)
     words = "a drift of the tip sensor"
     check = "log the tip sensor for some minutes with the arm clamped"
 
     rate_m_s: float = Field(description="drift of the tip sensor")
-
-    def modify(self, machine: Machine) -> Machine:
-        return with_sensor(machine, drift_m_s=machine.sensor.drift_m_s + self.rate_m_s)
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
@@ -55,6 +51,7 @@ class Quantisation(Effect):
     """tip_m rounded to the nearest multiple of a step, after the noise."""
 
     id = "quantisation"
+    acts = ("sensor", "step_m", max)
     words = "coarse quantisation of the tip sensor"
     check = "move the tip slowly and look for steps in the reading"
     dependence = "non-smooth"
@@ -62,20 +59,15 @@ class Quantisation(Effect):
     # Values on a grid are plain to see: the step is read off them (`diagnosis.machine.quantisation_grid`).
     step_m: NotNegative = Field(description="resolution of the tip sensor; 0 is none")
 
-    def modify(self, machine: Machine) -> Machine:
-        return with_sensor(machine, step_m=max(machine.sensor.step_m, self.step_m))
-
 
 @register
 class SensorLag(Effect):
     """First-order lag on the tip sensor, before its gain, drift and noise."""
 
     id = "sensor_lag"
+    acts = ("sensor", "lag_s", alone)
     words = "a lag of the tip sensor"
     check = "tap against the tip and compare when its sensor and the encoder answer"
     sought = Sought((2e-4, 200), (0.02, 40, 10), "dt_s")
 
     time_constant_s: NotNegative = Field(description="time constant; 0 is none")
-
-    def modify(self, machine: Machine) -> Machine:
-        return with_sensor(machine, lag_s=self.time_constant_s)

@@ -144,7 +144,7 @@ def test_response_at_zero_and_nyquist_counts_once(plant):
         delay_samples=0,
         feedthrough=False,
     )
-    assert data.n_rows == 2 * omega.size - 2
+    assert data.n_samples == 2 * omega.size - 2
 
 
 def test_control_design_takes_model_and_posterior(plant):

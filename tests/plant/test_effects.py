@@ -245,7 +245,7 @@ def test_the_same_effect_twice_is_refused():
 
 
 def test_a_ratio_that_multiplies_nothing_is_refused_when_it_is_registered():
-    with pytest.raises(TypeError, match="nothing multiplies no stated value"):
+    with pytest.raises(TypeError, match="nothing neither acts on a value nor multiplies one"):
 
         @register
         class Nothing(RatioEffect):
