@@ -41,7 +41,6 @@ class ResponseDraws(Protocol):
 
     def draw(self, rng: np.random.Generator, draws: int) -> Responses:
         """Function of omega (F,) that gives the same `draws` posterior samples (draws, F) at every call."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -173,7 +173,11 @@ class _Matching:
             poles = Poles(np.exp(-self.dt_s * np.exp(np.clip(np.sort(logs), low, high))))
             return self._coefficients(poles, thin, samples).gamma + outside
 
-        corner = self._model_corner()
+        # Where |T_ref| has fallen by 3 dB from its value at the lowest grid frequency.
+        omega = self.grids[0]
+        size = np.abs(self._model_at(omega))
+        below = np.flatnonzero(size < size[0] / np.sqrt(2))
+        corner = float(omega[below[0]] if below.size else 0.1 * omega[-1])
         spread = np.log(corner) + np.log(4.0) * (np.arange(self.options.order) - (self.options.order - 1) / 2)
         answers = [
             scipy.optimize.minimize(
@@ -186,13 +190,6 @@ class _Matching:
         ]
         best = min(answers, key=lambda answer: float(answer.fun))
         return Poles(np.exp(-self.dt_s * np.exp(np.clip(np.sort(best.x), low, high))))
-
-    def _model_corner(self) -> float:
-        """Frequency where |T_ref| has fallen by 3 dB from its value at the lowest grid frequency."""
-        omega = self.grids[0]
-        size = np.abs(self._model_at(omega))
-        below = np.flatnonzero(size < size[0] / np.sqrt(2))
-        return float(omega[below[0]] if below.size else 0.1 * omega[-1])
 
     def _model_at(self, omega: Real) -> Complex:
         return self.model.at(imaginary_axis(omega, self.dt_s))

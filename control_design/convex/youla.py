@@ -29,7 +29,6 @@ from control_design.convex.youla_basis import (
     Factors,
     chosen_poles,
     coprime_factors,
-    stable_loop,
     with_constant,
 )
 from control_design.plants.ellipses import Complex, Real
@@ -192,8 +191,10 @@ class BracketProblem:
         return point
 
     def _loop(self, data: PlantData) -> AffineLoop:
-        if self.factors is None:
-            return stable_loop(data.ellipses.centre * data.delay)
+        if self.factors is None:  # a stable plant: M = Y = 1, X = 0, hence K S = Q and S = 1 - G Q
+            response = data.ellipses.centre * data.delay
+            one, zero = np.ones_like(response), np.zeros_like(response)
+            return AffineLoop(response, zero, one, one, -response)
         return self.factors.loop(data.ellipses.omega_rad_s)
 
     def _basis(self, data: PlantData) -> Complex:

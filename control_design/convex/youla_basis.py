@@ -76,12 +76,6 @@ class Factors:
         return AffineLoop(n / m, m * x, m * m, m * y, -m * n)
 
 
-def stable_loop(response: Complex) -> AffineLoop:
-    """The same for a stable plant with response (F,): M = Y = 1, X = 0, hence K S = Q and S = 1 - G Q."""
-    one, zero = np.ones_like(response), np.zeros_like(response)
-    return AffineLoop(response, zero, one, one, -response)
-
-
 def coprime_factors(plant: control.StateSpace) -> Factors:
     """Factors of a discrete SISO plant by state feedback F and observer gain L, both linear-quadratic.
 

@@ -72,7 +72,6 @@ class FirstOrderUncertainty(Protocol):
 
     def first_order(self, intervals: FrequencyIntervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
         """(centre (F,), generators (F, Q)), both times (z - 1)^cleared."""
-        ...
 
 
 def expandable(channel: PlantChannel, integrators: int, between_own_points: str) -> Expand | None:

@@ -9,7 +9,8 @@ import numpy as np
 from control_design.plants.frequency_grid import lowest_rad_s
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification, SpecificationError
-from control_design.synthesis.synthesis import Progress, synthesise
+from control_design.synthesis.order_search import Progress
+from control_design.synthesis.synthesis import synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import SynthesisResult
 

@@ -18,7 +18,8 @@ from control_design.analysis.joint_coverage import unstable_draws
 from control_design.plants.guards import Guard
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
-from control_design.synthesis.synthesis import Progress, part_of, synthesise
+from control_design.synthesis.order_search import Progress
+from control_design.synthesis.synthesis import part_of, synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
 from ident.data.shown import Shown

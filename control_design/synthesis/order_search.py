@@ -19,7 +19,7 @@ from control_design.synthesis.starts import StartMaker, with_gain
 from control_design.synthesis.synthesis_result import LARGEST_GAMMA, StartReport
 from control_design.synthesis.youla_starts import FreeControllers, fitted
 
-Told = Callable[[float, str], None]
+Progress = Callable[[float, str], None]
 
 _STEPS = 100  # of the descent
 _DRAWS = 200  # shaped loops drawn; each costs 1 ms
@@ -73,7 +73,7 @@ class OrderSearch:
         problem: Problem,
         cascade: Cascade,
         rng: np.random.Generator,
-        tell: Told,
+        tell: Progress,
         given: Sequence[Real] = (),
     ) -> None:
         self.problem, self.cascade, self.rng, self.tell, self.given = problem, cascade, rng, tell, given

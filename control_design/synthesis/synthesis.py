@@ -3,7 +3,7 @@ the asked one first; and why a controller is no design at all."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,14 +16,12 @@ from control_design.plants.frequency_grid import local_maxima
 from control_design.plants.guards import Guard
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification, SpecificationError
-from control_design.synthesis.order_search import OrderResult, OrderSearch, TriedController
+from control_design.synthesis.order_search import OrderResult, OrderSearch, Progress, TriedController
 from control_design.synthesis.problem import Problem
 from control_design.synthesis.starts import with_cancelling_section
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
 from control_design.synthesis.youla_starts import FreeController, FreeControllers, free_controllers
-
-Progress = Callable[[float, str], None]
 
 _STILL_BLOCKING = 0.98  # a weighted maximum within 2 % of the worst one blocks the specification too
 _MEANINGLESS = 1e4  # a weighted worst case above it is a loop on the edge of stability, whatever its digits

@@ -29,7 +29,7 @@ from ident.data.record import Record, in_groups
 # A period repeats the input to this share of its power (40 dB: an input as commanded, or well measured).
 _REPEATS = 1e-4
 # Power of a line over the strongest: excited above the first, without excitation below the second.
-_EXCITED, _SILENT = 1e-2, 1e-4
+EXCITED, _SILENT = 1e-2, 1e-4
 # Records whose input differs by less in rms are of one amplitude, in itself of one realisation.
 SAME = 0.02
 # Noise is averaged over this many harmonics to each side, fewer next to zero.
@@ -247,7 +247,7 @@ class _Steady:
             period,
             spectrum,
             np.fft.rfft(y - line, axis=1)[:, 1:],
-            power > _EXCITED,
+            power > EXCITED,
             power < _SILENT,
             advance,
         )

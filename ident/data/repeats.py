@@ -16,12 +16,10 @@ import numpy as np
 from scipy.stats import f
 
 from ident.data.arrays import ComplexArray, RealArray
-from ident.data.distortion import SAME
+from ident.data.distortion import EXCITED, SAME
 from ident.data.nonparametric import spectra_of
 from ident.data.record import Record, in_groups
 
-# Power of the excitation over its strongest, where the response is looked at.
-_EXCITED = 1e-2
 # Lines averaged for one estimate: five.
 _HALF_WIDTH = 2
 # Chance makes an amplitude effect anywhere in one linear experiment of a hundred.
@@ -171,7 +169,7 @@ def _experiment(form: Sequence[tuple[Record, RealArray]]) -> Repeats | None:
         return None
     spectra = spectra_of([record for same in repeated for _, record in same], periodic=False)
     power = np.mean(np.abs(spectra.instrument) ** 2, axis=0)
-    excited = np.flatnonzero(power > _EXCITED * power.max())
+    excited = np.flatnonzero(power > EXCITED * power.max())
     width = 2 * _HALF_WIDTH + 1
     count = excited.size // width
     if count < 3:

@@ -246,24 +246,16 @@ def block_states(data: Regression, poles: Poles, signal: RealArray) -> RealArray
     return np.concatenate(parts) if parts else np.zeros((0, signal.size))
 
 
-def fitted_output(data: Regression, projection: Projection) -> RealArray:
-    """The part of the output that the poles make, (N,)."""
-    # A polynomial part stays in the span of free responses; without them it has to be left out.
-    if data.structure.estimate_initial_state:
-        return np.asarray(data.y - projection.residual)
-    return np.asarray(projection.coefficients(data.y) @ projection.shared)
-
-
-def pole_sensitivities(data: Regression, poles: Poles, projection: Projection) -> RealArray:
-    """States (B, N) of each block driven by the fitted output, projected off the regression."""
-    states = block_states(data, poles, fitted_output(data, projection))
-    data.take_out_local(projection.local_q, states)
-    states -= (states @ projection.shared_q.T) @ projection.shared_q
-    return states
-
-
 def linearisation(data: Regression, poles: Poles) -> Linearisation:
     """`Regression.linearise` by orthogonal factorisation."""
     projection = project(data, poles)
-    states, residual = pole_sensitivities(data, poles, projection), projection.residual
+    # What the poles make of the output. A polynomial part stays in the span of free responses; without them
+    # it has to be left out.
+    fitted = np.asarray(data.y - projection.residual)
+    if not data.structure.estimate_initial_state:
+        fitted = np.asarray(projection.coefficients(data.y) @ projection.shared)
+    # The states of each block that it drives, projected off the regression.
+    states, residual = block_states(data, poles, fitted), projection.residual
+    data.take_out_local(projection.local_q, states)
+    states -= (states @ projection.shared_q.T) @ projection.shared_q
     return Linearisation(float(residual @ residual), states @ states.T, states @ residual)

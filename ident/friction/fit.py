@@ -13,7 +13,7 @@ Neglected: a level that depends on position or load; records start at rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -35,10 +35,10 @@ from ident.friction.gauss_newton import (
 from ident.friction.in_loop import fit_friction_in_loop, recorded_in_loop
 from ident.friction.inverse_dynamics import presliding_of, with_measured_direction
 from ident.one_input import untested_model
+from ident.search.order_selection import Progress
 
 _MOST_SEARCHES = 8  # for the poles, anew with each better level; two or three are usual
 
-Report = Callable[[float, str], None]
 # Different positions: with 21 the level was within its standard deviation (7 %), with 11 a third too low.
 _FEWEST_VALUES = 15
 # A position that is noise to this share has not moved.
@@ -55,7 +55,7 @@ def fit_friction(
     *,
     presliding: float = PRESLIDING,
     free: bool = False,
-    progress: Report | None = None,
+    progress: Progress | None = None,
 ) -> FrictionFit:
     """Law of the friction and the arm behind it.
 
@@ -94,7 +94,7 @@ def fit_friction(
 
 
 def _running_free(
-    records: Sequence[Record], options: IdentOptions, presliding: float, report: Report
+    records: Sequence[Record], options: IdentOptions, presliding: float, report: Progress
 ) -> FrictionFit:
     """The fit whose simulation starts at rest with every record and sees nothing of it but the input."""
     report(0.0, "friction: start")

@@ -63,13 +63,13 @@ from ident.friction.observer import NEARBY, ObserverFilter, observed, prediction
 from ident.friction.spring import Spring
 from ident.identification import Identification
 from ident.one_input import identify, untested_model
+from ident.search.order_selection import Progress
 from ident.search.pole_search import PoleSearch
 from ident.uncertainty.autoregression import fit_autoregression
 from ident.uncertainty.embedding_algebra import by_class, sandwiched
 from ident.uncertainty.pole_intervals import laurent_rows
 from ident.unstable import find_unstable
 
-Report = Callable[[float, str], None]
 _ROUNDS, _FEW_ROUNDS, _LONGEST_DELAY = 6, 2, 20
 # A level that moves by less than the first share stays; by more than the second, or with errors that fall to
 # the third, the order is chosen anew.
@@ -200,7 +200,7 @@ class _Logs:
 
 
 def fit_friction_in_loop(
-    records: Sequence[Record], options: IdentOptions, *, progress: Report | None = None
+    records: Sequence[Record], options: IdentOptions, *, progress: Progress | None = None
 ) -> FrictionFit:
     """Law of the friction and the arm behind it from logs of a loop.
 
@@ -238,7 +238,7 @@ def fit_friction_in_loop(
     return replace(found, covariance_factor=sandwiched(wider, scores))
 
 
-def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: Report) -> FrictionFit:
+def _completed(logs: _Logs, options: IdentOptions, found: FrictionFit, report: Progress) -> FrictionFit:
     """From the fit with the fewest poles: dead time and lag of the drive, the law of the friction, as many
     poles as the data ask for. Raises LostError."""
     left_open = options.delay_left_to_data
@@ -543,7 +543,7 @@ def identify_behind(
     found: FrictionFit,
     records: Sequence[Record],
     options: IdentOptions | None = None,
-    progress: Report | None = None,
+    progress: Progress | None = None,
 ) -> Identification:
     """The arm behind the friction of logs of a loop: poles of the number that the fit of the friction has, on
     records with the friction taken off, whitened by its observer. Residuals and fit are over windows

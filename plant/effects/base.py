@@ -95,7 +95,7 @@ class Effect(BaseModel):
         part, name, joined = self.acts or ("rig", str(self.multiplies), mul)
         there, size = getattr(machine, part), next(iter(self.parameters().values()))
         if part == "rig":
-            return with_parameters(machine, {name: joined(machine.rig.value(name), size)})
+            return replace(machine, rig=machine.rig.perturbed({name: joined(machine.rig.value(name), size)}))
         return replace(machine, **{part: replace(there, **{name: joined(getattr(there, name), size)})})
 
     @classmethod
@@ -220,10 +220,6 @@ def with_joint(machine: Machine, **changes: Any) -> Machine:
 
 def with_torque(machine: Machine, torque: SmoothTorque) -> Machine:
     return with_joint(machine, torques=(*machine.joint.torques, torque))
-
-
-def with_parameters(machine: Machine, values: Mapping[str, float]) -> Machine:
-    return replace(machine, rig=machine.rig.perturbed(values))
 
 
 def alone(there: object, own: float) -> float:

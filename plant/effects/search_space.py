@@ -12,11 +12,10 @@ from functools import cached_property
 from typing import Any, Literal, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from plant.machine import Real
 from plant.rig import Rig
 
-Real = npt.NDArray[np.float64]
 Scale = Literal["log", "linear", "angle"]
 Dependence = Literal["smooth", "continuous", "non-smooth"]
 Harmonic = Literal["hub_angle", "time"]

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ident.data.foreign_files import Unread, content_of, npz_arrays, shown
 from workflow.engine import codec, documents
@@ -26,8 +25,6 @@ from workflow.engine.errors import InputError, cannot, naming
 
 TEMPORARY_SUFFIX = ".part"
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # earliest date a zip entry can carry; a constant makes the bytes reproducible
-
-AnyArray = npt.NDArray[Any]
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -143,7 +140,7 @@ def write_new_directory(out: Path, texts: Mapping[str, str]) -> list[Path]:
     return list(files)
 
 
-def csv_text(columns: Mapping[str, AnyArray]) -> str:
+def csv_text(columns: Mapping[str, codec.AnyArray]) -> str:
     """Signals (T,) as CSV with one header line; nine digits, far below any sensor's noise."""
     stream, table = io.StringIO(), np.column_stack(list(columns.values()))
     np.savetxt(stream, table, "%.9g", ",", header=",".join(columns), comments="")
@@ -167,7 +164,7 @@ def read_json(path: Path) -> dict[str, Any]:
         return codec.unpack(dict, documents.read_json(path), {})
 
 
-def npz_bytes(arrays: Mapping[str, AnyArray]) -> bytes:
+def npz_bytes(arrays: Mapping[str, codec.AnyArray]) -> bytes:
     """npz file content; equal arrays give equal bytes. Raises TypeError for object arrays."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
@@ -184,7 +181,7 @@ def npz_bytes(arrays: Mapping[str, AnyArray]) -> bytes:
     return buffer.getvalue()
 
 
-def read_npz(path: Path) -> dict[str, AnyArray]:
+def read_npz(path: Path) -> dict[str, codec.AnyArray]:
     """All arrays of an npz file, read without pickle.
 
     Raises InputError naming the file.

@@ -12,6 +12,7 @@ from control_design.analysis.closed_loop import ClosedLoopTrajectory, simulate, 
 from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
+from ident.data.arrays import RealArray
 from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import SimulatedSource
 from workflow.engine.errors import naming
@@ -19,7 +20,7 @@ from workflow.tasks.design import model_answer
 from workflow.tasks.friction_loop import check_friction
 from workflow.tasks.loop_conditions import ConditionBench
 from workflow.tasks.loop_sensitivity import rms_of, sensitivity_on_arm, settling_samples
-from workflow.tasks.results import ClosedLoopResult, LoopCheck, LoopMetrics, LoopRuns, Real
+from workflow.tasks.results import ClosedLoopResult, LoopCheck, LoopMetrics, LoopRuns
 from workflow.tasks.sampled_plant import simulate_draw
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, converter_steps, loop_of_arm, rig_of
 from workflow.tasks.stage import StageInput
@@ -37,10 +38,10 @@ class Trial:
     each. given: what the loop is given for the reference, which a filter makes of it. resolution: one count
     of the sensor."""
 
-    time_s: Real
-    reference: Real
-    given: Real
-    disturbance: Real
+    time_s: RealArray
+    reference: RealArray
+    given: RealArray
+    disturbance: RealArray
     step: float
     half: int
     tracking: bool
@@ -178,8 +179,8 @@ def run_on_arm(stage: StageInput, controller: Controller, trial: Trial) -> LoopR
 
 def run_on_draws(
     controller: Controller,
-    drawn: tuple[ResponsePosterior, Real],
-    shown: tuple[ResponsePosterior, Real] | None,
+    drawn: tuple[ResponsePosterior, RealArray],
+    shown: tuple[ResponsePosterior, RealArray] | None,
     trial: Trial,
     **steps: float,
 ) -> LoopRuns:
@@ -195,7 +196,7 @@ def run_on_draws(
     return _loop_runs(runs, [tip.simulate(run.command + trial.disturbance, own) for run, own in pairs])
 
 
-def _loop_runs(runs: Sequence[ClosedLoopTrajectory], performance: Sequence[Real] | None) -> LoopRuns:
+def _loop_runs(runs: Sequence[ClosedLoopTrajectory], performance: Sequence[RealArray] | None) -> LoopRuns:
     return LoopRuns(
         np.stack([run.measured for run in runs]),
         np.stack([run.command for run in runs]),
@@ -232,6 +233,6 @@ def describe(runs: LoopRuns, trial: Trial) -> tuple[LoopMetrics, ...]:
     return tuple(rows)
 
 
-def _tail(signal: Real) -> Real:
+def _tail(signal: RealArray) -> RealArray:
     """The last tenth."""
     return signal[-max(1, signal.size // 10) :]

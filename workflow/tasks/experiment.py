@@ -8,9 +8,9 @@ from functools import cached_property
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BeforeValidator, Field
 
+from ident.data.arrays import RealArray
 from plant.excitation import crest_factor
 from plant.experiment_plan import ExperimentPlan
 from plant.modal import linear_arm
@@ -18,8 +18,6 @@ from plant.rig import Rig
 from workflow.config.rig_settings import rig_called
 from workflow.config.settings import Section
 from workflow.engine.errors import InputError
-
-Real = npt.NDArray[np.float64]
 
 
 class ExperimentLimits(Section):
@@ -85,7 +83,7 @@ class PlannedExperiment:
     limits: ExperimentLimits
     plan: ExperimentPlan
     seed: int
-    voltages_V: Real
+    voltages_V: RealArray
 
     @cached_property
     def records(self) -> tuple[PlannedRecord, ...]:
@@ -103,19 +101,19 @@ class PlannedExperiment:
         return self.plan.duration_s(self.limits.dt_s)
 
     @cached_property
-    def lines_Hz(self) -> Real:
+    def lines_Hz(self) -> RealArray:
         """Excited lines (H,)."""
         return self.plan.lines(self.limits.dt_s) / (self.plan.period_samples * self.limits.dt_s)
 
     @cached_property
-    def detection_Hz(self) -> Real:
+    def detection_Hz(self) -> RealArray:
         """Odd lines between the excited ones that were left out (K,)."""
         lines = self.plan.lines(self.limits.dt_s)
         missing = np.setdiff1d(np.arange(lines[0], lines[-1] + 1, 2), lines)
         return np.asarray(missing / (self.plan.period_samples * self.limits.dt_s))
 
     @cached_property
-    def gain(self) -> Real | None:
+    def gain(self) -> RealArray | None:
         """|hub angle / voltage| (H,) in rad/V, None without a rig or a gain."""
         omega = 2 * np.pi * self.lines_Hz
         if self.limits.rig is not None:
@@ -136,7 +134,7 @@ class PlannedExperiment:
         return tuple(self.plan.radius(rms, self.limits.dt_s, noise_rad) for rms in self.plan.rms_V)
 
 
-def motion_of(limits: ExperimentLimits) -> Callable[[Real], Real] | None:
+def motion_of(limits: ExperimentLimits) -> Callable[[RealArray], RealArray] | None:
     """Hub angle (T,) [rad] from rest under a voltage (T,): that of the linear rig, or of an integrator."""
     rig, gain = limits.rig, limits.gain_rad_per_Vs
     if rig is not None:

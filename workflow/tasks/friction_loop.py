@@ -25,7 +25,7 @@ from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller, FrictionFeedforward
 from control_design.specification import Specification
 from ident.closed_loop import controller_of
-from ident.data.arrays import kernel_array
+from ident.data.arrays import RealArray, kernel_array
 from ident.friction import FrictionFit, FrictionLaw
 from ident.friction.kernel import loop_through
 from workflow.tasks.loop_sensitivity import (
@@ -40,7 +40,6 @@ from workflow.tasks.results import (
     DesignResult,
     FrictionCheck,
     Interval,
-    Real,
     SensitivityCheck,
     SlowSine,
 )
@@ -71,7 +70,7 @@ class FrictionLoop:
 
     controller: Controller
     found: FrictionFit
-    coefficients: Real
+    coefficients: RealArray
     friction: FrictionLaw
     beyond: float = 0.0
     measurement_step: float = 0.0
@@ -82,7 +81,7 @@ class FrictionLoop:
         """On the arm as it was fitted."""
         return cls(controller, found, found.coefficients, found.law, found.beyond, **steps)
 
-    def run(self, reference: Real, noise: np.random.Generator | None = None) -> ClosedLoopTrajectory:
+    def run(self, reference: RealArray, noise: np.random.Generator | None = None) -> ClosedLoopTrajectory:
         """From rest, reference (T,); noise: white, of the size of the fit's residual (sensor and encoder)."""
         law, arm = self.controller, self.found.arm
         n, spring = reference.size, self.found.spring
@@ -116,7 +115,7 @@ class FrictionLoop:
         time_s = np.asarray(np.arange(n) * law.dt_s, dtype=np.float64)
         return ClosedLoopTrajectory(time_s, reference, measured[:, None], command, limited, law.dt_s)
 
-    def answer(self, step: Real, given: Real | None = None) -> ClosedLoopTrajectory:
+    def answer(self, step: RealArray, given: RealArray | None = None) -> ClosedLoopTrajectory:
         """To a step (T,), held as long as friction may make it wait; given (T,): as a filter has it."""
         held = min(_WATCHED * step.size, max(_MOST_WATCHED, step.size)) - step.size
         run = self.run(np.pad(step if given is None else given, (0, held), mode="edge"))
@@ -218,8 +217,8 @@ def interval_of(values: Sequence[float], level: float = 0.95) -> Interval:
 def check_friction(
     stage: StageInput,
     controller: Controller,
-    reference: Real,
-    given: Real,
+    reference: RealArray,
+    given: RealArray,
     sensitivity: SensitivityCheck | None,
 ) -> FrictionCheck:
     """What friction does to the loop of this controller (without feed-forward), predicted and, where
@@ -283,7 +282,7 @@ def check_friction(
     )
 
 
-def beside_recorded(stage: StageInput, loop: FrictionLoop, step: Real) -> dict[str, Any]:
+def beside_recorded(stage: StageInput, loop: FrictionLoop, step: RealArray) -> dict[str, Any]:
     """The loop that made the logs on the same step (T,), and both on the reference of the first log: fields
     of `FrictionCheck`."""
     own, first = recorded_loop(stage, loop), stage.results.records.fitted(stage.config.control_channel)[0]
@@ -347,7 +346,7 @@ def _around(value: float, found: FrictionFit) -> Interval:
     return value * max(1 - share, 0.0), value * (1 + share)
 
 
-def holds_from(sizes: Sequence[float] | Real, excess: Real) -> float | None:
+def holds_from(sizes: Sequence[float] | RealArray, excess: RealArray) -> float | None:
     """The size from which on, up to the first (largest), the excess (N,) is not positive; between sizes
     straight over their logarithm."""
     over = np.flatnonzero(~(excess <= 0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -27,6 +27,7 @@ from ident.friction import (
 )
 from ident.one_input import identify
 from ident.response_uncertainty import NOISE_ORDERS
+from ident.search.order_selection import Progress
 from ident.stabilisation import stabilisation
 from ident.uncertainty.embedding import tangent
 from workflow.config.run_config import Channel, ClosedLoopData, FileSource, Role
@@ -35,7 +36,6 @@ from workflow.tasks.results import IdentifiedChannel, IdentifyResult
 from workflow.tasks.stage import StageInput
 from workflow.text.templates import said
 
-Report = Callable[[float, str], None]
 _OF_THE_FIT = 0.6  # share of the time; the stabilisation plot takes the rest
 # Samples of a record that tell whether its command follows its output.
 _TELLING = 50_000
@@ -127,7 +127,7 @@ def made_in_loop(measured: Sequence[Record]) -> bool:
 def shaft_friction(
     measured: Sequence[Record],
     channel: Channel,
-    report: Report,
+    report: Progress,
     *,
     free: bool = False,
 ) -> FrictionFit:
@@ -143,7 +143,7 @@ def identify_channel(
     measured: Sequence[Record],
     unseen: Sequence[tuple[Record, Role]],
     loop: ClosedLoopData | None,
-    report: Report,
+    report: Progress,
     *,
     friction: FrictionFit | None = None,
     with_plot: bool = True,
@@ -181,7 +181,9 @@ def identify_channel(
             friction=friction,
         )
         if friction is not None:
-            found = clipped_as_measured(found, measured)
+            # What stands at its limit is seen in what was measured, not where the friction is taken off.
+            others = [w for w in found.identification.search.warnings if w.kind is not FindingKind.CLIPPED]
+            found = with_warnings(found, [*others, *clipped(measured)])
         warnings = [*doubts, *amplitude_effects(measured), *found.identification.warnings]
         model = found.model
         if (band := channel.data_band_rad_s) is not None:
@@ -266,19 +268,12 @@ def with_warnings(found: IdentifiedChannel, warnings: Sequence[Finding]) -> Iden
     return replace(found, identification=replace(found.identification, search=search))
 
 
-def clipped_as_measured(found: IdentifiedChannel, measured: Sequence[Record]) -> IdentifiedChannel:
-    """What stands at its limit is seen in what was measured, not in what taking the friction off has left."""
-    warnings = found.identification.search.warnings
-    others = [warning for warning in warnings if warning.kind is not FindingKind.CLIPPED]
-    return with_warnings(found, [*others, *clipped(measured)])
-
-
 def identified_channel(
     name: str,
     used: Sequence[Record],
     fresh: Sequence[tuple[Record, Role]],
     options: IdentOptions,
-    report: Report,
+    report: Progress,
     *,
     with_plot: bool = True,
     friction: FrictionFit | None = None,

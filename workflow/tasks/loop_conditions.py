@@ -16,13 +16,14 @@ import numpy as np
 from control_design.analysis.closed_loop import ClosedLoopTrajectory, simulate
 from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
+from ident.data.arrays import RealArray
 from ident.uncertainty import ResponsePosterior
 from plant.effects import EFFECTS, parse_effects
 from plant.machine import Machine
 from plant.rig import Rig
 from plant.simulation import simulate as simulate_arm
 from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
-from workflow.tasks.results import ConditionRun, Real
+from workflow.tasks.results import ConditionRun
 from workflow.tasks.sampled_plant import FINITE, simulate_draw
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, UNITS, encoded_arm
 from workflow.text.templates import said
@@ -36,7 +37,7 @@ _SETTLED = 0.1  # of the move: a run whose last tenth swings by less has settled
 def condition_run(
     name: str,
     words: str,
-    reference: Real,
+    reference: RealArray,
     predicted: ClosedLoopTrajectory,
     achieved: ClosedLoopTrajectory,
     size: float,
@@ -80,7 +81,7 @@ class ConditionBench:
     source: SimulatedSource
     options: ClosedLoopOptions
     rig: Rig
-    reference: Real
+    reference: RealArray
     measured: int
     rng: np.random.Generator
     reference_filter: ReferenceFilter | None = None
@@ -97,10 +98,10 @@ class ConditionBench:
 
     def predict(
         self,
-        reference: Real,
+        reference: RealArray,
         *,
         law: Controller | None = None,
-        output_disturbance: Real | None = None,
+        output_disturbance: RealArray | None = None,
         clip: float = np.inf,
     ) -> ClosedLoopTrajectory:
         """The loop on the posterior mean, which has no friction for a feed-forward to meet."""
@@ -113,7 +114,7 @@ class ConditionBench:
             clip=clip,
         )
 
-    def _filtered(self, reference: Real) -> Real:
+    def _filtered(self, reference: RealArray) -> RealArray:
         """What the loop is given for a reference."""
         return reference if self.reference_filter is None else self.reference_filter.filtered(reference)
 
@@ -228,15 +229,15 @@ class ConditionBench:
         self,
         name: str,
         words: str,
-        reference: Real | None = None,
+        reference: RealArray | None = None,
         *,
         law: Controller | None = None,
         clip: float = np.inf,
-        output_disturbance: Real | None = None,
+        output_disturbance: RealArray | None = None,
         effects: Mapping[str, Mapping[str, Any]] | None = None,
         rig: Rig | None = None,
         steps: tuple[float, float] | None = None,
-        tip_force_N: Real | None = None,
+        tip_force_N: RealArray | None = None,
     ) -> ConditionRun:
         """The reference (the step, unless another is given) predicted, and achieved on the arm with effects
         exchanged by name; steps: of measurement and command."""

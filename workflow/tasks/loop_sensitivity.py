@@ -11,7 +11,8 @@ import numpy as np
 from control_design.analysis.closed_loop import MeasuredSensitivity, measure_sensitivity
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
-from workflow.tasks.results import MeasuredPeak, Real, SensitivityCheck
+from ident.data.arrays import RealArray
+from workflow.tasks.results import MeasuredPeak, SensitivityCheck
 from workflow.tasks.simulated_rig import loop_of_arm
 from workflow.tasks.stage import StageInput
 
@@ -24,7 +25,7 @@ _LINES_BELOW_PEAK = 20  # the peak is read to 5 % of its frequency
 _SHORTEST, _LONGEST = 500, 4000
 
 
-def rms_of(signals: Sequence[Real]) -> float:
+def rms_of(signals: Sequence[RealArray]) -> float:
     """Root mean square of signals (T,), each about its mean, over all of them."""
     return float(np.sqrt(np.mean([np.var(signal) for signal in signals])))
 

@@ -11,7 +11,6 @@ from functools import cached_property
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from control_design.analysis.certificate import Certificate
 from control_design.analysis.closed_loop import StepMetrics
@@ -24,21 +23,21 @@ from control_design.specification import Specification
 from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
 from ident.basis.model import GobfModel
 from ident.checks.plausible_modes import PairKind, kind_of_pair
-from ident.checks.residual_tests import ResidualTest, conditions_of
+from ident.checks.residual_tests import conditions_of
 from ident.checks.validation import FreshFit, ScatterRow
+from ident.data.arrays import BoolArray, RealArray
 from ident.data.ellipses import chi2_radius
 from ident.data.finding import Finding, distinct
 from ident.data.record import Record
 from ident.friction import EquivalentFriction, FrictionFit
 from ident.identification import Identification
+from ident.response_uncertainty import Tests
 from ident.stabilisation import Stabilisation
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.nominal import NominalAgreement
 from workflow.config.run_config import Channel, Role, RunConfig
 from workflow.engine.run_directory import RunDirectory
 
-Real = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 Interval = tuple[float, float]
 T = TypeVar("T")
 
@@ -194,9 +193,6 @@ class IdentifyResult:
 
 
 # Ellipses
-
-
-Tests = tuple[ResidualTest, ResidualTest]
 
 
 @dataclass(frozen=True)
@@ -398,10 +394,10 @@ class ReferenceFilterResult:
 class LoopRuns:
     """Closed-loop runs (R, T); limited: where a limit was active; performance: None without a channel."""
 
-    output: Real
-    command: Real
-    performance: Real | None
-    limited: Bool
+    output: RealArray
+    command: RealArray
+    performance: RealArray | None
+    limited: BoolArray
 
 
 @dataclass(frozen=True)
@@ -429,9 +425,9 @@ class MeasuredPeak:
     off_certified_percent: float | None
     peak_command: float
     limited_fraction: float
-    omega_rad_s: Real
-    magnitude: Real
-    std: Real
+    omega_rad_s: RealArray
+    magnitude: RealArray
+    std: RealArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -457,8 +453,8 @@ class SlowSine:
     amplitude: float
     omega_rad_s: float
     linear_rms: float
-    without: Real
-    given: Real
+    without: RealArray
+    given: RealArray
     moves_from: float = field(default=0.0, metadata={"since": 8})
 
     @property
@@ -491,10 +487,10 @@ class FrictionCheck:
     level: float
     level_interval: Interval
     presliding: float
-    sizes: Real
-    low: Real
-    high: Real
-    measured: Real | None
+    sizes: RealArray
+    low: RealArray
+    high: RealArray
+    measured: RealArray | None
     nominal_peak: float
     certified_peak: float
     tolerance_percent: float
@@ -507,10 +503,10 @@ class FrictionCheck:
     step: StepMetrics
     watched_s: float
     left: float
-    output: Real
+    output: RealArray
     tracking: SlowSine
     recorded: StepMetrics | None = field(default=None, metadata={"since": 9})
-    recorded_output: Real | None = field(default=None, metadata={"since": 9})
+    recorded_output: RealArray | None = field(default=None, metadata={"since": 9})
     errors: tuple[float, ...] = field(default=(), metadata={"since": 9})
 
     @property
@@ -541,11 +537,11 @@ class ConditionRun:
     peak_command: float
     limited_fraction: float
     settled: bool
-    reference: Real
-    predicted: Real
-    achieved: Real
-    predicted_command: Real
-    achieved_command: Real
+    reference: RealArray
+    predicted: RealArray
+    achieved: RealArray
+    predicted_command: RealArray
+    achieved_command: RealArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -566,10 +562,10 @@ class LoopCheck:
     filtered: bool
     predicted: LoopMetrics
     achieved: tuple[LoopMetrics, ...]
-    time_s: Real
-    reference: Real
-    disturbance: Real
-    model_answer: Real | None
+    time_s: RealArray
+    reference: RealArray
+    disturbance: RealArray
+    model_answer: RealArray | None
     predicted_runs: LoopRuns
     achieved_runs: LoopRuns
     sensitivity: SensitivityCheck | None = None
@@ -577,7 +573,7 @@ class LoopCheck:
     friction: FrictionCheck | None = None
 
     @property
-    def with_friction(self) -> tuple[Real, ...]:
+    def with_friction(self) -> tuple[RealArray, ...]:
         """Outputs of the reference step with the identified friction, where the runs are of linear plants: of
         the loop, and of the recorded one where the logs tell it."""
         known = () if self.machine == "simulated" or self.friction is None else (self.friction,)

@@ -8,22 +8,20 @@ from operator import add
 
 import control
 import numpy as np
-import numpy.typing as npt
 
 from control_design.analysis.closed_loop import ClosedLoopTrajectory, LinearMachine, simulate
 from control_design.controllers.controller import Controller
 from ident.basis.functions import inverse_all_pass
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
+from ident.data.arrays import RealArray
 from ident.uncertainty import ResponsePosterior
-
-Real = npt.NDArray[np.float64]
 
 FINITE = 1e9
 """Input at which a machine is clipped only so that a loop that runs away stays made of numbers."""
 
 
-def realise(posterior: ResponsePosterior, coefficients: Real) -> control.StateSpace:
+def realise(posterior: ResponsePosterior, coefficients: RealArray) -> control.StateSpace:
     """One draw of coefficients (P,): poles and kernel in parallel.
 
     A kernel of L taps is the basis of L poles at zero; both parts carry their own integrators and delay.
@@ -42,7 +40,7 @@ def realise(posterior: ResponsePosterior, coefficients: Real) -> control.StateSp
 
 
 def _part(
-    posterior: ResponsePosterior, poles: Poles, coefficients: Real, feedthrough: float
+    posterior: ResponsePosterior, poles: Poles, coefficients: RealArray, feedthrough: float
 ) -> control.StateSpace:
     return GobfModel(
         poles,
@@ -57,11 +55,11 @@ def _part(
 def simulate_draw(
     controller: Controller,
     posterior: ResponsePosterior,
-    coefficients: Real,
-    reference: Real,
+    coefficients: RealArray,
+    reference: RealArray,
     *,
-    input_disturbance: Real | None = None,
-    output_disturbance: Real | None = None,
+    input_disturbance: RealArray | None = None,
+    output_disturbance: RealArray | None = None,
     measurement_step: float = 0.0,
     command_step: float = 0.0,
     clip: float = np.inf,

@@ -16,7 +16,7 @@ from ident.basis.poles import Poles
 from ident.checks.answer import refuse_unanswered
 from ident.checks.residual_tests import residual_advice, residual_tests, whiteness_test
 from ident.checks.validation import ScatterRow, repeat_scatter
-from ident.data.arrays import ComplexArray
+from ident.data.arrays import ComplexArray, RealArray
 from ident.data.distortion import distortion_of
 from ident.data.finding import FindingKind, finding
 from ident.data.nonparametric import empirical_frf
@@ -31,7 +31,7 @@ from ident.friction import (
     other_output_without_friction,
     without_friction,
 )
-from ident.response_uncertainty import with_noise_model
+from ident.response_uncertainty import Tests, with_noise_model
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.conditions import combine_posteriors, record_posteriors, repeat_posteriors
 from ident.uncertainty.embedding import tangent
@@ -46,9 +46,7 @@ from workflow.tasks.results import (
     IdentifiedChannel,
     Intervals,
     ModeInterval,
-    Real,
     RunRecord,
-    Tests,
     UncertainChannel,
     UncertaintyResult,
 )
@@ -194,7 +192,7 @@ def uncertain_channel(
     level: float,
     posterior: ResponsePosterior,
     result: IdentifiedChannel,
-    omega: Real,
+    omega: RealArray,
     *,
     tests: Tests,
     poles: Poles | None = None,
@@ -266,7 +264,7 @@ def posterior_of(
     return combine_posteriors(each, small_sample_level=options.level)
 
 
-def nominal_grid(omega: Real, band: tuple[float, float] | None) -> Real:
+def nominal_grid(omega: RealArray, band: tuple[float, float] | None) -> RealArray:
     """Where the nominal model has to be right: the band of the data, everywhere without one."""
     if band is None:
         return omega
@@ -274,7 +272,9 @@ def nominal_grid(omega: Real, band: tuple[float, float] | None) -> Real:
     return inside if inside.size >= _FEWEST_FREQUENCIES else np.geomspace(*band, _FEWEST_FREQUENCIES)
 
 
-def nominal_of(posterior: ResponsePosterior, poles: Poles, omega: Real, untold: ComplexArray) -> GobfModel:
+def nominal_of(
+    posterior: ResponsePosterior, poles: Poles, omega: RealArray, untold: ComplexArray
+) -> GobfModel:
     """Nearest model on the identified poles without the pairs (P,) that the records do not tell, with them,
     or on every pole taken twice: the first that stays in its ellipses, else the second.
 
@@ -298,7 +298,7 @@ def _untold(model: GobfModel, intervals: Intervals | None) -> ComplexArray:
     return poles.pairs[[i for i, mode in zip(by_frequency, modes, strict=False) if not mode.told]]
 
 
-def display_grid(model: GobfModel, records: Sequence[Record]) -> Real:
+def display_grid(model: GobfModel, records: Sequence[Record]) -> RealArray:
     """Frequencies (F,) for pictures: from one period per longest record to Nyquist, denser at modes."""
     longest_s = max(record.n_samples for record in records) * model.dt_s
     poles = model.poles
@@ -334,7 +334,7 @@ def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> In
     )
 
 
-def _interval(ends: Real) -> tuple[float, float]:
+def _interval(ends: RealArray) -> tuple[float, float]:
     return float(ends[0]), float(ends[1])
 
 
