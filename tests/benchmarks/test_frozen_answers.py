@@ -155,7 +155,7 @@ def test_questions_are_answered_in_processes_and_one_that_takes_too_long_is_give
     (found,) = frozen_answers.answers(["flexible link A"], 2, change, "")
     assert found[0] == "flexible link A"
     assert found[1][0] == {"lines": {"raises": "no answer after 180 s of CPU"}}
-    names = ["random design 145", "forty logs, npz mat"]
+    names = ["forty logs, txt tsv dat gz", "forty logs, npz mat"]
     found = dict(frozen_answers.answers(names, 1, "", ""))
     assert found.keys() == set(names)
     here = {name: plain(QUESTIONS[name].ask()) for name in names}

@@ -42,7 +42,7 @@ def open_loop(seed: int) -> tuple[np.ndarray, ...]:
 
 
 def in_loop(seed: int, *, coulomb: float) -> tuple[np.ndarray, ...]:
-    return tuple(column[:4000] for column in recorded(seed, rms=0.2, coulomb=coulomb))
+    return tuple(column[:2500] for column in recorded(seed, rms=0.2, coulomb=coulomb))
 
 
 # How a log is made, its reference, what is said of it, and how it is used.
