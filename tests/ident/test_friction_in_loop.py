@@ -50,7 +50,7 @@ def belt() -> tuple[Machine, list[Record], FrictionFit]:
 
 
 @pytest.mark.slow
-def test_level_and_dead_time_of_a_belt_are_found(belt: tuple[Machine, list[Record], FrictionFit]) -> None:
+def test_level_and_dead_time_of_a_belt_are_found(belt) -> None:
     one, _, found = belt
     assert found.observed
     assert found.significant
@@ -61,9 +61,7 @@ def test_level_and_dead_time_of_a_belt_are_found(belt: tuple[Machine, list[Recor
     assert found.beyond == 0
 
 
-def test_ellipses_and_mode_of_a_belt_are_those_without_friction(
-    belt: tuple[Machine, list[Record], FrictionFit],
-) -> None:
+def test_ellipses_and_mode_of_a_belt_are_those_without_friction(belt) -> None:
     one, records, found = belt
     mode, omega = modes_of(one)[0], np.geomspace(1.0, 200.0, 80)
     about = identify_behind(
@@ -79,9 +77,7 @@ def test_ellipses_and_mode_of_a_belt_are_those_without_friction(
     assert np.median(np.abs(ellipses.centre / true - 1)) < 0.005
 
 
-def test_ellipses_hold_a_part_of_the_friction_that_looks_like_damping(
-    belt: tuple[Machine, list[Record], FrictionFit],
-) -> None:
+def test_ellipses_hold_a_part_of_the_friction_that_looks_like_damping(belt) -> None:
     """5 % of the friction, one standard deviation: no residual shows it where it moves with the speed."""
     one, records, found = belt
     omega, dt_s = np.geomspace(2.0, 20.0, 30), one.plant.dt_s
