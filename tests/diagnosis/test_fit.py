@@ -55,6 +55,7 @@ def test_most_starts_end_in_one_minimum_although_it_lies_in_a_flat_valley(ends):
     assert values[0] < 1e-3 * values[-1]
 
 
+@pytest.mark.slow
 def test_the_minimum_leaves_white_noise(ends):
     best = min(ends, key=lambda end: end.cost)
     n = best.left.size

@@ -35,7 +35,7 @@ NO_REFERENCE = ("time_s", "", "u_A", "y_rad")
 def open_loop(seed: int) -> tuple[np.ndarray, ...]:
     """A mode at 40 rad/s and sensor noise that is a random walk, no white one."""
     rng = np.random.default_rng(seed)
-    u = np.repeat(rng.choice([-1.0, 1.0], 600), 5)
+    u = np.repeat(rng.choice([-1.0, 1.0], 400), 5)
     pole = np.exp((-4 + 40j) * DT_S)
     y = lfilter([0.0, 0.01], [1.0, -2 * pole.real, abs(pole) ** 2], u)
     return np.arange(u.size) * DT_S, np.zeros(u.size), u, y + np.cumsum(0.003 * rng.standard_normal(u.size))
