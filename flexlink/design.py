@@ -30,6 +30,7 @@ from control_design.specification import Specification
 from control_design.specification.multivariable import MultivariableSpecification
 from control_design.synthesis import joint_synthesis, multivariable, synthesis
 from control_design.synthesis.multivariable import MultivariableResult
+from control_design.synthesis.order_search import Progress
 from control_design.synthesis.synthesis_options import MultivariableOptions, SynthesisOptions
 from control_design.synthesis.synthesis_result import SynthesisResult
 from flexlink.keywords import WrongArgumentError, options_of, refuse_rate
@@ -184,7 +185,7 @@ def synthesise(
     *,
     rng: np.random.Generator | int = 0,
     guards: Sequence[Guard] = (),
-    progress: synthesis.Progress | None = None,
+    progress: Progress | None = None,
     thorough: bool = True,
     **settings: Any,
 ) -> SynthesisResult:
@@ -221,7 +222,7 @@ def synthesise_jointly(
     draws: int = 10_000,
     rounds: int = 3,
     first: SynthesisResult | None = None,
-    progress: synthesis.Progress | None = None,
+    progress: Progress | None = None,
     **settings: Any,
 ) -> joint_synthesis.JointDesign:
     """As `synthesise`, until the stated share of sampled responses is stable (Monte Carlo, not a bound).
