@@ -11,6 +11,7 @@ import pytest
 from scipy.fft import dct
 from scipy.optimize import minimize
 
+from benchmarks import look_alikes
 from diagnosis import (
     Case,
     EffectParameter,
@@ -969,6 +970,9 @@ def test_how_much_is_felt_of_the_start_says_nothing_about_a_set():
 def test_a_cause_on_no_list_may_act_like_what_explains_all(names):
     """By Bayes' rule from the counted cases and the priors; nothing is lost, and the rest is unknown."""
     seen = tomllib.loads((Path(verdict.__file__).parent / "look_alikes.toml").read_text(encoding="utf-8"))
+    stored = Path(look_alikes.__file__).parent / "results" / "look_alikes.txt"
+    counted = ", ".join(f"{name} {n}" for name, n in seen["stood_in"].items())
+    assert stored.read_text(encoding="utf-8").endswith(f"{seen['cases']} cases; named: {counted}\n")
     listed = (*EFFECTS, *set(names) - set(EFFECTS))
     there = []
     for name in names:
