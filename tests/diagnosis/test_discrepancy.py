@@ -40,6 +40,13 @@ def test_a_quarter_of_the_noise_in_one_octave_is_plain(output):
     assert found.size == pytest.approx(0.25 / np.sqrt(2), rel=0.3)
 
 
+def test_size_of_white_energy_is_its_rms():
+    rng = np.random.default_rng(2)
+    found = discrepancy(3.0 * _noise(rng), SEGMENTS)
+    # Energies of all lines add up to the sum of squares: sqrt(9 - 1), to the scatter of 7202 squares.
+    assert found.size == pytest.approx(np.sqrt(8), rel=4 * np.sqrt(2 / 7202))
+
+
 @pytest.mark.parametrize(("n", "ratio"), [(40.0, 1.0), (40.0, 3.0), (900.0, 1.4), (900.0, 20.0)])
 def test_factor_of_a_band_is_the_integral_over_its_size(n, ratio):
     S = n * ratio
@@ -55,6 +62,13 @@ def test_factor_of_a_band_is_the_integral_over_its_size(n, ratio):
     integral, _ = quad(density, low, high, points=[peak], limit=400)
     # Grid of 1500 points: the ends count whole cells.
     assert _log_factor(n, S) == pytest.approx(top + np.log(integral), abs=0.02)
+
+
+def test_some_and_any_differ_by_the_case_of_nothing():
+    found = discrepancy(_noise(np.random.default_rng(5)), SEGMENTS)
+    nothing = 18 * np.log(1 - 0.15)
+    some = np.log((np.exp(found.log_gain) - np.exp(nothing)) / (1 - np.exp(nothing)))
+    assert found.log_gain_some == pytest.approx(some, abs=1e-9)
 
 
 def test_wrong_length_is_refused():

@@ -9,6 +9,7 @@ import pytest
 
 mujoco = pytest.importorskip("mujoco")
 
+from benchmarks import mujoco_cases as cases  # noqa: E402
 from diagnosis import PlantCase, PlantExperiment, diagnose  # noqa: E402
 from diagnosis.machine.mujoco_plant import MujocoArm  # noqa: E402
 from diagnosis.machine.mujoco_quantities import Quantities  # noqa: E402
@@ -704,3 +705,17 @@ def test_a_joint_on_a_base_that_flies_is_refused_in_one_line(base, refused):
             MujocoArm(spec, ("hip",), DT_S)
     else:
         MujocoArm(spec, ("hip",), DT_S)
+
+
+def test_the_equations_of_the_benchmark_are_those_of_mujoco():
+    """Both truths of the same two-joint arm under the same torques; they share no line."""
+    masses, damping, armature = np.array([1.2, 0.8]), np.array([0.25, 0.12]), np.array([0.03, 0.015])
+    for effect, flat in (("payload", False), ("tilt", True)):
+        truth = cases.Truth(2, masses, damping, armature, effect, 1, 0.2, flat)
+        one, other = cases.InMujoco(truth), cases.ByEquations(truth)
+        for k in range(100):
+            torque = np.array([np.sin(0.1 * k), 0.4 * np.cos(0.13 * k)])
+            one.step(torque)
+            other.step(torque)
+        assert np.ptp(one.angle - cases.at_rest(truth)) > 0.02
+        np.testing.assert_allclose(one.angle, other.angle, rtol=0, atol=5e-3)

@@ -80,6 +80,14 @@ def test_what_the_records_decided_is_said():
     assert next_experiment((first, second), Limits(1.0)).decided
 
 
+def test_identical_hypotheses_are_not_separated():
+    effect = CoulombFriction(torque_Nm=0.01)
+    chosen = next_experiment(_competing(effect, effect), Limits(1.0))
+    assert not chosen.separates
+    assert chosen.separations[0].standard_deviations == 0.0
+    assert len(chosen.considered) == 15
+
+
 def test_what_free_parameters_absorb_does_not_count():
     """Two sizes of one effect are one explanation."""
     sizes = TipPayload(mass_kg=0.010), TipPayload(mass_kg=0.011)
@@ -90,6 +98,13 @@ def test_what_free_parameters_absorb_does_not_count():
     assert held > 10
     # What a tenth more costs sizes known to a factor e, log 1.1 = 0.095, and the curvature of the response.
     assert free < 0.02 * held
+
+
+def test_tolerances_only_take_separation_away():
+    effects = (InputDelay(delay_s=0.006), ActuatorLag(time_constant_s=0.006))
+    voltage = prbs(9, 4, 1.0, 700)
+    d, less = (_distance(_vague(*effects, rig=rig), voltage) for rig in (RIG, TOLERANT))
+    assert 0 < less <= d * (1 + 1e-6)
 
 
 def _gain(voltage, truth, hypothesis, seed):

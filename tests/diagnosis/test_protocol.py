@@ -276,6 +276,13 @@ def test_a_validation_record_that_was_fitted_validates_nothing():
     )
 
 
+def test_doubts_are_in_the_answer():
+    case = PlantCase("c", replace(PLANT, model_error=0.05), DIFFERENT)
+    with pytest.warns(UserWarning, match="offset changes no output"):
+        found = diagnose(case)
+    assert found.doubts == doubts_about(case) != ()
+
+
 def test_an_effect_of_ones_own_stands_for_the_listed_one_of_its_name():
     own = PlantEffect("output_offset", (EffectParameter("y", 0.1, 1.0),), signed=True)
     plant = replace(PLANT, effects=(own,))

@@ -15,7 +15,7 @@ from diagnosis.where.where import subsystem_mass, where
 from diagnosis.where.where_energy import band_gaps, sensor_gaps
 from diagnosis.where.where_trends import amplitude_finding, common_findings
 from plant import EFFECTS, multisine, multisine_lines, simulate
-from plant.effects.joint import HardeningSpring, PeriodicDisturbance
+from plant.effects.joint import CoulombFriction, HardeningSpring, PeriodicDisturbance
 from plant.effects.link import LinkStiffness, TipPayload
 from plant.effects.sensor import Quantisation, SensorGain
 from tests.diagnosis.recorded import recorded_case
@@ -30,6 +30,13 @@ def _gap(shape):
     """A gap made by shape(name, T) -> (T, 2), on top of white noise of one seed."""
     residuals = white(np.random.default_rng(5))
     return _sum(residuals, {name: shape(name, e.shape[0]) for name, e in residuals.items()})
+
+
+def test_noise_alone_is_said_to_be_noise():
+    residuals = white(np.random.default_rng(2))
+    found = where(made(residuals), residuals)
+    assert not found.gap.found
+    assert not found.is_gap
 
 
 def test_a_band_is_found_in_the_sensor_it_was_put_in():
@@ -210,6 +217,15 @@ def test_experiments_with_the_same_input_do_not_count_as_different():
     assert common_findings(Case("same", RIG, tuple(experiments)), residuals, 0.01) == ()
 
 
+def test_linear_and_nonlinear_causes_are_told_apart():
+    heavier = _of_effect(TipPayload(mass_kg=0.02))
+    assert heavier.linear.share > 0.9
+    assert heavier.linear.linear
+    friction = _of_effect(CoulombFriction(torque_Nm=0.01))
+    assert friction.linear.share < 0.6
+    assert friction.amplitude.exponent < 0.5
+
+
 def test_a_periodic_record_shows_the_response_and_the_distortion():
     found = _of_effect(LinkStiffness(ratio=0.9))
     (periodic,) = found.periodic
@@ -237,6 +253,7 @@ def test_even_and_odd_distortion_come_apart_on_an_odd_multisine():
     assert finding.even_odd_separable
     found = {(g.sensor, g.group) for g in finding.groups if g.found}
     assert found == {("tip", "not excited, even")}
+    assert finding.worst_group.group == "not excited, even"
 
 
 def test_subsystem_mass_keeps_the_whole_probability():
@@ -273,6 +290,21 @@ def test_residuals_that_do_not_fit_the_case_are_refused(change, message):
 def _recorded(gap_cases, name):
     case = recorded_case(gap_cases / "labelled" / name)
     return where(case, ResidualModel(case).by_experiment(np.zeros(0), ()))
+
+
+def test_recorded_sensor_drift_is_a_drift_of_the_tip_sensor(gap_cases):
+    found = _recorded(gap_cases, "sensor_drift")
+    (tip,) = (d for d in found.drift if d.found)
+    assert tip.sensor == "tip"
+    # answer.toml: rate_m_s
+    assert tip.interval[0] <= -0.002875 <= tip.interval[1]
+    assert found.dominant_sensor == "tip"
+    assert tip.notable
+
+
+def test_recorded_saturation_shows_in_the_one_experiment_that_saturates(gap_cases):
+    found = _recorded(gap_cases, "actuator_saturation")
+    assert [x.experiment for x in found.experiments if x.gap.found] == ["experiments/03_multisine.csv"]
 
 
 def test_recorded_dry_friction_turns_round_with_the_speed(gap_cases):

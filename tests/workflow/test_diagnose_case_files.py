@@ -221,6 +221,11 @@ def test_wrong_calls_are_one_line(folder, refused, tmp_path):
     assert not out.exists()
 
 
+def test_a_damaged_case_names_itself(tmp_path):
+    with pytest.raises(InputError, match=r"case\.toml"):
+        load_case(tmp_path)
+
+
 def test_a_case_folder_reads_nothing_outside_itself(folder, tmp_path):
     """Unless the user names the case file himself."""
     inside = folder / "experiments/01_prbs.csv"

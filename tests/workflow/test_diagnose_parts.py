@@ -16,6 +16,7 @@ from workflow.diagnose.words import (
     short_answer,
     unit_of,
 )
+from workflow.text import formats
 
 LINEAR = {
     "nothing": [],
@@ -104,6 +105,11 @@ def test_no_probability_is_called_certain():
     assert probability_words(0.0) == "under 0.1 %"
     assert probability_words(0.954) == "95.4 %"
     assert probability_words(0.996) == "99.6 %"
+
+
+def test_filters_of_diagnoses_hide_none_of_the_shared_ones():
+    """The shared macros of a diagnosis' page go through the shared ones."""
+    assert not set(FILTERS) & (set(formats.FILTERS) | {"words"})
 
 
 @pytest.mark.parametrize(
