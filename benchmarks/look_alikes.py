@@ -1,8 +1,7 @@
 """How often does an effect get the name of a cause that is on no list?
 
 Workshop cases of the independent rigs are diagnosed: those whose cause is on no list, and those with one
-effect, which is taken off the list before. Named is what is present with at least .5, the weight that these
-counts have had on that taken out. They stand in `diagnosis/imperfect/look_alikes.toml`.
+effect, which is taken off the list before. Named is what is present with at least .5.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from pathlib import Path
 
 from benchmarks.harness import Print, main, timed
 from diagnosis import diagnose
-from diagnosis.imperfect.verdict import acts_like
 from plant.effects import EFFECTS
 from validation.blind.generate import generate
 from workflow.diagnose.case_files import load_case
@@ -52,9 +50,7 @@ def run(out: Print, *, single: int = 20, unlisted: int = 16) -> None:
                     warnings.simplefilter("ignore")
                     found, seconds = timed(lambda place=place: diagnose(load_case(place).case))
                 there = {
-                    e.name: e.presence
-                    for e in found.effects
-                    if e.name in EFFECTS and e.presence >= NAMED * (1 - acts_like(e.name, tuple(EFFECTS)))
+                    e.name: e.presence for e in found.effects if e.name in EFFECTS and e.presence >= NAMED
                 }
                 stood_in.update(there)
                 cases += 1

@@ -158,7 +158,6 @@ class Diagnosis(Shown):
     partial_model : tuple of str. Effects of the repaired model where the answer is unknown: they close most
         of the held-out gap, and nobody says that they are the cause.
     completeness : whether that is all.
-    acts_alike : probability that the answer only acts like a cause that is on no list.
     noise_below_stated : tuple of (output, noise, stated noise). Of an own machine whose records show less
         noise than is stated, in whose place it was counted.
     doubts : sentences on what makes the answer doubtful, whatever the fit says (`machine.probed`).
@@ -194,7 +193,6 @@ class Diagnosis(Shown):
     residuals_after: dict[str, Real]
     simulations: int
     completeness: Completeness
-    acts_alike: float = 0.0
     held_out_decided: bool = False
     unlisted: tuple[Any, ...] = ()
     partial_model: tuple[str, ...] = ()

@@ -77,9 +77,9 @@ class Judgement:
 
     @property
     def shares(self) -> dict[str, float]:
-        """Presence of every effect, probabilities of none and of unknown, without what only acts like one."""
-        found, cause = self.probabilities, self.probabilities.cause
-        return {**found.presence, "none": cause["none"], "unknown": cause["unknown"] - found.alike}
+        """Presence of every effect, probabilities of none and unknown."""
+        both = {name: self.probabilities.cause[name] for name in ("none", "unknown")}
+        return {**self.probabilities.presence, **both}
 
     @property
     def ambiguous_with(self) -> tuple[str, ...]:
@@ -99,7 +99,7 @@ class Judgement:
         if self.verdict == "none":
             far = np.max(np.abs(self.repaired.deviations), initial=0.0) > FAR_OFF
             return "parametric" if far else "none"
-        unsure = self.probabilities.cause[self.answer] + self.probabilities.alike < SURE
+        unsure = self.probabilities.cause[self.answer] < SURE
         likely = any(self.shares[name] >= POSSIBLE for name in self.ambiguous_with)
         return "ambiguous" if unsure or likely else "effect"
 
@@ -148,7 +148,6 @@ def assembled(
         residuals_refit=refit,
         residuals_after=after,
         completeness=completeness_of(case, found.complete, after),
-        acts_alike=weighed.alike,
         **more,
     )
 

@@ -112,13 +112,11 @@ class Probabilities:
         probability of a set of several effects belongs to its first member, found to explain most.
     sets : over sets of effects (sorted names; () is none, ("unknown",) unknown), summing to one.
     presence : effect -> probability that it is there at all, as the main cause or beside another.
-    alike : of unknown, what an effect explains and a cause beyond the list that acts like it would, too.
     """
 
     cause: dict[str, float]
     sets: dict[tuple[str, ...], float]
     presence: dict[str, float]
-    alike: float = 0.0
 
     def beside(self, name: str, *, leads: bool) -> Probabilities:
         """The same answers with one more effect that is certain, in every set but unknown.
@@ -132,7 +130,7 @@ class Probabilities:
             cause[name] += cause["none"]
             cause["none"] = 0.0
         sets = {key if key == _UNKNOWN else tuple(sorted((*key, name))): p for key, p in self.sets.items()}
-        return Probabilities(cause, sets, {**self.presence, name: certain}, self.alike)
+        return Probabilities(cause, sets, {**self.presence, name: certain})
 
     def with_untried(
         self, untried: Mapping[str, str], priors: tuple[float, float, float] = PRIORS, *, larger: bool
@@ -147,7 +145,7 @@ class Probabilities:
         tried = 1 - len(untried) / len(listed)
         one, several, beyond = priors
         missed = one * (1 - tried) + several * (1 - (0.0 if larger else tried**2))
-        moved = (cause["unknown"] - self.alike) * missed / (missed + beyond)
+        moved = cause["unknown"] * missed / (missed + beyond)
         sets = {**self.sets, _UNKNOWN: self.sets[_UNKNOWN] - moved}
         cause["unknown"] -= moved
         for name in untried or listed:
@@ -155,7 +153,7 @@ class Probabilities:
             sets[(name,)] = sets.get((name,), 0.0) + share
             for entries in (cause, presence):
                 entries[name] = entries.get(name, 0.0) + share
-        return Probabilities(cause, sets, presence, self.alike)
+        return Probabilities(cause, sets, presence)
 
     def counting_as_unknown(self, untried: Iterable[str]) -> Probabilities:
         """What was not tried counts as unknown, of the cause."""

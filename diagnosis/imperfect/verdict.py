@@ -8,10 +8,8 @@ the motion, of estimation and held-out records.
 from __future__ import annotations
 
 import time
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import resources
 from itertools import combinations
 from math import comb
 
@@ -29,7 +27,7 @@ from diagnosis.machine.rounding import Rounding, rounding_effect
 from diagnosis.search.explanation import Explanation, best_of_sets
 from diagnosis.search.loop import MANY, SEVERAL
 from diagnosis.search.search import Search
-from plant.effects import EFFECTS, LOOK_ALIKES
+from plant.effects import LOOK_ALIKES
 
 # Log likelihoods count this much less than independent coefficients would (calibrated on generated cases:
 # `flexlink blind --workshop`); prior densities of stated values count whole.
@@ -451,15 +449,14 @@ def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: f
     """Every set shared out among those of its effects that matter, whether or not it is complete.
 
     Where it is not, an effect that carries little beside what is left may only stand in for that
-    (`_genuine`); where it is, a cause that is on no list may act like it (`acts_like`). Unknown is where
-    none is there. Beside a cause beyond the list that carries more, unknown is the main cause. None of them
-    only as far as the nominal alone leaves no more than imperfections (none_enough): where it leaves more
-    and the set does not, the largest of its effects interests, however little it carries. With none_enough
-    zero nobody has stated what does not interest: then that is unknown.
+    (`_genuine`); unknown is where none is there. Beside a cause beyond the list that carries more, unknown is
+    the main cause. None of them only as far as the nominal alone leaves no more than imperfections
+    (none_enough): where it leaves more and the set does not, the largest of its effects interests, however
+    little it carries. With none_enough zero nobody has stated what does not interest: then that is unknown.
     """
     shared: dict[tuple[str, ...], float] = {("unknown",): 0.0}
     cause = {"none": 0.0, **dict.fromkeys(listed, 0.0), "unknown": 0.0}
-    presence, alike = dict.fromkeys(listed, 0.0), 0.0
+    presence = dict.fromkeys(listed, 0.0)
 
     def give(names: Sequence[str], share: float, main: str = "") -> None:
         key = tuple(sorted(names))
@@ -470,30 +467,17 @@ def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: f
 
     for one in sets:
         parts = sorted(one.parts, key=lambda part: -part.share)
-        real = [1 - p.matters * acts_like(p.name, listed) for p in parts]
-        every = float(np.prod(real))
-        # It is all; an effect of it only acts like the cause; all but a cause beyond the list that looks like
-        # an effect; something else is missing.
-        branches = (
-            one.complete * every,
-            one.complete * (1 - every),
-            one.explains - one.complete,
-            1 - one.explains,
-        )
+        # It is all; all but a cause beyond the list that looks like an effect; something else is missing.
+        branches = (one.complete, one.explains - one.complete, 1 - one.explains)
         for branch, probability in enumerate(branches):
-            genuine = [
-                (1.0, (own - every) / max(1 - every, _NOTHING), float(p.by_name == 0), _genuine(p, one))
-                for p, own in zip(parts, real, strict=True)
-            ]
-            there = [p.matters * each[branch] for p, each in zip(parts, genuine, strict=True)]
+            genuine = [(1.0, float(p.by_name == 0), _genuine(p, one))[branch] for p in parts]
+            there = [p.matters * real for p, real in zip(parts, genuine, strict=True)]
             for chosen in subsets(range(len(parts))) if probability > 0 else ():
                 share = one.weight * probability
                 share *= float(np.prod([p if k in chosen else 1 - p for k, p in enumerate(there)]))
                 names = [parts[k].name for k in chosen]
                 if branch:
-                    looks_alike = branch == 2 and bool(names) and parts[chosen[0]].share < one.beyond
-                    looks_alike |= branch == 1 and 0 not in chosen
-                    alike += share * (branch == 1 and looks_alike)
+                    looks_alike = branch == 1 and bool(names) and parts[chosen[0]].share < one.beyond
                     give(names or ["unknown"], share, "unknown" if looks_alike else "")
                     continue
                 if not names:
@@ -505,22 +489,7 @@ def _probabilities(sets: Sequence[Judged], listed: Sequence[str], none_enough: f
         {name: float(p) for name, p in cause.items()},
         {names: float(p) for names, p in shared.items()},
         {name: float(p) for name, p in presence.items()},
-        float(alike),
     )
-
-
-def acts_like(name: str, listed: Sequence[str]) -> float:
-    """Probability that what an effect explains is the work of a cause on no list.
-
-    From the prior of such a cause and how often each effect stood in for one in diagnoses (look_alikes.toml),
-    Jeffreys' half a case added. Effects of other machines share what all of those did together.
-    """
-    seen = tomllib.loads(resources.files(__package__).joinpath("look_alikes.toml").read_text("utf-8"))
-    named, cases = seen["stood_in"], seen["cases"]
-    known = (named.get(name, 0) + 0.5) / (cases + 1)
-    rate = known if name in EFFECTS else sum(named.values()) / cases / len(listed)
-    odds = _PRIOR_UNKNOWN * rate * len(listed) / _PRIOR_COUNT[1]
-    return float(odds / (1 + odds))
 
 
 def _genuine(part: Part, one: Judged) -> float:

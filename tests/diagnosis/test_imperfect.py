@@ -1,17 +1,15 @@
 """Diagnosis beside a model error: levels learned from the records, starts and zeros that nobody knows."""
 
-import tomllib
+from __future__ import annotations
+
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.fft import dct
 from scipy.optimize import minimize
 
-from benchmarks import look_alikes
 from diagnosis import (
     Case,
     EffectParameter,
@@ -26,7 +24,6 @@ from diagnosis.fit.descent import Descent, descend, occam, refined, scanned
 from diagnosis.fit.levels import Levels, quietest
 from diagnosis.fit.records import FittedStart, Records, StartColumns
 from diagnosis.fit.starts import StartPoint, points_of
-from diagnosis.imperfect import verdict
 from diagnosis.imperfect.answered import _in_part
 from diagnosis.imperfect.carried import shares_of
 from diagnosis.imperfect.verdict import TEMPER, _enough, _weights, is_silent, judged
@@ -37,7 +34,7 @@ from diagnosis.search.moves import BesideSet, InWindows, LookAlike, descended
 from diagnosis.search.search import Search
 from diagnosis.search.settled import best_move, settled
 from diagnosis.search.windows import in_windows
-from plant.effects import EFFECTS, LOOK_ALIKES, parse_effect
+from plant.effects import LOOK_ALIKES, parse_effect
 from plant.presets import paper_link
 from plant.simulation import Simulator
 from validation.blind.generate import generate
@@ -964,27 +961,3 @@ def test_how_much_is_felt_of_the_start_says_nothing_about_a_set():
     felt = StartColumns(end.columns.zeros, tuple(3 * own for own in end.columns.states), end.columns.per_zero)
     # The volume of twelve further unknowns would be twelve times log 3.
     assert occam(records, replace(end, columns=felt)) == pytest.approx(occam(records, end), abs=0.5)
-
-
-@pytest.mark.parametrize("names", [("gravity",), ("actuator_lag", "backlash"), ("of_an_own_machine",)])
-def test_a_cause_on_no_list_may_act_like_what_explains_all(names):
-    """By Bayes' rule from the counted cases and the priors; nothing is lost, and the rest is unknown."""
-    seen = tomllib.loads((Path(verdict.__file__).parent / "look_alikes.toml").read_text(encoding="utf-8"))
-    stored = Path(look_alikes.__file__).parent / "results" / "look_alikes.txt"
-    counted = ", ".join(f"{name} {n}" for name, n in seen["stood_in"].items())
-    assert stored.read_text(encoding="utf-8").endswith(f"{seen['cases']} cases; named: {counted}\n")
-    listed = (*EFFECTS, *set(names) - set(EFFECTS))
-    there = []
-    for name in names:
-        rate = (seen["stood_in"].get(name, 0) + 0.5) / (seen["cases"] + 1)
-        rate = rate if name in EFFECTS else sum(seen["stood_in"].values()) / seen["cases"] / len(listed)
-        there.append(0.35 / len(listed) / (0.35 / len(listed) + 0.15 * rate))
-    parts = tuple(verdict.Part(name, 0.3 - 0.1 * k, 1.0) for k, name in enumerate(names))
-    whole: Any = SimpleNamespace(names=names)
-    found = verdict._probabilities(
-        [verdict.Judged(whole, parts, 0.0, 1.0, 1.0, 0.01, 0.3, 0.0, 1.0)], listed, 1.0
-    )
-    assert [found.presence[name] for name in names] == pytest.approx(there)
-    assert found.cause[names[0]] == pytest.approx(there[0])
-    assert found.cause["unknown"] == found.alike == pytest.approx(1 - there[0])
-    assert sum(found.cause.values()) == pytest.approx(1) == sum(found.sets.values())

@@ -257,7 +257,8 @@ def test_one_output_is_a_column_in_whatever_form(given):
 
 def test_exchanged_columns_are_doubted():
     moves = np.cumsum(np.random.default_rng(4).standard_normal((400, 2)), axis=0)
-    plant = SimpleNamespace(replayed=lambda effects: lambda u: np.resize(moves, (len(u), 2)), untracked=0)
+    given = {"untracked": 0, "body": None}
+    plant = SimpleNamespace(replayed=lambda effects: lambda u: np.resize(moves, (len(u), 2)), **given)
 
     def doubts(measured):
         record = SimpleNamespace(input=moves, output=measured)

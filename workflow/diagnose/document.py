@@ -56,7 +56,6 @@ def document_of(
         },
         "completeness": found.completeness,
         "partial_model": found.partial_model,
-        "acts_alike": found.acts_alike,
         "ambiguous_with": found.ambiguous_with,
         "instead": found.instead,
         "perhaps": found.perhaps,
