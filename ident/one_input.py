@@ -142,11 +142,11 @@ def _behind_dead_time(
     if found is None:
         return plain, at_once
     best, told = found
-    search = best.fitted.search
+    search = best.search
     search.minima = [*plain.search.minima, *search.minima]
     search.stages = [*plain.search.stages, *search.stages]
     search.evaluations += plain.search.evaluations
-    return SearchOutcome(search, best.fitted.end, best.selection, dead_time=told), False
+    return SearchOutcome(search, best.end, best.selection, dead_time=told), False
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,37 +49,35 @@ def seek(records: Sequence[Record], plain: Fitted, starts: Sequence[int]) -> tup
         return None
     best = max((_behind(records, plain, start) for start in starts), key=lambda end: end.gain_over(plain))
     for _ in range(_ROUNDS):
-        moved, _ = _moved(records, best.fitted)
-        if _delay(moved) == _delay(best.fitted):
+        moved, _ = _moved(records, best)
+        if _delay(moved) == _delay(best):
             break
         best = _behind(records, moved, _delay(moved))
     for _ in range(_ROUNDS):
-        if _delay(best.fitted) == 0 or best.gain_over(plain) <= _STRONG:
+        if _delay(best) == 0 or best.gain_over(plain) <= _STRONG:
             return None
         other = _better_neighbour(records, best)
         if other is None:
             break
         best = other
-    _, known = _moved(records, best.fitted)
-    found = best.fitted
+    _, known = _moved(records, best)
     limit = float(chi2.ppf(_LEVEL, 1))
-    likely = [delay for delay, other in known.items() if gain(found, other) <= limit]
-    if min(likely) < _delay(found):
+    likely = [delay for delay, other in known.items() if gain(best, other) <= limit]
+    if min(likely) < _delay(best):
         # Ellipses hold a response that begins later than the delay, never one that begins earlier.
         early = _behind(records, known[min(likely)], min(likely))
-        best = early if early.fitted.poles.order <= found.poles.order else best
-        found = best.fitted
+        best = early if early.poles.order <= best.poles.order else best
     # The poles that were left may also do without a delay, in a place that the first search has missed.
-    if best.gain_over(_behind(records, found, 0).fitted) <= _STRONG:
+    if best.gain_over(_behind(records, best, 0)) <= _STRONG:
         return None
     return best, finding(
         FindingKind.DEAD_TIME,
-        delay=_delay(found),
-        delay_ms=1e3 * _delay(found) * found.data.dt_s,
+        delay=_delay(best),
+        delay_ms=1e3 * _delay(best) * best.data.dt_s,
         low=min(likely),
         high=max(likely),
-        partial=bool(np.any(np.abs(found.poles.real[found.search.fixed.real.size :]) < DEADBEAT)),
-        order=found.poles.order,
+        partial=bool(np.any(np.abs(best.poles.real[best.search.fixed.real.size :]) < DEADBEAT)),
+        order=best.poles.order,
         order_without=plain.poles.order,
         gain=best.gain_over(plain),
     )
@@ -126,19 +124,17 @@ def first_answer(records: Sequence[Record]) -> tuple[tuple[int, ...], bool]:
 
 
 @dataclass(frozen=True, eq=False)
-class Selected:
+class Selected(Fitted):
     """An order selected behind a delay."""
 
-    fitted: Fitted
     selection: OrderSelection
 
     def gain_over(self, other: Fitted) -> float:
         """By how much the criterion of the order is lower; a delay of d samples costs 2 ln(1 + d), as an
         integer of which the small ones are the likelier (Rissanen)."""
-        found = self.fitted
-        fewer = other.data.n_parameters(other.poles.order) - found.data.n_parameters(found.poles.order)
-        longer = float(np.log1p(_delay(found)) - np.log1p(_delay(other)))
-        return gain(found, other) + fewer * float(np.log(found.worth())) - 2 * longer
+        fewer = other.data.n_parameters(other.poles.order) - self.data.n_parameters(self.poles.order)
+        longer = float(np.log1p(_delay(self)) - np.log1p(_delay(other)))
+        return gain(self, other) + fewer * float(np.log(self.worth())) - 2 * longer
 
 
 def _behind(records: Sequence[Record], near: Fitted, delay: int, again: bool = False) -> Selected:
@@ -148,13 +144,12 @@ def _behind(records: Sequence[Record], near: Fitted, delay: int, again: bool = F
     selection = OrderSelection(search)
     known = near.poles.order > search.fixed.order and not again
     start = search.descend(near.poles, f"delay {delay}") if known else None
-    return Selected(Fitted(search, selection.run(start)), selection)
+    return Selected(search, selection.run(start), selection)
 
 
-def _better_neighbour(records: Sequence[Record], best: Selected) -> Selected | None:
+def _better_neighbour(records: Sequence[Record], found: Selected) -> Selected | None:
     """The order selected again, at neighbours and from the start: a pole too many stands for what is wrong
     with the number of samples. None where nothing is better."""
-    found = best.fitted
     _, known = _moved(records, found)
     # What a neighbour loses with these poles, fewer of them would have to be worth.
     most = found.data.n_parameters(found.poles.order) * float(np.log(found.worth()))
@@ -163,7 +158,7 @@ def _better_neighbour(records: Sequence[Record], best: Selected) -> Selected | N
         for step, again in _NEIGHBOURS
         if _delay(found) + step not in known or gain(found, known[_delay(found) + step]) < most
     ]
-    other = max(near, key=lambda item: item.gain_over(found), default=best)
+    other = max(near, key=lambda item: item.gain_over(found), default=found)
     return other if other.gain_over(found) > 0 else None
 
 

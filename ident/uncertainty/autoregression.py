@@ -9,7 +9,6 @@ the fit.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cholesky, hankel, solve_triangular, toeplitz
@@ -24,30 +23,25 @@ _LARGEST_CONDITION = 1e4
 _FREQUENCIES = np.concatenate([np.geomspace(1e-4, 1e-2, 128), np.linspace(0.0, np.pi, 2048)])
 
 
-@dataclass(frozen=True, eq=False)
-class Absorbed:
-    """Columns Z (T,r) of each record, for innovations of unit variance. Where a fit leaves the first rows
-    out, Z is what the noise filter makes of its whitened rows from rest."""
-
-    columns: tuple[RealArray, ...]
-
-    def gradient(self, whitening: RealArray, order: int, start: int) -> RealArray:
-        """-E sum over t >= start of (A e)_t e_(t-i), i = 1 .. order, over records longer than 2 start."""
-        sums = np.zeros(order)
-        for z in self.columns:
-            if z.shape[0] <= 2 * start:
-                continue
-            innovations = lfilter(whitening, np.ones(1), z, axis=0)[start:]
-            for i in range(1, order + 1):
-                sums[i - 1] += float(np.sum(innovations * z[start - i : z.shape[0] - i]))
-        return sums
+def _gradient(absorbed: Sequence[RealArray], whitening: RealArray, order: int, start: int) -> RealArray:
+    """-E sum over t >= start of (A e)_t e_(t-i), i = 1 .. order, over records longer than 2 start, whose fit
+    has `absorbed` the columns Z (T,r) for innovations of unit variance. Where it leaves the first rows out, Z
+    is what the noise filter makes of its whitened rows from rest."""
+    sums = np.zeros(order)
+    for z in absorbed:
+        if z.shape[0] <= 2 * start:
+            continue
+        innovations = lfilter(whitening, np.ones(1), z, axis=0)[start:]
+        for i in range(1, order + 1):
+            sums[i - 1] += float(np.sum(innovations * z[start - i : z.shape[0] - i]))
+    return sums
 
 
 def fit_autoregression(
     residuals: Sequence[RealArray],
     max_order: int,
     weights: RealArray | None = None,
-    absorbed: Absorbed | None = None,
+    absorbed: Sequence[RealArray] | None = None,
 ) -> RealArray:
     """[1, a_1, ..., a_n] of A(q) e = white, order n <= max_order by BIC, from all records together.
 
@@ -79,7 +73,7 @@ def fit_autoregression(
     if weights is None or absorbed is None or best.size == 1 or weights.size == 1:
         return _stable(best)
     order = best.size - 1
-    gradient = absorbed.gradient(weights, order, max_order)
+    gradient = _gradient(absorbed, weights, order, max_order)
     # (X^T X)^-1 through the singular values of X: its square may be beyond the reach of double precision.
     _, d, vt = np.linalg.svd(rows[:, :order], full_matrices=False)
     kept = d > np.finfo(np.float64).eps * n * d[0]

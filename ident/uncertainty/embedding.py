@@ -276,11 +276,11 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
         kernel = conditional_posterior(grid, *grid_weights(grid, options.no_remainder))
         if not options.prior_missed_mode > 0:
             return _Solved(rows, reduced, kernel)
-        candidates = candidate_pairs(max(record.n_samples for record in rows.records), rows.missed_above)
-        statistics = pair_statistics(rows.pair_blocks(), reduced, candidates.poles)
+        poles, prior = candidate_pairs(max(record.n_samples for record in rows.records), rows.missed_above)
+        statistics = pair_statistics(rows.pair_blocks(), reduced, poles)
         odds = options.prior_missed_mode / (1 - options.prior_missed_mode)
         log_rest = total_log_evidence(grid, options.no_remainder)
-        missed = pair_mixture(candidates, statistics, reduced.degrees_of_freedom, log_rest, odds)
+        missed = pair_mixture(poles, prior, statistics, reduced.degrees_of_freedom, log_rest, odds)
         if missed.visible is None or n_added == _MOST_ADDED:
             return _Solved(rows, reduced, kernel, missed)
         # Twice: the pair's first-order movement is in the regressors too.

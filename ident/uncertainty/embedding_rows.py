@@ -14,7 +14,7 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure, answered, driving_input, level_before, stabilised
 from ident.data.arrays import IntArray, RealArray
 from ident.data.record import Record
-from ident.uncertainty.autoregression import Absorbed, first_rows, whitened
+from ident.uncertainty.autoregression import first_rows, whitened
 from ident.uncertainty.embedding_algebra import (
     NUISANCE_RANK,
     Delays,
@@ -160,7 +160,7 @@ class EmbeddingRows:
 
 def gls_residuals(
     rows: EmbeddingRows, reduced: ReducedRegression, kernel: KernelPosterior
-) -> tuple[list[RealArray], Absorbed]:
+) -> tuple[list[RealArray], list[RealArray]]:
     """y minus posterior mean and nuisance, unwhitened, one array per record; and what the fit has absorbed.
     rows: of the fit, with its whitening. Neglected: the kernel's share of the absorption."""
     mean, _ = joint_factor(reduced, kernel)
@@ -189,4 +189,4 @@ def gls_residuals(
         if drops:
             columns = lfilter(np.ones(1), rows.whitening, whitened(columns, rows.whitening), axis=0)
         absorbed.append(columns)
-    return residuals, Absorbed(tuple(absorbed))
+    return residuals, absorbed

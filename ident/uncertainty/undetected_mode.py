@@ -53,14 +53,6 @@ _DISTINGUISHABLE = 1e-6  # a thousandth of the amplitude
 
 
 @dataclass(frozen=True, eq=False)
-class CandidatePairs:
-    """Poles (J,) of the upper half plane and prior weights (J,) that sum to 1."""
-
-    poles: ComplexArray
-    prior: RealArray
-
-
-@dataclass(frozen=True, eq=False)
 class PairStatistics:
     """What the data say on each pair, nuisance and F projected out.
 
@@ -104,10 +96,10 @@ class PairEvidence:
 
 
 @lru_cache(maxsize=16)
-def candidate_pairs(n_samples: int, above: float = 0.0) -> CandidatePairs:
-    """Grid of lightly damped pairs, from six periods in the record, or `above` [rad/sample], to nine
-    tenths of the Nyquist frequency.
+def candidate_pairs(n_samples: int, above: float = 0.0) -> tuple[ComplexArray, RealArray]:
+    """Grid of lightly damped pairs: poles (J,) of the upper half plane and prior weights (J,) that sum to 1.
 
+    From six periods in the record, or `above` [rad/sample], to nine tenths of the Nyquist frequency.
     Free oscillations of a candidate fall to e^-2 within the record: a sharper peak could stand between the
     frequencies that the record resolves, as high as one likes, and no data would contradict it.
     """
@@ -123,7 +115,7 @@ def candidate_pairs(n_samples: int, above: float = 0.0) -> CandidatePairs:
             omega *= 1 + _SPACING * damping
         poles += group
         prior += [1 / len(group)] * len(group)
-    return CandidatePairs(readonly(poles, np.complex128), readonly(np.array(prior) / np.sum(prior)))
+    return readonly(poles, np.complex128), readonly(np.array(prior) / np.sum(prior))
 
 
 def pair_statistics(
@@ -242,7 +234,8 @@ class PairMixture:
 
 
 def pair_mixture(
-    candidates: CandidatePairs,
+    poles: ComplexArray,
+    prior: RealArray,
     statistics: PairStatistics,
     degrees_of_freedom: int,
     log_rest: float,
@@ -256,7 +249,7 @@ def pair_mixture(
     than the rest. The weight of pairs not kept is shared out among all others.
     """
     evidence = pair_evidence(statistics, degrees_of_freedom)
-    logs = evidence.log_likelihood + np.log(prior_odds * candidates.prior[:, None] * evidence.prior)
+    logs = evidence.log_likelihood + np.log(prior_odds * prior[:, None] * evidence.prior)
     top = max(float(logs.max()), log_rest)
     joint = np.exp(logs - top)
     per_pair = joint.sum(axis=1)
@@ -264,8 +257,8 @@ def pair_mixture(
     # The likeliest pairs of probable neighbourhoods (two half bandwidths), in grid order: moments of a
     # mixture feel an improbable hypothesis by the square of its distance, and it is outside every confidence
     # region.
-    probability, frequency = per_pair / total, np.angle(candidates.poles)
-    decay = -np.log(np.abs(candidates.poles))
+    probability, frequency = per_pair / total, np.angle(poles)
+    decay = -np.log(np.abs(poles))
     near = np.abs(frequency[:, None] - frequency) <= 2 * np.maximum(decay[:, None], decay)
     probable = np.flatnonzero((near @ probability > _LEAST_PROBABILITY) & (probability > _NEGLIGIBLE))
     kept = np.sort(probable[np.argsort(probability[probable])[::-1][:_MOST_PAIRS]])
@@ -279,7 +272,7 @@ def pair_mixture(
     gain = -degrees_of_freedom * np.log1p(-min(float(explained[best]) / statistics.residual, 1 - 1e-15))
     visible = gain > 4 * np.log(degrees_of_freedom) and per_pair.sum() > 0.5 * total
     return PairMixture(
-        poles=candidates.poles[kept],
+        poles=poles[kept],
         weight=per_pair[kept] / (total - per_pair.sum() + per_pair[kept].sum()),
         mean=mean,
         covariance=covariance,
@@ -288,7 +281,7 @@ def pair_mixture(
             [np.zeros((statistics.onto_regressors.shape[1], 0)), *statistics.onto_regressors[kept]]
         ),
         probability=float(per_pair.sum() / total),
-        visible=complex(candidates.poles[best]) if visible else None,
+        visible=complex(poles[best]) if visible else None,
     )
 
 
