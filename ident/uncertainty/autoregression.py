@@ -23,7 +23,9 @@ _LARGEST_CONDITION = 1e4
 _FREQUENCIES = np.concatenate([np.geomspace(1e-4, 1e-2, 128), np.linspace(0.0, np.pi, 2048)])
 
 
-def _gradient(absorbed: Sequence[RealArray], whitening: RealArray, order: int, start: int) -> RealArray:
+def absorbed_gradient(
+    absorbed: Sequence[RealArray], whitening: RealArray, order: int, start: int
+) -> RealArray:
     """-E sum over t >= start of (A e)_t e_(t-i), i = 1 .. order, over records longer than 2 start, whose fit
     has `absorbed` the columns Z (T,r) for innovations of unit variance. Where it leaves the first rows out, Z
     is what the noise filter makes of its whitened rows from rest."""
@@ -73,7 +75,7 @@ def fit_autoregression(
     if weights is None or absorbed is None or best.size == 1 or weights.size == 1:
         return _stable(best)
     order = best.size - 1
-    gradient = _gradient(absorbed, weights, order, max_order)
+    gradient = absorbed_gradient(absorbed, weights, order, max_order)
     # (X^T X)^-1 through the singular values of X: its square may be beyond the reach of double precision.
     _, d, vt = np.linalg.svd(rows[:, :order], full_matrices=False)
     kept = d > np.finfo(np.float64).eps * n * d[0]
