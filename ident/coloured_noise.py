@@ -29,7 +29,7 @@ from ident.uncertainty.autoregression import fit_autoregression
 Identify = Callable[[Sequence[Record], IdentOptions, float, float], Identification]
 """Records, options, and the part of the progress (from, to): a fit that takes the noise as white."""
 
-_ARX_ORDERS = (4, 8, 12, 16, 20, 24, 30)
+_ARX_ORDERS = (4, 8, 12, 16, 20, 24, 30)  # tried, one chosen by BIC
 # Rows of the shortest record per order of the noise model.
 _ROWS_PER_ORDER = 13
 _RESIDUAL_ORDER = 12  # BIC takes 1 to 6 of it for drift and friction beside sensor noise

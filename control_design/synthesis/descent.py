@@ -21,7 +21,7 @@ from control_design.plants.ellipses import Real
 from control_design.synthesis.minimax_step import MinimaxStep, minimax_step
 from control_design.synthesis.rows import LoopRows, Rows
 
-_FIRST_BOX, _LARGEST_BOX, _SMALLEST_BOX = 0.3, 1.0, 1e-4
+_FIRST_BOX, _LARGEST_BOX, _SMALLEST_BOX = 0.3, 1.0, 1e-4  # of a step, in natural units
 _PATIENCE, _SLOW = 15, 1e-3  # give up where so many steps gain less than this share
 _LEAST_GAIN = 1e-7  # predicted gain of a step, in the logarithm, not worth taking
 _FAR_BELOW = 2.5  # rows this far (in log) below the worst cannot become it within one step and are left out

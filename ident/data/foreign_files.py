@@ -27,7 +27,7 @@ MOST_COLUMNS = 4096
 
 _SCRIPT = Path(__file__).with_name("child_reader.py")
 _SECONDS = CPU_SECONDS + 30  # of waiting
-_REFUSED, _NO_LIBRARY = 2, 3
+_REFUSED, _NO_LIBRARY = 2, 3  # exit codes of the reader
 _ENCRYPTED = 0x1  # bit 0 of the flags of a zip entry (APPNOTE 4.4.4)
 
 

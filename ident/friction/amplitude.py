@@ -38,7 +38,7 @@ from ident.friction.arm import FASTEST_POLE, SteppedArm
 from ident.friction.gauss_newton import FrictionFit
 from ident.friction.posterior import BehindFriction
 
-_REALISATIONS, _DRAWS = 128, 400
+_REALISATIONS, _DRAWS = 128, 400  # of the input that are averaged; of the posterior that are spread
 # The first period dies out from rest, the second is in steady state.
 _PERIODS = 2
 _CHANGE_OF_LEVEL = 0.02  # for a derivative between runs of equal phases: small, and far above rounding

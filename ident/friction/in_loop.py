@@ -70,6 +70,7 @@ from ident.uncertainty.embedding_algebra import by_class, sandwiched
 from ident.uncertainty.pole_intervals import laurent_rows
 from ident.unstable import find_unstable
 
+# Rounds of friction and poles in turns, fewer to compare delays; the longest of these, in samples.
 _ROUNDS, _FEW_ROUNDS, _LONGEST_DELAY = 6, 2, 20
 # A level that moves by less than the first share stays; by more than the second, or with errors that fall to
 # the third, the order is chosen anew.

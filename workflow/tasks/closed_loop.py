@@ -29,6 +29,7 @@ _LEAD_IN = 0.05  # share of the record before the step, so that the picture show
 # A run counts as settled when, at the end of either half, it moves by less than this share of the step and,
 # where tracking is asked for, has arrived within it. Within one count of the sensor no controller sees it.
 _SETTLED = 0.1
+# Samples of a run on the simulated arm, and at most of one on a plant that was drawn.
 _SHORTEST, _LONGEST, _LONGEST_DRAWN = 200, 6000, 60_000
 
 

@@ -22,7 +22,7 @@ SMALL = 0.1  # of the large excitation: friction weighs ten times as much
 _INPUT_SHARE = 0.7  # of the input's rms in the records of the fit that the loop's command may take
 _CREST = 4.0  # peak over rms that a multisine's command stays below
 _LINES_BELOW_PEAK = 20  # the peak is read to 5 % of its frequency
-_SHORTEST, _LONGEST = 500, 4000
+_SHORTEST, _LONGEST = 500, 4000  # samples of a period
 
 
 def rms_of(signals: Sequence[RealArray]) -> float:

@@ -17,7 +17,7 @@ from plant.experiment_plan import ExperimentPlan
 from workflow.engine.errors import InputError
 from workflow.tasks.first_look import first_look, from_reference, told_response
 
-_LEVELS = (1.0, 0.5)
+_LEVELS = (1.0, 0.5)  # shares of the largest: what differs between them is not linear
 # Beyond what the logs tell, the loop is taken to answer so many times as much as at the last line they tell.
 _UNTOLD = 2.0
 # Where no band is stated: from this part of the highest frequency that is told, and so many periods of the
