@@ -78,14 +78,12 @@ def telling(case: PlantCase, deadline_s: float = np.inf) -> Telling:
         (candidate, *_), first = effect.candidates(), effect.parameters[0].name
         # Of a range of twenty to one, steps of an eighth.
         grid = [np.array([x, *candidate.starts[0][1:]]) for x in np.linspace(*candidate.axes[0].box, 24)]
-        least[effect.name] = max(
-            (
-                abs(change.values[first])
-                for change in map(candidate.effect_at, grid)
-                if _shown(_over(_outputs(plant, (change,), records), stated, levels), samples) > 1
-            ),
-            default=np.inf,
-        )
+        changes = [candidate.effect_at(x) for x in grid]
+        done = [_over(_outputs(plant, (change,), records), stated, levels) for change in changes]
+        seen = {abs(c.values[first]): d for c, d in zip(changes, done, strict=True) if _shown(d, samples) > 1}
+        least[effect.name] = max(seen, default=np.inf)
+        if seen and not np.any(columns[effect.name]):
+            columns[effect.name] = seen[least[effect.name]]
     hidden = tuple(name for name in columns if not least[name] < most[name])
     told = {name: c / np.linalg.norm(c) for name, c in columns.items() if name not in hidden}
     return Telling(least, hidden, _alike(told), tuple(name for name in names if name not in columns))

@@ -175,10 +175,10 @@ def register(kind: type[E]) -> type[E]:
     Raises TypeError for a ratio without a stated value that it multiplies or a `modify` of its own, and for
     an effect without id or words: the pages need them.
     """
-    if kind.modify is Effect.modify and not (kind.acts or kind.multiplies):
-        raise TypeError(f"{kind.id} neither acts on a value nor multiplies one: it needs its own modify")
     if missing := [name for name in ("id", "words") if not hasattr(kind, name)]:
         raise TypeError(f"effect {kind.__name__}: state its {' and '.join(missing)} in the class")
+    if kind.modify is Effect.modify and not (kind.acts or kind.multiplies):
+        raise TypeError(f"{kind.id} neither acts on a value nor multiplies one: it needs its own modify")
     if not hasattr(kind, "group"):
         kind.group = cast(Group, kind.__module__.rpartition(".")[2])
     (LOOK_ALIKES if kind.look_alike_of else EFFECTS)[kind.id] = kind
