@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diagnosis.machine.case import Case
-from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.where.findings import RegimeBin, RegimeFinding, RegimePeak
 
 Integer = npt.NDArray[np.int64]
@@ -103,18 +103,8 @@ def regime_axes(moved: Mapping[str, Motion], bins: int = 5) -> tuple[RegimeAxis,
         values = {name: v for name, v in values.items() if v is not None}
         return {name: np.abs(v) for name, v in values.items()} if size else values
 
-    speed = of("speed_rad_s")
-    fastest = max(float(np.max(np.abs(v))) for v in speed.values())
-    # A hundredth of the largest speed counts as standing still, neither forwards nor backwards.
-    still = 0.01 * fastest
     axes = [
-        RegimeAxis(
-            "speed_sign",
-            "rad/s",
-            ("backwards", "forwards"),
-            ((-fastest, -still), (still, fastest)),
-            {name: np.where(v > still, 1, np.where(v < -still, 0, -1)) for name, v in speed.items()},
-        ),
+        _directions("speed_sign", "rad/s", ("backwards", "forwards"), of("speed_rad_s")),
         _quantiles("speed_size", "rad/s", of("speed_rad_s", True), bins),
         RegimeAxis(
             "reversal",
@@ -131,6 +121,52 @@ def regime_axes(moved: Mapping[str, Motion], bins: int = 5) -> tuple[RegimeAxis,
     return tuple(axis for axis in axes if axis is not None and _enough(axis))
 
 
+def axes_of_output(
+    case: CaseOfMachine, residuals: Mapping[str, Real], dt_s: float, k: int, bins: int = 5
+) -> tuple[RegimeAxis, ...]:
+    """Of any machine, for residuals (T, Y) of its k-th output: its value, rate and direction as simulated,
+    size and direction of every input, time in the record. Rows that are missing are in no bin."""
+    output, every = case.machine.output_names[k], {e.name: e for e in case.experiments}
+    value = {name: e.output[:, k] - residuals[name][:, k] * case.noise[k] for name, e in every.items()}
+    rate = {name: np.asarray(np.gradient(v, dt_s)) for name, v in value.items()}
+    sizes = {name: np.abs(v) for name, v in rate.items()}
+    axes = [
+        _quantiles(f"value of {output}", "", value, bins, f"where {output} is"),
+        _directions(f"direction of {output}", "", (f"where {output} falls", f"where {output} rises"), rate),
+        _quantiles(f"rate of {output}", "per s", sizes, bins, f"where {output} changes by"),
+        _stretches({name: np.asarray(np.arange(len(v)) * dt_s) for name, v in value.items()}, bins + 1),
+    ]
+    inputs = next(iter(every.values())).input.shape[1]
+    for j in range(inputs):
+        called = "the input" if inputs == 1 else f"input {j + 1}"
+        u = {name: e.input[:, j] for name, e in every.items()}
+        signs = f"where {called} is negative", f"where {called} is positive"
+        axes += [
+            _directions(f"sign of {called}", "", signs, u),
+            _quantiles(
+                f"size of {called}",
+                "",
+                {name: np.abs(v) for name, v in u.items()},
+                bins,
+                f"where {called} has a size of",
+            ),
+        ]
+    for axis in (axis for axis in axes if axis is not None):
+        for name, e in every.items():
+            axis.labels[name][list(getattr(e, "missing", ()))] = -1
+    return tuple(axis for axis in axes if axis is not None and _enough(axis))
+
+
+def _directions(
+    name: str, unit: str, titles: tuple[str, str], values: Mapping[str, Real]
+) -> RegimeAxis | None:
+    """Below zero and above; a hundredth of the largest value is neither. None without values."""
+    largest = max(float(np.max(np.abs(v))) for v in values.values())
+    still = 0.01 * largest
+    labels = {n: np.where(v > still, 1, np.where(v < -still, 0, -1)) for n, v in values.items()}
+    return RegimeAxis(name, unit, titles, ((-largest, -still), (still, largest)), labels) if largest else None
+
+
 def _enough(axis: RegimeAxis) -> bool:
     counts = np.zeros(len(axis.titles), dtype=int)
     for labels in axis.labels.values():
@@ -138,7 +174,9 @@ def _enough(axis: RegimeAxis) -> bool:
     return len(axis.titles) >= 2 and bool(np.all(counts >= _LEAST_SAMPLES))
 
 
-def _quantiles(name: str, unit: str, values: Mapping[str, Real], bins: int) -> RegimeAxis | None:
+def _quantiles(
+    name: str, unit: str, values: Mapping[str, Real], bins: int, words: str = "at"
+) -> RegimeAxis | None:
     """Bins of about equal count over all experiments; None without values or if all are equal.
 
     Many equal values (a binary voltage) make fewer bins, none of them with less than half the mean count.
@@ -161,7 +199,8 @@ def _quantiles(name: str, unit: str, values: Mapping[str, Real], bins: int) -> R
         return None
     edges = tuple(pairwise((float(np.min(everything)), *inner, float(np.max(everything)))))
     labels = {name: np.searchsorted(inner, v, side="right") for name, v in values.items()}
-    return RegimeAxis(name, unit, tuple(f"at {a:.3g} to {b:.3g} {unit}" for a, b in edges), edges, labels)
+    titles = tuple(f"{words} {a:.3g} to {b:.3g} {unit}".rstrip() for a, b in edges)
+    return RegimeAxis(name, unit, titles, edges, labels)
 
 
 def _stretches(time: Mapping[str, Real], bins: int) -> RegimeAxis:

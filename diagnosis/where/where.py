@@ -19,7 +19,7 @@ from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.where.distortion import periodic_findings
 from diagnosis.where.findings import Where, sensors_of
 from diagnosis.where.missing_function import missing_functions
-from diagnosis.where.regimes import motions, regime_axes, regime_findings
+from diagnosis.where.regimes import axes_of_output, motions, regime_axes, regime_findings
 from diagnosis.where.where_energy import Energy, band_gaps, experiment_gaps, part_gap, sensor_gaps
 from diagnosis.where.where_trends import amplitude_finding, common_findings, drift_findings, linear_correction
 from plant.effects import EFFECTS
@@ -75,10 +75,19 @@ def where(
 
 
 def where_in_records(case: CaseOfMachine, residuals: Mapping[str, Real], dt_s: float) -> Where:
-    """Of any machine: by sensor, experiment and frequency; arguments as of `where`."""
+    """Of any machine: by sensor, experiment, frequency, and by what its outputs and inputs do (direction,
+    size, rate, time in the record); arguments as of `where`."""
+    names, rng = case.machine.output_names, np.random.default_rng(0)
+    axes = [axes_of_output(case, residuals, dt_s, k) for k in range(len(names))]
     if case.machine.weighing.model_error > 0:
         _, residuals = over_levels(case, residuals, thresholds_of(case))
-    return _by_parts(residuals, case.machine.output_names, dt_s, LEVEL)
+    of_each = [{name: e[:, [k]] for name, e in residuals.items()} for k in range(len(names))]
+    regimes = [
+        finding
+        for e, sensor, own in zip(of_each, names, axes, strict=True)
+        for finding in regime_findings(e, (sensor,), own, LEVEL / len(names), rng)
+    ]
+    return replace(_by_parts(residuals, names, dt_s, LEVEL), regimes=tuple(regimes))
 
 
 def _by_parts(residuals: Mapping[str, Real], sensors: Sequence[str], dt_s: float, level: float) -> Where:

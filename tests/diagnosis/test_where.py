@@ -7,11 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.fft import dct
+from scipy.signal import lfilter
 
 from diagnosis import Case, Experiment, ResidualModel
 from diagnosis.where.distortion import periodic_findings
 from diagnosis.where.regimes import motions
-from diagnosis.where.where import subsystem_mass, where
+from diagnosis.where.where import subsystem_mass, where, where_in_records
 from diagnosis.where.where_energy import band_gaps, sensor_gaps
 from diagnosis.where.where_trends import amplitude_finding, common_findings
 from plant import EFFECTS, multisine, multisine_lines, simulate
@@ -378,3 +379,32 @@ def test_of_records_shorter_than_a_second_no_growth_with_the_input_is_said(sampl
     found = amplitude_finding(case, residuals, 0.05, rng)
     assert (found is not None) == said
     assert found is None or np.all(np.isfinite(found.interval))
+
+
+@pytest.mark.parametrize(
+    ("added", "said"),
+    [
+        (lambda y, v, u, t, noise: 2 * (v > 0) * noise, "direction of a: where a "),
+        (
+            lambda y, v, u, t, noise: 3.0 * (np.abs(u) > 0.8),
+            "size of input 1: where input 1 has a size of 0.",
+        ),
+        (lambda y, v, u, t, noise: 3.0 * (y > 0.3), "value of a: where a is 0."),
+        (lambda y, v, u, t, noise: 3.0 * (t > 6), "time: 6.7 to 8 s after the start"),
+        (lambda y, v, u, t, noise: 0 * y, ""),
+    ],
+)
+def test_of_any_machine_it_is_said_when_it_errs(added, said):
+    """One of two outputs, in a direction, for a size of an input, at a place, late, never."""
+    rng, records, left, t = np.random.default_rng(1), [], {}, 0.01 * np.arange(800)
+    for name in "nopqrstuvw":
+        u = rng.uniform(-1, 1, (100, 2)).repeat(8, axis=0)
+        y, e = lfilter([0.1], [1.0, -0.9], u, axis=0), rng.standard_normal((800, 2))
+        e[:, 0] += added(y[:, 0], np.gradient(y[:, 0]), u[:, 0], t, rng.standard_normal(800))
+        records.append(SimpleNamespace(name=name, input=u, output=y + 1e-3 * e, role="estimation"))
+        left[name] = e
+    machine = SimpleNamespace(output_names=("a", "b"), weighing=SimpleNamespace(model_error=0.0))
+    case = SimpleNamespace(machine=machine, experiments=records, noise=np.array([1e-3, 1e-3]))
+    found = where_in_records(case, left, 0.01).telling_regimes
+    assert [one.sensor for one in found] == ["a"] * len(found)
+    assert any(f"{one.axis}: {one.peak.label}".startswith(said) for one in found) == bool(said)

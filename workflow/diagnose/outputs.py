@@ -12,7 +12,7 @@ import tomlkit
 
 from diagnosis.answer import Diagnosis
 from diagnosis.machine.telling import telling
-from diagnosis.where.where import where
+from diagnosis.where.where import where, where_in_records
 from plant.rig import Rig
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.check import of_case
@@ -98,8 +98,11 @@ class Work:
             if loaded.repaired is not None:
                 files[f"{name}.xml"] = loaded.repaired(found, self.out).encode()
             files[f"{name}.html"] = plant_page(found, coming, told, loaded.model_error, *files).encode()
+        remains = remains_of(found)
         beside = {
-            "completeness": completeness_of(found, remains_of(found)),
+            "where": where_in_records(found.case, found.residuals_refit, found.case.dt_s),
+            "remains": remains,
+            "completeness": completeness_of(found, remains),
             "next_experiment": {"advice": coming.advice, **codec.plain(coming.repeat or {})},
             "check": told.numbers,
         }

@@ -110,7 +110,7 @@ def draw_regimes(where: Where, model_error: float = 0.0) -> Figure | None:
         at, count = np.arange(len(finding.bins)), len(finding.bins)
         low, high = np.array([one.interval for one in finding.bins]).T
         axes.bar(at, high - low, bottom=low, width=0.8, color="#dddddd", label="95 % of what chance gives")
-        name, colour = _LOOKS[finding.sensor]
+        name, colour = _look(where, finding.sensor)
         axes.plot(at, [one.energy for one in finding.bins], "o", ms=6, color=colour, label=name)
         # The label where there is room for words, else the range on two lines.
         named = [
@@ -121,7 +121,7 @@ def draw_regimes(where: Where, model_error: float = 0.0) -> Figure | None:
         axes.axhline(1.0, **gap_style.floor_of(model_error))
         axes.set_ylim(bottom=0)
         axes.grid(visible=False, axis="x")
-        axes.set_xlabel(_with_unit(_REGIMES[finding.axis], finding.unit))
+        axes.set_xlabel(_with_unit(_REGIMES.get(finding.axis, finding.axis), finding.unit))
         axes.set_ylabel(f"residual energy\nover that of {floor} [1]")
         axes.set_title(name, fontsize=9.5, fontweight="normal")
     return figure
