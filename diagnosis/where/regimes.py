@@ -140,7 +140,7 @@ def axes_of_output(
     for j in range(inputs):
         called = "the input" if inputs == 1 else f"input {j + 1}"
         u = {name: e.input[:, j] for name, e in every.items()}
-        signs = f"where {called} is negative", f"where {called} is positive"
+        signs = f"where {called} < 0", f"where {called} > 0"
         axes += [
             _directions(f"sign of {called}", "", signs, u),
             _quantiles(
