@@ -249,7 +249,7 @@ def test_a_ratio_that_multiplies_nothing_is_refused_when_it_is_registered():
 
         @register
         class Nothing(RatioEffect):
-            id = "nothing"
+            id, words = "nothing", "nothing"
 
     assert "nothing" not in EFFECTS
 
