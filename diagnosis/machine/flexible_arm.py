@@ -50,6 +50,8 @@ class FlexibleArm:
     outputs: tuple[Output, ...] = ("hub_angle_rad", "tip_m")
     model_error: float = 0.0
 
+    input_names = ("voltage_V",)
+
     @property
     def output_names(self) -> Sequence[str]:
         return self.outputs

@@ -93,6 +93,10 @@ class SimulatedMachine(Protocol):
     def output_names(self) -> Sequence[str]: ...
 
     @property
+    def input_names(self) -> Sequence[str]:
+        """Empty where nobody has named them."""
+
+    @property
     def noise(self) -> Real:
         """(Y,) noise standard deviations in the outputs' units."""
 

@@ -231,4 +231,5 @@ class MujocoArm(MujocoModel):
                 replace(self, tracking_rad_s=0.0), every, noise, False, _starts=simulation._starts
             ),
             units=self.units,
+            input_names=self.inputs,
         )

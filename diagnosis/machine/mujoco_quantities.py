@@ -249,7 +249,8 @@ class Quantities:
             put,
             "delay_s",
             self.model.dt_s,
-            *(((0.02, 100.0), (0.2, 10.0))),
+            (0.02, 100.0),
+            (0.2, 10.0),
             group="sensor",
         )
 

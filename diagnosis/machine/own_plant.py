@@ -94,6 +94,7 @@ class Plant:
     untracked : the simulation without what holds it near a record, which is in these inputs; None: nothing
         does.
     units : output -> unit, of outputs whose names do not end with it.
+    input_names : of the inputs, for pages; inputs behind these only hold a simulation near its record.
     """
 
     simulation: Simulate
@@ -109,6 +110,7 @@ class Plant:
     settled: Callable[[Real, Real], Real] | None = None
     untracked: Simulate | None = None
     units: Mapping[str, str] = field(default_factory=dict)
+    input_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         lock(self, "noise")

@@ -74,7 +74,8 @@ def telling(case: PlantCase, deadline_s: float = np.inf) -> Telling:
     samples = [len(e.output) for e in records]
     shows = {name: _shown(column, samples) for name, column in columns.items()}
     least = {name: sizes[name] / shows[name] if shows[name] > 0 else np.inf for name in columns}
-    for effect in (one for one in plant.effects if not one.grows and one.name in columns):
+    limits = (one for one in plant.effects if not one.grows and one.name in columns)
+    for effect in (one for one in limits if time.monotonic() < deadline_s):
         (candidate, *_), first = effect.candidates(), effect.parameters[0].name
         # Of a range of twenty to one, steps of an eighth.
         grid = [np.array([x, *candidate.starts[0][1:]]) for x in np.linspace(*candidate.axes[0].box, 24)]

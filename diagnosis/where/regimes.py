@@ -129,16 +129,21 @@ def axes_of_output(
     output, every = case.machine.output_names[k], {e.name: e for e in case.experiments}
     value = {name: e.output[:, k] - residuals[name][:, k] * case.noise[k] for name, e in every.items()}
     rate = {name: np.asarray(np.gradient(v, dt_s)) for name, v in value.items()}
-    sizes = {name: np.abs(v) for name, v in rate.items()}
     axes = [
         _quantiles(f"value of {output}", "", value, bins, f"where {output} is"),
         _directions(f"direction of {output}", "", (f"where {output} falls", f"where {output} rises"), rate),
-        _quantiles(f"rate of {output}", "per s", sizes, bins, f"where {output} changes by"),
+        _quantiles(
+            f"rate of {output}",
+            "per s",
+            {name: np.abs(v) for name, v in rate.items()},
+            bins,
+            f"where {output} changes by",
+        ),
         _stretches({name: np.asarray(np.arange(len(v)) * dt_s) for name, v in value.items()}, bins + 1),
     ]
-    inputs = next(iter(every.values())).input.shape[1]
-    for j in range(inputs):
-        called = "the input" if inputs == 1 else f"input {j + 1}"
+    for j, called in enumerate(
+        case.machine.input_names or [f"input {j + 1}" for j in range(case.experiments[0].input.shape[1])]
+    ):
         u = {name: e.input[:, j] for name, e in every.items()}
         signs = f"where {called} < 0", f"where {called} > 0"
         axes += [
@@ -219,8 +224,9 @@ def regime_findings(
     rng: np.random.Generator,
 ) -> tuple[RegimeFinding, ...]:
     """One finding per axis and sensor; all of them together raise a false alarm with the chance `level`."""
-    each = level / max(len(axes) * len(sensors), 1)
-    found = []
+    each, found = level / max(len(axes) * len(sensors), 1), list[RegimeFinding]()
+    if each * (_SHIFTS + 1) <= 1:  # of so many questions no answer is beyond chance
+        return ()
     for axis in axes:
         sums, counts = _shifted_energy(residuals, axis, rng)
         found += [_finding(axis, sensor, sums[:, s], counts, each) for s, sensor in enumerate(sensors)]

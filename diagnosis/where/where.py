@@ -81,11 +81,12 @@ def where_in_records(case: CaseOfMachine, residuals: Mapping[str, Real], dt_s: f
     axes = [axes_of_output(case, residuals, dt_s, k) for k in range(len(names))]
     if case.machine.weighing.model_error > 0:
         _, residuals = over_levels(case, residuals, thresholds_of(case))
-    of_each = [{name: e[:, [k]] for name, e in residuals.items()} for k in range(len(names))]
     regimes = [
         finding
-        for e, sensor, own in zip(of_each, names, axes, strict=True)
-        for finding in regime_findings(e, (sensor,), own, LEVEL / len(names), rng)
+        for k, (sensor, own) in enumerate(zip(names, axes, strict=True))
+        for finding in regime_findings(
+            {name: e[:, [k]] for name, e in residuals.items()}, (sensor,), own, LEVEL / len(names), rng
+        )
     ]
     return replace(_by_parts(residuals, names, dt_s, LEVEL), regimes=tuple(regimes))
 

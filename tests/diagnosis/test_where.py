@@ -401,10 +401,10 @@ def test_of_any_machine_it_is_said_when_it_errs(added, said):
         u = rng.uniform(-1, 1, (100, 2)).repeat(8, axis=0)
         y, e = lfilter([0.1], [1.0, -0.9], u, axis=0), rng.standard_normal((800, 2))
         e[:, 0] += added(y[:, 0], np.gradient(y[:, 0]), u[:, 0], t, rng.standard_normal(800))
-        records.append(SimpleNamespace(name=name, input=u, output=y + 1e-3 * e, role="estimation"))
+        records.append(SimpleNamespace(name=name, input=u, output=y + 1e-3 * e))
         left[name] = e
-    machine = SimpleNamespace(output_names=("a", "b"), weighing=SimpleNamespace(model_error=0.0))
-    case = SimpleNamespace(machine=machine, experiments=records, noise=np.array([1e-3, 1e-3]))
+    given = {"input_names": (), "output_names": ("a", "b"), "weighing": SimpleNamespace(model_error=0.0)}
+    case = SimpleNamespace(machine=SimpleNamespace(**given), experiments=records, noise=np.full(2, 1e-3))
     found = where_in_records(case, left, 0.01).telling_regimes
-    assert [one.sensor for one in found] == ["a"] * len(found)
+    assert {one.sensor for one in found} <= {"a"}
     assert any(f"{one.axis}: {one.peak.label}".startswith(said) for one in found) == bool(said)

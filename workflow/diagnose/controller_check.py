@@ -293,5 +293,5 @@ def _sampled(a: Real, b: Real, c: Real, dt_s: float, path: VoltagePath) -> contr
 
 def _held(a: Real, b: Real, time_s: float) -> tuple[Real, Real]:
     """e^(a t) and the integral of e^(a s) b over (0, t)."""
-    step, held, *_ = cont2discrete((a, b, *(np.zeros((1, len(a))), np.zeros((1, b.shape[1])))), time_s, "zoh")
+    step, held, *_ = cont2discrete((a, b, np.zeros((1, len(a))), np.zeros((1, b.shape[1]))), time_s, "zoh")
     return step, held

@@ -93,14 +93,19 @@ class Work:
             found = self.diagnose(loaded.case, progress=lambda f, m: report(_CONTROLLER * f, m))
             found = with_units(replace(found, doubts=(*loaded.doubts, *found.doubts)), loaded.units)
             coming = following(found)
+            place, remains = (
+                where_in_records(found.case, found.residuals_refit, found.case.dt_s),
+                remains_of(found),
+            )
             told = of_case(loaded, telling(loaded.case, time.monotonic() + _TOLD_S))
             files = {}
             if loaded.repaired is not None:
                 files[f"{name}.xml"] = loaded.repaired(found, self.out).encode()
-            files[f"{name}.html"] = plant_page(found, coming, told, loaded.model_error, *files).encode()
-        remains = remains_of(found)
+            files[f"{name}.html"] = plant_page(
+                found, coming, told, loaded.model_error, *files, places=(place, remains)
+            ).encode()
         beside = {
-            "where": where_in_records(found.case, found.residuals_refit, found.case.dt_s),
+            "where": place,
             "remains": remains,
             "completeness": completeness_of(found, remains),
             "next_experiment": {"advice": coming.advice, **codec.plain(coming.repeat or {})},

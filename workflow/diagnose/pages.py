@@ -59,10 +59,13 @@ def plant_page(
     told: RunSummary | None = None,
     model_error: float = 0.0,
     repaired: str = "",
+    *,
+    places: tuple[Where, Where] | None = None,
 ) -> str:
     """One self-contained HTML page about a `PlantCase`; equal content gives equal bytes. told: what its
     records can tell (`workflow.diagnose.check`). model_error: as stated. repaired: file of the repaired model
-    beside the page.
+    beside the page. places: where the error
+    lies and what remains lies, where these are known.
 
     Raises ValueError if the plant does not state its sampling period.
     """
@@ -73,10 +76,11 @@ def plant_page(
         "parameters": dict(found.rig.parameters),
         "effects": [change.to_dict() for change in found.repair],
     }
+    place, remains = places or (where_in_records(found.case, found.residuals_refit, dt_s), remains_of(found))
     page = {
         "found": found,
-        "where": where_in_records(found.case, found.residuals_refit, dt_s),
-        "remains": remains_of(found),
+        "where": place,
+        "remains": remains,
         "next_experiment": coming,
         "told": told,
         "model_error": model_error,

@@ -393,6 +393,7 @@ def _with_all(
             settings.model_error,
             dt_s,
             units=getattr(simulation, "units", {}),
+            input_names=tuple(inputs),
         )
         around = partial(with_effects, experiments=experiments, dt_s=dt_s, at_rest_before=False)
         motion, motion_is = (outputs[0], settings.motion) if settings.motion else _motion(inputs, outputs)

@@ -87,7 +87,8 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
                     measured=OUTPUT_NAMES.index(config.control_channel.output),
                     rng=stage.rng("closed_loop", "conditions"),
                 )
-                conditions = bench.run_all()
+                some = bench.slew(), bench.push(), *bench.payloads(), bench.late(), *bench.frictions()
+                conditions = [*some, bench.coarse(), *bench.overdriven()]
         else:
             # Control and performance channel are drawn independently.
             own = posterior.sample(stage.rng("closed_loop", "control"), options.draws)

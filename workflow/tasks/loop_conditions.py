@@ -91,11 +91,6 @@ class ConditionBench:
         """Effects of the arm the controller meets, by name."""
         return {str(e["name"]): dict(e) for e in (*self.source.effects, *self.options.effects)}
 
-    def run_all(self) -> list[ConditionRun]:
-        """Every condition that this arm and controller allow."""
-        found = [self.slew(), self.push(), *self.payloads(), self.late(), *self.frictions(), self.coarse()]
-        return [*found, *self.overdriven()]
-
     def predict(
         self,
         reference: RealArray,
