@@ -32,13 +32,11 @@ help:
 	@echo "make dist   wheel and source archive in build/dist, the same bytes from the same commit"
 	@echo "make check  what CI runs: tests, lint, types, wheel"
 
-# What a user needs. Not compiled to bytecode: of the large packages a run imports a small part. The pip that comes with
-# older systems (23.0) looks for many minutes which of the pinned versions go together.
+# What a user needs. Not compiled to bytecode: of the large packages a run imports a small part.
 $(PRODUCT): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "flexlink needs Python 3.11 or newer with venv"; exit 2; }
 	@echo "installing flexlink and its pinned dependencies into $(VENV) (half a minute, once)"
 	@$(PYTHON) -m venv $(VENV)
-	@$(PIP) --upgrade pip
 	@$(PIP) --no-compile -e '.[logs,mujoco]'
 	@touch $@
 
