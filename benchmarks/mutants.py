@@ -355,7 +355,7 @@ class Judge:
         self.copy, self.slow, self.cpu_s, self.fail_anyway = copy, slow, 0.0, set[str]()
 
     def verdict(self, mutant: Mutant, *, frozen: bool) -> str:
-        """Who saw it. Raises ValueError where it cannot be placed."""
+        """Who saw it. Raises ValueError where it cannot be placed, RuntimeError where tests cannot be run."""
         while True:
             with self.copy.holding(mutant) as root:
                 failed = self._failed(root, ROOMS[mutant.room])
@@ -363,6 +363,8 @@ class Judge:
                 break
             if self._failed(self.copy.clean, [failed]) is None:
                 return f"killed by {failed}"
+            if failed in self.fail_anyway:  # no test, which could be left out
+                raise RuntimeError(f"the tests cannot be run without a mutant either: {failed}")
             self.fail_anyway.add(failed)
         if not frozen:
             return "survived the tests"

@@ -88,6 +88,7 @@ def checkout(tmp_path):
     """A small one: one function is tested, one is not, and one test fails."""
     root = tmp_path / "checkout"
     for file, text in {
+        "plant/__init__.py": "",  # else an installed package of that name is found first
         "plant/shape.py": CODE,
         "tests/plant/test_shape.py": TEST,
         "pyproject.toml": "[tool.pytest.ini_options]\nmarkers = ['slow: long']\n",
@@ -121,3 +122,11 @@ def test_what_tests_see_and_what_survives_and_the_checkout_stays_as_it_is(checko
     assert texts(checkout) == before
     assert copy.left_behind() == []
     assert not (copy.path / ".git").exists()
+
+
+def test_tests_that_cannot_be_run_are_said_instead_of_run_for_ever(checkout, tmp_path):
+    (checkout / "tests/plant/test_shape.py").write_text("import nowhere\n")
+    with pytest.raises(RuntimeError, match="cannot be run without a mutant either: tests/plant/test_shape"):
+        Judge(Copy(checkout, tmp_path / "copies"), slow=False).verdict(
+            by_function(checkout, "area"), frozen=False
+        )
