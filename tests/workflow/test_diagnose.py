@@ -456,6 +456,7 @@ def test_no_name_of_the_standard_library_in_the_current_folder_is_taken_for_it(t
     (index, (files, safe)) = ast.literal_eval(done.stdout)
     assert (index, len(files), safe) == (0, len(NAMES), None)
     assert not any(str(tmp_path) in file for file in files)
+    (tmp_path / "types.py").unlink()  # Python's own -m ends at it, whatever the package
     version = run([sys.executable, "-m", "flexlink", "--version"])
     assert version.stdout.startswith("flexlink "), version.stderr
 
