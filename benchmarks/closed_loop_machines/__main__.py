@@ -7,19 +7,18 @@ Seeds with seed mod 6 below 4 record the reference. Series 1 is for development.
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.closed_loop_machines.judge import followed, judged
-from benchmarks.closed_loop_machines.logs import Machine, machine, write
+from benchmarks.closed_loop_machines.judge import judged
+from benchmarks.closed_loop_machines.logs import machine, write
 from benchmarks.closed_loop_machines.machines import KINDS
 from benchmarks.harness import Print, main
 
@@ -35,19 +34,14 @@ def run(
     keep: str = "",
     judge_only: bool = False,
     make_only: str = "",
-    follow: bool = False,
 ) -> None:
     """A line per machine and the table by kind. bla: realisations, 0 for none; keep: where logs, runs and
-    judged.json stay, to be judged again with judge_only. follow: only what `judge.followed` makes of the
-    machines in `keep` that ended without a certificate."""
+    judged.json stay, to be judged again with judge_only."""
     first, last = map(int, seeds.split(":"))
     cases = [(kind, seed) for kind in kinds.split(",") for seed in range(first, last)]
     if make_only:
         for kind, seed in cases:
             write(machine(kind, seed, series), Path(make_only), Path(f"{make_only.rstrip('/')}_truth"))
-        return
-    if follow:
-        _follow(out, [machine(*case, series) for case in cases], Path(keep), jobs)
         return
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as scratch, ProcessPoolExecutor(jobs) as pool:
@@ -61,18 +55,6 @@ def run(
     for kind in dict.fromkeys(row["kind"] for row in found):
         out(_table_row(kind, [row for row in found if row["kind"] == kind]))
     out(_table_row("all", found))
-
-
-def _follow(out: Print, machines: Sequence[Machine], folder: Path, jobs: int) -> None:
-    """A line per machine that ended without a certificate: whether its next step led to one."""
-    told = [(one, json.loads((folder / one.name / "told.json").read_text())) for one in machines]
-    ended = [(one, row["line"]) for one, row in told if not row["certified"]]
-    with ThreadPoolExecutor(jobs) as pool:
-        led = list(pool.map(lambda pair: followed(pair[0], folder, pair[1]), ended))
-    for (one, _), certified in zip(ended, led, strict=True):
-        out(f"{one.name}: " + ("no next step" if certified is None else f"certified {certified}"))
-    named, right = sum(certified is not None for certified in led), led.count(True)
-    out(f"of {len(led)} without a certificate {named} name a next step; it led to one in {right}")
 
 
 def _one(case: tuple[str, int], series: int, **options: Any) -> dict[str, Any]:

@@ -28,7 +28,6 @@ from __future__ import annotations
 import json
 import re
 import resource
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -38,7 +37,7 @@ from typing import Any
 import numpy as np
 import scipy.signal
 
-from benchmarks.closed_loop_machines.logs import Machine, printed, write
+from benchmarks.closed_loop_machines.logs import Machine, write
 from benchmarks.closed_loop_machines.machines import TAU, loop_gain, loop_radius
 from benchmarks.closed_loop_machines.simulator import Array, Law, Plant, response
 
@@ -73,48 +72,6 @@ def judged(one: Machine, folder: Path, bla: int = 0, judge_only: bool = False) -
         found |= controller_on_machine(one, truth, run)
     (work / "judged.json").write_text(json.dumps(found, indent=1, default=float) + "\n")
     return found
-
-
-def followed(one: Machine, folder: Path, line: str) -> bool | None:
-    """Whether the next step of a line that ended without a certificate leads to one; None where it names
-    none. A reference that is planned is played on the machine, its last record validates; of several steps
-    that one is taken."""
-    work, logs = folder / one.name, sorted((folder / "logs" / one.name).glob("*"))
-    config, run, steps = work / "run" / "config.toml", work / "followed", work / "played"
-    if not config.is_file():  # refused before there was a run
-        config = work / "my.toml"
-        _flexlink("init", *map(str, logs), "--out", str(config), "--replace")
-    edited = config.with_name("followed.toml")
-    if "flexlink excite --closed-loop" in line:
-        asked = [] if one.kept else ["--rms", f"{0.5 * one.draft.motion_rad * one.plant.scale:.4g}"]
-        plan = work / "plan"
-        shutil.rmtree(plan, ignore_errors=True)
-        if _flexlink("excite", "--closed-loop", *map(str, logs), "--out", str(plan), *asked)[0]:
-            return False
-        steps.mkdir(exist_ok=True)
-        made = replace(one, kept=True)
-        for k, file in enumerate(sorted(plan.glob("*.csv"))):
-            reference = np.loadtxt(file, delimiter=",", skiprows=1)[:, 1]
-            printed(made, made.play(reference, made.rng(3000 + k)), 0, 0.0, steps / f"{k:02d}.csv.gz")
-        config = work / "followed.toml"
-        if _flexlink("init", *map(str, sorted(steps.glob("*"))), "--out", str(config), "--replace")[0]:
-            return False
-    elif "response = 'as recorded'" in line:
-        text = config.read_text()
-        edited.write_text(text.replace('response = "without friction"', 'response = "as recorded"'))
-        config = edited
-    elif meets := re.search(r"(\w+) = ([\d.e+-]+) would meet it", line):
-        key = re.escape(meets[1])
-        edited.write_text(re.sub(rf"(?m)^{key} = \S+", f"{meets[1]} = {meets[2]}", config.read_text()))
-        config = edited
-    elif "controller_order" in line:
-        edited.write_text(config.read_text().replace("controller_order = 5", "controller_order = 8"))
-        config = edited
-    else:
-        return None
-    words = "--config", str(config), "--out", str(run), "--replace", "--json"
-    code, text, _ = _flexlink("run", *words)
-    return code == 0 and bool(json.loads(text).get("certified"))
 
 
 def controller_on_machine(one: Machine, truth: dict[str, Any], run: Path) -> dict[str, Any]:
