@@ -63,18 +63,6 @@ def _case(rng, samples=400, model_error=0.05):
     return Case("walk", RIG, tuple(records), model_error)
 
 
-def test_weights_are_the_slope_of_the_loss():
-    rng = np.random.default_rng(1)
-    case = _case(rng)
-    levels = Levels.of(case.estimation, case.noise, 0.05)
-    e = 0.01 * rng.standard_normal(case.estimation[0].output.size)
-    for k in (0, 5, 100, 799):
-        step = np.zeros(e.size)
-        step[k] = 1e-6
-        slope = (levels.loss(e + step) - levels.loss(e - step)) / 2e-6
-        assert slope == pytest.approx(levels.weights(e)[k] * e[k], rel=1e-5)
-
-
 def test_a_share_of_a_band_counts_the_same_at_any_size_above_its_floor():
     case = _case(np.random.default_rng(2))
     levels = Levels.of(case.estimation, case.noise, 1e-6)

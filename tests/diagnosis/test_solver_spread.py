@@ -7,6 +7,8 @@ from diagnosis.evidence.hypotheses import disagreement_gain
 from diagnosis.fit.discrepancy import Discrepancy
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
+from plant import EFFECTS
+from plant.effects.search_space import Candidate
 from tests.diagnosis.recorded import end_of_fit, simulated_case
 from validation.blind.rigs import draw_rig
 
@@ -29,8 +31,8 @@ def _near_the_truth(folder, effect, values, *, seed, off=1.0):
 @pytest.mark.parametrize(
     ("seed", "off"),
     [
-        *[(0, 0.999), (7, 1.001)],
-        *[pytest.param(0, 1.001, marks=pytest.mark.slow), pytest.param(7, 0.999, marks=pytest.mark.slow)],
+        (0, 0.999),
+        *[pytest.param(*one, marks=pytest.mark.slow) for one in ((0, 1.001), (7, 0.999), (7, 1.001))],
         *[pytest.param(seed, off, marks=pytest.mark.long) for seed in (1, 6) for off in (0.999, 1.001)],
     ],
 )
@@ -72,7 +74,7 @@ def test_residuals_that_drift_as_predicted_are_white_over_it():
     assert drift.log_gain == pytest.approx(expected, rel=0.05)
 
 
-def test_no_evidence_pays_for_a_rest_that_no_solver_leaves(tmp_path):
-    _, end = _near_the_truth(tmp_path, "backlash", {"gap_rad": 0.02}, seed=1)
+def test_no_evidence_pays_for_a_rest_that_no_solver_leaves():
+    end = end_of_fit((Candidate(EFFECTS["backlash"], (), ()),), (), np.zeros(4), np.zeros((4, 0)))
     assert disagreement_gain(end, Discrepancy(2e4, 2e4, 0.3)) > 1.9e4
     assert disagreement_gain(end, Discrepancy(2e4, 2e4, 2.0)) < 2e3

@@ -80,7 +80,7 @@ def test_what_classes_of_rows_differ_in_widens_the_ellipses(share):
     """A gain that is larger in the faster half of the rows; without it the classes add little."""
     pole, n, widths = 0.9 * np.exp(0.3j), 3000, []
     model = GobfModel(Poles(np.zeros(0), np.array([pole])), np.zeros(2), DT)
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         u = rng.standard_normal(n)
         y = signal.lfilter([0, 0.1], np.poly([pole, np.conj(pole)]).real, u)

@@ -438,8 +438,7 @@ def test_ellipses_hold_the_force_that_the_data_leave_open(wide: float, share: fl
     damped = 1 + wide * np.random.default_rng(3).standard_normal(600)
 
     def arm(c: float) -> ComplexArray:
-        sampled = control.tf([1], [1, c, 0]).sample(dt_s)
-        return np.array([sampled(np.exp(1j * one * dt_s)) for one in omega])
+        return np.asarray(control.tf([1], [1, c, 0]).sample(dt_s)(np.exp(1j * omega * dt_s)))
 
     poles, middle = Poles(np.array([np.exp(-dt_s)])), arm(1.0)
     nothing = ResponsePosterior(poles.doubled(), np.zeros(size), np.zeros((size, 1)), dt_s, 20, integrators=1)

@@ -13,7 +13,6 @@ from ident.basis.model import MisoModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.data.record import Record
-from ident.one_input import identify
 from ident.several_outputs import identify_mimo
 from ident.uncertainty.matrix_response import matrix_posterior
 
@@ -136,15 +135,6 @@ def test_the_rational_factor_is_that_of_the_balls(integrators):
     np.testing.assert_allclose(
         values.conj().swapaxes(1, 2) @ values, own.conj().swapaxes(1, 2) @ own, rtol=1e-4, atol=1e-14
     )
-
-
-def test_one_input_and_one_output_are_those_of_the_plain_fit():
-    item = record(structure(), 3).siso("u1", "y1")
-    one, several = identify([item]), identify_mimo([item])
-    np.testing.assert_allclose(
-        several.model.frequency_response(OMEGA)[:, 0, 0], one.model.frequency_response(OMEGA), rtol=0.05
-    )
-    assert several.rank_one == ()
 
 
 def test_a_start_in_motion_is_estimated():

@@ -19,9 +19,7 @@ def test_help_names_the_plugged_commands_without_importing_them():
     assert "\n  paper " in done.stdout
 
 
-def test_a_plugged_command_whose_argument_is_called_like_one_of_ours(tmp_path):
-    command = [sys.executable, "-m", "workflow", "paper", "--out", "run"]
+def test_a_plugged_command_whose_argument_is_called_like_one_of_ours(refused, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "run").write_text("a file")
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("flexlink: cannot write run: ")
+    assert refused("paper", "--out", "run").startswith("flexlink: cannot write run: ")

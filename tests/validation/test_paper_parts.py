@@ -26,10 +26,8 @@ from validation.paper.usual_starts import instrumental_variables, usual_oe
 
 
 def test_simulation_example_is_the_printed_plant():
-    """Zeros near +10.8 and -10.5, two poles at the origin; held input by another discretisation."""
+    """Held input by another discretisation; zeros and poles are in test_example_arms."""
     plant = paper_example()
-    np.testing.assert_allclose(np.sort(plant.zeros().real), [-10.5, 10.8], rtol=1e-3)
-    assert np.sum(np.abs(plant.poles()) < 1e-6) == 2
     numerator, denominator, _ = scipy.signal.cont2discrete(
         (plant.num[0][0], plant.den[0][0]), DT_S, method="zoh"
     )
