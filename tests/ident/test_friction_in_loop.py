@@ -45,7 +45,7 @@ def belt() -> tuple[Machine, list[Record], FrictionFit]:
     """The kind of log that was reported: a belt under its PD controller."""
     one = machine("belt", 0)
     log = logged(one, 0)
-    records = [log.slice(0, round(0.35 * log.n_samples))]
+    records = [log.slice(0, round(0.22 * log.n_samples))]
     return one, records, fit_friction(records, IdentOptions(integrators=1))
 
 
