@@ -189,7 +189,17 @@ def advice(
         *([finding(FindingKind.WEAK_INPUT, limit_rad_s=limit)] if limit < 0.6 * np.pi / data.dt_s else []),
         *clipped(records),
         *_drifting(records, data, model, residuals, fixed),
-        *_far_from_zero(records, data),
+        *(
+            finding(
+                FindingKind.FAR_FROM_ZERO,
+                record=record.label,
+                input=record.input_names[0],
+                mean=record.input.mean(),
+                std=record.input.std(),
+            )
+            for record in ([] if data.structure.estimate_initial_state else records)
+            if abs(record.input.mean()) > _LARGE_OFFSET * record.input.std()
+        ),
     ]
 
 
@@ -321,23 +331,6 @@ def _is_a_line(data: Regression, poles: Poles, index: int) -> bool:
     if not data.n_samples > with_lines.n_parameters(without.order):
         return False
     return with_lines.linearise(*without.writable()).rss <= _AS_WELL * data.linearise(*poles.writable()).rss
-
-
-def _far_from_zero(records: Sequence[Record], data: Regression) -> list[Finding]:
-    found = []
-    for record in records:
-        u = record.input[:, 0]
-        if abs(u.mean()) > _LARGE_OFFSET * u.std() and not data.structure.estimate_initial_state:
-            found.append(
-                finding(
-                    FindingKind.FAR_FROM_ZERO,
-                    record=record.label,
-                    input=record.input_names[0],
-                    mean=u.mean(),
-                    std=u.std(),
-                )
-            )
-    return found
 
 
 def excitation_limit_rad_s(

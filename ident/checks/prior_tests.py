@@ -281,19 +281,15 @@ def _spare_integrators(records: Sequence[Record], given: Fitted) -> tuple[int, f
         if value > (k - fewer) * one:
             break
         found = fewer, value, (k - fewer) * one
-    return None if found is not None and _other_pole_to_spare(given, one) else found
-
-
-def _other_pole_to_spare(given: Fitted, price: float) -> bool:
-    """Is the model as good without one of its searched poles, or pairs (twice the price)? Then that one can
-    take the place of an integrator, or a pair that of two."""
-    poles, fixed = given.poles, given.search.fixed
-    fewer = [(poles.without_real(i), price) for i in range(fixed.real.size, poles.real.size)]
-    fewer += [(poles.without_pair(i), 2 * price) for i in range(fixed.pairs.size, poles.pairs.size)]
-    return any(
-        statistic(given.search.descend(start, "one less").rss, given) <= limit_here
-        for start, limit_here in fewer
-    )
+    if found is not None:
+        # As good without one of the searched poles, or pairs (twice the price): that one can take the place
+        # of an integrator, or a pair that of two.
+        poles, fixed = given.poles, given.search.fixed
+        less = [(poles.without_real(i), one) for i in range(fixed.real.size, poles.real.size)]
+        less += [(poles.without_pair(i), 2 * one) for i in range(fixed.pairs.size, poles.pairs.size)]
+        if any(statistic(given.search.descend(start, "one less").rss, given) <= most for start, most in less):
+            return None
+    return found
 
 
 @dataclass(frozen=True)

@@ -135,7 +135,10 @@ class Table:
                 raise ValueError(f"{self.path}: {columns}; the file has {self.listed(name)}")
         found = {name: self._numbers(name) for name in dict.fromkeys(wanted)}
         if self.clocks:
-            found = self._held(found, self.clocks[rows_of or next(iter(found))])
+            base = self.clocks[rows_of or next(iter(found))]
+            rows = base[base >= max(self.clocks[name][0] for name in found)]
+            held = {name: np.searchsorted(self.clocks[name], rows, side="right") - 1 for name in found}
+            found = {name: values[held[name]] for name, values in found.items()}
         sizes = {name: column.size for name, column in found.items()}
         if len(set(sizes.values())) > 1:
             raise ValueError(
@@ -143,14 +146,6 @@ class Table:
                 "samples of one time"
             )
         return found
-
-    def _held(self, found: Mapping[str, RealArray], base: RealArray) -> dict[str, RealArray]:
-        clocks = [self.clocks[name] for name in found]
-        rows = base[base >= max(clock[0] for clock in clocks)]
-        return {
-            name: values[np.searchsorted(clock, rows, side="right") - 1]
-            for (name, values), clock in zip(found.items(), clocks, strict=True)
-        }
 
     def _alike(self, wanted: str) -> list[str]:
         """Columns of one name, as `distinct` tells them apart."""

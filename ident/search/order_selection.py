@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -75,8 +76,12 @@ class OrderSelection:
         best = self._noted(self.search.rescan(first))
         for _ in range(3):
             order = best.poles.order
-            grown = self._grow_pairs(best, most_pairs)
-            best = self._grow_real(grown) if options.n_real is None else grown
+            best = grown = self._grow_pairs(best, most_pairs)
+            while options.n_real is None and self._counts(best)[0] < options.max_real and self._visible(best):
+                trial = self._noted(self.search.rescan(self.search.add_real(best.poles)))
+                if not self._better(trial, best):
+                    break
+                best = trial
             best = self.pruned(best)
             # From where no pair was to be added, none will be: a second look would end the same.
             if best is grown or best.poles.order == order:
@@ -112,12 +117,8 @@ class OrderSelection:
                         poles.without_pair(i).appended(Poles(np.exp(-size * np.array(apart))))
                         for apart in ([1.0], [1.0 / _APART, _APART])
                     ]
-            if not trials:
-                break
-            ends = [self._noted(self.search.descend(trial, "real poles of a pair")) for trial in trials]
-            criterion = self._criterion(best)
-            chosen = min(ends, key=lambda end: criterion(end.rss, end.poles.order))
-            if not criterion(chosen.rss, chosen.poles.order) < criterion(best.rss, best.poles.order):
+            chosen = self._likeliest(best, trials, "real poles of a pair")
+            if chosen is best:
                 break
             best = self.pruned(chosen)
         return self._apart(best)
@@ -172,25 +173,22 @@ class OrderSelection:
         samples = self.search.colour(best).effective_samples
         return self._noted(found) if samples * np.log(best.rss / found.rss) > _LIKELIER else best
 
-    def _grow_real(self, best: Refined) -> Refined:
-        while self._counts(best)[0] < self.options.max_real and self._visible(best):
-            trial = self._noted(self.search.rescan(self.search.add_real(best.poles)))
-            if not self._better(trial, best):
-                break
-            best = trial
-        return best
-
     def pruned(self, best: Refined) -> Refined:
         """Take out poles whose loss the criterion does not mind, the least needed first."""
         free_real, free_pairs = self.options.n_real is None, self.options.n_pairs is None
         while trials := self._one_less(best.poles, free_real, free_pairs):
-            criterion = self._criterion(best)
-            ends = [self._noted(self.search.descend(poles, "pruning", 1e-4)) for poles in trials]
-            chosen = min(ends, key=lambda end: criterion(end.rss, end.poles.order))
-            if not criterion(chosen.rss, chosen.poles.order) < criterion(best.rss, best.poles.order):
+            chosen = self._likeliest(best, trials, "pruning", 1e-4)
+            if chosen is best:
                 break
             best = self._noted(self.search.descend(chosen.poles, "pruning"))
         return best
+
+    def _likeliest(self, best: Refined, trials: Sequence[Poles], *how: Any) -> Refined:
+        """Of `best` and where descents from these poles end, by the criterion read from its residual; how: as
+        `PoleSearch.descend`."""
+        ends = [self._noted(self.search.descend(poles, *how)) for poles in trials]
+        criterion = self._criterion(best)
+        return min([best, *ends], key=lambda end: criterion(end.rss, end.poles.order))
 
     def _reduced(self, end: Refined, counts: tuple[int, int]) -> Refined:
         """Poles taken out one by one, the one first whose loss costs least, down to the given numbers."""

@@ -132,7 +132,11 @@ def combine_posteriors(
     count = len(posteriors)
     means = np.stack([posterior.mean for posterior in posteriors])
     mean = means.mean(axis=0)
-    between = (means - mean).T * np.sqrt(_widening(count, small_sample_level) * (1 + 1 / count) / (count - 1))
+    if small_sample_level is not None and count < 4:
+        raise ValueError(f"a small-sample region needs at least four conditions; got {count}")
+    # Hotelling's prediction region over the chi-square ellipse.
+    wider = 1.0 if small_sample_level is None else hotelling_widening(count - 1, small_sample_level)
+    between = (means - mean).T * np.sqrt(wider * (1 + 1 / count) / (count - 1))
     within = np.hstack([posterior.covariance_factor for posterior in posteriors]) / count
     report = first.report and replace(
         first.report,
@@ -142,12 +146,3 @@ def combine_posteriors(
     )
     factor = np.asarray(np.linalg.qr(np.hstack([between, within]).T, mode="r")).T
     return replace(first, mean=mean, covariance_factor=factor, report=report)
-
-
-def _widening(count: int, level: float | None) -> float:
-    """Hotelling's prediction region over the chi-square ellipse, both at `level`; 1 without a level."""
-    if level is None:
-        return 1.0
-    if count < 4:
-        raise ValueError(f"a small-sample region needs at least four conditions; got {count}")
-    return float(hotelling_widening(count - 1, level))
