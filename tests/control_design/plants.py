@@ -56,5 +56,16 @@ def uncertain_lag(std: float, level: float = 0.95) -> UncertainPlant:
     return UncertainPlant("lag", control.ss([[0.98]], [[1.0]], [[0.02]], 0, 0.005), posterior, level=level)
 
 
+def notched(corners_rad: Any, dt_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Numerator and denominator in z of PI and notches, corners in radians per sample: poles close together
+    where these are small."""
+    above, below = np.array([1.0, -1 + 2 * dt_s]), np.array([1.0, -1.0])
+    for corner in corners_rad:
+        zero, pole = np.exp((-0.02 + 1j) * corner), np.exp(0.7 * (-1 + 1j) * corner)
+        above = np.polymul(above, np.poly([zero, zero.conj()]).real)
+        below = np.polymul(below, np.poly([pole, pole.conj()]).real)
+    return above, below
+
+
 def gain(value: float, delay: int = 1) -> Controller:
     return Controller.proportional(value, 0.005, computational_delay_samples=delay)

@@ -68,6 +68,7 @@ def test_a_simple_plant_has_a_simple_controller(coarse):
     assert designed("lag").gamma <= 1.02 * bound * 1.001
 
 
+@pytest.mark.slow
 def test_same_generator_same_design(coarse):
     one, other = designed("lag"), synthesise([lag(0.5)], auto(WISH), rng=np.random.default_rng(7))
     assert np.array_equal(one.controller.A, other.controller.A)

@@ -18,31 +18,14 @@ from control_design.convex.reference_filter import ReferenceFilter
 from tests.compiler import COMPILER, compiled, needs_compiler
 from workflow.tasks.exports import law_bytes
 
+from .plants import notched
+
 _SAMPLES = 160
-_NAMES = [
-    "A",
-    "B",
-    "C",
-    "D",
-    "M",
-    "LEVEL",
-    "TURN",
-    "SHARE",
-    "EXCESS",
-    "FALL",
-    "INPUT_LIMIT",
-    "LARGEST_CHANGE",
-]
+_NAMES = (*"ABCDM", "LEVEL", "TURN", "SHARE", "EXCESS", "FALL", "INPUT_LIMIT", "LARGEST_CHANGE")
 
 
 def _companion(corners, dt):
-    """PI and notches, corners in radians per sample: poles close together where these are small."""
-    above, below = np.array([1.0, -1 + 2 * dt]), np.array([1.0, -1.0])
-    for corner in corners:
-        zero, pole = np.exp((-0.02 + 1j) * corner), np.exp(0.7 * (-1 + 1j) * corner)
-        above = np.polymul(above, np.poly([zero, zero.conj()]).real)
-        below = np.polymul(below, np.poly([pole, pole.conj()]).real)
-    return scipy.signal.tf2ss(above, below)
+    return scipy.signal.tf2ss(*notched(corners, dt))
 
 
 def _system(rng, inputs, outputs, dt):

@@ -13,6 +13,8 @@ import flexlink
 from control_design import Controller
 from control_design.controllers.controller import FrictionFeedforward
 
+from .plants import notched
+
 _DT = 0.01
 
 
@@ -186,11 +188,7 @@ _NOTCHES = ((), (5.0,), (5.0, 12.0), (20.0, 60.0), (50.0, 200.0), (50.0, 200.0, 
 def test_companion_forms_of_slow_controllers_are_taken(dt_s):
     """PI and notches: poles so close together that rounding moves them. A gain is sought for a limit only."""
     for corners in _NOTCHES:
-        above, below = np.array([1.0, -1 + 2 * dt_s]), np.array([1.0, -1.0])
-        for corner in dt_s * np.array(corners):
-            zero, pole = np.exp((-0.02 + 1j) * corner), np.exp(0.7 * (-1 + 1j) * corner)
-            above = np.polymul(above, np.poly([zero, zero.conj()]).real)
-            below = np.polymul(below, np.poly([pole, pole.conj()]).real)
+        above, below = notched(dt_s * np.array(corners), dt_s)
         law = scipy.signal.tf2ss(above, below)
         assert not Controller(*law, dt_s).anti_windup_gain.any()
         if dt_s * min(corners, default=1e3) > 1e-3 * 5 ** len(corners):  # else A - M C is lost in rounding

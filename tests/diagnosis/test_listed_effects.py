@@ -76,11 +76,22 @@ def _missed(found, truth, free):
     return np.linalg.norm(found - truth, axis=0) / np.linalg.norm(free - truth, axis=0)
 
 
+def _missed_around(name, effects, force, truth, dt_s=DT_S, motion="x", sign=1.0):
+    """The same of effects with their values around the simulation of a body."""
+    simulation = _Counted(name, dt_s, sign)
+    plant = _wrapped(simulation, force, list(effects), dt_s, motion)
+    found = plant.simulated([Change(*effect) for effect in effects.items()])(force[:, None])
+    return _missed(sign * found, truth, sign * simulation({}, {}, force[:, None]))
+
+
 @pytest.mark.parametrize(
     ("name", "motion"),
     [
-        *(pytest.param(name, "x", marks=pytest.mark.slow) for name in ("mass", "on a spring")),
-        *[("on a spring", "v"), ("pendulum", "v")],
+        *(
+            pytest.param(*one, marks=pytest.mark.slow)
+            for one in (("mass", "x"), ("on a spring", "x"), ("on a spring", "v"))
+        ),
+        ("pendulum", "v"),
     ],
 )
 def test_dry_friction_around_a_simulation_is_the_one_inside_it(name, motion):
@@ -137,19 +148,16 @@ def test_springs_viscous_and_stribeck_friction_together():
     def level(v):
         return (0.5 + 0.4 * np.exp(-abs(v) / 0.3)) / 2
 
-    force, simulation = _force(DT_S), _Counted("mass", DT_S)
+    force = _force(DT_S)
     truth = rubbing(_acceleration("mass", lambda x, v: 1.5 * v + 8 * x + 10 * x**3), force, DT_S, level)
-    names = ["stribeck_friction", "viscous_friction", "spring", "hardening_spring"]
-    values = [
-        {"static_force": 0.9, "coulomb_share": 5 / 9, "velocity": 0.3},
-        {"coefficient": 1.5},
-        {"stiffness": 8.0},
-        {"cubic": 10.0},
-    ]
-    plant = _wrapped(simulation, force, names, DT_S)
-    found = plant.simulated([Change(n, v) for n, v in zip(names, values, strict=True)])(force[:, None])
+    effects = {
+        "stribeck_friction": {"static_force": 0.9, "coulomb_share": 5 / 9, "velocity": 0.3},
+        "viscous_friction": {"coefficient": 1.5},
+        "spring": {"stiffness": 8.0},
+        "hardening_spring": {"cubic": 10.0},
+    }
     # Measured 4e-4: the trapezoidal rule on a period of 300 samples.
-    assert np.all(_missed(found, truth, simulation({}, {}, force[:, None])) < 1e-3)
+    assert np.all(_missed_around("mass", effects, force, truth) < 1e-3)
 
 
 SMOOTH = {
@@ -159,19 +167,21 @@ SMOOTH = {
 }
 
 
+def _smooth(name, samples, motion):
+    """What is missed of a smooth force at so many samples per period."""
+    dt_s, (values, more) = 2 * np.pi / np.sqrt(40) / samples, SMOOTH[name]
+    force = np.random.default_rng(3).uniform(-6, 6, 300)
+    truth = rubbing(_acceleration("on a spring", more), force, dt_s, lambda v: 1e-12)
+    return _missed_around("on a spring", {name: values}, force, truth, dt_s, motion)
+
+
 @pytest.mark.parametrize("name", SMOOTH)
 @pytest.mark.parametrize("motion", ["x", "v"])
 def test_smooth_forces_at_few_samples_per_period(name, motion):
     """Measured: of the body's motion up to 0.2 % of what they change, of another output 1.8 % at 9 and
     0.5 % at 18."""
-    values, more = SMOOTH[name]
     for samples, most in ((9, 0.02), (18, 0.006)):
-        dt_s = 2 * np.pi / np.sqrt(40) / samples
-        force, simulation = np.random.default_rng(3).uniform(-6, 6, 300), _Counted("on a spring", dt_s)
-        truth = rubbing(_acceleration("on a spring", more), force, dt_s, lambda v: 1e-12)
-        plant = _wrapped(simulation, force, [name], dt_s, motion)
-        found = plant.simulated([Change(name, values)])(force[:, None])
-        missed = _missed(found, truth, simulation({}, {}, force[:, None]))
+        missed = _smooth(name, samples, motion)
         assert np.all(missed < most)
         assert missed["xv".index(motion)] < 0.002
 
@@ -183,16 +193,10 @@ def test_smooth_forces_where_a_response_has_no_poles(name, motion, monkeypatch):
     """The trapezoidal rule over whole samples, of second order. Measured 7 to 19 % of what they change at 9,
     1.6 to 5.1 % at 18, 0.4 to 1.3 % at 36."""
     monkeypatch.setattr(LinearBody, "of", lambda *response, **how: None)
-    values, more = SMOOTH[name]
     missed = []
     for samples in (9, 18, 36):
-        dt_s = 2 * np.pi / np.sqrt(40) / samples
-        force, simulation = np.random.default_rng(3).uniform(-6, 6, 300), _Counted("on a spring", dt_s)
-        truth = rubbing(_acceleration("on a spring", more), force, dt_s, lambda v: 1e-12)
         with pytest.warns(UserWarning, match="is not one of 6 poles or fewer"):
-            plant = _wrapped(simulation, force, [name], dt_s, motion)
-        found = plant.simulated([Change(name, values)])(force[:, None])
-        missed.append(_missed(found, truth, simulation({}, {}, force[:, None])))
+            missed.append(_smooth(name, samples, motion))
     assert np.all(np.array(missed) < [[0.20], [0.052], [0.014]])
     np.testing.assert_allclose(missed[1] / missed[2], 4, rtol=0.15)
 
@@ -259,11 +263,9 @@ def test_fewer_than_six_samples_per_period_are_told():
 def test_friction_one_way_in_the_direction_of_the_force():
     force, acceleration = _force(DT_S), _acceleration("on a spring")
     truth = rubbing(acceleration, force, DT_S, lambda v: 0.4 if v > 0 else 1e-12)
+    effect = {"one_sided_friction": {"force": 0.8}}
     for sign in (1.0, -1.0):
-        simulation = _Counted("on a spring", DT_S, sign)
-        plant = _wrapped(simulation, force, ["one_sided_friction"], DT_S)
-        found = plant.simulated([Change("one_sided_friction", {"force": 0.8})])(force[:, None])
-        assert np.all(_missed(sign * found, truth, sign * simulation({}, {}, force[:, None])) < 1e-3)
+        assert np.all(_missed_around("on a spring", effect, force, truth, sign=sign) < 1e-3)
 
 
 @pytest.mark.parametrize("motion", ["x", "v"])
@@ -275,16 +277,14 @@ def test_friction_one_way_in_the_direction_of_the_force():
     ],
 )
 def test_friction_by_direction_and_by_the_square_of_speed(name, values, more, motion):
-    force, simulation = _force(DT_S), _Counted("on a spring", DT_S)
+    force = _force(DT_S)
     truth = rubbing(_acceleration("on a spring", more), force, DT_S, lambda v: 1e-12)
-    plant = _wrapped(simulation, force, [name], DT_S, motion)
-    found = plant.simulated([Change(name, values)])(force[:, None])
-    assert np.all(_missed(found, truth, simulation({}, {}, force[:, None])) < 2e-3)
+    assert np.all(_missed_around("on a spring", {name: values}, force, truth, motion=motion) < 2e-3)
 
 
 @pytest.mark.parametrize("motion", ["x", "v"])
 def test_friction_in_proportion_to_the_force_that_is_commanded(motion):
-    force, simulation, now = _force(DT_S), _Counted("mass", DT_S), 0.0
+    force, now = _force(DT_S), 0.0
 
     def acceleration(x, v, u):
         nonlocal now
@@ -292,9 +292,8 @@ def test_friction_in_proportion_to_the_force_that_is_commanded(motion):
         return u / 2
 
     truth = rubbing(acceleration, force, DT_S, lambda v: 0.15 * now / 2)
-    plant = _wrapped(simulation, force, ["load_friction"], DT_S, motion)
-    found = plant.simulated([Change("load_friction", {"share": 0.15})])(force[:, None])
-    assert np.all(_missed(found, truth, simulation({}, {}, force[:, None])) < 1e-3)
+    effect = {"load_friction": {"share": 0.15}}
+    assert np.all(_missed_around("mass", effect, force, truth, motion=motion) < 1e-3)
 
 
 @njit
@@ -324,12 +323,10 @@ def _behind(force, dt_s, mass, level, gap, weight, turned):
     ],
 )
 def test_friction_behind_a_play_and_a_mass_off_the_axis(motion, name, values, inside):
-    force, simulation = _force(DT_S), _Counted("mass", DT_S)
+    force = _force(DT_S)
     truth = _behind(force, DT_S, 2.0, *inside)
-    plant = _wrapped(simulation, force, [name], DT_S, motion)
-    found = plant.simulated([Change(name, values)])(force[:, None])
     # The first is crossed inside a part of a sample.
-    assert np.all(_missed(found, truth, simulation({}, {}, force[:, None])) < 2e-2)
+    assert np.all(_missed_around("mass", {name: values}, force, truth, motion=motion) < 2e-2)
 
 
 def test_friction_behind_a_play_that_a_known_motion_takes():

@@ -201,6 +201,7 @@ def test_a_constant_at_one_operating_point_may_be_an_unlisted_static_error(means
     assert (found.presence("output_offset") > 0.8) is sure
 
 
+@pytest.mark.slow
 def test_a_stated_value_far_beyond_its_tolerance_is_named():
     found = diagnose(_case("backlash", spring_N_m=-6))
     assert (found.verdict, found.combination) == ("effect", ("wrong_spring_N_m",))

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 
+from ident.basis.poles import Poles
 from ident.data.record import Record
 
 DT_S = 0.005
@@ -82,6 +83,17 @@ def _scaled_truth(system, u, snr_db, seed, name):
     A, B, C, D = system
     scale = 0.1265 / np.std(run(system, u))
     return _truth((A, B, scale * C, scale * D), u, snr_db, np.random.default_rng(seed), name)
+
+
+def by_factors(decays, modes, integrators):
+    """Denominator in s of 1/s^k, lags (rates) and modes (rad/s, damping), and its poles in z, zeros in place
+    of the integrators as a `GobfModel` has them."""
+    denominator = np.concatenate([[1.0], np.zeros(integrators)])
+    for factor in (*([1, rate] for rate in decays), *([1, 2 * zeta * w, w**2] for w, zeta in modes)):
+        denominator = np.polymul(denominator, factor)
+    omega, zeta = np.reshape(modes, (-1, 2)).T
+    poles = Poles.from_continuous(decay_per_s=decays, omega_rad_s=omega, zeta=zeta, dt_s=DT_S)
+    return denominator, Poles(np.concatenate([np.zeros(integrators), poles.real]), poles.pairs)
 
 
 P2_HZ = (2.5, 11.0, 27.0)

@@ -151,16 +151,13 @@ PLANTS = {
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "runs", [pytest.param(4, marks=pytest.mark.slow), pytest.param(30, marks=pytest.mark.long)]
-)
 @pytest.mark.parametrize("kind", PLANTS)
-def test_ellipses_hold_the_plant_in_a_loop_with_noise(kind, runs):
+def test_ellipses_hold_the_plant_in_a_loop_with_noise(kind):
     """Two records with different controllers, a tenth of the motion is noise."""
     (num, den), options = PLANTS[kind]
     omega = np.geomspace(0.5, 300.0, 60)
     truth = signal.freqz(np.r_[0.0, num], den, worN=omega * DT)[1]
-    held, bounds = [], EmbeddingOptions(fir_length=20, prior_missed_mode=0.0)
+    held, bounds, runs = [], EmbeddingOptions(fir_length=20, prior_missed_mode=0.0), 30
     for seed in range(runs):
         records = [
             looped((num, den), [900 + seed, k], n=1000, noise=0.02, gains=gains)
@@ -171,7 +168,7 @@ def test_ellipses_hold_the_plant_in_a_loop_with_noise(kind, runs):
         posterior = tangent(stage.records, identify(stage.records, asked).model, bounds)
         held.append(posterior.at(omega).contains(truth).mean())
     # Of a smooth response few frequencies are independent: one run has a standard deviation of 16 %.
-    assert 0.95 - 3 * 0.16 / np.sqrt(runs) <= np.mean(held) <= (0.99 if runs > 4 else 1)
+    assert 0.95 - 3 * 0.16 / np.sqrt(runs) <= np.mean(held) <= 0.99
 
 
 def test_records_without_reference_are_refused():

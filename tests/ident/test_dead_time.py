@@ -72,7 +72,7 @@ def test_a_delay_is_found_with_the_order_behind_it(plant, delay, noise_pole):
     ("plant", "kind", "delay"),
     [
         ("first", "step", 40),
-        ("second", "multisine", 14),
+        pytest.param("second", "multisine", 14, marks=pytest.mark.slow),
         pytest.param("two modes", "multisine", 40, marks=pytest.mark.slow),
         pytest.param("two modes", "step", 14, marks=pytest.mark.slow),
     ],

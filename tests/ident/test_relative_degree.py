@@ -9,8 +9,7 @@ from ident.basis.functions import basis_response, basis_state_space
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.basis.relative_degree import conditions, conditions_with_sensitivities, null_space
-
-DT_S = 0.005
+from tests.ident.benchmark_plants import DT_S, by_factors
 
 
 def moments(response, circles, count):
@@ -49,23 +48,10 @@ PLANTS = {
 @pytest.mark.parametrize("plant", PLANTS)
 def test_sampled_plants_satisfy_the_conditions_of_their_relative_degree_and_no_more(plant):
     numerator, decays, modes, k = PLANTS[plant]
-    denominator = np.concatenate([[1.0], np.zeros(k)])
-    for decay in decays:
-        denominator = np.polymul(denominator, [1, decay])
-    for omega, zeta in modes:
-        denominator = np.polymul(denominator, [1, 2 * zeta * omega, omega**2])
+    denominator, poles = by_factors(decays, modes, k)
     order = denominator.size - 1
     relative_degree = order - (len(numerator) - 1)
     A, B, C, _, _ = scipy.signal.cont2discrete(scipy.signal.tf2ss(numerator, denominator), DT_S)
-    poles = with_zeros(
-        Poles.from_continuous(
-            decay_per_s=decays,
-            omega_rad_s=[omega for omega, _ in modes],
-            zeta=[zeta for _, zeta in modes],
-            dt_s=DT_S,
-        ),
-        k,
-    )
     # Coefficients from the response, each frequency weighted by its size.
     z = np.exp(1j * np.geomspace(0.1, 600, 300) * DT_S)
     response = np.array([(C @ np.linalg.solve(point * np.eye(order) - A, B))[0, 0] for point in z])

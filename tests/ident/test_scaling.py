@@ -52,7 +52,11 @@ ONE = [(1e6, 1.0, 1.0), (1.0, 1e-6, 1.0), (1.0, 1.0, 1e6), (1.0, 1.0, 1e-6)]
 
 @pytest.mark.parametrize(
     ("name", "delay", "scales"),
-    [*((name, 0, ALL) for name in OPTIONS), ("white", 12, ALL), *(("white", 0, scales) for scales in ONE)],
+    [
+        *((name, 0, ALL) for name in OPTIONS),
+        ("white", 12, ALL),
+        *(pytest.param("white", 0, scales, marks=pytest.mark.slow) for scales in ONE),
+    ],
 )
 def test_units_change_nothing(name, delay, scales):
     found, ellipses = plain(name, delay)

@@ -13,7 +13,7 @@ from ident.fit.least_squares import fit
 from ident.fit.refinement import Bounds, pole_system
 from ident.fit.regression import prepare
 from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
-from tests.ident.benchmark_plants import DT_S, p1, p1_friction, p2
+from tests.ident.benchmark_plants import DT_S, by_factors, p1, p1_friction, p2
 
 OMEGA = np.geomspace(0.1, 600, 400)
 BOUNDS = Bounds.from_options(IdentOptions(), 1000, DT_S)
@@ -81,18 +81,9 @@ def test_gradient_is_exact(case, relative_degree):
 
 def test_fit_is_the_least_squares_fit_over_sampled_plants_of_that_relative_degree():
     """Continuous-time numerators of limited degree, sampled by SciPy one by one, span the same outputs."""
-    decays, modes, k = [3.0], [(15.0, 0.015), (90.0, 0.02)], 1
-    denominator = np.array([1.0, 0.0])
-    for decay in decays:
-        denominator = np.polymul(denominator, [1, decay])
-    for omega, zeta in modes:
-        denominator = np.polymul(denominator, [1, 2 * zeta * omega, omega**2])
-    poles = Poles.from_continuous(
-        decay_per_s=decays, omega_rad_s=[w for w, _ in modes], zeta=[z for _, z in modes], dt_s=DT_S
-    )
-    poles = Poles(np.concatenate([[0.0], poles.real]), poles.pairs)
+    denominator, poles = by_factors([3.0], [(15.0, 0.015), (90.0, 0.02)], 1)
     record = p1(0).record
-    data = prepare([record], Structure(integrators=k))
+    data = prepare([record], Structure(integrators=1))
     for relative_degree in (2, 3, 5):
         columns = []
         for degree in range(denominator.size - relative_degree):
