@@ -15,6 +15,7 @@ import argparse
 import datetime
 import inspect
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -130,6 +131,19 @@ def data_folder(*needed: str) -> Path:
     if not all((folder / name).is_dir() for name in needed):
         sys.exit(f"set FLEXLINK_DATA to the folder that holds {', '.join(needed)}")
     return folder
+
+
+def flexlink(*words: str, longest_s: float | None = None) -> tuple[int, str, list[str]]:
+    """Exit code and standard output of a command, and the lines it said but for progress (on standard error
+    where there are any); -1 where it takes longer than longest_s."""
+    command = [sys.executable, "-m", "flexlink", *words]
+    try:
+        ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=longest_s)
+    except subprocess.TimeoutExpired:
+        return -1, "", [f"no answer in {longest_s} s"]
+    said = [line.strip() for line in (ended.stderr or ended.stdout).splitlines() if line.strip()]
+    said = [line for line in said if not re.match(r"flexlink: \d+ s: ", line)]
+    return ended.returncode, ended.stdout, said or ["(nothing said)"]
 
 
 def reading(name: str, **values: object) -> str:

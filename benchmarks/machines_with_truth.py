@@ -11,10 +11,7 @@ modulus margin with the true response, at the frequencies that truth.json has.
 from __future__ import annotations
 
 import json
-import re
 import resource
-import subprocess
-import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import scipy.signal
 
-from benchmarks.harness import Print, main
+from benchmarks.harness import Print, flexlink, main
 
 _RADIUS_2 = -2 * np.log(0.05)  # chi-square of two degrees of freedom, 95 %
 
@@ -33,14 +30,9 @@ def answered(folder: Path, work: Path) -> tuple[float, int, str]:
     logs = [str(path) for path in sorted(folder.glob("run*.csv"))]
     call = ["run", *logs, "--out", str(work / "run"), "--replace", "--json"]
     begun = time.monotonic()
-    ended = subprocess.run(
-        [sys.executable, "-m", "flexlink", *call], capture_output=True, text=True, check=False
-    )
-    said = [x for x in ended.stderr.splitlines() if x.strip() and not re.match(r"flexlink: \d+ s:", x)]
-    line = said[-1] if said else ""
-    if ended.stdout.lstrip().startswith("{"):
-        line = str(json.loads(ended.stdout).get("verdict"))
-    return time.monotonic() - begun, ended.returncode, line
+    code, text, said = flexlink(*call)
+    line = str(json.loads(text).get("verdict")) if text.lstrip().startswith("{") else said[-1]
+    return time.monotonic() - begun, code, line
 
 
 def told(folder: Path, work: Path) -> list[str]:

@@ -12,8 +12,6 @@ by more than a tenth.
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from benchmarks.harness import Print, main
+from benchmarks.harness import Print, flexlink, main
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.results import RunResults
 
@@ -74,17 +72,14 @@ def answer(logs: list[Path], way: str, work: Path) -> tuple[bool, float | None, 
         table = WAYS[way](pd.read_csv(log, sep=sep, decimal=point))
         table.to_csv(work / log.name, index=False, sep=sep, decimal=point)
     call = ["run", *map(str, sorted(work.glob("*.csv"))), "--out", str(work / "out"), "--json"]
-    ended = subprocess.run(
-        [sys.executable, "-m", "flexlink", *call], capture_output=True, text=True, check=False
-    )
-    said = [line for line in ended.stderr.splitlines() if line.strip()]
+    code, text, said = flexlink(*call)
     directory = RunDirectory(work / "out")
     if directory.stage_file("identify") is None:
-        return False, None, said[-1] if said else ""
+        return False, None, said[-1]
     channel = RunResults(directory).identify.channels[0]
     modes = [mode.frequency_Hz for mode in channel.modes if channel.is_mode(mode)]
-    verdict = json.loads(ended.stdout).get("verdict") if ended.stdout.startswith("{") else said[-1]
-    return ended.returncode == 0, min(modes, default=None), str(verdict)
+    verdict = json.loads(text).get("verdict") if text.startswith("{") else said[-1]
+    return code == 0, min(modes, default=None), str(verdict)
 
 
 def run(out: Print, *, machines: str = "../shared/machines", only: str = "", ways: str = "") -> None:

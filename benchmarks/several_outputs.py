@@ -3,9 +3,8 @@
 Plants: `joints`, two joints with one flexible mode per link, weak springs in place of integrators; `links`,
 the two-link arm of `validation.example_arms`, both joints free. Records of 6000 and 8000 samples, both motors
 at once (binary sequences), sensor noise with correlation .3. Of every seed: rms of |Ghat - G| / |G| over 1 to
-200 rad/s by channel; states; share of frequencies whose 95 % ball holds G, by band. Peers are told the number
-of states, and are run where they are installed: nfoursid and sippy-unipi (N4SID), jax-sysid (output error
-by L-BFGS, begun at nfoursid's answer; its default, a random start, ends farther away).
+200 rad/s by channel; states; share of frequencies whose 95 % ball holds G, by band. nfoursid (N4SID) is told
+the number of states, and is run where it is installed.
 
 Then the arm of a CD player (DaISy; FLEXLINK_DATA): fit of samples 0 to 1023, free run on 1024 to 2047 with
 its state fitted, fit % of both outputs, numbers of poles given.
@@ -15,6 +14,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -78,7 +78,7 @@ def response(system: Any, omega: np.ndarray) -> np.ndarray:
     return np.moveaxis(np.atleast_3d(system(np.exp(1j * omega * system.dt))), 2, 0)
 
 
-def n4sid_nfoursid(record: Record, order: int) -> control.StateSpace:
+def n4sid(record: Record, order: int) -> control.StateSpace:
     from nfoursid.nfoursid import NFourSID
 
     frame = pd.DataFrame(np.hstack([record.input, record.output]), columns=[*NAMES[0], *NAMES[1]])
@@ -86,37 +86,6 @@ def n4sid_nfoursid(record: Record, order: int) -> control.StateSpace:
     search.subspace_identification()
     found, _ = search.system_identification(rank=order)
     return control.ss(found.a, found.b, found.c, found.d, record.dt_s)
-
-
-def n4sid_sippy(record: Record, order: int) -> control.StateSpace:
-    from sippy_unipi import system_identification
-
-    found = system_identification(
-        record.output.T, record.input.T, "N4SID", SS_fixed_order=order, SS_f=20, SS_p=20
-    )
-    return control.ss(found.A, found.B, found.C, found.D, record.dt_s)
-
-
-def output_error_jax_sysid(record: Record, order: int) -> control.StateSpace:
-    import jax
-    from jax_sysid.models import LinearModel
-
-    jax.config.update("jax_enable_x64", True)
-    start = n4sid_nfoursid(record, order)
-    radius = np.abs(np.linalg.eigvals(start.A)).max()
-    inputs, outputs = record.input.std(axis=0), record.output.std(axis=0)
-    # Its simulation of an unstable start overflows and the search ends there.
-    a = start.A if radius < 1 else start.A * (0.999 / radius)
-    model = LinearModel(order, 2, 2, ss=[a, start.B * inputs, start.C / outputs[:, None]])
-    model.loss(rho_x0=1e-6, rho_th=0.0)
-    # Straight after the start L-BFGS often does no step; Adam with small steps leads it in.
-    model.optimization(adam_eta=1e-4, adam_epochs=500, lbfgs_epochs=8000, iprint=-1)
-    model.fit(record.output / outputs, record.input / inputs)
-    a, b, c, _ = model.ssdata()
-    return control.ss(a, b / inputs, c * outputs[:, None], np.zeros((2, 2)), record.dt_s)
-
-
-PEERS = {"nfoursid": n4sid_nfoursid, "sippy-unipi": n4sid_sippy, "jax-sysid": output_error_jax_sysid}
 
 
 def run(out: Print, *, seeds: int = 50, first: int = 0, plants: str = "joints,links") -> None:
@@ -129,7 +98,6 @@ def run(out: Print, *, seeds: int = 50, first: int = 0, plants: str = "joints,li
 
 def _plant(out: Print, name: str, seeds: range) -> None:
     errors: dict[str, list[np.ndarray]] = {}
-    peer_seconds: dict[str, list[float]] = {}
     held, states, seconds, enclosure = [], [], [], []
     for seed in seeds:
         plant, record = record_of(name, seed)
@@ -150,18 +118,12 @@ def _plant(out: Print, name: str, seeds: range) -> None:
         held.append(balls.holds(response(plant, BALLS)))
         independent = np.sqrt(chi2.ppf(balls.level, 2 * balls.centre[0].size) / 2)
         enclosure.append(float(np.median(balls.radius / independent)))
-        for peer, fit in PEERS.items():
-            try:
-                found, taken = timed(partial(fit, record, plant.nstates))
-            except ImportError:
-                continue
-            noted(peer, response(found, ERRORS))
-            peer_seconds.setdefault(peer, []).append(taken)
+        with suppress(ImportError):
+            noted("nfoursid", response(n4sid(record, plant.nstates), ERRORS))
     out(f"{name}: {plant.nstates} states, seeds {seeds.start} to {seeds.stop - 1}")
     for method, values in errors.items():
         median = "  ".join(f"{v:7.3f}" for v in np.median(values, axis=0))
-        took = f"; CPU {np.median(peer_seconds[method]):.1f} s" if method in peer_seconds else ""
-        out(f"  {method:20s} rms error %, median, by channel: {median}{took}")
+        out(f"  {method:20s} rms error %, median, by channel: {median}")
     counts = ", ".join(f"{n}: {states.count(n)}" for n in sorted(set(states)))
     out(f"  states: {counts}; CPU {np.median(seconds):.1f} s, at most {max(seconds):.1f} s")
     bands = "  ".join(f"{100 * part.mean():.1f}" for part in np.array_split(np.array(held), BANDS, axis=1))

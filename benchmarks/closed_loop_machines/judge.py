@@ -28,8 +28,6 @@ from __future__ import annotations
 import json
 import re
 import resource
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,13 +38,12 @@ import scipy.signal
 from benchmarks.closed_loop_machines.logs import Machine, write
 from benchmarks.closed_loop_machines.machines import TAU, loop_gain, loop_radius
 from benchmarks.closed_loop_machines.simulator import Array, Law, Plant, response
+from benchmarks.harness import flexlink
 
 _LONGEST_S = 900
 _RADIUS_2 = -2 * np.log(0.05)  # chi-square of two degrees of freedom, 95 %
 # A next step names a command, an option or a setting.
 _STEP = re.compile(r"flexlink \w+|--[a-z]|[a-z]+_[a-z_]+ = |integrators? = |\[\w+\]")
-
-_PROGRESS = re.compile(r"flexlink: \d+ s: ")
 
 
 def judged(one: Machine, folder: Path, bla: int = 0, judge_only: bool = False) -> dict[str, Any]:
@@ -58,7 +55,7 @@ def judged(one: Machine, folder: Path, bla: int = 0, judge_only: bool = False) -
         work.mkdir(parents=True, exist_ok=True)
         begin = _cpu_s()
         words = "--out", str(run), "--replace", "--json"
-        code, text, lines = _flexlink("run", *map(str, logs), *words)
+        code, text, lines = flexlink("run", *map(str, logs), *words, longest_s=_LONGEST_S)
         answer = json.loads(text) if text.lstrip().startswith("{") else {}
         line = answer.get("verdict") or " | ".join(lines[-3:])
         row = {"kind": one.kind, "seed": one.seed, "code": code, "cpu_s": _cpu_s() - begin, "line": line}
@@ -88,18 +85,6 @@ def controller_on_machine(one: Machine, truth: dict[str, Any], run: Path) -> dic
 
 def _cpu_s() -> float:
     return resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-
-
-def _flexlink(*words: str) -> tuple[int, str, list[str]]:
-    """Exit code, standard output, lines said (on standard error where there are any)."""
-    command = [sys.executable, "-m", "flexlink", *words]
-    try:
-        ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_LONGEST_S)
-    except subprocess.TimeoutExpired:
-        return -1, "", [f"no answer in {_LONGEST_S} s"]
-    said = [line.strip() for line in (ended.stderr or ended.stdout).splitlines() if line.strip()]
-    said = [line for line in said if not _PROGRESS.match(line)]
-    return ended.returncode, ended.stdout, said or ["(nothing said)"]
 
 
 def read_law(path: Path) -> tuple[Law, int]:
