@@ -39,52 +39,18 @@ _UNITS: Mapping[str, Mapping[str, Convert]] = {
     "real": {},
     "imag": {},
 }
-_WORDS: Mapping[str, frozenset[str]] = {
-    "frequency": frozenset(
-        {"frequency", "freq", "frequenz", "fréquence", "frecuencia", "f", "omega", "ω", "w", "hz"}
-    ),
-    "gain": frozenset(
-        {
-            "gain",
-            "mag",
-            "magnitude",
-            "amplitude",
-            "ampl",
-            "amp",
-            "betrag",
-            "modulus",
-            "verstärkung",
-            "abs",
-            "db",
-        }
-    ),
-    "phase": frozenset({"phase", "phas", "ph", "arg", "argument", "phi", "φ", "deg"}),
-    "real": frozenset({"re", "real", "realteil"}),
-    "imag": frozenset({"im", "imag", "imaginary", "imaginaer", "imaginär", "imaginärteil"}),
+_SPELLED = {
+    "frequency": "frequency freq frequenz fréquence frecuencia f omega ω w hz",
+    "gain": "gain mag magnitude amplitude ampl amp betrag modulus verstärkung abs db",
+    "phase": "phase phas ph arg argument phi φ deg",
+    "real": "re real realteil",
+    "imag": "im imag imaginary imaginaer imaginär imaginärteil",
 }
+_WORDS = {role: frozenset(words.split()) for role, words in _SPELLED.items()}
 # Beside such a word a column is about something else: its spread, its sign turned, its slope.
-_OTHER = frozenset(
-    {
-        "variance",
-        "var",
-        "std",
-        "stddev",
-        "sigma",
-        "error",
-        "err",
-        "coherence",
-        "coh",
-        "covariance",
-        "cov",
-        "noise",
-        "margin",
-        "delay",
-        "group",
-        "lag",
-        "attenuation",
-        "difference",
-        "reference",
-    }
+_OTHER = re.compile(
+    "variance|var|std|stddev|sigma|error|err|coherence|coh|covariance|cov|noise|margin|delay|group|lag|"
+    "attenuation|difference|reference"
 )
 # Units and letters, that count where no other word says what it is.
 _SHORT = frozenset({"hz", "db", "deg", "f", "w", "amp", "re", "im"})
@@ -209,7 +175,7 @@ def _stated(table: Table, name: str) -> str:
 def _role(name: str, unit: str) -> str | None:
     """What a column is by the words of its name; by its unit where these are none that is known."""
     words, plain = _words(name), unicodedata.normalize("NFKC", name)
-    if words & _OTHER:
+    if any(map(_OTHER.fullmatch, words)):
         return None
     if words & {"f", "w"} and (stated := _unit(name, unit)) and stated not in _UNITS["frequency"]:
         return None  # a force in N, a power in W
