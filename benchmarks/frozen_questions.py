@@ -257,12 +257,12 @@ def two_joints(case: str) -> Answer:
 def joints_run() -> Answer:
     """A whole run for two simulated joints, as small as tests have it."""
     from tests.workflow.test_joints import _JOINTS, _REST, _SOURCE
-    from workflow.config.joints_config import load_joints
+    from workflow.config.joints_config import load_any
     from workflow.tasks.pipeline import run_pipeline
 
     with scratch() as folder:
         (folder / "two.toml").write_text(_SOURCE + _JOINTS + _REST)
-        summary = run_pipeline(load_joints(folder / "two.toml")[0], folder / "run")
+        summary = run_pipeline(load_any(folder / "two.toml")[0], folder / "run")
     kept = Kept()
     kept("said", certified=summary.certified)
     kept("lines", verdict=summary.verdict)

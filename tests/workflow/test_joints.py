@@ -14,9 +14,10 @@ from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import matrix_response
 from plant import multisine, multisine_lines, two_link_arm
 from workflow.cli import main
-from workflow.config.joints_config import JointsConfig, load_joints
+from workflow.config.joints_config import JointsConfig, load_any
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.joints import JointsResults, _judged, machine_at
+from workflow.tasks.joints import JointsResults, _judged
+from workflow.tasks.simulated_rig import machine_at
 
 _JOINTS = """
 [[joints]]
@@ -54,7 +55,7 @@ points = [{ name = "bent", elbow_rad = 1.6 }]
 
 def test_the_example_is_valid():
     """Its run takes half a minute."""
-    config, _ = load_joints(Path(__file__).parents[2] / "examples" / "two_joint_arm.toml")
+    config, _ = load_any(Path(__file__).parents[2] / "examples" / "two_joint_arm.toml")
     assert len(config.source.points) == 9
     assert JointsConfig.from_document(config.to_document(), source="x") == config
 
@@ -107,7 +108,7 @@ def _check_the_ball(run: Path):
 @pytest.mark.long
 def test_logs_of_a_closed_loop_give_a_certified_controller(run_of_the_arm, tmp_path, capsys):
     law = Controller.from_json((run_of_the_arm / "controller.json").read_text())
-    config = load_joints(run_of_the_arm / "config.toml")[0]
+    config = load_any(run_of_the_arm / "config.toml")[0]
     rng = np.random.default_rng(5)
     machine = machine_at(config.source, config.source.points[0], rng, coulomb_Nm=(0.0, 0.0))
     lines = multisine_lines(3000, law.dt_s, (0.2, 60.0))

@@ -11,16 +11,10 @@ import numpy as np
 
 from ident.data.record import Record
 from workflow.commands.init import decided
-from workflow.config.joints_config import AnyConfig, TwoJointSource, is_for_joints, load_any, load_joints
-from workflow.config.run_config import (
-    FileSource,
-    RunConfig,
-    SimulatedSource,
-    built_in_config,
-    load_simulation,
-)
+from workflow.config.joints_config import AnyConfig, JointsConfig, load_any, load_simulation
+from workflow.config.run_config import FileSource, SimulatedSource, built_in_config
 from workflow.engine import storage
-from workflow.engine.errors import InputError, naming
+from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory, default_directory
 from workflow.tasks.records import read_records
@@ -75,8 +69,7 @@ def run_from_files(
     # What is refused does not wait for what computes: that takes seconds to load.
     if isinstance(config.source, FileSource) and not known and not (resume and place.exists()):
         RunDirectory(place).refuse_unless_free(resume=resume, replace=replace)
-        channels: Any = config.channels if isinstance(config, RunConfig) else config.joints
-        read = read_records(config.source, channels)
+        read = read_records(config.source, config.columns)
     from workflow.report.pages import page_of
     from workflow.tasks.pipeline import run_pipeline
 
@@ -115,32 +108,18 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
     Columns time_s, reference_rad (of a loop), voltage_V, hub_angle_rad, tip_m, so that the files can be read
     back as a log. Raises InputError.
     """
-    if config_path is not None and is_for_joints(config_path):
-        return _simulate_joints(config_path, out)
     config = load_simulation(config_path) if config_path is not None else built_in_config()[0]
-    if not isinstance(config.source, SimulatedSource):
-        raise InputError(f"{config_path}: source.kind is 'files'; simulating needs kind = 'simulated'")
+    if isinstance(config.source, FileSource):
+        kind = "two_joint_arm" if isinstance(config, JointsConfig) else "simulated"
+        raise InputError(f"{config_path}: source.kind is 'files'; simulating needs kind = {kind!r}")
     RunDirectory(out).refuse_unless_free()
     # Here: what simulates takes seconds to load, and a configuration that is refused does not need it.
-    from workflow.tasks.simulated_rig import TRUTH_FILE, simulate_record, truth_of
+    from workflow.tasks.simulated_rig import TRUTH_FILE, simulated_records, truth_of
 
-    records = []
-    for index, entry in enumerate(config.source.records):
-        with naming(f"{config_path or 'default arm'}: source.records[{index}] ({entry.name})"):
-            records.append(simulate_record(config.source, entry, config.run.seed))
-    truth = {TRUTH_FILE: truth_of(config.source).model_dump_json(indent=1) + "\n"}
-    return storage.write_new_directory(out, _as_csv(records) | truth)
-
-
-def _simulate_joints(config_path: Path, out: Path) -> list[Path]:
-    config = load_joints(config_path)[0]
-    if not isinstance(config.source, TwoJointSource):
-        raise InputError(f"{config_path}: source.kind is 'files'; simulating needs kind = 'two_joint_arm'")
-    RunDirectory(out).refuse_unless_free()
-    from workflow.tasks.joints import simulate_point
-
-    records = [simulate_point(config, config.source, point) for point in config.source.points]
-    return storage.write_new_directory(out, _as_csv(records))
+    files = _as_csv(simulated_records(config, str(config_path or "default arm")))
+    if isinstance(config.source, SimulatedSource):
+        files[TRUTH_FILE] = truth_of(config.source).model_dump_json(indent=1) + "\n"
+    return storage.write_new_directory(out, files)
 
 
 def _as_csv(records: Sequence[Record]) -> dict[str, str]:

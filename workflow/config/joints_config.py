@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-import tomlkit
-from pydantic import Field, NonNegativeInt, model_validator
+from pydantic import Field, NonNegativeInt, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from control_design.specification import Specification
 from control_design.specification.multivariable import MultivariableSpecification
 from control_design.synthesis.synthesis_options import MultivariableOptions
-from workflow.config.run_config import FileSource, Name, RunConfig, RunSection, load_config
-from workflow.config.settings import Section, check, repeated
+from workflow.config.run_config import FileSource, Name, Role, Run, RunConfig, SimulatedSource, loaded
+from workflow.config.settings import Section, repeated
 from workflow.engine.documents import read_toml
 
 Two = tuple[float, float]
@@ -26,6 +24,15 @@ class OperatingPoint(Section):
     elbow_rad: float = Field(description="angle of link 2 against link 1")
     shoulder_rad: float = Field(0.0, description="angle of link 1; matters under gravity")
     payload_kg: float = Field(0.05, ge=0, description="point mass at the tip")
+
+    # Of the record that is made there.
+    kind: ClassVar[str] = "multisine"
+    role: ClassVar[Role] = "estimation"
+    remark: ClassVar[str] = ""
+
+    @property
+    def condition(self) -> str:
+        return self.name
 
 
 class TwoJointSource(Section):
@@ -41,6 +48,13 @@ class TwoJointSource(Section):
     coulomb_Nm: Two = Field((0.0, 0.0), description="dry friction of each joint while records are made")
     gravity_m_s2: float = Field(0.0, ge=0, description="0: the arm moves in a horizontal plane")
 
+    input_limit: ClassVar[float | None] = None
+
+    @property
+    def records(self) -> tuple[OperatingPoint, ...]:
+        """One at each operating point."""
+        return self.points
+
 
 Source = Annotated[TwoJointSource | FileSource, Field(discriminator="kind")]
 
@@ -53,7 +67,12 @@ class Joint(Specification):
 
     def asked(self) -> Specification:
         """What is asked, without the columns."""
-        return Specification(**self.model_dump(include=self.model_fields_set - {"input", "output"}))
+        return Specification(**self.model_dump(exclude={"input", "output"}))
+
+    @model_serializer(mode="wrap")
+    def _as_given(self, every: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Without keys that were not given: some are refused where they are stated."""
+        return {key: value for key, value in every(self).items() if key in self.model_fields_set}
 
 
 class JointsIdentification(Section):
@@ -98,10 +117,9 @@ class JointsLoop(Section):
     coulomb_Nm: Two | None = Field(None, description="dry friction of each joint in further runs")
 
 
-class JointsConfig(Section):
-    """A whole run for several joints. Load with `load_joints`."""
+class JointsConfig(Run):
+    """A whole run for several joints. Load with `load_any`."""
 
-    run: RunSection = Field(default_factory=RunSection)
     source: Source
     joints: tuple[Joint, ...] = Field(min_length=2)
     identification: JointsIdentification = Field(
@@ -173,42 +191,33 @@ class JointsConfig(Section):
         return (stated,) * len(self.joints) if isinstance(stated, int) else stated
 
     @property
-    def input_files(self) -> list[Path]:
-        """Every file the run reads besides its configuration."""
-        source = self.source
-        return sorted({record.path for record in source.records}) if isinstance(source, FileSource) else []
+    def columns(self) -> tuple[Joint, ...]:
+        """Inputs and outputs that records have."""
+        return self.joints
 
-    def to_document(self) -> dict[str, Any]:
-        """JSON-able, every default filled in, but for keys of a joint that were not given."""
-        document = self.model_dump(mode="json")
-        document["joints"] = [joint.model_dump(mode="json", exclude_unset=True) for joint in self.joints]
-        return document
+    @property
+    def loops(self) -> tuple[Joint, ...]:
+        """What the controller drives and is fed."""
+        return self.joints
 
-    def to_toml(self) -> str:
-        """As a user would write it; what has no value is left out."""
-        joints = [joint.model_dump(mode="json", exclude_unset=True) for joint in self.joints]
-        return tomlkit.dumps(self.model_dump(mode="json", exclude_none=True) | {"joints": joints})
 
-    @classmethod
-    def from_document(cls, document: Mapping[str, Any], *, source: str) -> JointsConfig:
-        """Inverse of `to_document`."""
-        return check(cls, document, source=source, context={"may_be_gone": True})
+class SimulationConfig(Run):
+    """The experiments of a simulated machine alone."""
+
+    source: SimulatedSource
 
 
 AnyConfig = RunConfig | JointsConfig
 
 
 def load_any(path: Path) -> tuple[AnyConfig, str]:
-    """A run of one loop or of several joints, and its text. Raises InputError as `load_config`."""
-    return load_joints(path) if is_for_joints(path) else load_config(path)
+    """Configuration of one loop or of several joints, and its text. Raises InputError: file, dotted key and
+    what was expected in one line."""
+    return loaded(JointsConfig, path) if "joints" in read_toml(path)[1] else loaded(RunConfig, path)
 
 
-def is_for_joints(path: Path) -> bool:
-    """Whether a file describes a run for several joints. Raises InputError as `load_joints`."""
-    return "joints" in read_toml(path)[1]
-
-
-def load_joints(path: Path) -> tuple[JointsConfig, str]:
-    """Configuration and its text. Raises InputError: file, dotted key and what was expected in one line."""
-    text, document = read_toml(path)
-    return check(JointsConfig, document, source=str(path), context={"base": path.absolute().parent}), text
+def load_simulation(path: Path) -> AnyConfig | SimulationConfig:
+    """A whole configuration, or one of [run] and [source] alone. Raises InputError as `load_any`."""
+    if read_toml(path)[1].keys() <= SimulationConfig.model_fields.keys():
+        return loaded(SimulationConfig, path)[0]
+    return load_any(path)[0]

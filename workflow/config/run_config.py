@@ -1,4 +1,4 @@
-"""`RunConfig`: everything a run depends on, from one TOML file."""
+"""`Run`: what the configurations of all runs are; `RunConfig`: that of one loop, from one TOML file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from importlib import resources
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 import tomlkit
 from pydantic import AfterValidator, Field, model_validator
@@ -49,6 +49,11 @@ class SimulatedRecord(Section):
     condition: str | None = Field(None, description="records with the same label are repeats of one another")
     remark: str = Field("", description="shown beside the record in the report")
     excitation: Excitation
+
+    @property
+    def kind(self) -> str:
+        """Of the excitation."""
+        return self.excitation.kind
 
 
 class SimulatedLoop(Section):
@@ -107,6 +112,7 @@ class SimulatedSource(Section):
 class FileRecord(Section):
     """One log file; [source] gives the keys that are left out."""
 
+    kind: ClassVar[str] = "file"
     path: InputPath = Field(
         description="csv or named arrays (npz, mat, ...); relative to this file; ${FLEXLINK_DATA} is expanded"
     )
@@ -332,17 +338,38 @@ class Notes(Section):
     unknown: tuple[str, ...] = Field((), description="sentences for the report: limits of its statements")
 
 
-class SimulationConfig(Section):
-    """The experiments of a simulated machine alone. Load with `load_simulation`."""
+class Run(Section):
+    """What runs of one loop and of several joints have in common."""
 
     run: RunSection = Field(default_factory=RunSection)
-    source: SimulatedSource
+    source: Section
+
+    @property
+    def input_files(self) -> list[Path]:
+        """Every file the run reads besides its configuration."""
+        source = self.source
+        return sorted({record.path for record in source.records}) if isinstance(source, FileSource) else []
+
+    def to_document(self) -> dict[str, Any]:
+        """JSON-able, every default filled in; `from_document` gives back an equal configuration."""
+        return self.model_dump(mode="json")
+
+    def to_toml(self) -> str:
+        """As a user would write it; what has no value is left out."""
+        return tomlkit.dumps(self.model_dump(mode="json", exclude_none=True))
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], *, source: str) -> Self:
+        """Inverse of `to_document`; input files may have moved away since (a report needs them no more)."""
+        return check(cls, document, source=source, context={"may_be_gone": True})
 
 
-class RunConfig(Section):
-    """A whole run. Load with `load_config`."""
+RunT = TypeVar("RunT", bound=Run)
 
-    run: RunSection = Field(default_factory=RunSection)
+
+class RunConfig(Run):
+    """A whole run of one loop. Load with `load_config`."""
+
     source: Source
     channels: tuple[Channel, ...] = Field(min_length=1)
     closed_loop_data: ClosedLoopData = Field(default_factory=ClosedLoopData)
@@ -462,24 +489,18 @@ class RunConfig(Section):
     @property
     def input_files(self) -> list[Path]:
         """Every file the run reads besides its configuration."""
-        if isinstance(self.source, FileSource):
-            controller = self.closed_loop_data.controller_file
-            paths = {record.path for record in self.source.records}
-            return sorted(paths if controller is None else paths | {controller})
-        return [self.source.rig] if isinstance(self.source.rig, Path) else []
+        more = getattr(self.source, "rig", None), self.closed_loop_data.controller_file
+        return sorted({*super().input_files, *(path for path in more if isinstance(path, Path))})
 
-    def to_document(self) -> dict[str, Any]:
-        """JSON-able, every default filled in; `from_document` gives back an equal configuration."""
-        return self.model_dump(mode="json")
+    @property
+    def columns(self) -> tuple[Channel, ...]:
+        """Inputs and outputs that records have."""
+        return self.channels
 
-    def to_toml(self) -> str:
-        """As a user would write it; what has no value is left out."""
-        return tomlkit.dumps(self.model_dump(mode="json", exclude_none=True))
-
-    @classmethod
-    def from_document(cls, document: Mapping[str, Any], *, source: str) -> RunConfig:
-        """Inverse of `to_document`; input files may have moved away since (a report needs them no more)."""
-        return check(cls, document, source=source, context={"may_be_gone": True})
+    @property
+    def loops(self) -> tuple[Channel, ...]:
+        """What the controller drives and is fed."""
+        return (self.control_channel,)
 
 
 def record_name(record: SimulatedRecord | FileRecord) -> str:
@@ -489,16 +510,13 @@ def record_name(record: SimulatedRecord | FileRecord) -> str:
 
 def load_config(path: Path) -> tuple[RunConfig, str]:
     """Configuration and its text. Raises InputError: file, dotted key and what was expected in one line."""
+    return loaded(RunConfig, path)
+
+
+def loaded(kind: type[RunT], path: Path) -> tuple[RunT, str]:
+    """The same of another kind of run."""
     text, document = read_toml(path)
-    return check(RunConfig, document, source=str(path), context={"base": path.absolute().parent}), text
-
-
-def load_simulation(path: Path) -> RunConfig | SimulationConfig:
-    """A whole configuration, or one of [run] and [source] alone. Raises InputError as `load_config`."""
-    _, document = read_toml(path)
-    if document.keys() <= SimulationConfig.model_fields.keys():
-        return check(SimulationConfig, document, source=str(path), context={"base": path.absolute().parent})
-    return load_config(path)[0]
+    return check(kind, document, source=str(path), context={"base": path.absolute().parent}), text
 
 
 def built_in_config() -> tuple[RunConfig, str]:

@@ -12,8 +12,8 @@ from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
 from ident.basis.model_files import ModelFile
 from ident.data.foreign_files import content_of
-from workflow.config.joints_config import JointsConfig
-from workflow.config.run_config import FileSource, RunConfig
+from workflow.config.joints_config import AnyConfig
+from workflow.config.run_config import FileSource
 from workflow.engine import documents, storage
 from workflow.engine.errors import naming
 from workflow.engine.run_directory import CONTROLLER_SUFFIXES
@@ -58,11 +58,8 @@ class Logged:
     signals: str
 
     @classmethod
-    def of(cls, config: RunConfig | JointsConfig, records: RecordsResult) -> Logged:
-        source, loops = (
-            config.source,
-            config.joints if isinstance(config, JointsConfig) else (config.control_channel,),
-        )
+    def of(cls, config: AnyConfig, records: RecordsResult) -> Logged:
+        source, loops = config.source, config.loops
         scale, offset = (source.scale, source.offset) if isinstance(source, FileSource) else ({}, {})
         columns = [[loop.output for loop in loops], [loop.input for loop in loops]]
         error, command = (tuple(scale.get(name, 1.0) for name in names) for names in columns)

@@ -28,13 +28,12 @@ from ident.data.record import Record
 from ident.identification import MimoIdentification
 from ident.several_outputs import identify_mimo
 from ident.uncertainty.matrix_response import MatrixUncertainty, matrix_posterior
-from plant import TwoLinkMachine, multisine, multisine_lines, two_link_arm
-from workflow.config.joints_config import JointsConfig, OperatingPoint, TwoJointSource
+from workflow.config.joints_config import JointsConfig, TwoJointSource
 from workflow.config.run_config import Role
 from workflow.engine.errors import naming
-from workflow.engine.randomness import stage_rng
-from workflow.tasks.records import read_records, refuse_constant_input, with_common_sampling_time
-from workflow.tasks.results import RecordsResult, RunRecord, StageResult, StageResults
+from workflow.tasks.records import make_records
+from workflow.tasks.results import RecordsResult, StageResult, StageResults
+from workflow.tasks.simulated_rig import machine_at
 from workflow.tasks.stage import Stage, StageInput
 
 Real = npt.NDArray[np.float64]
@@ -186,59 +185,6 @@ def _of(stage: StageInput) -> tuple[JointsConfig, JointsResults]:
     config: Any = stage.config
     results: Any = stage.results
     return config, results
-
-
-def make_records(stage: StageInput) -> RecordsResult:
-    """Records of every operating point: simulated, or log files, whose `condition` names the point."""
-    config, _ = _of(stage)
-    source = config.source
-    if isinstance(source, TwoJointSource):
-        records = []
-        for number, point in enumerate(source.points):
-            stage.progress.update("records", number / len(source.points), point.name)
-            records.append(
-                RunRecord(simulate_point(config, source, point), "estimation", point.name, "", "multisine")
-            )
-        return RecordsResult(tuple(records))
-    channels: Any = config.joints
-    read = stage.read or read_records(source, channels)
-    found = RecordsResult(
-        tuple(
-            RunRecord(record.limited(source.input_limit or np.inf), entry.role, entry.condition, entry.remark)
-            for entry, record in zip(source.records, with_common_sampling_time(read), strict=True)
-        )
-    )
-    for item in found.of_role("estimation"):
-        if all(np.ptp(column) == 0 for column in item.record.input.T):
-            refuse_constant_input(item.record)
-    return found
-
-
-def simulate_point(config: JointsConfig, source: TwoJointSource, point: OperatingPoint) -> Record:
-    """The record of an operating point: independent multisines at both motors, from rest."""
-    draw = partial(stage_rng, config.run.seed, "records", point.name)
-    machine = machine_at(source, point, draw("noise"), coulomb_Nm=source.coulomb_Nm)
-    period, rng = source.samples, draw("excitation")
-    lines = multisine_lines(period, source.dt_s, source.band_Hz)
-    u = np.column_stack([multisine(lines, period, rms, rng) for rms in source.rms_V])
-    inputs, outputs = ([getattr(joint, kind) for joint in config.joints] for kind in ("input", "output"))
-    return Record(
-        point.name, u, machine.run(u), source.dt_s, tuple(inputs), tuple(outputs), input_units=("V",) * 2,
-        output_units=("rad",) * 2,
-    )  # fmt: skip
-
-
-def machine_at(
-    source: TwoJointSource,
-    point: OperatingPoint,
-    rng: np.random.Generator,
-    *,
-    coulomb_Nm: tuple[float, float],
-    extra_kg: float = 0.0,
-) -> TwoLinkMachine:
-    """The simulated arm around an operating point."""
-    arm = two_link_arm(point.payload_kg + extra_kg, coulomb_Nm, source.gravity_m_s2)
-    return TwoLinkMachine(arm, (point.shoulder_rad, point.elbow_rad), source.dt_s, source.noise_rad, rng)
 
 
 def identify_points(stage: StageInput) -> PointModels:

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ident.data.record import Record, in_one_unit
-from workflow.config.run_config import (
-    Channel,
-    FileRecord,
-    FileSource,
-    SimulatedRecord,
-    SimulatedSource,
-    record_name,
-)
+from workflow.config.joints_config import Joint, OperatingPoint
+from workflow.config.run_config import Channel, FileRecord, FileSource, SimulatedRecord, record_name
 from workflow.engine.errors import InputError, naming
 
 if TYPE_CHECKING:
@@ -27,40 +22,40 @@ MOST_SAMPLES = 20_000_000  # of 4 kB each, 80 GB: more memory than most machines
 
 
 def make_records(stage: StageInput) -> RecordsResult:
-    """All records of the configuration, in its order, simulated or read.
+    """All records of the configuration, in its order, simulated or read. Of several joints the `condition`
+    of a record names the operating point.
 
     Raises InputError: a file or an excitation that is none, sampling times that differ, or a record to
-    identify from whose input stands still.
+    identify from whose inputs all stand still.
     """
     # Late: logs are read and refused before what computes is loaded, which takes seconds.
     from workflow.tasks.results import RecordsResult, RunRecord
-    from workflow.tasks.simulated_rig import simulate_record
+    from workflow.tasks.simulated_rig import simulated_records
 
     source, made = stage.config.source, list(stage.read)
-    entries: Sequence[SimulatedRecord | FileRecord] = source.records
-    if isinstance(source, SimulatedSource):
-        for index, entry in enumerate(source.records):
-            stage.progress.update("records", index / len(source.records), entry.name)
-            with naming(f"{stage.called}: source.records[{index}] ({entry.name})"):
-                made.append(simulate_record(source, entry, stage.config.run.seed))
+    entries: Sequence[SimulatedRecord | FileRecord | OperatingPoint] = source.records
+    if not isinstance(source, FileSource):
+        made = simulated_records(stage.config, stage.called, partial(stage.progress.update, "records"))
     elif not made:
-        made = read_records(source, stage.config.channels)
+        made = read_records(source, stage.config.columns)
     limit, records = source.input_limit or np.inf, list[RunRecord]()
     for about, record in zip(entries, with_common_sampling_time(made), strict=True):
-        kind = about.excitation.kind if isinstance(about, SimulatedRecord) else "file"
-        records.append(RunRecord(record.limited(limit), about.role, about.condition, about.remark, kind))
+        records.append(
+            RunRecord(record.limited(limit), about.role, about.condition, about.remark, about.kind)
+        )
     result = RecordsResult(tuple(records))
     for item in result.of_role("estimation"):
-        refuse_constant_input(item.record)
+        if not np.ptp(item.record.input, axis=0).any():
+            refuse_constant_input(item.record)
     return result
 
 
-def read_records(source: FileSource, channels: Sequence[Channel]) -> list[Record]:
+def read_records(source: FileSource, channels: Sequence[Channel | Joint]) -> list[Record]:
     """Every log file of a configuration. Raises InputError: one line naming file and place."""
     return [read_record(source, entry, channels) for entry in source.records]
 
 
-def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channel]) -> Record:
+def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channel | Joint]) -> Record:
     """One log file as the configuration describes it. Raises InputError: one line naming file and place."""
     inputs = list(dict.fromkeys(channel.input for channel in channels))
     outputs = list(dict.fromkeys(channel.output for channel in channels))

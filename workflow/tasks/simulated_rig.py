@@ -1,11 +1,12 @@
-"""The simulated arm as a configuration describes it: rig file or preset, effects by name, experiments; and
+"""The simulated arms as a configuration describes them: rig file or preset, effects by name, experiments; and
 `truth.json` beside its logs, with the modes of the arm behind them, shown beside what is found.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,14 +17,28 @@ from control_design.analysis.closed_loop import simulate as simulate_loop
 from control_design.controllers.controller import Controller
 from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.data.record import Record
+from plant import TwoLinkMachine, multisine, multisine_lines, two_link_arm
 from plant.effects import make_machine, parse_effects
 from plant.modal import default_n_modes, equations_of_motion
 from plant.rig import Rig
 from plant.simulation import SampledArm, quantised, simulate
+from workflow.config.joints_config import (
+    AnyConfig,
+    JointsConfig,
+    OperatingPoint,
+    SimulationConfig,
+    TwoJointSource,
+)
 from workflow.config.rig_settings import rig_called
-from workflow.config.run_config import ClosedLoopOptions, RunConfig, SimulatedRecord, SimulatedSource
+from workflow.config.run_config import (
+    ClosedLoopOptions,
+    RunConfig,
+    SimulatedRecord,
+    SimulatedSource,
+)
 from workflow.config.settings import Section, check
 from workflow.engine import documents
+from workflow.engine.errors import naming
 from workflow.engine.randomness import stage_rng
 from workflow.tasks.results import IdentifiedChannel
 from workflow.tasks.sampled_plant import FINITE
@@ -78,6 +93,55 @@ def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) 
         reference=None if reference is None else reference[:, None],
         reference_names=() if reference is None else (REFERENCE_NAME,),
     )
+
+
+def simulated_records(
+    config: AnyConfig | SimulationConfig,
+    called: str,
+    progress: Callable[[float, str], None] = lambda share, name: None,
+) -> list[Record]:
+    """Every record of a configuration whose records are not files, told of as it is made. Raises InputError
+    that names the entry."""
+    source, key, made = config.source, "records", list[Record]()
+    entries: Sequence[Any] = source.records
+    make: Callable[[Any], Record]
+    if isinstance(config, JointsConfig) and isinstance(source, TwoJointSource):
+        key, make = "points", partial(simulate_point, config, source)
+    else:
+        assert isinstance(source, SimulatedSource)  # or nobody would have asked
+        make = partial(simulate_record, source, seed=config.run.seed)
+    for index, entry in enumerate(entries):
+        progress(index / len(entries), entry.name)
+        with naming(f"{called}: source.{key}[{index}] ({entry.name})"):
+            made.append(make(entry))
+    return made
+
+
+def simulate_point(config: JointsConfig, source: TwoJointSource, point: OperatingPoint) -> Record:
+    """The record of an operating point: independent multisines at both motors, from rest."""
+    draw = partial(stage_rng, config.run.seed, "records", point.name)
+    machine = machine_at(source, point, draw("noise"), coulomb_Nm=source.coulomb_Nm)
+    period, rng = source.samples, draw("excitation")
+    lines = multisine_lines(period, source.dt_s, source.band_Hz)
+    u = np.column_stack([multisine(lines, period, rms, rng) for rms in source.rms_V])
+    inputs, outputs = ([getattr(joint, kind) for joint in config.joints] for kind in ("input", "output"))
+    return Record(
+        point.name, u, machine.run(u), source.dt_s, tuple(inputs), tuple(outputs), input_units=("V",) * 2,
+        output_units=("rad",) * 2,
+    )  # fmt: skip
+
+
+def machine_at(
+    source: TwoJointSource,
+    point: OperatingPoint,
+    rng: np.random.Generator,
+    *,
+    coulomb_Nm: tuple[float, float],
+    extra_kg: float = 0.0,
+) -> TwoLinkMachine:
+    """The simulated arm around an operating point."""
+    arm = two_link_arm(point.payload_kg + extra_kg, coulomb_Nm, source.gravity_m_s2)
+    return TwoLinkMachine(arm, (point.shoulder_rad, point.elbow_rad), source.dt_s, source.noise_rad, rng)
 
 
 def encoded_arm(
