@@ -16,7 +16,8 @@ from plant import multisine, multisine_lines, two_link_arm
 from workflow.cli import main
 from workflow.config.joints_config import JointsConfig, load_any
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.joints import JointsResults, _judged
+from workflow.tasks.joints import _judged
+from workflow.tasks.results import RunResults
 from workflow.tasks.simulated_rig import machine_at
 
 _JOINTS = """
@@ -97,7 +98,7 @@ def test_a_run_ends_with_a_certified_controller_and_a_page(run_of_the_arm):
 
 def _check_the_ball(run: Path):
     """It holds the response of small motions, linearised by automatic differentiation, not identified."""
-    (point,) = JointsResults(RunDirectory.open(run)).identify.points
+    (point,) = RunResults(RunDirectory.open(run)).identify.points
     a, b = two_link_arm(0.05).linear(1.6)
     true = control.c2d(control.ss(a, b, np.eye(2, len(a)), np.zeros((2, 2))), point.model.dt_s)
     inside = point.shown.distance(matrix_response(true, point.shown.omega_rad_s)) <= 1
@@ -176,7 +177,7 @@ def test_logs_give_the_same_model_as_the_arm(logs, run_of_the_arm, tmp_path, cap
     config.write_text(config.read_text().replace('"bent" }]', '"bent" }, ' + ", ".join(fresh) + "]"))
     assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["numbers"]
-    (point,) = JointsResults(RunDirectory(tmp_path / "run")).identify.points
+    (point,) = RunResults(RunDirectory(tmp_path / "run")).identify.points
     kept, wrong = ([fit.fit_percent for fit in fits] for fits in point.fresh)
     np.testing.assert_allclose(kept, point.fit_percent[0], atol=3)
     assert wrong[1] < 0 < wrong[0] < kept[0] - 10
@@ -332,7 +333,7 @@ def test_a_study_varies_what_a_joint_is_asked(run_of_the_arm, tmp_path):
     table = pd.read_csv(out / "table.csv")
     assert list(table["state"]) == ["certified", "not certified"]
     assert table["worst_gamma"][0] < 1 < table["worst_gamma"][1]
-    certificate = JointsResults(RunDirectory(run_of_the_arm)).certify.certificate
+    certificate = RunResults(RunDirectory(run_of_the_arm)).certify.certificate
     disks = [disk.alpha for one in certificate.verdicts for disk in (one.input_disk, one.output_disk)]
     assert table["disk_margin"][0] == pytest.approx(min(disks), rel=1e-9)
     own = out / "points" / "1"
@@ -365,8 +366,8 @@ def test_each_input_may_have_its_own_dead_time(logs, run_of_the_arm, tmp_path):
     text = text.replace("n_real = 3", f"input_delay_samples = {list(late)}\nn_real = 3")
     config = _written(tmp_path, text)
     assert _run(config) == 0
-    (found,) = JointsResults(RunDirectory(tmp_path / "run")).identify.points
-    (own,) = JointsResults(RunDirectory(run_of_the_arm)).identify.points
+    (found,) = RunResults(RunDirectory(tmp_path / "run")).identify.points
+    (own,) = RunResults(RunDirectory(run_of_the_arm)).identify.points
     assert found.model.order == own.model.order
     omega = np.geomspace(1.0, 300.0, 50)
     phase = np.exp(-1j * omega[:, None] * own.model.dt_s * np.array(late))[:, None, :]

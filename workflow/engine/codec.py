@@ -46,7 +46,7 @@ def pack(value: Any) -> tuple[Any, dict[str, AnyArray]]:
 
 def unpack(kind: type[T], document: Any, arrays: Mapping[str, AnyArray]) -> T:
     """Inverse of `pack`. Raises CodecError naming the place in the document."""
-    found: T = _unpack(kind, document, arrays, kind.__name__)
+    found: T = _unpack(kind, document, arrays, getattr(kind, "__name__", "result"))
     return found
 
 
@@ -61,7 +61,7 @@ def to_arrays(value: Any) -> dict[str, AnyArray]:
 def from_arrays(kind: type[T], arrays: Mapping[str, AnyArray]) -> T:
     """Inverse of `to_arrays`. Raises CodecError."""
     if DOCUMENT not in arrays:
-        raise CodecError(f"holds no {kind.__name__}: {DOCUMENT!r} is missing")
+        raise CodecError(f"holds no {getattr(kind, '__name__', kind)}: {DOCUMENT!r} is missing")
     try:
         document = json.loads(arrays[DOCUMENT].tobytes().decode("utf-8"))
     except (ValueError, RecursionError):

@@ -18,7 +18,6 @@ from workflow.config.joints_config import JointsConfig
 from workflow.figures import style
 from workflow.figures.bands import Real, envelope, outline
 from workflow.figures.validation import draw_free_run
-from workflow.tasks.joints import JointsResults
 
 _LOW = 1e-3  # smallest frequency of the singular values, of the Nyquist frequency
 
@@ -28,7 +27,7 @@ class JointsView:
     """A run for several joints whose stages are all there."""
 
     config: JointsConfig
-    results: JointsResults
+    results: Any
     manifest: Mapping[str, Any]
 
     @cached_property

@@ -10,42 +10,44 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from workflow.config.joints_config import JointsConfig
+from workflow.config.joints_config import AnyConfig
 from workflow.config.run_config import RunConfig
 from workflow.engine import storage
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.joints import JointsView
 from workflow.figures.subjects import RunView, log_channel
 from workflow.report.rendering import RenderedPage, render_page
-from workflow.tasks.joints import JOINT_STAGES
 from workflow.tasks.log_identification import LogIdentification
-from workflow.tasks.results import ReportResult, RunRecord
-from workflow.tasks.stage import Stage, StageInput
+from workflow.tasks.results import ReportResult, RunRecord, RunResults
+from workflow.tasks.stage import Stage, StageInput, stages_for
 from workflow.tasks.stages import STAGES
 from workflow.tasks.summary import summarise, title_of
 
 
 def write_report(
-    results: Any,
-    config: RunConfig | JointsConfig,
+    results: RunResults,
+    config: AnyConfig,
     progress: Callable[[float, str], None] | None = None,
     also: Iterable[str] = (),
 ) -> Path:
     """Draw every picture into `figures/`, and write `report.html`: all of them or none.
 
-    results: RunResults or JointsResults, as the configuration is. also: kinds of file beside SVG, pdf or png.
-    Pictures of an earlier report that this run no longer has are removed. Returns the path of the page.
-    Raises InputError when a stage the report cannot do without is missing, or the disk refuses.
+    also: kinds of file beside SVG, pdf or png. Pictures of an earlier report that this run no longer has are
+    removed. Returns the path of the page. Raises InputError when a stage the report cannot do without is
+    missing, or the disk refuses.
     """
-    run, template = results.run, "joints.html.j2"
-    view: Any = JointsView
-    more: dict[str, Any] = {}
-    if isinstance(config, RunConfig):
-        view, template = RunView, "report.html.j2"
-        more = {"study": (run.path.parent.parent / "study.html").is_file()}  # of which this run is a point
-        more["certified"] = summarise(results, config).certified
-    shown = {"title": title_of(config, run), "run": view(config, results, run.manifest())}
-    return _write(run, render_page(template, progress, also=also, **shown, **more))
+    run = results.run
+    view: Any = RunView if isinstance(config, RunConfig) else JointsView
+    page = render_page(
+        "report.html.j2",
+        progress,
+        also=also,
+        title=title_of(config, run),
+        run=view(config, results, run.manifest()),
+        study=(run.path.parent.parent / "study.html").is_file(),  # of which this run is a point
+        certified=summarise(results, config).certified,
+    )
+    return _write(run, page)
 
 
 def _write(run: RunDirectory, page: RenderedPage) -> Path:
@@ -68,9 +70,9 @@ def write_page(stage: StageInput, also: Iterable[str] = ()) -> ReportResult:
     return ReportResult(storage.sha256_of_file(path))
 
 
-def page_of(config: RunConfig | JointsConfig, also: Iterable[str] = ()) -> Stage:
+def page_of(config: AnyConfig, also: Iterable[str] = ()) -> Stage:
     """The stage that writes the page of a run. also: kinds of file for its pictures beside SVG."""
-    stage = JOINTS_REPORT if isinstance(config, JointsConfig) else REPORT
+    stage = stages_for(config, (*STAGES, REPORT))[-1]
     return replace(stage, run=partial(write_page, also=also)) if also else stage
 
 
@@ -80,17 +82,9 @@ REPORT = Stage(
     write_page,
     expected_s=7.0,
     # Words that appear on the page and nowhere before.
-    uses={"run": True, "notes": True, "specification": True},
+    uses={"run": True, "notes": True, "specification": True, "joints": True},
     also_writes=lambda run: (run.report_path,),
-)
-
-JOINTS_REPORT = Stage(
-    "report",
-    tuple(stage.name for stage in JOINT_STAGES),
-    write_page,
-    expected_s=5.0,
-    uses={"run": True, "joints": True},
-    also_writes=lambda run: (run.report_path,),
+    several=(write_page, 5.0),
 )
 
 

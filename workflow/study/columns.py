@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from control_design.analysis.margins import Margins
-    from workflow.tasks.joints import JointsResults
     from workflow.tasks.results import RunResults
 
 Number = float | int | None
@@ -112,7 +111,7 @@ def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None)
     return found
 
 
-def numbers_of_joints(results: JointsResults) -> dict[str, Number]:
+def numbers_of_joints(results: Any) -> dict[str, Number]:
     """The same of several joints: worst over the operating points, over sensors and actuators, and, in closed
     loop, over runs and joints. disk_margin is that of the nominal loop."""
     from workflow.engine.codec import plain

@@ -25,8 +25,10 @@ from workflow.engine.run_directory import RunDirectory
 from workflow.engine.store import Store
 from workflow.study.points import Base, Combination, Point
 from workflow.study.task import Done
-from workflow.tasks.pipeline import stage_input_hash
+from workflow.tasks.pipeline import controller_stages, plant_stages, stage_input_hash
+from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage
+from workflow.tasks.summary import summarise
 
 LAYOUT_VERSION = 1  # the first; a study of another one is not resumed
 
@@ -72,14 +74,13 @@ class StudyDirectory(Store):
 
     def has_plant(self, point: Point) -> bool:
         """Whether the plant of a point is there, made from what it would be made from now."""
-        return _matches(self.plant(point), point, point.kind.plant, skip=point.given)
+        return _matches(self.plant(point), point, plant_stages(point.config), skip=point.given)
 
     def has_point(self, point: Point) -> bool:
         """Whether a point is finished, with the plant that stands in the study."""
         run = self.point(point)
-        return _matches(run, point, point.kind.after) and run.stage_files(_plant(point)) == self.plant_files(
-            point
-        )
+        finished = _matches(run, point, controller_stages(point.config))
+        return finished and run.stage_files(_plant(point)) == self.plant_files(point)
 
     def save_plant(self, point: Point, given: Mapping[str, bytes], done: Done) -> None:
         """Keep records, model and ellipses."""
@@ -91,7 +92,7 @@ class StudyDirectory(Store):
         """Keep a finished point, with the plant's stages beside its own: a run like any other."""
         run = self.point(point)
         _write(run, point, self.plant_files(point), done)
-        certified = point.kind.summarise(point.kind.results(run), point.config).certified
+        certified = summarise(RunResults(run), point.config).certified
         run.record_status("complete" if certified else "complete, not certified")
 
     def link_numbers(self, points: Iterable[Combination]) -> None:
@@ -110,7 +111,7 @@ class StudyDirectory(Store):
 
 
 def _plant(point: Point) -> tuple[str, ...]:
-    return tuple(stage.name for stage in point.kind.plant)
+    return tuple(stage.name for stage in plant_stages(point.config))
 
 
 def _write(run: RunDirectory, point: Point, given: Mapping[str, bytes], done: Done) -> None:

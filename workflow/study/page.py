@@ -21,9 +21,8 @@ from workflow.figures import style
 from workflow.study.columns import COLUMNS, Number, StudyColumn, numbers_of, numbers_of_joints
 from workflow.study.points import Combination, Point, short
 from workflow.study.settings import ParetoPlot, StudyAxis, StudyConfig
-from workflow.tasks.joints import JointsResults
 from workflow.tasks.results import RunResults
-from workflow.tasks.summary import summarise_joints, verdict_of
+from workflow.tasks.summary import summarise, verdict_of
 from workflow.text.templates import RunSummary, render_text, rows_of, said
 
 State = Literal[
@@ -58,9 +57,10 @@ class PointRow(Combination):
 
 def row_of(point: Point, run: RunDirectory) -> PointRow:
     """The row of a finished point."""
+    results = RunResults(run)
     if isinstance(point.config, JointsConfig):
-        return _row_of_joints(point, JointsResults(run), point.config)
-    results, specification = RunResults(run), point.config.specification
+        return _row_of_joints(point, results)
+    specification = point.config.specification
     design, certify, check = results.design, results.certify, results.closed_loop.check
     state: State = (
         "impossible"
@@ -93,7 +93,7 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
     return PointRow(point.number, point.name, point.values, state, why, numbers)
 
 
-def _row_of_joints(point: Point, results: JointsResults, config: JointsConfig) -> PointRow:
+def _row_of_joints(point: Point, results: Any) -> PointRow:
     state: State = (
         "impossible"
         if results.design.found is None
@@ -103,7 +103,7 @@ def _row_of_joints(point: Point, results: JointsResults, config: JointsConfig) -
         if all(run.settled for run in results.closed_loop.runs)
         else "does not settle"
     )
-    why = summarise_joints(results, config).verdict
+    why = summarise(results, point.config).verdict
     return PointRow(point.number, point.name, point.values, state, why, numbers_of_joints(results))
 
 

@@ -19,7 +19,7 @@ from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory, hash_of
 from workflow.study.settings import StudyAxis, StudyConfig, last_name, with_values
-from workflow.tasks.pipeline import Kind, any_config_of, kind_of
+from workflow.tasks.pipeline import any_config_of, controller_stages, plant_stages
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +34,6 @@ class Base:
     run: RunDirectory | None
     folder: Path
     left_out: float | None = None
-
-    @property
-    def kind(self) -> Kind:
-        """Of one loop, or of several joints: every point is of the same."""
-        return kind_of(self.config)
 
     def changed(self, values: Mapping[str, Any], source: str) -> AnyConfig:
         """The configuration with dotted keys set. Raises InputError naming `source` where they do not fit."""
@@ -68,7 +63,7 @@ class Base:
         """SHA-256 of the stage files taken from a given run."""
         if self.run is None:
             return {}
-        return {stage.name: self.run.stage_digest(stage.name) for stage in self.kind.plant}
+        return {stage.name: self.run.stage_digest(stage.name) for stage in plant_stages(self.config)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,11 +96,6 @@ class Point(Combination):
     design_key: str
     given: tuple[str, ...]
 
-    @property
-    def kind(self) -> Kind:
-        """Of one loop, or of several joints."""
-        return kind_of(self.config)
-
 
 def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
     """What the study starts from, with its `changes` and seed applied.
@@ -122,7 +112,7 @@ def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
     elif base.is_dir():
         run = RunDirectory.open(base)
         config = any_config_of(run)
-        for stage in kind_of(config).plant:
+        for stage in plant_stages(config):
             run.stage_digest(stage.name)  # says which one is missing
     else:
         config, _ = load_any(base)
@@ -162,15 +152,16 @@ class PointMaker:
             return Contradiction(self._made, name, dict(values), str(error))
         inputs = self._base.inputs_of(config)
         given = () if self._original is None else shared_stages(config, self._original)
+        plant = plant_stages(config)
         plant_key = hash_of(
             {
                 "given": {name: self._digests[name] for name in given},
-                "seed": None if len(given) == len(self._base.kind.plant) else config.run.seed,
+                "seed": None if len(given) == len(plant) else config.run.seed,
                 "files": dict(inputs),
-                "settings": {stage.name: stage.settings(config) for stage in self._base.kind.plant},
+                "settings": {stage.name: stage.settings(config) for stage in plant},
             }
         )
-        design = self._base.kind.after[0].settings(config)
+        design = controller_stages(config)[0].settings(config)
         design_key = hash_of({"plant": plant_key, "seed": config.run.seed, "settings": design})
         name = self._name(values, hash_of({"plant": plant_key, "config": config.to_document()}))
         return Point(self._made, name, dict(values), config, inputs, plant_key, design_key, given)
@@ -218,7 +209,7 @@ class PointMaker:
 def shared_stages(one: AnyConfig, other: AnyConfig) -> tuple[str, ...]:
     """Stages of the plant before the first whose settings differ."""
     same = itertools.takewhile(
-        lambda stage: hash_of(stage.settings(one)) == hash_of(stage.settings(other)), kind_of(one).plant
+        lambda stage: hash_of(stage.settings(one)) == hash_of(stage.settings(other)), plant_stages(one)
     )
     return tuple(stage.name for stage in same)
 

@@ -22,7 +22,9 @@ from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.study.points import Point
 from workflow.tasks.pipeline import stage_input_hash
-from workflow.tasks.stage import StageInput
+from workflow.tasks.results import RunResults
+from workflow.tasks.stage import StageInput, stages_for
+from workflow.tasks.stages import STAGES
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +70,8 @@ class PointTask:
         run.stages_path.mkdir(parents=True)
         for name, content in self.given.items():
             storage.write_bytes(run.stages_path / name, content)
-        seconds, hashes, results = {}, {}, point.kind.results(run)
-        for stage in (stage for stage in point.kind.stages if stage.name in self.stages):
+        seconds, hashes, results = {}, {}, RunResults(run)
+        for stage in (stage for stage in stages_for(point.config, STAGES) if stage.name in self.stages):
             started = time.monotonic()
             wanted = stage_input_hash(stage, point.config, run, point.inputs)
             there = (one.stage_file(stage.name) for one in earlier if one.is_done(stage.name, wanted))

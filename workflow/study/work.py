@@ -28,6 +28,7 @@ from workflow.study.points import (
 )
 from workflow.study.settings import JOINTS_PLOTS, StudyFile
 from workflow.study.task import Done, PointTask
+from workflow.tasks.pipeline import controller_stages, plant_stages
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage
 from workflow.text.templates import RunSummary
@@ -134,7 +135,7 @@ class _Work:
                 groups.setdefault(point.design_key, []).append(point)
         self._report(rows.values())
         work = [
-            _task(group, self.directory.plant_files(group[0]), self.base.kind.after)
+            _task(group, self.directory.plant_files(group[0]), controller_stages(self.base.config))
             for group in groups.values()
         ]
         for found in _done(self.executor, list(groups.values()), work):
@@ -155,7 +156,7 @@ class _Work:
         work = []
         for point, given in wanted:
             there = {name.partition(".")[0] for name in given}
-            lacking = [stage for stage in self.base.kind.plant if stage.name not in there]
+            lacking = [stage for stage in plant_stages(self.base.config) if stage.name not in there]
             work.append(_task([point], given, lacking))
         given_of = {point.name: given for point, given in wanted}
         for ((point, done),) in _done(self.here, [[point] for point, _ in wanted], work):

@@ -1,10 +1,10 @@
-"""The stages of a run for several joints: records, models with their balls, one controller, its certificate,
-the loop on the nonlinear machine at every operating point."""
+"""The stages of a run as they are for several joints: models with their balls, one controller, its
+certificate, the loop on the nonlinear machine at every operating point."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
@@ -12,29 +12,33 @@ import numpy as np
 import numpy.typing as npt
 
 from control_design.analysis.closed_loop import LinearMachine, simulate_joints
-from control_design.analysis.multivariable_certificate import MultivariableCertificate, certify_multivariable
+from control_design.analysis.multivariable_certificate import certify_multivariable
 from control_design.controllers.controller import Controller
-from control_design.plants.multivariable import MultivariablePlant, ResponseBall
-from control_design.plants.weights import RationalWeight
+from control_design.plants.multivariable import MultivariablePlant
 from control_design.specification import SpecificationError
-from control_design.synthesis.multivariable import MultivariableResult, synthesise_multivariable
-from ident.basis.mimo_model import MimoModel
+from control_design.synthesis.multivariable import synthesise_multivariable
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.checks.validation import FreshFit, fit_in_windows, fit_on_fresh_data
+from ident.checks.validation import fit_in_windows, fit_on_fresh_data
 from ident.closed_loop import two_stage_several
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.identification import MimoIdentification
 from ident.several_outputs import identify_mimo
-from ident.uncertainty.matrix_response import MatrixUncertainty, matrix_posterior
+from ident.uncertainty.matrix_response import matrix_posterior
 from workflow.config.joints_config import JointsConfig, TwoJointSource
 from workflow.config.run_config import Role
 from workflow.engine.errors import naming
-from workflow.tasks.records import make_records
-from workflow.tasks.results import RecordsResult, StageResult, StageResults
+from workflow.tasks.point_models import (
+    JointsCertificate,
+    JointsDesignResult,
+    JointsLoopResult,
+    JointsRun,
+    PointModel,
+    PointModels,
+)
 from workflow.tasks.simulated_rig import machine_at
-from workflow.tasks.stage import Stage, StageInput
+from workflow.tasks.stage import StageInput
 
 Real = npt.NDArray[np.float64]
 
@@ -42,149 +46,10 @@ _SETTLED = 0.1  # of the step: how far from it an output may be at the end of a 
 _SHOWN = 400  # frequencies of the pictures
 
 
-@dataclass(frozen=True, eq=False)
-class PointModel:
-    """What the records of one operating point say: model, ball (the factor Li as a state space of Li_a to
-    Li_d, radius), fits in per cent (records, outputs), whether each mode has one shape, balls for pictures.
-    later: samples by which each input acts later than in model and ball; their sizes are the same. fresh:
-    of every record that was kept back, how the model simulates each output.
-    """
-
-    name: str
-    model: MimoModel
-    noise_std: Real
-    fit_percent: Real
-    rank_one: tuple[bool, ...]
-    Lo: Real
-    Li_a: Real
-    Li_b: Real
-    Li_c: Real
-    Li_d: Real
-    radius: float
-    shown: MatrixUncertainty
-    warnings: tuple[Finding, ...] = ()
-    later: tuple[int, ...] = ()
-    fresh: tuple[tuple[FreshFit, ...], ...] = field(default=(), metadata={"since": 9})
-
-    @property
-    def shaped(self) -> bool:
-        """Every mode has one shape."""
-        return all(moved is not None for _, _, moved in self.modes)
-
-    @property
-    def states(self) -> int:
-        """Order of the state space."""
-        return len(self.model.state_space()[0])
-
-    def plant(self, gain_error: float) -> MultivariablePlant:
-        """For design and certificate."""
-        import control  # here, because it brings a plotting library with it
-
-        Li = control.ss(
-            self.Li_a, self.Li_b, self.Li_c, self.Li_d, self.model.dt_s, remove_useless_states=False
-        )
-        off: tuple[RationalWeight, ...] = ()
-        if gain_error:
-            weight = RationalWeight(numerator=(gain_error,), denominator=(1.0,))
-            off = (weight,) * len(self.model.input_names)
-        nominal = self.model.to_control()
-        if any(self.later):
-            nominal, Li = (_behind(system, self.later) for system in (nominal, Li))
-        ball = ResponseBall(self.Lo, Li, self.radius, lowest_rad_s=float(self.shown.omega_rad_s[0]))
-        return MultivariablePlant(self.name, nominal, ball, input_error=off)
-
-    @property
-    def modes(self) -> tuple[tuple[float, float, Real | None], ...]:
-        """Frequency [rad/s], damping ratio, and motion of the outputs, largest 1, of every pole pair below
-        the Nyquist frequency that has one shape (None: it has not)."""
-        found = []
-        residues, dt_s = self.model.residues(), self.model.dt_s
-        for pole, residue in zip(residues.poles, residues.pole, strict=True):
-            if not pole.imag:
-                continue
-            s = np.log(pole) / dt_s
-            left, sizes, _ = np.linalg.svd(residue)
-            one = sizes.size == 1 or sizes[1] < 1e-6 * sizes[0]
-            moved = left[:, 0] / left[np.argmax(np.abs(left[:, 0])), 0]
-            found.append((float(abs(s)), float(-s.real / abs(s)), moved.real if one else None))
-        return tuple(sorted(found, key=lambda mode: mode[0]))
-
-
-@dataclass(frozen=True, eq=False)
-class PointModels:
-    """One per operating point."""
-
-    points: tuple[PointModel, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class JointsDesignResult:
-    """The controller, if any, its worst case over plants and requirements, and one line about it."""
-
-    found: MultivariableResult | None
-    reason: str
-
-    @property
-    def controller(self) -> Controller | None:
-        return None if self.found is None else self.found.controller
-
-
-@dataclass(frozen=True, eq=False)
-class JointsCertificate:
-    """None where there is no controller."""
-
-    certificate: MultivariableCertificate | None
-
-    @property
-    def certified(self) -> bool:
-        return self.certificate is not None and self.certificate.met
-
-
-@dataclass(frozen=True, eq=False)
-class JointsRun:
-    """A step of all joints at an operating point. output (T, Y), command (T, U); settled: every output ends
-    within a tenth of its step; overshoot (Y,) over the step; limited: share of samples at a limit."""
-
-    point: str
-    condition: str
-    output: Real
-    command: Real
-    settled: bool
-    overshoot: Real
-    limited: float
-
-
-@dataclass(frozen=True, eq=False)
-class JointsLoopResult:
-    """machine: what ran; time_s (T,), reference (T, Y); skipped: why nothing ran."""
-
-    machine: Literal["simulated", "identified"] = "identified"
-    time_s: Real | None = None
-    reference: Real | None = None
-    runs: tuple[JointsRun, ...] = ()
-    skipped: str | None = None
-
-    def settled_points(self) -> tuple[int, int]:
-        """Operating points where every run settles, and their number."""
-        points = dict.fromkeys(run.point for run in self.runs)
-        good = [all(run.settled for run in self.runs if run.point == point) for point in points]
-        return sum(good), len(good)
-
-
-class JointsResults(StageResults):
-    """Of several joints."""
-
-    records = StageResult(RecordsResult)
-    identify = StageResult(PointModels)
-    design = StageResult(JointsDesignResult)
-    certify = StageResult(JointsCertificate)
-    closed_loop = StageResult(JointsLoopResult)
-
-
-def _of(stage: StageInput) -> tuple[JointsConfig, JointsResults]:
+def _of(stage: StageInput) -> tuple[JointsConfig, Any]:
+    """The configuration and the results, as what they are."""
     config: Any = stage.config
-    results: Any = stage.results
-    return config, results
+    return config, stage.results
 
 
 def identify_points(stage: StageInput) -> PointModels:
@@ -245,19 +110,6 @@ def _with_later_inputs(record: Record, later: tuple[int, ...]) -> Record:
     return replace(record.slice(most, record.n_samples), input=np.column_stack(held))
 
 
-def _behind(system: Any, later: tuple[int, ...]) -> Any:
-    """The system with each input so many samples later."""
-    import control
-
-    chains = [
-        control.ss(np.eye(n, k=-1), np.eye(n, 1), np.eye(1, n, n - 1), 0, system.dt)
-        if n
-        else control.ss([], [], [], 1, system.dt)
-        for n in later
-    ]
-    return system * control.append(*chains)
-
-
 def _described(
     name: str, records: list[Record], found: MimoIdentification, level: float, lowest_rad_s: float
 ) -> PointModel:
@@ -295,7 +147,7 @@ def design_joints(stage: StageInput) -> JointsDesignResult:
     )
 
 
-def _plants(config: JointsConfig, results: JointsResults) -> list[MultivariablePlant]:
+def _plants(config: JointsConfig, results: Any) -> list[MultivariablePlant]:
     return [point.plant(config.identification.gain_error) for point in results.identify.points]
 
 
@@ -348,7 +200,7 @@ def _judged(
 
 
 def _machines(
-    config: JointsConfig, results: JointsResults, stage: StageInput
+    config: JointsConfig, results: Any, stage: StageInput
 ) -> list[tuple[str, str, Callable[[], Any]]]:
     source, options = config.source, config.closed_loop
     if not isinstance(source, TwoJointSource):
@@ -367,26 +219,3 @@ def _machines(
             words = f"dry friction {options.coulomb_Nm[0]:g} and {options.coulomb_Nm[1]:g} N m"
             found.append((point.name, words, partial(at, coulomb_Nm=options.coulomb_Nm)))
     return found
-
-
-JOINT_STAGES: tuple[Stage, ...] = (
-    Stage(
-        "records", (), make_records, 3.0, uses={"source": True, "joints": {"__all__": {"input", "output"}}}
-    ),
-    Stage("identify", ("records",), identify_points, 15.0, uses={"identification": True}),
-    Stage(
-        "design",
-        ("identify",),
-        design_joints,
-        20.0,
-        uses={"joints": True, "design": True, "identification": True},
-    ),
-    Stage("certify", ("identify", "design"), certify_joints, 5.0, uses={"joints": True, "design": True}),
-    Stage(
-        "closed_loop",
-        ("identify", "design"),
-        run_loops,
-        5.0,
-        uses={"closed_loop": True, "source": True, "joints": True},
-    ),
-)

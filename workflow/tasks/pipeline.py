@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace as changed
+from dataclasses import asdict, replace as changed
 from pathlib import Path
 from typing import Any
 
@@ -23,28 +23,11 @@ from workflow.engine.errors import CommandInterruptedError, InputError, naming, 
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import KEPT_FILES, LAYOUT_VERSION, RunDirectory, hash_of
 from workflow.tasks.exports import Logged, model_bytes, write_controller
-from workflow.tasks.joints import JOINT_STAGES, JointsResults
-from workflow.tasks.results import RunResults
-from workflow.tasks.stage import Stage, StageInput
-from workflow.tasks.stages import STAGES
-from workflow.tasks.summary import summarise, summarise_joints
+from workflow.tasks.results import ReferenceFilterResult, RunResults
+from workflow.tasks.stage import Stage, StageInput, stages_for
+from workflow.tasks.stages import PLANT, STAGES
+from workflow.tasks.summary import summarise
 from workflow.text.templates import RunSummary, said
-
-
-@dataclass(frozen=True)
-class Kind:
-    """What differs between runs of one loop and of several joints: stages up to the uncertain plant, stages
-    from there to the page, what reads their results, the controller's files, the table."""
-
-    plant: tuple[Stage, ...]
-    after: tuple[Stage, ...]
-    results: Callable[[RunDirectory], Any]
-    keep: Callable[[Any, Any, Dialect], list[Path]]
-    summarise: Callable[[Any, Any], RunSummary]
-
-    @property
-    def stages(self) -> tuple[Stage, ...]:
-        return (*self.plant, *self.after)
 
 
 def run_pipeline(
@@ -74,7 +57,7 @@ def run_pipeline(
     then, unless identification had already been paid for. Raises StageError when a computation fails.
     """
     progress = progress or Progress()
-    run, kind = RunDirectory(Path(out)), kind_of(config)
+    run, stages = RunDirectory(Path(out)), stages_for(config, STAGES)
     existed, given = run.path.exists(), _given(config, run, progress, called)
     run.refuse_unless_free(resume=resume, replace=replace)
     inputs = {str(path): storage.sha256_of_file(path) for path in config.input_files}
@@ -83,7 +66,7 @@ def run_pipeline(
     if not (resume and existed) and not known:
         started = time.monotonic()
         with threadpool_limits(1):
-            ready = kind.stages[0].run(changed(given, read=read)), time.monotonic() - started
+            ready = stages[0].run(changed(given, read=read)), time.monotonic() - started
     # More threads round otherwise.
     with run.writing(resume=resume, replace=replace), threadpool_limits(1):
         run.begin_run(
@@ -101,18 +84,18 @@ def run_pipeline(
             run.write_stage(*os.path.splitext(name), content)
         dialect = changed(before, **(c_code or {}))  # as stated now, or else before
         run.record_status("running", c_code=asdict(dialect))
-        stages = kind.stages if page is None else (*kind.stages, page)
+        stages = stages if page is None else (*stages, page)
         progress.plan([(stage.name, stage.expected_s) for stage in stages])
         if note:
             progress.note(note)
         try:
             for stage in stages:
                 _perform(stage, given, inputs, ready if stage is stages[0] else None)
-            written = kind.keep(given.results, config, dialect)
+            written = _keep_files(given.results, config, dialect)
             for name in KEPT_FILES:  # none of an earlier design stay
                 if run.path / name not in written:
                     (run.path / name).unlink(missing_ok=True)
-            summary = kind.summarise(given.results, config)
+            summary = summarise(given.results, config)
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt) or interrupts.came():  # a library may make anything of it
                 with suppress(InputError):  # a full disk, a directory that is gone
@@ -131,7 +114,7 @@ def identify_only(
     replaced. Raises as a run."""
     given = StageInput(config, RunResults(RunDirectory(out)), progress or Progress())
     inputs = {str(path): storage.sha256_of_file(path) for path in config.input_files}
-    stages = kind_of(config).plant
+    stages = plant_stages(config)
     with given.results.run.writing(replace=True), threadpool_limits(1):
         given.results.run.begin_run(
             config_text=config_text,
@@ -152,18 +135,21 @@ def rebuild_page(run: RunDirectory, page: Stage, progress: Progress | None = Non
     given.progress.plan([(page.name, page.expected_s)])
     with run.locked():
         _perform(page, given, {}, always=True)
-    return kind_of(config).summarise(given.results, config)
+    return summarise(given.results, config)
 
 
 def _given(
     config: AnyConfig, run: RunDirectory, progress: Progress, called: str = "the configuration"
 ) -> StageInput:
     given: Any = config
-    return StageInput(given, kind_of(config).results(run), progress, called)
+    return StageInput(given, RunResults(run), progress, called)
 
 
-def certified_for(results: RunResults, config: RunConfig) -> str:
+def certified_for(results: RunResults, config: AnyConfig) -> str:
     """What a certificate of the plant that was identified is about."""
+    if isinstance(config, JointsConfig):
+        models: Any = results.identify
+        return f"{len(models.points)} operating points"
     channel = config.control_channel
     unit = results.records.unit(channel.input)
     return said("certified_for", channel.uncertainty, results.uncertainty.equivalent, unit)
@@ -228,38 +214,30 @@ def stage_input_hash(stage: Stage, config: AnyConfig, run: RunDirectory, inputs:
     )
 
 
-def _keep_files(results: RunResults, config: RunConfig, dialect: Dialect) -> list[Path]:
-    """model.json, and controller.json, .mat, .c and .h with those of its reference filter."""
-    found = results.uncertainty.channels[config.control_index]
-    model = results.run.path / "model.json"
-    storage.write_together({model: model_bytes(model, ModelFile(found.nominal, found.frequency))})
+def _keep_files(results: RunResults, config: AnyConfig, dialect: Dialect) -> list[Path]:
+    """controller.json, .mat, .c and .h; of one loop with those of its reference filter, and model.json."""
+    second, kept = ReferenceFilterResult(), list[Path]()
+    if isinstance(config, RunConfig):
+        second, found = results.reference_filter, results.uncertainty.channels[config.control_index]
+        kept = [results.run.path / "model.json"]
+        storage.write_together({kept[0]: model_bytes(kept[0], ModelFile(found.nominal, found.frequency))})
     if (controller := results.design.controller) is None:
-        return [model]
-    second, certified = results.reference_filter, results.certify.certified
+        return kept
     law = Logged.of(config, results.records).law(second.law(controller))
-    about = certified_for(results, config)
-    return [
-        model,
-        *write_controller(
-            results.run.path, law, second.filter, certified=certified, about=about, dialect=dialect
-        ),
-    ]
+    about, certified = certified_for(results, config), results.certify.certified
+    return kept + write_controller(
+        results.run.path, law, second.filter, certified=certified, about=about, dialect=dialect
+    )
 
 
-def _keep_joints_files(results: JointsResults, config: JointsConfig, dialect: Dialect) -> list[Path]:
-    if (law := results.design.controller) is None:
-        return []
-    law = Logged.of(config, results.records).law(law)
-    about = f"{len(results.identify.points)} operating points"
-    certified = results.certify.certified
-    return write_controller(results.run.path, law, None, certified=certified, about=about, dialect=dialect)
+def plant_stages(config: AnyConfig) -> tuple[Stage, ...]:
+    """Stages up to the uncertain plant."""
+    return tuple(stage for stage in stages_for(config, STAGES) if stage.name in PLANT)
 
 
-def kind_of(config: AnyConfig) -> Kind:
-    """Of one loop, or of several joints."""
-    if isinstance(config, JointsConfig):
-        return Kind(JOINT_STAGES[:2], JOINT_STAGES[2:], JointsResults, _keep_joints_files, summarise_joints)
-    return Kind(STAGES[:3], STAGES[3:], RunResults, _keep_files, summarise)
+def controller_stages(config: AnyConfig) -> tuple[Stage, ...]:
+    """Stages from the design to the closed loop."""
+    return tuple(stage for stage in stages_for(config, STAGES) if stage.name not in PLANT)
 
 
 def _fail(run: RunDirectory, error: BaseException, *, created: bool) -> None:

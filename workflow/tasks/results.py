@@ -37,6 +37,7 @@ from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.nominal import NominalAgreement
 from workflow.config.run_config import Channel, Role, RunConfig
 from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.point_models import JointsCertificate, JointsDesignResult, JointsLoopResult, PointModels
 
 Interval = tuple[float, float]
 T = TypeVar("T")
@@ -620,37 +621,34 @@ class ReportResult:
 
 
 class StageResult(Generic[T]):
-    """The result of the stage that the attribute is named after, read when it is first asked for."""
+    """The result of the stage that the attribute is named after, read when it is first asked for. several:
+    its type in a run for several joints, where that is another one."""
 
-    def __init__(self, kind: type[T]) -> None:
-        self._kind = kind
+    def __init__(self, kind: type[T], several: type | None = None) -> None:
+        self._kind: Any = kind if several is None else kind | several
 
     def __set_name__(self, owner: type, name: str) -> None:
         self._name = name
 
-    def __get__(self, results: StageResults, owner: type) -> T:
+    def __get__(self, results: RunResults, owner: type) -> T:
         if self._name not in results.read:
             results.read[self._name] = results.run.load_stage(self._name, self._kind)
         found: T = results.read[self._name]
         return found
 
 
-class StageResults:
+class RunResults:
     """Results of a run directory, each read once; `read` holds those that were."""
+
+    records = StageResult(RecordsResult)
+    identify = StageResult(IdentifyResult, PointModels)
+    uncertainty = StageResult(UncertaintyResult)
+    design = StageResult(DesignResult, JointsDesignResult)
+    achievable_performance = StageResult(AchievablePerformance)
+    certify = StageResult(CertifyResult, JointsCertificate)
+    reference_filter = StageResult(ReferenceFilterResult)
+    closed_loop = StageResult(ClosedLoopResult, JointsLoopResult)
 
     def __init__(self, run: RunDirectory) -> None:
         self.run = run
         self.read: dict[str, Any] = {}
-
-
-class RunResults(StageResults):
-    """Of one loop."""
-
-    records = StageResult(RecordsResult)
-    identify = StageResult(IdentifyResult)
-    uncertainty = StageResult(UncertaintyResult)
-    design = StageResult(DesignResult)
-    achievable_performance = StageResult(AchievablePerformance)
-    certify = StageResult(CertifyResult)
-    reference_filter = StageResult(ReferenceFilterResult)
-    closed_loop = StageResult(ClosedLoopResult)

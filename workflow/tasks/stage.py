@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,8 @@ class Stage:
     `uses` and `except_for` name the part of the configuration the result depends on (pydantic's `include` and
     `exclude`), `after` the stages whose files it reads: with the seed and the input files these make the
     input hash. `expected_s` (two cores, warm) only shapes the progress bar. `also_writes` names files outside
-    `stages/` that belong to the result.
+    `stages/` that belong to the result. several: what it does for several joints, and how long that takes;
+    None: there is no such step for them.
     """
 
     name: str
@@ -63,7 +64,20 @@ class Stage:
     uses: Mapping[str, Any]
     except_for: Mapping[str, Any] | None = None
     also_writes: Callable[[RunDirectory], tuple[Path, ...]] = lambda run: ()
+    several: tuple[Callable[[StageInput], Any], float] | None = None
 
     def settings(self, config: AnyConfig) -> dict[str, Any]:
         """Its share of the configuration, JSON-able."""
         return config.model_dump(mode="json", include=self.uses, exclude=self.except_for)
+
+
+def stages_for(config: AnyConfig, stages: Sequence[Stage]) -> tuple[Stage, ...]:
+    """The stages of a run: those that there are for one loop, or for several joints."""
+    if isinstance(config, RunConfig):
+        return tuple(stages)
+    there = {stage.name: stage.several for stage in stages if stage.several is not None}
+    return tuple(
+        replace(stage, run=run, expected_s=s, after=tuple(name for name in stage.after if name in there))
+        for stage in stages
+        for run, s in filter(None, [stage.several])
+    )

@@ -1,6 +1,7 @@
 """The stages of a run before its page, in order: each is a task on what the stages before it left.
 
-What each leaves behind is a type of `workflow.tasks.results`.
+What each leaves behind is a type of `workflow.tasks.results`. Keys of the configuration that one kind of run
+lacks are none of its settings.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.design import UNKNOWN_TO_BRACKET, certify_asked, find_bracket, find_design, find_filter
 from workflow.tasks.friction_loop import friction_feedforward, soonest
 from workflow.tasks.identification import identify_channels
+from workflow.tasks.joints import certify_joints, design_joints, identify_points, run_loops
 from workflow.tasks.records import make_records
 from workflow.tasks.results import (
     AchievablePerformance,
@@ -72,19 +74,28 @@ def design_filter(stage: StageInput) -> ReferenceFilterResult:
 
 
 _PLANT = ("identify", "uncertainty")
+PLANT = ("records", *_PLANT)  # up to the uncertain plant, which several designs may share
 _PURPOSES = {"channels": {"__all__": {"purpose"}}}
+_COLUMNS = {"__all__": {"input", "output"}}
+_JOINTS = {"joints": True, "design": True, "identification": True}  # a balls' share of gain is in there
 
 STAGES: tuple[Stage, ...] = (
     Stage(
-        "records", (), make_records, 1.0, uses={"source": True, "channels": {"__all__": {"input", "output"}}}
+        "records",
+        (),
+        make_records,
+        1.0,
+        uses={"source": True, "channels": _COLUMNS, "joints": _COLUMNS},
+        several=(make_records, 3.0),
     ),
     Stage(
         "identify",
         ("records",),
         identify_channels,
         2.0,
-        uses={"channels": True, "closed_loop_data": True},
+        uses={"channels": True, "closed_loop_data": True, "identification": True},
         except_for={"channels": {"__all__": {"uncertainty", "purpose"}}},
+        several=(identify_points, 15.0),
     ),
     Stage(
         "uncertainty",
@@ -104,7 +115,9 @@ STAGES: tuple[Stage, ...] = (
             "certificate": {"calibrate"},
             "closed_loop": {"reference_step", "measurement_step"},  # of the step that is to settle
             **_PURPOSES,
+            **_JOINTS,
         },
+        several=(design_joints, 20.0),
     ),
     Stage(
         "achievable_performance",
@@ -115,7 +128,14 @@ STAGES: tuple[Stage, ...] = (
         # Another order leaves the bracket as it is.
         except_for={"specification": set(UNKNOWN_TO_BRACKET)},
     ),
-    Stage("certify", (*_PLANT, "design"), certify_controller, 1.0, uses={"certificate": True}),
+    Stage(
+        "certify",
+        (*_PLANT, "design"),
+        certify_controller,
+        1.0,
+        uses={"certificate": True, **_JOINTS},
+        several=(certify_joints, 5.0),
+    ),
     Stage(
         "reference_filter",
         (*_PLANT, "design", "certify"),
@@ -128,7 +148,8 @@ STAGES: tuple[Stage, ...] = (
         ("records", *_PLANT, "design", "certify", "reference_filter"),
         run_closed_loop,
         5.0,
-        uses={"closed_loop": True, "source": True},
+        uses={"closed_loop": True, "source": True, "joints": True},
         except_for={"source": {"records"}},
+        several=(run_loops, 5.0),
     ),
 )

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from control_design.specification import Specification
 from ident.data.finding import Finding
 from ident.uncertainty import FrequencyUncertainty
-from workflow.config.joints_config import AnyConfig, JointsConfig
+from workflow.config.joints_config import AnyConfig
 from workflow.config.run_config import RunConfig
 from workflow.engine import codec
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.design import bracket_numbers, joint_numbers
 from workflow.tasks.exports import Logged
-from workflow.tasks.joints import JointsResults
 from workflow.tasks.results import (
     AchievablePerformance,
     CertifyResult,
@@ -29,20 +28,37 @@ from workflow.tasks.results import (
 from workflow.text.templates import RunSummary, rows_of, said, words
 
 
-def summarise(results: RunResults, config: RunConfig) -> RunSummary:
+def summarise(results: RunResults, config: AnyConfig) -> RunSummary:
     """The table of a run whose stages are all there."""
+    about = _of_one_loop(results, config) if isinstance(config, RunConfig) else _of_joints(results)
+    shown: dict[str, Any] = {"config": config, "results": results}
+    shares, signals = about.numbers.get("sampled_responses"), Logged.of(config, results.records).signals
+    return RunSummary(
+        title=title_of(config, results.run),
+        sections=rows_of("summary/run.j2", shares=shares, signals=signals, **shown),
+        brief=rows_of("summary/brief.j2", **shown),
+        numbers=about.numbers,
+        certified=results.certify.certified and about.settles,
+        verdict=about.verdict,
+        report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
+    )
+
+
+class _About(NamedTuple):
+    """What is said of each kind of run in its own words."""
+
+    numbers: dict[str, Any]
+    settles: bool
+    verdict: str
+
+
+def _of_one_loop(results: RunResults, config: RunConfig) -> _About:
     design, certify = results.design, results.certify
     achievable, loop = results.achievable_performance, results.closed_loop
     pairs = list(zip(results.identify.channels, results.uncertainty.channels, strict=True))
-    shares = joint_numbers(certify.sampled)
-    signals = Logged.of(config, results.records).signals
     conditions = results.uncertainty.conditions(config)
-    settles = loop.check is not None and loop.check.settled_draws == loop.check.draws
-    return RunSummary(
-        title=title_of(config, results.run),
-        sections=rows_of("summary/run.j2", config=config, results=results, shares=shares, signals=signals),
-        brief=rows_of("summary/brief.j2", config=config, results=results),
-        numbers={
+    return _About(
+        {
             "channels": [channel_numbers(found, spread) for found, spread in pairs],
             "design": {
                 "met": design.met,
@@ -52,16 +68,16 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
                 "blocking": [] if design.synthesis is None else codec.plain(design.synthesis.blocking),
                 "bandwidth_rad_s": bandwidth_numbers(design, certify, config.specification),
             },
-            "signals": signals,
+            "signals": Logged.of(config, results.records).signals,
             "certificate": codec.plain(certify.certificate),
             "certificate_conditions": [words(doubt) for doubt in conditions],
             "achievable_performance": bracket_numbers(achievable, design.gamma),
-            "sampled_responses": shares,
+            "sampled_responses": joint_numbers(certify.sampled),
             "reference_filter": codec.plain(results.reference_filter.filter),
             "closed_loop": loop_numbers(loop),
         },
-        certified=certify.certified and settles,
-        verdict=verdict_of(
+        loop.check is not None and loop.check.settled_draws == loop.check.draws,
+        verdict_of(
             design,
             certify,
             loop,
@@ -71,30 +87,21 @@ def summarise(results: RunResults, config: RunConfig) -> RunSummary:
             conditions,
             config.specification,
         ),
-        report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
     )
 
 
-def summarise_joints(results: JointsResults, config: JointsConfig) -> RunSummary:
-    """The table of a run for several joints."""
+def _of_joints(results: Any) -> _About:
     design, certify, loop = results.design, results.certify, results.closed_loop
     settled, points = loop.settled_points()
-    return RunSummary(
-        title=title_of(config, results.run),
-        sections=rows_of("summary/joints.j2", config=config, results=results),
-        brief=rows_of("summary/joints_brief.j2", config=config, results=results),
-        numbers={
+    return _About(
+        {
             "points": [codec.plain(point, arrays=False) for point in results.identify.points],
-            "design": {
-                "gamma": None if design.found is None else design.found.gamma,
-                "reason": design.reason,
-            },
+            "design": {"gamma": design.gamma, "reason": design.reason},
             "certificate": codec.plain(certify.certificate),
             "closed_loop": codec.plain(loop, arrays=False),
         },
-        certified=certify.certified and settled == points,
-        verdict=said("joints_verdict", design, certify, settled, points),
-        report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
+        settled == points,
+        said("joints_verdict", design, certify, settled, points),
     )
 
 
