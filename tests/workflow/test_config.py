@@ -65,7 +65,7 @@ def test_frozen_and_second_channel_is_performance():
         ('[[channels]]\ninput = "voltage_V"\noutput = "angle_rad"', "two channels are called 'angle_rad'"),
         ('[[channels]]\ninput = "v2"\noutput = "tip"', "same input"),
         ('[[channels]]\ninput = "voltage_V"\noutput = "tip"\npurpose = "control"', "exactly one channel"),
-        ('[[source.records]]\npath = "log.csv"', "two records are called 'log'"),
+        ('[[source.records]]\npath = "log.csv"', "records 'log' and 'log' share rows of log.csv"),
         ('[closed_loop_data]\nmethod = "two_stage"', "needs references"),
         ('[closed_loop]\neffects = [{ name = "tip_payload", mass_kg = 0.1 }]', "simulated arm only"),
         ("[run.more]\na = 1", "unknown key run.more"),

@@ -10,7 +10,16 @@ from pydantic import Field, NonNegativeInt, SerializerFunctionWrapHandler, model
 from control_design.specification import Specification
 from control_design.specification.multivariable import MultivariableSpecification
 from control_design.synthesis.synthesis_options import MultivariableOptions
-from workflow.config.run_config import FileSource, Name, Role, Run, RunConfig, SimulatedSource, loaded
+from workflow.config.run_config import (
+    AnyRun,
+    FileSource,
+    Name,
+    Notes,
+    Role,
+    RunConfig,
+    SimulatedSource,
+    loaded,
+)
 from workflow.config.settings import Section, repeated
 from workflow.engine.documents import read_toml
 
@@ -65,10 +74,6 @@ class Joint(Specification):
     input: str = Field(min_length=1, description="column of the command")
     output: str = Field(min_length=1, description="column of the measured angle")
 
-    def asked(self) -> Specification:
-        """What is asked, without the columns."""
-        return Specification(**self.model_dump(exclude={"input", "output"}))
-
     @model_serializer(mode="wrap")
     def _as_given(self, every: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Without keys that were not given: some are refused where they are stated."""
@@ -117,7 +122,7 @@ class JointsLoop(Section):
     coulomb_Nm: Two | None = Field(None, description="dry friction of each joint in further runs")
 
 
-class JointsConfig(Run):
+class JointsConfig(AnyRun):
     """A whole run for several joints. Load with `load_any`."""
 
     source: Source
@@ -127,6 +132,7 @@ class JointsConfig(Run):
     )
     design: JointsDesign = Field(default_factory=lambda: JointsDesign.model_validate({}))
     closed_loop: JointsLoop = Field(default_factory=lambda: JointsLoop.model_validate({}))
+    notes: Notes = Field(default_factory=Notes)
 
     @model_validator(mode="after")
     def _fit_together(self) -> Self:
@@ -178,7 +184,9 @@ class JointsConfig(Run):
     def specification(self) -> MultivariableSpecification:
         """What is asked of the whole."""
         return MultivariableSpecification(
-            joints=tuple(joint.asked() for joint in self.joints),
+            joints=tuple(
+                Specification(**joint.model_dump(exclude={"input", "output"})) for joint in self.joints
+            ),
             structure=self.design.structure,
             controller_order=self.design.controller_order,
             controller_damping=self.design.controller_damping,
@@ -201,7 +209,7 @@ class JointsConfig(Run):
         return self.joints
 
 
-class SimulationConfig(Run):
+class SimulationConfig(AnyRun):
     """The experiments of a simulated machine alone."""
 
     source: SimulatedSource

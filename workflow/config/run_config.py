@@ -1,4 +1,4 @@
-"""`Run`: what the configurations of all runs are; `RunConfig`: that of one loop, from one TOML file."""
+"""`AnyRun`: what the configurations of all runs are; `RunConfig`: that of one loop, from one TOML file."""
 
 from __future__ import annotations
 
@@ -49,11 +49,6 @@ class SimulatedRecord(Section):
     condition: str | None = Field(None, description="records with the same label are repeats of one another")
     remark: str = Field("", description="shown beside the record in the report")
     excitation: Excitation
-
-    @property
-    def kind(self) -> str:
-        """Of the excitation."""
-        return self.excitation.kind
 
 
 class SimulatedLoop(Section):
@@ -338,11 +333,26 @@ class Notes(Section):
     unknown: tuple[str, ...] = Field((), description="sentences for the report: limits of its statements")
 
 
-class Run(Section):
+class AnyRun(Section):
     """What runs of one loop and of several joints have in common."""
 
     run: RunSection = Field(default_factory=RunSection)
     source: Section
+
+    @model_validator(mode="after")
+    def _each_row_once(self) -> Self:
+        """Rows counted twice shrink every bound, and rows that were fitted validate nothing."""
+        if not isinstance(self.source, FileSource):
+            return self
+        for first, second in combinations(self.source.records, 2):
+            ends = [math.inf if r.stop_sample is None else r.stop_sample for r in (first, second)]
+            overlap = first.start_sample < ends[1] and second.start_sample < ends[0]
+            if (first.path, first.run) == (second.path, second.run) and overlap:
+                raise ValueError(
+                    f"records {record_name(first)!r} and {record_name(second)!r} share rows of "
+                    f"{first.path.name}: use each row once"
+                )
+        return self
 
     @property
     def input_files(self) -> list[Path]:
@@ -364,10 +374,10 @@ class Run(Section):
         return check(cls, document, source=source, context={"may_be_gone": True})
 
 
-RunT = TypeVar("RunT", bound=Run)
+RunT = TypeVar("RunT", bound=AnyRun)
 
 
-class RunConfig(Run):
+class RunConfig(AnyRun):
     """A whole run of one loop. Load with `load_config`."""
 
     source: Source
@@ -407,7 +417,6 @@ class RunConfig(Run):
             raise ValueError("all channels must have the same input: the controller drives one actuator")
         if (name := repeated(self.record_names)) is not None:
             raise ValueError(f"two records are called {name!r}: give them different names")
-        self._refuse_the_same_rows_twice()
         if not any(record.role == "estimation" for record in self.source.records):
             raise ValueError("no record has role 'estimation': there is nothing to identify from")
         if self.closed_loop.machine == "simulated" and self.source.kind != "simulated":
@@ -433,19 +442,6 @@ class RunConfig(Run):
                 "closed_loop_data.method = 'two_stage' needs references in [source] for every record"
             )
         return self
-
-    def _refuse_the_same_rows_twice(self) -> None:
-        """Rows counted twice shrink every bound, and rows that were fitted validate nothing."""
-        if not isinstance(self.source, FileSource):
-            return
-        for first, second in combinations(self.source.records, 2):
-            ends = [math.inf if r.stop_sample is None else r.stop_sample for r in (first, second)]
-            overlap = first.start_sample < ends[1] and second.start_sample < ends[0]
-            if (first.path, first.run) == (second.path, second.run) and overlap:
-                raise ValueError(
-                    f"records {record_name(first)!r} and {record_name(second)!r} share rows of "
-                    f"{first.path.name}: use each row once"
-                )
 
     @property
     def _has_references(self) -> bool:

@@ -3,9 +3,6 @@ kept back, mode shapes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,42 +11,12 @@ from matplotlib.figure import Figure
 from control_design.plants.multivariable import tustin_s
 from control_design.plants.scaled_bound import BoundRows, scaled_bound
 from control_design.specification.multivariable import gram
-from workflow.config.joints_config import JointsConfig
 from workflow.figures import style
 from workflow.figures.bands import Real, envelope, outline
+from workflow.figures.subjects import AnyRunView
 from workflow.figures.validation import draw_free_run
 
 _LOW = 1e-3  # smallest frequency of the singular values, of the Nyquist frequency
-
-
-@dataclass(frozen=True, eq=False)
-class JointsView:
-    """A run for several joints whose stages are all there."""
-
-    config: JointsConfig
-    results: Any
-    manifest: Mapping[str, Any]
-
-    @cached_property
-    def worst(self) -> tuple[Real, dict[str, Real]]:
-        """Frequencies (F,) [rad/s], and by requirement the largest worst case over the plants there (F,)."""
-        law = self.results.design.controller
-        assert law is not None
-        asked = self.config.specification()
-        top = 0.999 * np.pi / law.dt_s
-        omega = np.geomspace(_LOW * top, top, 300)
-        s, K = tustin_s(omega, law.dt_s), law.response(omega, with_delay=False)
-        found: dict[str, Real] = {}
-        for point in self.results.identify.points:
-            plant = point.plant(self.config.identification.gain_error)
-            G, seen, entering = plant.blocks(omega, law.computational_delay_samples)
-            for name, (of, weights) in asked.weights(plant.inputs, plant.outputs).items():
-                size = gram(weights, s)
-                none = np.zeros_like(size)
-                on_y, on_u = (size, none) if of == "y" else (none, size)
-                gamma = scaled_bound(BoundRows(G, seen, entering, on_y, on_u, False), K).gamma
-                found[name] = np.maximum(found.get(name, np.zeros(omega.size)), gamma)
-        return omega, found
 
 
 _MEANING = {
@@ -60,7 +27,7 @@ _MEANING = {
 
 
 @style.drawing("joint-steps")
-def draw_joint_steps(run: JointsView) -> Figure | None:
+def draw_joint_steps(run: AnyRunView) -> Figure | None:
     """Outputs and commands of every joint: the operating points as identified as lines, all others as their
     range."""
     loop = run.results.closed_loop
@@ -94,7 +61,7 @@ def _draw_runs(axes: Any, time_s: Real, lines: list[Real], label: str) -> None:
 
 
 @style.drawing("matrix-response")
-def draw_matrix_response(run: JointsView) -> Figure:
+def draw_matrix_response(run: AnyRunView) -> Figure:
     """Size of every channel with its ball, one curve per operating point."""
     points = run.results.identify.points
     joints = run.config.joints
@@ -132,7 +99,7 @@ def draw_matrix_response(run: JointsView) -> Figure:
 
 
 @style.drawing("singular-values")
-def draw_singular_values(run: JointsView) -> Figure:
+def draw_singular_values(run: AnyRunView) -> Figure:
     """Largest and smallest gain of the plant over all directions of its inputs, with the ball, per point."""
     figure, grid = style.panels(2.9, 1, 1, squeeze=False)
     axes = grid[0, 0]
@@ -159,11 +126,23 @@ def draw_singular_values(run: JointsView) -> Figure:
 
 
 @style.drawing("joint-requirements")
-def draw_joint_requirements(run: JointsView) -> Figure | None:
+def draw_joint_requirements(run: AnyRunView) -> Figure | None:
     """Largest singular value of every weighted function, the worst over balls and operating points."""
-    if run.results.design.controller is None:
+    if (law := run.results.design.controller) is None:
         return None
-    omega, found = run.worst
+    asked, top = run.config.specification(), 0.999 * np.pi / law.dt_s
+    omega = np.geomspace(_LOW * top, top, 300)
+    s, K = tustin_s(omega, law.dt_s), law.response(omega, with_delay=False)
+    found: dict[str, Real] = {}
+    for point in run.results.identify.points:
+        plant = point.plant(run.config.identification.gain_error)
+        G, seen, entering = plant.blocks(omega, law.computational_delay_samples)
+        for name, (of, weights) in asked.weights(plant.inputs, plant.outputs).items():
+            size = gram(weights, s)
+            none = np.zeros_like(size)
+            on_y, on_u = (size, none) if of == "y" else (none, size)
+            worst = scaled_bound(BoundRows(G, seen, entering, on_y, on_u, False), K).gamma
+            found[name] = np.maximum(found.get(name, np.zeros(omega.size)), worst)
     figure, grid = style.panels(2.9, 1, 1, squeeze=False)
     axes = grid[0, 0]
     colours = (style.MODEL, style.PREDICTED, style.ACHIEVED)
@@ -178,7 +157,7 @@ def draw_joint_requirements(run: JointsView) -> Figure | None:
 
 
 @style.drawing("joint-validation")
-def draw_joint_validation(run: JointsView) -> Figure | None:
+def draw_joint_validation(run: AnyRunView) -> Figure | None:
     """Of all records that were kept back the one that is met worst: every output, measured and simulated."""
     records = [(point, fits) for point in run.results.identify.points for fits in point.fresh]
     if not records:
@@ -196,7 +175,7 @@ def draw_joint_validation(run: JointsView) -> Figure | None:
 
 
 @style.drawing("mode-shapes")
-def draw_mode_shapes(run: JointsView) -> Figure | None:
+def draw_mode_shapes(run: AnyRunView) -> Figure | None:
     """Which joint moves how much in each mode of the first operating point."""
     point = run.results.identify.points[0]
     shaped = [(omega, zeta, moved) for omega, zeta, moved in point.modes if moved is not None]

@@ -157,12 +157,24 @@ def log_channel(result: LogIdentification) -> ChannelView:
 
 
 @dataclass(frozen=True, eq=False)
-class RunView:
-    """A run whose stages are all there."""
+class AnyRunView:
+    """A run whose stages are all there, of one loop or of several joints."""
+
+    config: Any
+    results: Any
+    manifest: Mapping[str, Any]
+
+    def largest_recorded(self, signal: str) -> float:
+        """Of an input, in the records of the fit."""
+        fitted = [item.record for item in self.results.records.of_role("estimation")]
+        return max(float(np.max(np.abs(one.input[:, one.input_names.index(signal)]))) for one in fitted)
+
+
+class RunView(AnyRunView):
+    """A run of one loop."""
 
     config: RunConfig
     results: RunResults
-    manifest: Mapping[str, Any]
 
     @property
     def specification(self) -> Specification:
@@ -259,12 +271,6 @@ class RunView:
     def shares(self) -> Mapping[str, Any]:
         """Shares of sampled responses that hold and are stable, with their 95 % intervals."""
         return joint_numbers(self.results.certify.sampled)
-
-    @property
-    def largest_recorded_input(self) -> float:
-        """Of the records of the fit."""
-        fitted = self.results.records.fitted(self.config.control_channel)
-        return max(float(np.max(np.abs(record.input))) for record in fitted)
 
     @cached_property
     def loop_grid(self) -> Real:

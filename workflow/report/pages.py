@@ -8,15 +8,14 @@ from dataclasses import replace
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from workflow.config.joints_config import AnyConfig
 from workflow.config.run_config import RunConfig
 from workflow.engine import storage
 from workflow.engine.run_directory import RunDirectory
-from workflow.figures.joints import JointsView
-from workflow.figures.subjects import RunView, log_channel
+from workflow.figures.subjects import AnyRunView, RunView, log_channel
 from workflow.report.rendering import RenderedPage, render_page
+from workflow.tasks.exports import Logged
 from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.results import ReportResult, RunRecord, RunResults
 from workflow.tasks.stage import Stage, StageInput, stages_for
@@ -37,7 +36,7 @@ def write_report(
     missing, or the disk refuses.
     """
     run = results.run
-    view: Any = RunView if isinstance(config, RunConfig) else JointsView
+    view = RunView if isinstance(config, RunConfig) else AnyRunView
     page = render_page(
         "report.html.j2",
         progress,
@@ -46,6 +45,7 @@ def write_report(
         run=view(config, results, run.manifest()),
         study=(run.path.parent.parent / "study.html").is_file(),  # of which this run is a point
         certified=summarise(results, config).certified,
+        signals=Logged.of(config, results.records).signals,
     )
     return _write(run, page)
 

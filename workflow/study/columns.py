@@ -7,6 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
+from workflow.config.joints_config import AnyConfig, JointsConfig
+from workflow.config.run_config import RunConfig
+
 if TYPE_CHECKING:
     from control_design.analysis.margins import Margins
     from workflow.tasks.results import RunResults
@@ -64,10 +67,18 @@ _ALL = (
 COLUMNS: Mapping[str, StudyColumn] = {column.name: column for column in _ALL}
 
 
-def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None) -> dict[str, Number]:
-    """Numbers of a point from the results of its stages; None where there is none.
+def numbers_of(results: RunResults, config: AnyConfig) -> dict[str, Number]:
+    """Numbers of a point from the results of its stages; None where there is none."""
+    from workflow.engine.codec import plain
 
-    Closed-loop numbers are the worst over the runs. The mode is the least damped one of the nominal closed
+    found: dict[str, Number] = {**dict.fromkeys(COLUMNS), "design_gamma": plain(results.design.gamma)}
+    return found | (
+        _of_joints(results) if isinstance(config, JointsConfig) else _of_one_loop(results, config)
+    )
+
+
+def _of_one_loop(results: RunResults, config: RunConfig) -> dict[str, Number]:
+    """Closed-loop numbers are the worst over the runs. The mode is the least damped one of the nominal closed
     loop, inside the band of the specification where it names one. The measured peak of S is that of the arm
     that was identified, at the larger of two sizes.
     """
@@ -78,8 +89,6 @@ def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None)
     gamma, certify = results.design.gamma, results.certify
     bracket, joint = bracket_numbers(results.achievable_performance, gamma), certify.sampled.joint
     found: dict[str, Number] = {
-        **dict.fromkeys(COLUMNS),
-        "design_gamma": plain(gamma),
         "any_order_gamma": bracket["reached"],
         "above_any_order_percent": bracket["above_percent"],
     }
@@ -96,7 +105,7 @@ def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None)
         found |= _margins("", verdict.worst_margins) | _margins("nominal_", verdict.nominal_margins)
         found["worst_gamma"] = plain(certificate.gamma if bound is None else bound)
         found["bandwidth_rad_s"] = verdict.bandwidth_rad_s
-        low, high = mode_band_rad_s or (0.0, math.inf)
+        low, high = config.specification.mode_band_rad_s or (0.0, math.inf)
         modes = [mode for mode in verdict.closed_loop_modes if low <= mode.omega_rad_s <= high]
         if least := min(modes, key=lambda mode: mode.zeta, default=None):
             found["mode_damping"], found["mode_omega_rad_s"] = least.zeta, least.omega_rad_s
@@ -111,15 +120,13 @@ def numbers_of(results: RunResults, mode_band_rad_s: tuple[float, float] | None)
     return found
 
 
-def numbers_of_joints(results: Any) -> dict[str, Number]:
-    """The same of several joints: worst over the operating points, over sensors and actuators, and, in closed
+def _of_joints(results: Any) -> dict[str, Number]:
+    """Worst over the operating points, over sensors and actuators, and, in closed
     loop, over runs and joints. disk_margin is that of the nominal loop."""
     from workflow.engine.codec import plain
 
-    found: dict[str, Number] = dict.fromkeys(COLUMNS)
-    design, certificate, runs = results.design.found, results.certify.certificate, results.closed_loop.runs
-    if design is not None:
-        found["design_gamma"] = plain(design.gamma)
+    found: dict[str, Number] = {}
+    certificate, runs = results.certify.certificate, results.closed_loop.runs
     if certificate is not None:
         verdicts = certificate.verdicts
         bounds = max(bound for verdict in verdicts for bound in verdict.bounds.values())

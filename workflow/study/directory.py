@@ -28,6 +28,7 @@ from workflow.study.task import Done
 from workflow.tasks.pipeline import controller_stages, plant_stages, stage_input_hash
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage
+from workflow.tasks.stages import PLANT
 from workflow.tasks.summary import summarise
 
 LAYOUT_VERSION = 1  # the first; a study of another one is not resumed
@@ -80,7 +81,7 @@ class StudyDirectory(Store):
         """Whether a point is finished, with the plant that stands in the study."""
         run = self.point(point)
         finished = _matches(run, point, controller_stages(point.config))
-        return finished and run.stage_files(_plant(point)) == self.plant_files(point)
+        return finished and run.stage_files(PLANT) == self.plant_files(point)
 
     def save_plant(self, point: Point, given: Mapping[str, bytes], done: Done) -> None:
         """Keep records, model and ellipses."""
@@ -107,11 +108,7 @@ class StudyDirectory(Store):
 
     def plant_files(self, point: Point) -> dict[str, bytes]:
         """The stage files of the plant that a point shares, by file name."""
-        return self.plant(point).stage_files(_plant(point))
-
-
-def _plant(point: Point) -> tuple[str, ...]:
-    return tuple(stage.name for stage in plant_stages(point.config))
+        return self.plant(point).stage_files(PLANT)
 
 
 def _write(run: RunDirectory, point: Point, given: Mapping[str, bytes], done: Done) -> None:

@@ -18,7 +18,7 @@ from workflow.config.joints_config import JointsConfig
 from workflow.engine import codec
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures import style
-from workflow.study.columns import COLUMNS, Number, StudyColumn, numbers_of, numbers_of_joints
+from workflow.study.columns import COLUMNS, Number, StudyColumn, numbers_of
 from workflow.study.points import Combination, Point, short
 from workflow.study.settings import ParetoPlot, StudyAxis, StudyConfig
 from workflow.tasks.results import RunResults
@@ -57,23 +57,23 @@ class PointRow(Combination):
 
 def row_of(point: Point, run: RunDirectory) -> PointRow:
     """The row of a finished point."""
-    results = RunResults(run)
-    if isinstance(point.config, JointsConfig):
-        return _row_of_joints(point, results)
-    specification = point.config.specification
-    design, certify, check = results.design, results.certify, results.closed_loop.check
+    results, config = RunResults(run), point.config
+    design, certify, numbers = results.design, results.certify, numbers_of(results, config)
     state: State = (
         "impossible"
         if design.synthesis is None
         else "not certified"
         if not certify.certified
-        else "keeps moving"
-        if check is None or check.settled_draws != check.draws
-        else "does not settle"  # at rest beside the reference
-        if check.tracking and check.spread_of("settling_time_s")[-1] is None
         else "certified"
+        if numbers["settled_draws"] and numbers["settled_draws"] == numbers["draws"]
+        else "keeps moving"
     )
-    numbers = numbers_of(results, specification.mode_band_rad_s)
+    if isinstance(config, JointsConfig):
+        if state == "keeps moving":  # which is not told from resting beside the reference
+            state = "does not settle"
+        why = summarise(results, config).verdict
+        return PointRow(point.number, point.name, point.values, state, why, numbers)
+    specification, check = config.specification, results.closed_loop.check
     # The certificate is the judge and names every item that is missed; the optimiser only what blocks it.
     why = certify.reason
     if design.gamma is not None and design.gamma > 1:
@@ -81,30 +81,16 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
         advice = said("order_advice", reached, design.gamma, order)
         why = f"{why}; {advice}" if advice else why
     if certify.certified:
-        conditions = results.uncertainty.conditions(point.config)
+        conditions = results.uncertainty.conditions(config)
         why = verdict_of(replace(design, met=True), certify, results.closed_loop, conditions=conditions)
     lowered = said("lowered", specification, design.specification, (), numbers["bandwidth_rad_s"] or 0)
-    if state == "does not settle":
-        why = said("never_settles", check)
+    if state == "certified" and check and check.tracking and check.spread_of("settling_time_s")[-1] is None:
+        state, why = "does not settle", said("never_settles", check)  # at rest beside the reference
     elif state == "certified" and lowered:
         state = "certified at a lower bandwidth"
     if lowered:
         why = f"{lowered}; {why}"
     return PointRow(point.number, point.name, point.values, state, why, numbers)
-
-
-def _row_of_joints(point: Point, results: Any) -> PointRow:
-    state: State = (
-        "impossible"
-        if results.design.found is None
-        else "not certified"
-        if not results.certify.certified
-        else "certified"
-        if all(run.settled for run in results.closed_loop.runs)
-        else "does not settle"
-    )
-    why = summarise(results, point.config).verdict
-    return PointRow(point.number, point.name, point.values, state, why, numbers_of_joints(results))
 
 
 def row_without_run(point: Combination, state: State, why: str) -> PointRow:

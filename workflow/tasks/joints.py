@@ -23,7 +23,7 @@ from ident.checks.validation import fit_in_windows, fit_on_fresh_data
 from ident.closed_loop import two_stage_several
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
-from ident.identification import MimoIdentification
+from ident.data.signal_filter import increments
 from ident.several_outputs import identify_mimo
 from ident.uncertainty.matrix_response import matrix_posterior
 from workflow.config.joints_config import JointsConfig, TwoJointSource
@@ -31,12 +31,12 @@ from workflow.config.run_config import Role
 from workflow.engine.errors import naming
 from workflow.tasks.point_models import (
     JointsCertificate,
-    JointsDesignResult,
     JointsLoopResult,
     JointsRun,
     PointModel,
     PointModels,
 )
+from workflow.tasks.results import DesignResult
 from workflow.tasks.simulated_rig import machine_at
 from workflow.tasks.stage import StageInput
 
@@ -69,7 +69,7 @@ def identify_points(stage: StageInput) -> PointModels:
     prepared: dict[tuple[str, Role], list[Record]] = {}
     for item in results.records.records:
         record = _with_later_inputs(item.record, later)
-        record = record.each(partial(np.diff, axis=0)) if options.increments else record
+        record = increments(record) if options.increments else record
         prepared.setdefault((item.condition or "arm", item.role), []).append(record)
     # A free run of joints that turn freely drifts away, that of differences does not.
     again = fit_on_fresh_data if options.increments else fit_in_windows
@@ -88,17 +88,28 @@ def identify_points(stage: StageInput) -> PointModels:
                 records, start = list(stages.records), stages.plant.poles
                 remarks = stages.finding, *stages.warnings
             one = identify_mimo(records, asked, start=start, progress=report)
-            point = _described(name, records, one, options.level, options.lowest_rad_s)
+            ball = matrix_posterior(records, one, level=options.level)
             outputs = list(enumerate(one.model.outputs))
             fits = [tuple(again(own, record.only(k)) for k, own in outputs) for record in fresh]
-        remarks += tuple(
-            finding(FindingKind.NO_ANSWER_THERE, record=f"{fit.name}, {output}", fit_percent=fit.fit_percent)
-            for each in fits
-            for fit, output in zip(each, one.model.output_names, strict=True)
-            if not fit.answers
-        )
-        warnings = (*remarks, *point.warnings)
-        found.append(replace(point, warnings=warnings, later=later, fresh=tuple(fits)))
+            remarks += tuple(
+                finding(
+                    FindingKind.NO_ANSWER_THERE, record=f"{fit.name}, {output}", fit_percent=fit.fit_percent
+                )
+                for each in fits
+                for fit, output in zip(each, one.model.output_names, strict=True)
+                if not fit.answers
+            )
+            # A colour of the noise is the ball's own.
+            remarks += tuple(item for item in one.warnings if item.kind is not FindingKind.COLOURED_RESIDUAL)
+            low = options.lowest_rad_s
+            shown = ball.at(np.geomspace(low, 0.999 * (np.pi / one.model.dt_s), _SHOWN))
+            noise_std = np.sqrt(np.diag(one.noise_covariance))
+            found.append(
+                PointModel(
+                    name, one.model, noise_std, one.output_fit_percent, one.rank_one, ball.output_factor,
+                    *ball.input_factor(low), ball.largest_radius(low), shown, remarks, later, tuple(fits),
+                )
+            )  # fmt: skip
         start = one.model.poles
     return PointModels(tuple(found))
 
@@ -110,20 +121,7 @@ def _with_later_inputs(record: Record, later: tuple[int, ...]) -> Record:
     return replace(record.slice(most, record.n_samples), input=np.column_stack(held))
 
 
-def _described(
-    name: str, records: list[Record], found: MimoIdentification, level: float, lowest_rad_s: float
-) -> PointModel:
-    posterior = matrix_posterior(records, found, level=level)
-    Li = posterior.input_factor(lowest_rad_s)
-    shown = posterior.at(np.geomspace(lowest_rad_s, 0.999 * (np.pi / found.model.dt_s), _SHOWN))
-    return PointModel(
-        name, found.model, np.sqrt(np.diag(found.noise_covariance)), found.output_fit_percent, found.rank_one,
-        posterior.output_factor, *Li, posterior.largest_radius(lowest_rad_s), shown,
-        tuple(item for item in found.warnings if item.kind is not FindingKind.COLOURED_RESIDUAL),
-    )  # fmt: skip  # the ball takes the noise in its colour
-
-
-def design_joints(stage: StageInput) -> JointsDesignResult:
+def design_joints(stage: StageInput) -> DesignResult:
     """One controller for all operating points."""
     config, results = _of(stage)
     plants = _plants(config, results)
@@ -136,11 +134,12 @@ def design_joints(stage: StageInput) -> JointsDesignResult:
                 progress=partial(stage.progress.update, "design"),
             )
         except SpecificationError as impossible:
-            return JointsDesignResult(None, str(impossible))
+            return DesignResult(None, met=False, reason=str(impossible))
     first = found.blocking[0]
     joint = config.joints[first.joint or 0]
-    return JointsDesignResult(
+    return DesignResult(
         found,
+        found.gamma <= 1.0,
         f"worst case {found.gamma:.3f} (at most 1 is needed), of {first.weight} of "
         f"{joint.input if first.weight == 'effort' else joint.output}, {first.plant}, at "
         f"{first.omega_rad_s:.3g} rad/s",

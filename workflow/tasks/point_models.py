@@ -4,16 +4,14 @@ the controller, its certificate, the loop at every point."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from control_design.analysis.multivariable_certificate import MultivariableCertificate
-from control_design.controllers.controller import Controller
 from control_design.plants.multivariable import MultivariablePlant, ResponseBall
 from control_design.plants.weights import RationalWeight
-from control_design.synthesis.multivariable import MultivariableResult
 from ident.basis.mimo_model import MimoModel
 from ident.checks.validation import FreshFit
 from ident.data.finding import Finding
@@ -63,13 +61,17 @@ class PointModel:
         Li = control.ss(
             self.Li_a, self.Li_b, self.Li_c, self.Li_d, self.model.dt_s, remove_useless_states=False
         )
-        off: tuple[RationalWeight, ...] = ()
-        if gain_error:
-            weight = RationalWeight(numerator=(gain_error,), denominator=(1.0,))
-            off = (weight,) * len(self.model.input_names)
+        gains = (gain_error,) * len(self.model.input_names) if gain_error else ()
+        off = tuple(RationalWeight(numerator=(gain,), denominator=(1.0,)) for gain in gains)
         nominal = self.model.to_control()
         if any(self.later):
-            nominal, Li = (_behind(system, self.later) for system in (nominal, Li))
+            chains = [
+                control.ss(np.eye(n, k=-1), np.eye(n, 1), np.eye(1, n, n - 1), 0, nominal.dt)
+                if n
+                else control.ss([], [], [], 1, nominal.dt)
+                for n in self.later
+            ]
+            nominal, Li = (system * control.append(*chains) for system in (nominal, Li))
         ball = ResponseBall(self.Lo, Li, self.radius, lowest_rad_s=float(self.shown.omega_rad_s[0]))
         return MultivariablePlant(self.name, nominal, ball, input_error=off)
 
@@ -95,22 +97,6 @@ class PointModels:
     """One per operating point."""
 
     points: tuple[PointModel, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class JointsDesignResult:
-    """The controller, if any, its worst case over plants and requirements, and one line about it."""
-
-    found: MultivariableResult | None
-    reason: str
-
-    @property
-    def controller(self) -> Controller | None:
-        return None if self.found is None else self.found.controller
-
-    @property
-    def gamma(self) -> float | None:
-        return None if self.found is None else self.found.gamma
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,16 +139,3 @@ class JointsLoopResult:
         points = dict.fromkeys(run.point for run in self.runs)
         good = [all(run.settled for run in self.runs if run.point == point) for point in points]
         return sum(good), len(good)
-
-
-def _behind(system: Any, later: tuple[int, ...]) -> Any:
-    """The system with each input so many samples later."""
-    import control
-
-    chains = [
-        control.ss(np.eye(n, k=-1), np.eye(n, 1), np.eye(1, n, n - 1), 0, system.dt)
-        if n
-        else control.ss([], [], [], 1, system.dt)
-        for n in later
-    ]
-    return system * control.append(*chains)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -40,9 +40,8 @@ def make_records(stage: StageInput) -> RecordsResult:
         made = read_records(source, stage.config.columns)
     limit, records = source.input_limit or np.inf, list[RunRecord]()
     for about, record in zip(entries, with_common_sampling_time(made), strict=True):
-        records.append(
-            RunRecord(record.limited(limit), about.role, about.condition, about.remark, about.kind)
-        )
+        of: Any = getattr(about, "excitation", about)
+        records.append(RunRecord(record.limited(limit), about.role, about.condition, about.remark, of.kind))
     result = RecordsResult(tuple(records))
     for item in result.of_role("estimation"):
         if not np.ptp(item.record.input, axis=0).any():

@@ -6,6 +6,7 @@ closed loop (R, T); responses (F,) over frequencies.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Generic, Literal, TypeVar
@@ -20,6 +21,7 @@ from control_design.convex.reference_filter import ReferenceFilter
 from control_design.convex.youla import YoulaBracket
 from control_design.plants.plant_set import PlantChannel as PlantChannel, UncertainPlant
 from control_design.specification import Specification
+from control_design.synthesis.multivariable import MultivariableResult
 from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
 from ident.basis.model import GobfModel
 from ident.checks.plausible_modes import PairKind, kind_of_pair
@@ -37,7 +39,7 @@ from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.nominal import NominalAgreement
 from workflow.config.run_config import Channel, Role, RunConfig
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.point_models import JointsCertificate, JointsDesignResult, JointsLoopResult, PointModels
+from workflow.tasks.point_models import JointsCertificate, JointsLoopResult, PointModels
 
 Interval = tuple[float, float]
 T = TypeVar("T")
@@ -330,11 +332,20 @@ class DesignResult:
     frequency and requirement block it; jointly: what became of designing for sampled responses.
     specification: with the bandwidth that was chosen, where the one asked for leaves that open."""
 
-    synthesis: SynthesisResult | None
+    synthesis: SynthesisResult | MultivariableResult | None
     met: bool
     reason: str
     jointly: str | None = None
     specification: Specification | None = field(default=None, metadata={"since": 2})
+
+    @staticmethod
+    def of_earlier(document: Mapping[str, Any]) -> Mapping[str, Any]:
+        """What several joints had as a type of their own."""
+        if document.get("$type") != "JointsDesignResult":
+            return document
+        found = document["found"]
+        met = found is not None and found["outcome"] == Outcome.MET_ON_GRID.name
+        return {"synthesis": found, "met": met, "reason": document["reason"], "jointly": None}
 
     @property
     def gamma(self) -> float | None:
@@ -643,7 +654,7 @@ class RunResults:
     records = StageResult(RecordsResult)
     identify = StageResult(IdentifyResult, PointModels)
     uncertainty = StageResult(UncertaintyResult)
-    design = StageResult(DesignResult, JointsDesignResult)
+    design = StageResult(DesignResult)
     achievable_performance = StageResult(AchievablePerformance)
     certify = StageResult(CertifyResult, JointsCertificate)
     reference_filter = StageResult(ReferenceFilterResult)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -30,34 +30,29 @@ from workflow.text.templates import RunSummary, rows_of, said, words
 
 def summarise(results: RunResults, config: AnyConfig) -> RunSummary:
     """The table of a run whose stages are all there."""
-    about = _of_one_loop(results, config) if isinstance(config, RunConfig) else _of_joints(results)
+    numbers, settles, verdict = (
+        _of_one_loop(results, config) if isinstance(config, RunConfig) else _of_joints(results)
+    )
     shown: dict[str, Any] = {"config": config, "results": results}
-    shares, signals = about.numbers.get("sampled_responses"), Logged.of(config, results.records).signals
+    shares, signals = numbers.get("sampled_responses"), Logged.of(config, results.records).signals
     return RunSummary(
         title=title_of(config, results.run),
         sections=rows_of("summary/run.j2", shares=shares, signals=signals, **shown),
         brief=rows_of("summary/brief.j2", **shown),
-        numbers=about.numbers,
-        certified=results.certify.certified and about.settles,
-        verdict=about.verdict,
+        numbers=numbers,
+        certified=results.certify.certified and settles,
+        verdict=verdict,
         report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
     )
 
 
-class _About(NamedTuple):
-    """What is said of each kind of run in its own words."""
-
-    numbers: dict[str, Any]
-    settles: bool
-    verdict: str
-
-
-def _of_one_loop(results: RunResults, config: RunConfig) -> _About:
+def _of_one_loop(results: RunResults, config: RunConfig) -> tuple[dict[str, Any], bool, str]:
+    """Numbers for programs, whether every run in closed loop settles, and the verdict."""
     design, certify = results.design, results.certify
     achievable, loop = results.achievable_performance, results.closed_loop
     pairs = list(zip(results.identify.channels, results.uncertainty.channels, strict=True))
     conditions = results.uncertainty.conditions(config)
-    return _About(
+    return (
         {
             "channels": [channel_numbers(found, spread) for found, spread in pairs],
             "design": {
@@ -90,10 +85,11 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> _About:
     )
 
 
-def _of_joints(results: Any) -> _About:
+def _of_joints(results: Any) -> tuple[dict[str, Any], bool, str]:
+    """The same of several joints."""
     design, certify, loop = results.design, results.certify, results.closed_loop
     settled, points = loop.settled_points()
-    return _About(
+    return (
         {
             "points": [codec.plain(point, arrays=False) for point in results.identify.points],
             "design": {"gamma": design.gamma, "reason": design.reason},
