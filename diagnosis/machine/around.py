@@ -155,7 +155,7 @@ def _ways(speed: Real) -> Real:
 
 
 AnyBody = Body | MeasuredBody
-Where = Literal["input", "output", "body"]
+Where = Literal["input", "output", "body", "model"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,14 +173,14 @@ class Drive:
     at_rest_before: bool = True
     _kept: dict[Hashable, Any] = field(default_factory=dict, repr=False)
 
-    def under(self, started: Started, acting: Sequence[tuple[Acts, Values]], run: Run) -> Run:
+    def under(self, started: Started, acting: Sequence[Acting], run: Run) -> Run:
         """The simulation with effects on the signal, in the order given; not a number where no fixed point
         was found."""
 
         def changed(command: Real) -> Real:
             now = command
-            for acts, values in acting:
-                now = acts.change(now, values, self.dt_s, 0.0 if self.at_rest_before else float(now[0]))
+            for law, _, values in acting:
+                now = law.signal(now, values, self.dt_s, 0.0 if self.at_rest_before else float(now[0]))
             return np.asarray(now - command)
 
         def simulated(inputs: Real) -> Real:
@@ -228,33 +228,56 @@ def _fixed(changed: Callable[[Real], Real], beyond: Real, response: Real, start:
     return x, np.asarray(beyond + scipy.signal.fftconvolve(response, x)[: x.size])
 
 
-@dataclass(frozen=True, eq=False)
-class Acts:
-    """What an effect does to a simulation.
+@dataclass(frozen=True)
+class Law:
+    """What an effect does to a simulation that does not know it.
 
-    on : column of the inputs or outputs, a drive, or a body. where : "input", "output" or "body".
-    change : of a column, (T,), values, dt_s, what it was before its first row -> (T,); of a body, values ->
-        fields of `BodyForces`.
-    at_rest_before : an input was zero before its first row; else, and every output, as in that row.
+    where : "input" or "output", it changes a signal; "body", it is a force on a moving body; "model", it
+        edits the description of a model.
+    change : of a signal, (T,), values, dt_s, what it was before its first row -> (T,); of a body, fields of
+        `BodyForces` and their parameters, or values -> fields; of a model, model and values -> None.
     """
 
     where: Where
+    change: Callable[..., Any] | Mapping[str, str]
+
+    def forces(self, values: Values) -> Mapping[str, float]:
+        """Fields of `BodyForces`."""
+        if isinstance(self.change, Mapping):
+            return {field: values[parameter] for field, parameter in self.change.items()}
+        return dict(self.change(values))
+
+    def signal(self, before: Real, values: Values, dt_s: float, at_first: float) -> Real:
+        """before (T,) changed; at_first: what it was before its first row."""
+        assert callable(self.change)
+        return np.asarray(self.change(before, values, dt_s, at_first))
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where a law acts. on : column of the inputs or outputs, a drive, or a body.
+
+    at_rest_before : an input was zero before its first row; else, and every output, as in that row.
+    """
+
     on: int | AnyBody | Drive
-    change: Callable[..., Any]
     dt_s: float
     at_rest_before: bool = True
 
 
-def around(started: Started, acting: Sequence[tuple[Acts, Values]]) -> Run:
+Acting = tuple[Law, Place, Values]
+
+
+def around(started: Started, acting: Sequence[Acting]) -> Run:
     """A simulation with effects around it, on each column in the order given."""
     bodies: dict[int, tuple[AnyBody, dict[str, float]]] = {}
-    drives: dict[int, tuple[Drive, list[tuple[Acts, Values]]]] = {}
-    for acts, values in acting:
-        if isinstance(acts.on, Drive):
-            drives.setdefault(id(acts.on), (acts.on, []))[1].append((acts, values))
-        elif not isinstance(acts.on, int):
-            _, sizes = bodies.setdefault(id(acts.on), (acts.on, {}))
-            for name, value in acts.change(values).items():
+    drives: dict[int, tuple[Drive, list[Acting]]] = {}
+    for law, place, values in acting:
+        if isinstance(place.on, Drive):
+            drives.setdefault(id(place.on), (place.on, []))[1].append((law, place, values))
+        elif not isinstance(place.on, int):
+            _, sizes = bodies.setdefault(id(place.on), (place.on, {}))
+            for name, value in law.forces(values).items():
                 # Laws of dry friction that are tried together add up, but for the speed over which one falls.
                 sizes[name] = value + (sizes.get(name, 0.0) if name != "stribeck_velocity" else 0.0)
     inner = started
@@ -264,7 +287,7 @@ def around(started: Started, acting: Sequence[tuple[Acts, Values]]) -> Run:
         inner = Started(body.under(inner, forces), at_rest, known, inner.start)
 
     for drive, effects in drives.values():
-        told = tuple((id(acts.change), *values.items()) for acts, values in effects)
+        told = tuple((id(law), *values.items()) for law, _, values in effects)
         outer = drive.under(inner, effects, inner.run), drive.under(inner, effects, inner.at_rest)
         inner = Started(*outer, (inner.key, told), inner.start)
 
@@ -278,14 +301,12 @@ def _norm(x: Real) -> float:
     return float(np.linalg.norm(x))
 
 
-def _changed(signals: Real, acting: Sequence[tuple[Acts, Values]], where: str) -> Real:
-    here = [(acts, values) for acts, values in acting if acts.where == where and isinstance(acts.on, int)]
-    if not here:
-        return signals
-    found = np.array(signals, dtype=np.float64)
-    for acts, values in here:
-        assert isinstance(acts.on, int)
-        signal = found[:, acts.on]
-        before = 0.0 if where == "input" and acts.at_rest_before else float(signal[0])
-        found[:, acts.on] = acts.change(signal, values, acts.dt_s, before)
+def _changed(signals: Real, acting: Sequence[Acting], where: Where) -> Real:
+    found = signals
+    for law, place, values in acting:
+        if law.where == where and isinstance(place.on, int):
+            found = np.array(signals, dtype=np.float64) if found is signals else found
+            signal = found[:, place.on]
+            before = 0.0 if where == "input" and place.at_rest_before else float(signal[0])
+            found[:, place.on] = law.signal(signal, values, place.dt_s, before)
     return found

@@ -27,7 +27,8 @@ import fmpy
 import numpy as np
 
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.machine.plant_effect import EffectParameter, PlantEffect
+from diagnosis.machine.plant_effect import PlantEffect
+from plant.effects.search_space import EffectParameter
 
 _CHILD = Path(__file__).with_name("fmu_child.py")
 # A simulation of a log takes milliseconds to seconds; a search makes thousands of them.

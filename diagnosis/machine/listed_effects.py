@@ -6,28 +6,29 @@ records' magnitudes, as in `plant.effects`, where effects of the same name are t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 
 import numpy as np
 import scipy
 
-from diagnosis.machine.around import Where
+from diagnosis.machine.around import Law
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.motion_effects import followed
-from diagnosis.machine.plant_effect import EffectParameter, PlantEffect
-from plant.effects.search_space import geometric
+from diagnosis.machine.plant_effect import PlantEffect
+from plant.effects.search_space import EffectParameter
 
 Values = Mapping[str, float]
 
-_SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.5, 0.8), "linear")
+# Of a delay in all a record: what comes later shows in too little of it.
+_LATEST = 0.2
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """Magnitudes of the records: largest input, force, position, speed, output about its mean, reading of it
-    about zero; sampling; longest record."""
+class Magnitudes:
+    """What ranges are multiples of: the records' largest input, force, position, speed, output about its mean
+    and reading of it about zero, their sampling and the longest."""
 
     input: float = 1.0
     force: float = 1.0
@@ -38,11 +39,34 @@ class Sizes:
     dt_s: float = 1.0
     duration_s: float = 1.0
 
+    @property
+    def latest(self) -> float:
+        """Of a delay, in samples."""
+        return _LATEST * self.duration_s / self.dt_s
 
-def _log(name: str, unit: float, low: float, high: float, first: float, last: float, count: int) -> Any:
-    """A range and starts, in multiples of a magnitude."""
-    starts = tuple(geometric(first * unit, min(last * unit, high * unit), count))
-    return EffectParameter(name, low * unit, high * unit, starts)
+    @property
+    def input_rate(self) -> float:
+        return self.input / self.duration_s
+
+    @property
+    def output_rate(self) -> float:
+        return self.output / self.duration_s
+
+    @property
+    def damping(self) -> float:
+        return self.force / self.speed
+
+    @property
+    def drag(self) -> float:
+        return self.force / self.speed**2
+
+    @property
+    def stiffness(self) -> float:
+        return self.force / self.position
+
+    @property
+    def hardening(self) -> float:
+        return self.force / self.position**3
 
 
 def _delayed(signal: Real, values: Values, dt_s: float, before: float) -> Real:
@@ -90,268 +114,242 @@ def _with_play(signal: Real, values: Values, dt_s: float, before: float) -> Real
     return np.asarray(followed(np.ascontiguousarray(signal), 0.5 * values["gap"], before))
 
 
-def _delays(s: Sizes) -> tuple[EffectParameter, ...]:
-    return (_log("delay_s", s.dt_s, 2e-4, min(100.0, 0.2 * s.duration_s / s.dt_s), 0.04, 30.0, 14),)
+def _dead(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    return np.asarray(np.sign(signal) * np.maximum(np.abs(signal) - values["width"], 0.0))
 
 
-def _lags(s: Sizes) -> tuple[EffectParameter, ...]:
-    return (_log("time_constant_s", s.dt_s, 2e-3, 200.0, 0.02, 40.0, 10),)
+def _falling(values: Values) -> dict[str, float]:
+    share, level = values["coulomb_share"], values["static_force"]
+    return {"coulomb": share * level, "excess": (1 - share) * level, "stribeck_velocity": values["velocity"]}
 
 
-def _gains(s: Sizes) -> tuple[EffectParameter, ...]:
-    return (EffectParameter("relative_error", 1e-4, 0.95, (0.02, 0.1, 0.3, 0.7)),)
+def _one_way(values: Values) -> dict[str, float]:
+    return {"up" if values["force"] > 0 else "down": abs(values["force"])}
 
 
-# Effects of the actuator act in this order, then those of the body, then those of the sensor.
-KINDS: dict[str, Callable[[str, Sizes], PlantEffect]] = {
-    "input_delay": lambda name, s: PlantEffect(
-        name,
-        _delays(s),
-        where="input",
-        change=_delayed,
-        check="log the input at the actuator beside the command and compare when they step",
-        group="actuator",
-    ),
-    "actuator_gain": lambda name, s: PlantEffect(
-        name,
-        _gains(s),
-        where="input",
-        change=_scaled,
-        signed=True,
-        check="hold two steady commands and measure what the actuator gives",
-        group="actuator",
-    ),
-    "input_offset": lambda name, s: PlantEffect(
-        name,
-        (_log("offset", s.input, 1e-5, 1.0, 1e-3, 0.3, 8),),
-        where="input",
-        change=_shifted,
-        signed=True,
-        check="command zero and measure what the actuator gives; on a force, level the machine",
-        group="actuator",
-    ),
-    "input_drift": lambda name, s: PlantEffect(
-        name,
-        (_log("rate_per_s", s.input / s.duration_s, 1e-5, 3.0, 1e-3, 1.0, 8),),
-        where="input",
-        change=_drifting,
-        signed=True,
-        check="hold a steady command for some minutes and measure what the actuator gives",
-        group="actuator",
-    ),
-    "input_backlash": lambda name, s: PlantEffect(
-        name,
-        (_log("gap", s.input, 1e-4, 1.5, 1e-3, 1.0, 20),),
-        where="input",
-        change=_with_play,
-        dependence="non-smooth",
-        check="command slow ramps up and down: the width between the two ways is the play",
-        group="actuator",
-    ),
-    "actuator_dead_zone": lambda name, s: PlantEffect(
-        name,
-        (_log("width", s.input, 1e-5, 1.0, 1e-3, 0.5, 12),),
-        where="input",
-        change=lambda signal, values, dt_s, before: np.asarray(
-            np.sign(signal) * np.maximum(np.abs(signal) - values["width"], 0.0)
+def _sized(
+    name: str, low: float, high: float, first: float, last: float, count: int, unit: str, most: str = ""
+) -> EffectParameter:
+    """A range and starts, in multiples of a magnitude."""
+    return EffectParameter(name, low, high, unit=unit, spread=(first, last, count), most=most)
+
+
+_DELAY = _sized("delay_s", 2e-4, 100.0, 0.04, 30.0, 14, "dt_s", most="latest")
+_LAG = _sized("time_constant_s", 2e-3, 200.0, 0.02, 40.0, 10, "dt_s")
+_GAIN = EffectParameter("relative_error", 1e-4, 0.95, (0.02, 0.1, 0.3, 0.7))
+_SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.5, 0.8), "linear")
+_VISCOUS = _sized("coefficient", 1e-5, 30.0, 1e-4, 3.0, 8, "damping")
+_ANGLE = EffectParameter("angle_rad", -np.pi, np.pi, (-2.4, -0.8, 0.8, 2.4), "linear")
+
+_actuator = partial(PlantEffect, group="actuator")
+_body = partial(PlantEffect, group="body")
+_sensor = partial(PlantEffect, group="sensor")
+
+# Effects of the actuator act in this order, then those of the body, then those of the sensor. By name only: a
+# play of a force is rare, and one before friction; a mass off its axis needs an angle; friction one way looks
+# like an offset beside friction both ways, and so does one in proportion to speed or load.
+KINDS: Mapping[str, PlantEffect] = {
+    kind.name: kind
+    for kind in (
+        _actuator(
+            "input_delay",
+            (_DELAY,),
+            law=Law("input", _delayed),
+            check="log the input at the actuator beside the command and compare when they step",
         ),
-        dependence="continuous",
-        check="raise the command slowly from zero and note where something begins to follow",
-        group="actuator",
-    ),
-    "actuator_saturation": lambda name, s: PlantEffect(
-        name,
-        (_log("limit", s.input, 0.05, 1.0, 0.1, 0.99, 24),),
-        where="input",
-        change=_clipped,
-        grows=False,
-        dependence="continuous",
-        check="command the largest input and measure what arrives",
-        group="actuator",
-    ),
-    "actuator_lag": lambda name, s: PlantEffect(
-        name,
-        _lags(s),
-        where="input",
-        change=_lagged,
-        check="step the command and look at what the actuator gives: it should step as well",
-        group="actuator",
-    ),
-    "coulomb_friction": lambda name, s: PlantEffect(
-        name,
-        (_log("force", s.force, 1e-5, 1.0, 3e-4, 0.6, 14),),
-        where="body",
-        change=lambda v: {"coulomb": v["force"]},
-        dependence="continuous",
-        check="raise the input slowly from rest and note where motion begins, in both directions",
-        group="body",
-    ),
-    "stribeck_friction": lambda name, s: PlantEffect(
-        name,
-        (
-            _log("static_force", s.force, 1e-5, 2.0, 3e-4, 0.6, 8),
-            _SHARE,
-            _log("velocity", s.speed, 0.01, 2.0, 0.012, 0.3, 3),
+        _actuator(
+            "actuator_gain",
+            (_GAIN,),
+            law=Law("input", _scaled),
+            signed=True,
+            check="hold two steady commands and measure what the actuator gives",
         ),
-        where="body",
-        change=lambda values: {
-            "coulomb": values["coulomb_share"] * values["static_force"],
-            "excess": (1 - values["coulomb_share"]) * values["static_force"],
-            "stribeck_velocity": values["velocity"],
-        },
-        dependence="continuous",
-        contains="coulomb_friction",
-        check="creep at several slow, steady speeds and note the input that each takes",
-        group="body",
-    ),
-    "one_sided_friction": lambda name, s: PlantEffect(
-        name,
-        (_log("force", s.force, 1e-5, 1.0, 1e-3, 0.6, 8),),
-        where="body",
-        change=lambda v: {"up" if v["force"] > 0 else "down": abs(v["force"])},
-        signed=True,
-        dependence="continuous",
-        check="raise the input slowly from rest, once in each direction",
-        group="body",
-    ),
-    "friction_behind_play": lambda name, s: PlantEffect(
-        name,
-        (
-            _log("force", s.force, 1e-5, 1.0, 3e-4, 0.6, 8),
-            _log("gap", s.position, 1e-5, 2.0, 3e-3, 0.3, 3),
+        _actuator(
+            "input_offset",
+            (_sized("offset", 1e-5, 1.0, 1e-3, 0.3, 8, "input"),),
+            law=Law("input", _shifted),
+            signed=True,
+            check="command zero and measure what the actuator gives; on a force, level the machine",
         ),
-        where="body",
-        change=lambda v: {"coulomb": v["force"], "gap": v["gap"]},
-        dependence="continuous",
-        contains="coulomb_friction",
-        check="move to and fro slowly and note the input: after each turn it rises only beyond the play",
-        group="body",
-    ),
-    "viscous_friction": lambda name, s: PlantEffect(
-        name,
-        (_log("coefficient", s.force / s.speed, 1e-5, 30.0, 1e-4, 3.0, 8),),
-        where="body",
-        change=lambda v: {"viscous": v["coefficient"]},
-        check="move at several steady speeds and note the input: it should grow in proportion",
-        group="body",
-    ),
-    "viscous_asymmetry": lambda name, s: PlantEffect(
-        name,
-        (_log("coefficient", s.force / s.speed, 1e-5, 30.0, 1e-4, 3.0, 8),),
-        where="body",
-        change=lambda v: {"asymmetry": v["coefficient"]},
-        signed=True,
-        dependence="continuous",
-        check="move at the same steady speeds both ways: one way takes more, in proportion to speed",
-        group="body",
-    ),
-    "quadratic_drag": lambda name, s: PlantEffect(
-        name,
-        (_log("coefficient", s.force / s.speed**2, 1e-5, 30.0, 1e-3, 3.0, 8),),
-        where="body",
-        change=lambda v: {"drag": v["coefficient"]},
-        check="move at several steady speeds: twice the speed should take four times the input",
-        group="body",
-    ),
-    "load_friction": lambda name, s: PlantEffect(
-        name,
-        (EffectParameter("share", 1e-4, 0.9, (1e-3, 0.01, 0.05, 0.15, 0.3, 0.6)),),
-        where="body",
-        change=lambda v: {"load": v["share"]},
-        dependence="continuous",
-        check="move slowly without and with a heavy load and compare what each takes beyond the load",
-        group="body",
-    ),
-    "spring": lambda name, s: PlantEffect(
-        name,
-        (_log("stiffness", s.force / s.position, 1e-5, 30.0, 1e-4, 3.0, 8),),
-        where="body",
-        change=lambda v: {"linear": v["stiffness"]},
-        check="let the machine go away from zero with the input off: it should stay where it is",
-        group="body",
-    ),
-    "eccentric_mass": lambda name, s: PlantEffect(
-        name,
-        (
-            _log("torque", s.force, 1e-5, 30.0, 1e-3, 3.0, 8),
-            EffectParameter("angle_rad", -np.pi, np.pi, (-2.4, -0.8, 0.8, 2.4), "linear"),
+        _actuator(
+            "input_drift",
+            (_sized("rate_per_s", 1e-5, 3.0, 1e-3, 1.0, 8, "input_rate"),),
+            law=Law("input", _drifting),
+            signed=True,
+            check="hold a steady command for some minutes and measure what the actuator gives",
         ),
-        where="body",
-        change=lambda v: {"weight": v["torque"], "turned": v["angle_rad"]},
-        check="let the machine hang free in several angles: it should stay where it is",
-        group="body",
-    ),
-    "hardening_spring": lambda name, s: PlantEffect(
-        name,
-        (_log("cubic", s.force / s.position**3, 1e-7, 1e3, 1e-5, 10.0, 12),),
-        where="body",
-        change=lambda v: {"cubic": v["cubic"]},
-        check="push by hand at small and at large distances and look for cables and hoses",
-        group="body",
-    ),
-    "backlash": lambda name, s: PlantEffect(
-        name,
-        (_log("gap", s.output, 1e-4, 1.0, 1e-3, 0.5, 20),),
-        where="output",
-        change=_with_play,
-        dependence="non-smooth",
-        check="hold the drive and move the load to and fro by hand: the free play is the backlash",
-        group="sensor",
-    ),
-    "output_saturation": lambda name, s: PlantEffect(
-        name,
-        (_log("limit", s.reading, 0.05, 1.0, 0.3, 0.999, 16),),
-        where="output",
-        change=_clipped,
-        grows=False,
-        dependence="continuous",
-        check="move slowly through the whole range: the reading should not stop before the machine does",
-        group="sensor",
-    ),
-    "output_lag": lambda name, s: PlantEffect(
-        name,
-        _lags(s),
-        where="output",
-        change=_lagged_sensor,
-        check="tap against the machine and compare when the sensors answer",
-        group="sensor",
-    ),
-    "output_delay": lambda name, s: PlantEffect(
-        name,
-        _delays(s),
-        where="output",
-        change=_delayed,
-        check="tap against the machine and compare when the sensors answer",
-        group="sensor",
-    ),
-    "output_gain": lambda name, s: PlantEffect(
-        name,
-        _gains(s),
-        where="output",
-        change=_scaled,
-        signed=True,
-        check="move by a known distance and compare the reading",
-        group="sensor",
-    ),
-    "output_offset": lambda name, s: PlantEffect(
-        name,
-        (_log("offset", s.output, 1e-6, 3.0, 1e-4, 0.5, 8),),
-        where="output",
-        change=_shifted,
-        signed=True,
-        check="go to a known position and compare the reading",
-        group="sensor",
-    ),
-    "output_drift": lambda name, s: PlantEffect(
-        name,
-        (_log("rate_per_s", s.output / s.duration_s, 1e-6, 3.0, 1e-4, 1.0, 8),),
-        where="output",
-        change=_drifting,
-        signed=True,
-        check="log the sensor for some minutes with the machine held",
-        group="sensor",
-    ),
+        _actuator(
+            "input_backlash",
+            (_sized("gap", 1e-4, 1.5, 1e-3, 1.0, 20, "input"),),
+            law=Law("input", _with_play),
+            dependence="non-smooth",
+            tried="by name",
+            check="command slow ramps up and down: the width between the two ways is the play",
+        ),
+        _actuator(
+            "actuator_dead_zone",
+            (_sized("width", 1e-5, 1.0, 1e-3, 0.5, 12, "input"),),
+            law=Law("input", _dead),
+            dependence="continuous",
+            check="raise the command slowly from zero and note where something begins to follow",
+        ),
+        _actuator(
+            "actuator_saturation",
+            (_sized("limit", 0.05, 1.0, 0.1, 0.99, 24, "input"),),
+            law=Law("input", _clipped),
+            grows=False,
+            dependence="continuous",
+            check="command the largest input and measure what arrives",
+        ),
+        _actuator(
+            "actuator_lag",
+            (_LAG,),
+            law=Law("input", _lagged),
+            check="step the command and look at what the actuator gives: it should step as well",
+        ),
+        _body(
+            "coulomb_friction",
+            (_sized("force", 1e-5, 1.0, 3e-4, 0.6, 14, "force"),),
+            law=Law("body", {"coulomb": "force"}),
+            dependence="continuous",
+            check="raise the input slowly from rest and note where motion begins, in both directions",
+        ),
+        _body(
+            "stribeck_friction",
+            (
+                _sized("static_force", 1e-5, 2.0, 3e-4, 0.6, 8, "force"),
+                _SHARE,
+                _sized("velocity", 0.01, 2.0, 0.012, 0.3, 3, "speed"),
+            ),
+            law=Law("body", _falling),
+            dependence="continuous",
+            contains="coulomb_friction",
+            check="creep at several slow, steady speeds and note the input that each takes",
+        ),
+        _body(
+            "one_sided_friction",
+            (_sized("force", 1e-5, 1.0, 1e-3, 0.6, 8, "force"),),
+            law=Law("body", _one_way),
+            signed=True,
+            dependence="continuous",
+            tried="by name",
+            check="raise the input slowly from rest, once in each direction",
+        ),
+        _body(
+            "friction_behind_play",
+            (
+                _sized("force", 1e-5, 1.0, 3e-4, 0.6, 8, "force"),
+                _sized("gap", 1e-5, 2.0, 3e-3, 0.3, 3, "position"),
+            ),
+            law=Law("body", {"coulomb": "force", "gap": "gap"}),
+            dependence="continuous",
+            contains="coulomb_friction",
+            tried="by name",
+            check="move to and fro slowly and note the input: after each turn it rises only beyond the play",
+        ),
+        _body(
+            "viscous_friction",
+            (_VISCOUS,),
+            law=Law("body", {"viscous": "coefficient"}),
+            check="move at several steady speeds and note the input: it should grow in proportion",
+        ),
+        _body(
+            "viscous_asymmetry",
+            (_VISCOUS,),
+            law=Law("body", {"asymmetry": "coefficient"}),
+            signed=True,
+            dependence="continuous",
+            tried="by name",
+            check="move at the same steady speeds both ways: one way takes more, in proportion to speed",
+        ),
+        _body(
+            "quadratic_drag",
+            (_sized("coefficient", 1e-5, 30.0, 1e-3, 3.0, 8, "drag"),),
+            law=Law("body", {"drag": "coefficient"}),
+            tried="by name",
+            check="move at several steady speeds: twice the speed should take four times the input",
+        ),
+        _body(
+            "load_friction",
+            (EffectParameter("share", 1e-4, 0.9, (1e-3, 0.01, 0.05, 0.15, 0.3, 0.6)),),
+            law=Law("body", {"load": "share"}),
+            dependence="continuous",
+            tried="by name",
+            check="move slowly without and with a heavy load and compare what each takes beyond the load",
+        ),
+        _body(
+            "spring",
+            (_sized("stiffness", 1e-5, 30.0, 1e-4, 3.0, 8, "stiffness"),),
+            law=Law("body", {"linear": "stiffness"}),
+            check="let the machine go away from zero with the input off: it should stay where it is",
+        ),
+        _body(
+            "eccentric_mass",
+            (
+                _sized("torque", 1e-5, 30.0, 1e-3, 3.0, 8, "force"),
+                _ANGLE,
+            ),
+            law=Law("body", {"weight": "torque", "turned": "angle_rad"}),
+            tried="by name",
+            check="let the machine hang free in several angles: it should stay where it is",
+        ),
+        _body(
+            "hardening_spring",
+            (_sized("cubic", 1e-7, 1e3, 1e-5, 10.0, 12, "hardening"),),
+            law=Law("body", {"cubic": "cubic"}),
+            check="push by hand at small and at large distances and look for cables and hoses",
+        ),
+        _sensor(
+            "backlash",
+            (_sized("gap", 1e-4, 1.0, 1e-3, 0.5, 20, "output"),),
+            law=Law("output", _with_play),
+            dependence="non-smooth",
+            check="hold the drive and move the load to and fro by hand: the free play is the backlash",
+        ),
+        _sensor(
+            "output_saturation",
+            (_sized("limit", 0.05, 1.0, 0.3, 0.999, 16, "reading"),),
+            law=Law("output", _clipped),
+            grows=False,
+            dependence="continuous",
+            tried="by name",
+            check="move slowly through the whole range: the reading should not stop before the machine does",
+        ),
+        _sensor(
+            "output_lag",
+            (_LAG,),
+            law=Law("output", _lagged_sensor),
+            tried="with several outputs",
+            check="tap against the machine and compare when the sensors answer",
+        ),
+        _sensor(
+            "output_delay",
+            (_DELAY,),
+            law=Law("output", _delayed),
+            tried="with several outputs",
+            check="tap against the machine and compare when the sensors answer",
+        ),
+        _sensor(
+            "output_gain",
+            (_GAIN,),
+            law=Law("output", _scaled),
+            signed=True,
+            tried="with several outputs",
+            check="move by a known distance and compare the reading",
+        ),
+        _sensor(
+            "output_offset",
+            (_sized("offset", 1e-6, 3.0, 1e-4, 0.5, 8, "output"),),
+            law=Law("output", _shifted),
+            signed=True,
+            check="go to a known position and compare the reading",
+        ),
+        _sensor(
+            "output_drift",
+            (_sized("rate_per_s", 1e-6, 3.0, 1e-4, 1.0, 8, "output_rate"),),
+            law=Law("output", _drifting),
+            signed=True,
+            check="log the sensor for some minutes with the machine held",
+        ),
+    )
 }
-
-# Where each acts.
-WHERE: dict[str, Where] = {name: kind(name, Sizes()).where or "body" for name, kind in KINDS.items()}

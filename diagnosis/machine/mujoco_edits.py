@@ -9,8 +9,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from diagnosis.machine.plant_effect import EffectParameter, PlantEffect
-from plant.effects.search_space import Dependence, geometric
+from diagnosis.machine.plant_effect import PlantEffect
+from plant.effects.search_space import Dependence, EffectParameter, geometric
 
 Put = Callable[..., None]
 

@@ -42,8 +42,7 @@ from diagnosis.machine.mujoco_edits import (
 from diagnosis.machine.mujoco_model import MujocoModel
 from diagnosis.machine.mujoco_simulation import start_filters
 from diagnosis.machine.own_plant import PlantExperiment
-from diagnosis.machine.plant_effect import EffectParameter
-from plant.effects.search_space import Dependence
+from plant.effects.search_space import Dependence, EffectParameter
 
 _SMOOTHED = 9  # samples, of a measured angle whose speed is asked
 # Numbers of a file have no more digits than this.

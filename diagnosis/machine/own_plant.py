@@ -165,7 +165,7 @@ class Plant:
     @property
     def body(self) -> MeasuredBody | None:
         """Whose motion is among the inputs."""
-        bodies = (effect.acts.on for effect in self.effects if effect.acts is not None)
+        bodies = (effect.place.on for effect in self.effects if effect.place is not None)
         return next((body for body in bodies if isinstance(body, MeasuredBody)), None)
 
     def value(self, key: str) -> float:
@@ -225,13 +225,11 @@ class Plant:
         if ratios:
             return self.scaled(ratios).simulated([e for e in effects if e.id not in wrong], states)
         begun = (0.0,) * len(self.start) if states is None else tuple(float(v) for v in states)
-        listed = {effect.name: effect.acts for effect in self.effects if effect.acts is not None}
-        told = {effect.id: effect.values for effect in effects if effect.id not in listed}
+        told = {effect.id: effect.values for effect in effects}
         acting = [
-            (acts, effect.values)
-            for name, acts in listed.items()
-            for effect in effects
-            if effect.id == name and acts is not None
+            (kind.law, kind.place, told.pop(kind.name))
+            for kind in self.effects
+            if kind.law is not None and kind.place is not None and kind.name in told
         ]
         known = (tuple(self.parameters.items()), tuple((k, tuple(v.items())) for k, v in told.items()))
 

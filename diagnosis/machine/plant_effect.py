@@ -2,58 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import product
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
-import numpy as np
-
-from diagnosis.machine.around import Acts, Where
+from diagnosis.machine.around import Law, Place, Where
 from plant.effects.base import ratio_candidates
-from plant.effects.search_space import Axis, Candidate, Dependence, Harmonic
+from plant.effects.search_space import (
+    Candidate,
+    Dependence,
+    EffectParameter as EffectParameter,
+    Harmonic,
+    searches,
+)
 
-_STEPS = {"smooth": 1e-5, "continuous": 1e-3, "non-smooth": 5e-3}
-
-
-@dataclass(frozen=True)
-class EffectParameter:
-    """A parameter of an effect: range, and values a search starts from.
-
-    name : str. With its unit.
-    low, high : float
-        On a "log" scale both above zero; the size of an effect is positive (see `PlantEffect.signed`).
-    starts : tuple of float
-        Without any: eight over the range for an effect's size, three for what follows, inside the range.
-    """
-
-    name: str
-    low: float
-    high: float
-    starts: tuple[float, ...] = ()
-    scale: Literal["log", "linear"] = "log"
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low < self.high):
-            raise ValueError(f"parameter {self.name}: needs low < high; got {self.low} and {self.high}")
-        if self.scale == "log" and not self.low > 0:
-            raise ValueError(f"parameter {self.name}: low must be above zero on a log scale; got {self.low}")
-        outside = [v for v in self.starts if not self.low <= v <= self.high]
-        if outside:
-            raise ValueError(
-                f"parameter {self.name}: start {outside[0]:.6g} is outside {self.low:.6g} to {self.high:.6g}"
-            )
-
-    def axis(self, dependence: Dependence) -> Axis:
-        return Axis(self.name, self.scale, self.low, self.high, _STEPS[dependence])
-
-    def start_coordinates(self, count: int) -> list[float]:
-        axis = self.axis("smooth")
-        if self.starts:
-            return [axis.coordinate(v) for v in self.starts]
-        low, high = axis.box
-        return [low + (high - low) * (k + 1) / (count + 1) for k in range(count)]
+Tried = Literal["always", "with several outputs", "by name"]
 
 
 @dataclass(frozen=True)
@@ -87,10 +51,11 @@ class PlantEffect:
     group : str. Where it acts (actuator, joint, sensor, ...); only shown.
     contains : str or None. Simpler effect that it is with its further parameters at an end of their ranges.
     check : str. What to do to see whether it is there: a command in a sentence; "" says nothing.
-    acts : Acts or None
-        What it does to a simulation that does not know it (`with_effects`); None: the simulation is told.
-    where, change : of a listed effect, what `Acts` says of it before it has a place.
+    law : Law or None. What it does to a simulation that does not know it; None: the simulation is told.
+    place : Place or None. Where a law acts around a simulation (`with_effects`).
     multiplies : str or None. Stated value that its only parameter, a ratio, multiplies (`wrong_value`).
+    tried : of those that `with_effects` may add, when "all" has it: "always", "with several outputs" (from
+        one alone it cannot be told from its twin at the input), or "by name" only.
     """
 
     name: str
@@ -100,11 +65,11 @@ class PlantEffect:
     dependence: Dependence = "smooth"
     group: str = ""
     contains: str | None = None
-    acts: Acts | None = None
     check: str = ""
-    where: Where | None = None
-    change: Callable[..., Any] = dict
+    law: Law | None = None
+    place: Place | None = None
     multiplies: str | None = None
+    tried: Tried = "always"
     harmonic: ClassVar[Harmonic | None] = None
     adds_to: ClassVar[str | None] = None
     absolute_angle: ClassVar[bool] = False
@@ -115,8 +80,14 @@ class PlantEffect:
             raise ValueError(f"effect {self.name}: needs at least one parameter")
         if self.name in ("none", "unknown"):
             raise ValueError(f"effect {self.name}: this name is an answer of its own")
-        if self.dependence not in _STEPS:
-            raise ValueError(f"effect {self.name}: dependence must be one of {', '.join(_STEPS)}")
+        if self.dependence not in get_args(Dependence):
+            raise ValueError(
+                f"effect {self.name}: dependence must be one of {', '.join(get_args(Dependence))}"
+            )
+
+    def at(self, magnitudes: object) -> PlantEffect:
+        """The same with ranges in units of their own (`EffectParameter.at`)."""
+        return replace(self, parameters=tuple(p.at(magnitudes) for p in self.parameters))
 
     def candidates(self) -> tuple[Candidate, ...]:
         if self.multiplies:
@@ -125,11 +96,7 @@ class PlantEffect:
                 replace(side, axes=(replace(side.axes[0], edge="high" if side.grows else "low"),))
                 for side in ratio_candidates(self, self.parameters[0].low, self.parameters[0].high)
             )
-        axes = tuple(p.axis(self.dependence) for p in self.parameters)
-        counts = [8, *[3] * (len(axes) - 1)]
-        values = [p.start_coordinates(n) for p, n in zip(self.parameters, counts, strict=True)]
-        signs = (1, -1) if self.signed else (1,)
-        return tuple(Candidate(self, axes, tuple(product(*values)), sign, self.grows) for sign in signs)
+        return searches(self, self.parameters, signed=self.signed, grows=self.grows)
 
     def from_search(self, values: Mapping[str, float], sign: int) -> Change:
         """The effect at these values, the size (the first parameter) with its sign."""
@@ -140,6 +107,11 @@ class PlantEffect:
     @property
     def id(self) -> str:
         return self.name
+
+    @property
+    def where(self) -> Where:
+        """Where its law acts: what a simulation is told acts in its model."""
+        return "model" if self.law is None else self.law.where
 
 
 # A stated value may be wrong by this factor.

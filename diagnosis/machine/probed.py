@@ -45,7 +45,7 @@ def doubts_about(case: PlantCase, deadline_s: float = np.inf) -> tuple[str, ...]
             return tuple(found)
         found += _of_value(plant, key, tolerance, inputs, stated)
     for effect in plant.effects:
-        if effect.acts is None and time.monotonic() < deadline_s:
+        if effect.place is None and time.monotonic() < deadline_s:
             candidate = effect.candidates()[0]
             change = candidate.effect_at(np.array(candidate.starts[-1 if effect.grows else 0]))
             runs = zip(inputs, stated, strict=True)

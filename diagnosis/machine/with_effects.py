@@ -13,38 +13,18 @@ from typing import Literal
 import numpy as np
 import scipy
 
-from diagnosis.machine.around import Acts, AnyBody, Body, Drive, MeasuredBody, Where
-from diagnosis.machine.listed_effects import KINDS, WHERE, Sizes
+from diagnosis.machine.around import AnyBody, Body, Drive, MeasuredBody, Place, Where
+from diagnosis.machine.listed_effects import KINDS, Magnitudes
 from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.motion_effects import BodyForces
 from diagnosis.machine.own_plant import Plant, PlantExperiment
+from diagnosis.machine.plant_effect import PlantEffect
 
 _MISSING = {
     "input": "changes a command, and the stated input is none or zero in every record",
     "body": "needs motion=, the output that is the body's position or speed",
 }
 _NEEDS_MOTION = "motion: the output that is the body's motion"
-# What no record of one output can tell from its twin at the input where the machine is linear.
-_TWINS = ("output_lag", "output_delay", "output_gain")
-# A play of a force is rare, and one before friction; a mass off its axis needs an angle; friction one way
-# looks like an offset beside friction both ways, and so does one in proportion to speed or load.
-_BY_NAME_ONLY = (
-    "input_backlash",
-    "one_sided_friction",
-    "viscous_asymmetry",
-    "quadratic_drag",
-    "load_friction",
-    "friction_behind_play",
-    "eccentric_mass",
-    "output_saturation",
-)
-_SMOOTH = (
-    "viscous_friction",
-    "viscous_asymmetry",
-    "quadratic_drag",
-    "spring",
-    "hardening_spring",
-    "eccentric_mass",
-)
 _SMOOTHED = 11  # samples, of a measured position whose speed is asked
 
 
@@ -110,14 +90,14 @@ def with_effects(
         sizes = _of_body(plant, experiments, dt_s, force, moving, motion_is, largest_force)
         body = Body(force, moving, motion_is == "speed", dt_s, sizes.force)
     elif measured_motion is not None:
-        sizes = Sizes(
+        sizes = Magnitudes(
             force=_largest(e.output[:, seen] for e in experiments),
             position=_largest(e.input[:, measured_motion[0]] for e in experiments),
             speed=_largest(e.input[:, measured_motion[1]] for e in experiments),
         )
         body = MeasuredBody.of(*measured_motion, seen, [e.input for e in experiments])
     else:
-        sizes = Sizes()
+        sizes = Magnitudes()
     sizes = replace(
         sizes,
         input=sizes.force if body and input == force else _largest(e.input[:, input] for e in experiments),
@@ -134,25 +114,31 @@ def with_effects(
         places["input"] = None
     found = list(plant.effects)
     own = {effect.name for effect in plant.effects}
-    every = [n for n in _of_all(plant) if places[WHERE[n]] is not None and prefix + n not in own]
-    chosen = every if names == "all" else names
-    for name in chosen:
-        where = WHERE[name]
-        place = places[where]
-        if place is None or (where == "input" and not sizes.input > 0):
-            raise ValueError(f"plant: {name} {_MISSING[where]}")
-        effect = KINDS[name](prefix + name, sizes)
-        acts = Acts(where, place, effect.change, dt_s, at_rest_before)
-        found.append(replace(effect, contains=effect.contains and prefix + effect.contains, acts=acts))
+    every = _of_all(plant)
+    here = [kind for kind in every if places[kind.where] is not None and prefix + kind.name not in own]
+    chosen = here if names == "all" else [KINDS[name] for name in names]
+    for kind in chosen:
+        on = places[kind.where]
+        if on is None or (kind.where == "input" and not sizes.input > 0):
+            raise ValueError(f"plant: {kind.name} {_MISSING[kind.where]}")
+        found.append(
+            replace(
+                kind.at(sizes),
+                name=prefix + kind.name,
+                contains=kind.contains and prefix + kind.contains,
+                place=Place(on, dt_s, at_rest_before),
+            )
+        )
     there = {effect.name for effect in found}
     inactive = dict(plant.inactive)
     if names == "all":
         # Of the actuator nothing applies where a motion is given: none drives it.
-        inactive |= {prefix + n: _NEEDS_MOTION for n in _of_all(plant) if WHERE[n] == "body" and body is None}
+        unmoved = [kind for kind in every if kind.where == "body" and body is None]
+        inactive |= {prefix + kind.name: _NEEDS_MOTION for kind in unmoved}
     inactive = {name: needs for name, needs in inactive.items() if name not in there}
     equipped = replace(plant, effects=tuple(found), dt_s=dt_s, inactive=inactive)
     _try(equipped, experiments[0], body)
-    smooth = [n for n in chosen if n in _SMOOTH]
+    smooth = [kind.name for kind in chosen if _is_smooth(kind)]
     if smooth and isinstance(body, Body) and body.doubt:
         warnings.warn(
             f"plant: after a pulse of force the motion {body.doubt}, so that {' and '.join(smooth)} are some "
@@ -162,9 +148,17 @@ def with_effects(
     return equipped
 
 
-def _of_all(plant: Plant) -> list[str]:
-    left_out = _BY_NAME_ONLY if len(plant.output_names) > 1 else (*_BY_NAME_ONLY, *_TWINS)
-    return [name for name in KINDS if name not in left_out]
+def _of_all(plant: Plant) -> list[PlantEffect]:
+    tried = ("always", "with several outputs") if len(plant.output_names) > 1 else ("always",)
+    return [kind for kind in KINDS.values() if kind.tried in tried]
+
+
+def _is_smooth(kind: PlantEffect) -> bool:
+    """Whether it is a force that changes little within a sample."""
+    if kind.law is None or kind.law.where != "body":
+        return False
+    forces = kind.law.forces({parameter.name: parameter.high for parameter in kind.parameters})
+    return replace(BodyForces(), **forces).smooth
 
 
 def _column(plant: Plant, output: str) -> int:
@@ -185,7 +179,7 @@ def _of_body(
     motion: int,
     motion_is: str,
     largest_force: float | None,
-) -> Sizes:
+) -> Magnitudes:
     pushed = largest_force or _largest(e.input[:, force] for e in experiments)
     if not pushed > 0:
         raise ValueError(
@@ -197,7 +191,7 @@ def _of_body(
     else:
         smooth = (scipy.signal.savgol_filter(x, _SMOOTHED, 2, deriv=1, delta=dt_s) for x in moved)
         position, speed = _largest(moved), _largest(smooth)
-    return Sizes(force=pushed, position=position, speed=speed)
+    return Magnitudes(force=pushed, position=position, speed=speed)
 
 
 def _motion(plant: Plant, experiment: PlantExperiment, column: int) -> Real:
@@ -214,7 +208,7 @@ def _motion(plant: Plant, experiment: PlantExperiment, column: int) -> Real:
 def _try(plant: Plant, experiment: PlantExperiment, body: AnyBody | None) -> None:
     """Raises ValueError where the simulation does not follow a moderate force on the body."""
     for effect in plant.effects:
-        if effect.acts is None or effect.acts.on is not body:
+        if effect.place is None or effect.place.on is not body:
             continue
         candidate = effect.candidates()[0]
         change = candidate.effect_at(np.array(candidate.starts[len(candidate.starts) // 2]))

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from pydantic import Field
 
 from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, alone, register
-from plant.effects.search_space import Sought
+from plant.effects.search_space import EffectParameter
 
 
 @register
@@ -20,7 +20,7 @@ class InputDelay(Effect):
     words = "a delay of the command"
     check = "log the voltage at the motor beside the command; the time between their steps is the delay"
     adds_to = "sampling.transport_delay_s"
-    sought = Sought((2e-4, 100), (0.04, 30, 14), "dt_s")
+    sought = (EffectParameter("delay_s", 2e-4, 100, unit="dt_s", spread=(0.04, 30, 14)),)
 
     delay_s: float = Field(ge=0, le=60.0, description="delay of the voltage; every sample of it is stored")
 
@@ -47,7 +47,7 @@ class ActuatorDeadZone(Effect):
     words = "a dead zone of the actuator"
     check = "raise the command slowly from zero and note where the voltage at the motor begins to follow"
     dependence = "continuous"
-    sought = Sought((1e-5, 1), (1e-3, 0.5, 12), "voltage_V", 1e-4)
+    sought = (EffectParameter("width_V", 1e-5, 1, unit="voltage_V", spread=(1e-3, 0.5, 12), step=1e-4),)
 
     width_V: NotNegative = Field(description="half width of the zone without torque")
 
@@ -62,7 +62,8 @@ class ActuatorSaturation(Effect):
     check = "command the largest voltage and measure what arrives at the motor"
     neutral = MappingProxyType({"limit_V": 1e6})
     dependence = "continuous"
-    sought = Sought((0.05, 1), (0.1, 0.99, 24), "voltage_V", 1e-4, grows=False)
+    sought = (EffectParameter("limit_V", 0.05, 1, unit="voltage_V", spread=(0.1, 0.99, 24), step=1e-4),)
+    grows = False
 
     limit_V: Positive = Field(description="largest voltage the driver delivers")
 
@@ -75,6 +76,6 @@ class ActuatorLag(Effect):
     acts = ("voltage", "lag_s", alone)
     words = "a lag of the actuator"
     check = "step the command and look at the voltage at the motor: it should step as well"
-    sought = Sought((2e-4, 200), (0.02, 40, 10), "dt_s")
+    sought = (EffectParameter("time_constant_s", 2e-4, 200, unit="dt_s", spread=(0.02, 40, 10)),)
 
     time_constant_s: NotNegative = Field(description="time constant T; 0 is none")

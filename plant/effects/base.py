@@ -16,10 +16,11 @@ from plant.effects.search_space import (
     Candidate,
     Dependence,
     EffectKind,
+    EffectParameter,
     Harmonic,
     Scales,
-    Sought,
     log_axis,
+    searches,
 )
 from plant.machine import Machine, Real, SmoothTorque
 from plant.rig import Rig
@@ -66,7 +67,8 @@ class Effect(BaseModel):
     adds_to : str or None. Key of the stated value that it adds to.
     contains : str or None. Simpler effect that it is with its further parameters at an end of their ranges.
     absolute_angle : bool. It depends on the true hub angle: where an encoder has its zero matters.
-    sought : Sought or None. Where to look for its only parameter; others have `candidates` of their own.
+    sought : tuple of EffectParameter. Where to look for its parameters, in multiples of the `Scales`; others
+        have `candidates` of their own. signed : the first may be negative as well; grows : see `Candidate`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
@@ -87,7 +89,9 @@ class Effect(BaseModel):
     adds_to: ClassVar[str | None] = None
     contains: ClassVar[str | None] = None
     absolute_angle: ClassVar[bool] = False
-    sought: ClassVar[Sought | None] = None
+    sought: ClassVar[tuple[EffectParameter, ...]] = ()
+    signed: ClassVar[bool] = False
+    grows: ClassVar[bool] = True
 
     def modify(self, machine: Machine) -> Machine:
         """The machine with this effect: its first parameter joined to the value that it `acts` on, or
@@ -101,15 +105,15 @@ class Effect(BaseModel):
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
         """Where to look for the effect; none for one that no fit can find."""
-        if cls.sought is None:
+        if not cls.sought:
             return ()
-        (parameter,) = cls.model_fields
-        return (cls._size(*cls.sought.at(parameter, scales), grows=cls.sought.grows),)
+        return searches(cls, [p.at(scales) for p in cls.sought], signed=cls.signed, grows=cls.grows)
 
     @classmethod
     def from_search(cls, values: Mapping[str, float], sign: int) -> Self:
         """The effect at the values of the search's axes; sign: which side of a signed size."""
-        return cls(**values)
+        size = next(iter(cls.model_fields))
+        return cls(**{**values, size: sign * values[size]} if cls.signed else values)
 
     @property
     def as_listed(self) -> bool:

@@ -22,7 +22,7 @@ from plant.effects.base import (
     with_joint,
     with_torque,
 )
-from plant.effects.search_space import PHASE, Axis, Candidate, Scales, Sought, geometric, log_axis
+from plant.effects.search_space import PHASE, Axis, Candidate, EffectParameter, Scales, geometric, log_axis
 from plant.machine import (
     CUBIC,
     QUADRATIC,
@@ -53,7 +53,7 @@ class CoulombFriction(Effect):
     check = "raise the voltage slowly from rest and note where the hub starts to turn, in both directions"
     friction = True
     dependence = "continuous"
-    sought = Sought((1e-5, 1), (3e-4, 0.6, 14), "torque_Nm", 1e-3)
+    sought = (EffectParameter("torque_Nm", 1e-5, 1, unit="torque_Nm", spread=(3e-4, 0.6, 14)),)
 
     torque_Nm: float = Field(ge=0, le=_LARGEST_LEVEL_NM, description="friction level Tc")
 
@@ -73,6 +73,15 @@ class StribeckFriction(Effect):
     friction = True
     neutral = MappingProxyType({"stribeck_velocity_rad_s": 0.1})
     dependence = "continuous"
+    # Share of the static level. A fall over less than a hundredth of the largest speed is over before it
+    # shows: dry friction of the Coulomb kind by another name.
+    sought = (
+        EffectParameter("static_torque_Nm", 1e-5, 2, unit="torque_Nm", spread=(3e-4, 0.6, 8), step=2e-3),
+        EffectParameter("coulomb_torque_Nm", 0.0, 0.98, (0.5, 0.8), "linear", step=2e-3),
+        EffectParameter(
+            "stribeck_velocity_rad_s", 0.01, 2, unit="speed_rad_s", spread=(0.012, 0.3, 3), step=2e-3
+        ),
+    )
 
     static_torque_Nm: float = Field(
         ge=0, le=_LARGEST_LEVEL_NM, description="break-away level Ts, at least Tc"
@@ -92,19 +101,6 @@ class StribeckFriction(Effect):
     def modify(self, machine: Machine) -> Machine:
         friction = DryFriction(self.static_torque_Nm, self.coulomb_torque_Nm, self.stribeck_velocity_rad_s)
         return with_joint(machine, friction=(*machine.joint.friction, friction))
-
-    @classmethod
-    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        tau, speed = scales.torque_Nm, scales.speed_rad_s
-        axes = [
-            log_axis("static_torque_Nm", 1e-5 * tau, 2 * tau, 2e-3),
-            Axis("coulomb_torque_Nm", "linear", 0.0, 0.98, 2e-3),  # share of the static level
-            # A fall over less than a hundredth of the largest speed is over before it shows: dry friction of
-            # the Coulomb kind by another name.
-            log_axis("stribeck_velocity_rad_s", 0.01 * speed, 2.0 * speed, 2e-3),
-        ]
-        levels, speeds = geometric(3e-4 * tau, 0.6 * tau, 8), geometric(0.012 * speed, 0.3 * speed, 3)
-        return (cls._candidate(axes, product(levels, [0.5, 0.8], speeds)),)
 
     @classmethod
     def from_search(cls, values: Mapping[str, float], sign: int) -> Self:
@@ -274,17 +270,12 @@ class HardeningSpring(Effect):
     words = "a hardening spring (cable, hose)"
     check = "pull the hub with a spring balance at small and at large angles and look for cables and hoses"
     absolute_angle = True
+    sought = (EffectParameter("cubic_Nm_rad3", 1e-7, 1e3, unit="hardening_Nm_rad3", spread=(1e-5, 10, 12)),)
 
     cubic_Nm_rad3: NotNegative = Field(description="coefficient k3")
 
     def modify(self, machine: Machine) -> Machine:
         return with_torque(machine, SmoothTorque(CUBIC, (self.cubic_Nm_rad3,), at="motor"))
-
-    @classmethod
-    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        tau, cube = scales.torque_Nm, scales.angle_rad**3
-        axis = log_axis("cubic_Nm_rad3", 1e-7 * tau / cube, 1e3 * tau / cube)
-        return (cls._size(axis, geometric(1e-5 * tau / cube, 10 * tau / cube, 12)),)
 
 
 @register
@@ -389,6 +380,6 @@ class Backlash(Effect):
     check = "hold the motor shaft and turn the hub to and fro by hand: the free play is the backlash"
     neutral = None  # without a gap the contact is still elastic
     dependence = "non-smooth"
-    sought = Sought((1e-5, 0.5), (3e-4, 0.2, 30), step=5e-3)
+    sought = (EffectParameter("gap_rad", 1e-5, 0.5, spread=(3e-4, 0.2, 30)),)
 
     gap_rad: Positive = Field(description="total gap")

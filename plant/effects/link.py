@@ -9,12 +9,13 @@ import numpy as np
 from pydantic import Field
 
 from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, register
-from plant.effects.search_space import Axis, Candidate, Scales, Sought
+from plant.effects.search_space import Candidate, EffectParameter, Scales, searches
 from plant.machine import Machine
 
-# A tilt is the listed one up to so far from along the link; directions of others that a search starts from.
+# A tilt is the listed one up to so far from along the link.
 _ALONG_RAD = 0.6
-_DIRECTION, _DIRECTIONS = Axis("direction_rad", "angle", -np.pi, np.pi, 1e-4), 6
+# A sixth of a turn apart, a search from one of them reaches any other.
+_DIRECTIONS_RAD = tuple(k * np.pi / 3 for k in (0, 1, 2, 3, -2, -1))
 
 
 @register
@@ -26,7 +27,7 @@ class TipPayload(Effect):
     words = "an additional mass at the tip"
     check = "weigh the tip with everything that is fixed to it"
     adds_to = "payload.mass_kg"
-    sought = Sought((1e-6, 5), (1e-4, 1.5, 14), "link_mass_kg")
+    sought = (EffectParameter("mass_kg", 1e-6, 5, unit="link_mass_kg", spread=(1e-4, 1.5, 14)),)
 
     mass_kg: NotNegative = Field(description="added point mass at the tip")
 
@@ -71,7 +72,10 @@ class Gravity(Effect):
     beside = "a linear spring from hub to ground, while motions are small; larger ones"
     environment = True
     absolute_angle = True
-    sought = Sought((1e-4, 20), (1e-3, 10, 12))
+    sought = (
+        EffectParameter("acceleration_m_s2", 1e-4, 20, spread=(1e-3, 10, 12)),
+        EffectParameter("direction_rad", -np.pi, np.pi, _DIRECTIONS_RAD, "angle", step=1e-4),
+    )
 
     acceleration_m_s2: NotNegative = Field(description="in-plane component of gravity")
     direction_rad: float = Field(default=0.0, description="hub angle at which the link hangs")
@@ -79,11 +83,8 @@ class Gravity(Effect):
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
         """With its direction where an output tells the zero of the angle; else that stands in for it."""
-        size, values = cls.sought.at("acceleration_m_s2", scales)
-        if not scales.any_direction:
-            return (cls._size(size, values),)
-        around = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS
-        return (cls._candidate([size, _DIRECTION], [(v, a) for v in values for a in around]),)
+        found = cls.sought if scales.any_direction else cls.sought[:1]
+        return searches(cls, [parameter.at(scales) for parameter in found])
 
     @property
     def as_listed(self) -> bool:

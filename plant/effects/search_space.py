@@ -6,9 +6,10 @@ torque, link mass, record length), so that no number belongs to one arm.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -200,6 +201,16 @@ class Scales:
         return self.rig.motor.torque_per_volt_Nm_V * self.voltage_V
 
     @property
+    def hardening_Nm_rad3(self) -> float:
+        """All of that torque at the largest angle."""
+        return self.torque_Nm / self.angle_rad**3
+
+    @property
+    def drift_m_s(self) -> float:
+        """The tip sensor's noise within a record."""
+        return self.rig.sensors.tip_noise_m / self.duration_s
+
+    @property
     def link_mass_kg(self) -> float:
         return self.rig.link.mass_per_length_kg_m * self.rig.link.length_m
 
@@ -212,24 +223,75 @@ class Scales:
         return 0.0 if key is None else self.rig.tolerances.get(key, 0.0)
 
 
-@dataclass(frozen=True)
-class Sought:
-    """Where to look for a single size, larger where the effect is (unless not `grows`).
+# Steps of difference quotients, where a parameter states none: dry friction creeps and backlash jumps.
+_STEPS: Mapping[Dependence, float] = {"smooth": 1e-5, "continuous": 1e-3, "non-smooth": 5e-3}
 
-    ends: of its range, starts: (first, last, count), both in the `Scales` called unit, or as they are. step:
-    see `Axis`.
+
+@dataclass(frozen=True)
+class EffectParameter:
+    """A parameter of an effect: range, and values a search starts from.
+
+    name : str. With its unit.
+    low, high : float
+        On a "log" scale both above zero; the size of an effect is positive, also of a signed one.
+    starts : tuple of float
+        Without any: eight over the range for an effect's size, three for what follows, inside the range.
+    unit : str
+        Name of a magnitude of machine and records that all of these are multiples of (`at`); "": none is.
+    spread : (first, last, count) or None. In place of starts: so many from first to last, in equal ratios.
+    most : str. Name of a magnitude that `high` does not go beyond, a multiple of the unit as well.
+    step : float or None. See `Axis`; None: by how outputs depend on the effect.
     """
 
-    ends: tuple[float, float]
-    starts: tuple[float, float, int]
-    unit: Literal["dt_s", "voltage_V", "torque_Nm", "link_mass_kg"] | None = None
-    step: float = 1e-5
-    grows: bool = True
+    name: str
+    low: float
+    high: float
+    starts: tuple[float, ...] = ()
+    scale: Scale = "log"
+    unit: str = ""
+    spread: tuple[float, float, int] | None = None
+    most: str = ""
+    step: float | None = None
 
-    def at(self, parameter: str, scales: Scales) -> tuple[Axis, list[float]]:
-        """Axis of the parameter, and values to start from."""
-        one = 1.0 if self.unit is None else getattr(scales, self.unit)
-        (low, high), (first, last, count) = self.ends, self.starts
-        return log_axis(parameter, low * one, high * one, self.step), geometric(
-            first * one, last * one, count
-        )
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low < self.high):
+            raise ValueError(f"parameter {self.name}: needs low < high; got {self.low} and {self.high}")
+        if self.scale == "log" and not self.low > 0:
+            raise ValueError(f"parameter {self.name}: low must be above zero on a log scale; got {self.low}")
+        outside = [v for v in self.starts if not self.low <= v <= self.high]
+        if outside:
+            raise ValueError(
+                f"parameter {self.name}: start {outside[0]:.6g} is outside {self.low:.6g} to {self.high:.6g}"
+            )
+
+    def at(self, magnitudes: object) -> EffectParameter:
+        """In units of its own: magnitudes has an attribute for every name."""
+        one = getattr(magnitudes, self.unit) if self.unit else 1.0
+        high = one * (min(self.high, getattr(magnitudes, self.most)) if self.most else self.high)
+        starts = tuple(one * v for v in self.starts)
+        if self.spread is not None:
+            first, last, count = self.spread
+            starts = tuple(geometric(one * first, min(one * last, high), count))
+        return EffectParameter(self.name, one * self.low, high, starts, self.scale, step=self.step)
+
+    def axis(self, dependence: Dependence) -> Axis:
+        step = _STEPS[dependence] if self.step is None else self.step
+        return Axis(self.name, self.scale, self.low, self.high, step)
+
+    def start_coordinates(self, count: int) -> list[float]:
+        axis = self.axis("smooth")
+        if self.starts:
+            return [axis.coordinate(v) for v in self.starts]
+        low, high = axis.box
+        return [low + (high - low) * (k + 1) / (count + 1) for k in range(count)]
+
+
+def searches(
+    kind: EffectKind, parameters: Sequence[EffectParameter], *, signed: bool = False, grows: bool = True
+) -> tuple[Candidate, ...]:
+    """Searches of an effect from every combination of its parameters' starts, a signed one on both sides."""
+    axes = tuple(p.axis(kind.dependence) for p in parameters)
+    counts = [8, *[3] * (len(axes) - 1)]
+    values = [p.start_coordinates(n) for p, n in zip(parameters, counts, strict=True)]
+    signs = (1, -1) if signed else (1,)
+    return tuple(Candidate(kind, axes, tuple(product(*values)), sign, grows) for sign in signs)

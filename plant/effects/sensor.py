@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from operator import add, mul
-from typing import Self
 
 from pydantic import Field
 
 from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, alone, register
-from plant.effects.search_space import Candidate, Scales, Sought, geometric, log_axis
+from plant.effects.search_space import EffectParameter
 
 
 @register
@@ -32,18 +30,10 @@ class SensorDrift(Effect):
     acts = ("sensor", "drift_m_s", add)
     words = "a drift of the tip sensor"
     check = "log the tip sensor for some minutes with the arm clamped"
+    signed = True
+    sought = (EffectParameter("rate_m_s", 1e-3, 1e4, unit="drift_m_s", spread=(0.1, 100, 6)),)
 
     rate_m_s: float = Field(description="drift of the tip sensor")
-
-    @classmethod
-    def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        rate = scales.rig.sensors.tip_noise_m / scales.duration_s
-        axis, starts = log_axis("rate_m_s", 1e-3 * rate, 1e4 * rate), geometric(0.1 * rate, 100 * rate, 6)
-        return tuple(cls._size(axis, starts, sign=sign) for sign in (1, -1))
-
-    @classmethod
-    def from_search(cls, values: Mapping[str, float], sign: int) -> Self:
-        return cls(rate_m_s=sign * values["rate_m_s"])
 
 
 @register
@@ -68,6 +58,6 @@ class SensorLag(Effect):
     acts = ("sensor", "lag_s", alone)
     words = "a lag of the tip sensor"
     check = "tap against the tip and compare when its sensor and the encoder answer"
-    sought = Sought((2e-4, 200), (0.02, 40, 10), "dt_s")
+    sought = (EffectParameter("time_constant_s", 2e-4, 200, unit="dt_s", spread=(0.02, 40, 10)),)
 
     time_constant_s: NotNegative = Field(description="time constant; 0 is none")

@@ -10,7 +10,7 @@ from pydantic import Field
 from diagnosis.evidence.hypotheses import log_prior
 from plant.effects import EFFECTS, Effect, in_words, parse_effects
 from plant.effects.base import NotNegative, register, with_torque
-from plant.effects.search_space import Sought
+from plant.effects.search_space import EffectParameter
 from plant.machine import QUADRATIC, SmoothTorque
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from workflow.diagnose.case_files import load_case
@@ -25,7 +25,9 @@ class WindDrag(Effect):
     id = "wind_drag"
     words = "a sail at the hub"
     group = "joint"
-    sought = Sought((1e-5, 1), (3e-4, 0.6, 14), "torque_Nm", 1e-3)
+    sought = (
+        EffectParameter("coefficient_Nms2", 1e-5, 1, unit="torque_Nm", spread=(3e-4, 0.6, 14), step=1e-3),
+    )
 
     coefficient_Nms2: NotNegative = Field(description="coefficient c")
 

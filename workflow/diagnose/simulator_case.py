@@ -19,7 +19,7 @@ import numpy as np
 
 from diagnosis.answer import Diagnosis, NamedEffect
 from diagnosis.machine.around import Body
-from diagnosis.machine.listed_effects import WHERE
+from diagnosis.machine.listed_effects import KINDS as LISTED
 from diagnosis.machine.machine_protocol import Real, check_count
 from diagnosis.machine.own_plant import OF_TRIAL, Plant, PlantCase, PlantExperiment, place_of
 from diagnosis.machine.plant_effect import PlantEffect
@@ -134,7 +134,7 @@ _SIZES = {
 
 def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dict[str, str]:
     """Parameter -> the same with its unit."""
-    acts, names = effect.acts, plant.output_names
+    on, names = effect.place and effect.place.on, plant.output_names
     units: dict[str, str] = {}
 
     def unit(name: str) -> str:
@@ -143,11 +143,11 @@ def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dic
 
     if effect.name.endswith(".sensor_offset"):  # of MuJoCo, whose other sizes have units
         units["S"] = unit(effect.name.removesuffix(".sensor_offset"))
-    elif acts is not None and isinstance(acts.on, Body):
-        units["F"], units["S"] = unit(inputs[acts.on.force]), unit((*names, "")[acts.on.motion])
-        units["x"] = units["S"] = units["S"].removesuffix("_s") if acts.on.of_speed else units["S"]
-    elif acts is not None and isinstance(acts.on, int):
-        units["S"] = unit(inputs[acts.on] if acts.where == "input" else names[acts.on])
+    elif isinstance(on, Body):
+        units["F"], units["S"] = unit(inputs[on.force]), unit((*names, "")[on.motion])
+        units["x"] = units["S"] = units["S"].removesuffix("_s") if on.of_speed else units["S"]
+    elif isinstance(on, int):
+        units["S"] = unit(inputs[on] if effect.where == "input" else names[on])
     found = {}
     for parameter in (one.name for one in effect.parameters):
         size = "{F}s2_{x}2" if effect.name.endswith("quadratic_drag") else _SIZES.get(parameter, "")
@@ -404,8 +404,8 @@ def _with_all(
             if settings.motion or motion is None:
                 raise ValueError(str(error).removesuffix(OF_TRIAL)) from error
             plant = around(plant, "all")
-        there = {effect.name for effect in plant.effects}
-        kinds = {place: [k for k in WHERE if k in there and WHERE[k] == place] for place in _PLACES}
+        there = [LISTED[effect.name] for effect in plant.effects if effect.name in LISTED]
+        kinds = {place: [kind.name for kind in there if kind.where == place] for place in _PLACES}
         for column, name in enumerate(inputs[1:], start=1):
             plant = around(plant, kinds["input"], input=column, prefix=f"{name}_")
         for name in outputs[1:]:
