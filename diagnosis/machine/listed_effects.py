@@ -34,6 +34,7 @@ class Magnitudes:
     force: float = 1.0
     position: float = 1.0
     speed: float = 1.0
+    inertia: float = 1.0
     output: float = 1.0
     reading: float = 1.0
     dt_s: float = 1.0
@@ -43,30 +44,6 @@ class Magnitudes:
     def latest(self) -> float:
         """Of a delay, in samples."""
         return _LATEST * self.duration_s / self.dt_s
-
-    @property
-    def input_rate(self) -> float:
-        return self.input / self.duration_s
-
-    @property
-    def output_rate(self) -> float:
-        return self.output / self.duration_s
-
-    @property
-    def damping(self) -> float:
-        return self.force / self.speed
-
-    @property
-    def drag(self) -> float:
-        return self.force / self.speed**2
-
-    @property
-    def stiffness(self) -> float:
-        return self.force / self.position
-
-    @property
-    def hardening(self) -> float:
-        return self.force / self.position**3
 
 
 def _delayed(signal: Real, values: Values, dt_s: float, before: float) -> Real:
@@ -138,7 +115,7 @@ _DELAY = _sized("delay_s", 2e-4, 100.0, 0.04, 30.0, 14, "dt_s", most="latest")
 _LAG = _sized("time_constant_s", 2e-3, 200.0, 0.02, 40.0, 10, "dt_s")
 _GAIN = EffectParameter("relative_error", 1e-4, 0.95, (0.02, 0.1, 0.3, 0.7))
 _SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.5, 0.8), "linear")
-_VISCOUS = _sized("coefficient", 1e-5, 30.0, 1e-4, 3.0, 8, "damping")
+_VISCOUS = _sized("coefficient", 1e-5, 30.0, 1e-4, 3.0, 8, "force/speed")
 _ANGLE = EffectParameter("angle_rad", -np.pi, np.pi, (-2.4, -0.8, 0.8, 2.4), "linear")
 
 _actuator = partial(PlantEffect, group="actuator")
@@ -173,7 +150,7 @@ KINDS: Mapping[str, PlantEffect] = {
         ),
         _actuator(
             "input_drift",
-            (_sized("rate_per_s", 1e-5, 3.0, 1e-3, 1.0, 8, "input_rate"),),
+            (_sized("rate_per_s", 1e-5, 3.0, 1e-3, 1.0, 8, "input/duration_s"),),
             law=Law("input", _drifting),
             signed=True,
             check="hold a steady command for some minutes and measure what the actuator gives",
@@ -264,7 +241,7 @@ KINDS: Mapping[str, PlantEffect] = {
         ),
         _body(
             "quadratic_drag",
-            (_sized("coefficient", 1e-5, 30.0, 1e-3, 3.0, 8, "drag"),),
+            (_sized("coefficient", 1e-5, 30.0, 1e-3, 3.0, 8, "force/speed^2"),),
             law=Law("body", {"drag": "coefficient"}),
             tried="by name",
             check="move at several steady speeds: twice the speed should take four times the input",
@@ -279,7 +256,7 @@ KINDS: Mapping[str, PlantEffect] = {
         ),
         _body(
             "spring",
-            (_sized("stiffness", 1e-5, 30.0, 1e-4, 3.0, 8, "stiffness"),),
+            (_sized("stiffness", 1e-5, 30.0, 1e-4, 3.0, 8, "force/position"),),
             law=Law("body", {"linear": "stiffness"}),
             check="let the machine go away from zero with the input off: it should stay where it is",
         ),
@@ -295,7 +272,7 @@ KINDS: Mapping[str, PlantEffect] = {
         ),
         _body(
             "hardening_spring",
-            (_sized("cubic", 1e-7, 1e3, 1e-5, 10.0, 12, "hardening"),),
+            (_sized("cubic", 1e-7, 1e3, 1e-5, 10.0, 12, "force/position^3"),),
             law=Law("body", {"cubic": "cubic"}),
             check="push by hand at small and at large distances and look for cables and hoses",
         ),
@@ -346,7 +323,7 @@ KINDS: Mapping[str, PlantEffect] = {
         ),
         _sensor(
             "output_drift",
-            (_sized("rate_per_s", 1e-6, 3.0, 1e-4, 1.0, 8, "output_rate"),),
+            (_sized("rate_per_s", 1e-6, 3.0, 1e-4, 1.0, 8, "output/duration_s"),),
             law=Law("output", _drifting),
             signed=True,
             check="log the sensor for some minutes with the machine held",

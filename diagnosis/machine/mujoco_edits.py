@@ -1,18 +1,12 @@
-"""Numbers of a MuJoCo model that may be off or missing, and how each is written into an MjSpec."""
+"""How numbers of a MuJoCo model that may be off or missing are written into an MjSpec."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
-
-from diagnosis.machine.plant_effect import PlantEffect
-from plant.effects.search_space import Dependence, EffectParameter, geometric
-
-Put = Callable[..., None]
 
 # Its defaults are MuJoCo's own: what an edit adds takes nothing from the default class of a model.
 PLAIN = mujoco.MjSpec()
@@ -23,45 +17,6 @@ _THINNEST = 1e-9
 STRIBECK, DEAD_ZONE, ELASTIC = "stribeck", "dead_zone", "elastic"
 # Which numbers of an actuator's gain and bias are force, by type: fixed or none, affine, muscle.
 FORCES = {0: (0,), 1: (0, 1, 2), 2: (2, 3)}
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """A number of the model. put: writes it into an MjSpec. Where the model has none of it, an effect:
-
-    parameter : with its unit; unit : its magnitude, of which low to high is its range. more : what follows
-    the size; grows, contains : as of `PlantEffect`. by_name : tried only where it is chosen.
-    """
-
-    name: str
-    value: float
-    put: Put
-    parameter: str = ""
-    unit: float = 1.0
-    span: tuple[float, float] = (1e-4, 1.0)
-    starts: tuple[float, float] = (3e-3, 0.6)
-    signed: bool = False
-    dependence: Dependence = "smooth"
-    group: str = ""
-    more: tuple[EffectParameter, ...] = ()
-    grows: bool = True
-    contains: str | None = None
-    by_name: bool = False
-
-    @property
-    def effect(self) -> PlantEffect:
-        low, high = (self.unit * share for share in self.span)
-        first, last = (self.unit * min(share, 0.6 * self.span[1]) for share in self.starts)
-        size = EffectParameter(self.parameter, low, high, tuple(geometric(first, last, 6)))
-        return PlantEffect(
-            self.name,
-            (size, *self.more),
-            self.signed,
-            self.grows,
-            self.dependence,
-            self.group,
-            self.contains,
-        )
 
 
 def put_compiled(spec: Any, model: Any) -> None:

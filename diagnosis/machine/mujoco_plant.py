@@ -25,12 +25,12 @@ import mujoco
 import numpy as np
 
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.machine.mujoco_edits import DEAD_ZONE, STRIBECK, Quantity
+from diagnosis.machine.mujoco_edits import DEAD_ZONE, STRIBECK
 from diagnosis.machine.mujoco_model import MujocoModel
 from diagnosis.machine.mujoco_quantities import Quantities
 from diagnosis.machine.mujoco_simulation import MujocoSimulation
 from diagnosis.machine.own_plant import Plant, PlantExperiment
-from diagnosis.machine.plant_effect import Change
+from diagnosis.machine.plant_effect import Change, PlantEffect
 
 # Last parts of numbers in a file that MuJoCo does not act on.
 _BEYOND = (".gain", ".offset", f".{DEAD_ZONE}", f".{STRIBECK}")
@@ -66,7 +66,7 @@ _HELD = 1.5
 class MujocoArm(MujocoModel):
     """A model whose values are nominal parameters, and whose missing ones are effects."""
 
-    def quantities(self, experiments: Sequence[PlantExperiment]) -> dict[str, Quantity]:
+    def quantities(self, experiments: Sequence[PlantExperiment]) -> dict[str, PlantEffect]:
         """Everything that may be off or missing, by name."""
         return Quantities(self, experiments).by_name()
 
@@ -172,9 +172,9 @@ class MujocoArm(MujocoModel):
         every = {
             name: one
             for name, one in there.items()
-            if not one.by_name or any(fnmatchcase(name, pattern) for pattern in named)
+            if one.tried == "always" or any(fnmatchcase(name, pattern) for pattern in named)
         }
-        stated = {name: one.value for name, one in every.items() if one.value != 0.0}
+        stated = {name: one.stated for name, one in every.items() if one.stated != 0.0}
         usual = {name: TOLERANCES.get(name.rpartition(".")[2], _ELSE) for name in stated}
         tolerances = {name: self.number(f"tolerance.{name}", usual[name]) for name in stated}
         simulation = MujocoSimulation(self, every, noise)
@@ -198,7 +198,7 @@ class MujocoArm(MujocoModel):
         for one in self.spec.actuators:
             needs[f"{one.name}.gain"] = "an actuator whose gain is fixed, affine or a muscle's"
             needs[f"{one.name}.lag"] = "an actuator without dynamics or with those of a filter"
-        missing = [one.effect for one in every.values() if one.value == 0.0]
+        missing = [one for one in every.values() if one.stated == 0.0]
         shown = {name for name, value in stated.items() if seen({name: _WRONG * value}, {})}
         unstable = set[str]()
         for one in missing:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 from scipy.signal import savgol_filter
 
+from diagnosis.machine.around import Law
+from diagnosis.machine.listed_effects import Magnitudes
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.mujoco_edits import (
     DEAD_ZONE,
@@ -18,8 +20,6 @@ from diagnosis.machine.mujoco_edits import (
     FORCES,
     LAGS,
     STRIBECK,
-    Put,
-    Quantity,
     put_at_joint,
     put_backlash,
     put_centre,
@@ -42,6 +42,7 @@ from diagnosis.machine.mujoco_edits import (
 from diagnosis.machine.mujoco_model import MujocoModel
 from diagnosis.machine.mujoco_simulation import start_filters
 from diagnosis.machine.own_plant import PlantExperiment
+from diagnosis.machine.plant_effect import PlantEffect
 from plant.effects.search_space import Dependence, EffectParameter
 
 _SMOOTHED = 9  # samples, of a measured angle whose speed is asked
@@ -58,6 +59,38 @@ _SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.5,), "linear")
 _DAMPING_RATIO = EffectParameter("damping_ratio", 1e-3, 1.0, (0.03, 0.3))
 
 
+def _size(
+    name: str,
+    unit: float | str = 1.0,
+    span: tuple[float, float] = (1e-4, 1.0),
+    starts: tuple[float, float] = (3e-3, 0.6),
+) -> EffectParameter:
+    """A range in multiples of a magnitude, or of one of that name, and six starts in its lower part."""
+    spread = (starts[0], min(starts[1], 0.6 * span[1]), 6)
+    if isinstance(unit, str):
+        return EffectParameter(name, *span, unit=unit, spread=spread)
+    return EffectParameter(name, *span, spread=spread).times(unit)
+
+
+def _number(
+    name: str, stated: float, put: Callable[..., None], *sizes: EffectParameter, **more: Any
+) -> PlantEffect:
+    """A number of a model. put : model, values -> None. sizes : of the effect where the model has none of it;
+    more : fields of `PlantEffect`."""
+    return PlantEffect(name, sizes, law=Law("model", put), stated=stated, **more)
+
+
+# In every joint: name, where it stands, which of several there, size and its unit (F force, x travel, m
+# inertia), largest size in it, dependence.
+_OF_JOINT: tuple[tuple[str, str, int, str, str, float, Dependence], ...] = (
+    ("frictionloss", "frictionloss", 0, "level_{F}", "force", 1.0, "continuous"),
+    ("damping", "damping", 0, "coefficient_{F}s_{x}", "force/speed", 10.0, "smooth"),
+    ("drag", "damping", 1, "coefficient_{F}s2_{x}2", "force/speed^2", 10.0, "smooth"),
+    ("armature", "armature", 0, "inertia_{m}", "inertia", 10.0, "smooth"),
+    ("stiffness", "stiffness", 0, "stiffness_{F}_{x}", "force/position", 10.0, "smooth"),
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Quantities:
     """Those of a model that moves as in experiments."""
@@ -65,7 +98,7 @@ class Quantities:
     model: MujocoModel
     experiments: Sequence[PlantExperiment]
 
-    def by_name(self) -> dict[str, Quantity]:
+    def by_name(self) -> dict[str, PlantEffect]:
         """Everything that may be off or missing, by name."""
         model, experiments, sizes = self.model, self.experiments, self.sizes
         spec, longest = model.spec, 0.2 * max(len(e.input) for e in experiments)
@@ -79,90 +112,87 @@ class Quantities:
         ]
         return {one.name: one for one in found}
 
-    def _of_joint(self, joint: Any, force: float, travel: float, speed: float) -> Iterator[Quantity]:
+    def _of_joint(self, joint: Any, force: float, travel: float, speed: float) -> Iterator[PlantEffect]:
         if joint.type not in _UNITS:
             return
         F, x, m = _UNITS[joint.type]
         name, h = joint.name, self.model.nominal.opt.timestep
         inertia = float(self.model.nominal.dof_M0[self.model.nominal.joint(name).dofadr[0]])
-        # Name, where it stands, parameter, unit, largest size in it, dependence.
-        parts: tuple[tuple[str, str, int, str, float, float, Dependence], ...] = (
-            ("frictionloss", "frictionloss", 0, f"level_{F}", force, 1.0, "continuous"),
-            ("damping", "damping", 0, f"coefficient_{F}s_{x}", force / speed, 10.0, "smooth"),
-            ("drag", "damping", 1, f"coefficient_{F}s2_{x}2", force / speed**2, 10.0, "smooth"),
-            ("armature", "armature", 0, f"inertia_{m}", inertia, 10.0, "smooth"),
-            ("stiffness", "stiffness", 0, f"stiffness_{F}_{x}", force / travel, 10.0, "smooth"),
-        )
-        of = partial(Quantity, group="joint")
-        for what, key, k, parameter, unit, most, kind in parts:
+        of = partial(_number, group="joint")
+        magnitudes = Magnitudes(force=force, position=travel, speed=speed, inertia=inertia)
+        for what, key, k, size, unit, most, dependence in _OF_JOINT:
             value = float(np.ravel(getattr(joint, key))[k])
-            put: Put = partial(put_at_joint, name, key, k)
-            usual = of(f"{name}.{what}", value, put, parameter, unit, (1e-4, most), dependence=kind)
-            yield replace(usual, by_name=what == "drag" and value == 0)
+            put: Callable[..., None] = partial(put_at_joint, name, key, k)
+            sized = _size(size.format(F=F, x=x, m=m), unit, (1e-4, most)).at(magnitudes)
+            tried = "by name" if what == "drag" and value == 0 else "always"
+            yield of(f"{name}.{what}", value, put, sized, dependence=dependence, tried=tried)
         if self.model.spec.numeric(f"{name}.{STRIBECK}") is None:
+            level = _size(f"level_{F}", force)
             velocity = EffectParameter(f"velocity_{x}_s", 0.01 * speed, speed, (0.02 * speed, 0.2 * speed))
-            inner = None if joint.frictionloss else f"{name}.frictionloss"
-            dry = of(f"{name}.{STRIBECK}", 0.0, partial(put_stribeck, name), f"level_{F}", force)
-            yield replace(dry, dependence="continuous", more=(_SHARE, velocity), contains=inner, by_name=True)
+            yield of(
+                f"{name}.{STRIBECK}",
+                0.0,
+                partial(put_stribeck, name),
+                *(level, _SHARE, velocity),
+                dependence="continuous",
+                contains=None if joint.frictionloss else f"{name}.frictionloss",
+                tried="by name",
+            )
         motor, load = joint.armature, inertia - joint.armature
         if not motor > 0:
             return
-        put, gap = partial(put_backlash, name), f"gap_{x}"
-        yield of(f"{name}.backlash", 0.0, put, gap, travel, (1e-3, 0.5), dependence="non-smooth")
+        gap = _size(f"gap_{x}", travel, (1e-3, 0.5))
+        yield of(f"{name}.backlash", 0.0, partial(put_backlash, name), gap, dependence="non-smooth")
         # From a spring that gives way by the travel to one that steps of the model can follow.
         softest, stiffest = force / travel, motor * load / inertia / h**2
         if (most := stiffest / softest) > 1:
-            put, parameter = partial(put_spring, name, load), f"stiffness_{F}_{x}"
-            spring = of(f"{name}.{ELASTIC}", 0.0, put, parameter, softest, (1.0, most), (1.0, 0.5 * most))
-            yield replace(spring, more=(_DAMPING_RATIO,), grows=False, by_name=True)
+            put = partial(put_spring, name, load)
+            stiffness = _size(f"stiffness_{F}_{x}", softest, (1.0, most), (1.0, 0.5 * most))
+            yield of(f"{name}.{ELASTIC}", 0.0, put, stiffness, _DAMPING_RATIO, grows=False, tried="by name")
 
-    def _of_actuator(self, one: Any, longest: float) -> Iterator[Quantity]:
+    def _of_actuator(self, one: Any, longest: float) -> Iterator[PlantEffect]:
         """longest : of a lag or delay, in samples."""
         lag = 0.0 if one.dyntype == mujoco.mjtDyn.mjDYN_NONE else float(one.dynprm[0])
-        late = partial(
-            Quantity,
-            unit=self.model.dt_s,
-            span=(0.02, longest),
-            starts=(0.2, min(20.0, longest)),
-            group="actuator",
-        )
-        of = partial(Quantity, dependence="continuous", group="actuator")
+        of = partial(_number, dependence="continuous", group="actuator")
+        late = partial(_size, unit=self.model.dt_s, span=(0.02, longest), starts=(0.2, min(20.0, longest)))
         if {int(one.gaintype), int(one.biastype)} <= set(FORCES):
-            yield Quantity(f"{one.name}.gain", 1.0, partial(put_gain, one.name))
+            yield _number(f"{one.name}.gain", 1.0, partial(put_gain, one.name))
         kinds, (_, stiffness, damping) = (int(one.gaintype), int(one.biastype)), one.biasprm[:3]
         if kinds == (0, 1) and stiffness == -one.gainprm[0] != 0:
             put = partial(put_kp, one.name, one.gainprm[0])
             # Without damping of its own it is what the gain is.
-            yield Quantity(f"{one.name}.kp", float(one.gainprm[0]), put, by_name=not damping)
+            tried = "always" if damping else "by name"
+            yield _number(f"{one.name}.kp", float(one.gainprm[0]), put, tried=tried)
             if damping:
                 put = partial(put_scaled, one.name, "biasprm", (2,), -damping)
-                yield Quantity(f"{one.name}.kv", -float(damping), put, by_name=True)
+                yield _number(f"{one.name}.kv", -float(damping), put, tried="by name")
         if kinds == (0, 0):
             dead = self.model.number(f"{one.name}.{DEAD_ZONE}", 0.0)
             u = [actuator.name for actuator in self.model.spec.actuators].index(one.name)
             put = partial(put_number, f"{one.name}.{DEAD_ZONE}")
             unit = max(float(np.max(np.abs(e.input[:, u]))) for e in self.experiments)
-            zone = of(f"{one.name}.{DEAD_ZONE}", dead, put, "width", unit or 1.0, (1e-3, 1.0))
-            yield replace(zone, by_name=dead == 0)
+            width = _size("width", unit or 1.0, (1e-3, 1.0))
+            yield of(f"{one.name}.{DEAD_ZONE}", dead, put, width, tried="always" if dead else "by name")
         stated = self.model.nominal.actuator(one.name)
         limits = tuple(stated.forcerange) if stated.forcelimited[0] else (-np.inf, np.inf)
         least, largest = self.forces[one.name]
         if least <= _REACHED * limits[0] or largest >= _REACHED * limits[1]:
-            yield Quantity(f"{one.name}.forcerange", 1.0, partial(put_forcerange, one.name, limits))
+            yield _number(f"{one.name}.forcerange", 1.0, partial(put_forcerange, one.name, limits))
         elif (force := max(-least, largest)) > 0:
             put = partial(put_limit, one.name, limits)
             # The kind of a joint says the unit of the force.
             on_joint = one.trntype in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
             kind = self.model.spec.joint(one.target).type if on_joint else None
             name = f"limit_{_UNITS[kind][0]}" if kind in _UNITS else "limit"
-            limit = of(f"{one.name}.forcerange", 0.0, put, name, force, (0.05, 1.0), (0.1, 0.98))
-            yield replace(limit, grows=False)
+            limit = _size(name, force, (0.05, 1.0), (0.1, 0.98))
+            yield of(f"{one.name}.forcerange", 0.0, put, limit, grows=False)
         if one.dyntype in LAGS:
-            yield late(f"{one.name}.lag", lag, partial(put_lag, one.name), "time_constant_s")
+            put = partial(put_lag, one.name)
+            yield _number(f"{one.name}.lag", lag, put, late("time_constant_s"), group="actuator")
         put = partial(put_delay, "actuator", one.name, self.model.spec.option.timestep)
-        yield late(f"{one.name}.delay", float(one.delay), put, "delay_s")
+        yield _number(f"{one.name}.delay", float(one.delay), put, late("delay_s"), group="actuator")
 
-    def _of_link(self, body: Any) -> Iterator[Quantity]:
+    def _of_link(self, body: Any) -> Iterator[PlantEffect]:
         model = self.model.nominal
         k = model.body(body.name).id
         if not model.body_weldid[k]:
@@ -171,24 +201,23 @@ class Quantities:
             put = partial(put_payload, *at)
             # Of all that moves with it: what a robot carries is no multiple of its last link.
             mass = float(model.body_subtreemass[model.body_rootid[k]])
-            yield Quantity(f"{body.name}.payload", 0.0, put, "mass_kg", mass, (1e-3, 10.0), group="link")
+            size = _size("mass_kg", mass, (1e-3, 10.0))
+            yield _number(f"{body.name}.payload", 0.0, put, size, group="link")
         if not body.mass > 0:
             return
-        yield Quantity(f"{body.name}.mass", float(body.mass), partial(put_mass, body.name), "mass_kg")
+        yield _number(f"{body.name}.mass", float(body.mass), partial(put_mass, body.name))
         # Of a link on one hinge in the world, inertia is what armature is.
         if model.body_weldid[model.body_parentid[model.body_weldid[k]]]:
-            yield Quantity(f"{body.name}.inertia", 1.0, partial(put_inertia, body.name))
-        part = partial(Quantity, group="link", by_name=True)
+            yield _number(f"{body.name}.inertia", 1.0, partial(put_inertia, body.name))
+        part = partial(_number, group="link", tried="by name")
         radius = max(float(np.sqrt(np.max(body.inertia) / body.mass)), float(np.linalg.norm(body.ipos)))
         for i, axis in enumerate("xyz"):
-            put = partial(put_centre, body.name, i)
-            yield part(
-                f"{body.name}.com_{axis}", 0.0, put, "shift_m", radius or 1.0, (1e-3, 1.0), signed=True
-            )
+            shift = _size("shift_m", radius or 1.0, (1e-3, 1.0))
+            yield part(f"{body.name}.com_{axis}", 0.0, partial(put_centre, body.name, i), shift, signed=True)
             yield part(f"{body.name}.stretch_{axis}", 1.0, partial(put_shape, body.name, i, i))
             for j in range(i):
                 put = partial(put_shape, body.name, j, i)
-                yield part(f"{body.name}.shear_{'xyz'[j]}{axis}", 0.0, put, "slope", 1.0, signed=True)
+                yield part(f"{body.name}.shear_{'xyz'[j]}{axis}", 0.0, put, _size("slope"), signed=True)
 
     def _load_place(self, k: int) -> tuple[str, tuple[float, ...]] | None:
         """Body and place in it of a payload of link k with all that is fixed to it: the first site.
@@ -217,7 +246,7 @@ class Quantities:
             far = max(far, float(along @ centre + np.abs(along @ turn) @ box[3:]))
         return model.body(k).name, tuple(data.xmat[k].reshape(3, 3).T @ (joint + far * along - data.xpos[k]))
 
-    def _of_gravity(self) -> Iterator[Quantity]:
+    def _of_gravity(self) -> Iterator[PlantEffect]:
         """Its direction: the largest component follows from the others and the size, unless it is released by
         a tolerance of its own."""
         gravity = np.array(self.model.spec.option.gravity)
@@ -225,33 +254,20 @@ class Quantities:
         for k, axis in enumerate("xyz"):
             name, turned = f"gravity.{axis}", k != main and gravity[main] != 0
             if k != main or not gravity[main] or self.model.number(f"tolerance.{name}", 0.0) > 0:
-                yield Quantity(
-                    name,
-                    float(gravity[k]),
-                    partial(put_gravity, k, main if turned else k),
-                    "acceleration_m_s2",
-                    _STANDARD_GRAVITY,
-                    signed=True,
-                    group="link",
-                )
+                put = partial(put_gravity, k, main if turned else k)
+                size = _size("acceleration_m_s2", _STANDARD_GRAVITY)
+                yield _number(name, float(gravity[k]), put, size, signed=True, group="link")
 
-    def _of_sensor(self, name: str, swing: float) -> Iterator[Quantity]:
+    def _of_sensor(self, name: str, swing: float) -> Iterator[PlantEffect]:
         sensor = self.model.spec.sensor(name)
         gain, offset = self.model.number(f"{name}.gain", 1.0), self.model.number(f"{name}.offset", 0.0)
-        yield Quantity(f"{name}.sensor_gain", gain, partial(put_number, f"{name}.gain"))
+        of = partial(_number, group="sensor")
+        yield _number(f"{name}.sensor_gain", gain, partial(put_number, f"{name}.gain"))
         put = partial(put_number, f"{name}.offset")
-        yield Quantity(f"{name}.sensor_offset", offset, put, "offset", swing, signed=True, group="sensor")
+        yield of(f"{name}.sensor_offset", offset, put, _size("offset", swing), signed=True)
         put = partial(put_delay, "sensor", name, self.model.spec.option.timestep)
-        yield Quantity(
-            f"{name}.sensor_delay",
-            float(sensor.delay),
-            put,
-            "delay_s",
-            self.model.dt_s,
-            (0.02, 100.0),
-            (0.2, 10.0),
-            group="sensor",
-        )
+        late = _size("delay_s", self.model.dt_s, (0.02, 100.0), (0.2, 10.0))
+        yield of(f"{name}.sensor_delay", float(sensor.delay), put, late)
 
     @cached_property
     def sizes(self) -> dict[str, tuple[float, float, float]]:

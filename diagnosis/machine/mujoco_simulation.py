@@ -22,12 +22,12 @@ from diagnosis.machine.mujoco_edits import (
     ELASTIC,
     PLAIN,
     STRIBECK,
-    Quantity,
     put_component,
     put_gain,
 )
 from diagnosis.machine.mujoco_model import MujocoModel
 from diagnosis.machine.own_plant import PlantExperiment
+from diagnosis.machine.plant_effect import PlantEffect
 
 Kept = TypeVar("Kept")
 
@@ -54,7 +54,7 @@ class MujocoSimulation:
     else every record starts as its first samples say."""
 
     arm: MujocoModel
-    quantities: Mapping[str, Quantity]
+    quantities: Mapping[str, PlantEffect]
     noise: Real
     settles: bool = True
     _models: dict[Any, tuple[Any, Any]] = field(default_factory=dict, repr=False)
@@ -65,7 +65,7 @@ class MujocoSimulation:
         """The model (MjSpec) with these values; of: as a whole, else what moves of it."""
         spec = (of or self.arm.moving).copy()
         for name, value in values.items():
-            self.quantities[name].put(spec, *np.ravel(value).tolist())
+            self.quantities[name].edit(spec, *np.ravel(value).tolist())
         return spec
 
     def __call__(
@@ -73,7 +73,7 @@ class MujocoSimulation:
     ) -> Real:
         values: dict[str, Any] = {**parameters}
         values |= {name: tuple(size.values()) for name, size in effects.items()}
-        changed = {k: v for k, v in values.items() if v != self.quantities[k].value}
+        changed = {k: v for k, v in values.items() if v != self.quantities[k].stated}
         model, start = self._model(changed), self._start(inputs)
         found = self._run(model, inputs, start.state if self.settles else start.guess)
         measured = inputs[:, len(self.arm.inputs) :]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, get_args
 
@@ -54,8 +54,10 @@ class PlantEffect:
     law : Law or None. What it does to a simulation that does not know it; None: the simulation is told.
     place : Place or None. Where a law acts around a simulation (`with_effects`).
     multiplies : str or None. Stated value that its only parameter, a ratio, multiplies (`wrong_value`).
-    tried : of those that `with_effects` may add, when "all" has it: "always", "with several outputs" (from
-        one alone it cannot be told from its twin at the input), or "by name" only.
+    tried : where nobody chose it, "always", "with several outputs" (from one alone it cannot be told from its
+        twin at the input), or "by name" only.
+    stated : of a number of a model, what the model has; 0: nothing, the effect may be missing. A number that
+        is stated may be wrong by a ratio: it needs no parameters.
     """
 
     name: str
@@ -66,17 +68,18 @@ class PlantEffect:
     group: str = ""
     contains: str | None = None
     check: str = ""
-    law: Law | None = None
+    law: Law | None = field(default=None, compare=False)
     place: Place | None = None
     multiplies: str | None = None
     tried: Tried = "always"
+    stated: float = 0.0
     harmonic: ClassVar[Harmonic | None] = None
     adds_to: ClassVar[str | None] = None
     absolute_angle: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", tuple(self.parameters))
-        if not self.parameters:
+        if not self.parameters and not self.stated:
             raise ValueError(f"effect {self.name}: needs at least one parameter")
         if self.name in ("none", "unknown"):
             raise ValueError(f"effect {self.name}: this name is an answer of its own")
@@ -97,6 +100,12 @@ class PlantEffect:
                 for side in ratio_candidates(self, self.parameters[0].low, self.parameters[0].high)
             )
         return searches(self, self.parameters, signed=self.signed, grows=self.grows)
+
+    def edit(self, model: Any, *values: float) -> None:
+        """Writes values of its parameters, or of a stated number, into the description of a model."""
+        assert self.law is not None
+        assert callable(self.law.change)
+        self.law.change(model, *values)
 
     def from_search(self, values: Mapping[str, float], sign: int) -> Change:
         """The effect at these values, the size (the first parameter) with its sign."""

@@ -270,7 +270,9 @@ class HardeningSpring(Effect):
     words = "a hardening spring (cable, hose)"
     check = "pull the hub with a spring balance at small and at large angles and look for cables and hoses"
     absolute_angle = True
-    sought = (EffectParameter("cubic_Nm_rad3", 1e-7, 1e3, unit="hardening_Nm_rad3", spread=(1e-5, 10, 12)),)
+    sought = (
+        EffectParameter("cubic_Nm_rad3", 1e-7, 1e3, unit="torque_Nm/angle_rad^3", spread=(1e-5, 10, 12)),
+    )
 
     cubic_Nm_rad3: NotNegative = Field(description="coefficient k3")
 

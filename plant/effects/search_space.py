@@ -201,14 +201,8 @@ class Scales:
         return self.rig.motor.torque_per_volt_Nm_V * self.voltage_V
 
     @property
-    def hardening_Nm_rad3(self) -> float:
-        """All of that torque at the largest angle."""
-        return self.torque_Nm / self.angle_rad**3
-
-    @property
-    def drift_m_s(self) -> float:
-        """The tip sensor's noise within a record."""
-        return self.rig.sensors.tip_noise_m / self.duration_s
+    def tip_noise_m(self) -> float:
+        return self.rig.sensors.tip_noise_m
 
     @property
     def link_mass_kg(self) -> float:
@@ -237,7 +231,8 @@ class EffectParameter:
     starts : tuple of float
         Without any: eight over the range for an effect's size, three for what follows, inside the range.
     unit : str
-        Name of a magnitude of machine and records that all of these are multiples of (`at`); "": none is.
+        Magnitude of machine and records that all of these are multiples of (`at`): a name, or a name over
+        others ("force/speed^2"); "": none is.
     spread : (first, last, count) or None. In place of starts: so many from first to last, in equal ratios.
     most : str. Name of a magnitude that `high` does not go beyond, a multiple of the unit as well.
     step : float or None. See `Axis`; None: by how outputs depend on the effect.
@@ -266,13 +261,20 @@ class EffectParameter:
 
     def at(self, magnitudes: object) -> EffectParameter:
         """In units of its own: magnitudes has an attribute for every name."""
-        one = getattr(magnitudes, self.unit) if self.unit else 1.0
-        high = one * (min(self.high, getattr(magnitudes, self.most)) if self.most else self.high)
-        starts = tuple(one * v for v in self.starts)
+        above, *below = self.unit.split("/")
+        one = getattr(magnitudes, above) if above else 1.0
+        for name, _, power in (part.partition("^") for part in below):
+            one = one / getattr(magnitudes, name) ** int(power or 1)
+        most = min(self.high, getattr(magnitudes, self.most)) if self.most else self.high
+        return replace(self, high=most, unit="", most="").times(one)
+
+    def times(self, one: float) -> EffectParameter:
+        """In multiples of a magnitude."""
+        high, starts = one * self.high, tuple(one * v for v in self.starts)
         if self.spread is not None:
             first, last, count = self.spread
             starts = tuple(geometric(one * first, min(one * last, high), count))
-        return EffectParameter(self.name, one * self.low, high, starts, self.scale, step=self.step)
+        return replace(self, low=one * self.low, high=high, starts=starts, spread=None)
 
     def axis(self, dependence: Dependence) -> Axis:
         step = _STEPS[dependence] if self.step is None else self.step

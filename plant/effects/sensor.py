@@ -31,7 +31,7 @@ class SensorDrift(Effect):
     words = "a drift of the tip sensor"
     check = "log the tip sensor for some minutes with the arm clamped"
     signed = True
-    sought = (EffectParameter("rate_m_s", 1e-3, 1e4, unit="drift_m_s", spread=(0.1, 100, 6)),)
+    sought = (EffectParameter("rate_m_s", 1e-3, 1e4, unit="tip_noise_m/duration_s", spread=(0.1, 100, 6)),)
 
     rate_m_s: float = Field(description="drift of the tip sensor")
 
