@@ -10,12 +10,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numba import njit
 
 from benchmarks.harness import Print, main
-from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
+from diagnosis import (
+    Actuator,
+    Body,
+    EffectParameter,
+    Plant,
+    PlantCase,
+    PlantEffect,
+    PlantExperiment,
+    diagnose,
+    with_effects,
+)
 from diagnosis.machine.machine_protocol import Real
 
 SAMPLES, STEPS, CONFIDENT = 600, 40, 0.8
@@ -139,7 +150,7 @@ class Made:
     name: str = ""
     size: float = 0.0
     motion: str | None = None
-    motion_is: str = "position"
+    motion_is: Literal["position", "speed"] = "position"
     hold: int = 20
     same: tuple[str, ...] = ()
 
@@ -182,9 +193,8 @@ class Made:
             "all",
             records,
             dt_s=self.dt_s,
-            motion=self.motion,
-            motion_is=self.motion_is,
-            at_rest_before=False,
+            actuator=Actuator(at_rest_before=False),
+            body=Body(self.motion, self.motion_is) if self.motion else None,
         )
         return PlantCase(called, around, tuple(records))
 

@@ -12,7 +12,16 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
+from diagnosis import (
+    Body,
+    EffectParameter,
+    Plant,
+    PlantCase,
+    PlantEffect,
+    PlantExperiment,
+    diagnose,
+    with_effects,
+)
 
 DT_S, NOISE_M = 0.01, 2e-4
 STATED = {"mass_kg": 2.0, "spring_N_m": 80.0, "damper_Ns_m": 3.0}
@@ -64,7 +73,7 @@ def case_of(experiments, **more):
     experiments = tuple(experiments)
     plant = Plant(simulate, STATED, TOLERANCES, ("position_m",), np.array([NOISE_M]), (STIFFENING,), **more)
     return PlantCase(
-        "carriage", with_effects(plant, NAMES, experiments, dt_s=DT_S, motion="position_m"), experiments
+        "carriage", with_effects(plant, NAMES, experiments, dt_s=DT_S, body=Body("position_m")), experiments
     )
 
 

@@ -40,21 +40,27 @@ class Started:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A body in the simulation: column of its force, column of its motion, force of a pulse to try it with.
+    """A body in the simulation, that friction and springs act on.
 
-    of_speed : bool. The motion is a speed; else it is a position.
+    motion : output, or column of what the simulation returns (beyond the outputs: a motion nobody measured).
+    force : column of the inputs with the force on it, held over each sample; None: that of the actuator.
+    largest_force : for ranges and a pulse to try it with, where that column is zero in the records.
     """
 
-    force: int
-    motion: int
-    of_speed: bool
-    dt_s: float
-    pulse: float
-    _kept: dict[Hashable, Any] = field(default_factory=dict, repr=False)
+    motion: str | int
+    motion_is: Literal["position", "speed"] = "position"
+    force: int | None = None
+    largest_force: float | None = None
+    dt_s: float = float("nan")
+    _kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def of_speed(self) -> bool:
+        return self.motion_is == "speed"
 
     def under(self, started: Started, forces: BodyForces) -> Run:
         """The simulation with forces on the body; not a number where none were found that it follows."""
-        run = started.run
+        run, (force_at, motion_at) = started.run, self._columns
 
         def simulated(inputs: Real) -> Real:
             asked = (started.key, inputs.shape)
@@ -62,16 +68,16 @@ class Body:
 
             def under(force: Real) -> tuple[Real, Real]:
                 moved = inputs.copy()
-                moved[:, self.force] = force
+                moved[:, force_at] = force
                 found = run(moved)
-                return found, sign * found[:, self.motion]
+                return found, sign * found[:, motion_at]
 
-            command = inputs[:, self.force]
+            command = inputs[:, force_at]
             free = self._remembered((started.key, started.start, inputs.tobytes()), lambda: under(command))
 
             def placed(outputs: Real, motion: Real) -> Real:
                 found = outputs.copy()
-                found[:, self.motion] = sign * motion
+                found[:, motion_at] = sign * motion
                 return found
 
             alone = free[0].shape[1] == 1
@@ -88,15 +94,23 @@ class Body:
 
     def _response(self, run: Run, inputs: Real) -> tuple[PulseResponse, float]:
         """From rest, other inputs as at the start; -1 where force and motion count opposite ways, else 1."""
+        force_at, motion_at = self._columns
+        pulse = self.largest_force or 1.0
         still = np.repeat(inputs[:1], len(inputs), axis=0)
-        still[:, self.force] = 0.0
+        still[:, force_at] = 0.0
         pushed = still.copy()
-        pushed[1, self.force] = self.pulse
-        moved = (run(pushed) - run(still))[:, self.motion] / self.pulse
+        pushed[1, force_at] = pulse
+        moved = (run(pushed) - run(still))[:, motion_at] / pulse
         first = np.abs(moved[:5])
         # The first that shows: at few samples per period the largest is on the way back.
         sign = float(np.sign(moved[np.argmax(first > _SHOWS * np.max(first))]))
         return PulseResponse.of(sign * moved, self.dt_s, of_speed=self.of_speed), sign
+
+    @property
+    def _columns(self) -> tuple[int, int]:
+        assert isinstance(self.force, int)
+        assert isinstance(self.motion, int)
+        return self.force, self.motion
 
     def _remembered(self, key: Hashable, compute: Callable[[], Any]) -> Any:
         if key not in self._kept:
@@ -110,27 +124,27 @@ class Body:
 class MeasuredBody:
     """A body whose motion is given, whose force is asked: inputs of position and speed, output of force.
 
-    It may be at rest where it is no faster than `slow`, or turns back before its speeds add up to `short`:
-    what friction holds there is anything up to its level, and such rows say nothing (`resting`).
+    position, speed : columns of the inputs; force : of the outputs, the sensor's.
+    slow, short : it may be at rest where it is no faster, or turns back before its speeds add up to that:
+        what friction holds there is anything up to its level, and such rows say nothing (`resting`).
     """
 
     position: int
     speed: int
-    force: int
-    slow: float
-    short: float
+    force: int = 0
+    slow: float = 0.0
+    short: float = 0.0
 
-    @classmethod
-    def of(cls, position: int, speed: int, force: int, inputs: Sequence[Real]) -> MeasuredBody:
-        """Inputs (T, U) of all records. Noise of the speed, white or not, is what it has on short ways."""
-        ways = np.concatenate([_ways(u[:, speed]) for u in inputs])
-        every = np.concatenate(inputs)[:, speed]
+    def of(self, force: int, inputs: Sequence[Real]) -> MeasuredBody:
+        """Of inputs (T, U) of all records. Noise of the speed, white or not, is what it has on short ways."""
+        ways = np.concatenate([_ways(u[:, self.speed]) for u in inputs])
+        every = np.concatenate(inputs)[:, self.speed]
         # Before a body slides, bearings and gears give way by thousandths of its longest way.
         short = 5e-3 * float(np.max(ways))
         rests = every[ways <= short]
         # Of four deviations of the noise a sign is sure; a tenth of the usual speed is more than noise.
         slow = min(4 * _norm(rests) / max(rests.size, 1) ** 0.5, 0.1 * _norm(every) / every.size**0.5)
-        return cls(position, speed, force, slow, short)
+        return replace(self, force=force, slow=slow, short=short)
 
     def under(self, started: Started, forces: BodyForces) -> Run:
         def simulated(inputs: Real) -> Real:
@@ -159,19 +173,48 @@ Where = Literal["input", "output", "body", "model"]
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
-    """A signal inside a loop that the simulation closes: `signal`, column of what it returns, is the command
-    of the drive, and the simulation adds column `added` of its inputs to that.
+class Sensor:
+    """An output, by name or column."""
 
-    What an effect makes of the command comes back through the loop: it is solved beside the loop's response
-    to a pulse, then simulated; where the loop is not linear, again beside what that gives.
+    output: str | int
+    dt_s: float = float("nan")
+
+    @property
+    def column(self) -> int:
+        assert isinstance(self.output, int)
+        return self.output
+
+    def before(self, signal: Real) -> float:
+        """What a signal (T,) was before its first row."""
+        return float(signal[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Actuator:
+    """A column of the inputs, or a signal inside a loop that the simulation closes.
+
+    drive : of such a loop: output, or column of what the simulation returns, that is the command of its
+        drive. The simulation adds `column`, zeros in records, to it.
+    at_rest_before : before its first row the command is zero; else as in that row.
+
+    What an effect makes of the command of a drive comes back through the loop: it is solved beside the loop's
+    response to a pulse, then simulated; where the loop is not linear, again beside what that gives.
     """
 
-    added: int
-    signal: int
-    dt_s: float
+    column: int = 0
+    drive: str | int | None = None
     at_rest_before: bool = True
-    _kept: dict[Hashable, Any] = field(default_factory=dict, repr=False)
+    dt_s: float = float("nan")
+    _kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
+
+    def before(self, signal: Real) -> float:
+        """What a signal (T,) was before its first row."""
+        return 0.0 if self.at_rest_before else float(signal[0])
+
+    @property
+    def _signal(self) -> int:
+        assert isinstance(self.drive, int)
+        return self.drive
 
     def under(self, started: Started, acting: Sequence[Acting], run: Run) -> Run:
         """The simulation with effects on the signal, in the order given; not a number where no fixed point
@@ -180,15 +223,15 @@ class Drive:
         def changed(command: Real) -> Real:
             now = command
             for law, _, values in acting:
-                now = law.signal(now, values, self.dt_s, 0.0 if self.at_rest_before else float(now[0]))
+                now = law.signal(now, values, self.dt_s, self.before(now))
             return np.asarray(now - command)
 
         def simulated(inputs: Real) -> Real:
             def with_added(extra: Real) -> tuple[Real, Real]:
                 moved = np.array(inputs)
-                moved[:, self.added] += extra
+                moved[:, self.column] += extra
                 found = run(moved)
-                return found, found[:, self.signal]
+                return found, found[:, self._signal]
 
             asked = (started.key, inputs.shape)
             if asked not in self._kept:
@@ -208,9 +251,9 @@ class Drive:
 
     def _response(self, run: Run, inputs: Real) -> Real:
         """(T,) of the signal to one that is added over the first sample, small beside what moves it."""
-        small, pushed = 1e-3 * max(float(np.std(run(inputs)[:, self.signal])), 1e-9), np.array(inputs)
-        pushed[0, self.added] += small
-        return np.asarray((run(pushed) - run(inputs))[:, self.signal] / small)
+        small, pushed = 1e-3 * max(float(np.std(run(inputs)[:, self._signal])), 1e-9), np.array(inputs)
+        pushed[0, self.column] += small
+        return np.asarray((run(pushed) - run(inputs))[:, self._signal] / small)
 
 
 def _fixed(changed: Callable[[Real], Real], beyond: Real, response: Real, start: Real) -> tuple[Real, Real]:
@@ -229,7 +272,7 @@ def _fixed(changed: Callable[[Real], Real], beyond: Real, response: Real, start:
 
 
 @dataclass(frozen=True)
-class Law:
+class EffectLaw:
     """What an effect does to a simulation that does not know it.
 
     where : "input" or "output", it changes a signal; "body", it is a force on a moving body; "model", it
@@ -253,30 +296,19 @@ class Law:
         return np.asarray(self.change(before, values, dt_s, at_first))
 
 
-@dataclass(frozen=True, eq=False)
-class Place:
-    """Where a law acts. on : column of the inputs or outputs, a drive, or a body.
-
-    at_rest_before : an input was zero before its first row; else, and every output, as in that row.
-    """
-
-    on: int | AnyBody | Drive
-    dt_s: float
-    at_rest_before: bool = True
-
-
-Acting = tuple[Law, Place, Values]
+Place = Actuator | Sensor | Body | MeasuredBody
+Acting = tuple[EffectLaw, Place, Values]
 
 
 def around(started: Started, acting: Sequence[Acting]) -> Run:
     """A simulation with effects around it, on each column in the order given."""
     bodies: dict[int, tuple[AnyBody, dict[str, float]]] = {}
-    drives: dict[int, tuple[Drive, list[Acting]]] = {}
+    drives: dict[int, tuple[Actuator, list[Acting]]] = {}
     for law, place, values in acting:
-        if isinstance(place.on, Drive):
-            drives.setdefault(id(place.on), (place.on, []))[1].append((law, place, values))
-        elif not isinstance(place.on, int):
-            _, sizes = bodies.setdefault(id(place.on), (place.on, {}))
+        if isinstance(place, Actuator) and place.drive is not None:
+            drives.setdefault(id(place), (place, []))[1].append((law, place, values))
+        elif isinstance(place, Body | MeasuredBody):
+            _, sizes = bodies.setdefault(id(place), (place, {}))
             for name, value in law.forces(values).items():
                 # Laws of dry friction that are tried together add up, but for the speed over which one falls.
                 sizes[name] = value + (sizes.get(name, 0.0) if name != "stribeck_velocity" else 0.0)
@@ -292,7 +324,7 @@ def around(started: Started, acting: Sequence[Acting]) -> Run:
         inner = Started(*outer, (inner.key, told), inner.start)
 
     def simulated(inputs: Real) -> Real:
-        return _changed(inner.run(_changed(inputs, acting, "input")), acting, "output")
+        return _changed(inner.run(_changed(inputs, acting, Actuator)), acting, Sensor)
 
     return simulated
 
@@ -301,12 +333,11 @@ def _norm(x: Real) -> float:
     return float(np.linalg.norm(x))
 
 
-def _changed(signals: Real, acting: Sequence[Acting], where: Where) -> Real:
+def _changed(signals: Real, acting: Sequence[Acting], kind: type[Actuator] | type[Sensor]) -> Real:
     found = signals
     for law, place, values in acting:
-        if law.where == where and isinstance(place.on, int):
+        if isinstance(place, kind) and getattr(place, "drive", None) is None:
             found = np.array(signals, dtype=np.float64) if found is signals else found
-            signal = found[:, place.on]
-            before = 0.0 if where == "input" and place.at_rest_before else float(signal[0])
-            found[:, place.on] = law.signal(signal, values, place.dt_s, before)
+            signal = found[:, place.column]
+            found[:, place.column] = law.signal(signal, values, place.dt_s, place.before(signal))
     return found

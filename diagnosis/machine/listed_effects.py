@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 import scipy
 
-from diagnosis.machine.around import Law
+from diagnosis.machine.around import EffectLaw
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.motion_effects import followed
 from diagnosis.machine.plant_effect import PlantEffect
@@ -131,34 +131,34 @@ KINDS: Mapping[str, PlantEffect] = {
         _actuator(
             "input_delay",
             (_DELAY,),
-            law=Law("input", _delayed),
+            law=EffectLaw("input", _delayed),
             check="log the input at the actuator beside the command and compare when they step",
         ),
         _actuator(
             "actuator_gain",
             (_GAIN,),
-            law=Law("input", _scaled),
+            law=EffectLaw("input", _scaled),
             signed=True,
             check="hold two steady commands and measure what the actuator gives",
         ),
         _actuator(
             "input_offset",
             (_sized("offset", 1e-5, 1.0, 1e-3, 0.3, 8, "input"),),
-            law=Law("input", _shifted),
+            law=EffectLaw("input", _shifted),
             signed=True,
             check="command zero and measure what the actuator gives; on a force, level the machine",
         ),
         _actuator(
             "input_drift",
             (_sized("rate_per_s", 1e-5, 3.0, 1e-3, 1.0, 8, "input/duration_s"),),
-            law=Law("input", _drifting),
+            law=EffectLaw("input", _drifting),
             signed=True,
             check="hold a steady command for some minutes and measure what the actuator gives",
         ),
         _actuator(
             "input_backlash",
             (_sized("gap", 1e-4, 1.5, 1e-3, 1.0, 20, "input"),),
-            law=Law("input", _with_play),
+            law=EffectLaw("input", _with_play),
             dependence="non-smooth",
             tried="by name",
             check="command slow ramps up and down: the width between the two ways is the play",
@@ -166,14 +166,14 @@ KINDS: Mapping[str, PlantEffect] = {
         _actuator(
             "actuator_dead_zone",
             (_sized("width", 1e-5, 1.0, 1e-3, 0.5, 12, "input"),),
-            law=Law("input", _dead),
+            law=EffectLaw("input", _dead),
             dependence="continuous",
             check="raise the command slowly from zero and note where something begins to follow",
         ),
         _actuator(
             "actuator_saturation",
             (_sized("limit", 0.05, 1.0, 0.1, 0.99, 24, "input"),),
-            law=Law("input", _clipped),
+            law=EffectLaw("input", _clipped),
             grows=False,
             dependence="continuous",
             check="command the largest input and measure what arrives",
@@ -181,13 +181,13 @@ KINDS: Mapping[str, PlantEffect] = {
         _actuator(
             "actuator_lag",
             (_LAG,),
-            law=Law("input", _lagged),
+            law=EffectLaw("input", _lagged),
             check="step the command and look at what the actuator gives: it should step as well",
         ),
         _body(
             "coulomb_friction",
             (_sized("force", 1e-5, 1.0, 3e-4, 0.6, 14, "force"),),
-            law=Law("body", {"coulomb": "force"}),
+            law=EffectLaw("body", {"coulomb": "force"}),
             dependence="continuous",
             check="raise the input slowly from rest and note where motion begins, in both directions",
         ),
@@ -198,7 +198,7 @@ KINDS: Mapping[str, PlantEffect] = {
                 _SHARE,
                 _sized("velocity", 0.01, 2.0, 0.012, 0.3, 3, "speed"),
             ),
-            law=Law("body", _falling),
+            law=EffectLaw("body", _falling),
             dependence="continuous",
             contains="coulomb_friction",
             check="creep at several slow, steady speeds and note the input that each takes",
@@ -206,7 +206,7 @@ KINDS: Mapping[str, PlantEffect] = {
         _body(
             "one_sided_friction",
             (_sized("force", 1e-5, 1.0, 1e-3, 0.6, 8, "force"),),
-            law=Law("body", _one_way),
+            law=EffectLaw("body", _one_way),
             signed=True,
             dependence="continuous",
             tried="by name",
@@ -218,7 +218,7 @@ KINDS: Mapping[str, PlantEffect] = {
                 _sized("force", 1e-5, 1.0, 3e-4, 0.6, 8, "force"),
                 _sized("gap", 1e-5, 2.0, 3e-3, 0.3, 3, "position"),
             ),
-            law=Law("body", {"coulomb": "force", "gap": "gap"}),
+            law=EffectLaw("body", {"coulomb": "force", "gap": "gap"}),
             dependence="continuous",
             contains="coulomb_friction",
             tried="by name",
@@ -227,13 +227,13 @@ KINDS: Mapping[str, PlantEffect] = {
         _body(
             "viscous_friction",
             (_VISCOUS,),
-            law=Law("body", {"viscous": "coefficient"}),
+            law=EffectLaw("body", {"viscous": "coefficient"}),
             check="move at several steady speeds and note the input: it should grow in proportion",
         ),
         _body(
             "viscous_asymmetry",
             (_VISCOUS,),
-            law=Law("body", {"asymmetry": "coefficient"}),
+            law=EffectLaw("body", {"asymmetry": "coefficient"}),
             signed=True,
             dependence="continuous",
             tried="by name",
@@ -242,14 +242,14 @@ KINDS: Mapping[str, PlantEffect] = {
         _body(
             "quadratic_drag",
             (_sized("coefficient", 1e-5, 30.0, 1e-3, 3.0, 8, "force/speed^2"),),
-            law=Law("body", {"drag": "coefficient"}),
+            law=EffectLaw("body", {"drag": "coefficient"}),
             tried="by name",
             check="move at several steady speeds: twice the speed should take four times the input",
         ),
         _body(
             "load_friction",
             (EffectParameter("share", 1e-4, 0.9, (1e-3, 0.01, 0.05, 0.15, 0.3, 0.6)),),
-            law=Law("body", {"load": "share"}),
+            law=EffectLaw("body", {"load": "share"}),
             dependence="continuous",
             tried="by name",
             check="move slowly without and with a heavy load and compare what each takes beyond the load",
@@ -257,7 +257,7 @@ KINDS: Mapping[str, PlantEffect] = {
         _body(
             "spring",
             (_sized("stiffness", 1e-5, 30.0, 1e-4, 3.0, 8, "force/position"),),
-            law=Law("body", {"linear": "stiffness"}),
+            law=EffectLaw("body", {"linear": "stiffness"}),
             check="let the machine go away from zero with the input off: it should stay where it is",
         ),
         _body(
@@ -266,27 +266,27 @@ KINDS: Mapping[str, PlantEffect] = {
                 _sized("torque", 1e-5, 30.0, 1e-3, 3.0, 8, "force"),
                 _ANGLE,
             ),
-            law=Law("body", {"weight": "torque", "turned": "angle_rad"}),
+            law=EffectLaw("body", {"weight": "torque", "turned": "angle_rad"}),
             tried="by name",
             check="let the machine hang free in several angles: it should stay where it is",
         ),
         _body(
             "hardening_spring",
             (_sized("cubic", 1e-7, 1e3, 1e-5, 10.0, 12, "force/position^3"),),
-            law=Law("body", {"cubic": "cubic"}),
+            law=EffectLaw("body", {"cubic": "cubic"}),
             check="push by hand at small and at large distances and look for cables and hoses",
         ),
         _sensor(
             "backlash",
             (_sized("gap", 1e-4, 1.0, 1e-3, 0.5, 20, "output"),),
-            law=Law("output", _with_play),
+            law=EffectLaw("output", _with_play),
             dependence="non-smooth",
             check="hold the drive and move the load to and fro by hand: the free play is the backlash",
         ),
         _sensor(
             "output_saturation",
             (_sized("limit", 0.05, 1.0, 0.3, 0.999, 16, "reading"),),
-            law=Law("output", _clipped),
+            law=EffectLaw("output", _clipped),
             grows=False,
             dependence="continuous",
             tried="by name",
@@ -295,21 +295,21 @@ KINDS: Mapping[str, PlantEffect] = {
         _sensor(
             "output_lag",
             (_LAG,),
-            law=Law("output", _lagged_sensor),
+            law=EffectLaw("output", _lagged_sensor),
             tried="with several outputs",
             check="tap against the machine and compare when the sensors answer",
         ),
         _sensor(
             "output_delay",
             (_DELAY,),
-            law=Law("output", _delayed),
+            law=EffectLaw("output", _delayed),
             tried="with several outputs",
             check="tap against the machine and compare when the sensors answer",
         ),
         _sensor(
             "output_gain",
             (_GAIN,),
-            law=Law("output", _scaled),
+            law=EffectLaw("output", _scaled),
             signed=True,
             tried="with several outputs",
             check="move by a known distance and compare the reading",
@@ -317,14 +317,14 @@ KINDS: Mapping[str, PlantEffect] = {
         _sensor(
             "output_offset",
             (_sized("offset", 1e-6, 3.0, 1e-4, 0.5, 8, "output"),),
-            law=Law("output", _shifted),
+            law=EffectLaw("output", _shifted),
             signed=True,
             check="go to a known position and compare the reading",
         ),
         _sensor(
             "output_drift",
             (_sized("rate_per_s", 1e-6, 3.0, 1e-4, 1.0, 8, "output/duration_s"),),
-            law=Law("output", _drifting),
+            law=EffectLaw("output", _drifting),
             signed=True,
             check="log the sensor for some minutes with the machine held",
         ),

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from scipy.signal import savgol_filter
 
-from diagnosis.machine.around import Law
+from diagnosis.machine.around import EffectLaw
 from diagnosis.machine.listed_effects import Magnitudes
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.mujoco_edits import (
@@ -77,7 +77,7 @@ def _number(
 ) -> PlantEffect:
     """A number of a model. put : model, values -> None. sizes : of the effect where the model has none of it;
     more : fields of `PlantEffect`."""
-    return PlantEffect(name, sizes, law=Law("model", put), stated=stated, **more)
+    return PlantEffect(name, sizes, law=EffectLaw("model", put), stated=stated, **more)
 
 
 # In every joint: name, where it stands, which of several there, size and its unit (F force, x travel, m
@@ -143,9 +143,10 @@ class Quantities:
             return
         gap = _size(f"gap_{x}", travel, (1e-3, 0.5))
         yield of(f"{name}.backlash", 0.0, partial(put_backlash, name), gap, dependence="non-smooth")
-        # From a spring that gives way by the travel to one that steps of the model can follow.
+        # From a spring that gives way by the travel to one that steps of the model can follow; half
+        # of that is a start as well.
         softest, stiffest = force / travel, motor * load / inertia / h**2
-        if (most := stiffest / softest) > 1:
+        if (most := stiffest / softest) > 2:
             put = partial(put_spring, name, load)
             stiffness = _size(f"stiffness_{F}_{x}", softest, (1.0, most), (1.0, 0.5 * most))
             yield of(f"{name}.{ELASTIC}", 0.0, put, stiffness, _DAMPING_RATIO, grows=False, tried="by name")

@@ -165,8 +165,8 @@ class Plant:
     @property
     def body(self) -> MeasuredBody | None:
         """Whose motion is among the inputs."""
-        bodies = (effect.place.on for effect in self.effects if effect.place is not None)
-        return next((body for body in bodies if isinstance(body, MeasuredBody)), None)
+        places = (effect.place for effect in self.effects)
+        return next((place for place in places if isinstance(place, MeasuredBody)), None)
 
     def value(self, key: str) -> float:
         """Stated value of a parameter."""

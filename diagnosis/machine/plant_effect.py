@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, get_args
 
-from diagnosis.machine.around import Law, Place, Where
+from diagnosis.machine.around import EffectLaw, Place, Where
 from plant.effects.base import ratio_candidates
 from plant.effects.search_space import (
     Candidate,
@@ -51,7 +51,7 @@ class PlantEffect:
     group : str. Where it acts (actuator, joint, sensor, ...); only shown.
     contains : str or None. Simpler effect that it is with its further parameters at an end of their ranges.
     check : str. What to do to see whether it is there: a command in a sentence; "" says nothing.
-    law : Law or None. What it does to a simulation that does not know it; None: the simulation is told.
+    law : EffectLaw or None. What it does to a simulation that does not know it; None: the simulation is told.
     place : Place or None. Where a law acts around a simulation (`with_effects`).
     multiplies : str or None. Stated value that its only parameter, a ratio, multiplies (`wrong_value`).
     tried : where nobody chose it, "always", "with several outputs" (from one alone it cannot be told from its
@@ -68,7 +68,7 @@ class PlantEffect:
     group: str = ""
     contains: str | None = None
     check: str = ""
-    law: Law | None = field(default=None, compare=False)
+    law: EffectLaw | None = field(default=None, compare=False)
     place: Place | None = None
     multiplies: str | None = None
     tried: Tried = "always"

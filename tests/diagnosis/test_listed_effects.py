@@ -11,6 +11,7 @@ from scipy.linalg import expm
 from scipy.signal import lfilter, lsim
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
+from diagnosis.machine.around import Actuator, Body, MeasuredBody
 from diagnosis.machine.listed_effects import KINDS
 from diagnosis.machine.motion_effects import BodyForces, LinearBody, PulseResponse
 from diagnosis.machine.plant_effect import Change
@@ -67,8 +68,8 @@ class _Counted:
 def _wrapped(simulation, force, names, dt_s, motion="x"):
     record = PlantExperiment("a", "estimation", force[:, None], simulation({}, {}, force[:, None]))
     plant = Plant(simulation, {}, {}, ("x", "v"), np.full(2, 1e-4))
-    how = {"motion": motion, "motion_is": "speed" if motion == "v" else "position"}
-    return with_effects(plant, names, [record], dt_s=dt_s, **how)
+    body = Body(motion, "speed" if motion == "v" else "position")
+    return with_effects(plant, names, [record], dt_s=dt_s, body=body)
 
 
 def _missed(found, truth, free):
@@ -224,7 +225,7 @@ def test_a_spring_around_a_simulation_is_the_one_written_into_it(samples):
     plant = Plant(
         lambda p, effects, u: _semi_implicit(u[:, 0].copy(), 0.0, dt_s), {}, {}, ("x",), np.array([1e-4])
     )
-    plant = with_effects(plant, ["hardening_spring"], [record], dt_s=dt_s, motion="x")
+    plant = with_effects(plant, ["hardening_spring"], [record], dt_s=dt_s, body=Body("x"))
     found = plant.simulated([Change("hardening_spring", {"cubic": 60.0})])(force)
     inside = _semi_implicit(force[:, 0].copy(), 60.0, dt_s)
     assert 60 * np.max(inside**2) > 0.4 * 40
@@ -365,8 +366,8 @@ def test_rows_in_which_a_known_motion_may_rest_say_nothing(kind):
         records.append(PlantExperiment(role, role, np.column_stack([x, speed]), torque))
     names = ("coulomb_friction", "output_offset", "viscous_friction")
     plant = Plant(lambda p, e, u: 0.3 * u[:, 1:], {}, {}, ("torque",), np.array([0.02]), model_error=0.05)
-    assert not with_effects(plant, "all", records, dt_s=0.02, measured_motion=(0, 1)).inactive
-    plant = with_effects(plant, names, records, dt_s=0.02, measured_motion=(0, 1))
+    assert not with_effects(plant, "all", records, dt_s=0.02, body=MeasuredBody(0, 1)).inactive
+    plant = with_effects(plant, names, records, dt_s=0.02, body=MeasuredBody(0, 1))
     found = diagnose(PlantCase("joint", plant, records))
     moving = np.setdiff1d(np.arange(v.size), found.case.experiments[0].missing)
     assert np.count_nonzero(v[moving] * speed[moving] > 0) == moving.size > 0.75 * v.size
@@ -409,7 +410,7 @@ def test_an_effect_of_the_drive_inside_a_loop_is_the_one_written_into_it(name, v
     truth = _looped(reference, inputs[:, 1], inside)
     record = PlantExperiment("a", "estimation", inputs, truth[:, :1])
     plant = Plant(lambda p, e, u: _looped(u[:, 0], u[:, 1]), {}, {}, ("x",), np.array([1e-4]))
-    plant = with_effects(plant, [name], [record], dt_s=DT_S, input=1, drive=1)
+    plant = with_effects(plant, [name], [record], dt_s=DT_S, actuator=Actuator(1, drive=1))
     found = plant.simulated([Change(name, values)])(inputs)
     free = _looped(reference, inputs[:, 1])[:, :1]
     assert np.linalg.norm(free - truth[:, :1]) > 0.05 * np.linalg.norm(truth[:, 0])
@@ -426,7 +427,7 @@ def test_an_effect_of_the_drive_inside_a_loop_is_diagnosed():
         records.append(PlantExperiment(f"{role} {len(records)}", role, inputs, y))
     plant = Plant(lambda p, e, u: _looped(*u.T), {}, {}, ("x",), np.array([1e-3]), model_error=0.02)
     names = ["input_offset", "actuator_gain", "actuator_dead_zone", "input_delay"]
-    plant = with_effects(plant, names, records, dt_s=DT_S, input=1, drive=1)
+    plant = with_effects(plant, names, records, dt_s=DT_S, actuator=Actuator(1, drive=1))
     found = diagnose(PlantCase("loop", plant, tuple(records)))
     assert found.combination == ("actuator_dead_zone",)
     assert found.repair[0].values["width"] == pytest.approx(2.0, rel=0.02)
@@ -451,7 +452,7 @@ def test_effects_of_actuator_and_sensor_are_their_equations():
     late = averaged(np.concatenate([np.zeros(2300), fine])[: fine.size])
     np.testing.assert_allclose(_after("input_delay", {"delay_s": 0.023}, u), late, atol=1e-12)
     held = averaged(np.concatenate([np.full(2300, u[0]), fine])[: fine.size])
-    running = _after("input_delay", {"delay_s": 0.023}, u, at_rest_before=False)
+    running = _after("input_delay", {"delay_s": 0.023}, u, actuator=Actuator(at_rest_before=False))
     np.testing.assert_allclose(running, held, atol=1e-12)
     np.testing.assert_allclose(_after("output_delay", {"delay_s": 0.02}, u)[2:], u[:-2], atol=1e-12)
     grid = DT_S / 1000 * np.arange(fine.size)
@@ -501,7 +502,7 @@ def test_two_friction_laws_add_up_and_an_unmeasured_motion_will_do():
     record = PlantExperiment("a", "estimation", force[:, None], simulation({}, {}, force[:, None])[:, :1])
     plant = Plant(simulation, {}, {}, ("x",), np.full(1, 1e-4))
     names = ["coulomb_friction", "stribeck_friction"]
-    plant = with_effects(plant, names, [record], dt_s=DT_S, motion=1, motion_is="speed")
+    plant = with_effects(plant, names, [record], dt_s=DT_S, body=Body(1, "speed"))
     assert plant.effects[1].contains == "coulomb_friction"
     half = Change("coulomb_friction", {"force": 0.4})
     flat = Change("stribeck_friction", {"static_force": 0.4, "coulomb_share": 1.0, "velocity": 0.1})
@@ -528,14 +529,14 @@ def test_a_trial_that_friction_cannot_be_put_around_ran_away():
     record = PlantExperiment("a", "estimation", force[:, None], simulation({}, {}, force[:, None]))
     own = tuple(PlantEffect(name, (EffectParameter("size", 0.1, 1.0),)) for name in broken)
     plant = Plant(simulation, {}, {}, ("x", "v"), np.full(2, noise), own)
-    equipped = with_effects(plant, ["coulomb_friction"], [record], dt_s=DT_S, motion="x")
+    equipped = with_effects(plant, ["coulomb_friction"], [record], dt_s=DT_S, body=Body("x"))
     friction = Change("coulomb_friction", {"force": 0.8})
     for name in broken:
         found = equipped.simulator([Change(name, {"size": 0.5}), friction])(force[:, None])
         np.testing.assert_array_equal(found, 1e12 * noise)
         stated = replace(plant, simulation=lambda p, e, u, name=name: simulation(p, {name: {}}, u))
         with pytest.raises(ValueError, match="friction and springs need a force that moves the body"):
-            with_effects(stated, ["coulomb_friction"], [record], dt_s=DT_S, motion="x")
+            with_effects(stated, ["coulomb_friction"], [record], dt_s=DT_S, body=Body("x"))
 
 
 def test_a_response_that_grows_without_end_prints_nothing(capfd):

@@ -458,7 +458,7 @@ def test_a_value_that_the_compiler_or_a_class_gives_is_nominal_and_can_be_change
     rest = '<default><default class="stiff"><joint stiffness="4" armature="0.3"/></default></default>'
     arm, given = link(PLAIN, rest=rest, joint=joint)
     model, quantity = edited(arm, name, 0.5)
-    assert quantity.value == pytest.approx(getattr(given, value)[0], rel=1e-12) != 0
+    assert quantity.stated == pytest.approx(getattr(given, value)[0], rel=1e-12) != 0
     assert getattr(model, value)[0] == 0.5
 
 

@@ -17,6 +17,7 @@ from scipy.signal import lfilter
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
 from diagnosis.fit.descent import descend
 from diagnosis.imperfect.answered import beside_imperfections, searched
+from diagnosis.machine.around import Actuator, Body
 from diagnosis.search.moves import Alone, BesideSet, Enlarge, FromContacts, Scan
 from diagnosis.search.search import Search
 from diagnosis.where.where import where_in_records
@@ -143,8 +144,8 @@ def _case(name, seed=0, **off):
         y = truth(u) + noise * rng.standard_normal(SAMPLES)
         experiments.append(PlantExperiment(f"up to {amplitude:g}", role, u[:, None], y[:, None]))
     plant = Plant(simulation, stated, tolerances, ("y",), np.array([noise]), model_error=0.05)
-    is_speed = "speed" if simulation is _shaft else "position"
-    plant = with_effects(plant, "all", experiments, dt_s=DT_S, motion="y", motion_is=is_speed)
+    body = Body("y", "speed" if simulation is _shaft else "position")
+    plant = with_effects(plant, "all", experiments, dt_s=DT_S, body=body)
     return PlantCase(name, plant, tuple(experiments))
 
 
@@ -195,7 +196,7 @@ def test_a_constant_at_one_operating_point_may_be_an_unlisted_static_error(means
 
     plant = Plant(simulate, {"outlet": 0.1}, {"outlet": 0.01}, ("y",), np.array([1e-3]), model_error=0.05)
     names = ["output_offset", "input_delay", "actuator_lag"]
-    plant = with_effects(plant, names, experiments, dt_s=DT_S, at_rest_before=False)
+    plant = with_effects(plant, names, experiments, dt_s=DT_S, actuator=Actuator(at_rest_before=False))
     found = diagnose(PlantCase("level", plant, tuple(experiments)))
     assert found.presence("output_offset") > 0.5
     assert (found.presence("output_offset") > 0.8) is sure
@@ -232,7 +233,7 @@ def test_what_is_wrong_is_named_beside_a_bias_that_drifts():
         {"time_constant_s": 0.1, "gain_rad_Vs": 0.05},
     )
     plant = Plant(_turning, stated, tolerances, ("angle_rad",), np.array([1e-3]))
-    plant = with_effects(plant, "all", experiments, dt_s=DT_S, motion="angle_rad")
+    plant = with_effects(plant, "all", experiments, dt_s=DT_S, body=Body("angle_rad"))
     case = PlantCase("turning motor", plant, tuple(experiments))
     free = beside_imperfections(searched(case, lambda done, what: None), np.random.default_rng(0))
     shares_done: list[float] = []
@@ -399,7 +400,7 @@ def test_effects_of_a_body_are_not_ruled_out_where_no_motion_is_stated():
     plant, records = _noisy_motor()
     without = with_effects(plant, "all", records, dt_s=DT_S)
     assert {"coulomb_friction", "spring"} <= set(without.inactive)
-    moving = {"motion": "speed_rad_s", "motion_is": "speed"}
+    moving = {"body": Body("speed_rad_s", "speed")}
     assert not with_effects(plant, "all", records, dt_s=DT_S, **moving).inactive
     assert not with_effects(without, ("spring",), records, dt_s=DT_S, **moving).inactive.keys() & {"spring"}
     assert not with_effects(plant, ("input_delay",), records, dt_s=DT_S).inactive
@@ -431,7 +432,7 @@ def test_a_time_limit_is_kept_while_a_fit_is_running(monkeypatch, limit_s, model
         records.append(PlantExperiment(name, role, force, _carriage(truth, {}, force)))
     stated = dict.fromkeys(truth, 0.05)
     plant = Plant(clock.simulate, truth, stated, ("position_m",), np.array([1e-5]), model_error=model_error)
-    equipped = with_effects(plant, "all", records, dt_s=DT_S, motion="position_m")
+    equipped = with_effects(plant, "all", records, dt_s=DT_S, body=Body("position_m"))
     case = PlantCase("slow", equipped, tuple(records))
     begun = clock.now
     found = diagnose(case, time_limit_s=limit_s)

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete, lfilter
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
+from diagnosis.machine.around import Actuator, Body
 from diagnosis.machine.machine_protocol import Weighing
 from diagnosis.machine.probed import doubtful_columns, doubts_about
 from examples import own_plant
@@ -360,13 +361,16 @@ def _by(simulation):
         (lambda: _by(lambda p, e, u: p["m"] * u), "plant: with k 2 the simulation ended with KeyError: 'm'"),
         (lambda: _by(lambda p, e, u: u * (1 / (p["k"] - 2))), "as stated ended with ZeroDivisionError"),
         (lambda: _listed("none_such"), "no listed effect is called 'none_such'; there are input_delay"),
-        (lambda: _listed("coulomb_friction"), "coulomb_friction needs motion="),
-        (lambda: _listed("spring", motion="x"), "no output is called 'x'; there are y"),
-        (lambda: _listed("input_delay", input=1), "there is no input 1; the records have 1"),
-        (lambda: _listed("spring", motion="y", force=0, level=0.0), "needs largest_force="),
+        (lambda: _listed("coulomb_friction"), "coulomb_friction needs body="),
+        (lambda: _listed("spring", body=Body("x")), "no output is called 'x'; there are y"),
+        (lambda: _listed("input_delay", actuator=Actuator(1)), "there is no input 1; the records have 1"),
+        (lambda: _listed("spring", body=Body("y", force=0), level=0.0), "state largest_force="),
         (lambda: _listed("input_offset", level=0.0), "zero in every record"),
-        (lambda: _listed("spring", motion=3), r"column 3 of a simulation that returns \(30, 1\)"),
-        (lambda: _listed("spring", motion="y", late=9), "simulated motion follows the stated input later"),
+        (lambda: _listed("spring", body=Body(3)), r"column 3 of a simulation that returns \(30, 1\)"),
+        (
+            lambda: _listed("spring", body=Body("y"), late=9),
+            "simulated motion follows the stated input later",
+        ),
     ],
 )
 def test_bad_input_is_refused_in_one_line(make, message):

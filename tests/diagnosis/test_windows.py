@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
 
-from diagnosis import Case, Plant, PlantCase, PlantExperiment, diagnose, with_effects
+from diagnosis import Body, Case, Plant, PlantCase, PlantExperiment, diagnose, with_effects
 from diagnosis.fit.windows import Windows
 from tests.diagnosis.machines import rubbing
 from tests.diagnosis.test_imperfect import RIG, _experiment
@@ -77,7 +77,7 @@ def _late_tank(u, rng):
 def test_an_effect_is_sized_in_windows_beside_a_drift_nobody_lists(
     simulate, stated, truth, motion, name, size
 ):
-    found = diagnose(_case(simulate, stated, truth, motion=motion))
+    found = diagnose(_case(simulate, stated, truth, body=motion and Body(motion)))
     assert found.presence(name) > 0.8
     (value,) = next(e for e in found.effects if e.name == name).parameters.values()
     # 12 and 1 % measured: friction acts along the speed of a run that has drifted.

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from diagnosis.answer import Diagnosis, NamedEffect
-from diagnosis.machine.around import Body
+from diagnosis.machine.around import Actuator, Body, Sensor
 from diagnosis.machine.listed_effects import KINDS as LISTED
 from diagnosis.machine.machine_protocol import Real, check_count
 from diagnosis.machine.own_plant import OF_TRIAL, Plant, PlantCase, PlantExperiment, place_of
@@ -39,7 +39,6 @@ from workflow.engine.run_directory import hash_of
 from workflow.text.formats import listing
 from workflow.text.names import unit_of
 
-_PLACES = ("input", "output")
 # Of one log the last part judges what the first part fitted.
 _FITTED = 2 / 3
 # Of an FMU's or a Python file's value where nothing else is stated.
@@ -134,7 +133,7 @@ _SIZES = {
 
 def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dict[str, str]:
     """Parameter -> the same with its unit."""
-    on, names = effect.place and effect.place.on, plant.output_names
+    on, names = effect.place, plant.output_names
     units: dict[str, str] = {}
 
     def unit(name: str) -> str:
@@ -144,10 +143,11 @@ def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dic
     if effect.name.endswith(".sensor_offset"):  # of MuJoCo, whose other sizes have units
         units["S"] = unit(effect.name.removesuffix(".sensor_offset"))
     elif isinstance(on, Body):
-        units["F"], units["S"] = unit(inputs[on.force]), unit((*names, "")[on.motion])
+        at = on.motion if isinstance(on.motion, int) else 0
+        units["F"], units["S"] = unit(inputs[on.force or 0]), unit((*names, "")[at])
         units["x"] = units["S"] = units["S"].removesuffix("_s") if on.of_speed else units["S"]
-    elif isinstance(on, int):
-        units["S"] = unit(inputs[on] if effect.where == "input" else names[on])
+    elif isinstance(on, Sensor) or (isinstance(on, Actuator) and on.drive is None):
+        units["S"] = unit((names if isinstance(on, Sensor) else inputs)[on.column])
     found = {}
     for parameter in (one.name for one in effect.parameters):
         size = "{F}s2_{x}2" if effect.name.endswith("quadratic_drag") else _SIZES.get(parameter, "")
@@ -395,21 +395,24 @@ def _with_all(
             units=getattr(simulation, "units", {}),
             input_names=tuple(inputs),
         )
-        around = partial(with_effects, experiments=experiments, dt_s=dt_s, at_rest_before=False)
+        around = partial(with_effects, experiments=experiments, dt_s=dt_s)
         motion, motion_is = (outputs[0], settings.motion) if settings.motion else _motion(inputs, outputs)
+        body = Body(motion, motion_is) if motion else None
         try:
-            plant = around(plant, "all", motion=motion, motion_is=motion_is)
+            plant = around(plant, "all", actuator=Actuator(at_rest_before=False), body=body)
         except ValueError as error:
             # A motion that was only guessed may be none: its effects then stay untried, and the page says so.
             if settings.motion or motion is None:
                 raise ValueError(str(error).removesuffix(OF_TRIAL)) from error
-            plant = around(plant, "all")
+            plant = around(plant, "all", actuator=Actuator(at_rest_before=False))
         there = [LISTED[effect.name] for effect in plant.effects if effect.name in LISTED]
-        kinds = {place: [kind.name for kind in there if kind.where == place] for place in _PLACES}
+        of_actuator = [kind.name for kind in there if kind.where == "input"]
+        of_sensor = [kind.name for kind in there if kind.where == "output"]
         for column, name in enumerate(inputs[1:], start=1):
-            plant = around(plant, kinds["input"], input=column, prefix=f"{name}_")
+            actuator = Actuator(column, at_rest_before=False)
+            plant = around(plant, of_actuator, actuator=actuator, prefix=f"{name}_")
         for name in outputs[1:]:
-            plant = around(plant, kinds["output"], output=name, prefix=f"{name}_")
+            plant = around(plant, of_sensor, sensor=Sensor(name), prefix=f"{name}_")
         return plant, None, ()
 
     return finish
