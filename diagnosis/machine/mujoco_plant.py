@@ -45,7 +45,7 @@ TOLERANCES = {
     "drag": 0.2,
     "gain": 0.02,
     "kp": 0.02,
-    "kv": 0.1,
+    "kv": 0.02,
     "dead_zone": 0.2,
     "forcerange": 0.1,
     "lag": 0.2,
@@ -221,8 +221,6 @@ class MujocoArm(MujocoModel):
             self.dt_s,
             inactive={
                 **{name: need for name, need in sorted(needs.items()) if name not in every},
-                # Stated, and taken as exact: the damping of the joint does the same.
-                **{f"wrong_{n}": "its name in candidates" for n in {*there} - {*every} if n.endswith(".kv")},
                 **dict.fromkeys(silent, "records in which it shows"),
                 **dict.fromkeys(unstable, "smaller steps of the model (timestep)"),
             },

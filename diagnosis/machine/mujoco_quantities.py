@@ -166,7 +166,7 @@ class Quantities:
             yield _number(f"{one.name}.kp", float(one.gainprm[0]), put, tried=tried)
             if damping:
                 put = partial(put_scaled, one.name, "biasprm", (2,), -damping)
-                yield _number(f"{one.name}.kv", -float(damping), put, tried="by name")
+                yield _number(f"{one.name}.kv", -float(damping), put)
         if kinds == (0, 0):
             dead = self.model.number(f"{one.name}.{DEAD_ZONE}", 0.0)
             u = [actuator.name for actuator in self.model.spec.actuators].index(one.name)
