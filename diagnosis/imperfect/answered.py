@@ -22,9 +22,6 @@ from diagnosis.search.loop import Progress
 from diagnosis.search.search import Search
 from plant.effects.search_space import Candidate
 
-# What closes less than this share of the held-out gap, or leaves as much of the motion, is not put into the
-# model where the cause is unknown.
-_MOST_OF_IT = 0.5
 # RMS in noise deviations: what a simulation without error leaves, and a little that the search has not found.
 _NEAR_NOISE = 2.0
 
@@ -157,9 +154,9 @@ def _in_part(search: Search, found: judging.Verdict, *, looks_like: bool) -> Exp
         return found.nominal
     unlisted = set(whole.explanation.names) - {part.name for part in whole.parts}
     part, noise = _kept(search, whole, unlisted), search.case.noise
-    closes = closed_by(search, part, found.nominal) > _MOST_OF_IT
+    closes = closed_by(search, part, found.nominal) > judging.MOST_OF_IT
     nearer = part.pooled_held_out(noise) < found.nominal.pooled_held_out(noise)
-    return part if closes and nearer and np.max(part.shares[1]) < 1 - _MOST_OF_IT else found.nominal
+    return part if closes and nearer and np.max(part.shares[1]) < 1 - judging.MOST_OF_IT else found.nominal
 
 
 def _competing(search: Search, found: judging.Verdict) -> tuple[CompetingHypothesis, ...]:

@@ -41,6 +41,8 @@ _SOFT = 0.06
 # about it, and one standard deviation of it may act as an effect does (set on 40 generated cases, where dry
 # friction and cogging of the background added to what was found).
 LITTLE = 0.25
+# What closes less than this share of a gap does not close it.
+MOST_OF_IT = 0.5
 # A wrong stated value interests from this many tolerances on.
 _FAR_OFF = 4.4
 # What a complete answer leaves, and what an unknown cause does: medians in model errors, widths (logarithms
@@ -159,7 +161,6 @@ def judged(search: Search) -> Verdict:
         near_sets = [one for one in sets if one.score > sets[0].score - SUBSTANTIAL]
         for near in near_sets:
             search.exchanged(near.explanation, {part.name for part in near.parts if part.matters > 0.5})
-            search.joined(sets[0].explanation, near.explanation)
         for one in [*(near.explanation for near in near_sets), *search.found[known:]]:
             search.simpler(one)
         if len(search.found) == known:
@@ -341,7 +342,8 @@ def _part(
         return Part(name, 0.0, 0.0)
     k, weighing = explanation.names.index(name), search.case.machine.weighing
     model_error, listed = weighing.model_error, weighing.listed
-    estimated, held_out = map(float, _carried(rest, explanation))
+    carried = _carried(rest, explanation)
+    estimated, held_out = map(float, carried)
     # A drift may make much of an effect in the records it was fitted to.
     share = float(min(np.sqrt(estimated * held_out), held_out))
     if share < model_error < estimated and is_silent(search, explanation, name):
@@ -350,7 +352,9 @@ def _part(
         # Without it the others fit the records they were fitted to as well, with values that others refute.
         share = held_out
     share = max(share, seen.share if seen else 0.0)
-    matters, off = _soft(share / model_error), _tolerances_off(search, explanation, k)
+    least = _least_that_matters(search, carried, explanation) if name in listed else model_error
+    matters = _soft(share / least)
+    off = _tolerances_off(search, explanation, k)
     if off is not None:
         # A stated value in itself: what it changes may be imitated by the others within their tolerances. Far
         # off is not enough: of a value that nobody stated anything is.
@@ -359,6 +363,18 @@ def _part(
         # An effect and a deviation that cancel each other are no finding, whatever a fit without it left.
         matters *= _soft(off / EDGE)
     return Part(name, share, matters)
+
+
+def _least_that_matters(search: Search, carried: Real, explanation: Explanation) -> float:
+    """Share of the motion: the stated model error, or less where an effect explains most of the error that
+    there is, of estimation and of held-out records (carried, as shares of the motion), and its set leaves
+    less than a good model does. Then that says how much the simulation misses, and counts as much as what is
+    stated: the geometric mean of both."""
+    stated = search.case.machine.weighing.model_error
+    if np.any(carried**2 < MOST_OF_IT * np.max(search.base.mean_squares, axis=1)):
+        return stated
+    shown = float(np.max(np.sqrt(explanation.mean_squares))) / _IMPERFECTIONS
+    return float(np.sqrt(stated * np.clip(shown, _IMPERFECTIONS * stated, stated)))
 
 
 def is_silent(search: Search, explanation: Explanation, name: str) -> bool:

@@ -208,31 +208,12 @@ class SearchLoop(ABC, Generic[E]):
                 if (this := (*key, around.loss, explanation.evidence, rival.evidence)) in self._reduced:
                     continue
                 self._reduced.add(this)
-                joined = self._joined(around, rival, [other], explanation.end.loss)
-                if joined is not None:
-                    best[key] = joined
-
-    def joined(self, one: E, other: E) -> None:
-        """Both together where no set of their effects is known: each may explain other records, and larger
-        sets are sought beside the likeliest alone."""
-        further = [c for c in other.end.candidates if c.effect not in one.names]
-        together = (*one.end.candidates, *further)
-        key = tuple(sorted(c.effect for c in together))
-        contained = {c.kind.contains for c in together} & set(key)
-        if len(key) > self.case.machine.weighing.most_effects or contained or key in best_of_sets(self.found):
-            return
-        if (this := (*key, one.evidence, other.evidence)) not in self._reduced:
-            self._reduced.add(this)
-            self._joined(one.end, other, further, one.end.loss)
-
-    def _joined(self, around: Descent, rival: E, further: Sequence[Candidate], loss: float) -> E | None:
-        """Effects of a rival beside others, from where it ended; None where much more than `loss` is left."""
-        at = [rival.end.coordinates_of(rival.names.index(c.effect)) for c in further]
-        x, candidates = np.concatenate([around.coordinates, *at]), (*around.candidates, *further)
-        followed, d, x = best_following(self.records, around, candidates, [x])
-        if followed >= loss + DECISIVE:
-            return None
-        return self.add(descend(self.records, candidates, d, x, around.start))
+                at = rival.end.coordinates_of(rival.names.index(other.effect))
+                x, candidates = np.concatenate([around.coordinates, at]), (*around.candidates, other)
+                # Not where much more is left than with the effect that is replaced.
+                followed, d, x = best_following(self.records, around, candidates, [x])
+                if followed < explanation.end.loss + DECISIVE:
+                    best[key] = self.add(descend(self.records, candidates, d, x, around.start))
 
     def without(self, explanation: E, k: int) -> E:
         """The best explanation by the same effects but the k-th."""
