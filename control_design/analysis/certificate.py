@@ -20,7 +20,7 @@ from control_design.analysis.stability import (
     mode_changes,
     nyquist_count,
 )
-from control_design.analysis.worst_case import worst_case
+from control_design.analysis.worst_case import WorstCase, worst_case
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.frequency_grid import checked_grid, near_the_circle, with_own_grid
@@ -207,6 +207,33 @@ def certify(
     )
 
 
+def loop_margins(
+    controller: Controller, plant: UncertainPlant, worst: WorstCase
+) -> tuple[Margins, Margins, float]:
+    """Margins of the centres, the smallest over all members of the ellipses, and the bandwidth [rad/s] up to
+    which every member has |S| below -3 dB: on the grid of `worst` and, of a plant that is known there,
+    between its points. They say nothing of a loop that is not stable."""
+    known = plant.own_grid is None
+    integrates, _ = loop_integrators(controller, plant)
+
+    def loop_gain(omega: Real) -> Complex:
+        return controller.response(omega) * plant.at(omega).centre
+
+    at_zero = None if integrates else float(loop_gain(np.zeros(1))[0].real)
+    nominal = nominal_margins(loop_gain, worst.omega_rad_s, refinable=known, at_zero=at_zero)
+    distance = worst.values["distance"]
+    found = ellipse_margins(
+        worst.loop_factor,
+        worst.ellipses,
+        distance,
+        between=(lambda omega: (controller.response(omega), plant.at(omega))) if known else None,
+        at_zero=not integrates,
+    )
+    below = np.flatnonzero(distance < np.sqrt(2.0))
+    bandwidth = float(worst.omega_rad_s[below[0] - 1]) if below.size and below[0] > 0 else 0.0
+    return nominal, found.worse(nominal), bandwidth
+
+
 def _check_plant(
     controller: Controller,
     plant: UncertainPlant,
@@ -231,34 +258,21 @@ def _check_plant(
     grid = np.union1d(grid, own_points) if assumed_linear else own_points
 
     worst = worst_case(partial(controller.response, with_delay=False), seen, specification, grid)
-    refinable = seen.own_grid is None
-
-    def loop_gain(omega: Real) -> Complex:
-        return controller.response(omega) * seen.at(omega).centre
-
     integrators, unstable = loop_integrators(controller, plant)
-    dense = worst.omega_rad_s
     # On a plant's own frequencies the count is that of its data; what lies between them is the proof's.
-    counted = own_points if assumed_linear else dense
+    counted = own_points if assumed_linear else worst.omega_rad_s
     count = nyquist_count(
-        loop_gain, counted, integrators=integrators, unstable_poles=unstable, refinable=plant.own_grid is None
+        lambda omega: controller.response(omega) * seen.at(omega).centre,
+        counted,
+        integrators=integrators,
+        unstable_poles=unstable,
+        refinable=plant.own_grid is None,
     )
-    at_zero = None if integrators else float(loop_gain(np.zeros(1))[0].real)
-    nominal = nominal_margins(loop_gain, dense, refinable=refinable, at_zero=at_zero)
-    distance = worst.values["distance"]
-    margins = ellipse_margins(
-        worst.loop_factor,
-        worst.ellipses,
-        distance,
-        between=(lambda omega: (controller.response(omega), seen.at(omega))) if refinable else None,
-        at_zero=not integrators,
-    ).worse(nominal)
-    at = int(np.argmin(distance))
+    nominal, margins, bandwidth = loop_margins(controller, seen, worst)
+    at = int(np.argmin(worst.values["distance"]))
     peaks: dict[str, tuple[float, float | None]] = {name: worst.peak(name) for name in worst.names}
     weighted = max(peak for peak, _ in peaks.values())
     stable = bool(radius < 1.0)
-    below = np.flatnonzero(distance < np.sqrt(2.0))
-    bandwidth = float(worst.omega_rad_s[below[0] - 1]) if below.size and below[0] > 0 else 0.0
     peak_sensitivity = 1.0 / margins.modulus if margins.modulus > 0 else float("inf")
     if not stable:  # |1 + K G| says nothing of a loop that is not stable
         nominal = margins = Margins(*[np.nan] * len(fields(Margins)))

@@ -369,7 +369,7 @@ class ControllerDamping(Requirement):
     """Damping ratio of the controller's own pole pairs, a bound on parameters in the synthesis."""
 
     zeta: float
-    caption = "damping ratio of the controller's own poles"
+    caption = f"damping ratio of the controller's own poles, within {100 * SOLVER_SLACK:g} %"
 
     def check(self, found: Findings) -> SpecificationItem:
         # In Tustin's plane, where the cascade and its bound live: ln z would call fast pairs less damped.

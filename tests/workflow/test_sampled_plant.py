@@ -8,7 +8,7 @@ from control_design.analysis.closed_loop import LinearMachine, simulate
 from control_design.controllers.controller import Controller
 from ident.basis.poles import Poles
 from ident.uncertainty import ResponsePosterior
-from workflow.tasks.sampled_plant import FINITE, realise, simulate_draw
+from workflow.tasks.sampled_plant import FINITE, realise, simulate_plant
 
 DT_S = 0.01
 
@@ -54,7 +54,7 @@ def test_closed_loop_is_the_linear_feedback(feedthrough):
     gain = 0.3
     reference = np.where(np.arange(80) >= 5, 1.0, 0.0)
     disturbance = np.where(np.arange(80) >= 40, 0.5, 0.0)
-    run = simulate_draw(law(gain, 1), found, found.mean, reference, input_disturbance=disturbance)
+    run = simulate_plant(law(gain, 1), realise(found, found.mean), reference, input_disturbance=disturbance)
     plant = realise(found, found.mean)
     assert (plant.D.item() != 0) == feedthrough
     late = control.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], DT_S)
@@ -71,7 +71,7 @@ def test_closed_loop_is_the_linear_feedback(feedthrough):
 def test_direct_term_without_a_delay_is_refused():
     found = posterior(feedthrough=True, integrators=0, delay=0)
     with pytest.raises(ValueError, match="at least one sample of computational delay"):
-        simulate_draw(law(0.3, 0), found, found.mean, np.ones(5))
+        simulate_plant(law(0.3, 0), realise(found, found.mean), np.ones(5))
 
 
 def test_loop_that_runs_away_stays_finite():

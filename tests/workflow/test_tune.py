@@ -8,7 +8,6 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ import control
 import numpy as np
 import pytest
 
-from control_design.analysis.closed_loop import LinearMachine, simulate
 from control_design.plants.plant_set import UncertainPlant
 from tests.browser import PROGRAM, Browser
 from tests.workflow import report_examples as example
@@ -29,6 +27,7 @@ from workflow.config.design_file import DesignFile, read_design_file
 from workflow.engine import codec
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.results import IdentifiedPlant, RunResults
+from workflow.text.formats import percent, si
 
 UNCERTAIN = "\n[uncertainty]\nmultiplicative = 0.05\n"
 
@@ -166,24 +165,6 @@ def test_the_scaled_design_is_the_last_one_times_a_gain(session):
     assert np.allclose(limit[np.isfinite(limit)], 5.0, rtol=1e-3)
     # A smaller gain suits a smaller effort.
     assert found["gain"] < session.scaled({"effort_limit": 50.0})["gain"]
-
-
-def test_the_step_is_that_of_the_loop(session):
-    session.design({})
-    step = session.scaled({})["plants"][0]["step"]
-    gain = session.scaled({})["gain"]
-    law = replace(
-        session._last,
-        C=gain * session._last.C,
-        D=gain * session._last.D,
-        anti_windup_gain=None,
-        input_limit=None,
-    )
-    time_s = np.array(step["x"])
-    whole = simulate(law, LinearMachine(arm()), np.ones(int(time_s[-1] / DT_S) + 2)).measured
-    # Of an impulse response that has fallen to a thousandth, what is left wraps around.
-    assert np.allclose(step["nominal"], whole[np.rint(time_s / DT_S).astype(int)], atol=5e-3)
-    assert step["samples"] == []
 
 
 def test_confidence_is_kept_with_the_design(posterior_session):
@@ -419,7 +400,7 @@ def test_controls_are_made_of_the_specification(session):
 
 
 def test_an_order_of_its_own_choice(session):
-    assert 1 <= session.design({"controller_order": "auto"})["order"] <= 12
+    assert 1 <= int(dict(session.design({"controller_order": "auto"})["numbers"])["controller order"]) <= 12
 
 
 def test_a_plant_of_its_own_grid_has_curves_on_it(session):
@@ -434,6 +415,25 @@ def test_a_plant_of_its_own_grid_has_curves_on_it(session):
     plant = UncertainPlant("known", control.ss(nominal), Known())
     gains = tuning._gains(session._last, plant, session.specification)
     assert len(gains[0]["x"]) == 40
+
+
+def test_numbers_beside_the_sliders_are_those_of_the_run(fast_run, monkeypatch, tmp_path):
+    """Its own controller: predicted step and certified margins, as its page and terminal have them."""
+    results = RunResults(RunDirectory(fast_run[0]))
+    session = TuningSession([fast_run[0]], DesignFile(), tmp_path / "saved", 2006)
+    monkeypatch.setattr(tuning, "_GAINS", np.ones(1))
+    found = session.scaled({})
+    shown, check = dict(found["numbers"]), results.closed_loop.check
+    worst, step = results.certify.certificate.plants[0].worst_margins, check.predicted
+    assert shown["overshoot"] == percent(step.overshoot_percent)
+    assert shown["settling time to 2 %"] == si(step.settling_time_s, "s")
+    assert shown["peak command"] == si(step.peak_command, "V")
+    assert session.step_words == si(check.reference_step, "rad", 4)
+    phase, delay = np.degrees(worst.phase_rad), 1000 * worst.delay_s
+    margins = {"modulus": worst.modulus, "gain": worst.gain_up, "phase": phase, "delay": delay}
+    for name, value in margins.items():  # the certificate's grid is denser
+        assert float(shown[f"{name} margin"].split()[0]) == pytest.approx(value, rel=0.01)
+    assert len(found["plants"][0]["step"]["samples"]) == 15
 
 
 def test_a_run_is_tuned_from_its_own_design_at_the_bandwidth_it_found(fast_run, tmp_path):

@@ -83,20 +83,18 @@ def load_asked(
     return sources, asked, specification
 
 
-def of_run(paths: Sequence[Path]) -> DesignResult | None:
-    """What the run has designed whose directory is the only plant."""
-    if len(paths) > 1 or not paths[0].is_dir():
-        return None
-    run = RunDirectory.open(paths[0])
-    return RunResults(run).design if run.stage_file("design") else None
+def of_run(paths: Sequence[Path]) -> RunResults | None:
+    """The run whose directory is the only plant, if it has come to a design."""
+    run = RunDirectory.open(paths[0]) if len(paths) == 1 and paths[0].is_dir() else None
+    return RunResults(run) if run is not None and run.stage_file("design") else None
 
 
-def at_one_bandwidth(specification: Specification, found: DesignResult | None) -> Specification:
+def at_one_bandwidth(specification: Specification, found: RunResults | None) -> Specification:
     """Of one that leaves the bandwidth open: that which its run has found, or the one to try first. A search
     for it takes a dozen designs."""
     known = specification.model_dump(include=set(Specification.model_fields))
     if known.pop("lowest_bandwidth_rad_s") is not None and found is not None:
-        known["bandwidth_rad_s"] = (found.specification or specification).bandwidth_rad_s
+        known["bandwidth_rad_s"] = (found.design.specification or specification).bandwidth_rad_s
     return Specification.model_validate(known)
 
 

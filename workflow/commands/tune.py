@@ -70,6 +70,8 @@ class TuneServer(ThreadingHTTPServer):
                     for name, value in session.specification.model_dump(exclude_none=True).items()
                     if isinstance(value, dict | tuple)
                 ],
+                step=session.step_words,
+                filtered=session.filter is not None,
                 out=session.out,
                 name=next(name for k in count(1) if not (session.out / (name := f"tuned-{k}")).exists()),
             )

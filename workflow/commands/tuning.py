@@ -7,23 +7,28 @@ import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, reduce
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+import control
 import numpy as np
 import tomlkit
 
-from control_design.analysis.certificate import Certificate, certify
-from control_design.analysis.joint_coverage import at_level, drawn
+from control_design.analysis.certificate import certify, loop_margins
+from control_design.analysis.closed_loop import ClosedLoopTrajectory, step_metrics
+from control_design.analysis.joint_coverage import at_level
+from control_design.analysis.margins import Margins
 from control_design.analysis.stability import closed_loop_poles
-from control_design.analysis.worst_case import PlantData, worst_of
+from control_design.analysis.worst_case import PlantData, WorstCase, worst_of
 from control_design.controllers.controller import Controller
-from control_design.plants.ellipses import Complex, Real
+from control_design.plants.ellipses import Real
 from control_design.plants.frequency_grid import checked_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification, SpecificationError
 from control_design.synthesis.synthesis import synthesise_near
+from ident.uncertainty import ResponsePosterior
 from workflow.commands.design import at_one_bandwidth, design_controller, load_asked, of_run
 from workflow.config.design_file import DesignFile, PlantSection, read_design_file
 from workflow.config.settings import check
@@ -34,14 +39,17 @@ from workflow.figures.sensitivity import sensitivity_curves
 from workflow.figures.subjects import unit_of
 from workflow.tasks.design import bracket_numbers, find_bracket, find_design
 from workflow.tasks.design_source import level_can_change
+from workflow.tasks.loop_sensitivity import settling_samples
 from workflow.tasks.results import DesignResult
-from workflow.text.templates import said
+from workflow.tasks.sampled_plant import FINITE, realise, simulate_plant
+from workflow.text.formats import bound, si, unit
+from workflow.text.templates import rows_of, said
 
 CONFIDENCE = "confidence"  # a setting beside those of the specification: level of the ellipses
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,60}")
 _GAINS = np.geomspace(0.25, 4.0, 33)  # of the last controller, tried for settings that have no design yet
 _SAMPLES = 15  # posterior samples whose steps are shown
-_LONGEST = 1 << 14  # samples of a step response
+_STEP_SAMPLES = 200, 1 << 14  # of two steps: a run's, as far as an answer comes soon
 _SHOWN = 1e-4  # share of the Nyquist frequency where pictures over frequency begin, or lower
 _NEAR = 3.0  # distance from 0 up to which the Nyquist curve is shown
 _ELLIPSES, _CORNERS = 60, 24
@@ -72,7 +80,13 @@ class TuningSession:
         self.specification = at_one_bandwidth(specification, found)
         self._plants, self._units = [source.plant for source in sources], sources[0].units
         self.drawable = all(level_can_change(plant) for plant in self._plants)
-        self._last = None if found is None else found.controller
+        self._last = None if found is None else found.design.controller
+        # Overshoot, settling time and command are those of the run's reference step, through its filter.
+        self._step_size, self.filter = 1.0, None
+        if found is not None and found.run.stage_file("closed_loop") and found.closed_loop.check is not None:
+            self._step_size = found.closed_loop.check.reference_step
+            self.filter = found.reference_filter.filter
+        self.step_words = si(self._step_size, self._units[1] or "in the unit of the output", 4)
         self._newest, self._designing = 0, threading.Lock()
 
     # -- settings --------------------------------------------------------------------------------------------
@@ -83,10 +97,9 @@ class TuningSession:
         del fields["lowest_bandwidth_rad_s"]
         found = [_control(name, field, getattr(self.specification, name)) for name, field in fields.items()]
         if self.drawable:
-            level = {"ge": 0.5, "lt": 0.9999}
             words = "confidence of each ellipse: share of the probability inside"
             about = {"name": CONFIDENCE, "kind": "number", "words": words, "value": self._plants[0].level}
-            found.append(about | level)
+            found.append(about | {"ge": 0.5, "lt": 0.9999})
         return [one | {"unit": unit_of(one["name"], *self._units)} for one in found if one is not None]
 
     def _read(self, values: Mapping[str, Any]) -> tuple[Specification, list[UncertainPlant], float | None]:
@@ -118,17 +131,20 @@ class TuningSession:
             raise InputError("no design yet: wait for the first")
         data = [PlantData.build(p, specification, _grid(p, last, 120, 20)) for p in plants]
         k = [last.response(one.ellipses.omega_rad_s, with_delay=False) for one in data]
-
-        def gamma(gain: float) -> float:
-            worst = [worst_of(d.weighted(gain * v)) for d, v in zip(data, k, strict=True)]
-            return max(float(np.max(one)) for one in worst)
-
-        ranked = sorted((gamma(gain), abs(math.log(gain)), gain) for gain in _GAINS.tolist())
-        for found, _, gain in ranked:
+        ranked = []
+        for gain in _GAINS.tolist():
+            worst = [
+                WorstCase(d.ellipses.omega_rad_s, d.ellipses, gain * v * d.delay, d.weighted(gain * v))
+                for d, v in zip(data, k, strict=True)
+            ]
+            gamma = max(float(np.max(worst_of(one.values))) for one in worst)
+            ranked.append((gamma, abs(math.log(gain)), gain, worst))
+        for gamma, _, gain, worst in sorted(ranked, key=itemgetter(0, 1)):
             law = replace(last, C=gain * last.C, D=gain * last.D, anti_windup_gain=None)
             if all(np.all(np.abs(closed_loop_poles(law, plant)) < 1) for plant in plants):
-                numbers = {"gain": gain, "gamma": found, "certified": None}
-                return {**_finite(numbers), "plants": self._curves(law, plants, specification)}
+                margins = [loop_margins(law, p, one)[1:] for p, one in zip(plants, worst, strict=True)]
+                numbers = {"gain": gain, "gamma": gamma, "certified": None}
+                return {**_finite(numbers), **self._seen(law, plants, specification, gamma, margins)}
         raise InputError("no gain keeps the last controller stable with these settings")
 
     def near(self, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -136,14 +152,12 @@ class TuningSession:
         nowhere."""
         if self._last is None or self.file.certificate.calibrate:
             return {}
-        found = self._designed(values, self._last)
+        found = self.design(values, self._last)
         return found if found["plants"] else {}
 
-    def design(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """A new design with its certificate. Raises SupersededError where a newer one is asked for."""
-        return self._designed(values, None)
-
-    def _designed(self, values: Mapping[str, Any], like: Controller | None) -> dict[str, Any]:
+    def design(self, values: Mapping[str, Any], like: Controller | None = None) -> dict[str, Any]:
+        """A new design with its certificate, `like` a controller or whole. Raises SupersededError where a
+        newer one is asked for."""
         asked = self.completed(values)
         specification, plants, _ = self._read(values)
         self._newest += 1
@@ -173,13 +187,24 @@ class TuningSession:
                 active = next(iter(found.synthesis.blocking), None)
                 words = active and f"{active.weight} of {active.plant} at {active.omega_rad_s:.4g} rad/s"
                 numbers |= {"gamma": found.synthesis.gamma, "active": words or ""}
-                numbers["order"] = found.synthesis.controller.order
             if law is None:
                 return {**_finite(numbers), "plants": []}
             certificate = certify(law, plants, used, between_own_points=asked.plant.between_points)
             still()
             self._last = law
-        return {**_finite(numbers | _of(certificate)), "plants": self._curves(law, plants, used)}
+        margins = [(verdict.worst_margins, verdict.bandwidth_rad_s) for verdict in certificate.plants]
+        seen = self._seen(law, plants, used, certificate.gamma, margins)
+        items = [
+            {
+                "requirement": item.requirement + (f" ({item.plant})" if len(plants) > 1 else ""),
+                "required": ("≥ " if item.at_least else "≤ ") + si(item.required, item.unit, 4),
+                "achieved": unit(bound(item.achieved, item.at_least), item.unit),
+                "met": item.met,
+            }
+            for item in certificate.items
+        ]
+        numbers |= {"certified": certificate.certified, "gamma": certificate.gamma, "items": items}
+        return {**_finite(numbers), **seen, "reason": said("certificate_reason", certificate)}
 
     def bound(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """What a controller of any order could reach with these settings."""
@@ -212,50 +237,65 @@ class TuningSession:
 
     # -- curves ----------------------------------------------------------------------------------------------
 
-    def _curves(
-        self, law: Controller, plants: Sequence[UncertainPlant], specification: Specification
-    ) -> list[dict[str, Any]]:
-        return [
-            {
-                "name": plant.name,
-                "gains": _gains(law, plant, specification),
-                "nyquist": _nyquist(law, plant),
-                "step": self._step(law, plant),
-            }
-            for plant in plants
-        ]
+    def _seen(
+        self,
+        law: Controller,
+        plants: Sequence[UncertainPlant],
+        specification: Specification,
+        gamma: float,
+        margins: Sequence[tuple[Margins, float]],
+    ) -> dict[str, Any]:
+        """Numbers (words, value) and curves of a loop. margins: over the ellipses of each plant, with its
+        bandwidth [rad/s]."""
+        runs = [self._steps(law, plant) for plant in plants]
+        table = rows_of(
+            "summary/tune.j2",
+            gamma=gamma,
+            margins=reduce(Margins.worse, [worst for worst, _ in margins]),
+            bandwidth_rad_s=min(bandwidth for _, bandwidth in margins),
+            steps=[step_metrics(nominal) for nominal, *_ in runs],
+            unit=self._units[0],
+            order=law.order,
+        )
+        curves = []
+        for plant, (nominal, *drawn) in zip(plants, runs, strict=True):
+            y = nominal.measured
+            # The step until it hardly moves.
+            away = np.flatnonzero(np.abs(y - y[-1]) > 0.01 * self._step_size)
+            shown = min(y.size, max(40, int(1.5 * (away[-1] + 1)) if away.size else 40))
+            at = np.unique(np.linspace(0, shown - 1, 300).astype(int))
+            curves.append(
+                {
+                    "name": plant.name,
+                    "gains": _gains(law, plant, specification),
+                    "nyquist": _nyquist(law, plant),
+                    "step": {
+                        "x": _short(nominal.time_s[at]),
+                        "nominal": _short(y[at]),
+                        "samples": [_short(run.measured[at]) for run in drawn],
+                    },
+                }
+            )
+        return {"numbers": table[0].rows, "plants": curves}
 
-    def _step(self, law: Controller, plant: UncertainPlant) -> dict[str, Any]:
-        """Unit step of the reference: nominal, and models drawn from the posterior where there are any."""
+    def _steps(self, law: Controller, plant: UncertainPlant) -> list[ClosedLoopTrajectory]:
+        """The reference step on the nominal model, and on models drawn from the posterior where there is one;
+        as a run predicts it (`workflow.tasks.closed_loop`)."""
         radius = float(np.max(np.abs(closed_loop_poles(law, plant)), initial=0.0))
-        if not radius < 1.0:
-            return {}
-        needed = math.log(1e-3) / math.log(max(radius, 1e-3))
-        n = min(max(256, 1 << math.ceil(math.log2(needed + 1))), _LONGEST)
-        omega = plant.nyquist_rad_s * np.linspace(0.0, 1.0, n // 2 + 1).clip(1e-6)
-        loop = law.response(omega) * np.vstack([plant.channel.nominal_response(omega), self._drawn(plant, n)])
-        steps = np.cumsum(np.fft.irfft(loop / (1.0 + loop), n, axis=1), axis=1)
-        away = np.flatnonzero(np.abs(steps[0] - steps[0, -1]) > 0.01 * max(abs(steps[0, -1]), 1e-300))
-        shown = min(n, max(40, int(1.5 * (away[-1] + 1)) if away.size else 40))
-        at = np.unique(np.linspace(0, shown - 1, 300).astype(int))
-        return {
-            "x": _short(at * plant.dt_s),
-            "nominal": _short(steps[0, at]),
-            "samples": [_short(one[at]) for one in steps[1:]],
-        }
-
-    def _drawn(self, plant: UncertainPlant, n: int) -> Complex:
-        """Responses (D, n/2 + 1) drawn from the posterior, the same at every call; none where none can be."""
-        number = next(k for k, known in enumerate(self._plants) if known.name == plant.name)
-        if not self.drawable:
-            return np.empty((0, n // 2 + 1), dtype=np.complex128)
-        return _samples(self._plants[number], n, self.seed)
+        step = np.full(settling_samples(radius, *_STEP_SAMPLES) // 2, self._step_size)
+        given = step if self.filter is None else self.filter.filtered(step)
+        models = [plant.nominal]
+        if isinstance(plant.uncertainty, ResponsePosterior):
+            models = _models(plant.uncertainty, self.seed)
+        runs = [simulate_plant(law, model, given, clip=FINITE) for model in models]
+        return [replace(run, reference=step) for run in runs]
 
 
 @lru_cache(maxsize=8)
-def _samples(plant: UncertainPlant, n: int, seed: int) -> Complex:
-    omega = plant.nyquist_rad_s * np.linspace(0.0, 1.0, n // 2 + 1).clip(1e-6)
-    return np.asarray(drawn(plant.channel)(stage_rng(seed, "tune"), _SAMPLES)(omega))
+def _models(posterior: ResponsePosterior, seed: int) -> list[control.StateSpace]:
+    """The mean, and models drawn from the posterior, the same at every call."""
+    drawn = posterior.sample(stage_rng(seed, "tune"), _SAMPLES)
+    return [realise(posterior, one) for one in (posterior.mean, *drawn)]
 
 
 def _grid(plant: UncertainPlant, law: Controller, n_log: int, per_mode: int) -> Real:
@@ -300,32 +340,6 @@ def _nyquist(law: Controller, plant: UncertainPlant) -> dict[str, Any]:
         "re": _short(line.real),
         "im": _short(line.imag),
         "ellipses": [[_short(one.real), _short(one.imag)] for one in outline],
-    }
-
-
-def _of(certificate: Certificate) -> dict[str, Any]:
-    """Verdict, worst margins and requirements of a certificate."""
-    plants = certificate.plants
-    worst = [verdict.worst_margins for verdict in plants]
-    return {
-        "certified": certificate.certified,
-        "gamma": certificate.gamma,
-        "proved": certificate.gamma_bound,
-        "reason": said("certificate_reason", certificate),
-        "modulus": min(one.modulus for one in worst),
-        "gain_margin": min(one.gain_up for one in worst),
-        "phase_deg": math.degrees(min(one.phase_rad for one in worst)),
-        "delay_ms": 1e3 * min(one.delay_s for one in worst),
-        "bandwidth": min(verdict.bandwidth_rad_s for verdict in plants),
-        "items": [
-            {
-                "requirement": item.requirement + (f" ({item.plant})" if len(plants) > 1 else ""),
-                "required": ("≥ " if item.at_least else "≤ ") + f"{item.required:.4g} {item.unit}".strip(),
-                "achieved": f"{item.achieved:.4g} {item.unit}".strip(),
-                "met": item.met,
-            }
-            for item in certificate.items
-        ],
     }
 
 

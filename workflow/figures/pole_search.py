@@ -172,7 +172,20 @@ def _stabilisation(axes: Axes, plot: Stabilisation, response: FrequencyUncertain
     stable, same = plot.stable, plot.previous >= 0
     axes.set_xscale("log")
     if response is not None:
-        _faint(axes, response)
+        # The gain behind the marks, on a log scale of its own that nobody has to read.
+        gain = np.abs(response.centre)
+        seen, log = response.omega_rad_s[gain > 0], np.log(gain[gain > 0])
+        low, high = np.percentile(log, 1), log.max()
+        axes.plot(
+            seen,
+            0.03 + 0.94 * np.clip((log - low) / max(high - low, 1e-12), 0.0, 1.0),
+            transform=axes.get_xaxis_transform(),
+            color=style.MEASURED,
+            lw=0.8,
+            alpha=0.4,
+            label="gain computed from the records (own log scale)",
+        )
+        axes.set_xlim(seen[0], seen[-1])
     for mode in plot.columns():
         axes.axvline(mode.omega_rad_s, color=style.PREDICTED, lw=0.9, alpha=0.5)
     kinds = (
@@ -194,21 +207,3 @@ def _stabilisation(axes: Axes, plot: Stabilisation, response: FrequencyUncertain
         axes.set_xlim(omega.min() / 1.5, omega.max() * 1.5)
     axes.set_title("Stabilisation: which modes stay")
     axes.set(xlabel=_PAIR_AXIS, ylabel="pole pairs in the fit [1]")
-
-
-def _faint(axes: Axes, response: FrequencyUncertainty) -> None:
-    """The gain behind the marks, on a log scale of its own that nobody has to read."""
-    gain = np.abs(response.centre)
-    omega, log = response.omega_rad_s[gain > 0], np.log(gain[gain > 0])
-    low, high = np.percentile(log, 1), log.max()
-    height = np.clip((log - low) / max(high - low, 1e-12), 0.0, 1.0)
-    axes.plot(
-        omega,
-        0.03 + 0.94 * height,
-        transform=axes.get_xaxis_transform(),
-        color=style.MEASURED,
-        lw=0.8,
-        alpha=0.4,
-        label="gain computed from the records (own log scale)",
-    )
-    axes.set_xlim(omega[0], omega[-1])

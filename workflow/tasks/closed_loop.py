@@ -21,7 +21,7 @@ from workflow.tasks.friction_loop import check_friction
 from workflow.tasks.loop_conditions import ConditionBench
 from workflow.tasks.loop_sensitivity import rms_of, sensitivity_on_arm, settling_samples
 from workflow.tasks.results import ClosedLoopResult, LoopCheck, LoopMetrics, LoopRuns
-from workflow.tasks.sampled_plant import simulate_draw
+from workflow.tasks.sampled_plant import realise, simulate_plant
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, converter_steps, loop_of_arm, rig_of
 from workflow.tasks.stage import StageInput
 
@@ -190,7 +190,7 @@ def run_on_draws(
     one: its output follows from the command that acted. steps: of the converters."""
     posterior, draws = drawn
     how: dict[str, Any] = {"input_disturbance": trial.disturbance, **steps}
-    runs = [simulate_draw(controller, posterior, one, trial.given, **how) for one in draws]
+    runs = [simulate_plant(controller, realise(posterior, one), trial.given, **how) for one in draws]
     if shown is None:
         return _loop_runs(runs, None)
     tip, tip_draws = shown

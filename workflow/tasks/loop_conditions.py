@@ -24,7 +24,7 @@ from plant.rig import Rig
 from plant.simulation import simulate as simulate_arm
 from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
 from workflow.tasks.results import ConditionRun
-from workflow.tasks.sampled_plant import FINITE, simulate_draw
+from workflow.tasks.sampled_plant import FINITE, realise, simulate_plant
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, UNITS, encoded_arm
 from workflow.text.templates import said
 
@@ -100,10 +100,9 @@ class ConditionBench:
         clip: float = np.inf,
     ) -> ClosedLoopTrajectory:
         """The loop on the posterior mean, which has no friction for a feed-forward to meet."""
-        return simulate_draw(
+        return simulate_plant(
             replace(law or self.controller, feedforward=None),
-            self.posterior,
-            self.posterior.mean,
+            realise(self.posterior, self.posterior.mean),
             self._filtered(reference),
             output_disturbance=output_disturbance,
             clip=clip,

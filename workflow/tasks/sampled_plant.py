@@ -1,4 +1,4 @@
-"""A plant drawn from an identified posterior, in a closed loop."""
+"""A plant drawn from an identified posterior, and a linear plant in a closed loop."""
 
 from __future__ import annotations
 
@@ -52,10 +52,9 @@ def _part(
     ).to_control()
 
 
-def simulate_draw(
+def simulate_plant(
     controller: Controller,
-    posterior: ResponsePosterior,
-    coefficients: RealArray,
+    plant: control.StateSpace,
     reference: RealArray,
     *,
     input_disturbance: RealArray | None = None,
@@ -64,14 +63,12 @@ def simulate_draw(
     command_step: float = 0.0,
     clip: float = np.inf,
 ) -> ClosedLoopTrajectory:
-    """The loop on the plant of one draw of coefficients (P,); signals (T,), steps and clip as of
-    `simulate`.
+    """The loop on a discrete plant, as of `realise`; signals (T,), steps and clip as of `simulate`.
 
     A direct term answers to the input of the same instant, which a sampled machine cannot do: it is measured
     before the input is known. There the machine keeps one sample of the loop's computational delay itself.
     Raises ValueError where the loop has none.
     """
-    plant = realise(posterior, coefficients)
     direct = bool(np.any(plant.D != 0))
     if direct:
         delay = controller.computational_delay_samples

@@ -186,15 +186,12 @@ const numbers = () => {
   $("verdict").className = "verdict" + (state ? " certified" : state == null ? " plain" : "");
   $("headline").textContent = state ? "Certified" : state == null ? "Not certified yet" : "Not certified";
   $("numbers").replaceChildren();
-  const rows = [
-    ["worst case γ", "gamma", 4], ["γ of any order, bound", "bound", 4], ["modulus margin", "modulus", 3], ["phase margin, deg", "phase_deg", 3],
-    ["gain margin, factor", "gain_margin", 3], ["delay margin, ms", "delay_ms", 3], ["bandwidth, rad/s", "bandwidth", 4], ["controller order", "order", 3],
-  ];
-  for (const [words, key, n] of rows) {
-    const box = make("div", $("numbers")), old = shown.stale && key !== "gamma";
+  const rows = found => [...found?.numbers ?? [], ["γ of any order, bound", digits(found?.bound)]], other = new Map(rows(pinned));
+  for (const [words, value] of rows(shown)) {
+    const box = make("div", $("numbers"));
     make("dt", box, words);
-    const value = make("dd", box, old ? "…" : digits(shown[key], n));
-    if (pinned) make("small", value, "pinned: " + digits(pinned[key], n));
+    const cell = make("dd", box, value);
+    if (pinned) make("small", cell, "pinned: " + (other.get(words) ?? "–"));
   }
   const box = make("div", $("numbers"));
   make("dt", box, "active constraint");
