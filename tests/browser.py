@@ -1,6 +1,7 @@
 """What a reader's browser makes of a page: Chromium without a screen, over a pipe (DevTools protocol)."""
 
 import base64
+import importlib.util
 import json
 import os
 import shutil
@@ -154,6 +155,19 @@ class Browser:
 
 
 _READER = Path(__file__).with_name("reader.js").read_text().partition("\n")[2]
+AXE = importlib.util.find_spec(
+    "axe_core_python"
+)  # of the extra dev
+_SERIOUS = """axe.run().then(found => found.violations.filter(one => /serious|critical/.test(one.impact))
+  .map(one => `${one.impact}: ${one.id}, ${one.nodes.length} times: ${one.nodes[0].html.slice(0, 100)}`))"""
+
+
+def barriers(browser: Browser) -> list[str]:
+    """What axe-core calls serious or critical on the open page; nothing where it is not installed."""
+    if AXE is None or AXE.origin is None:
+        return []
+    browser.ask(Path(AXE.origin).with_name("axe.min.js").read_text(encoding="utf-8") + ";0")
+    return list(browser.ask(_SERIOUS))
 
 
 def faults_of(browser: Browser, page: Path) -> list[str]:
@@ -162,5 +176,5 @@ def faults_of(browser: Browser, page: Path) -> list[str]:
     for width, dark in ((1280, False), (1280, True), (400, False)):
         browser.open(page, width, dark=dark)
         faults, _ = browser.ask(f"({_READER})()")
-        found += [f"{page.name}: {fault}" for fault in faults + browser.complaints()]
+        found += [f"{page.name}: {fault}" for fault in faults + browser.complaints() + barriers(browser)]
     return list(dict.fromkeys(found))

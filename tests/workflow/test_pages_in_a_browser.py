@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from plant import paper_link
-from tests.browser import PROGRAM, Browser
+from tests.browser import AXE, PROGRAM, Browser, barriers
 from tests.workflow import report_examples as example
 from tests.workflow.page_shape import shape_faults
 from workflow.figures.bode import draw_bode
@@ -126,13 +126,13 @@ def test_an_entry_of_the_legend_hides_what_it_names_by_mouse_and_keys(opened):
     hidden = "[...document.querySelectorAll('.plot')[0].querySelectorAll('.k1')].map(g => g.style.display)"
     assert set(opened.ask(hidden)) == {""}
     assert len(opened.ask(hidden)) == 2  # in the panels of gain and phase
-    opened.ask("document.querySelectorAll('.legend li')[1].focus()")
+    opened.ask("document.querySelectorAll('[data-entry]')[1].focus()")
     opened.press("Enter")
     assert set(opened.ask(hidden)) == {"none"}
     left, top, right, bottom = axes(opened, 0)["box"]
     opened.mouse("mouseMoved", *place(opened, (left + right) / 2, (top + bottom) / 2))
     assert "identified response (centre)" not in tip(opened)
-    opened.ask("document.querySelectorAll('.legend li')[1].click()")
+    opened.ask("document.querySelectorAll('[data-entry]')[1].click()")
     assert set(opened.ask(hidden)) == {""}
 
 
@@ -163,17 +163,14 @@ def test_a_picture_saved_from_the_page_looks_like_itself(opened):
     assert len(image) > 20_000  # an empty canvas of this size has less
 
 
-def test_a_narrow_screen_gets_panels_below_each_other(browser, page):
+def test_a_narrow_screen_gets_panels_below_each_other(browser, faults_seen, page):
+    assert faults_seen(page) == []
     browser.open(page, 400)
     widths = (
         "[...document.querySelectorAll('.parted > svg.part')].map(svg => svg.getBoundingClientRect().width)"
     )
     assert len(browser.ask(widths)) == 2  # the two panels of the poles
     assert min(browser.ask(widths)) > 350
-
-
-def test_a_page_with_two_pictures(faults_seen, page):
-    assert faults_seen(page) == []
 
 
 def test_report_of_a_run(browser, faults_seen, tmp_path):
@@ -200,6 +197,7 @@ def test_the_shape_of_a_page_is_measured(browser, tmp_path):
     for fault in ("screens", "words, at most", "more than 1 line", "picture ends", "0 numbers", "6 bullets"):
         assert fault in faults
     assert "said twice: the same six words are here" in faults
+    assert "html-has-lang" in str(barriers(browser)) or AXE is None
 
 
 def test_page_of_a_planned_experiment(faults_seen, tmp_path):

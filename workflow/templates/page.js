@@ -76,7 +76,7 @@ class Plot {
     holder.addEventListener("pointerleave", () => this.leave());
     this.listen(this.svg);
     const figure = holder.closest("figure");
-    for (const item of figure.querySelectorAll(".legend li")) this.entry(item);
+    for (const item of figure.querySelectorAll("[data-entry]")) this.entry(item);
     const tools = make("p", figure, "", "tools");
     for (const [words, act] of [["whole", () => this.whole()], ["SVG", () => this.save("svg")], ["PNG", () => this.save("png")]])
       make("button", tools, words).addEventListener("click", act);

@@ -206,7 +206,7 @@ const numbers = () => {
 // One panel: x and y as [low, high, log]; returns places and the group for curves, cut at the frame.
 const panel = (title, [xl, xh, xlog], [yl, yh, ylog], xwords, even = false) => {
   const box = make("div", $("panels"));
-  make("h3", box, title);
+  make("h2", box, title);
   const w = Math.max(box.clientWidth, 240), h = 225, [l, r, t, b] = [46, 8, 8, 34], name = "clip" + $("panels").childElementCount;
   if (even) [xl, xh] = [-1, 1].map(side => (xl + xh) / 2 + side * (yh - yl) * (w - l - r) / (h - t - b) / 2);
   const svg = draw("svg", box, {viewBox: `0 0 ${w} ${h}`, role: "img", "aria-label": title});
