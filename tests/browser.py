@@ -155,9 +155,7 @@ class Browser:
 
 
 _READER = Path(__file__).with_name("reader.js").read_text().partition("\n")[2]
-AXE = importlib.util.find_spec(
-    "axe_core_python"
-)  # of the extra dev
+AXE = importlib.util.find_spec("axe_core_python")  # of the extra dev
 _SERIOUS = """axe.run().then(found => found.violations.filter(one => /serious|critical/.test(one.impact))
   .map(one => `${one.impact}: ${one.id}, ${one.nodes.length} times: ${one.nodes[0].html.slice(0, 100)}`))"""
 

@@ -63,7 +63,8 @@ def test_page_stands_alone_and_says_both_sides(results, pictures, tmp_path, faul
     (tmp_path / "paper.html").write_text(page)
     assert faults_seen(tmp_path / "paper.html") == []
     assert "--seed 7" in page
-    assert re.search(r"\d of 7 figures come out as the paper reports", page)
+    assert re.search(r"\d of 7 figures as the paper reports; not Fig", page)
+    assert page.count("<b>Why:</b>") >= sum(not agrees for agrees in findings.agrees.values()) > 0
     assert page.count("The paper reports") == page.count("We find") == 7
     for item in REPORTED:
         assert page.count(item.place) >= 2  # beside the figure and over its table

@@ -148,7 +148,7 @@ def test_noise_in_a_loop_without_reference_is_refused(flexlink, noisy_logs):
         by_run(noisy_logs, None)
     told = flexlink(*command, "--loop-method", "direct", "--json").document()["numbers"]["closed_loop"]
     assert told["method"] == "direct"
-    assert "as asked for: what the loop feeds back moves the response" in told["reason"]
+    assert "as specified: what the loop feeds back moves the response" in told["reason"]
 
 
 @pytest.mark.slow

@@ -88,7 +88,7 @@ def test_words_of_the_achievable_performance():
     assert "order 4 reaches γ = 0.88 (needed: 1 or less); a higher order can gain at most 9.4 %" in words
     assert "gains less than 0.5 %" in said("any_order", found, 0.8, 4)
     below = said("any_order", found, 0.797, 4)
-    assert "that is approximate" in below
+    assert "is approximate" in below
     assert "gain" not in below
     assert bracket_numbers(found, 0.88)["above_percent"] == pytest.approx(10.0)
     assert "some controller of a higher order reaches γ = 0.8" in said("any_order", found, float("inf"), 4)
@@ -382,5 +382,5 @@ def test_a_verdict_says_up_to_where_the_logs_tell_nothing():
     rest = CertifyResult(None, certified=False, reason="NOT met"), ClosedLoopResult()
     for met, begins in ((False, "specification not met: gamma 1.2; "), (True, "not certified: NOT met; ")):
         words = verdict_of(replace(design, met=met), *rest, achievable(0.8), 3, 1.0)
-        assert words.startswith(f"{begins}below 1 rad/s (0.159 Hz) the logs do not tell the response")
+        assert words.startswith(f"{begins}below 1 rad/s (0.159 Hz) the logs do not show the response")
         assert "flexlink excite" in words
