@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -60,7 +60,7 @@ class Body:
 
     def under(self, started: Started, forces: BodyForces) -> Run:
         """The simulation with forces on the body; not a number where none were found that it follows."""
-        run, (force_at, motion_at) = started.run, self._columns
+        run, force_at, motion_at = started.run, int(self.force or 0), int(self.motion)
 
         def simulated(inputs: Real) -> Real:
             asked = (started.key, inputs.shape)
@@ -94,7 +94,7 @@ class Body:
 
     def _response(self, run: Run, inputs: Real) -> tuple[PulseResponse, float]:
         """From rest, other inputs as at the start; -1 where force and motion count opposite ways, else 1."""
-        force_at, motion_at = self._columns
+        force_at, motion_at = int(self.force or 0), int(self.motion)
         pulse = self.largest_force or 1.0
         still = np.repeat(inputs[:1], len(inputs), axis=0)
         still[:, force_at] = 0.0
@@ -105,12 +105,6 @@ class Body:
         # The first that shows: at few samples per period the largest is on the way back.
         sign = float(np.sign(moved[np.argmax(first > _SHOWS * np.max(first))]))
         return PulseResponse.of(sign * moved, self.dt_s, of_speed=self.of_speed), sign
-
-    @property
-    def _columns(self) -> tuple[int, int]:
-        assert isinstance(self.force, int)
-        assert isinstance(self.motion, int)
-        return self.force, self.motion
 
     def _remembered(self, key: Hashable, compute: Callable[[], Any]) -> Any:
         if key not in self._kept:
@@ -169,24 +163,18 @@ def _ways(speed: Real) -> Real:
 
 
 AnyBody = Body | MeasuredBody
-Where = Literal["input", "output", "body", "model"]
+Where = Literal["input", "output", "body", "model", "told"]
 
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
     """An output, by name or column."""
 
-    output: str | int
+    column: str | int
     dt_s: float = float("nan")
 
-    @property
-    def column(self) -> int:
-        assert isinstance(self.output, int)
-        return self.output
-
-    def before(self, signal: Real) -> float:
-        """What a signal (T,) was before its first row."""
-        return float(signal[0])
+    # Whatever it reads, it has read before.
+    at_rest_before: ClassVar[bool] = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,23 +195,16 @@ class Actuator:
     dt_s: float = float("nan")
     _kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
 
-    def before(self, signal: Real) -> float:
-        """What a signal (T,) was before its first row."""
-        return 0.0 if self.at_rest_before else float(signal[0])
-
-    @property
-    def _signal(self) -> int:
-        assert isinstance(self.drive, int)
-        return self.drive
-
     def under(self, started: Started, acting: Sequence[Acting], run: Run) -> Run:
         """The simulation with effects on the signal, in the order given; not a number where no fixed point
         was found."""
 
+        signal = int(self.drive or 0)
+
         def changed(command: Real) -> Real:
             now = command
             for law, _, values in acting:
-                now = law.signal(now, values, self.dt_s, self.before(now))
+                now = law.change(now, values, self.dt_s, 0.0 if self.at_rest_before else float(now[0]))
             return np.asarray(now - command)
 
         def simulated(inputs: Real) -> Real:
@@ -231,7 +212,7 @@ class Actuator:
                 moved = np.array(inputs)
                 moved[:, self.column] += extra
                 found = run(moved)
-                return found, found[:, self._signal]
+                return found, found[:, signal]
 
             asked = (started.key, inputs.shape)
             if asked not in self._kept:
@@ -251,9 +232,10 @@ class Actuator:
 
     def _response(self, run: Run, inputs: Real) -> Real:
         """(T,) of the signal to one that is added over the first sample, small beside what moves it."""
-        small, pushed = 1e-3 * max(float(np.std(run(inputs)[:, self._signal])), 1e-9), np.array(inputs)
+        signal, free = int(self.drive or 0), run(inputs)
+        small, pushed = 1e-3 * max(float(np.std(free[:, signal])), 1e-9), np.array(inputs)
         pushed[0, self.column] += small
-        return np.asarray((run(pushed) - run(inputs))[:, self._signal] / small)
+        return np.asarray((run(pushed) - free)[:, signal] / small)
 
 
 def _fixed(changed: Callable[[Real], Real], beyond: Real, response: Real, start: Real) -> tuple[Real, Real]:
@@ -276,24 +258,19 @@ class EffectLaw:
     """What an effect does to a simulation that does not know it.
 
     where : "input" or "output", it changes a signal; "body", it is a force on a moving body; "model", it
-        edits the description of a model.
+        edits the description of a model; "told", the simulation knows it and is told.
     change : of a signal, (T,), values, dt_s, what it was before its first row -> (T,); of a body, fields of
         `BodyForces` and their parameters, or values -> fields; of a model, model and values -> None.
     """
 
-    where: Where
-    change: Callable[..., Any] | Mapping[str, str]
+    where: Where = "told"
+    change: Any = None
 
     def forces(self, values: Values) -> Mapping[str, float]:
         """Fields of `BodyForces`."""
         if isinstance(self.change, Mapping):
-            return {field: values[parameter] for field, parameter in self.change.items()}
-        return dict(self.change(values))
-
-    def signal(self, before: Real, values: Values, dt_s: float, at_first: float) -> Real:
-        """before (T,) changed; at_first: what it was before its first row."""
-        assert callable(self.change)
-        return np.asarray(self.change(before, values, dt_s, at_first))
+            return {field: float(values[parameter]) for field, parameter in self.change.items()}
+        return {field: float(value) for field, value in self.change(values).items()}
 
 
 Place = Actuator | Sensor | Body | MeasuredBody
@@ -314,7 +291,7 @@ def around(started: Started, acting: Sequence[Acting]) -> Run:
                 sizes[name] = value + (sizes.get(name, 0.0) if name != "stribeck_velocity" else 0.0)
     inner = started
     for body, sizes in bodies.values():
-        forces, known = replace(BodyForces(), **sizes), (inner.key, tuple(sizes.items()))
+        forces, known = BodyForces(**sizes), (inner.key, tuple(sizes.items()))
         at_rest = body.under(replace(inner, run=inner.at_rest, start=None), forces)
         inner = Started(body.under(inner, forces), at_rest, known, inner.start)
 
@@ -338,6 +315,7 @@ def _changed(signals: Real, acting: Sequence[Acting], kind: type[Actuator] | typ
     for law, place, values in acting:
         if isinstance(place, kind) and getattr(place, "drive", None) is None:
             found = np.array(signals, dtype=np.float64) if found is signals else found
-            signal = found[:, place.column]
-            found[:, place.column] = law.signal(signal, values, place.dt_s, place.before(signal))
+            k = int(place.column)
+            before = 0.0 if place.at_rest_before else float(found[0, k])
+            found[:, k] = law.change(found[:, k], values, place.dt_s, before)
     return found

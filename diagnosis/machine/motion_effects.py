@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import astuple, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -53,8 +54,7 @@ class NotFollowedError(ValueError, ArithmeticError):
     """No force can be put around a simulation: wrong as stated, in a fit a trial that ran away."""
 
 
-@dataclass(frozen=True)
-class BodyForces:
+class BodyForces(NamedTuple):
     """Forces on a body against its motion, SI or whatever units force and motion have.
 
     Dry friction of size coulomb + excess exp(-|v| / stribeck_velocity), with `up` more while v > 0 and `down`
@@ -90,10 +90,6 @@ class BodyForces:
         whole = rest + dry + smooth + self.linear * x + self.cubic * x**3 + unbalanced
         # The commanded force is the whole one: more of it is lost where it drives than where it brakes.
         return np.asarray(whole / (1 - self.load * np.sign(v) * np.sign(whole)) - rest)
-
-    @property
-    def sizes(self) -> tuple[float, ...]:
-        return tuple(map(float, astuple(self)))
 
     @property
     def smooth(self) -> bool:
@@ -209,7 +205,7 @@ class LinearBody:
             self.ahead,
             self.of_speed,
             self.dt_s,
-            forces.sizes,
+            forces,
         )
         # What comes early or late in a sample moves the body as a pair of forces around it does.
         moment += self.early * held
@@ -281,9 +277,7 @@ class PulseResponse:
     ) -> tuple[Real, Real, Real]:
         """The same as `LinearBody.answer`, the motion being that of a simulation under held forces."""
         seen = self.motion(simulated, force)
-        held, x, v = _solve(
-            *seen, force - command, command, self.position, self.speed, self.ahead, forces.sizes
-        )
+        held, x, v = _solve(*seen, force - command, command, self.position, self.speed, self.ahead, forces)
         motion = v if self.of_speed else x
         return held, motion, motion
 
@@ -388,13 +382,13 @@ def _solve(
     hx: Real,
     hv: Real,
     ahead: int,
-    sizes: tuple[float, ...],
+    forces: BodyForces,
 ) -> tuple[Real, Real, Real]:
     """Forces (T,), positions and speeds (T,) with them, from those under the forces `held`."""
     T = position.size
     f, x, v = held.copy(), position.copy(), speed.copy()
     change = np.zeros(T)
-    gx, gv, at, half = hx[ahead], hv[ahead], 0.0, 0.5 * sizes[11]
+    gx, gv, at, half = hx[ahead], hv[ahead], 0.0, 0.5 * forces.gap
     for k in range(T - ahead):
         n = k + ahead
         dx, dv = 0.0, 0.0
@@ -404,7 +398,7 @@ def _solve(
         ax, av = position[n] + dx - gx * held[k], speed[n] + dv - gv * held[k]
         x0, v0 = (x[n - 1], v[n - 1]) if n > 0 else (ax, av)
         at = x0 if k == 0 else at
-        f[k], x[n], v[n] = _acted(ax, av, x0, v0, gx, gv, command[k], at, sizes)
+        f[k], x[n], v[n] = _acted(ax, av, x0, v0, gx, gv, command[k], at, forces)
         at = min(max(at, x[n] - half), x[n] + half)
         change[k] = f[k] - held[k]
     return f, x, v
@@ -420,7 +414,7 @@ def _acted(
     gv: float,
     command: float,
     at: float,
-    sizes: tuple[float, ...],
+    forces: BodyForces,
 ) -> tuple[float, float, float]:
     """Mean force over a sample or a part of one, position and speed at its end.
 
@@ -428,7 +422,7 @@ def _acted(
     rubs behind the play stands.
     """
     coulomb, excess, falls, up, down, viscous, linear, cubic, asymmetry, drag, load, gap, weight, turned = (
-        sizes
+        forces
     )
     coulomb += load * abs(command)
     rubs_up, rubs_down = _beyond(x0, ax, at, 0.5 * gap), _beyond(-x0, -ax, -at, 0.5 * gap)
@@ -518,7 +512,7 @@ def _through(
     ahead: int,
     of_speed: bool,
     dt_s: float,
-    sizes: tuple[float, ...],
+    forces: BodyForces,
 ) -> tuple[Real, Real, Real, Real]:
     """Means and moments of the forces in every sample (T,), positions and speeds (T,); beyond, slopes (T,):
     position or speed beside the response to forces, and by how much it changes per sample."""
@@ -530,7 +524,7 @@ def _through(
     for i in range(N):
         gx += of_x[i] * pushed[i]
         gv += of_v[i] * pushed[i]
-    travelled, half = 0.0, 0.5 * sizes[11]
+    travelled, half = 0.0, 0.5 * forces.gap
     x0, v0 = (0.0, beyond[0]) if of_speed else (beyond[0], slopes[0] / dt_s)
     at = x0
     if ahead == 1:
@@ -556,7 +550,7 @@ def _through(
                     moved[i] += step[i, j] * state[j]
                 ax += of_x[i] * moved[i]
                 av += of_v[i] * moved[i]
-            f, x1, end = _acted(ax, av, x0, v0, gx, gv, command[k], at, sizes)
+            f, x1, end = _acted(ax, av, x0, v0, gx, gv, command[k], at, forces)
             at = min(max(at, x1 - half), x1 + half)
             for i in range(N):
                 state[i] = moved[i] + pushed[i] * f

@@ -65,7 +65,7 @@ class MujocoSimulation:
         """The model (MjSpec) with these values; of: as a whole, else what moves of it."""
         spec = (of or self.arm.moving).copy()
         for name, value in values.items():
-            self.quantities[name].edit(spec, *np.ravel(value).tolist())
+            self.quantities[name].law.change(spec, *np.ravel(value).tolist())
         return spec
 
     def __call__(

@@ -229,7 +229,7 @@ class Plant:
         acting = [
             (kind.law, kind.place, told.pop(kind.name))
             for kind in self.effects
-            if kind.law is not None and kind.place is not None and kind.name in told
+            if kind.place is not None and kind.name in told
         ]
         known = (tuple(self.parameters.items()), tuple((k, tuple(v.items())) for k, v in told.items()))
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, get_args
 
-from diagnosis.machine.around import EffectLaw, Place, Where
+from diagnosis.machine.around import EffectLaw, Place
 from plant.effects.base import ratio_candidates
 from plant.effects.search_space import (
     Candidate,
@@ -51,7 +51,7 @@ class PlantEffect:
     group : str. Where it acts (actuator, joint, sensor, ...); only shown.
     contains : str or None. Simpler effect that it is with its further parameters at an end of their ranges.
     check : str. What to do to see whether it is there: a command in a sentence; "" says nothing.
-    law : EffectLaw or None. What it does to a simulation that does not know it; None: the simulation is told.
+    law : EffectLaw. What it does to a simulation that does not know it; default: the simulation is told.
     place : Place or None. Where a law acts around a simulation (`with_effects`).
     multiplies : str or None. Stated value that its only parameter, a ratio, multiplies (`wrong_value`).
     tried : where nobody chose it, "always", "with several outputs" (from one alone it cannot be told from its
@@ -68,7 +68,7 @@ class PlantEffect:
     group: str = ""
     contains: str | None = None
     check: str = ""
-    law: EffectLaw | None = field(default=None, compare=False)
+    law: EffectLaw = field(default=EffectLaw(), compare=False)
     place: Place | None = None
     multiplies: str | None = None
     tried: Tried = "always"
@@ -101,12 +101,6 @@ class PlantEffect:
             )
         return searches(self, self.parameters, signed=self.signed, grows=self.grows)
 
-    def edit(self, model: Any, *values: float) -> None:
-        """Writes values of its parameters, or of a stated number, into the description of a model."""
-        assert self.law is not None
-        assert callable(self.law.change)
-        self.law.change(model, *values)
-
     def from_search(self, values: Mapping[str, float], sign: int) -> Change:
         """The effect at these values, the size (the first parameter) with its sign."""
         size = self.parameters[0].name
@@ -116,11 +110,6 @@ class PlantEffect:
     @property
     def id(self) -> str:
         return self.name
-
-    @property
-    def where(self) -> Where:
-        """Where its law acts: what a simulation is told acts in its model."""
-        return "model" if self.law is None else self.law.where
 
 
 # A stated value may be wrong by this factor.

@@ -68,7 +68,7 @@ def with_effects(
         if not 0 <= column < experiments[0].input.shape[1]:
             count = experiments[0].input.shape[1]
             raise ValueError(f"plant: there is no input {column}; the records have {count}, from 0 on")
-    seen = 0 if sensor is None else _column(plant, sensor.output)
+    seen = 0 if sensor is None else _column(plant, sensor.column)
     commanded = None if signal is None else _largest(_motion(plant, e, signal) for e in experiments)
     sizes = Magnitudes()
     if isinstance(body, Body):
@@ -102,12 +102,12 @@ def with_effects(
     found = list(plant.effects)
     own = {effect.name for effect in plant.effects}
     every = _of_all(plant)
-    here = [kind for kind in every if places[kind.where] is not None and prefix + kind.name not in own]
+    here = [kind for kind in every if places[kind.law.where] is not None and prefix + kind.name not in own]
     chosen = here if names == "all" else [KINDS[name] for name in names]
     for kind in chosen:
-        place = places[kind.where]
-        if place is None or (kind.where == "input" and not sizes.input > 0):
-            raise ValueError(f"plant: {kind.name} {_MISSING[kind.where]}")
+        place = places[kind.law.where]
+        if place is None or (kind.law.where == "input" and not sizes.input > 0):
+            raise ValueError(f"plant: {kind.name} {_MISSING[kind.law.where]}")
         found.append(
             replace(
                 kind.at(sizes),
@@ -119,7 +119,7 @@ def with_effects(
     there = {effect.name for effect in found}
     inactive = dict(plant.inactive)
     if names == "all":
-        unmoved = [kind for kind in every if kind.where == "body" and body is None]
+        unmoved = [kind for kind in every if kind.law.where == "body" and body is None]
         inactive |= {prefix + kind.name: _NEEDS_MOTION for kind in unmoved}
     inactive = {name: needs for name, needs in inactive.items() if name not in there}
     equipped = replace(plant, effects=tuple(found), dt_s=dt_s, inactive=inactive)
@@ -141,10 +141,10 @@ def _of_all(plant: Plant) -> list[PlantEffect]:
 
 def _is_smooth(kind: PlantEffect) -> bool:
     """Whether it is a force that changes little within a sample."""
-    if kind.law is None or kind.law.where != "body":
+    if kind.law.where != "body":
         return False
     forces = kind.law.forces({parameter.name: parameter.high for parameter in kind.parameters})
-    return replace(BodyForces(), **forces).smooth
+    return BodyForces(**forces).smooth
 
 
 def _column(plant: Plant, output: str | int) -> int:

@@ -16,7 +16,7 @@ class InputDelay(Effect):
     """Pure delay of the held voltage by any fraction of the sampling period."""
 
     id = "input_delay"
-    acts = ("voltage", "delay_s", add)
+    law = ("voltage", "delay_s", add)
     words = "a delay of the command"
     check = "log the voltage at the motor beside the command; the time between their steps is the delay"
     adds_to = "sampling.transport_delay_s"
@@ -30,7 +30,7 @@ class ActuatorGain(RatioEffect):
     """Voltage multiplied by a ratio; the back-EMF is not."""
 
     id = "actuator_gain"
-    acts = ("voltage", "gain", mul)
+    law = ("voltage", "gain", mul)
     words = "a wrong gain of the actuator"
     check = "hold two steady commands and compare the voltage at the motor with them"
     multiplies = "motor.torque_constant_Nm_A"
@@ -43,7 +43,7 @@ class ActuatorDeadZone(Effect):
     """Voltage becomes sign(V) max(|V| - w, 0)."""
 
     id = "actuator_dead_zone"
-    acts = ("voltage", "dead_zone_V", add)
+    law = ("voltage", "dead_zone_V", add)
     words = "a dead zone of the actuator"
     check = "raise the command slowly from zero and note where the voltage at the motor begins to follow"
     dependence = "continuous"
@@ -57,7 +57,7 @@ class ActuatorSaturation(Effect):
     """Voltage clipped to +-limit."""
 
     id = "actuator_saturation"
-    acts = ("voltage", "limit_V", min)
+    law = ("voltage", "limit_V", min)
     words = "saturation of the actuator"
     check = "command the largest voltage and measure what arrives at the motor"
     neutral = MappingProxyType({"limit_V": 1e6})
@@ -73,7 +73,7 @@ class ActuatorLag(Effect):
     """First-order lag 1 / (T s + 1) on the acting voltage, after every other voltage effect."""
 
     id = "actuator_lag"
-    acts = ("voltage", "lag_s", alone)
+    law = ("voltage", "lag_s", alone)
     words = "a lag of the actuator"
     check = "step the command and look at the voltage at the motor: it should step as well"
     sought = (EffectParameter("time_constant_s", 2e-4, 200, unit="dt_s", spread=(0.02, 40, 10)),)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from operator import mul
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, cast
@@ -22,7 +23,7 @@ from plant.effects.search_space import (
     log_axis,
     searches,
 )
-from plant.machine import Machine, Real, SmoothTorque
+from plant.machine import Machine, Real
 from plant.rig import Rig
 
 Group = Literal["actuator", "joint", "link", "sensor"]
@@ -57,7 +58,9 @@ class Effect(BaseModel):
         It takes energy at the joint: closed loops are also tried without it and with twice its torques.
     multiplies : str or None
         Key of the stated value that its ratio multiplies, whose tolerance may explain it as well.
-    acts : (part of the machine, name of a value there, how the first parameter joins it) or None
+    law : (part of the machine, name of what is there, how it changes) or None
+        Two numbers make another one; a class makes a part of the parameters by name, a `partial` one of their
+        values.
     harmonic : str or None
         The torque is a sine of the hub angle or of time: amplitude and phase follow by linear least squares.
     look_alike_of : str or None
@@ -82,7 +85,7 @@ class Effect(BaseModel):
     environment: ClassVar[bool] = False
     friction: ClassVar[bool] = False
     multiplies: ClassVar[str | None] = None
-    acts: ClassVar[tuple[Part, str, Callable[[Any, float], float]] | None] = None
+    law: ClassVar[tuple[Part, str, Callable[..., Any]] | None] = None
     harmonic: ClassVar[Harmonic | None] = None
     look_alike_of: ClassVar[str | None] = None
     beside: ClassVar[str | None] = None
@@ -94,13 +97,20 @@ class Effect(BaseModel):
     grows: ClassVar[bool] = True
 
     def modify(self, machine: Machine) -> Machine:
-        """The machine with this effect: its first parameter joined to the value that it `acts` on, or
-        multiplies."""
-        part, name, joined = self.acts or ("rig", str(self.multiplies), mul)
-        there, size = getattr(machine, part), next(iter(self.parameters().values()))
+        """The machine with this effect, by its law or times the ratio."""
+        part, name, how = self.law or ("rig", str(self.multiplies), mul)
+        values = self.parameters()
         if part == "rig":
-            return replace(machine, rig=machine.rig.perturbed({name: joined(machine.rig.value(name), size)}))
-        return replace(machine, **{part: replace(there, **{name: joined(getattr(there, name), size)})})
+            size = how(machine.rig.value(name), *values.values())
+            return replace(machine, rig=machine.rig.perturbed({name: size}))
+        whole = getattr(machine, part)
+        there = getattr(whole, name)
+        if isinstance(how, type | partial):
+            own = how(**values) if isinstance(how, type) else how(tuple(values.values()))
+            found = (*there, own) if isinstance(there, tuple) else own
+        else:
+            found = how(there, *values.values())
+        return replace(machine, **{part: replace(whole, **{name: found})})
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
@@ -159,11 +169,6 @@ class Effect(BaseModel):
         )
         return Candidate(cls, tuple(axes), starts, sign, grows)
 
-    @classmethod
-    def _size(cls, axis: Axis, values: Iterable[float], *, sign: int = 1, grows: bool = True) -> Candidate:
-        """A search over the one parameter."""
-        return cls._candidate([axis], ((v,) for v in values), sign=sign, grows=grows)
-
 
 EFFECTS: dict[str, type[Effect]] = {}
 LOOK_ALIKES: dict[str, type[Effect]] = {}
@@ -181,7 +186,7 @@ def register(kind: type[E]) -> type[E]:
     """
     if missing := [name for name in ("id", "words") if not hasattr(kind, name)]:
         raise TypeError(f"effect {kind.__name__}: state its {' and '.join(missing)} in the class")
-    if kind.modify is Effect.modify and not (kind.acts or kind.multiplies):
+    if kind.modify is Effect.modify and not (kind.law or kind.multiplies):
         raise TypeError(f"{kind.id} neither acts on a value nor multiplies one: it needs its own modify")
     if not hasattr(kind, "group"):
         kind.group = cast(Group, kind.__module__.rpartition(".")[2])
@@ -216,14 +221,6 @@ def ratio_candidates(kind: EffectKind, tolerance: float, largest: float) -> tupl
         starts = tuple((float(v),) for v in np.minimum(-points, np.log(below)))
         sides.append(Candidate(kind, (axis,), starts, sign=-1, grows=False))
     return tuple(sides)
-
-
-def with_joint(machine: Machine, **changes: Any) -> Machine:
-    return replace(machine, joint=replace(machine.joint, **changes))
-
-
-def with_torque(machine: Machine, torque: SmoothTorque) -> Machine:
-    return with_joint(machine, torques=(*machine.joint.torques, torque))
 
 
 def alone(there: object, own: float) -> float:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 from itertools import product
 from operator import add
 from types import MappingProxyType
@@ -19,8 +21,6 @@ from plant.effects.base import (
     RatioEffect,
     alone,
     register,
-    with_joint,
-    with_torque,
 )
 from plant.effects.search_space import PHASE, Axis, Candidate, EffectParameter, Scales, geometric, log_axis
 from plant.machine import (
@@ -59,7 +59,8 @@ class CoulombFriction(Effect):
 
     def modify(self, machine: Machine) -> Machine:
         friction = DryFriction(self.torque_Nm, self.torque_Nm, 1.0)
-        return with_joint(machine, friction=(*machine.joint.friction, friction))
+        joint = replace(machine.joint, friction=(*machine.joint.friction, friction))
+        return replace(machine, joint=joint)
 
 
 @register
@@ -67,6 +68,7 @@ class StribeckFriction(Effect):
     """Dry friction of size Tc + (Ts - Tc) exp(-|omega| / vs); at rest up to Ts is held (same pre-sliding)."""
 
     id = "stribeck_friction"
+    law = ("joint", "friction", DryFriction)
     words = "dry friction that falls with speed (Stribeck)"
     check = "let the hub creep at several slow, steady speeds and note the voltage that each takes"
     contains = "coulomb_friction"
@@ -98,10 +100,6 @@ class StribeckFriction(Effect):
             )
         return self
 
-    def modify(self, machine: Machine) -> Machine:
-        friction = DryFriction(self.static_torque_Nm, self.coulomb_torque_Nm, self.stribeck_velocity_rad_s)
-        return with_joint(machine, friction=(*machine.joint.friction, friction))
-
     @classmethod
     def from_search(cls, values: Mapping[str, float], sign: int) -> Self:
         """The Coulomb level is sought as a share of the static one."""
@@ -118,7 +116,7 @@ class ViscousFriction(Effect):
     """Torque -c omega, added to the linear friction of the rig."""
 
     id = "viscous_friction"
-    acts = ("rig", "hub.viscous_friction_Nms", add)
+    law = ("rig", "hub.viscous_friction_Nms", add)
     words = "additional viscous friction"
     check = "turn the hub at several steady speeds and note the voltage: it should grow in proportion"
     adds_to = "hub.viscous_friction_Nms"
@@ -134,7 +132,8 @@ class ViscousFriction(Effect):
         least = _VISCOUS_TOLERANCES * spread
         usual = (least, USUAL_TOLERANCES * spread) if least > 0 else None
         axis = log_axis("coefficient_Nms", max(1e-5 * damping, least), 30 * damping, usual=usual)
-        return (cls._size(axis, geometric(max(1e-4 * damping, 1.2 * least), 3 * damping, 8)),)
+        first = max(1e-4 * damping, 1.2 * least)
+        return (cls._candidate([axis], ((v,) for v in geometric(first, 3 * damping, 8))),)
 
 
 @register
@@ -146,14 +145,11 @@ class QuadraticDrag(Effect):
     """
 
     id = "quadratic_drag"
+    law = ("joint", "torques", partial(SmoothTorque, QUADRATIC, at="motor", of="speed"))
     words = "a drag that grows with the square of the speed"
     look_alike_of = "viscous_friction"
 
     coefficient_Nms2: NotNegative = Field(description="coefficient c")
-
-    def modify(self, machine: Machine) -> Machine:
-        torque = SmoothTorque(QUADRATIC, (self.coefficient_Nms2,), at="motor", of="speed")
-        return with_torque(machine, torque)
 
 
 @register
@@ -178,17 +174,13 @@ class AttachedBody(Effect):
     """
 
     id = "attached_body"
+    law = ("joint", "attached", TorsionSpring)
     words = "a body that something compliant holds to the hub"
     look_alike_of = "hub_inertia"
 
     inertia_kg_m2: Positive = Field(description="inertia Ja of the body")
     stiffness_Nm_rad: Positive = Field(description="stiffness k")
     damping_Nms: NotNegative = Field(description="damping c")
-
-    def modify(self, machine: Machine) -> Machine:
-        return with_joint(
-            machine, attached=TorsionSpring(self.stiffness_Nm_rad, self.damping_Nms, self.inertia_kg_m2)
-        )
 
     @classmethod
     def in_place_of(cls, other: Candidate, x: Real, rig: Rig) -> Candidate:
@@ -214,6 +206,7 @@ class TorqueRipple(Effect):
     """Extra motor torque a sin(N theta + p), theta the shaft angle; N counts per hub revolution."""
 
     id = "torque_ripple"
+    law = ("joint", "torques", partial(SmoothTorque, SINE, at="shaft"))
     words = "torque ripple over the hub angle"
     check = "turn the hub slowly by hand with the motor off and feel for places where it sticks"
     harmonic = "hub_angle"
@@ -221,9 +214,6 @@ class TorqueRipple(Effect):
     amplitude_Nm: NotNegative = Field(description="amplitude a")
     cycles_per_rev: float = Field(ge=0, le=1e4, description="cycles N per hub revolution")
     phase_rad: float = Field(description="phase p at theta = 0")
-
-    def modify(self, machine: Machine) -> Machine:
-        return with_torque(machine, SmoothTorque(SINE, tuple(self.parameters().values()), at="shaft"))
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
@@ -240,6 +230,7 @@ class PeriodicDisturbance(Effect):
     """Torque a sin(2 pi f t + p) from ground on the hub, t from the start of the record."""
 
     id = "periodic_disturbance"
+    law = ("joint", "disturbance", Disturbance)
     words = "a periodic disturbance torque"
     check = "log the arm for half a minute at zero voltage: a disturbance from outside goes on"
     environment = True
@@ -248,10 +239,6 @@ class PeriodicDisturbance(Effect):
     amplitude_Nm: NotNegative = Field(description="amplitude a")
     frequency_Hz: NotNegative = Field(description="frequency f")
     phase_rad: float = Field(description="phase p at the start of the record")
-
-    def modify(self, machine: Machine) -> Machine:
-        disturbance = Disturbance(self.amplitude_Nm, self.frequency_Hz, self.phase_rad)
-        return with_joint(machine, disturbance=(*machine.joint.disturbance, disturbance))
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
@@ -267,6 +254,7 @@ class HardeningSpring(Effect):
     """Cubic spring from hub (motor side, with backlash) to ground, torque -k3 theta^3, no linear part."""
 
     id = "hardening_spring"
+    law = ("joint", "torques", partial(SmoothTorque, CUBIC, at="motor"))
     words = "a hardening spring (cable, hose)"
     check = "pull the hub with a spring balance at small and at large angles and look for cables and hoses"
     absolute_angle = True
@@ -275,9 +263,6 @@ class HardeningSpring(Effect):
     )
 
     cubic_Nm_rad3: NotNegative = Field(description="coefficient k3")
-
-    def modify(self, machine: Machine) -> Machine:
-        return with_torque(machine, SmoothTorque(CUBIC, (self.cubic_Nm_rad3,), at="motor"))
 
 
 @register
@@ -289,7 +274,7 @@ class GroundSpring(Effect):
     """
 
     id = "ground_spring"
-    acts = ("joint", "ground_spring_Nm_rad", add)
+    law = ("joint", "ground_spring_Nm_rad", add)
     words = "a linear spring from hub to ground"
     look_alike_of = "gravity"
 
@@ -309,15 +294,13 @@ class JointCompliance(Effect):
     """
 
     id = "joint_compliance"
+    law = ("joint", "compliance", TorsionSpring)
     words = "a compliant joint between hub and link"
     check = "hold the hub and push the link sideways at its clamp: nothing should give"
     neutral = None  # the rigid joint is the limit of infinite stiffness
 
     stiffness_Nm_rad: Positive = Field(description="stiffness k")
     damping_Nms: NotNegative = Field(description="damping c")
-
-    def modify(self, machine: Machine) -> Machine:
-        return with_joint(machine, compliance=TorsionSpring(self.stiffness_Nm_rad, self.damping_Nms))
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
@@ -337,6 +320,7 @@ class BaseCompliance(Effect):
     """
 
     id = "base_compliance"
+    law = ("joint", "base", TorsionSpring)
     words = "a compliant base under the motor"
     check = "put a dial gauge on the base of the motor and shake the arm: nothing should move"
     neutral = None  # the fixed base is the limit of infinite stiffness
@@ -344,11 +328,6 @@ class BaseCompliance(Effect):
     stiffness_Nm_rad: Positive = Field(description="stiffness k to ground")
     damping_Nms: NotNegative = Field(description="damping c to ground")
     inertia_kg_m2: Positive = Field(description="inertia Jb of the base")
-
-    def modify(self, machine: Machine) -> Machine:
-        return with_joint(
-            machine, base=TorsionSpring(self.stiffness_Nm_rad, self.damping_Nms, self.inertia_kg_m2)
-        )
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
@@ -377,7 +356,7 @@ class Backlash(Effect):
     """
 
     id = "backlash"
-    acts = ("joint", "backlash_gap_rad", alone)
+    law = ("joint", "backlash_gap_rad", alone)
     words = "backlash in the gear"
     check = "hold the motor shaft and turn the hub to and fro by hand: the free play is the backlash"
     neutral = None  # without a gap the contact is still elastic

@@ -23,7 +23,7 @@ class TipPayload(Effect):
     """A point mass added to the payload of the rig."""
 
     id = "tip_payload"
-    acts = ("rig", "payload.mass_kg", add)
+    law = ("rig", "payload.mass_kg", add)
     words = "an additional mass at the tip"
     check = "weigh the tip with everything that is fixed to it"
     adds_to = "payload.mass_kg"

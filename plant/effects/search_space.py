@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
+from operator import attrgetter
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -201,10 +202,6 @@ class Scales:
         return self.rig.motor.torque_per_volt_Nm_V * self.voltage_V
 
     @property
-    def tip_noise_m(self) -> float:
-        return self.rig.sensors.tip_noise_m
-
-    @property
     def link_mass_kg(self) -> float:
         return self.rig.link.mass_per_length_kg_m * self.rig.link.length_m
 
@@ -262,9 +259,9 @@ class EffectParameter:
     def at(self, magnitudes: object) -> EffectParameter:
         """In units of its own: magnitudes has an attribute for every name."""
         above, *below = self.unit.split("/")
-        one = getattr(magnitudes, above) if above else 1.0
+        one = attrgetter(above)(magnitudes) if above else 1.0
         for name, _, power in (part.partition("^") for part in below):
-            one = one / getattr(magnitudes, name) ** int(power or 1)
+            one = one / attrgetter(name)(magnitudes) ** int(power or 1)
         most = min(self.high, getattr(magnitudes, self.most)) if self.most else self.high
         return replace(self, high=most, unit="", most="").times(one)
 

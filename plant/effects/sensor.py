@@ -15,7 +15,7 @@ class SensorGain(RatioEffect):
     """tip_m (or tip acceleration, or deflection) multiplied by a ratio, before its noise."""
 
     id = "sensor_gain"
-    acts = ("sensor", "gain", mul)
+    law = ("sensor", "gain", mul)
     words = "a wrong gain of the tip sensor"
     check = "move the tip by a known length and compare the reading"
 
@@ -27,11 +27,15 @@ class SensorDrift(Effect):
     """rate * time added to tip_m, time from the start of the record."""
 
     id = "sensor_drift"
-    acts = ("sensor", "drift_m_s", add)
+    law = ("sensor", "drift_m_s", add)
     words = "a drift of the tip sensor"
     check = "log the tip sensor for some minutes with the arm clamped"
     signed = True
-    sought = (EffectParameter("rate_m_s", 1e-3, 1e4, unit="tip_noise_m/duration_s", spread=(0.1, 100, 6)),)
+    sought = (
+        EffectParameter(
+            "rate_m_s", 1e-3, 1e4, unit="rig.sensors.tip_noise_m/duration_s", spread=(0.1, 100, 6)
+        ),
+    )
 
     rate_m_s: float = Field(description="drift of the tip sensor")
 
@@ -41,7 +45,7 @@ class Quantisation(Effect):
     """tip_m rounded to the nearest multiple of a step, after the noise."""
 
     id = "quantisation"
-    acts = ("sensor", "step_m", max)
+    law = ("sensor", "step_m", max)
     words = "coarse quantisation of the tip sensor"
     check = "move the tip slowly and look for steps in the reading"
     dependence = "non-smooth"
@@ -55,7 +59,7 @@ class SensorLag(Effect):
     """First-order lag on the tip sensor, before its gain, drift and noise."""
 
     id = "sensor_lag"
-    acts = ("sensor", "lag_s", alone)
+    law = ("sensor", "lag_s", alone)
     words = "a lag of the tip sensor"
     check = "tap against the tip and compare when its sensor and the encoder answer"
     sought = (EffectParameter("time_constant_s", 2e-4, 200, unit="dt_s", spread=(0.02, 40, 10)),)

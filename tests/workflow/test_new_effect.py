@@ -3,13 +3,14 @@
 import json
 import re
 import tomllib
+from functools import partial
 
 import pytest
 from pydantic import Field
 
 from diagnosis.evidence.hypotheses import log_prior
 from plant.effects import EFFECTS, Effect, in_words, parse_effects
-from plant.effects.base import NotNegative, register, with_torque
+from plant.effects.base import NotNegative, register
 from plant.effects.search_space import EffectParameter
 from plant.machine import QUADRATIC, SmoothTorque
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
@@ -25,14 +26,12 @@ class WindDrag(Effect):
     id = "wind_drag"
     words = "a sail at the hub"
     group = "joint"
+    law = ("joint", "torques", partial(SmoothTorque, QUADRATIC, at="motor", of="speed"))
     sought = (
         EffectParameter("coefficient_Nms2", 1e-5, 1, unit="torque_Nm", spread=(3e-4, 0.6, 14), step=1e-3),
     )
 
     coefficient_Nms2: NotNegative = Field(description="coefficient c")
-
-    def modify(self, machine):
-        return with_torque(machine, SmoothTorque(QUADRATIC, (self.coefficient_Nms2,), at="motor", of="speed"))
 
 
 @pytest.fixture(params=["take the sail off and run again", None], ids=["check", "no check"])

@@ -143,11 +143,10 @@ def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dic
     if effect.name.endswith(".sensor_offset"):  # of MuJoCo, whose other sizes have units
         units["S"] = unit(effect.name.removesuffix(".sensor_offset"))
     elif isinstance(on, Body):
-        at = on.motion if isinstance(on.motion, int) else 0
-        units["F"], units["S"] = unit(inputs[on.force or 0]), unit((*names, "")[at])
+        units["F"], units["S"] = unit(inputs[on.force or 0]), unit((*names, "")[int(on.motion)])
         units["x"] = units["S"] = units["S"].removesuffix("_s") if on.of_speed else units["S"]
     elif isinstance(on, Sensor) or (isinstance(on, Actuator) and on.drive is None):
-        units["S"] = unit((names if isinstance(on, Sensor) else inputs)[on.column])
+        units["S"] = unit((names if isinstance(on, Sensor) else inputs)[int(on.column)])
     found = {}
     for parameter in (one.name for one in effect.parameters):
         size = "{F}s2_{x}2" if effect.name.endswith("quadratic_drag") else _SIZES.get(parameter, "")
@@ -406,8 +405,8 @@ def _with_all(
                 raise ValueError(str(error).removesuffix(OF_TRIAL)) from error
             plant = around(plant, "all", actuator=Actuator(at_rest_before=False))
         there = [LISTED[effect.name] for effect in plant.effects if effect.name in LISTED]
-        of_actuator = [kind.name for kind in there if kind.where == "input"]
-        of_sensor = [kind.name for kind in there if kind.where == "output"]
+        of_actuator = [kind.name for kind in there if kind.law.where == "input"]
+        of_sensor = [kind.name for kind in there if kind.law.where == "output"]
         for column, name in enumerate(inputs[1:], start=1):
             actuator = Actuator(column, at_rest_before=False)
             plant = around(plant, of_actuator, actuator=actuator, prefix=f"{name}_")
