@@ -126,7 +126,7 @@ class JointsConfig(AnyRun):
     """A whole run for several joints. Load with `load_any`."""
 
     source: Source
-    joints: tuple[Joint, ...] = Field(min_length=2)
+    joints: tuple[Joint, ...] = Field(min_length=1)
     identification: JointsIdentification = Field(
         default_factory=lambda: JointsIdentification.model_validate({})
     )

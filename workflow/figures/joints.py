@@ -132,7 +132,7 @@ def draw_joint_requirements(run: AnyRunView) -> Figure | None:
         return None
     asked, top = run.config.specification(), 0.999 * np.pi / law.dt_s
     omega = np.geomspace(_LOW * top, top, 300)
-    s, K = tustin_s(omega, law.dt_s), law.response(omega, with_delay=False)
+    s, K = tustin_s(omega, law.dt_s), law.response(omega, with_delay=False).reshape(-1, *law.D.shape)
     found: dict[str, Real] = {}
     for point in run.results.identify.points:
         plant = point.plant(run.config.identification.gain_error)
@@ -179,7 +179,7 @@ def draw_mode_shapes(run: AnyRunView) -> Figure | None:
     """Which joint moves how much in each mode of the first operating point."""
     point = run.results.identify.points[0]
     shaped = [(omega, zeta, moved) for omega, zeta, moved in point.modes if moved is not None]
-    if not shaped:
+    if not shaped or len(run.config.joints) == 1:  # which moves as it moves
         return None
     figure, panels = style.small_multiples(len(shaped), min(len(shaped), 3), 2.1, 0.6, sharey=True)
     for axes, (omega, zeta, moved) in zip(panels, shaped, strict=True):

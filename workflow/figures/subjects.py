@@ -169,6 +169,11 @@ class AnyRunView:
         fitted = [item.record for item in self.results.records.of_role("estimation")]
         return max(float(np.max(np.abs(one.input[:, one.input_names.index(signal)]))) for one in fitted)
 
+    @property
+    def signals(self) -> str:
+        """What the controller's files take and give."""
+        return Logged.of(self.config, self.results.records).signals
+
 
 class RunView(AnyRunView):
     """A run of one loop."""

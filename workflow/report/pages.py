@@ -15,7 +15,6 @@ from workflow.engine import storage
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.subjects import AnyRunView, RunView, log_channel
 from workflow.report.rendering import RenderedPage, render_page
-from workflow.tasks.exports import Logged
 from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.results import ReportResult, RunRecord, RunResults
 from workflow.tasks.stage import Stage, StageInput, stages_for
@@ -45,7 +44,6 @@ def write_report(
         run=view(config, results, run.manifest()),
         study=(run.path.parent.parent / "study.html").is_file(),  # of which this run is a point
         certified=summarise(results, config).certified,
-        signals=Logged.of(config, results.records).signals,
     )
     return _write(run, page)
 
