@@ -3,8 +3,6 @@ kept back, mode shapes."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -33,31 +31,27 @@ def draw_joint_steps(run: AnyRunView) -> Figure | None:
     loop = run.results.closed_loop
     if loop.time_s is None or loop.reference is None:
         return None
-    first = [each for each in loop.runs if each.condition == loop.runs[0].condition]
     joints = run.config.joints
     figure, grid = style.panels(4.6, 2, len(joints), squeeze=False, sharex="col")
     for k, joint in enumerate(joints):
-        _draw_runs(grid[0, k], loop.time_s, [one.output[:, k] for one in loop.runs], "all runs")
-        _draw_runs(grid[1, k], loop.time_s, [one.command[:, k] for one in loop.runs], "all runs")
-        for number, one in enumerate(first):
-            label = "as identified" if number == 0 else None
-            for row, signal in ((0, one.output), (1, one.command)):
-                line = outline(loop.time_s, signal[:, k], 150)
-                grid[row, k].plot(*line, **style.ACHIEVED_LINE, label=label)
+        for axes, name, signal in zip(
+            grid[:, k], (joint.output, joint.input), ("output", "command"), strict=True
+        ):
+            lines = np.stack([getattr(one, signal)[:, k] for one in loop.runs])
+            axes.fill_between(*envelope(loop.time_s, lines), **style.ACHIEVED_BAND, label="all runs")
+            for number, (one, line) in enumerate(zip(loop.runs, lines, strict=True)):
+                if one.condition == loop.runs[0].condition:
+                    look = style.ACHIEVED_LINE | {"label": None if number else "as identified"}
+                    axes.plot(*outline(loop.time_s, line, 150), **look)
+            axes.set_ylabel(style.two_lines(name, run.results.records.unit(name)))
         steps = outline(loop.time_s, loop.reference[:, k], 150)
         grid[0, k].plot(*steps, **style.REFERENCE_STEPS, label="reference")
-        largest, limit = max(float(np.max(np.abs(one.command[:, k]))) for one in loop.runs), joint.input_limit
-        if limit is not None and largest > 0.5 * limit:
+        limit = joint.input_limit
+        if limit is not None and np.max(np.abs(lines)) > 0.5 * limit:
             grid[1, k].axhline(limit, **style.LIMIT_LINE, label="limit of the actuator")
             grid[1, k].axhline(-limit, **style.LIMIT_LINE)
-        for row, name in ((0, joint.output), (1, joint.input)):
-            grid[row, k].set_ylabel(style.two_lines(name, run.results.records.unit(name)))
         grid[1, k].set_xlabel("time [s]")
     return figure
-
-
-def _draw_runs(axes: Any, time_s: Real, lines: list[Real], label: str) -> None:
-    axes.fill_between(*envelope(time_s, np.stack(lines)), **style.ACHIEVED_BAND, label=label)
 
 
 @style.drawing("matrix-response")
