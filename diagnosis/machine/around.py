@@ -54,10 +54,6 @@ class Body:
     dt_s: float = float("nan")
     _kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
 
-    @property
-    def of_speed(self) -> bool:
-        return self.motion_is == "speed"
-
     def under(self, started: Started, forces: BodyForces) -> Run:
         """The simulation with forces on the body; not a number where none were found that it follows."""
         run, force_at, motion_at = started.run, int(self.force or 0), int(self.motion)
@@ -104,7 +100,7 @@ class Body:
         first = np.abs(moved[:5])
         # The first that shows: at few samples per period the largest is on the way back.
         sign = float(np.sign(moved[np.argmax(first > _SHOWS * np.max(first))]))
-        return PulseResponse.of(sign * moved, self.dt_s, of_speed=self.of_speed), sign
+        return PulseResponse.of(sign * moved, self.dt_s, of_speed=self.motion_is == "speed"), sign
 
     def _remembered(self, key: Hashable, compute: Callable[[], Any]) -> Any:
         if key not in self._kept:

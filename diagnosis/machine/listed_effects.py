@@ -125,7 +125,7 @@ _sensor = partial(PlantEffect, group="sensor")
 # Effects of the actuator act in this order, then those of the body, then those of the sensor. By name only: a
 # play of a force is rare, and one before friction; a mass off its axis needs an angle; friction one way looks
 # like an offset beside friction both ways, and so does one in proportion to speed or load.
-KINDS: Mapping[str, PlantEffect] = {
+KINDS: dict[str, PlantEffect] = {
     kind.name: kind
     for kind in (
         _actuator(

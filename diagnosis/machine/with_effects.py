@@ -18,7 +18,6 @@ from diagnosis.machine.listed_effects import KINDS, Magnitudes
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.motion_effects import BodyForces
 from diagnosis.machine.own_plant import Plant, PlantExperiment
-from diagnosis.machine.plant_effect import PlantEffect
 
 _MISSING = {
     "input": "changes a command, and the stated input is none or zero in every record",
@@ -101,7 +100,8 @@ def with_effects(
     }
     found = list(plant.effects)
     own = {effect.name for effect in plant.effects}
-    every = _of_all(plant)
+    alone = len(plant.output_names) == 1
+    every = [one for one in KINDS.values() if one.tried == "always" or (one.tried != "by name" and not alone)]
     here = [kind for kind in every if places[kind.law.where] is not None and prefix + kind.name not in own]
     chosen = here if names == "all" else [KINDS[name] for name in names]
     for kind in chosen:
@@ -124,7 +124,12 @@ def with_effects(
     inactive = {name: needs for name, needs in inactive.items() if name not in there}
     equipped = replace(plant, effects=tuple(found), dt_s=dt_s, inactive=inactive)
     _try(equipped, experiments[0], body)
-    smooth = [kind.name for kind in chosen if _is_smooth(kind)]
+    smooth = [
+        kind.name
+        for kind in chosen
+        if kind.law.where == "body"
+        and BodyForces(**kind.law.forces({one.name: one.high for one in kind.parameters})).smooth
+    ]
     if smooth and isinstance(body, Body) and body.doubt:
         warnings.warn(
             f"plant: after a pulse of force the motion {body.doubt}, so that {' and '.join(smooth)} are some "
@@ -132,19 +137,6 @@ def with_effects(
             stacklevel=2,
         )
     return equipped
-
-
-def _of_all(plant: Plant) -> list[PlantEffect]:
-    tried = ("always", "with several outputs") if len(plant.output_names) > 1 else ("always",)
-    return [kind for kind in KINDS.values() if kind.tried in tried]
-
-
-def _is_smooth(kind: PlantEffect) -> bool:
-    """Whether it is a force that changes little within a sample."""
-    if kind.law.where != "body":
-        return False
-    forces = kind.law.forces({parameter.name: parameter.high for parameter in kind.parameters})
-    return BodyForces(**forces).smooth
 
 
 def _column(plant: Plant, output: str | int) -> int:

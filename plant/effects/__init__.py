@@ -1,6 +1,7 @@
 """Effects that can separate a machine from its nominal rig, and their registry.
 
-A new effect is one registered class in the module of its group, and one entry in the contract test.
+A new effect is one registered class in the module of its group, and one entry in the contract test: its
+parts are those of every effect (CONTRIBUTING.md).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from pydantic import ValidationError
 
 from plant.effects import actuator, joint, link, sensor
 from plant.effects.base import EFFECTS, LOOK_ALIKES, Effect
+from plant.effects.search_space import EffectParameter
 from plant.machine import Machine, VoltagePath
 from plant.rig import Rig, one_line
 
@@ -19,6 +21,7 @@ __all__ = [
     "EFFECTS",
     "LOOK_ALIKES",
     "Effect",
+    "EffectParameter",
     "actuator",
     "in_words",
     "joint",

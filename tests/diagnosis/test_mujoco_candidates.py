@@ -103,8 +103,10 @@ def dead(u: Any) -> Any:
 
 
 weak = true_rod(drive=MOTOR.format('forcerange="-.5 .5"'))
+strong = rod(drive=MOTOR.format('forcerange="-20 20"'))
 # Second moments (.02, .01, .03) kg m2: sheared along x by z, stretched along x.
 sheared, stretched = "0.04 0.0512 0.0312 0 -0.006 0", "0.04 0.0638 0.0438 0 0 0"
+wide = Machine(true_head(inertia=stretched), size=0.4)
 SERVO_OF_40_4 = rod(drive=SERVO.format(40, 4))
 # Truth, model, candidates by name, what is named with its size. The damping of a joint does what that of its
 # servo does, so it is excluded.
@@ -115,23 +117,11 @@ CASES: dict[str, tuple[Machine, str, str, str, float]] = {
     "stribeck": (Machine(true_rod(), stribeck), rod(), "*.stribeck", "hinge.stribeck", 0.35),
     "dead zone": (Machine(true_rod(), arrives=dead), rod(), "*.dead_zone", "motor.dead_zone", 0.25),
     "a limit": (Machine(weak), rod(), "motor.forcerange", "motor.forcerange", 0.5),
-    "a limit below that stated": (
-        Machine(weak),
-        rod(drive=MOTOR.format('forcerange="-20 20"')),
-        "motor.forcerange",
-        "motor.forcerange",
-        0.5,
-    ),
+    "a limit below that stated": (Machine(weak), strong, "motor.forcerange", "motor.forcerange", 0.5),
     "spring": (Machine(SPRUNG), rod(), "*.elastic", "hinge.elastic", 60.0),
     "centre": (Machine(true_rod(com=0.36, **hanging)), rod(**hanging), "*.com_*", "rod.com_x", 0.06),
     "shear": (Machine(true_head(inertia=sheared), size=0.4), head(), "*.shear_*", "head.shear_xz", 0.2),
-    "stretch": (
-        Machine(true_head(inertia=stretched), size=0.4),
-        head(),
-        "*.stretch_*",
-        "wrong_head.stretch_x",
-        1.3,
-    ),
+    "stretch": (wide, head(), "*.stretch_*", "wrong_head.stretch_x", 1.3),
 }
 
 

@@ -11,8 +11,8 @@ mujoco = pytest.importorskip("mujoco")
 
 from benchmarks import mujoco_cases as cases  # noqa: E402
 from diagnosis import PlantCase, PlantExperiment, diagnose  # noqa: E402
+from diagnosis.machine import mujoco_quantities  # noqa: E402
 from diagnosis.machine.mujoco_plant import MujocoArm  # noqa: E402
-from diagnosis.machine.mujoco_quantities import Quantities  # noqa: E402
 from diagnosis.machine.plant_effect import Change  # noqa: E402
 
 DT_S = 0.01
@@ -462,6 +462,14 @@ def test_a_value_that_the_compiler_or_a_class_gives_is_nominal_and_can_be_change
     assert getattr(model, value)[0] == 0.5
 
 
+def test_a_row_of_the_table_of_joints_is_an_effect_of_each(monkeypatch):
+    row = ("margin", "margin", 0, "margin_{x}", "position", 1.0, "smooth")
+    monkeypatch.setattr(mujoco_quantities, "_OF_JOINT", (*mujoco_quantities._OF_JOINT, row))
+    model, effect = edited(rod(), "hinge.margin", 0.3)
+    assert model.jnt_margin[0] == 0.3
+    assert [(p.name, p.high > p.low > 0) for p in effect.parameters] == [("margin_rad", True)]
+
+
 @pytest.mark.parametrize("damping", ['dampratio="1"', 'kv="3"', ""])
 def test_the_gain_of_a_servo_is_its_stiffness_and_its_damping(damping):
     """The ratio of damping stands for a number that the compiler makes of stiffness and inertia."""
@@ -561,7 +569,7 @@ def test_the_force_on_a_joint_is_what_its_actuators_do_whatever_lies_between(dri
     arm, _ = link(PLAIN, motor=f"{motor}</actuator>{tendon}<actuator>")
     torque = steps()
     measured = PlantExperiment("one", "estimation", np.column_stack([torque, torque]), torque[:, None])
-    assert Quantities(arm, (measured,)).sizes["hinge"][0] == pytest.approx(
+    assert mujoco_quantities.Quantities(arm, (measured,)).sizes["hinge"][0] == pytest.approx(
         4 * np.max(np.abs(torque)), rel=1e-9
     )
 

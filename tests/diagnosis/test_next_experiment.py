@@ -11,7 +11,7 @@ from diagnosis.evidence.hypotheses import Hypothesis
 from diagnosis.evidence.search import fitted_to
 from diagnosis.fit.nominal import LogNormalParameters
 from diagnosis.machine.flexible_arm import FlexibleArm
-from diagnosis.machine.plant_effect import Change
+from diagnosis.machine.plant_effect import Change, EffectParameter
 from diagnosis.next_experiment.discrimination import (
     CompetingHypothesis,
     competing_hypotheses,
@@ -26,7 +26,6 @@ from plant import prbs, simulate
 from plant.effects.actuator import ActuatorLag, ActuatorSaturation, InputDelay
 from plant.effects.joint import CoulombFriction, ViscousFriction
 from plant.effects.link import TipPayload
-from plant.effects.search_space import EffectParameter
 from tests.diagnosis.recorded import end_of_fit
 from tests.diagnosis.synthetic_residuals import DT, NOISE, RIG, inputs, made, white
 

@@ -145,8 +145,7 @@ def _case(name, seed=0, **off):
         experiments.append(PlantExperiment(f"up to {amplitude:g}", role, u[:, None], y[:, None]))
     plant = Plant(simulation, stated, tolerances, ("y",), np.array([noise]), model_error=0.05)
     body = Body("y", "speed" if simulation is _shaft else "position")
-    plant = with_effects(plant, "all", experiments, dt_s=DT_S, body=body)
-    return PlantCase(name, plant, tuple(experiments))
+    return PlantCase(name, with_effects(plant, "all", experiments, dt_s=DT_S, body=body), tuple(experiments))
 
 
 @pytest.mark.parametrize(

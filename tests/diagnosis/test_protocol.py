@@ -367,10 +367,7 @@ def _by(simulation):
         (lambda: _listed("spring", body=Body("y", force=0), level=0.0), "state largest_force="),
         (lambda: _listed("input_offset", level=0.0), "zero in every record"),
         (lambda: _listed("spring", body=Body(3)), r"column 3 of a simulation that returns \(30, 1\)"),
-        (
-            lambda: _listed("spring", body=Body("y"), late=9),
-            "simulated motion follows the stated input later",
-        ),
+        (lambda: _listed("spring", body=Body("y"), late=9), "motion follows the stated input later"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(make, message):

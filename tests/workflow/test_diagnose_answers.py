@@ -16,13 +16,12 @@ from jinja2 import StrictUndefined
 
 from diagnosis.answer import Completeness, DetailVerdict, Diagnosis, NamedEffect, Shares, share_closed
 from diagnosis.machine.own_plant import Plant, PlantCase, PlantExperiment
-from diagnosis.machine.plant_effect import Change, PlantEffect
+from diagnosis.machine.plant_effect import Change, EffectParameter, PlantEffect
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from diagnosis.next_experiment.next_experiment import Considered, NextExperiment, Separation
 from diagnosis.next_experiment.repeat import Change as Changed, Repeat
 from flexlink import shown
 from plant.effects.joint import GroundSpring
-from plant.effects.search_space import EffectParameter
 from tests.workflow.command import build_nothing
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from workflow.diagnose import command, outputs, pages

@@ -9,9 +9,8 @@ import pytest
 from pydantic import Field
 
 from diagnosis.evidence.hypotheses import log_prior
-from plant.effects import EFFECTS, Effect, in_words, parse_effects
+from plant.effects import EFFECTS, Effect, EffectParameter, in_words, parse_effects
 from plant.effects.base import NotNegative, register
-from plant.effects.search_space import EffectParameter
 from plant.machine import QUADRATIC, SmoothTorque
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from workflow.diagnose.case_files import load_case
@@ -27,9 +26,7 @@ class WindDrag(Effect):
     words = "a sail at the hub"
     group = "joint"
     law = ("joint", "torques", partial(SmoothTorque, QUADRATIC, at="motor", of="speed"))
-    sought = (
-        EffectParameter("coefficient_Nms2", 1e-5, 1, unit="torque_Nm", spread=(3e-4, 0.6, 14), step=1e-3),
-    )
+    sought = (EffectParameter("coefficient_Nms2", 1e-5, 1, unit="torque_Nm", spread=(3e-4, 0.6, 14)),)
 
     coefficient_Nms2: NotNegative = Field(description="coefficient c")
 

@@ -144,7 +144,7 @@ def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dic
         units["S"] = unit(effect.name.removesuffix(".sensor_offset"))
     elif isinstance(on, Body):
         units["F"], units["S"] = unit(inputs[on.force or 0]), unit((*names, "")[int(on.motion)])
-        units["x"] = units["S"] = units["S"].removesuffix("_s") if on.of_speed else units["S"]
+        units["x"] = units["S"] = units["S"].removesuffix("_s") if on.motion_is == "speed" else units["S"]
     elif isinstance(on, Sensor) or (isinstance(on, Actuator) and on.drive is None):
         units["S"] = unit((names if isinstance(on, Sensor) else inputs)[int(on.column)])
     found = {}
