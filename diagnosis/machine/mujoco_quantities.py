@@ -206,7 +206,7 @@ class Quantities:
             yield _number(f"{body.name}.payload", 0.0, put, size, group="link")
         if not body.mass > 0:
             return
-        yield _number(f"{body.name}.mass", float(body.mass), partial(put_mass, body.name))
+        yield _number(f"{body.name}.mass", float(body.mass), partial(put_mass, body.name), _size("mass_kg"))
         # Of a link on one hinge in the world, inertia is what armature is.
         if model.body_weldid[model.body_parentid[model.body_weldid[k]]]:
             yield _number(f"{body.name}.inertia", 1.0, partial(put_inertia, body.name))

@@ -81,7 +81,10 @@ def of_case(loaded: SimulatorCase, found: Telling) -> RunSummary:
         "limits": [effect.name for effect in case.plant.effects if not effect.grows],
         "units": case.units,
         "values": dict(case.plant.parameters),
-        "value_names": {key: of[key].parameter if key in of else key for key in case.plant.parameters},
+        "value_names": {
+            key: next((one.name for one in of[key].parameters), "") if key in of else key
+            for key in case.plant.parameters
+        },
         "untried": dict(case.plant.inactive),
         "advice": list(dict.fromkeys(_advice(first)))[:_MOST_ADVICE],
     }
