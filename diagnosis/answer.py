@@ -49,6 +49,7 @@ class NamedEffect:
         it explains in that set; of one that is not in the repaired model without an interval (nan).
     remarks : parameter -> what its interval does not say: at an end of its range, or as wide as that.
     untried : what it would need to be tried; "" where it was.
+    acts_alike : probability that a cause on no list acts like it, in which case it is not there.
     widened_by : key of the nominal value that the first interval is widest by, where tolerances make up most
         of it; else "". Were all of them exact, it would be half as wide or less.
     """
@@ -63,6 +64,7 @@ class NamedEffect:
     remarks: Mapping[str, str] = field(default_factory=dict)
     untried: str = ""
     widened_by: str = ""
+    acts_alike: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -212,9 +214,9 @@ class Diagnosis(Shown):
         """Of the answer: the main cause where it stands alone, the whole set where there are several."""
         if self.verdict != "effect":
             return self.probabilities[self.verdict]
-        if len(self.combination) == 1:
-            return self.probabilities[self.combination[0]]
-        return self.sets[tuple(sorted(self.combination))]
+        together = self.sets[tuple(sorted(self.combination))]
+        alone = self.probabilities[self.combination[0]] if len(self.combination) == 1 else together
+        return min(alone, *map(self.presence, self.combination))
 
     def presence(self, name: str) -> float:
         """Probability that an effect is there at all; of "none" and "unknown" that they are the answer."""

@@ -55,7 +55,8 @@ class Model:
 class Judgement:
     """What a judge says. answer: the first one; together: effects accepted with it, rounding too where it
     interests; alike: others that fit as well. refit, repaired: without and with effects; repair: these;
-    complete: probability that they are all. untried: effect -> what it needs to be tried."""
+    complete: probability that they are all. untried: effect -> what it needs to be tried. acts_alike:
+    effect -> probability that a cause on no list acts like it."""
 
     probabilities: Probabilities
     answer: str
@@ -68,6 +69,7 @@ class Judgement:
     rounding: Rounding | None = None
     alike: tuple[str, ...] = ()
     untried: Mapping[str, str] | None = None
+    acts_alike: Mapping[str, float] | None = None
     converged: bool = True
 
     @property
@@ -171,4 +173,5 @@ def _entry(
         gap = held_out_gap(case, found.repaired.residuals)
         sizes = rounding.effect.parameters()
         entry = replace(entry, parameters=sizes, intervals=rounding.intervals, gap_after=gap)
-    return replace(entry, untried=(found.untried or {}).get(name, ""))
+    alike = (found.acts_alike or {}).get(name, 0.0)
+    return replace(entry, untried=(found.untried or {}).get(name, ""), acts_alike=alike)

@@ -50,14 +50,16 @@ def without_error(
     hypotheses = [h for h in every if h.is_answer]
     alike = [h for h in every if not h.is_answer]
     likeliest = max(every, key=lambda h: h.unknown_weight)
-    last = accepted.end if late else _refined(model, accepted.end)
+    last = accepted.end
+    if not late and (last.candidates or last.deviations.size):
+        last = min(last.on(model, model.start, **FINE), last, key=lambda one: one.loss)
     refit = model.by_experiment(base.deviations, ())
     after = model.by_experiment(last.deviations, last.effects)
     rounding, together = rounding_effect(case), accepted.names
     if rounding is not None:
         leads = leads_over(case, rounding, refit, after)
         weighed = weighed.beside(rounding.name, leads=leads)
-        together = rounding.joined(accepted.names, leads=leads)
+        together = (rounding.name, *together) if leads or not together else (*together, rounding.name)
     if search.left_out:
         weighed = weighed.with_untried(untried, larger=True)
     # What was not tried counts as unknown.
@@ -127,12 +129,6 @@ def _accepted(hypotheses: Sequence[Hypothesis], answer: str) -> Hypothesis:
     """The best hypothesis of the answer: nothing added for none and unknown, else the set it leads."""
     names = () if answer in ("none", "unknown") else (answer,)
     return max((h for h in hypotheses if h.names[:1] == names), key=lambda h: h.log_weight)
-
-
-def _refined(model: ResidualModel, end: Descent) -> Descent:
-    if not end.candidates and not end.deviations.size:
-        return end
-    return min(end.on(model, model.start, **FINE), end, key=lambda one: one.loss)
 
 
 def _fitted(

@@ -117,6 +117,7 @@ def beside_imperfections(search: Search, rng: np.random.Generator) -> Diagnosis:
             judging.below_threshold(search, accepted),
             found.rounding,
             untried=found.untried,
+            acts_alike=found.alike,
         ),
         _fitted(search, found, accepted, shares.carried, rng),
         rng,

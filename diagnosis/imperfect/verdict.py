@@ -8,8 +8,10 @@ the motion, of estimation and held-out records.
 from __future__ import annotations
 
 import time
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import resources
 from itertools import combinations
 from math import comb
 
@@ -27,7 +29,7 @@ from diagnosis.machine.rounding import Rounding, rounding_effect
 from diagnosis.search.explanation import Explanation, best_of_sets
 from diagnosis.search.loop import MANY, SEVERAL
 from diagnosis.search.search import Search
-from plant.effects import LOOK_ALIKES
+from plant.effects import EFFECTS, LOOK_ALIKES
 
 # Log likelihoods count this much less than independent coefficients would (calibrated on generated cases:
 # `flexlink blind --workshop`); prior densities of stated values count whole.
@@ -111,7 +113,7 @@ class Verdict:
     """probabilities; judged: the sets that were weighed, likeliest first; answer: names that are accepted,
     with rounding where that interests, which is read off the values and in none of the sets. nominal: as
     stated, or re-estimated where that leaves less of the held-out records. untried: effect -> what it needs
-    to be tried."""
+    to be tried. alike: effect -> what its presence is less by, as a cause on no list may act like it."""
 
     probabilities: Probabilities
     judged: tuple[Judged, ...]
@@ -119,6 +121,7 @@ class Verdict:
     accepted: tuple[str, ...]
     nominal: Explanation
     untried: Mapping[str, str]
+    alike: Mapping[str, float]
     rounding: Rounding | None = None
 
     def fitted(self, names: Iterable[str]) -> set[str]:
@@ -187,7 +190,30 @@ def judged(search: Search) -> Verdict:
     )
     answer = probabilities.counting_as_unknown(untried).answer
     accepted = _accepted(probabilities, answer, sets, beside)
-    return Verdict(probabilities, sets, answer, accepted, nominal, untried, rounding if beside else None)
+    # Where something is missing, what stands in for it is weighed already (`_genuine`); effects of other
+    # machines nobody has counted.
+    there, whole = probabilities.presence, sum(one.weight * one.explains for one in sets)
+    acting = {
+        name: p * whole * acts_like(name, len(weighing.listed))
+        for name, p in there.items()
+        if name in EFFECTS and name not in beside
+    }
+    probabilities = replace(probabilities, presence={n: p - acting.get(n, 0.0) for n, p in there.items()})
+    return Verdict(
+        probabilities, sets, answer, accepted, nominal, untried, acting, rounding if beside else None
+    )
+
+
+def acts_like(name: str, listed: int) -> float:
+    """Probability that what an effect explains is the work of a cause on no list, given that it is there.
+
+    From the priors of an effect, one of so many that are listed, and of such a cause, and from how often it
+    stood in for one (look_alikes.toml), shrunk to the rate of all effects.
+    """
+    seen = tomllib.loads(resources.files(__package__).joinpath("look_alikes.toml").read_text("utf-8"))
+    pooled = seen["pooled_cases"] * sum(seen["stood_in"].values()) / seen["cases"] / listed
+    rate = (seen["stood_in"].get(name, 0) + pooled) / (seen["cases"] + seen["pooled_cases"])
+    return float(1 / (1 + _PRIOR_COUNT[1] / (_PRIOR_UNKNOWN * rate * listed)))
 
 
 def late(search: Search) -> bool:
@@ -353,8 +379,7 @@ def _part(
         share = held_out
     share = max(share, seen.share if seen else 0.0)
     least = _least_that_matters(search, carried, explanation) if name in listed else model_error
-    matters = _soft(share / least)
-    off = _tolerances_off(search, explanation, k)
+    matters, off = _soft(share / least), _tolerances_off(search, explanation, k)
     if off is not None:
         # A stated value in itself: what it changes may be imitated by the others within their tolerances. Far
         # off is not enough: of a value that nobody stated anything is.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,9 +27,6 @@ class Rounding:
     @property
     def name(self) -> str:
         return Quantisation.id
-
-    def joined(self, names: Sequence[str], *, leads: bool) -> tuple[str, ...]:
-        return (self.name, *names) if leads or not names else (*names, self.name)
 
 
 def rounding_effect(case: CaseOfMachine) -> Rounding | None:

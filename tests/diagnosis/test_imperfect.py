@@ -24,6 +24,7 @@ from diagnosis.fit.descent import Descent, descend, occam, refined, scanned
 from diagnosis.fit.levels import Levels, quietest
 from diagnosis.fit.records import FittedStart, Records, StartColumns
 from diagnosis.fit.starts import StartPoint, points_of
+from diagnosis.imperfect import verdict
 from diagnosis.imperfect.answered import _in_part
 from diagnosis.imperfect.carried import shares_of
 from diagnosis.imperfect.verdict import TEMPER, _enough, _weights, is_silent, judged
@@ -692,6 +693,15 @@ def test_far_values_are_scanned_where_contacts_switch():
     assert (stiffness, gap) == pytest.approx((40.0, 0.1), rel=0.03)
 
 
+@pytest.mark.parametrize(
+    ("name", "there"),
+    # By hand: .15 of an unlisted cause; .35 of one of 23; 35 cases at 15/36/23 beside 36 with 4, 2 and 0.
+    [("gravity", 0.608), ("actuator_lag", 0.732), ("actuator_dead_zone", 0.919)],
+)
+def test_what_often_stood_in_for_another_cause_is_less_sure(name, there):
+    assert 1 - verdict.acts_like(name, 23) == pytest.approx(there, abs=2e-3)
+
+
 def _judged(sets, **told):
     return judged(_searched(sets, **told))
 
@@ -779,19 +789,14 @@ def test_simpler_effects_are_sought_in_every_set_that_is_as_likely(further_gain,
 
 
 @pytest.mark.parametrize(
-    ("stated", "left", "held_out", "there"),
-    [
-        (0.045, 0.001, 0.001, True),
-        # The rest is as large as of a good model.
-        (0.045, 0.03, 0.03, False),
-        # What it does for the records that it is fitted to, it does not for the others.
-        (0.045, 0.001, 0.043, False),
-        (0.03, 0.001, 0.001, False),
-    ],
+    ("error", "left", "held_out", "there"),
+    [(45, 1, 1, True), (45, 30, 30, False), (45, 1, 43, False), (30, 1, 1, False)],
 )
-def test_below_the_threshold_an_effect_matters_that_is_most_of_the_error(stated, left, held_out, there):
-    found = _judged({(): (0.0, stated, stated), ("coulomb_friction",): (400.0, left, held_out)})
-    assert found.probabilities.presence["coulomb_friction"] == pytest.approx(float(there), abs=0.15)
+def test_below_the_threshold_an_effect_matters_that_is_most_of_the_error(error, left, held_out, there):
+    """Of both kinds of records, and where less is left than of a good model (thousandths of the motion)."""
+    shares = 1e-3 * error, 1e-3 * left, 1e-3 * held_out
+    found = _judged({(): (0.0, shares[0], shares[0]), ("coulomb_friction",): (400.0, *shares[1:])})
+    assert (found.probabilities.presence["coulomb_friction"] > 0.6) == there
     assert found.answer == ("coulomb_friction" if there else "none")
 
 
@@ -832,7 +837,7 @@ def test_what_may_be_left_is_as_the_docs_say(stated, told):
 
 @pytest.mark.parametrize(
     ("left", "answer", "presence"),
-    [(0.1, "gravity", (0.9, 1.0)), (0.2, "gravity", (0.5, 0.9)), (0.27, "unknown", (0.0, 0.3))],
+    [(0.1, "gravity", (0.7, 1.0)), (0.2, "gravity", (0.5, 0.9)), (0.27, "unknown", (0.0, 0.3))],
 )
 def test_an_effect_is_present_though_something_else_is_missing(left, answer, presence):
     # 0.3 of the motion is left without it; what carries less than is left may only stand in for that.
