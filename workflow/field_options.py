@@ -93,7 +93,8 @@ def option_name(key: str) -> str:
 def _parameter(key: str, field: FieldInfo) -> inspect.Parameter:
     kind = _kind(field.annotation)
     words = (_BY_COLUMN if _is_mapping(field.annotation) else "") + described(field)
-    said = typer.Option(option_name(key), help=words[0].upper() + words[1:])
+    form = "<float> <float>" if get_origin(kind) is tuple else None
+    said = typer.Option(option_name(key), help=words[0].upper() + words[1:], metavar=form)
     return inspect.Parameter(
         key.replace(".", "_"),
         inspect.Parameter.KEYWORD_ONLY,

@@ -126,7 +126,7 @@ def test_the_page_answers_in_order(files, tmp_path, faults_seen):
     places = [html.index(f"<h2>{question}</h2>") for question in QUESTIONS]
     assert places == sorted(places)
     assert "Dry (Coulomb) friction (96 %, 0.05 N m)" in html
-    assert "<dt>That is all</dt><dd>97 %<small>what remains is noise</small></dd>" in html
+    assert "<dt>Complete</dt><dd>97 %<small>what remains is noise</small></dd>" in html
     cells = re.sub("<td[^>]*>", "<td>", html)
     assert "<td>torque</td><td>0.05 N m</td><td>0.049 to 0.051</td>" in cells
     assert "<td>coulomb_friction</td>" not in cells

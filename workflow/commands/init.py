@@ -25,7 +25,7 @@ from ident.data.roles import Roles, is_position, rising
 from ident.data.table import Table
 from ident.data.time_grid import option_for
 from ident.data.wrapping import wraps_at
-from workflow.commands.logs import Reading
+from workflow.commands.logs import Reading, to_type
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from workflow.config.run_config import RunConfig
     from workflow.tasks.draft import Draft
 
-_SHORT = 60  # letters of a log's name that leave room for a command in a line
 _NEARLY_ALL = 0.99  # rows of a held log: one may be missing
 
 
@@ -189,10 +188,8 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> ReadCha
             tables.append(read_table(path).with_decimal(stated.decimal))
             if has_response(tables[-1]):
                 raise ValueError("a frequency response, no log: flexlink design takes it")
-    # The options are what has to be seen of a line that may be cut.
-    typed = shlex.quote(str(logs[0])) if len(logs) == 1 and len(str(logs[0])) < _SHORT else "LOG..."
     with naming(str(logs[0])):
-        roles = stated.roles(tables[0], typed, command)
+        roles = stated.roles(tables[0], to_type(logs), command)
         if stated.dt_s is not None and stated.time is None:
             roles = replace(roles, time=None)
         tables = [run for table in tables for run in table.runs(roles.time)]
@@ -200,7 +197,7 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> ReadCha
             ways = ", or --time ".join(
                 ["--dt-s SECONDS", *(shlex.quote(shown(n, 30)) for n in rising(tables[0]))]
             )
-            raise ValueError(f"no column looks like time: type flexlink {command} {typed} {ways}")
+            raise ValueError(f"no column looks like time: type flexlink {command} {to_type(logs)} {ways}")
     with naming(""):
         options = [
             option_for(table.stamps(roles.time, roles.output if table.sparse else None, stated.time_unit)[0])

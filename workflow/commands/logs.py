@@ -17,6 +17,8 @@ from ident.data.table import Table
 from workflow.config.log_reading import LogReading
 from workflow.engine.errors import naming
 
+_SHORT = 160  # letters of logs' names that leave room for the options in a line
+
 
 class Reading(LogReading):
     """Columns of one channel and how they are read, as stated; the rest as in `Record.from_file`. doubts: of
@@ -86,6 +88,11 @@ class Logs:
     input_limit: float | None
 
 
+def to_type(logs: Sequence[Path]) -> str:
+    """Logs in a command that a complaint offers: its options have to be seen of a line that may be cut."""
+    return named if len(named := shlex.join(map(str, logs))) < _SHORT else "LOG..."
+
+
 def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: Sequence[Path] = ()) -> Logs:
     """One channel of log files as stated; columns that are not named are found where names and units leave no
     doubt. Raises InputError: one line naming file, column or line."""
@@ -95,7 +102,7 @@ def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: S
             tables.append(read_table(path).with_decimal(how.decimal))
     if how.input_name is None or how.output_name is None or (how.time is None and how.dt_s is None):
         with naming(str(logs[0])):
-            roles = how.roles(tables[0], shlex.join(map(str, logs)), "identify")
+            roles = how.roles(tables[0], to_type(logs), "identify")
         given: dict[str, Any] = {
             "input_name": roles.input,
             "output_name": roles.output,

@@ -32,10 +32,22 @@ def look(
             out,
             render_page("look.html.j2", title=f"Log {log.name}", found=found, next=_next(found)).html,
         )
+    columns = {
+        column.name: {
+            "unit": column.unit,
+            "refused": column.why,
+            "lowest": None if column.values is None else float(column.values.min()),
+            "highest": None if column.values is None else float(column.values.max()),
+            "clipped_share": column.clipped,
+            "step": column.step,
+        }
+        for column in found.columns
+    }
+    parts = {name: codec.plain(getattr(found, name)) for name in ("rows", "layout", "time", "response")}
     return RunSummary(
         title=str(log),
         sections=rows_of("summary/look.j2", found=found),
-        numbers=_numbers(found),
+        numbers=parts | {"columns": columns},
         verdict=_next(found),
         report_path=None if out is None else str(out),
     )
@@ -69,19 +81,3 @@ def _next(found: LogLook) -> str:
         if doubt.kind is FindingKind.WRAPS and doubt.values["name"] == roles.output
     ]
     return " ".join(["flexlink identify", log, *options, *doubted])
-
-
-def _numbers(found: LogLook) -> dict[str, object]:
-    columns = {
-        column.name: {
-            "unit": column.unit,
-            "refused": column.why,
-            "lowest": None if column.values is None else float(column.values.min()),
-            "highest": None if column.values is None else float(column.values.max()),
-            "clipped_share": column.clipped,
-            "step": column.step,
-        }
-        for column in found.columns
-    }
-    time, layout, response = (codec.plain(part) for part in (found.time, found.layout, found.response))
-    return {"rows": found.rows, "layout": layout, "time": time, "response": response, "columns": columns}
