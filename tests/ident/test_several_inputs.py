@@ -50,12 +50,12 @@ def response(system, omega=OMEGA):
     return np.array([(C @ np.linalg.solve(np.exp(1j * w * DT_S) * eye - A, B) + D)[0] for w in omega])
 
 
-def record(seed, n=3000, noise_std=0.05, system=None):
-    """Random binary inputs, white noise on the output."""
+def record(seed, n=3000, noise_std=0.05, system=None, start=None):
+    """Random binary inputs, white noise on the output; from rest unless a start state is given."""
     rng = np.random.default_rng(seed)
     system = sampled() if system is None else system
     u = rng.choice([-1.0, 1.0], (n, system[1].shape[1]))
-    y = signal.dlsim((*system, DT_S), u)[1][:, 0]
+    y = signal.dlsim((*system, DT_S), u, x0=start)[1][:, 0]
     names = tuple(f"motor_{i + 1}" for i in range(u.shape[1]))
     return Record(f"seed {seed}", u, (y + noise_std * rng.normal(size=n))[:, None], DT_S, names, ("tip",))
 
@@ -171,6 +171,13 @@ def test_one_motor_at_a_time_in_records_of_their_own():
     result = identify_mimo(items)
     np.testing.assert_allclose(result.model.poles.omega_rad_s(DT_S), [20.0, 90.0], rtol=2e-3)
     assert len(result.residuals) == 2
+
+
+def test_initial_state_is_noticed():
+    start = np.array([3.0, 2.0, 0.0, -1.0, 0.0])
+    result = identify_mimo([record(0, start=start)])
+    assert result.structure.estimate_initial_state
+    np.testing.assert_allclose(result.model.poles.omega_rad_s(DT_S), [20.0, 90.0], rtol=2e-3)
 
 
 def test_a_model_is_locked_and_gives_its_channels(fitted):
