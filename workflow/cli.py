@@ -140,7 +140,7 @@ Logs = Annotated[
     list[Path], typer.Argument(help="CSV or other tables, npz, MAT, ... (docs/logs.md); used together.")
 ]
 SomeLogs = Annotated[
-    list[Path] | None, typer.Argument(help="Logs (docs/logs.md): run them; or of the loop, --closed-loop.")
+    list[Path] | None, typer.Argument(help="Log files (docs/logs.md); of excite with --closed-loop.")
 ]
 Config = Annotated[
     Path | None, typer.Option(help="TOML file (see examples/ and README); without it the built-in arm.")
