@@ -159,7 +159,7 @@ def _ways(speed: Real) -> Real:
 
 
 AnyBody = Body | MeasuredBody
-Where = Literal["input", "output", "body", "model", "told"]
+Where = Literal["input", "output", "body", "model", "simulation"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,8 +216,8 @@ class Actuator:
             response, extra = self._kept[asked], np.zeros(len(inputs))
             found, command = with_added(extra)
             for _ in range(_ROUNDS):
-                beyond = command - scipy.signal.fftconvolve(response, extra)[: extra.size]
-                extra, expected = _fixed(changed, beyond, response, extra)
+                alone = command - scipy.signal.fftconvolve(response, extra)[: extra.size]
+                extra, expected = _fixed(changed, alone, response, extra)
                 found, command = with_added(extra)
                 missed, size = _norm(command - expected), _norm(extra)
                 if not missed > _CLOSE * size:
@@ -234,11 +234,11 @@ class Actuator:
         return np.asarray((run(pushed) - free)[:, signal] / small)
 
 
-def _fixed(changed: Callable[[Real], Real], beyond: Real, response: Real, start: Real) -> tuple[Real, Real]:
-    """x (T,) = changed(beyond + response * x), and that command; Anderson's mixing of the last steps."""
+def _fixed(changed: Callable[[Real], Real], alone: Real, response: Real, start: Real) -> tuple[Real, Real]:
+    """x (T,) = changed(alone + response * x), and that command; Anderson's mixing of the last steps."""
     points, steps, x = list[Real](), list[Real](), start
     for _ in range(_STEPS):
-        step = changed(beyond + scipy.signal.fftconvolve(response, x)[: x.size]) - x
+        step = changed(alone + scipy.signal.fftconvolve(response, x)[: x.size]) - x
         if not _norm(step) > _STANDS * _norm(x):
             break
         points, steps = [*points, x][-_MIXED:], [*steps, step][-_MIXED:]
@@ -246,7 +246,7 @@ def _fixed(changed: Callable[[Real], Real], beyond: Real, response: Real, start:
         if len(steps) > 1:
             moves, turns = np.diff(points, axis=0).T, np.diff(steps, axis=0).T
             x = x - (moves + turns) @ np.linalg.lstsq(turns, step, rcond=1e-12)[0]
-    return x, np.asarray(beyond + scipy.signal.fftconvolve(response, x)[: x.size])
+    return x, np.asarray(alone + scipy.signal.fftconvolve(response, x)[: x.size])
 
 
 @dataclass(frozen=True)
@@ -254,12 +254,12 @@ class EffectLaw:
     """What an effect does to a simulation that does not know it.
 
     where : "input" or "output", it changes a signal; "body", it is a force on a moving body; "model", it
-        edits the description of a model; "told", the simulation knows it and is told.
+        edits the description of a model; "simulation", it is told to the simulation, which knows it.
     change : of a signal, (T,), values, dt_s, what it was before its first row -> (T,); of a body, fields of
         `BodyForces` and their parameters, or values -> fields; of a model, model and values -> None.
     """
 
-    where: Where = "told"
+    where: Where = "simulation"
     change: Any = None
 
     def forces(self, values: Values) -> Mapping[str, float]:
@@ -292,9 +292,9 @@ def around(started: Started, acting: Sequence[Acting]) -> Run:
         inner = Started(body.under(inner, forces), at_rest, known, inner.start)
 
     for drive, effects in drives.values():
-        told = tuple((id(law), *values.items()) for law, _, values in effects)
+        by = tuple((id(law), *values.items()) for law, _, values in effects)
         outer = drive.under(inner, effects, inner.run), drive.under(inner, effects, inner.at_rest)
-        inner = Started(*outer, (inner.key, told), inner.start)
+        inner = Started(*outer, (inner.key, by), inner.start)
 
     def simulated(inputs: Real) -> Real:
         return _changed(inner.run(_changed(inputs, acting, Actuator)), acting, Sensor)

@@ -33,7 +33,7 @@ from diagnosis.machine.own_plant import Plant, PlantExperiment
 from diagnosis.machine.plant_effect import Change, PlantEffect
 
 # Last parts of numbers in a file that MuJoCo does not act on.
-_BEYOND = (".gain", ".offset", f".{DEAD_ZONE}", f".{STRIBECK}")
+_IGNORED = (".gain", ".offset", f".{DEAD_ZONE}", f".{STRIBECK}")
 # Relative standard deviations where the file has no <numeric name="tolerance.NAME">, by a name's last part.
 TOLERANCES = {
     "mass": 0.03,
@@ -118,9 +118,9 @@ class MujocoArm(MujocoModel):
                     whole[at : at + size] = pose[first : first + size]
                 key.qpos = whole
         names = [one.name for one in spec.numerics if not one.name.startswith("tolerance.")]
-        if beyond := [name for name in names if name.endswith(_BEYOND)]:
+        if ignored := [name for name in names if name.endswith(_IGNORED)]:
             note = spec.text("flexlink") or spec.add_text(name="flexlink")
-            note.data = f"MuJoCo does not act on {', '.join(beyond)}"
+            note.data = f"MuJoCo does not act on {', '.join(ignored)}"
         for e in records:
             data = plant.simulation.began(model, e.input)
             spec.add_key(name=f"start of {e.name}", qpos=data.qpos, qvel=data.qvel, act=data.act)

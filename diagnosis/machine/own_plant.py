@@ -225,18 +225,18 @@ class Plant:
         if ratios:
             return self.scaled(ratios).simulated([e for e in effects if e.id not in wrong], states)
         begun = (0.0,) * len(self.start) if states is None else tuple(float(v) for v in states)
-        told = {effect.id: effect.values for effect in effects}
+        inside = {effect.id: effect.values for effect in effects}
         acting = [
-            (kind.law, kind.place, told.pop(kind.name))
+            (kind.law, kind.place, inside.pop(kind.name))
             for kind in self.effects
-            if kind.place is not None and kind.name in told
+            if kind.place is not None and kind.name in inside
         ]
-        known = (tuple(self.parameters.items()), tuple((k, tuple(v.items())) for k, v in told.items()))
+        known = (tuple(self.parameters.items()), tuple((k, tuple(v.items())) for k, v in inside.items()))
 
-        def told_simulation(begun: tuple[float, ...], inputs: Real) -> Real:
+        def simulation_itself(begun: tuple[float, ...], inputs: Real) -> Real:
             start = (dict(zip(self.start, begun, strict=True)),) if self.start else ()
             try:
-                given = self.simulation(self.parameters, told, inputs, *start)
+                given = self.simulation(self.parameters, inside, inputs, *start)
                 if np.iscomplexobj(given):
                     raise ValueError("complex outputs")
                 found = np.asarray(given, dtype=np.float64)
@@ -258,7 +258,7 @@ class Plant:
                 )
             return found
 
-        run, at_rest = (partial(told_simulation, b) for b in (begun, (0.0,) * len(self.start)))
+        run, at_rest = (partial(simulation_itself, b) for b in (begun, (0.0,) * len(self.start)))
         wrapped = around(Started(run, at_rest, known, begun), acting)
         return lambda inputs: wrapped(inputs)[:, : self.noise.size]
 
