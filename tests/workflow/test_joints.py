@@ -253,6 +253,7 @@ def test_logs_that_are_not_taken_say_why(logs, tmp_path, capfd):
     [
         ("input_limit = 24.0\n\n[[joints]]", "\n[[joints]]", "input_limit"),
         ('output = "elbow_rad"', 'output = "shoulder_rad"', "two joints have the output"),
+        ('output = "elbow_rad"', 'output = "shoulder_V"', "'shoulder_V' is an input and an output"),
         ("bandwidth_rad_s = 5.0", "bandwidth_rad_s = 5.0\ndelay_margin_s = 0.01", "delay_margin_s"),
         ("controller_order = 4", "controller_order = 5", "two per modal block"),
         ("[design]", "[closed_loop]\nstep = [0.0, 0.0]\n\n[design]", "at least one"),

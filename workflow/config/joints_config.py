@@ -139,6 +139,8 @@ class JointsConfig(AnyRun):
         for kind in ("input", "output"):
             if (name := repeated([getattr(joint, kind) for joint in self.joints])) is not None:
                 raise ValueError(f"two joints have the {kind} {name!r}: each needs its own")
+        if both := {joint.input for joint in self.joints} & {joint.output for joint in self.joints}:
+            raise ValueError(f"{min(both)!r} is an input and an output: give each signal its own column")
         for number, joint in enumerate(self.joints):
             if joint.input_limit is None:
                 raise ValueError(
