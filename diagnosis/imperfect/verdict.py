@@ -191,12 +191,12 @@ def judged(search: Search) -> Verdict:
     answer = probabilities.counting_as_unknown(untried).answer
     accepted = _accepted(probabilities, answer, sets, beside)
     # Where something is missing, what stands in for it is weighed already (`_genuine`); effects of other
-    # machines nobody has counted.
+    # machines nobody has counted, whatever they are called.
     there, whole = probabilities.presence, sum(one.weight * one.explains for one in sets)
     acting = {
         name: p * whole * acts_like(name, len(weighing.listed))
         for name, p in there.items()
-        if name in EFFECTS and name not in beside
+        if weighing.listed == tuple(EFFECTS) and name not in beside
     }
     probabilities = replace(probabilities, presence={n: p - acting.get(n, 0.0) for n, p in there.items()})
     return Verdict(
