@@ -17,8 +17,6 @@ from ident.data.table import Table
 from workflow.config.log_reading import LogReading
 from workflow.engine.errors import naming
 
-_SHORT = 160  # letters of logs' names that leave room for the options in a line
-
 
 class Reading(LogReading):
     """Columns of one channel and how they are read, as stated; the rest as in `Record.from_file`. doubts: of
@@ -90,7 +88,7 @@ class Logs:
 
 def to_type(logs: Sequence[Path]) -> str:
     """Logs in a command that a complaint offers: its options have to be seen of a line that may be cut."""
-    return named if len(named := shlex.join(map(str, logs))) < _SHORT else "LOG..."
+    return named if len(named := shlex.join(map(str, logs))) < 160 else "LOG..."
 
 
 def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: Sequence[Path] = ()) -> Logs:
