@@ -366,8 +366,8 @@ class ModeDamping(Requirement):
 
 @dataclass(frozen=True)
 class ControllerDamping(Requirement):
-    """Damping ratio of the controller's own pole pairs, a bound on parameters in the synthesis: poles that
-    solvers leave within `SOLVER_SLACK` below it are at the bound, and `achieved` says so."""
+    """Damping ratio of the controller's own pole pairs, a bound on parameters in the synthesis, met within
+    `SOLVER_SLACK`."""
 
     zeta: float
     caption = "damping ratio of the controller's own poles"
@@ -380,8 +380,7 @@ class ControllerDamping(Requirement):
         zeta = -np.real(pairs) / np.abs(pairs)
         least = int(np.argmin(zeta)) if pairs.size else None
         achieved, omega = (1.0, None) if least is None else (float(zeta[least]), float(np.abs(pairs[least])))
-        if met := achieved >= self.zeta * (1 - SOLVER_SLACK):
-            achieved = max(achieved, self.zeta)
+        met = achieved >= self.zeta * (1 - SOLVER_SLACK)
         return SpecificationItem(
             self.caption, "controller", self.zeta, achieved, "", met, omega, None, True, "controller"
         )

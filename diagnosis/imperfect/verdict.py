@@ -11,6 +11,7 @@ import time
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib import resources
 from itertools import combinations
 from math import comb
@@ -204,6 +205,7 @@ def judged(search: Search) -> Verdict:
     )
 
 
+@cache
 def acts_like(name: str, listed: int) -> float:
     """Probability that what an effect explains is the work of a cause on no list, given that it is there.
 

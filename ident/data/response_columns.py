@@ -48,10 +48,11 @@ _SPELLED = {
 }
 _WORDS = {role: frozenset(words.split()) for role, words in _SPELLED.items()}
 # Beside such a word a column is about something else: its spread, its sign turned, its slope.
-_OTHER = re.compile(
-    "variance|var|std|stddev|sigma|error|err|coherence|coh|covariance|cov|noise|margin|delay|group|lag|"
-    "attenuation|difference|reference"
+_SPELLED_OTHER = (
+    "variance var std stddev sigma error err coherence coh covariance cov noise margin delay group lag "
+    "attenuation difference reference"
 )
+_OTHER = frozenset(_SPELLED_OTHER.split())
 # Units and letters, that count where no other word says what it is.
 _SHORT = frozenset({"hz", "db", "deg", "f", "w", "amp", "re", "im"})
 # Words of a gain that no signal of a log is called by.
@@ -175,7 +176,7 @@ def _stated(table: Table, name: str) -> str:
 def _role(name: str, unit: str) -> str | None:
     """What a column is by the words of its name; by its unit where these are none that is known."""
     words, plain = _words(name), unicodedata.normalize("NFKC", name)
-    if any(map(_OTHER.fullmatch, words)):
+    if words & _OTHER:
         return None
     if words & {"f", "w"} and (stated := _unit(name, unit)) and stated not in _UNITS["frequency"]:
         return None  # a force in N, a power in W
