@@ -9,19 +9,20 @@ from dataclasses import replace
 import numpy as np
 
 from diagnosis.answer import Diagnosis
-from diagnosis.exact import without_error
 from diagnosis.fit.levels import quietest
-from diagnosis.imperfect.answered import (
-    beside_imperfections,
+from diagnosis.judge.known_noise import KnownNoise
+from diagnosis.judge.model_error import (
+    BesideModelError,
     looked_at_again,
     reaches_noise,
-    searched,
 )
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine
 from diagnosis.machine.own_plant import PlantCase
 from diagnosis.machine.probed import doubts_about
 from diagnosis.search.loop import Progress
+from diagnosis.search.search import Search
+from diagnosis.search.white import WhiteSearch
 
 # Share of a time limit for fits; the rest is for what the answer needs besides.
 _SEARCHED = 0.9
@@ -102,19 +103,19 @@ def _answered(
     """With the noise as stated."""
     weighing = case.machine.weighing
     if not weighing.model_error > 0:
-        return without_error(case, progress, rng, deadline_s)
+        return KnownNoise(WhiteSearch(case, progress, deadline_s).run_in_time()).answer(rng)
     if isinstance(case, Case):
         case = case.at_fast_lengths()
-    found = searched(case, lambda done, what: progress(_FIRST_SEARCH * done, what), deadline_s)
+    found = Search(case, lambda done, what: progress(_FIRST_SEARCH * done, what), deadline_s).run_in_time()
     if found.left_out:
-        return beside_imperfections(found, rng)
+        return BesideModelError(found, rng).answer(rng)
 
     def again(done: float, what: str) -> None:
         progress(_FIRST_SEARCH + (1 - _FIRST_SEARCH) * done, what)
 
     if isinstance(case, PlantCase) and not weighing.stated and reaches_noise(found):
         as_sensors = replace(case, plant=replace(case.plant, model_error=0.0))
-        exact = without_error(as_sensors, again, rng, deadline_s)
+        exact = KnownNoise(WhiteSearch(as_sensors, again, deadline_s).run_in_time()).answer(rng)
         if exact.verdict != "unknown":
             return exact
-    return looked_at_again(found, beside_imperfections(found, rng), again, deadline_s, rng)
+    return looked_at_again(found, BesideModelError(found, rng).answer(rng), again, deadline_s, rng)

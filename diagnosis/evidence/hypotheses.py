@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import log_ndtr
 
+from diagnosis.evidence.explanation import Weighed, best_of_sets
 from diagnosis.fit.descent import Descent
 from diagnosis.fit.discrepancy import Discrepancy
 from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL
 from diagnosis.fit.solver_spread import NO_DRIFT, Drift
-from diagnosis.search.explanation import Weighed
 from plant.effects import EFFECTS
 
 # Solver disagreement in noise deviations (half-normal scale); 0.2 between two solvers of backlash.
@@ -167,11 +167,6 @@ class Probabilities:
         return max(self.cause, key=self.cause.__getitem__)
 
 
-def best_of_sets(hypotheses: Sequence[Hypothesis]) -> dict[tuple[str, ...], Hypothesis]:
-    """Sorted effect names -> the hypothesis of this set with the largest weight."""
-    return {h.key: h for h in sorted(hypotheses, key=lambda h: h.log_weight)}
-
-
 def probabilities(hypotheses: Sequence[Hypothesis]) -> Probabilities:
     """Probabilities from the evidence of everything that was fitted.
 
@@ -179,7 +174,7 @@ def probabilities(hypotheses: Sequence[Hypothesis]) -> Probabilities:
     """
     if not hypotheses:
         raise ValueError("probabilities need at least one hypothesis")
-    best = best_of_sets([h for h in hypotheses if h.is_answer])
+    best = best_of_sets((h for h in hypotheses if h.is_answer), lambda h: h.log_weight)
     unknown, keys = max(h.unknown_weight for h in hypotheses), [*best, _UNKNOWN]
     logs = np.array([*(h.log_weight for h in best.values()), unknown])
     weight = np.exp(logs - np.max(logs))

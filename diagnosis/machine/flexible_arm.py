@@ -66,7 +66,7 @@ class FlexibleArm:
 
     @property
     def weighing(self) -> Weighing:
-        return Weighing(model_error=self.model_error)
+        return Weighing(model_error=self.model_error, counted="rigs")
 
     @property
     def description(self) -> Rig:

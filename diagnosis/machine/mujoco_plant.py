@@ -230,4 +230,5 @@ class MujocoArm(MujocoModel):
             ),
             units=self.units,
             input_names=self.inputs,
+            counted="models",
         )

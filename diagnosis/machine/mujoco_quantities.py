@@ -187,10 +187,16 @@ class Quantities:
             name = f"limit_{_UNITS[kind][0]}" if kind in _UNITS else "limit"
             limit = _size(name, force, (0.05, 1.0), (0.1, 0.98))
             yield of(f"{one.name}.forcerange", 0.0, put, limit, grows=False)
+        option = self.model.spec.option
         if one.dyntype in LAGS:
-            put = partial(put_lag, one.name)
-            yield _number(f"{one.name}.lag", lag, put, late("time_constant_s"), group="actuator")
-        put = partial(put_delay, "actuator", one.name, self.model.spec.option.timestep)
+            # Integrated as all else is, a filter that is faster than a step runs away.
+            explicit = option.integrator == mujoco.mjtIntegrator.mjINT_RK4 or one.dyntype == LAGS[1]
+            least = max(0.02, option.timestep / self.model.dt_s) if explicit else 0.02
+            size = late(
+                "time_constant_s", span=(least, longest), starts=(max(0.2, least), min(20.0, longest))
+            )
+            yield _number(f"{one.name}.lag", lag, partial(put_lag, one.name), size, group="actuator")
+        put = partial(put_delay, "actuator", one.name, option.timestep)
         yield _number(f"{one.name}.delay", float(one.delay), put, late("delay_s"), group="actuator")
 
     def _of_link(self, body: Any) -> Iterator[PlantEffect]:

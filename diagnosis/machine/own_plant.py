@@ -94,6 +94,7 @@ class Plant:
     untracked : the simulation without what holds it near a record, which is in these inputs; None: nothing
         does.
     units : output -> unit, of outputs whose names do not end with it.
+    counted : as in `Weighing`.
     input_names : of the inputs, for pages; inputs behind these only hold a simulation near its record.
     """
 
@@ -111,6 +112,7 @@ class Plant:
     untracked: Simulate | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     input_names: tuple[str, ...] = ()
+    counted: str = ""
 
     def __post_init__(self) -> None:
         lock(self, "noise")
@@ -156,7 +158,8 @@ class Plant:
     def weighing(self) -> Weighing:
         stated = self.model_error is not None
         model_error = _USUAL_MODEL_ERROR if self.model_error is None else float(self.model_error)
-        return Weighing(tuple(kind.id for kind in self.missing), model_error, _MOST_EFFECTS, stated)
+        listed = tuple(kind.id for kind in self.missing)
+        return Weighing(listed, model_error, _MOST_EFFECTS, stated, self.counted)
 
     @property
     def description(self) -> Plant:

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from diagnosis.evidence.hypotheses import Hypothesis, best_of_sets
+from diagnosis.evidence.explanation import best_of_sets
+from diagnosis.evidence.hypotheses import Hypothesis
 from diagnosis.fit.coordinates import box, effects_at, quotients
 from diagnosis.fit.descent import Descent
 from diagnosis.fit.nominal import NominalParameters
@@ -100,7 +101,7 @@ def competing_hypotheses(
     sets : Sorted effect names -> probability, as `probabilities` gives them; names without a fit ("unknown")
         are passed over.
     """
-    best = best_of_sets(hypotheses)
+    best = best_of_sets(hypotheses, lambda h: h.log_weight)
     # Equally hopeless sets have probabilities of zero alike: their weight orders them.
     kept: list[tuple[str, ...]] = []
     for key in sorted(best, key=lambda k: (sets.get(k, 0.0), best[k].log_weight), reverse=True):

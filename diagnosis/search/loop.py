@@ -5,16 +5,16 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Generic
+from typing import Any, Generic, Self
 
 import numpy as np
 
+from diagnosis.evidence.explanation import E, best_of_sets
 from diagnosis.fit.descent import Descent, best_following, descend
 from diagnosis.fit.likelihood import DECISIVE
 from diagnosis.fit.records import RecordsToFit
 from diagnosis.fit.starts import StartPoint, point_of
-from diagnosis.machine.machine_protocol import CaseOfMachine
-from diagnosis.search.explanation import E, best_of_sets
+from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
 from plant.effects.search_space import Candidate
 
 Progress = Callable[[float, str], None]
@@ -59,6 +59,8 @@ class SearchLoop(ABC, Generic[E]):
         self.left_out: list[str] = []
         self.points: list[tuple[Candidate, list[StartPoint]]] = []
         self.rough: list[tuple[Descent, list[StartPoint]]] = []
+        # Whose simulations are counted, and ended by a time limit.
+        self.watched: tuple[RecordsToFit, ...] = ()
         # Whether starts of records that are only predicted feel contacts.
         self.touching = False
         # Already tried: sets without one of their effects, with a simpler one, with another in its place.
@@ -78,22 +80,21 @@ class SearchLoop(ABC, Generic[E]):
 
     @property
     def simulations(self) -> int:
-        return self.records.simulations
+        return sum(records.simulations for records in self.watched)
+
+    @property
+    def out_of_time(self) -> bool:
+        return time.monotonic() > self.deadline_s
 
     @abstractmethod
     def run(self) -> None:
         """All of it, the nominal first."""
 
-    @property
-    def watched(self) -> tuple[RecordsToFit, ...]:
-        """Whose simulations a time limit ends."""
-        return (self.records,)
-
-    def run_in_time(self) -> None:
+    def run_in_time(self) -> Self:
         """To its end or to its deadline, whatever is being fitted then, once the nominal is."""
 
         def watch() -> None:
-            if self.found and time.monotonic() > self.deadline_s:
+            if self.found and self.out_of_time:
                 raise OutOfTimeError
 
         watched = self.watched if np.isfinite(self.deadline_s) else ()
@@ -107,6 +108,7 @@ class SearchLoop(ABC, Generic[E]):
             self.left_out.append("what was being fitted")
         for records in watched:
             records.before_each = lambda: None
+        return self
 
     @property
     def untried(self) -> dict[str, str]:
@@ -122,6 +124,10 @@ class SearchLoop(ABC, Generic[E]):
     @abstractmethod
     def explained(self, end: Descent) -> E:
         """An end with what it leaves, weighed."""
+
+    @abstractmethod
+    def whitened(self, found: E, experiments: Sequence[RecordOfMachine] | None = None) -> dict[str, Real]:
+        """experiment -> (measured - model)/noise (T, Y), of the given ones (default: all)."""
 
     @abstractmethod
     def looked_for(
@@ -148,7 +154,7 @@ class SearchLoop(ABC, Generic[E]):
                 move.apply(self)
 
     def late(self, what: str) -> bool:
-        if time.monotonic() < self.deadline_s:
+        if not self.out_of_time:
             return False
         if what not in self.left_out:
             self.left_out.append(what)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import find_peaks
 
+from diagnosis.evidence.explanation import Weighed, best_of_sets
 from diagnosis.fit.descent import Descent, best_following, descend, refined, scanned
 from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL, WORTH_IT
 from diagnosis.fit.nominal import EDGE
@@ -19,7 +20,6 @@ from diagnosis.fit.records import FittedStart, Records
 from diagnosis.fit.starts import StartPoint, beside, point_of, points_of, superposed
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.search.explanation import Weighed, best_of_sets
 from diagnosis.search.loop import MANY, NEAREST, SEVERAL, Move, SearchLoop
 from diagnosis.search.settled import settled
 from diagnosis.search.windows import in_windows

@@ -8,13 +8,13 @@ from functools import cached_property
 
 import numpy as np
 
+from diagnosis.evidence.explanation import Explanation
 from diagnosis.fit.descent import FINE, Descent, descend, loss_at, occam, refined
 from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL
 from diagnosis.fit.records import FittedStart, Records, mean_square_left
 from diagnosis.fit.starts import StartPoint, beside
 from diagnosis.fit.windows import Windows
-from diagnosis.machine.machine_protocol import CaseOfMachine
-from diagnosis.search.explanation import Explanation
+from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
 from diagnosis.search.loop import MANY, NEAREST, SEVERAL, Progress, SearchLoop
 from diagnosis.search.moves import (
     Alone,
@@ -51,14 +51,7 @@ class Search(SearchLoop[Explanation]):
         self.refuted: set[str] = set()
         self.records = Records(case, case.estimation, windows)
         self.held_out = Records(case, case.held_out, windows)
-
-    @property
-    def watched(self) -> tuple[Records, ...]:
-        return self.records, self.held_out
-
-    @property
-    def simulations(self) -> int:
-        return self.records.simulations + self.held_out.simulations
+        self.watched = self.records, self.held_out
 
     @cached_property
     def horizon(self) -> Windows | None:
@@ -187,6 +180,14 @@ class Search(SearchLoop[Explanation]):
                 ]
             ),
         )
+
+    def whitened(
+        self, found: Explanation, experiments: Sequence[RecordOfMachine] | None = None
+    ) -> dict[str, Real]:
+        records = (*self.records.experiments, *self.held_out.experiments)
+        parts = zip(records, (*found.left, *found.left_held_out), strict=True)
+        left = {e.name: part / self.case.noise for e, part in parts}
+        return {e.name: left[e.name] for e in experiments or self.case.experiments}
 
     def _beginning(self, held: Records, fitted: FittedStart) -> FittedStart:
         """Starts of records as their first samples say, sensors at the zeros that others have."""

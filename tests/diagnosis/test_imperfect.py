@@ -20,22 +20,22 @@ from diagnosis import (
     PlantExperiment,
     diagnose,
 )
+from diagnosis.evidence.explanation import Explanation
 from diagnosis.fit.descent import Descent, descend, occam, refined, scanned
 from diagnosis.fit.levels import Levels, quietest
 from diagnosis.fit.records import FittedStart, Records, StartColumns
 from diagnosis.fit.starts import StartPoint, points_of
-from diagnosis.imperfect import verdict
-from diagnosis.imperfect.answered import _in_part
-from diagnosis.imperfect.carried import shares_of
-from diagnosis.imperfect.verdict import TEMPER, _enough, _weights, is_silent, judged
+from diagnosis.judge import verdict
+from diagnosis.judge.carried import shares_of
+from diagnosis.judge.model_error import _in_part
+from diagnosis.judge.verdict import TEMPER, _enough, _weights, is_silent, judged
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Weighing
-from diagnosis.search.explanation import Explanation
 from diagnosis.search.moves import BesideSet, InWindows, LookAlike, descended
 from diagnosis.search.search import Search
 from diagnosis.search.settled import best_move, settled
 from diagnosis.search.windows import in_windows
-from plant.effects import LOOK_ALIKES, parse_effect
+from plant.effects import EFFECTS, LOOK_ALIKES, parse_effect
 from plant.presets import paper_link
 from plant.simulation import Simulator
 from validation.blind.generate import generate
@@ -699,7 +699,7 @@ def test_far_values_are_scanned_where_contacts_switch():
     [("gravity", 0.608), ("actuator_lag", 0.732), ("actuator_dead_zone", 0.919)],
 )
 def test_what_often_stood_in_for_another_cause_is_less_sure(name, there):
-    assert 1 - verdict.acts_like(name, 23) == pytest.approx(there, abs=2e-3)
+    assert 1 - verdict.acts_like(name, tuple(EFFECTS), "rigs") == pytest.approx(there, abs=2e-3)
 
 
 def _judged(sets, **told):
@@ -759,7 +759,7 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
         exchanged=lambda explanation, sought: None,
         left_out=(),
         untried={},
-        deadline_s=np.inf,
+        out_of_time=False,
         acts_on_held_out=lambda whole, k: acts,
         by_these=lambda names, whole: found[frozenset(names)],
         finished=lambda explanation: explanation,

@@ -8,7 +8,6 @@ from scipy.optimize import minimize_scalar
 
 from diagnosis import Plant, PlantCase, PlantEffect, PlantExperiment, ResidualModel
 from diagnosis.evidence.hypotheses import Hypothesis
-from diagnosis.evidence.search import fitted_to
 from diagnosis.fit.nominal import LogNormalParameters
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.plant_effect import Change, EffectParameter
@@ -22,6 +21,7 @@ from diagnosis.next_experiment.discrimination import (
 from diagnosis.next_experiment.experiment_choices import Limits, excitations
 from diagnosis.next_experiment.next_experiment import next_experiment
 from diagnosis.next_experiment.repeat import best_repeat
+from diagnosis.search.white import fitted_to
 from plant import prbs, simulate
 from plant.effects.actuator import ActuatorLag, ActuatorSaturation, InputDelay
 from plant.effects.joint import CoulombFriction, ViscousFriction

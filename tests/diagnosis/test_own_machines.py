@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
 from diagnosis.fit.descent import descend
-from diagnosis.imperfect.answered import beside_imperfections, searched
+from diagnosis.judge.model_error import BesideModelError
 from diagnosis.machine.around import Actuator, Body
 from diagnosis.search.moves import Alone, BesideSet, Enlarge, FromContacts, Scan
 from diagnosis.search.search import Search
@@ -234,7 +234,7 @@ def test_what_is_wrong_is_named_beside_a_bias_that_drifts():
     plant = Plant(_turning, stated, tolerances, ("angle_rad",), np.array([1e-3]))
     plant = with_effects(plant, "all", experiments, dt_s=DT_S, body=Body("angle_rad"))
     case = PlantCase("turning motor", plant, tuple(experiments))
-    free = beside_imperfections(searched(case, lambda done, what: None), np.random.default_rng(0))
+    free = BesideModelError(Search(case, lambda done, what: None).run_in_time(), rng).answer(rng)
     shares_done: list[float] = []
     found = diagnose(case, progress=lambda done, what: shares_done.append(done))
     assert shares_done == sorted(shares_done)
@@ -422,7 +422,7 @@ class _Clock:
 @pytest.mark.parametrize(("model_error", "limit_s"), [(0.05, 10.0), (0.0, 20.0)])
 def test_a_time_limit_is_kept_while_a_fit_is_running(monkeypatch, limit_s, model_error):
     clock = _Clock()
-    for module in ("diagnosis", "imperfect.verdict", "search.loop"):
+    for module in ("diagnosis", "search.loop"):
         monkeypatch.setattr(f"diagnosis.{module}.time", clock)
     rng, truth = np.random.default_rng(3), {"mass_kg": 1.0, "damper": 2.0, "spring": 50.0}
     records = []

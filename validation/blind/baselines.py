@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from diagnosis.evidence.search import fitted_to
 from diagnosis.fit.descent import Descent
 from diagnosis.fit.residual import ResidualModel, pooled_rms
 from diagnosis.machine.case import Case
+from diagnosis.search.white import fitted_to
 
 # A false alarm in a thousand cases without effect, if noise were all there is.
 _SIGNIFICANCE = 1e-3

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -68,9 +68,11 @@ class Explanation(Weighed):
 E = TypeVar("E", bound=Weighed)
 
 
-def best_of_sets(found: Iterable[E]) -> dict[tuple[str, ...], E]:
-    """The best by each set of effects, the likeliest first."""
+def best_of_sets(
+    found: Iterable[E], weight: Callable[[E], float] = lambda e: e.evidence
+) -> dict[tuple[str, ...], E]:
+    """Sorted effect names -> the explanation by these of largest weight, the likeliest first."""
     best: dict[tuple[str, ...], E] = {}
-    for explanation in sorted(found, key=lambda e: -e.evidence):
+    for explanation in sorted(found, key=lambda e: -weight(e)):
         best.setdefault(explanation.key, explanation)
     return best

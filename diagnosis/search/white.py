@@ -18,7 +18,7 @@ from diagnosis.fit.likelihood import DECISIVE, WORTH_IT
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
 from diagnosis.fit.starts import StartPoint, beside, superposed
-from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
 from diagnosis.search.loop import NEAREST, SEVERAL, Progress, SearchLoop
 from diagnosis.search.moves import Alone, BesideSet, Enlarge, FromPoints, InPlaceOf, LookAlike
 from plant.effects.search_space import Candidate
@@ -54,6 +54,7 @@ class WhiteSearch(SearchLoop[Hypothesis]):
     def __init__(self, case: CaseOfMachine, progress: Progress, deadline_s: float = np.inf) -> None:
         super().__init__(case, progress, deadline_s)
         self.records = ResidualModel(case)
+        self.watched = (self.records,)
 
     def run(self) -> None:
         """The nominal, every effect alone, and sets of effects as long as they gain."""
@@ -135,6 +136,11 @@ class WhiteSearch(SearchLoop[Hypothesis]):
         if {*end.names} <= {*listed}:
             return found
         return replace(found, log_weight=-np.inf, unknown_weight=found.log_weight + float(np.log(UNLISTED)))
+
+    def whitened(
+        self, found: Hypothesis, experiments: Sequence[RecordOfMachine] | None = None
+    ) -> dict[str, Real]:
+        return self.records.by_experiment(found.end.deviations, found.end.effects, experiments)
 
 
 def _beyond_noise(end: Descent) -> float:

@@ -7,10 +7,9 @@ the motion, of estimation and held-out records.
 
 from __future__ import annotations
 
-import time
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
 from itertools import combinations
@@ -20,17 +19,18 @@ import numpy as np
 from scipy.special import expit, softmax
 from scipy.stats import norm
 
+from diagnosis.evidence.explanation import Explanation, best_of_sets
 from diagnosis.evidence.hypotheses import UNLISTED, Probabilities
 from diagnosis.fit.coordinates import DRAWS
 from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL
 from diagnosis.fit.nominal import EDGE
 from diagnosis.fit.records import Records, mean_square_left
+from diagnosis.judge.judgement import Judgement
 from diagnosis.machine.machine_protocol import Real, Weighing
 from diagnosis.machine.rounding import Rounding, rounding_effect
-from diagnosis.search.explanation import Explanation, best_of_sets
 from diagnosis.search.loop import MANY, SEVERAL
 from diagnosis.search.search import Search
-from plant.effects import EFFECTS, LOOK_ALIKES
+from plant.effects import LOOK_ALIKES
 
 # Log likelihoods count this much less than independent coefficients would (calibrated on generated cases:
 # `flexlink blind --workshop`); prior densities of stated values count whole.
@@ -110,20 +110,12 @@ class Judged:
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
-    """probabilities; judged: the sets that were weighed, likeliest first; answer: names that are accepted,
-    with rounding where that interests, which is read off the values and in none of the sets. nominal: as
-    stated, or re-estimated where that leaves less of the held-out records. untried: effect -> what it needs
-    to be tried. alike: effect -> what its presence is less by, as a cause on no list may act like it."""
+class JudgedSets(Judgement):
+    """judged : the sets that were weighed, likeliest first. nominal : as stated, or re-estimated where that
+    leaves less of the held-out records."""
 
-    probabilities: Probabilities
-    judged: tuple[Judged, ...]
-    answer: str
-    accepted: tuple[str, ...]
-    nominal: Explanation
-    untried: Mapping[str, str]
-    alike: Mapping[str, float]
-    rounding: Rounding | None = None
+    judged: tuple[Judged, ...] = field(kw_only=True)
+    nominal: Explanation = field(kw_only=True)
 
     def fitted(self, names: Iterable[str]) -> set[str]:
         """Those of the names that are in sets."""
@@ -154,13 +146,13 @@ def _gain(explanation: Explanation, listed: Sequence[str]) -> float:
     )
 
 
-def judged(search: Search) -> Verdict:
+def judged(search: Search) -> JudgedSets:
     """The answer from everything that a search has fitted; fits the best set without each of its effects, and
     with simpler ones. What that finds is weighed with all others."""
     nominal = min(search.base, search.stated(), key=lambda e: e.pooled_held_out(search.case.noise))
     for _ in range(SEVERAL):
         known, sets = len(search.found), _weighed(search, nominal)
-        if late(search):
+        if search.out_of_time:
             break
         near_sets = [one for one in sets if one.score > sets[0].score - SUBSTANTIAL]
         for near in near_sets:
@@ -191,36 +183,46 @@ def judged(search: Search) -> Verdict:
     )
     answer = probabilities.counting_as_unknown(untried).answer
     accepted = _accepted(probabilities, answer, sets, beside)
-    # Where something is missing, what stands in for it is weighed already (`_genuine`); effects of other
-    # machines nobody has counted, whatever they are called.
+    # Where something is missing, what stands in for it is weighed already (`_genuine`).
     there, whole = probabilities.presence, sum(one.weight * one.explains for one in sets)
     acting = {
-        name: p * whole * acts_like(name, len(weighing.listed))
+        name: p * whole * acts_like(name, weighing.listed, weighing.counted)
         for name, p in there.items()
-        if weighing.listed == tuple(EFFECTS) and name not in beside
+        if weighing.counted and name not in beside
     }
     probabilities = replace(probabilities, presence={n: p - acting.get(n, 0.0) for n, p in there.items()})
-    return Verdict(
-        probabilities, sets, answer, accepted, nominal, untried, acting, rounding if beside else None
+    return JudgedSets(
+        probabilities,
+        answer,
+        accepted,
+        untried,
+        rounding if beside else None,
+        acts_alike=acting,
+        judged=sets,
+        nominal=nominal,
     )
 
 
 @cache
-def acts_like(name: str, listed: int) -> float:
+def acts_like(name: str, listed: tuple[str, ...], machines: str) -> float:
     """Probability that what an effect explains is the work of a cause on no list, given that it is there.
 
-    From the priors of an effect, one of so many that are listed, and of such a cause, and from how often it
-    stood in for one (look_alikes.toml), shrunk to the rate of all effects.
+    From the priors of an effect, one of those that are listed, and of such a cause, and from how often effects
+    of its kind stood in for one in these machines (a table of look_alikes.toml), shrunk to the rate of all
+    kinds and shared by those of the kind that are listed.
     """
-    seen = tomllib.loads(resources.files(__package__).joinpath("look_alikes.toml").read_text("utf-8"))
-    pooled = seen["pooled_cases"] * sum(seen["stood_in"].values()) / seen["cases"] / listed
-    rate = (seen["stood_in"].get(name, 0) + pooled) / (seen["cases"] + seen["pooled_cases"])
-    return float(1 / (1 + _PRIOR_COUNT[1] / (_PRIOR_UNKNOWN * rate * listed)))
+    tables = tomllib.loads(resources.files(__package__).joinpath("look_alikes.toml").read_text("utf-8"))
+    seen, kind = tables[machines], kind_of(name)
+    pooled = seen["pooled_cases"] * sum(seen["stood_in"].values()) / seen["cases"] / seen["kinds"]
+    rate = (seen["stood_in"].get(kind, 0) + pooled) / (seen["cases"] + seen["pooled_cases"])
+    each = rate / sum(kind_of(other) == kind for other in listed)
+    return float(1 / (1 + _PRIOR_COUNT[1] / (_PRIOR_UNKNOWN * each * len(listed))))
 
 
-def late(search: Search) -> bool:
-    """Whether a time limit leaves no time for a further fit."""
-    return time.monotonic() > search.deadline_s
+def kind_of(name: str) -> str:
+    """Of an effect, whichever joint, actuator, link or sensor of a model it is of; stated values that may be
+    wrong too."""
+    return name.removeprefix("wrong_").rpartition(".")[2]
 
 
 def _accepted(
@@ -258,7 +260,7 @@ def _weighed(search: Search, nominal: Explanation) -> tuple[Judged, ...]:
     ranked = sorted((best[key] for key in score), key=lambda e: -score[e.key])
     top = score[ranked[0].key]
     chosen = [e for e in ranked[:MANY] if score[e.key] > top - DECISIVE]
-    in_time = not late(search)
+    in_time = not search.out_of_time
     return tuple(_judged(search, e, best, nominal, fit=in_time and k == 0) for k, e in enumerate(chosen))
 
 

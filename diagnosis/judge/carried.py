@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from diagnosis.answer import BLOCK, Shares
+from diagnosis.evidence.explanation import Explanation
 from diagnosis.fit.coordinates import DRAWS
 from diagnosis.fit.records import Records
-from diagnosis.imperfect.verdict import is_silent, late
+from diagnosis.judge.verdict import is_silent
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.rounding import rounding_effect
-from diagnosis.search.explanation import Explanation
 from diagnosis.search.loop import SEVERAL
 from diagnosis.search.search import Search
 
@@ -43,7 +43,7 @@ def shares_of(
     names = (*fitted, *(name for name in accepted.names if name not in fitted))
     parts = [chosen for count in range(len(names) + 1) for chosen in combinations(names, count)]
     known = {accepted.key, *(e.key for e in search.found)}
-    in_time = not late(search) or all(tuple(sorted(chosen)) in known for chosen in parts)
+    in_time = not search.out_of_time or all(tuple(sorted(chosen)) in known for chosen in parts)
     subsets = {chosen: search.by_these(chosen, accepted) for chosen in (parts if in_time else ((),))}
     # Alone a part may run away, far beyond what the nominal leaves: it carries nothing.
     nothing = _blocks(search, nominal)

@@ -1,0 +1,207 @@
+"""The judge of a machine that its simulation does not reach, whatever is added: beside a model error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from diagnosis.answer import Diagnosis
+from diagnosis.evidence.explanation import Explanation, best_of_sets
+from diagnosis.fit.descent import Descent
+from diagnosis.judge import verdict as judging
+from diagnosis.judge.carried import closed_by, shares_of
+from diagnosis.judge.judgement import Judge
+from diagnosis.judge.verdict import JudgedSets
+from diagnosis.machine.case import Case
+from diagnosis.machine.flexible_arm import FlexibleArm
+from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.own_plant import PlantCase
+from diagnosis.next_experiment.discrimination import MOST_COMPETING, CompetingHypothesis, fitted_hypothesis
+from diagnosis.search.loop import Progress
+from diagnosis.search.search import Search
+from plant.effects.search_space import Candidate
+
+# RMS in noise deviations: what a simulation without error leaves, and a little that the search has not found.
+_NEAR_NOISE = 2.0
+
+
+def looked_at_again(
+    first: Search, answer: Diagnosis, progress: Progress, deadline_s: float, rng: np.random.Generator
+) -> Diagnosis:
+    """The answer of a machine that does not forget its inputs, from windows where a free run says less.
+
+    Windows are not looked at where the records leave no gap that interests, nor where the first answer leaves
+    none, in them either; they are not taken where they only add to what was named.
+    """
+    # Unlisted causes act within windows too: what a free run leaves unknown stays so, and what it names of a
+    # rig stands.
+    named = set(answer.combination)
+    windows = first.horizon if named and isinstance(answer.case, PlantCase) else None
+    if windows is None:
+        return answer
+    search = Search(answer.case, progress, deadline_s, windows)
+    holding = [e for e in first.found if named <= set(e.names)]
+    if holding:
+        named_alone = first.by_these(answer.combination, max(holding, key=lambda e: e.evidence))
+        # The same effects in windows, descended on from where the free run ended.
+        left = np.sqrt(search.explained(named_alone.end.on(search.records)).mean_squares)
+        if max(np.max(left), np.max(named_alone.shares)) < answer.case.machine.weighing.model_error:
+            return answer
+    again = BesideModelError(search.run_in_time(), rng).answer(rng)
+    return again if again.combination and not named < set(again.combination) else answer
+
+
+def reaches_noise(search: Search) -> bool:
+    """Whether some set leaves little beyond the noise of any output and record: it may be exact."""
+    return any(
+        max(np.sqrt(np.mean(part**2, axis=0)).max() for part in search.whitened(e).values()) < _NEAR_NOISE
+        for e in search.found
+    )
+
+
+class BesideModelError(Judge[Explanation]):
+    """By likelihoods whose levels nobody knows: what a model error leaves is coloured, and no two records'
+    alike."""
+
+    search: Search
+    said: JudgedSets
+
+    def __init__(self, search: Search, rng: np.random.Generator) -> None:
+        """Validation records have a veto: what certainly makes these worse is something else. Without such an
+        effect everything is judged anew."""
+        self.search, case = search, search.case
+        noise, listed = case.noise, case.machine.weighing.listed
+        while True:
+            self.said = found = judging.judged(search)
+            search.progress(1.0, "done")
+            refit, best = found.nominal, found.judged[0]
+            accepted, self.partial, self.looks_like = refit, tuple[str, ...](), False
+            if found.answer == "unknown":
+                self.looks_like = best.explains > 0.5 and not set(best.explanation.names) <= set(listed)
+                accepted = _in_part(search, found, looks_like=self.looks_like)
+                self.partial = tuple(sorted(accepted.names))
+            elif found.accepted:
+                fitted = found.fitted(found.accepted)
+                whole = next(one for one in found.judged if fitted <= {p.name for p in one.parts})
+                accepted = _kept(search, whole, found.accepted)
+                if accepted.pooled_held_out(noise) > refit.pooled_held_out(noise):
+                    accepted = whole.explanation
+            if accepted.names:
+                # Values are re-estimated beside effects too only where that serves validation records.
+                accepted = min(accepted, search.stated(accepted), key=lambda e: e.pooled_held_out(noise))
+            self.shares = shares_of(search, found.accepted or self.partial, accepted, refit, rng)
+            worse = {n for n, (*_, most) in self.shares.carried.items() if most <= 0 and n in found.accepted}
+            if not (worse := worse - search.refuted - {*self.shares.silent}):
+                break
+            search.refuted |= worse
+        self.stated, self.refit, self.repaired = search.stated(), refit, accepted
+        self.complete = judging.below_threshold(search, accepted)
+        self.sets = best_of_sets(search.found)
+
+    def answer(self, rng: np.random.Generator) -> Diagnosis:
+        """What a time limit left out is said."""
+        named = self.repaired if self.partial else self.said.judged[0].explanation
+        return self.recorded(
+            rng,
+            unlisted=named.end.effects if self.looks_like else (),
+            partial_model=self.partial,
+            shares=self.shares,
+            competing=_competing(self.search, self.said),
+        )
+
+    def holding(self, name: str) -> Explanation | None:
+        judged = [one.explanation for one in self.said.judged]
+        return next((e for e in (self.repaired, *judged, *self.sets.values()) if name in e.names), None)
+
+    def covariance(self, found: Explanation) -> Real:
+        likely = np.linalg.pinv(found.end.normal(self.search.records).hessian, hermitian=True)
+        return judging.TEMPER * np.asarray(likely, dtype=np.float64)
+
+    def further(self, found: Explanation, k: int) -> Real:
+        """From imperfections of the model that may act as the effect does."""
+        candidate, coordinates = found.end.candidates[k], found.end.coordinates_of(k)
+        rest = judging.best_without(self.sets, found, found.names[k])
+        alike = judging.LITTLE * self.search.case.machine.weighing.model_error
+        share = max(judging.share_beside(rest, found), alike)
+        sizes = alike / share * np.array([_size(candidate, i, x) for i, x in enumerate(coordinates)])
+        return np.outer(sizes, sizes)
+
+    def explains(self, found: Explanation, name: str) -> tuple[float, float, float]:
+        rest = judging.best_without(self.sets, found, name)
+        closes = [closed_by(self.search, e, self.refit) for e in (found, rest)]
+        alone = (max(closes[0] - closes[1], 0.0), float("nan"), float("nan"))
+        return self.shares.carried.get(name) or alone
+
+
+def _kept(search: Search, whole: judging.Judged, accepted: Iterable[str]) -> Explanation:
+    """A set without what is not accepted and carries next to nothing, fitted to its end.
+
+    Nor is kept what stands at an end of its range: a size that is no answer, and moves those that are.
+    """
+    least = judging.LITTLE * search.case.machine.weighing.model_error
+    accepted = set(accepted)
+    small = {part.name for part in whole.parts if part.share > least and part.by_name < 1}
+    kept = [n for n in whole.explanation.names if n in accepted | small]
+    if search.out_of_time:
+        return whole.explanation
+    return search.finished(search.by_these(kept, whole.explanation))
+
+
+def _in_part(search: Search, found: JudgedSets, *, looks_like: bool) -> Explanation:
+    """What the records look like, or the likeliest set of listed effects.
+
+    The nominal re-estimated where that does not close most of the held-out gap, leaves half of the motion
+    there, or as much as the nominal as stated.
+    """
+    listed = (one for one in found.judged if one.parts and len(one.parts) == len(one.explanation.names))
+    whole = found.judged[0] if looks_like else next(listed, None)
+    if whole is None:
+        return found.nominal
+    unlisted = set(whole.explanation.names) - {part.name for part in whole.parts}
+    part, noise = _kept(search, whole, unlisted), search.case.noise
+    closes = closed_by(search, part, found.nominal) > judging.MOST_OF_IT
+    nearer = part.pooled_held_out(noise) < found.nominal.pooled_held_out(noise)
+    return part if closes and nearer and np.max(part.shares[1]) < 1 - judging.MOST_OF_IT else found.nominal
+
+
+def _competing(search: Search, found: JudgedSets) -> tuple[CompetingHypothesis, ...]:
+    """Sets whose effects that matter contradict each other, for the experiment that parts them.
+
+    One standard deviation is what the likelihood counts as one: the energies that do not interest, over as
+    many independent values as its bands have. Neglected: that they grow with the motion.
+    """
+    case, records, kept = search.case, search.records, dict[tuple[str, ...], Descent]()
+    for one in found.judged:
+        key = tuple(sorted(part.name for part in one.parts if part.matters >= 0.5))
+        if key and not any(set(key) <= set(other) or set(other) <= set(key) for other in kept):
+            kept[key] = one.explanation.end
+    floor, counted = (
+        part.reshape(-1, case.noise.size).sum(axis=0)  # bands are ordered record, octave, output
+        for part in (records.levels.floor, records.levels.counted)
+    )
+    noise = np.sqrt(judging.TEMPER * floor / counted)
+    if isinstance(case, Case):
+        level = dict(zip(case.outputs, noise, strict=True))
+        noise = np.array([level.get(name, np.inf) for name in FlexibleArm(case.rig).output_names])
+    return tuple(
+        fitted_hypothesis(
+            records.nominal,
+            end.candidates,
+            end.deviations,
+            end.coordinates,
+            end.precision(records) / judging.TEMPER,
+            found.probability(key),
+            noise,
+            key,
+        )
+        for key, end in list(kept.items())[:MOST_COMPETING]
+    )
+
+
+def _size(candidate: Candidate, i: int, x: float) -> float:
+    """By how much the i-th coordinate changes where the effect becomes larger by a small part of itself."""
+    axis = candidate.axes[i]
+    if axis.scale == "log" and axis.parameter != "ratio":
+        return 1.0
+    return abs(x) if i == 0 else 0.0
