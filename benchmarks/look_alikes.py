@@ -1,9 +1,9 @@
 """How often does an effect get the name of a cause that is on no list?
 
-Diagnosed are workshop cases of the independent rigs, those whose cause is on no list and those with one effect
-that is taken off the list before, and MuJoCo cases (`mujoco_cases`) without their effect on the list. Named is
-what is present with at least .5; for the counts of `diagnosis/judge/look_alikes.toml` before what it loses by
-these (`NamedEffect.acts_alike`) is taken off.
+Diagnosed are workshop cases of the independent rigs, those whose cause is on no list and those with one
+effect that is taken off the list before, and MuJoCo cases (`mujoco_cases`) without their effect on the list.
+Named is what is present with at least .5; for the counts of `diagnosis/judge/look_alikes.toml` before what it
+loses by these (`NamedEffect.acts_alike`) is taken off.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import chain, starmap
 from pathlib import Path
 
 from benchmarks.harness import Print, main, timed
@@ -67,8 +68,8 @@ def of_models(count: int) -> Iterator[tuple[str, str, list[str], PlantCase]]:
 
 
 def run(out: Print, *, single: int = 20, unlisted: int = 16, models: int = 40) -> None:
-    rigs = ("single", single), ("unlisted", unlisted)
-    machines = {"rigs": [case for asked in rigs for case in of_rigs(*asked)], "models": of_models(models)}
+    rigs = {kind: count for kind, count in (("single", single), ("unlisted", unlisted)) if count}
+    machines = {"rigs": chain.from_iterable(starmap(of_rigs, rigs.items())), "models": of_models(models)}
     for machine, every in machines.items():
         stood_in, cases, sure = Counter[str](), 0, 0
         for name, cause, gone, case in every:

@@ -207,16 +207,16 @@ def judged(search: Search) -> JudgedSets:
 def acts_like(name: str, listed: tuple[str, ...], machines: str) -> float:
     """Probability that what an effect explains is the work of a cause on no list, given that it is there.
 
-    From the priors of an effect, one of those that are listed, and of such a cause, and from how often effects
-    of its kind stood in for one in these machines (a table of look_alikes.toml), shrunk to the rate of all
-    kinds and shared by those of the kind that are listed.
+    From the priors of an effect, one of those that are listed, and of such a cause, and from how often
+    effects of its kind stood in for one in these machines (a table of look_alikes.toml), shrunk to the rate
+    of all kinds and shared by those of the kind that are listed.
     """
     tables = tomllib.loads(resources.files(__package__).joinpath("look_alikes.toml").read_text("utf-8"))
     seen, kind = tables[machines], kind_of(name)
     pooled = seen["pooled_cases"] * sum(seen["stood_in"].values()) / seen["cases"] / seen["kinds"]
     rate = (seen["stood_in"].get(kind, 0) + pooled) / (seen["cases"] + seen["pooled_cases"])
     each = rate / sum(kind_of(other) == kind for other in listed)
-    return float(1 / (1 + _PRIOR_COUNT[1] / (_PRIOR_UNKNOWN * each * len(listed))))
+    return float(1 / (1 + _PRIOR_COUNT[1] / (seen["unlisted"] * each * len(listed))))
 
 
 def kind_of(name: str) -> str:
