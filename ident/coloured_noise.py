@@ -21,6 +21,7 @@ from ident.checks.residual_tests import whiteness_test
 from ident.checks.validation import fit_on_fresh_data
 from ident.data.arrays import RealArray
 from ident.data.finding import FindingKind, finding
+from ident.data.nonparametric import over_lines
 from ident.data.record import Record
 from ident.fit.regression import thinned
 from ident.identification import Identification
@@ -33,7 +34,6 @@ _ARX_ORDERS = (4, 8, 12, 16, 20, 24, 30)  # tried, one chosen by BIC
 # Rows of the shortest record per order of the noise model.
 _ROWS_PER_ORDER = 13
 _RESIDUAL_ORDER = 12  # BIC takes 1 to 6 of it for drift and friction beside sensor noise
-_LINES = 25  # power of white noise, averaged over 25 lines, scatters by a fifth
 
 
 def identify_in_noise(records: Sequence[Record], options: IdentOptions, identify: Identify) -> Identification:
@@ -140,6 +140,6 @@ def _half_power_Hz(found: Identification) -> float:
     longest = max(found.residuals, key=len)
     power = np.abs(np.fft.rfft(longest - longest.mean(), 2 * longest.size)) ** 2
     # Lines of white noise scatter by as much as their mean: means over neighbours show what stands out.
-    power = np.convolve(power, np.full(_LINES, 1 / _LINES), "same")
+    power = over_lines(power)
     beyond = np.cumsum(np.maximum(power - 2 * np.median(power), 0.0))
     return float(np.searchsorted(beyond, 0.5 * beyond[-1]) / (2 * longest.size * found.model.dt_s))

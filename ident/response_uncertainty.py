@@ -24,13 +24,12 @@ from ident.checks.residual_tests import (
 )
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.finding import Finding, distinct
+from ident.data.frequency_uncertainty import FREQUENCIES
 from ident.data.record import Record
 from ident.identification import Identification
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.nominal import NominalAgreement, nominal_near
 
-# Frequencies over which a low-order nominal model is fitted to a posterior.
-_NOMINAL_POINTS = 400
 # Largest orders of the noise model that are tried, until the residuals behind it are white.
 NOISE_ORDERS = (8, 32)
 # Factor on the odds: Bayes factor of "positive" evidence (Kass and Raftery, 1995).
@@ -77,7 +76,7 @@ class Uncertainty(ResponsePosterior):
     def shown_grid(self) -> RealArray:
         """Frequencies (F,) over three decades up to the Nyquist frequency."""
         nyquist = np.pi / self.dt_s
-        return np.geomspace(1e-3 * nyquist, nyquist, _NOMINAL_POINTS)
+        return np.geomspace(1e-3 * nyquist, nyquist, FREQUENCIES)
 
     @property
     def missed_mode_suspected(self) -> bool:

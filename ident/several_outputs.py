@@ -34,9 +34,8 @@ from ident.mode_shapes import one_shape_each
 from ident.one_input import in_order, least_order
 from ident.search.order_selection import OrderSelection, Progress, silent
 from ident.search.pole_search import PoleSearch, SearchTrace
+from ident.uncertainty.embedding import NOISE_ROUNDS
 
-# Rounds of noise covariance and fit; the covariance of the second is that of the first to a few per cent.
-_ROUNDS = 3
 # Covariance of whitened residuals, off the unit matrix by less: the weights are right.
 _WHITE = 0.05
 # Level of the test of one shape per mode.
@@ -85,7 +84,7 @@ def identify_mimo(
     report = progress or silent
     _refuse_outputs(records, options)
     white = np.diag(1 / np.std(np.concatenate([record.output for record in records]), axis=0))
-    for turn in range(_ROUNDS):
+    for turn in range(NOISE_ROUNDS):
         # Most of the time goes into the first round.
         begun, part = 0.9 * (0.0, 0.7, 0.85)[turn], 0.9 * (0.7, 0.15, 0.15)[turn]
         told = partial(lambda begun, part, share, what: report(begun + part * share, what), begun, part)
@@ -95,7 +94,7 @@ def identify_mimo(
         spare = 1 - data.n_parameters(found.end.poles.order) / data.n_samples
         covariance = residual @ residual.T / residual.shape[1] / spare
         refined = np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), white))
-        if turn == _ROUNDS - 1 or np.max(np.abs(covariance - np.eye(len(covariance)))) < _WHITE:
+        if turn == NOISE_ROUNDS - 1 or np.max(np.abs(covariance - np.eye(len(covariance)))) < _WHITE:
             break
         white = refined
     report(0.95, "one shape for every mode")

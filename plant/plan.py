@@ -33,9 +33,9 @@ _RIPPLE_PHASE_RAD, _SLEW_RAD_S, _LARGEST_PHASE_RAD = 0.25, 5.0, 0.5
 # A basic step is halved this many times to place a switching instant (to 1.2 us at the basic step above).
 _HALVINGS = 9
 # A stuck friction element or a closed contact oscillates; its phase may advance by this much in one basic
-# step. Less for contacts, which bounce: what a step misses there is amplified by the bounces that follow.
+# step; by no more than that of a ripple for contacts: the bounces that follow amplify what a step misses.
 # That is so at the basic step above, and in proportion at others, up to as much as for friction.
-_PHASE_PER_STEP_RAD, _CONTACT_PHASE_RAD = 0.8, 0.25
+_PHASE_PER_STEP_RAD = 0.8
 # Falling Stribeck friction is a negative damper; a step may cover this much of its growth time.
 _GROWTH_PER_STEP = 0.3
 # A fraction of a sample below this is no separate part of it.
@@ -416,7 +416,7 @@ class _Builder:
             mobility = abs(element_rows[e, 1] @ held_columns[:, 4 + e])
             if element[e, 0] == FRICTION and element[e, 3] != 0:
                 longest = min(longest, _GROWTH_PER_STEP * element[e, 4] / (element[e, 3] * mobility))
-            most = _CONTACT_PHASE_RAD * coarse if element[e, 0] == CONTACT else np.inf
+            most = _RIPPLE_PHASE_RAD * coarse if element[e, 0] == CONTACT else np.inf
             phase = min(_PHASE_PER_STEP_RAD, most)
             longest = min(longest, phase / np.sqrt(stiffness * mobility))
         return float(longest)

@@ -37,12 +37,11 @@ _AS_WELL = 1.05
 _SAME_INPUT = 1e-12
 # Inputs are alike in a band where a combination of them, each of unit power there, has less of it ...
 _ALIKE_INPUT = 1e-2
-# ... by lines whose power is worth so many an input (a Hann window makes 1.5 of one; independent inputs then
-# have ten times as much), within an octave. Poles bridge a band of less than a third of an octave. An input
+# ... by lines whose power is worth so many an input (a Hann window makes 1.5 of one, 2 of a sine; an
+# integrator that hunts in stiction has 3.3, logs of 45 machines 8 up; independent inputs then have ten times
+# as much in a combination), within an octave. Poles bridge a band of less than a third of an octave. An input
 # rests at lines with less than _LEAKAGE of its mean density.
 _LINES_AN_INPUT, _CELLS, _LEAST_CELLS = 6.0, 12, 4
-# A sine in a Hann window has 2, an integrator hunting in stiction 3.3, logs of 45 machines and measured 8 up.
-_FEWEST_LINES = 6.0
 # Deviations from an operating point this many times larger are lost beside it.
 _LARGE_OFFSET = 10.0
 
@@ -60,7 +59,7 @@ def refuse_few_lines(records: Sequence[Record]) -> None:
     count, largest_Hz = power.sum() ** 2 / (power @ power), (1 + power.argmax()) / (shortest * dt_s)
     references = [record.reference for record in records if record.reference is not None]
     still = bool(references) and not any(np.any(np.ptp(one, axis=0)) for one in references)
-    if count >= _FEWEST_LINES and not still:
+    if count >= _LINES_AN_INPUT and not still:
         return
     why = (
         f"the reference '{records[0].reference_names[0]}' of these logs stands still"

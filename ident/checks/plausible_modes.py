@@ -16,6 +16,8 @@ from ident.fit.refinement import Bounds
 FEWEST_PERIODS = 3.0
 # Above it (overshoot of a step below 10 %) a pair swings no more than two real poles do.
 LARGEST_DAMPING = 0.6
+# Lightly damped: above it a pair's peak, or notch, is less than 1.75 of the gain at rest, 1 / (2 zeta).
+LIGHT = 0.3
 
 
 class PairKind(Enum):

@@ -14,9 +14,10 @@ from scipy.stats import chi2, norm
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.validation import fit_on_fresh_data
 from ident.data.arrays import RealArray, lock
-from ident.data.finding import Finding, FindingKind, finding
+from ident.data.finding import TEST_LEVEL, Finding, FindingKind, finding
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
+from ident.fit.problem import WHITE_LAGS
 
 # Frequencies at which feedback is looked for, and bands over which it is averaged.
 _RESOLVED, _BANDS = 60, 6
@@ -75,7 +76,7 @@ class ResidualTest:
         )
 
 
-def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = 25, level: float = 0.99) -> ResidualTest:
+def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = WHITE_LAGS) -> ResidualTest:
     """Autocorrelation of residuals, one (T,) array per record, at lags 1..max_lag, pooled; Ljung-Box over all
     lags.
 
@@ -87,13 +88,15 @@ def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = 25, level: 
     correlation = _pooled_correlation(centred, centred, max_lag)[max_lag + 1 :]
     lags = np.arange(1, max_lag + 1)
     probability = float(chi2.sf(n * (n + 2) * float(np.sum(correlation**2 / (n - lags))), max_lag))
-    passed = probability >= 1 - level
-    band = np.full(max_lag, norm.ppf(0.5 + level / 2) / np.sqrt(n))
-    return ResidualTest("whiteness", lags.astype(np.float64), correlation, band, level, probability, passed)
+    passed = probability >= 1 - TEST_LEVEL
+    band = np.full(max_lag, norm.ppf(0.5 + TEST_LEVEL / 2) / np.sqrt(n))
+    return ResidualTest(
+        "whiteness", lags.astype(np.float64), correlation, band, TEST_LEVEL, probability, passed
+    )
 
 
 def independence_test(
-    inputs: Sequence[RealArray], residuals: Sequence[RealArray], *, max_lag: int = 25, level: float = 0.99
+    inputs: Sequence[RealArray], residuals: Sequence[RealArray], *, max_lag: int = WHITE_LAGS
 ) -> ResidualTest:
     """Cross-correlation of past input and residual at lags -max_lag..max_lag (residual after input: lag > 0).
 
@@ -117,13 +120,13 @@ def independence_test(
     # 2 Phi(-x), all of max_lag + 1 lags below x with probability (1 - that)^(max_lag + 1).
     single = 2 * norm.sf(np.abs(correlation[max_lag:]) / deviation)
     probability = float(-np.expm1((max_lag + 1) * np.log1p(-min(float(single.min()), 1 - 1e-16))))
-    passed = probability >= 1 - level
-    band = np.full(correlation.size, norm.ppf(0.5 + level / 2) * deviation)
+    passed = probability >= 1 - TEST_LEVEL
+    band = np.full(correlation.size, norm.ppf(0.5 + TEST_LEVEL / 2) * deviation)
     lags = np.arange(-max_lag, max_lag + 1)
     before = np.abs(correlation[:max_lag]).max() if max_lag else 0.0
-    precedes = bool(before > deviation * norm.ppf(1 - (1 - level) / (2 * max(max_lag, 1))))
+    precedes = bool(before > deviation * norm.ppf(1 - (1 - TEST_LEVEL) / (2 * max(max_lag, 1))))
     return ResidualTest(
-        "independence", lags.astype(np.float64), correlation, band, level, probability, passed, precedes
+        "independence", lags.astype(np.float64), correlation, band, TEST_LEVEL, probability, passed, precedes
     )
 
 
@@ -155,7 +158,7 @@ def residual_advice(
     return found
 
 
-def fed_back(posterior: ResponsePosterior, records: Sequence[Record], level: float = 0.95) -> float:
+def fed_back(posterior: ResponsePosterior, records: Sequence[Record]) -> float:
     """How far what the residuals still have in common with the input would move the response at least, in
     radii of its ellipses: root mean square over a band, chance taken off, of all bands the largest.
 
@@ -173,9 +176,9 @@ def fed_back(posterior: ResponsePosterior, records: Sequence[Record], level: flo
         )
         for record in records
     ]
-    common = empirical_frf(rest, half_width_lines=max(5, shortest // (4 * _RESOLVED)), level=level)
+    common = empirical_frf(rest, half_width_lines=max(5, shortest // (4 * _RESOLVED)))
     omega = common.omega_rad_s
-    ellipses = posterior.at(omega, level)
+    ellipses = posterior.at(omega)
     radius = ellipses.ellipse().semi_major
     chance = np.trace(common.covariance, axis1=1, axis2=2)
     told = (radius < np.abs(ellipses.centre)) & (chance < np.abs(ellipses.centre) ** 2)

@@ -40,19 +40,13 @@ class FreshFit:
         lock(self, "simulated", "residual")
 
 
-def fit_on_fresh_data(
-    model: GobfModel | MisoModel | ResponsePosterior,
-    record: Record,
-    *,
-    estimate_initial_state: bool = True,
-    estimate_offset: bool = True,
-) -> FreshFit:
+def fit_on_fresh_data(model: GobfModel | MisoModel | ResponsePosterior, record: Record) -> FreshFit:
     """Free-run simulation of a record of one output, no output fed back.
 
-    estimate_initial_state: the free response of poles and integrators at the start is fitted to the record;
-    estimate_offset: a constant. Of an unstable model the free run is that of B G to B y
-    (`ident.basis.structure.stabilised`), and simulated what it predicts from sample to sample. Raises
-    ValueError for another sampling time, other inputs than the model's, several outputs, or a constant one.
+    The free response of poles and integrators at the start, and a constant, are fitted to the record. Of an
+    unstable model the free run is that of B G to B y (`ident.basis.structure.stabilised`), and simulated what
+    it predicts from sample to sample. Raises ValueError for another sampling time, other inputs than the
+    model's, several outputs, or a constant one.
     """
     record.refuse_several(model.dt_s, model.n_inputs if isinstance(model, MisoModel) else 1)
     unstable, delay = model.unstable, model.input_delay_samples
@@ -64,16 +58,12 @@ def fit_on_fresh_data(
     spread = float(np.linalg.norm(measured - measured.mean()))
     if spread == 0:
         raise ValueError(f"{record.label}: the output is constant")
-    unknown = estimate_offset and estimate_initial_state and not model.integrators
-    u = record.input - np.array([level_before(column) if unknown else 0.0 for column in record.input.T])
+    u = record.input if model.integrators else record.input - list(map(level_before, record.input.T))
     simulated = model.simulate(u) if isinstance(model, MisoModel) else model.stable_part.simulate(u[:, 0])
-    simulated, without = answered(simulated, delay), y
-    degrees = max(int(estimate_offset), model.integrators if estimate_initial_state else 0)
-    nuisance = nuisance_columns(model.poles, y.size, degrees, estimate_initial_state)
-    if nuisance.shape[1]:
-        coefficients, *_ = np.linalg.lstsq(nuisance, np.column_stack([y - simulated, y]), rcond=1e-10)
-        simulated = simulated + nuisance @ coefficients[:, 0]
-        without = y - nuisance @ coefficients[:, 1]
+    simulated = answered(simulated, delay)
+    nuisance = nuisance_columns(model.poles, y.size, max(1, model.integrators), True)
+    coefficients, *_ = np.linalg.lstsq(nuisance, np.column_stack([y - simulated, y]), rcond=1e-10)
+    simulated, without = simulated + nuisance @ coefficients[:, 0], y - nuisance @ coefficients[:, 1]
     residual = y - simulated
     left = float(np.linalg.norm(residual))
     answers = left < float(np.linalg.norm(without))

@@ -43,6 +43,9 @@ class EllipseAxes:
         return np.asarray(self.direction[:, None] * shape, dtype=np.complex128)
 
 
+LEVEL = 0.95  # of ellipses and intervals where nobody says another
+
+
 def chi2_radius(level: float) -> float:
     """sqrt of the chi-square quantile with two degrees of freedom: 2.4477 at 0.95."""
     if not 0 < level < 1:

@@ -17,10 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ident.data.child_reader import CPU_SECONDS
-
-LARGEST_BYTES = 2**30
-"""Of a file, and of what it unpacks to: some hundred channels at 1 kHz for twenty minutes as doubles."""
+from ident.data.child_reader import CPU_SECONDS, LARGEST_BYTES as LARGEST_BYTES
 
 MOST_COLUMNS = 4096
 """Of a table: each is looked at, and a line of it printed. More is a table that lies on its side."""

@@ -17,6 +17,8 @@ from ident.data.table import LARGEST
 
 # A product of factors can miss symmetry or semidefiniteness by rounding, not by more.
 _PSD_TOLERANCE = 1e-9
+# Of a grid of our own: a hundred a decade over four decades.
+FREQUENCIES = 400
 
 _COLUMNS = ("real", "imag", "variance_real", "variance_imag")
 _CROSS = "covariance_real_imag"

@@ -13,6 +13,8 @@ from ident.data.ellipses import circular_widening
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 
+_LINES = 25  # power of white noise, averaged over so many lines, scatters by a fifth
+
 
 def empirical_frf(
     records: Record | Sequence[Record],
@@ -54,14 +56,14 @@ def empirical_frf(
 
 
 def coherence(
-    records: Sequence[Record], *, half_width_lines: int | None = None, periodic: bool = False
+    records: Sequence[Record], *, half_width_lines: int | None = None
 ) -> tuple[RealArray, RealArray]:
     """omega (F,) and the magnitude-squared coherence (F,) of input and output, 0..1.
 
     Averaged over the same lines and records as `empirical_frf`. 1 minus it is the share of the output's power
     that no linear response to this input explains: noise, another input, or nonlinearity.
     """
-    spectra = spectra_of(records, periodic)
+    spectra = spectra_of(records, periodic=False)
     groups = _groups(spectra, 2 * _half_width(half_width_lines, len(records)) + 1, None, None)
     u, y = spectra.input[:, groups], spectra.output[:, groups]
     cross = np.abs(np.sum(y * u.conj(), axis=(0, 2))) ** 2
@@ -149,3 +151,8 @@ def _local_ratio(spectra: Spectra, groups: IntArray, level: float) -> tuple[Comp
     # One complex parameter was fitted per group, hence n - 1.
     power = np.sum(np.abs(terms) ** 2, axis=(0, 2)) * n_terms / (n_terms - 1)
     return centre, circular_widening(n_terms - 1, level) * power / np.abs(denominator) ** 2
+
+
+def over_lines(power: RealArray) -> RealArray:
+    """Mean of every line of a spectrum and its neighbours."""
+    return np.convolve(power, np.full(_LINES, 1 / _LINES), "same")

@@ -22,7 +22,7 @@ from ident.data.wrapping import spikes_in, unwrapped, wraps_at
 T = TypeVar("T")
 
 # Clocks of one machine differ by less: a thousandth of every frequency, below what most records tell.
-_SAME_CLOCK = 1e-3
+SAME_CLOCK = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -120,7 +120,7 @@ class Record(Shown):
 
     def sampled_like(self, other: Record) -> bool:
         """Whether the sampling times are one but for the clocks of hosts, to 0.1 %."""
-        return abs(self.dt_s - other.dt_s) <= _SAME_CLOCK * other.dt_s
+        return abs(self.dt_s - other.dt_s) <= SAME_CLOCK * other.dt_s
 
     def refuse_several(self, dt_s: float | None = None, inputs: int = 1) -> None:
         """Raise ValueError unless there are so many inputs and one output, sampled at dt_s where given."""

@@ -17,13 +17,12 @@ from scipy.stats import f
 
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.distortion import EXCITED, SAME
+from ident.data.finding import TEST_LEVEL
 from ident.data.nonparametric import spectra_of
 from ident.data.record import Record, in_groups
 
 # Lines averaged for one estimate: five.
 _HALF_WIDTH = 2
-# Chance makes an amplitude effect anywhere in one linear experiment of a hundred.
-_LEVEL = 0.99
 # Bands in which it is looked for, a decade.
 _PER_DECADE = 8
 _FEWEST = 3  # frequencies in a band: of fewer there is no slope beside its mean
@@ -77,7 +76,7 @@ class Repeats:
         low, high = self.omega_rad_s[0] * (1 - 1e-9), self.omega_rad_s[-1] * (1 + 1e-9)
         edges = np.geomspace(low, high, max(round(_PER_DECADE * np.log10(high / low)), 1) + 1).tolist()
         bands = [self.across_amplitudes(*ends) for ends in pairwise(edges)]
-        limit = (1 - _LEVEL) / max(sum(band is not None for band in bands), 1)
+        limit = (1 - TEST_LEVEL) / max(sum(band is not None for band in bands), 1)
         return tuple(band for band in bands if band is not None and band.probability < limit)
 
     def across_amplitudes(self, low_rad_s: float, high_rad_s: float) -> AmplitudeBand | None:

@@ -55,11 +55,11 @@ def band_limited(
     return record.each(filtered)
 
 
-def settling_time_s(dt_s: float, low_rad_s: float, high_rad_s: float, *, filter_order: int = 2) -> float:
-    """Time after which the start of `band_limited` has died down to e^-5: before, it looks like a mode at the
-    edge."""
+def settling_time_s(dt_s: float, low_rad_s: float, high_rad_s: float) -> float:
+    """Time after which the start of `band_limited` (order 2) has died down to e^-5: before, it looks like
+    a mode at the edge."""
     _, poles, _ = scipy.signal.butter(
-        filter_order, [low_rad_s, high_rad_s], "bandpass", output="zpk", fs=2 * np.pi / dt_s
+        2, [low_rad_s, high_rad_s], "bandpass", output="zpk", fs=2 * np.pi / dt_s
     )
     return float(-5 * dt_s / np.log(np.abs(poles).max()))
 

@@ -11,12 +11,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
+from ident.data.child_reader import LARGEST_TEXT_BYTES
 from ident.data.foreign_files import MOST_COLUMNS, distinct
 from ident.data.time_stamps import is_stamp
 from ident.data.units import is_unit, says_time
-
-LARGEST_TEXT_BYTES = 2**28
-"""Of a text file: cells as text take several times as much memory."""
 
 # Lines that are looked at to find the layout.
 _SAMPLE = 400

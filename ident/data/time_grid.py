@@ -34,12 +34,10 @@ _PARTS = 10
 _READINGS = 3
 
 
-def sampling_time(
-    table: Table, stamps: RealArray | None, name: str | None, dt_s: float | None, *, options: bool = True
-) -> float:
-    """dt in seconds from time stamps [s] (mean interval), or the given one; both must agree. options: whether
-    who reads the complaint can give --repair and --resample-s. Raises ValueError if neither is given, dt_s is
-    not positive, or the stamps are not increasing and uniform to `TIME_TOLERANCE`, rounding aside."""
+def sampling_time(table: Table, stamps: RealArray | None, name: str | None, dt_s: float | None) -> float:
+    """dt in seconds from time stamps [s] (mean interval), or the given one; both must agree. Raises
+    ValueError if neither is given, dt_s is not positive, or the stamps are not increasing and uniform to
+    `TIME_TOLERANCE`, rounding aside."""
     if dt_s is not None and not (np.isfinite(dt_s) and dt_s > 0):
         raise ValueError(f"{table.path}: dt_s must be a positive number of seconds; got {dt_s}")
     if stamps is None:
@@ -67,7 +65,7 @@ def sampling_time(
         raise ValueError(
             f"{table.path}, {table.place(row + 1)}: time '{name}' steps by {interval[row]:.6g} s where most "
             f"steps are {median:.6g} s; expected uniform sampling (each step within {TIME_TOLERANCE:.0%}); "
-            f"{what}: {_advice(stamps, options)}"
+            f"{what}: {_advice(stamps)}"
         )
     mean = float((stamps[-1] - stamps[0]) / interval.size)
     if dt_s is None:
@@ -128,7 +126,7 @@ def option_for(stamps: RealArray) -> str:
     return f"--resample-s {_coarser(interval):g}"
 
 
-def _advice(stamps: RealArray, options: bool) -> str:
+def _advice(stamps: RealArray, options: bool = True) -> str:
     found = option_for(stamps)
     if found == "split":
         return "split the file there"
@@ -201,9 +199,9 @@ class TimeGrid:
 
     @classmethod
     def of(cls, table: Table, name: str, stamps: RealArray, *, options: bool = True) -> TimeGrid:
-        """The grid under the stamps (R,) [s] of the column `name`; its phase is their mean. options: as of
-        `sampling_time`. Raises ValueError, one line with file and row: time that does not increase, too many
-        rows lost, a stamp too far off the grid."""
+        """The grid under the stamps (R,) [s] of the column `name`; its phase is their mean. options: whether
+        who reads the complaint can give --repair and --resample-s. Raises ValueError, one line with file and
+        row: time that does not increase, too many rows lost, a stamp too far off the grid."""
         table.increasing(stamps, name)
         interval = np.diff(stamps)
         step, counts = float(np.median(interval)), _counts(interval)

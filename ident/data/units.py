@@ -112,7 +112,7 @@ _FOLLOWS, _COHERENT = 1.3, 0.5
 
 # A log of more samples than this, with steps of at least so many seconds, is rather one in milliseconds.
 _MANY_SAMPLES = 1000
-_LONG_STEP_S = 0.5  # machines are logged faster than twice a second
+LONG_STEP_S = 0.5  # machines are logged faster than twice a second
 # No machine is logged with shorter steps, nor one whose motion the samples show with longer ones.
 _SHORTEST_S, _LONGEST_S = 1e-6, 1.0
 # Seconds since 1970 of the years 2001 and 2100: stamps in between, in whatever unit, are dates.
@@ -213,7 +213,7 @@ class TimeColumn:
     def doubt(self, dt_s: float) -> Finding:
         """What there is to say of a doubtful column with steps of dt_s."""
         # Machines are logged faster than twice a second: steps of 4 are milliseconds, of 4000 microseconds.
-        unit = next((unit for unit in ("ms", "us") if dt_s < _LONG_STEP_S * _PER_SECOND[unit]), "ns")
+        unit = next((unit for unit in ("ms", "us") if dt_s < LONG_STEP_S * _PER_SECOND[unit]), "ns")
         options = f"--time-unit {unit}"
         return finding(
             FindingKind.TIME_UNIT, name=self.name, in_header=self.in_header, dt_s=dt_s, options=options
@@ -278,7 +278,7 @@ class TimeColumn:
             return False
         step = (stamps[-1] - stamps[0]) / (stamps.size - 1)
         integers = bool(np.all(stamps == np.round(stamps)) and stamps[-1] > 1)
-        return integers or bool(step >= _LONG_STEP_S and stamps.size > _MANY_SAMPLES)
+        return integers or bool(step >= LONG_STEP_S and stamps.size > _MANY_SAMPLES)
 
 
 def refuse_step(label: str, dt_s: float, output: RealArray, column: TimeColumn | None = None) -> None:
@@ -295,7 +295,7 @@ def refuse_step(label: str, dt_s: float, output: RealArray, column: TimeColumn |
         rate = f"; of a rate of {dt_s:g} Hz it is {1 / dt_s:.6g}" if moves else ""
         what = f"dt_s = {dt_s:g} is in seconds, and no machine is logged that {'slowly' if moves else 'fast'}"
         raise ValueError(f"{label}: {what}{rate}; expected {_SHORTEST_S:g} to {_LONGEST_S:g} s")
-    unit = next((unit for unit in ("ms", "us", "ns") if dt_s < _LONG_STEP_S * _PER_SECOND[unit]), "ns")
+    unit = next((unit for unit in ("ms", "us", "ns") if dt_s < LONG_STEP_S * _PER_SECOND[unit]), "ns")
     said = f"its unit is said to be {column.in_header}" if column.in_header else "no unit is stated"
     raise ValueError(
         f"{label}: time column '{shown(column.name, 60)}' has steps of {dt_s:.4g} s, {said}: no machine that "

@@ -23,8 +23,8 @@ from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.fit.least_squares import RANK_TOLERANCE
 from ident.fit.problem import CandidateCost, Linearisation, ResidualColour, residual_colour
 
-# A minor axis below this part of the major one would let one direction of one frequency overrule the rest.
-_THINNEST = 1e-4
+# A thinner ellipse (over its major axis, or the response) would let one frequency overrule all the others.
+THINNEST = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +168,7 @@ def prepare_response(
             f"at omega = {at:.6g} rad/s the response is given as exactly known: a fit needs a covariance at "
             "every frequency, the smallest that is still honest"
         )
-    weight = np.stack([1 / s1, np.where(real_only, 0.0, 1 / np.maximum(s2, _THINNEST * s1))])
+    weight = np.stack([1 / s1, np.where(real_only, 0.0, 1 / np.maximum(s2, THINNEST * s1))])
     frame = FrfRegression(
         z=np.exp(1j * omega * response.dt_s),
         common=front_response(omega, response.dt_s, integrators, delay_samples),

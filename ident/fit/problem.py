@@ -16,11 +16,11 @@ from scipy.special import chdtri
 from ident.basis.coordinates import SearchSpace
 from ident.basis.poles import Poles
 from ident.data.arrays import ComplexArray, IntArray, RealArray, kernel_array
+from ident.data.finding import TEST_LEVEL
 
 # Below this share of |y|^2 products of columns know nothing; a refinement sees the true residual.
 _FLOOR = 1e-13
-_LAGS_OF_WHITENESS = 25  # as `ident.checks.residual_tests.whiteness_test`
-_LEVEL = 0.99  # of that test
+WHITE_LAGS = 25  # at which a residual is tested for whiteness
 
 
 class Linearisation(NamedTuple):
@@ -142,9 +142,9 @@ def residual_colour(residual: RealArray, starts: IntArray) -> ResidualColour:
     if not covariance[0] > 0:
         return ResidualColour(float(n), False)
     squares = (covariance[1:] / covariance[0]) ** 2
-    few = squares[:_LAGS_OF_WHITENESS]
+    few = squares[:WHITE_LAGS]
     return ResidualColour(
         # What white noise shows by chance, 1/N per lag, is no colour.
         effective_samples=float(n / (1 + 2 * np.sum(np.maximum(squares - 1 / n, 0.0)))),
-        white=few.size == _LAGS_OF_WHITENESS and bool(n * np.sum(few) < chdtri(few.size, 1 - _LEVEL)),
+        white=few.size == WHITE_LAGS and bool(n * np.sum(few) < chdtri(few.size, 1 - TEST_LEVEL)),
     )

@@ -35,13 +35,12 @@ from ident.data.arrays import ComplexArray, RealArray, real_rows
 from ident.data.distortion import period_of
 from ident.data.record import Record
 from ident.friction.arm import FASTEST_POLE, SteppedArm
-from ident.friction.gauss_newton import FrictionFit
+from ident.friction.gauss_newton import CHANGE_OF_LOG, FrictionFit
 from ident.friction.posterior import BehindFriction
 
 _REALISATIONS, _DRAWS = 128, 400  # of the input that are averaged; of the posterior that are spread
 # The first period dies out from rest, the second is in steady state.
 _PERIODS = 2
-_CHANGE_OF_LEVEL = 0.02  # for a derivative between runs of equal phases: small, and far above rounding
 # A line of the spectrum counts as excited above this share of the largest.
 _EXCITED = 1e-3
 _N_GRID = 300  # frequencies: over five decades 30 in every half decade that is counted
@@ -207,7 +206,7 @@ def _simulated(
 
     n, moves = solved(ratios)
     # A level that is not told from none has its uncertainty for a step, and cannot be negative.
-    step = max(_CHANGE_OF_LEVEL * friction.level, 0.5 * friction.level_std)
+    step = max(CHANGE_OF_LOG * friction.level, 0.5 * friction.level_std)
     ends = friction.level + step, max(friction.level - step, 0.0)
     above, below = (solved(simulated(end))[0] for end in ends)
     left_open = np.asarray(np.linalg.qr((moves - moves.mean(axis=0)) / _REALISATIONS, mode="r")).T

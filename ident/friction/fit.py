@@ -20,7 +20,7 @@ import numpy as np
 
 from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
-from ident.checks.plausible_modes import LARGEST_DAMPING
+from ident.checks.plausible_modes import LARGEST_DAMPING, LIGHT
 from ident.checks.residual_tests import whiteness_test
 from ident.data.record import Record
 from ident.friction.arm import PRESLIDING, FrictionLaw
@@ -45,7 +45,6 @@ _FEWEST_VALUES = 15
 _MOSTLY_NOISE = 0.9
 # A driven shaft's speed is within 90 degrees of its force, with a lag on top; beyond a mode it is opposite.
 _MOST_DEG = 135.0
-_LIGHT = 0.3  # with more damping a mode's peak is less than 1.75 of its gain at rest: 1 / (2 zeta)
 _UNSEEN, _ANYWAY = "the friction of the shaft cannot be told: ", "; response = 'as recorded' needs none"
 
 
@@ -53,7 +52,6 @@ def fit_friction(
     records: Sequence[Record],
     options: IdentOptions | None = None,
     *,
-    presliding: float = PRESLIDING,
     free: bool = False,
     progress: Progress | None = None,
 ) -> FrictionFit:
@@ -61,8 +59,7 @@ def fit_friction(
 
     records: one input, and the position of the shaft that the friction acts on as the one output; at rest at
     their first sample, unless made in a loop (`ident.friction.in_loop`). options: of the search for the arm's
-    poles; integrators at most 1. presliding: expected, in output units, within a factor of twenty (in a loop
-    a share of the motion). free: the arm's free run is asked for, even where it leaves more than noise;
+    poles; integrators at most 1. free: the arm's free run is asked for, even where it leaves more than noise;
     otherwise an observer follows such records too. Raises ValueError where the shaft does not move, there is
     more than one integrator or a direct term, or `identify` refuses the records.
     """
@@ -78,7 +75,7 @@ def fit_friction(
             raise ValueError(f"{record.label}: the shaft does not move, so that its friction cannot be seen")
     report = progress or (lambda fraction, message: None)
     try:
-        found = _running_free(records, options, presliding, report)
+        found = _running_free(records, options, report)
     except LostError:
         if free:
             raise
@@ -93,9 +90,7 @@ def fit_friction(
     return found
 
 
-def _running_free(
-    records: Sequence[Record], options: IdentOptions, presliding: float, report: Progress
-) -> FrictionFit:
+def _running_free(records: Sequence[Record], options: IdentOptions, report: Progress) -> FrictionFit:
     """The fit whose simulation starts at rest with every record and sees nothing of it but the input."""
     report(0.0, "friction: start")
     structure = options.structure()
@@ -109,8 +104,8 @@ def _running_free(
     best: FrictionFit | None = None
     for search in range(_MOST_SEARCHES):
         report(0.2 + 0.8 * search / _MOST_SEARCHES, "friction: arm and level together")
-        law = FrictionLaw(level, presliding) if best is None else best.law
-        found = descended(started(model, structure, law), records, presliding, least)
+        law = FrictionLaw(level, PRESLIDING) if best is None else best.law
+        found = descended(started(model, structure, law), records, PRESLIDING, least)
         if best is not None and not (
             simulated_rss(found, records) + WORTH * found.noise_std**2 < simulated_rss(best, records)
         ):
@@ -119,7 +114,7 @@ def _running_free(
         # The poles may have been led astray by friction that was not yet right: search for them again.
         model = untested_model([found.taken_off(record) for record in records], options)
     assert best is not None
-    return descended(best, records, presliding, least, held=False)
+    return descended(best, records, PRESLIDING, least, held=False)
 
 
 def moved_to(found: FrictionFit, records: Sequence[Record], model: GobfModel) -> FrictionFit:
@@ -156,7 +151,7 @@ def _off_the_force(model: GobfModel) -> tuple[float, float]:
     """Where, rad/s, and how far, degrees, the speed is off the input at most, around the first mode or
     below."""
     dt_s = model.dt_s
-    omega = model.poles.omega_rad_s(dt_s)[model.poles.zeta() < _LIGHT]
+    omega = model.poles.omega_rad_s(dt_s)[model.poles.zeta() < LIGHT]
     first = float(omega.min()) if omega.size else 0.3 * np.pi / dt_s
     worst = 0.0, 0.0
     for at in (0.1 * first, first) if omega.size else (0.1 * first,):

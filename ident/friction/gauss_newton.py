@@ -34,7 +34,7 @@ WORTH = 0.5
 # Sizes of the changes that derivatives are taken from, relative to the motion and to the level: of the
 # simulation, whose friction turns at other times after a large change, and where an observer tells it.
 _CHANGE = 1e-6
-_CHANGE_OF_LEVEL, _CHANGE_OF_LOG, _CHANGE_BEYOND = 2e-3, 0.02, 0.05
+_CHANGE_OF_LEVEL, CHANGE_OF_LOG, _CHANGE_BEYOND = 2e-3, 0.02, 0.05
 
 
 class LostError(ValueError):
@@ -235,7 +235,7 @@ def driven_by_law(found: FrictionFit, record: Record) -> RealArray:
     columns = []
     for k in range(parameters.size):
         change = np.zeros(parameters.size)
-        change[k] = size = _CHANGE_OF_LOG if k % 2 else _CHANGE_OF_LEVEL * found.level
+        change[k] = size = CHANGE_OF_LOG if k % 2 else _CHANGE_OF_LEVEL * found.level
         law = law_of(parameters + change)
         columns.append((found.motion(record, law)[1] - friction) / size)
         if found.spring is not None and np.isfinite(found.law.fall):

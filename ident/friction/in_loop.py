@@ -63,10 +63,11 @@ from ident.friction.observer import NEARBY, ObserverFilter, observed, prediction
 from ident.friction.spring import Spring
 from ident.identification import Identification
 from ident.one_input import identify, untested_model
+from ident.response_uncertainty import NOISE_ORDERS
 from ident.search.order_selection import Progress
 from ident.search.pole_search import PoleSearch
 from ident.uncertainty.autoregression import fit_autoregression
-from ident.uncertainty.embedding_algebra import by_class, sandwiched
+from ident.uncertainty.embedding_algebra import RANK, by_class, sandwiched
 from ident.uncertainty.pole_intervals import laurent_rows
 from ident.unstable import find_unstable
 
@@ -90,9 +91,6 @@ _FALLS, _EXCESS, _STEPS = (0.03, 0.1, 0.3), 0.1, 6
 # Errors of the fewest poles, as a multiple of the other structure's, above which a structure is given up. An
 # arm that a weight throws over was right at 1.02 of an integrator's, and ended at .79 of them.
 _WORSE_AT_FIRST = 1.5
-# Directions of a start (columns of unit length) below this are left out; as few of the parameters.
-_RANK = 1e-10
-NOISE_ORDER = 32  # as `EmbeddingOptions.max_ar_order` where 8 leave residuals that are not white
 
 
 def recorded_in_loop(records: Sequence[Record]) -> bool:
@@ -562,7 +560,7 @@ def identify_behind(
         fit_percent=np.array([fit.fit_percent for fit in fits]),
         rss=rss,
         noise_std=float(np.sqrt(rss / sum(residual.size for residual in residuals))),
-        noise_filter=fit_autoregression(residuals, NOISE_ORDER),
+        noise_filter=fit_autoregression(residuals, NOISE_ORDERS[-1]),
     )
 
 
@@ -590,7 +588,7 @@ def _equations(
         if not np.all(np.isfinite(length)):
             raise LostError
         u, d, _ = np.linalg.svd(nuisance[:, length > 0] / length[length > 0], full_matrices=False)
-        u = u[:, d > _RANK * d.max(initial=0.0)]
+        u = u[:, d > RANK * d.max(initial=0.0)]
         rows = rows - u @ (u.T @ rows)
         if not np.all(np.isfinite(rows)):
             raise LostError
@@ -615,7 +613,7 @@ def heterogeneity(
     together = least_squares(blocks, targets, nothing)
     alone = [least_squares([b], [t], nothing) for b, t in zip(blocks, targets, strict=True)]
     sizes = [(one[1], np.linalg.norm(one[1], axis=0)) for one in (together, *alone)]
-    rank = [int(np.linalg.matrix_rank(r / np.where(n > 0, n, 1.0), tol=_RANK)) for r, n in sizes]
+    rank = [int(np.linalg.matrix_rank(r / np.where(n > 0, n, 1.0), tol=RANK)) for r, n in sizes]
     left = sum(one[3] for one in alone)
     freedom = max(sum(rank[1:]) - rank[0], 1), sum(t.size for t in targets) - sum(rank[1:])
     return max(1.0, float((together[3] - left) / freedom[0] / (left / freedom[1])))

@@ -9,11 +9,11 @@ import numba
 import numpy as np
 
 from ident.data.arrays import COMPILED, ComplexArray, IntArray, RealArray
+from ident.data.nonparametric import over_lines
 from ident.data.record import Record
 from ident.friction.arm import less_friction
 
-# Lines over which a spectrum is smoothed, and what lines of white noise may have beyond their median.
-_LINES, _BEYOND = 25, 1.5
+_BEYOND = 1.5  # over the median of a smoothed spectrum: as much as lines of white noise may have
 # A position is well above its noise where its power is so many times the noise's.
 _WELL = 10.0
 _LEAST_NOISE = 1e-6  # of the motion: a sensor of 20 bits
@@ -43,7 +43,7 @@ class _Spectrum(NamedTuple):
 def _spectrum(y: RealArray) -> _Spectrum:
     line = np.linspace(y[0], y[-1], y.size)
     values = np.fft.rfft(np.concatenate([y - line, -(y - line)[::-1]]))
-    power = np.convolve(np.abs(values) ** 2, np.full(_LINES, 1 / _LINES), "same")
+    power = over_lines(np.abs(values) ** 2)
     floor = _BEYOND * np.median(power[power.size // 2 :])
     return _Spectrum(line, values, power / max(floor, np.finfo(np.float64).tiny))
 

@@ -15,20 +15,21 @@ from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.data.arrays import ComplexArray, RealArray, real_rows
-from ident.data.ellipses import chi2_radius
+from ident.data.ellipses import LEVEL, chi2_radius
+from ident.data.frequency_uncertainty import FREQUENCIES
 from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
 from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, linearised
-from ident.friction.in_loop import NOISE_ORDER, heterogeneity
+from ident.friction.in_loop import heterogeneity
 from ident.friction.inverse_dynamics import smoothed, speed_classes
+from ident.response_uncertainty import NOISE_ORDERS
 from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
 
 # Share of the level that a linear force which shows in no residual may have (deviation).
 _SHAPE = 0.05
-# Grid of what is put onto the basis.
-_FREQUENCIES, _LENGTHS, _LEVEL = 400, 100, 0.95
+_LENGTHS = 100  # of the longest record: the lowest frequency
 # Normals along which the response is bent, points of an arc, its parts that are kept as a share of the
 # largest; of powers its square.
 _MOST_CURVED, _STEPS, _SMALL = 3, 17, 1e-3
@@ -108,7 +109,7 @@ def _behind_observed(
     known = found.law.n_logs + len(records)
     # What drives an arm away from its simulation is never white: as missed modes five slow ones were added.
     # Above those of the model, where logs excite little, one may be missing.
-    coloured = {"coloured_noise": True, "max_ar_order": max(options.max_ar_order, NOISE_ORDER)}
+    coloured = {"coloured_noise": True, "max_ar_order": max(options.max_ar_order, NOISE_ORDERS[-1])}
     swinging = model.poles.pairs if model.poles.pairs.size else model.poles.real[model.poles.real > 0]
     above = _BEYOND * float(np.max(np.abs(np.log(swinging)), initial=0.0))
     response, change, factor = tangent_beside(
@@ -165,7 +166,7 @@ def of_force(
     along = np.linalg.svd(real_rows(np.where(low[:, None], change, 0.0)), full_matrices=False)[2][
         :_MOST_CURVED
     ]
-    radius, least = chi2_radius(_LEVEL), 1 / _MOST_GAIN
+    radius, least = chi2_radius(LEVEL), 1 / _MOST_GAIN
     upright = np.real((1j * omega[0]) ** response.integrators * gain[0]) > 0
     centre, columns = np.ones(omega.size, np.complex128), list[ComplexArray]()
     onto = [np.eye(along.shape[1]) - along.T @ along]
@@ -213,13 +214,13 @@ def _parts_of(arc: ComplexArray, middle: ComplexArray) -> ComplexArray:
     parts = parts[: middle.size, :n] * sizes[:n] + 1j * parts[middle.size :, :n] * sizes[:n]
     parts = parts @ np.linalg.qr(np.column_stack([parts[0].real, np.eye(n)]))[0]
     most = np.append(min(_REACH, _LARGEST * abs(middle[0]) / abs(parts[0, 0])), np.full(n - 1, _REACH))
-    return np.asarray(parts * most / chi2_radius(_LEVEL), np.complex128)
+    return np.asarray(parts * most / chi2_radius(LEVEL), np.complex128)
 
 
 def _frequencies(response: ResponsePosterior, longest_s: float) -> RealArray:
     """(F,) [rad/s], as dense as what a kernel does between them."""
     nyquist = np.pi / response.dt_s
-    slow = np.geomspace(1 / (_LENGTHS * longest_s), nyquist, _FREQUENCIES)
+    slow = np.geomspace(1 / (_LENGTHS * longest_s), nyquist, FREQUENCIES)
     return np.union1d(
         slow, nyquist * np.arange(1, 2 * response.fir_length + 1) / (2 * response.fir_length + 1)
     )

@@ -61,7 +61,8 @@ _SHAPES = (tc_factor, exponential_factor, alternating_factor)
 _MOST_ADDED = 5
 # Share of the output that is nothing beside its noise.
 _FREE = 1e-9
-# Rounds of residuals, noise model, whitening: the first is unwhitened, the others remove its bias.
+# Rounds of residuals, noise model, whitening: the first is unwhitened, the others remove its bias; of several
+# outputs the covariance of the second is that of the first to a few per cent.
 NOISE_ROUNDS = 3
 
 

@@ -23,10 +23,8 @@ from ident.data.arrays import IntArray, RealArray
 _PIECE = 65536
 # Columns of the QR decomposition that are done at a time.
 _PANEL = 32
-# Nuisance columns whose part orthogonal to the earlier ones is below this are the same column twice.
-NUISANCE_RANK = 1e-10
-# Below this entry of R11 (columns of unit length) records cannot tell a column from the earlier ones.
-_EXCITATION = 1e-10
+# Columns of unit length whose part orthogonal to the earlier ones is below this say what those say.
+RANK = 1e-10
 # Share of the largest prior variance below which a tap is none: rounding, even ten orders above the noise.
 _DIED_OUT = 1e-17
 # Scales of a remainder up to what an order selection keeps, probability of more, and the largest energy.
@@ -138,7 +136,7 @@ def nuisance_basis(nuisance: RealArray) -> RealArray:
     if scaled.shape[1] == 0:
         return scaled
     q, r, _ = qr(scaled, mode="economic", pivoting=True)
-    rank = int(np.count_nonzero(np.abs(np.diag(r)) > NUISANCE_RANK))
+    rank = int(np.count_nonzero(np.abs(np.diag(r)) > RANK))
     return np.asarray(q[:, :rank])
 
 
@@ -197,7 +195,7 @@ def reduce_stacked(stacked: StackedBlocks) -> ReducedRegression:
     if np.any(own == 0):
         raise ValueError(f"the input does not excite regressor {int(np.argmax(own == 0)) + 1} of {own.size}")
     # Columns that are not, to rounding, combinations of earlier ones.
-    kept = np.flatnonzero(np.abs(np.diag(triangle[:p, :p])) > _EXCITATION * own)
+    kept = np.flatnonzero(np.abs(np.diag(triangle[:p, :p])) > RANK * own)
     if kept.size < p:
         columns = np.concatenate([kept, np.arange(p, p + length + 1)])
         triangle = triangle_of(triangle[:, columns])

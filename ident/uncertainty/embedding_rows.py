@@ -16,7 +16,7 @@ from ident.data.arrays import IntArray, RealArray
 from ident.data.record import Record
 from ident.uncertainty.autoregression import first_rows, whitened
 from ident.uncertainty.embedding_algebra import (
-    NUISANCE_RANK,
+    RANK,
     Delays,
     KernelPosterior,
     ReducedRegression,
@@ -178,7 +178,7 @@ def gls_residuals(
         if nuisance.shape[1]:
             # Fitted where it was estimated, in the whitened rows, and taken off the plain ones.
             u, d, vt = np.linalg.svd(whitened(nuisance, rows.whitening), full_matrices=False)
-            rank = int(np.count_nonzero(d > NUISANCE_RANK * d[0]))
+            rank = int(np.count_nonzero(d > RANK * d[0]))
             local = nuisance @ (vt[:rank].T / d[:rank])
             fitted = local @ (u[:, :rank].T @ whitened(np.column_stack([rest, shared]), rows.whitening))
             rest = rest - fitted[:, 0]

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from ident.basis.mimo_model import MimoModel
 from ident.basis.structure import front_response
 from ident.data.arrays import ComplexArray, RealArray, lock
+from ident.data.frequency_uncertainty import FREQUENCIES
 from ident.data.record import Record
 from ident.data.shown import Shown
 from ident.fit.several_outputs import prepare_outputs, whitened
@@ -25,7 +26,7 @@ from ident.identification import MimoIdentification
 from ident.mode_shapes import ModalFit, modes_of
 from ident.uncertainty.autoregression import autocovariance, fit_autoregression
 
-_RADII, _AROUND = 400, 41  # frequencies, and those around a mode, whose largest radius stands for all
+_AROUND = 41  # frequencies around a mode, beside those of the grid, whose largest radius stands for all
 _AR_ORDER = 16  # at most, of the noise
 _DRAWS = 20_000  # of the sum of squares: its 95 % quantile then is right to about 1 %
 
@@ -104,7 +105,7 @@ class MatrixPosterior(Shown):
             omega * (1 + zeta * np.linspace(-5, 5, _AROUND))
             for omega, zeta in zip(poles.omega_rad_s(self.dt_s), poles.zeta(), strict=True)
         ]
-        grid = np.unique(np.concatenate([np.geomspace(lowest_rad_s, nyquist, _RADII), *around]))
+        grid = np.unique(np.concatenate([np.geomspace(lowest_rad_s, nyquist, FREQUENCIES), *around]))
         return float(np.max(self.at(grid[(grid >= lowest_rad_s) & (grid <= nyquist)]).radius))
 
     def at(self, omega_rad_s: RealArray) -> MatrixUncertainty:

@@ -17,9 +17,8 @@ from ident.data.arrays import ComplexArray, RealArray
 from ident.data.ellipses import standard_axes
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.fit.frf_regression import THINNEST
 
-# An ellipse thinner than this part of the response would let one frequency overrule all the others.
-_THINNEST = 1e-4
 # A model of a loop's logs outside most of its own ellipses explains nothing: machines whose certificates held
 # had 87 % or more of them around their model, wrong ones 46 % or less (benchmarks.closed_loop_machines).
 MOST_INSIDE_PERCENT = 50.0
@@ -45,7 +44,7 @@ def nominal_near(posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.Ar
     common = front_response(omega, posterior.dt_s, posterior.integrators, posterior.input_delay_samples)
     common = common / all_pass_response(posterior.unstable, z)
     s1, s2, u1 = standard_axes(uncertainty.covariance)
-    floor = _THINNEST * np.abs(uncertainty.centre)
+    floor = THINNEST * np.abs(uncertainty.centre)
     aligned = (common * u1.conj())[:, None] * columns
     target = uncertainty.centre * u1.conj()
     along, across = 1 / np.hypot(s1, floor), 1 / np.hypot(s2, floor)

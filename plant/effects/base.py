@@ -7,10 +7,10 @@ from dataclasses import replace
 from functools import partial
 from operator import mul
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, cast
+from typing import Any, ClassVar, Literal, Self, TypeVar, cast
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
 from plant.effects.search_space import (
     Axis,
@@ -24,13 +24,10 @@ from plant.effects.search_space import (
     searches,
 )
 from plant.machine import Machine, Real
-from plant.rig import Rig
+from plant.rig import NotNegative as NotNegative, Positive as Positive, Rig
 
 Group = Literal["actuator", "joint", "link", "sensor"]
 Part = Literal["rig", "voltage", "joint", "sensor"]
-
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
 
 # A ratio closer to one than this many tolerances of the value it multiplies is not significant; nearly all
 # are within so many tolerances: who states a value to 5 % is seldom wrong by a factor of ten.
@@ -160,14 +157,13 @@ class Effect(BaseModel):
         axes: Sequence[Axis],
         points: Iterable[Sequence[float]] = (),
         *,
-        sign: int = 1,
         grows: bool = True,
     ) -> Candidate:
         """A search that starts from these points, given in the units of the axes' parameters."""
         starts = tuple(
             tuple(axis.coordinate(v) for axis, v in zip(axes, point, strict=True)) for point in points
         )
-        return Candidate(cls, tuple(axes), starts, sign, grows)
+        return Candidate(cls, tuple(axes), starts, grows=grows)
 
 
 EFFECTS: dict[str, type[Effect]] = {}

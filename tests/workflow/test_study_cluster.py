@@ -130,7 +130,7 @@ def test_a_network_that_stalls(cluster, monkeypatch, who, words):
         found = far.run([Sleep(0.0), Sleep(300.0)])
         assert next(found) == (0, 0.0)
         # Not before: a worker says nothing while it imports what its first task needs.
-        for name, seconds in {"SILENT_S": 4, "WITHOUT_WORKERS_S": 4, "ANSWER_S": 1, "_ASK_S": 0.2}.items():
+        for name, seconds in {"SILENT_S": 4, "WITHOUT_WORKERS_S": 4, "CONNECT_S": 1, "_ASK_S": 0.2}.items():
             monkeypatch.setattr(f"workflow.engine.executor.{name}", seconds)
         stalled = cluster.scheduler if who == "scheduler" else cluster.workers[0]
         stalled.send_signal(signal.SIGSTOP)

@@ -9,6 +9,7 @@ import numpy as np
 
 from ident.basis.model_files import ModelFile
 from ident.basis.options import IdentOptions
+from ident.data.frequency_uncertainty import FREQUENCIES
 from ident.data.frf_records import FrfRepeats, measured_response
 from ident.frequency_fit import identify_frf
 from ident.uncertainty.nominal import nominal_near
@@ -19,8 +20,6 @@ from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
 from workflow.tasks.results import IdentifiedPlant
 from workflow.text.formats import count
 from workflow.text.templates import RunSummary, rows_of, words
-
-_EXPORTED_POINTS = 400  # a hundred a decade over four decades
 
 
 def identify_response(
@@ -64,7 +63,7 @@ def identify_response(
     written: dict[Path, bytes] = {}
     if out is not None or export is not None:
         ends = response.omega_rad_s[response.omega_rad_s > 0]
-        omega = np.geomspace(ends[0], ends[-1], _EXPORTED_POINTS)
+        omega = np.geomspace(ends[0], ends[-1], FREQUENCIES)
         if out is not None:
             nominal = nominal_near(found.posterior, found.model.poles, omega)
             written[out] = storage.npz_bytes(

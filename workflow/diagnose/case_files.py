@@ -11,6 +11,7 @@ import numpy as np
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.plausible import refuse_implausible
 from ident.data.foreign_files import shown
+from ident.data.record import SAME_CLOCK
 from ident.data.record_files import read_table
 from ident.data.time_grid import TimeGrid
 from ident.data.units import per, written_unit
@@ -24,8 +25,6 @@ from workflow.engine.run_directory import hash_of
 
 # Names of pages and files in the output directory that no case may take.
 _TAKEN_NAMES = ("index", "diagnose")
-# Time stamps are written with a few digits; a rig with another sampling period is off by far more.
-_SAMPLING_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +133,7 @@ def _experiment(
                 values["time_s"] = table.seconds(time.column, values["time_s"], None)[0]
             grid = TimeGrid.of(table, time.column, values["time_s"], options=False)
         stated = rig.sampling.dt_s
-        if not abs(grid.dt_s - stated) <= _SAMPLING_TOLERANCE * stated:
+        if not abs(grid.dt_s - stated) <= SAME_CLOCK * stated:
             raise InputError(
                 f"{path}: sampled every {grid.dt_s:.6g} s, but the rig file states sampling.dt_s = "
                 f"{stated:.6g}"

@@ -29,7 +29,7 @@ from ident.data.record_files import read_table
 from ident.data.roles import time_of
 from ident.data.table import Table
 from ident.data.time_grid import TimeGrid, sampling_time
-from ident.data.units import COUNTED, per, size_of, written_unit
+from ident.data.units import COUNTED, LONG_STEP_S, per, size_of, written_unit
 from plant.effects.search_space import geometric
 from workflow.diagnose.case_settings import Column
 from workflow.diagnose.simulator_settings import KINDS, SimulatorSettings
@@ -53,7 +53,6 @@ _MOST_STEPS, _MOST_SAMPLES = 500, 100
 _UNITS_OF_TIME = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
 # What positions are logged in beside the unit of the model.
 _OTHERS = {"rad": ("degrees", np.pi / 180), "m": ("millimetres", 1e-3)}
-_SLOWEST_S = 0.5  # machines are logged faster than twice a second
 # Third differences of white noise have twenty times its variance; no motion is left in them.
 _THIRD = 20.0
 
@@ -513,7 +512,7 @@ def _refuse_other_unit(
         step, written = (float(np.ptp(one)) / max(len(stamps) - 1, 1) for one in (seconds, stamps))
         if fits(step) and not column.doubtful:
             continue
-        likely = [per for per in _UNITS_OF_TIME if written * per < _SLOWEST_S and fits(written * per)]
+        likely = [per for per in _UNITS_OF_TIME if written * per < LONG_STEP_S and fits(written * per)]
         per = (likely or [1e-3])[0]
         of_model = f", {step / step_s:.4g} steps of the model ({step_s:g} s)" if step_s else ""
         raise InputError(

@@ -43,8 +43,7 @@ MOST_ATTEMPTS = 3  # the second and third alone, when the others are done
 CONNECT_S = 10.0  # a scheduler in the same network answers in milliseconds
 # Work that cannot go on says so within a minute.
 WITHOUT_WORKERS_S = 50.0
-SILENT_S = 40.0  # within the minute above, less the last `ANSWER_S` and `_ASK_S`
-ANSWER_S = 10.0  # as `CONNECT_S`
+SILENT_S = 40.0  # within the minute above, less the last `CONNECT_S` and `_ASK_S`
 _LOOK_S = 0.05  # short beside any task
 _ASK_S = 2.0  # often beside `SILENT_S`, seldom beside what a scheduler can answer
 
@@ -367,7 +366,7 @@ class DaskCluster(Executor):
         stopped, or cut off, keeps its connections: only what it says tells that it is there."""
         # KeyError: while a connection is broken.
         with suppress(OSError, TimeoutError, RuntimeError, KeyError):
-            identity = self._client.sync(self._client.scheduler.identity, callback_timeout=ANSWER_S)
+            identity = self._client.sync(self._client.scheduler.identity, callback_timeout=CONNECT_S)
             seen = {name: about["last_seen"] for name, about in identity["workers"].items()}
             self._heard_s = time.monotonic()
             if any(self._last_seen.get(name) != at for name, at in seen.items()):

@@ -17,7 +17,6 @@ from workflow.figures.bands import Real, outline
 from workflow.text.formats import listing
 
 _MOST_BARS = 8  # more names are too small to read at the width of a page
-_LEAST = 0.02  # of the floor: less is drawn there
 _LOOKS = {"stated": ("s", -0.22), "refit": ("D", 0.0), "repaired": ("o", 0.22)}
 
 
@@ -43,7 +42,7 @@ def draw_waterfall(found: Diagnosis) -> Figure:
     gaps, floor = found.gaps, found.noise_floor
     # Nothing beyond noise has no place on a logarithmic axis.
     rows = {
-        name: {model: max(value, _LEAST * floor) for model, value in entry.items()}
+        name: {model: max(value, gap_style.LEAST * floor) for model, value in entry.items()}
         for name, entry in found.gap_by_experiment.items()
     }
     rough = found.case.model_error

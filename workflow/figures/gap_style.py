@@ -23,6 +23,7 @@ WORDS: Mapping[str, str] = {
 }
 RESIDUAL_AXIS = "residual over noise, RMS [1]"
 SHARE_AXIS = "residual, RMS [% of the motion]"
+LEAST = 0.05  # of the noise, or what a good model may miss: on a log axis less is drawn there
 UNINTERESTING = "significance threshold"
 NOISE_BAND = {"color": "#e6e6e6", "lw": 0, "label": "2 standard deviations of the sensor noise"}
 # What is measured: words, unit, colour.

@@ -13,7 +13,6 @@ from workflow.text.formats import portion
 _LOOKS = {SENSORS[output][0]: (words, colour) for output, (words, _, colour) in gap_style.OUTPUTS.items()}
 _MOST_REGIMES = 6  # two rows of panels
 _FEW_BINS = 2  # labels of three in words overlap
-_SMALLEST = 0.05  # noise deviations; less is drawn there
 _WHISKER = {"color": "#444444", "lw": 1.0}
 _REGIMES = {
     "speed_sign": "sign of the hub speed",
@@ -68,17 +67,17 @@ def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure
             size, interval = _of_band(where, band, model_error)
             left.plot(
                 [band.low_Hz, band.high_Hz],
-                [max(size, factor * _SMALLEST)] * 2,
+                [max(size, factor * gap_style.LEAST)] * 2,
                 color=colour,
                 alpha=1.0 if band.gap.found else 0.35,
                 lw=4.0,
                 solid_capstyle="butt",
             )
-            left.plot([middle, middle], np.maximum(interval, factor * _SMALLEST), **_WHISKER)
+            left.plot([middle, middle], np.maximum(interval, factor * gap_style.LEAST), **_WHISKER)
         left.plot([], [], color=colour, lw=4.0, label=name)
     left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel=words)
     # Up to the threshold at least, so that a frame in which nothing is large is not empty.
-    left.set_ylim(factor * _SMALLEST, max(left.get_ylim()[1], factor))
+    left.set_ylim(factor * gap_style.LEAST, max(left.get_ylim()[1], factor))
     left.set_title("By frequency")
     for row, entry in enumerate(experiments):
         for sensor, part, offset in zip(sensors, entry.sensors, 0.15 * apart, strict=True):

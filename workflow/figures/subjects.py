@@ -22,6 +22,7 @@ from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import Specification
 from ident.basis.options import IdentOptions
 from ident.checks.distortion_findings import distortion_findings
+from ident.checks.plausible_modes import LIGHT
 from ident.data.distortion import Distortion, distortion_of
 from ident.data.finding import Finding
 from ident.data.record import Record
@@ -42,7 +43,6 @@ FRICTION = (
     style.MODEL_LINE | {"label": "identified arm with friction"},
     style.MEASURED_LINE | {"label": "the same arm in the recorded loop"},
 )
-LIGHT = 0.3  # damping ratio below which a pole pair is called lightly damped
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from workflow.engine.run_directory import RunDirectory
 from workflow.figures.subjects import AnyRunView, RunView, log_channel
 from workflow.report.rendering import RenderedPage, render_page
 from workflow.tasks.log_identification import LogIdentification
-from workflow.tasks.results import ReportResult, RunRecord, RunResults
+from workflow.tasks.results import RunRecord, RunResults
 from workflow.tasks.stage import Stage, StageInput, stages_for
 from workflow.tasks.stages import STAGES
 from workflow.tasks.summary import summarise, title_of
@@ -62,10 +62,10 @@ def _write(run: RunDirectory, page: RenderedPage) -> Path:
     return run.report_path
 
 
-def write_page(stage: StageInput, also: Iterable[str] = ()) -> ReportResult:
+def write_page(stage: StageInput, also: Iterable[str] = ()) -> str:
     """The last stage of a run: report.html and the hash of its content; also: as of `write_report`."""
     path = write_report(stage.results, stage.config, partial(stage.progress.update, "report"), also)
-    return ReportResult(storage.sha256_of_file(path))
+    return storage.sha256_of_file(path)
 
 
 def page_of(config: AnyConfig, also: Iterable[str] = ()) -> Stage:

@@ -19,16 +19,12 @@ from workflow.engine.errors import naming
 from workflow.tasks.design import model_answer
 from workflow.tasks.friction_loop import check_friction
 from workflow.tasks.loop_conditions import ConditionBench
-from workflow.tasks.loop_sensitivity import rms_of, sensitivity_on_arm, settling_samples
+from workflow.tasks.loop_sensitivity import LEAD_IN, SETTLED, rms_of, sensitivity_on_arm, settling_samples
 from workflow.tasks.results import ClosedLoopResult, LoopCheck, LoopMetrics, LoopRuns
 from workflow.tasks.sampled_plant import realise, simulate_plant
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, converter_steps, loop_of_arm, rig_of
 from workflow.tasks.stage import StageInput
 
-_LEAD_IN = 0.05  # share of the record before the step, so that the picture shows rest
-# A run counts as settled when, at the end of either half, it moves by less than this share of the step and,
-# where tracking is asked for, has arrived within it. Within one count of the sensor no controller sees it.
-_SETTLED = 0.1
 # Samples of a run on the simulated arm, and at most of one on a plant that was drawn.
 _SHORTEST, _LONGEST, _LONGEST_DRAWN = 200, 6000, 60_000
 
@@ -149,7 +145,7 @@ def make_trial(
     disturbance, k, half = options.disturbance, np.arange(samples), samples // 2
     if disturbance is None:
         disturbance = 0.1 * rms_of([record.input for record in used])
-    reference = np.where(k >= round(_LEAD_IN * samples), step, 0.0)
+    reference = np.where(k >= round(LEAD_IN * samples), step, 0.0)
     return Trial(
         time_s=np.asarray(k * dt_s, dtype=np.float64),
         reference=reference,
@@ -222,8 +218,8 @@ def describe(runs: LoopRuns, trial: Trial) -> tuple[LoopMetrics, ...]:
         )
         error = trial.reference - output
         ends = [_tail(error[: trial.half]), _tail(error[trial.half :])]
-        steady = all(np.ptp(end) <= max(_SETTLED * abs(trial.step), 2 * trial.resolution) for end in ends)
-        arrived = abs(float(np.mean(ends[0]))) <= max(_SETTLED * abs(trial.step), trial.resolution)
+        steady = all(np.ptp(end) <= max(SETTLED * abs(trial.step), 2 * trial.resolution) for end in ends)
+        arrived = abs(float(np.mean(ends[0]))) <= max(SETTLED * abs(trial.step), trial.resolution)
         rows.append(
             LoopMetrics(
                 **vars(step_metrics(step)),

@@ -11,12 +11,12 @@ from scipy.signal import butter, sosfiltfilt
 
 from diagnosis.machine.quantisation_grid import grid_step
 from ident.checks.input_checks import refuse_few_lines
+from ident.checks.plausible_modes import LIGHT
 from ident.closed_loop import controller_of
 from ident.data.arrays import clipped_share
 from ident.data.record import Record
 from ident.friction import recorded_in_loop
 from workflow.tasks.first_look import (
-    SWINGS,
     TOLD,
     FirstLook,
     first_look,
@@ -128,7 +128,7 @@ def informed(draft: Draft, found: IdentifiedChannel, spread: UncertainChannel) -
         (mode.omega_rad_s, mode.damping)
         for mode, interval in zip(found.modes, intervals, strict=True)
         if interval is not None and interval.told
-        if found.is_mode(mode) and mode.damping < SWINGS
+        if found.is_mode(mode) and mode.damping < LIGHT
     ]
     notch = next((float(zero) for zero in notches(model) if band[0] < zero < band[1]), None)
     look = replace(look, told_rad_s=band, mode=min(modes, default=None), notch=notch)

@@ -11,6 +11,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import butter, sosfiltfilt
 
 from ident.basis.model import GobfModel
+from ident.checks.plausible_modes import LIGHT
 from ident.data.arrays import RealArray
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.nonparametric import empirical_frf, spectra_of
@@ -20,8 +21,6 @@ from ident.data.record import Record
 TOLD = 0.3
 # ... at this share of the lines just below, and at so many in all: those in between may not be excited.
 _OF_LINES, _FEWEST = 0.2, 3
-# A pole or zero that swings: less damped ones show as a peak or a notch.
-SWINGS = 0.3
 # Of the rigid motion: half of the frequency that is tried, with two more derivatives for what bends there; it
 # tells what holds the position where it explains this share of the command's power.
 _EXPLAINED = 0.97
@@ -216,7 +215,7 @@ def notches(model: GobfModel) -> RealArray:
     """Natural frequencies [rad/s] of lightly damped zeros, ascending."""
     zeros = np.asarray(model.zeros())
     s = np.log(zeros[(np.imag(zeros) > 0) & (np.abs(zeros) > 0)]) / model.dt_s
-    return np.sort(np.abs(s)[np.abs(np.real(s)) < SWINGS * np.abs(s)])
+    return np.sort(np.abs(s)[np.abs(np.real(s)) < LIGHT * np.abs(s)])
 
 
 def _rigid(records: Sequence[Record], response: FrequencyUncertainty, position: bool) -> RigidMotion | None:

@@ -26,6 +26,7 @@ from control_design.controllers.controller import Controller, FrictionFeedforwar
 from control_design.specification import Specification
 from ident.closed_loop import controller_of
 from ident.data.arrays import RealArray, kernel_array
+from ident.data.ellipses import LEVEL
 from ident.friction import FrictionFit, FrictionLaw
 from ident.friction.kernel import loop_through
 from workflow.tasks.loop_sensitivity import (
@@ -207,10 +208,10 @@ def friction_feedforward(controller: Controller, found: FrictionFit) -> Friction
     )
 
 
-def interval_of(values: Sequence[float], level: float = 0.95) -> Interval:
+def interval_of(values: Sequence[float]) -> Interval:
     """Where one more of these positive values lies: Student's law of their logarithms."""
     logs = np.log(values)
-    reach = student.ppf(0.5 + level / 2, logs.size - 1) * np.sqrt(1 + 1 / logs.size) * np.std(logs, ddof=1)
+    reach = student.ppf(0.5 + LEVEL / 2, logs.size - 1) * np.sqrt(1 + 1 / logs.size) * np.std(logs, ddof=1)
     return float(np.exp(logs.mean() - reach)), float(np.exp(logs.mean() + reach))
 
 

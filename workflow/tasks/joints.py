@@ -22,6 +22,7 @@ from ident.basis.poles import Poles
 from ident.checks.validation import fit_in_windows, fit_on_fresh_data
 from ident.closed_loop import two_stage_several
 from ident.data.finding import Finding, FindingKind, finding
+from ident.data.frequency_uncertainty import FREQUENCIES
 from ident.data.record import Record
 from ident.data.signal_filter import increments
 from ident.several_outputs import identify_mimo
@@ -29,6 +30,7 @@ from ident.uncertainty.matrix_response import matrix_posterior
 from workflow.config.joints_config import JointsConfig, TwoJointSource
 from workflow.config.run_config import Role
 from workflow.engine.errors import naming
+from workflow.tasks.loop_sensitivity import SETTLED
 from workflow.tasks.point_models import (
     JointsCertificate,
     JointsLoopResult,
@@ -41,9 +43,6 @@ from workflow.tasks.simulated_rig import machine_at
 from workflow.tasks.stage import StageInput
 
 Real = npt.NDArray[np.float64]
-
-_SETTLED = 0.1  # of the step: how far from it an output may be at the end of a run
-_SHOWN = 400  # frequencies of the pictures
 
 
 def _of(stage: StageInput) -> tuple[JointsConfig, Any]:
@@ -102,7 +101,7 @@ def identify_points(stage: StageInput) -> PointModels:
             # A colour of the noise is the ball's own.
             remarks += tuple(item for item in one.warnings if item.kind is not FindingKind.COLOURED_RESIDUAL)
             low = options.lowest_rad_s
-            shown = ball.at(np.geomspace(low, 0.999 * (np.pi / one.model.dt_s), _SHOWN))
+            shown = ball.at(np.geomspace(low, 0.999 * (np.pi / one.model.dt_s), FREQUENCIES))
             noise_std = np.sqrt(np.diag(one.noise_covariance))
             found.append(
                 PointModel(
@@ -189,7 +188,7 @@ def _judged(
 ) -> JointsRun:
     late = output[-max(1, len(output) // 20) :]
     size = np.where(step, np.abs(step), np.max(np.abs(step)))  # of a joint that is to rest: the others' step
-    settled = bool(np.all(np.isfinite(output)) and np.all(np.abs(late - step) < _SETTLED * size))
+    settled = bool(np.all(np.isfinite(output)) and np.all(np.abs(late - step) < SETTLED * size))
     beyond = np.max(np.where(step < 0, -1.0, 1.0) * (output - step) / size, axis=0)
     limits = law.limits("input_limit")
     return JointsRun(

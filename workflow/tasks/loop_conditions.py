@@ -23,6 +23,7 @@ from plant.machine import Machine
 from plant.rig import Rig
 from plant.simulation import simulate as simulate_arm
 from workflow.config.run_config import ClosedLoopOptions, SimulatedSource
+from workflow.tasks.loop_sensitivity import SETTLED
 from workflow.tasks.results import ConditionRun
 from workflow.tasks.sampled_plant import FINITE, realise, simulate_plant
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, UNITS, encoded_arm
@@ -31,7 +32,6 @@ from workflow.text.templates import said
 _SLEW_SHARE = 0.6  # of the voltage limit that the slew is predicted to use
 _OVERDRIVEN = 2.0  # times the voltage limit that the large step would need
 _PUSH_S = 0.1  # half a period of 5 Hz: it excites the first modes
-_SETTLED = 0.1  # of the move: a run whose last tenth swings by less has settled
 
 
 def condition_run(
@@ -58,7 +58,7 @@ def condition_run(
         error_left_percent=float(np.mean(tail)),
         peak_command=float(np.max(np.abs(achieved.command))),
         limited_fraction=float(np.mean(achieved.limited)),
-        settled=bool(np.ptp(tail) <= 100 * _SETTLED),
+        settled=bool(np.ptp(tail) <= 100 * SETTLED),
         reference=reference,
         predicted=predicted.measured,
         achieved=achieved.measured,

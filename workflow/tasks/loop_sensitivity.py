@@ -16,6 +16,10 @@ from workflow.tasks.results import MeasuredPeak, SensitivityCheck
 from workflow.tasks.simulated_rig import loop_of_arm
 from workflow.tasks.stage import StageInput
 
+LEAD_IN = 0.05  # share of a run before its step, so that the picture shows rest
+# A run counts as settled when at its end it moves by less than this share of the step and, where tracking is
+# asked for, has arrived within it. Within one count of the sensor no controller sees it.
+SETTLED = 0.1
 _DRAWS = 3  # of random phases: the fewest that show a spread
 _PERIODS_SMALL = 4  # sensor noise weighs ten times as much there, too
 SMALL = 0.1  # of the large excitation: friction weighs ten times as much

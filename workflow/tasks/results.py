@@ -626,11 +626,6 @@ class ClosedLoopResult:
     check: LoopCheck | None = None
 
 
-@dataclass(frozen=True)
-class ReportResult:
-    report_sha256: str
-
-
 class StageResult(Generic[T]):
     """The result of the stage that the attribute is named after, read when it is first asked for. several:
     its type in a run for several joints, where that is another one."""

@@ -16,6 +16,7 @@ from control_design.plants.transfer import of_polynomials, of_roots
 from ident.basis.model_files import FORMAT
 from ident.data.foreign_files import content_of
 from ident.data.mat_files import mat_variables
+from ident.data.record import SAME_CLOCK
 from ident.data.record_files import READERS
 from workflow.engine import documents, storage
 from workflow.engine.errors import InputError, naming
@@ -23,7 +24,6 @@ from workflow.engine.errors import InputError, naming
 DOCUMENTS = (".json", ".mat", ".npz")
 _SAMPLING_TIME = ("dt_s", "dt", "Ts")
 _FORMS = (("numerator", "denominator"), ("num", "den"), ("zeros", "poles", "gain"))
-_SAME_CLOCK = 1e-3  # a share: clocks differ by some 1e-5, and files give three digits or more
 # Of an entry of a state space in any units: products of some of them are still numbers.
 _LARGEST = 1e50
 
@@ -120,7 +120,7 @@ def read_law(path: Path, dt_s: float, delay_samples: int = 0) -> Controller:
             raise ValueError(
                 f"is of {law.D.shape[1]} errors and {law.D.shape[0]} commands, expected one loop"
             )
-        if not abs(law.dt_s - dt_s) <= _SAME_CLOCK * dt_s:
+        if not abs(law.dt_s - dt_s) <= SAME_CLOCK * dt_s:
             raise ValueError(f"is sampled every {law.dt_s:g} s, expected {dt_s:g} s as of logs and plant")
     return law
 

@@ -134,11 +134,14 @@ def uncertainty_of(
 
         (behind, tests), _ = with_noise_model(options, white, arm_behind)
         linear = behind.shaft if at_shaft else behind.response
-        posterior, poles, equivalent = described_response(
-            behind, poles, friction, measured, channel.uncertainty, rng, equivalent
-        )
-    band = result.data_band_rad_s
-    omega = nominal_grid(display_grid(result.model, result.bounded), band)
+        posterior = behind.response
+        if channel.uncertainty.response == "this amplitude":
+            equivalent = equivalent or equivalent_friction(friction, measured, rng)
+            posterior, poles = at_amplitude(behind, equivalent, rng)
+    band, omega = result.data_band_rad_s, display_grid(result.model, result.bounded)
+    if band is not None:  # the nominal model has to be right there, and need not elsewhere
+        omega = omega[(omega >= band[0]) & (omega <= band[1])]
+        omega = omega if omega.size >= _FEWEST_FREQUENCIES else np.geomspace(*band, _FEWEST_FREQUENCIES)
     observer = friction is not None and friction.observed
     found = uncertain_channel(
         channel.uncertainty.method,
@@ -165,28 +168,6 @@ def uncertainty_of(
     return replace(found, advice=(*advice, *found.agreement.doubt)), equivalent
 
 
-def described_response(
-    behind: BehindFriction,
-    poles: Poles,
-    friction: FrictionFit,
-    measured: Sequence[Record],
-    described: UncertaintyOptions,
-    rng: np.random.Generator,
-    equivalent: EquivalentFriction | None = None,
-) -> tuple[ResponsePosterior, Poles, EquivalentFriction | None]:
-    """What the ellipses of an arm with friction are about, and the poles of its nominal: the response behind
-    the friction with the model's poles, or the one at an amplitude, and what stands for the friction there.
-
-    friction: as it was fitted to the measured records, from which equivalent follows where it is not known of
-    another output.
-    """
-    if described.response != "this amplitude":
-        return behind.response, poles, equivalent
-    if equivalent is None:
-        equivalent = equivalent_friction(friction, measured, rng)
-    return (*at_amplitude(behind, equivalent, rng), equivalent)
-
-
 def uncertain_channel(
     method: str,
     level: float,
@@ -206,6 +187,7 @@ def uncertain_channel(
     why = next((words(doubt) for doubt in doubts if doubt.kind is FindingKind.WRAPS), "")
     refuse_unanswered(linear, omega, result.identification.warnings, why=why)
     frequency = posterior.at(omega, level)
+    relative = 100 * frequency.ellipse().semi_major / np.abs(frequency.centre)
     bands = pairwise(np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist())  # of equal ratio
     intervals = intervals_of(linear, model.stable_poles, level)
     nominal = nominal_of(posterior, poles or model.poles, omega, _untold(model, intervals))
@@ -222,7 +204,11 @@ def uncertain_channel(
             level=level,
             band_rad_s=result.data_band_rad_s,
         ),
-        bands=tuple(band_row(frequency, low, high) for low, high in bands),
+        bands=tuple(
+            Band(low, high, float(np.median(inside)), float(np.max(inside)))
+            for low, high in bands
+            for inside in [relative[(frequency.omega_rad_s >= low) & (frequency.omega_rad_s < high)]]
+        ),
         tests=tests,
         agreement=NominalAgreement.of(frequency, nominal.frequency_response),
         intervals=intervals,
@@ -264,14 +250,6 @@ def posterior_of(
     return combine_posteriors(each, small_sample_level=options.level)
 
 
-def nominal_grid(omega: RealArray, band: tuple[float, float] | None) -> RealArray:
-    """Where the nominal model has to be right: the band of the data, everywhere without one."""
-    if band is None:
-        return omega
-    inside = omega[(omega >= band[0]) & (omega <= band[1])]
-    return inside if inside.size >= _FEWEST_FREQUENCIES else np.geomspace(*band, _FEWEST_FREQUENCIES)
-
-
 def nominal_of(
     posterior: ResponsePosterior, poles: Poles, omega: RealArray, untold: ComplexArray
 ) -> GobfModel:
@@ -309,13 +287,6 @@ def display_grid(model: GobfModel, records: Sequence[Record]) -> RealArray:
     ]
     low, high = 2 * np.pi / longest_s, np.pi / model.dt_s
     return frequency_grid(high, modes, omega_min_rad_s=low, n_log=300, n_mode=41 * len(modes))
-
-
-def band_row(frequency: FrequencyUncertainty, low: float, high: float) -> Band:
-    """Size of the ellipses in a band: major semi-axis over |G|, in percent."""
-    inside = (frequency.omega_rad_s >= low) & (frequency.omega_rad_s < high)
-    relative = 100 * frequency.ellipse().semi_major[inside] / np.abs(frequency.centre[inside])
-    return Band(low, high, float(np.median(relative)), float(np.max(relative)))
 
 
 def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> Intervals | None:
