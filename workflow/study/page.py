@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,41 +18,12 @@ from workflow.config.joints_config import JointsConfig
 from workflow.engine import codec
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures import style
-from workflow.study.columns import COLUMNS, Number, StudyColumn, numbers_of
-from workflow.study.points import Combination, Point, short
+from workflow.study.columns import COLUMNS, StudyColumn, numbers_of
+from workflow.study.points import Point, PointRow, State, short
 from workflow.study.settings import ParetoPlot, StudyAxis, StudyConfig
 from workflow.tasks.results import RunResults
 from workflow.tasks.summary import summarise, verdict_of
 from workflow.text.templates import RunSummary, render_text, rows_of, said
-
-State = Literal[
-    "certified",
-    "certified at a lower bandwidth",
-    "does not settle",
-    "keeps moving",
-    "not certified",
-    "impossible",
-    "failed",
-]
-
-
-@dataclass(frozen=True, eq=False)
-class PointRow(Combination):
-    """A point in the table. `numbers` has every column, None where there is no number."""
-
-    state: State
-    why: str
-    numbers: Mapping[str, Number]
-
-    @property
-    def good(self) -> bool:
-        """Certified, and every run in closed loop stops at its reference."""
-        return self.state == "certified" or self.lowered
-
-    @property
-    def lowered(self) -> bool:
-        """Certified for a lower bandwidth than specified."""
-        return self.state == "certified at a lower bandwidth"
 
 
 def row_of(point: Point, run: RunDirectory) -> PointRow:
@@ -91,11 +62,6 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
     if lowered:
         why = f"{lowered}; {why}"
     return PointRow(point.number, point.name, point.values, state, why, numbers)
-
-
-def row_without_run(point: Combination, state: State, why: str) -> PointRow:
-    """The row of a combination that contradicts itself, or of a point that failed."""
-    return PointRow(point.number, point.name, point.values, state, why, dict.fromkeys(COLUMNS))
 
 
 def csv_text(axes: Sequence[StudyAxis], rows: Sequence[PointRow], front: Sequence[Sequence[int]]) -> str:

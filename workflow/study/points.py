@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import ValidationError
 
@@ -18,8 +18,19 @@ from workflow.config.settings import check
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory, hash_of
+from workflow.study.columns import COLUMNS, Number
 from workflow.study.settings import StudyAxis, StudyConfig, last_name, with_values
 from workflow.tasks.pipeline import any_config_of, controller_stages, plant_stages
+
+State = Literal[
+    "certified",
+    "certified at a lower bandwidth",
+    "does not settle",
+    "keeps moving",
+    "not certified",
+    "impossible",
+    "failed",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +87,22 @@ class Combination:
 
 
 @dataclass(frozen=True, eq=False)
-class Contradiction(Combination):
-    """A combination that contradicts itself; `refusal` says how."""
+class PointRow(Combination):
+    """A point in the table. `numbers` has every column, None where there is no number."""
 
-    refusal: str
+    state: State
+    why: str
+    numbers: Mapping[str, Number] = field(default_factory=lambda: dict.fromkeys(COLUMNS))
+
+    @property
+    def good(self) -> bool:
+        """Certified, and every run in closed loop stops at its reference."""
+        return self.state == "certified" or self.lowered
+
+    @property
+    def lowered(self) -> bool:
+        """Certified for a lower bandwidth than specified."""
+        return self.state == "certified at a lower bandwidth"
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,14 +165,14 @@ class PointMaker:
         for index, axis in enumerate(self._axes):
             self._refuse_bad_values(index, axis)
 
-    def make(self, values: Mapping[str, Any]) -> Point | Contradiction:
+    def make(self, values: Mapping[str, Any]) -> Point | PointRow:
         """The point of these values, one per axis. That they contradict one another is a result too."""
         self._made += 1
         try:
             config = self._base.changed(values, "the configuration contradicts itself")
         except InputError as error:
             name = self._name(values, hash_of({"base": self._base.document, "values": values}))
-            return Contradiction(self._made, name, dict(values), str(error))
+            return PointRow(self._made, name, dict(values), "impossible", str(error))
         inputs = self._base.inputs_of(config)
         given = () if self._original is None else shared_stages(config, self._original)
         plant = plant_stages(config)
@@ -166,7 +189,7 @@ class PointMaker:
         name = self._name(values, hash_of({"plant": plant_key, "config": config.to_document()}))
         return Point(self._made, name, dict(values), config, inputs, plant_key, design_key, given)
 
-    def grid(self) -> list[Point | Contradiction]:
+    def grid(self) -> list[Point | PointRow]:
         """Every combination, the last axis fastest."""
         keys = [axis.key for axis in self._axes]
         combinations = itertools.product(*(axis.grid() for axis in self._axes))

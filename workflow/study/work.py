@@ -15,14 +15,15 @@ from workflow.engine.errors import InputError, StageError
 from workflow.engine.executor import Executor, Failure, workers
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
+from workflow.report.pages import REPORT
 from workflow.report.rendering import render_page
 from workflow.study.directory import StudyDirectory
-from workflow.study.page import PointRow, StudyView, csv_text, row_of, row_without_run, study_summary
+from workflow.study.page import StudyView, csv_text, row_of, study_summary
 from workflow.study.points import (
     Base,
-    Contradiction,
     Point,
     PointMaker,
+    PointRow,
     load_base,
     shared_stages,
 )
@@ -32,8 +33,6 @@ from workflow.tasks.pipeline import controller_stages, plant_stages
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage
 from workflow.text.templates import RunSummary
-
-_PLANT_S, _POINT_S, _PAGE_S = 6.0, 12.0, 4.0  # expected: they shape the progress bar only
 
 
 def run_study(
@@ -67,8 +66,12 @@ def run_study(
         directory = StudyDirectory(out)
         with directory.writing(resume=resume, replace=replace):
             directory.begin_study(text=file.text, base=base, resume=resume, replace=replace)
-            share = _POINT_S * len(points) / executor.width
-            progress.plan([("plant", _PLANT_S), ("points", share), ("page", _PAGE_S)])
+            plant_s, point_s = (
+                sum(stage.expected_s for stage in stages(base.config))
+                for stages in (plant_stages, controller_stages)
+            )
+            points_s = point_s * len(points) / executor.width
+            progress.plan([("plant", plant_s), ("points", points_s), ("page", REPORT.expected_s)])
             work = _Work(directory, base, maker.base_point(), executor, here, progress, len(points))
             try:
                 work.make_base_plant()
@@ -114,20 +117,18 @@ class _Work:
             if reason is not None:
                 raise InputError(f"the base cannot be identified: {reason}")
 
-    def compute(self, points: Sequence[Point | Contradiction]) -> list[PointRow]:
+    def compute(self, points: Sequence[Point | PointRow]) -> list[PointRow]:
         """The rows of the points: what is finished is kept, what shares a controller goes together."""
-        rows = {
-            point.name: row_without_run(point, "impossible", point.refusal)
-            for point in points
-            if isinstance(point, Contradiction)
-        }
+        rows = {point.name: point for point in points if isinstance(point, PointRow)}
         valid = {point.name: point for point in points if isinstance(point, Point)}.values()
         lacking = {point.plant_key: point for point in valid if not self.directory.has_plant(point)}
         self._plants([(point, self._given(point)) for point in lacking.values()])
         groups: dict[str, list[Point]] = {}
         for point in valid:
             if point.plant_key in self.broken_plants:
-                rows[point.name] = row_without_run(point, "failed", self.broken_plants[point.plant_key])
+                rows[point.name] = PointRow(
+                    point.number, point.name, point.values, "failed", self.broken_plants[point.plant_key]
+                )
             elif self.directory.has_point(point):
                 rows[point.name] = row_of(point, self.directory.point(point))
                 self.taken_up += 1
@@ -141,7 +142,7 @@ class _Work:
         for found in _done(self.executor, list(groups.values()), work):
             for point, done in found:
                 if isinstance(done, Failure):
-                    rows[point.name] = row_without_run(point, "failed", done.reason)
+                    rows[point.name] = PointRow(point.number, point.name, point.values, "failed", done.reason)
                 else:
                     self.directory.save_point(point, done)
                     rows[point.name] = row_of(point, self.directory.point(point))
