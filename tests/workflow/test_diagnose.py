@@ -24,7 +24,7 @@ from workflow.config.run_config import SimulatedSource
 from workflow.diagnose import command, outputs
 from workflow.diagnose.case_files import load_case
 from workflow.diagnose.command import diagnose_cases
-from workflow.diagnose.outputs import Work
+from workflow.diagnose.outputs import files_of
 from workflow.engine.errors import InputError, StageError
 from workflow.engine.executor import LocalProcesses, attempt
 
@@ -47,8 +47,8 @@ def undrawn(undrawn, monkeypatch):
 
 def made(folder, engine, *, rig=None, controller=False):
     """Files of one case, computed here."""
-    files, _ = Work(load_case(folder, rig), {"options": {"controller": controller}}, engine).run(
-        lambda f, m: None
+    files, _ = files_of(
+        load_case(folder, rig), {"options": {"controller": controller}}, engine, lambda f, m: None
     )
     return files
 
@@ -301,7 +301,7 @@ def here(monkeypatch):
                 yield index, attempt(partial(one.run, partial(watch, index)))
 
     monkeypatch.setattr(command, "workers", lambda jobs, *_: closing(Here(jobs)))
-    monkeypatch.setattr(outputs, "case_page", lambda content, report: "<html></html>\n")
+    monkeypatch.setattr(outputs, "case_page", lambda *_, **content: "<html></html>\n")
 
 
 def everything(out):

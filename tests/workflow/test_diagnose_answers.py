@@ -28,7 +28,7 @@ from workflow.diagnose import command, outputs, pages
 from workflow.diagnose.case_files import load_case
 from workflow.diagnose.fleet import FleetMachine
 from workflow.diagnose.following import Following
-from workflow.diagnose.outputs import Work
+from workflow.diagnose.outputs import files_of
 from workflow.diagnose.simulator_case import SimulatorCase
 from workflow.text.templates import RunSummary, environment
 
@@ -193,7 +193,7 @@ def drawn(loaded, found, coming, monkeypatch):
     """JSON answer, words of the page, rows of the terminal."""
     monkeypatch.setattr(outputs, "following", lambda _: coming)
     made_from = {"options": {"controller": False}}
-    files, _ = Work(loaded, made_from, lambda case, progress: found).run(lambda f, m: None)
+    files, _ = files_of(loaded, made_from, lambda case, progress: found, lambda f, m: None)
     document = json.loads(files[f"{loaded.case.name}.json"])
     page = re.sub(r"<script.*?</script>|<[^>]*>", " ", files[f"{loaded.case.name}.html"].decode(), flags=re.S)
     one, several = (

@@ -14,7 +14,7 @@ from plant.effects.base import NotNegative, register
 from plant.machine import QUADRATIC, SmoothTorque
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from workflow.diagnose.case_files import load_case
-from workflow.diagnose.outputs import Work
+from workflow.diagnose.outputs import files_of
 
 WIND = {"name": "wind_drag", "coefficient_Nms2": 0.02}
 
@@ -40,7 +40,7 @@ def check(request, monkeypatch):
 
 
 def _page(folder, engine):
-    files, _ = Work(load_case(folder), {"options": {"controller": False}}, engine).run(lambda f, m: None)
+    files, _ = files_of(load_case(folder), {"options": {"controller": False}}, engine, lambda f, m: None)
     return files, re.sub("<[^>]*>", "", files["arm.html"].decode())
 
 

@@ -17,7 +17,7 @@ from workflow.diagnose.case_files import LoadedCase, load_case
 from workflow.diagnose.case_settings import CASE_FILE, case_document
 from workflow.diagnose.directory import LAYOUT_VERSION, DiagnosisDirectory
 from workflow.diagnose.fleet import FleetMachine, csv_text, groups, trends
-from workflow.diagnose.outputs import Work
+from workflow.diagnose.outputs import files_of
 from workflow.diagnose.simulator_case import SimulatorCase, load_simulator_case
 from workflow.diagnose.simulator_settings import SimulatorSettings, is_simulator, settings_of
 from workflow.diagnose.words import FILTERS, short_answer
@@ -38,7 +38,7 @@ from workflow.report.rendering import render_page
 from workflow.text.templates import RunSummary, rows_of
 
 _Failed = tuple[str, Failure]  # case, why it has no answer
-_CASE_S, _OVERVIEW_S = 30.0, 1.0  # expected: they shape the progress bar only
+_CASE_S = 30.0  # expected: it shapes the progress bar only
 # Of more cases the terminal shows groups alone, and the overview draws no line for each.
 _MOST_SHOWN = 20
 
@@ -164,7 +164,7 @@ class Answers(Sequence[Mapping[str, Any]]):
 class PlacedCase:
     """A case by its place, read where it is done: whoever has a thousand of them holds no record.
 
-    folder: of relative places. See `Work` for the others.
+    folder: of relative places. See `files_of` for the others.
     """
 
     place: Path | SimulatorSettings
@@ -184,7 +184,7 @@ class PlacedCase:
 
     @property
     def made_from(self) -> dict[str, Any]:
-        """See `Work`."""
+        """See `files_of`."""
         return {
             "input_sha256": self.input_sha256,
             "code_sha256": self.code_sha256,
@@ -192,7 +192,7 @@ class PlacedCase:
         }
 
     def run(self, report: Report) -> tuple[dict[str, bytes], float]:
-        """See `Work`. Raises StageError: other code or files than where the work was given out."""
+        """See `files_of`. Raises StageError: other code or files than where the work was given out."""
         if self.code_sha256 != code_digest("diagnosis", drawing=True):
             raise StageError(
                 "the code of the worker is not that of the diagnosis: another version, or edited"
@@ -201,7 +201,7 @@ class PlacedCase:
         loaded = load_any_case(place, self.rig, self.folder)
         if loaded.input_sha256 != self.input_sha256:
             raise StageError(f"case {self.name}: its files changed meanwhile; run the command again")
-        return Work(loaded, self.made_from, self.diagnose, self.out).run(report)
+        return files_of(loaded, self.made_from, self.diagnose, report, self.out)
 
 
 def _load(
@@ -245,10 +245,8 @@ def _compute(
     there = {one.name: directory.finished(one.name, one.made_from) for one in work}
     answers = {name: FleetMachine.of(known) for name, known in there.items() if known is not None}
     todo = {one.name: one for one in work if one.name not in answers}
-    names, several, width = list(todo), len(work) > 1, executor.width
-    progress.plan(
-        [("cases", _CASE_S * len(todo) / width), *((("overview", _OVERVIEW_S),) if several else ())]
-    )
+    names, several = list(todo), len(work) > 1
+    progress.plan([("cases", _CASE_S * len(todo) / executor.width)])
     shares = [0.0] * len(todo)
     timings = directory.document("timings.json")
     failures: dict[str, Failure] = {}

@@ -34,7 +34,7 @@ from plant.modal import default_n_modes, equations_of_motion
 from plant.rig import Rig
 from plant.simulation import SampledArm
 from workflow.engine import codec
-from workflow.tasks.loop_sensitivity import plan_sensitivity, rms_of, settling_samples
+from workflow.tasks.loop_sensitivity import LEAD_IN, SETTLED, plan_sensitivity, rms_of, settling_samples
 
 Real = npt.NDArray[np.float64]
 
@@ -43,9 +43,7 @@ _MODULUS_MARGIN = 0.5  # the usual one: gain margin 2, phase margin 29 degrees
 _ORDER = 2  # a loop far below the first mode needs a lead and no more
 _STARTS = 2  # the second shows whether the first is an optimum
 _ENOUGH = 0.9  # gamma at which the search for a controller ends
-_LEAD_IN = 0.05  # share of the record before the step, so that the picture shows rest
 _SHORTEST, _LONGEST = 400, 3000
-_SETTLED = 0.1  # of the move: a run whose last tenth moves less has settled
 _SEED = 2006  # any; the same for both controllers
 
 
@@ -104,21 +102,22 @@ def check_controller(case: Case, rig: Rig, effects: tuple[Effect, ...]) -> Contr
 
     Raises NoControllerError where a plant allows no controller of this kind.
     """
-    plants = (_plant("nominal parameters", case.rig, ()), _plant("repaired", rig, effects))
+    machines = sampled_linear_machine(case.rig, ()), sampled_linear_machine(rig, effects)
+    plants = [_plant(*named) for named in zip(("nominal parameters", "repaired"), machines, strict=True)]
     specification = _specification(case, plants[0])
     designs = [_designed(plant, specification) for plant in plants]
-    certificates = [certify(k, [p.uncertain], specification) for k, p in zip(designs, plants, strict=True)]
+    certificates = [certify(k, [p], specification) for k, p in zip(designs, plants, strict=True)]
     trial = ControllerTrial.of(case, designs[0], plants[0])
     arm = _WatchedArm(rig, effects)
     runs = []
-    for controller, plant, certificate in zip(designs, plants, certificates, strict=True):
-        name, margin = plant.uncertain.name, certificate.plants[0].nominal_margins.modulus
-        runs.append(trial.run(controller, LinearMachine(plant.both), name, "its own model", margin))
+    for controller, plant, both, certificate in zip(designs, plants, machines, certificates, strict=True):
+        margin = certificate.plants[0].nominal_margins.modulus
+        runs.append(trial.run(controller, LinearMachine(both), plant.name, "its own model", margin))
         # On the arm: one over the largest |S| measured there.
         input_rms = rms_of([e.voltage_V for e in case.estimation])
-        plan = plan_sensitivity(controller, plant.uncertain, input_rms, trial.time_s.size // 2)
+        plan = plan_sensitivity(controller, plant, input_rms, trial.time_s.size // 2)
         seen = measure_sensitivity(controller, arm, np.random.default_rng(_SEED), **plan.excitation())
-        runs.append(trial.run(controller, arm, name, "repaired machine", 1.0 / seen.peak[0]))
+        runs.append(trial.run(controller, arm, plant.name, "repaired machine", 1.0 / seen.peak[0]))
     return ControllerCheck(
         trial=trial,
         specification=specification,
@@ -127,25 +126,17 @@ def check_controller(case: Case, rig: Rig, effects: tuple[Effect, ...]) -> Contr
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Plant:
-    """A linear machine with both outputs, and its hub channel for the design."""
-
-    both: control.StateSpace
-    uncertain: UncertainPlant
-
-
-def _plant(name: str, rig: Rig, effects: tuple[Effect, ...]) -> _Plant:
-    both = sampled_linear_machine(rig, effects)
+def _plant(name: str, both: control.StateSpace) -> UncertainPlant:
+    """The hub channel of a linear machine with both outputs, for the design."""
     hub, tip = (control.ss(both.A, both.B, both.C[i : i + 1], np.zeros((1, 1)), both.dt) for i in (0, 1))
     try:
-        return _Plant(both, UncertainPlant(name, hub, None, performance=PlantChannel(tip)))
+        return UncertainPlant(name, hub, None, performance=PlantChannel(tip))
     except ValueError as error:
         raise NoControllerError(str(error)) from error
 
 
-def _specification(case: Case, plant: _Plant) -> Specification:
-    modes = modes_of(plant.uncertain.poles, plant.uncertain.dt_s)
+def _specification(case: Case, plant: UncertainPlant) -> Specification:
+    modes = modes_of(plant.poles, plant.dt_s)
     if not modes:
         raise NoControllerError("the nominal rig has no lightly damped mode to set a bandwidth by")
     first = modes[0].omega_rad_s
@@ -168,14 +159,14 @@ def _step(case: Case) -> float:
     return 0.5 * rms_of([e.output[:, 0] for e in case.estimation])
 
 
-def _designed(plant: _Plant, specification: Specification) -> Controller:
+def _designed(plant: UncertainPlant, specification: Specification) -> Controller:
     options = SynthesisOptions(starts=_STARTS, sufficient_gamma=_ENOUGH)
     try:
-        found = synthesise([plant.uncertain], specification, options, rng=np.random.default_rng(_SEED))
+        found = synthesise([plant], specification, options, rng=np.random.default_rng(_SEED))
     except SpecificationError as error:
         raise NoControllerError(str(error)) from error
     if found.outcome is Outcome.NOT_CONVERGED:
-        raise NoControllerError(f"{plant.uncertain.name}: no start led to a stable loop")
+        raise NoControllerError(f"{plant.name}: no start led to a stable loop")
     return found.controller
 
 
@@ -189,15 +180,15 @@ class ControllerTrial:
     arm_m: float
 
     @classmethod
-    def of(cls, case: Case, controller: Controller, plant: _Plant) -> ControllerTrial:
+    def of(cls, case: Case, controller: Controller, plant: UncertainPlant) -> ControllerTrial:
         dt = case.rig.sampling.dt_s
-        radius = float(np.max(np.abs(closed_loop_poles(controller, plant.uncertain))))
+        radius = float(np.max(np.abs(closed_loop_poles(controller, plant))))
         k = np.arange(settling_samples(radius, _SHORTEST, _LONGEST))
         half = k.size // 2
         voltage = float(np.sqrt(np.mean([np.mean(e.voltage_V**2) for e in case.estimation])))
         return cls(
             time_s=np.asarray(k * dt, dtype=np.float64),
-            reference_rad=np.where(k >= round(_LEAD_IN * k.size), _step(case), 0.0),
+            reference_rad=np.where(k >= round(LEAD_IN * k.size), _step(case), 0.0),
             disturbance_V=np.where((k >= half) & (k < half + k.size // 20), 0.2 * voltage, 0.0),
             arm_m=case.rig.hub.radius_m + case.rig.link.length_m,
         )
@@ -225,7 +216,7 @@ class ControllerTrial:
             cost_s=float(np.sum(error**2)) * controller.dt_s,
             modulus_margin=margin,
             peak_command_V=float(np.max(np.abs(found.command))),
-            settles=bool(all(np.ptp(end) <= _SETTLED * self.step_rad for end in ends)),
+            settles=bool(all(np.ptp(end) <= SETTLED * self.step_rad for end in ends)),
             tip_m=tip,
             command_V=found.command,
         )

@@ -12,7 +12,7 @@ from workflow.diagnose.simulator_case import SimulatorCase
 from workflow.engine import codec
 
 FORMAT = "flexlink-diagnosis-1"
-LEAST_SHOWN = 1e-4  # sets of effects less probable than this are left out
+LEAST_SHOWN = 1e-4  # sets of effects less probable than this are left out, and no runner-up competes
 
 
 def completeness_of(found: Diagnosis, remains: Where) -> dict[str, Any]:

@@ -14,11 +14,10 @@ from diagnosis.next_experiment.experiment_choices import Limits
 from diagnosis.next_experiment.next_experiment import NextExperiment, next_experiment
 from diagnosis.next_experiment.repeat import Repeat, best_repeat
 from plant.effects import LOOK_ALIKES, in_words
+from workflow.diagnose.document import LEAST_SHOWN
 from workflow.engine import storage
 from workflow.text.formats import listing
 
-# Below this probability not even a runner-up competes.
-_THINKABLE = 1e-4
 _SHORTEST = 200  # samples
 # From this probability on an effect is looked for at the machine first, though an unknown cause is likelier.
 _LOOKED_FOR = 0.2
@@ -71,7 +70,7 @@ def following(found: Diagnosis) -> Following:
         replace(one, name=listing([in_words(cause) for cause in one.causes] or [in_words("none")]))
         for k, one in enumerate(found.competing)
         if k == 0
-        or one.probability >= _THINKABLE
+        or one.probability >= LEAST_SHOWN
         or any(cause in found.ambiguous_with for cause in one.causes)
     )
     if not isinstance(found.case, Case) or (found.case.model_error > 0 and len(competing) < 2):

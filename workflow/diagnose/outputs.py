@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from workflow.diagnose.controller_check import ControllerCheck, NoControllerErro
 from workflow.diagnose.directory import answer_text
 from workflow.diagnose.document import completeness_of, document_of
 from workflow.diagnose.following import following
-from workflow.diagnose.pages import CasePage, case_page, moved, plant_page, remains_of
+from workflow.diagnose.pages import case_page, moved, plant_page, remains_of
 from workflow.diagnose.simulator_case import SimulatorCase, with_units
 from workflow.engine import codec, storage
 from workflow.engine.errors import naming
@@ -29,101 +29,105 @@ from workflow.text.templates import render_text
 
 # Seconds for what records can tell.
 _TOLD_S = 10.0
-# Shares of a case's time, for the progress bar only.
-_DIAGNOSED, _WHERE, _NEXT, _CONTROLLER = 0.75, 0.8, 0.85, 0.9
+# What comes behind the diagnosis takes about so much of a case's time, for the progress bar only.
+_DIAGNOSED = 0.8
 
 
-@dataclass(frozen=True, eq=False)
-class Work:
-    """One case to do. made_from: what the answer depends on (equal entries, equal answer); of its `options`
-    `controller` says whether the controllers are compared. diagnose: `diagnosis.diagnose` with the others.
-    out: folder of the files."""
+def files_of(
+    loaded: LoadedCase | SimulatorCase,
+    made_from: Mapping[str, Any],
+    diagnose: Callable[..., Diagnosis],
+    report: Report,
+    out: Path = Path(),
+) -> tuple[dict[str, bytes], float]:
+    """File name -> content of one case, and the CPU time of the process so far [s].
 
-    loaded: LoadedCase | SimulatorCase
-    made_from: Mapping[str, Any]
-    diagnose: Callable[..., Diagnosis]
-    out: Path = Path()
-
-    def run(self, report: Report) -> tuple[dict[str, bytes], float]:
-        """File name -> content, and the CPU time of the process so far [s].
-
-        The JSON file names the others' hashes and is to be written last. Raises InputError or StageError, one
-        line.
-        """
-        if isinstance(self.loaded, SimulatorCase):
-            return self._of_simulator(self.loaded, report)
-        loaded, case = self.loaded, self.loaded.case
-        with naming(f"case {case.name}"):
-            found = self.diagnose(case, progress=lambda f, m: report(_DIAGNOSED * f, m))
-            report(_DIAGNOSED, "where")
-            place = where(found.case, found.residuals_refit, found.probabilities)
-            remains = remains_of(found)
-            report(_WHERE, "next experiment")
-            coming = following(found)
-            report(_NEXT, "controller")
-            check, no_check = (
-                _control(found) if self.made_from["options"]["controller"] else (None, "not_asked")
-            )
-        rig_name, effects_name = f"{case.name}.rig.toml", f"{case.name}.effects.toml"
-        effects = effects_text(found) if found.repair else ""
-        rig = rig_text(
-            case.name, case.rig, found.rig, moved(found, found.deviations), effects_name if effects else ""
-        )
-        html = case_page(
-            CasePage(loaded, found, place, remains, coming, check, no_check, rig, effects),
-            lambda f, m: report(_CONTROLLER + (1 - _CONTROLLER) * f, f"drawing {m}"),
-        )
-        files = {f"{case.name}.html": html.encode(), rig_name: rig.encode()}
-        if effects:
-            files[effects_name] = effects.encode()
-        if coming.proposal is not None and coming.proposal.separates:
-            files[f"{case.name}.next.csv"] = coming.csv_text().encode()
-        beside = {
-            "where": place,
-            "remains": remains,
-            "completeness": completeness_of(found, remains),
-            "next_experiment": {"advice": coming.advice, **codec.plain(coming.proposal or {})},
-            "controller": {"skipped": no_check} if check is None else check.document(),
-        }
-        return self._with_document(loaded, found, beside, files), time.process_time()
-
-    def _of_simulator(self, loaded: SimulatorCase, report: Report) -> tuple[dict[str, bytes], float]:
-        name = loaded.case.name
+    made_from: what the answer depends on (equal entries, equal answer); of its `options` `controller` says
+    whether the controllers are compared. diagnose: `diagnosis.diagnose` with the others. out: folder of the
+    files. The JSON file names the others' hashes and is to be written last. Raises InputError or StageError,
+    one line.
+    """
+    name = loaded.case.name
+    with naming(f"case {name}"):
+        found = diagnose(loaded.case, progress=lambda f, m: report(_DIAGNOSED * f, m))
+    if isinstance(loaded, SimulatorCase):
+        found = with_units(replace(found, doubts=(*loaded.doubts, *found.doubts)), loaded.units)
         with naming(f"case {name}"):
-            found = self.diagnose(loaded.case, progress=lambda f, m: report(_CONTROLLER * f, m))
-            found = with_units(replace(found, doubts=(*loaded.doubts, *found.doubts)), loaded.units)
-            coming = following(found)
-            place, remains = (
-                where_in_records(found.case, found.residuals_refit, found.case.dt_s),
-                remains_of(found),
-            )
-            told = of_case(loaded, telling(loaded.case, time.monotonic() + _TOLD_S))
-            files = {}
-            if loaded.repaired is not None:
-                files[f"{name}.xml"] = loaded.repaired(found, self.out).encode()
-            files[f"{name}.html"] = plant_page(
-                found, coming, told, loaded.model_error, *files, places=(place, remains)
-            ).encode()
-        beside = {
-            "where": place,
-            "remains": remains,
-            "completeness": completeness_of(found, remains),
-            "next_experiment": {"advice": coming.advice, **codec.plain(coming.repeat or {})},
-            "check": told.numbers,
-        }
-        return self._with_document(loaded, found, beside, files), time.process_time()
+            beside, files = _of_simulator(loaded, found, out)
+    else:
+        beside, files = _of_rig(loaded, found, made_from["options"]["controller"], report)
+    document = document_of(loaded, found, beside)
+    document["made_from"] = made_from
+    document["files"] = {name: storage.sha256_of_bytes(content) for name, content in files.items()}
+    return {**files, f"{name}.json": answer_text(document).encode()}, time.process_time()
 
-    def _with_document(
-        self,
-        loaded: LoadedCase | SimulatorCase,
-        found: Diagnosis,
-        beside: Mapping[str, Any],
-        files: dict[str, bytes],
-    ) -> dict[str, bytes]:
-        document = document_of(loaded, found, beside)
-        document["made_from"] = self.made_from
-        document["files"] = {name: storage.sha256_of_bytes(content) for name, content in files.items()}
-        return {**files, f"{loaded.case.name}.json": answer_text(document).encode()}
+
+def _of_rig(
+    loaded: LoadedCase, found: Diagnosis, controller: bool, report: Report
+) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """What the answer says beside the diagnosis, and the files beside the answer."""
+    case = loaded.case
+    with naming(f"case {case.name}"):
+        report(_DIAGNOSED, "where")
+        place = where(found.case, found.residuals_refit, found.probabilities)
+        remains = remains_of(found)
+        report(_DIAGNOSED, "next experiment")
+        coming = following(found)
+        report(_DIAGNOSED, "controller")
+        check, no_check = _control(found) if controller else (None, "not_asked")
+    rig_name, effects_name = f"{case.name}.rig.toml", f"{case.name}.effects.toml"
+    effects = effects_text(found) if found.repair else ""
+    rig = rig_text(
+        case.name, case.rig, found.rig, moved(found, found.deviations), effects_name if effects else ""
+    )
+    html = case_page(
+        found,
+        lambda f, m: report(_DIAGNOSED + (1 - _DIAGNOSED) * f, f"drawing {m}"),
+        loaded=loaded,
+        where=place,
+        remains=remains,
+        next_experiment=coming,
+        check=check,
+        no_check=no_check,
+        rig_text=rig,
+        effects_text=effects,
+    )
+    files = {f"{case.name}.html": html.encode(), rig_name: rig.encode()}
+    if effects:
+        files[effects_name] = effects.encode()
+    if coming.proposal is not None and coming.proposal.separates:
+        files[f"{case.name}.next.csv"] = coming.csv_text().encode()
+    beside = {
+        "where": place,
+        "remains": remains,
+        "completeness": completeness_of(found, remains),
+        "next_experiment": {"advice": coming.advice, **codec.plain(coming.proposal or {})},
+        "controller": {"skipped": no_check} if check is None else check.document(),
+    }
+    return beside, files
+
+
+def _of_simulator(
+    loaded: SimulatorCase, found: Diagnosis, out: Path
+) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """The same."""
+    name, coming, files = loaded.case.name, following(found), dict[str, bytes]()
+    place = where_in_records(found.case, found.residuals_refit, found.case.dt_s)
+    remains = remains_of(found)
+    told = of_case(loaded, telling(loaded.case, time.monotonic() + _TOLD_S))
+    if loaded.repaired is not None:
+        files[f"{name}.xml"] = loaded.repaired(found, out).encode()
+    files[f"{name}.html"] = plant_page(
+        found, coming, told, loaded.model_error, *files, places=(place, remains)
+    ).encode()
+    beside = {
+        "where": place,
+        "remains": remains,
+        "completeness": completeness_of(found, remains),
+        "next_experiment": {"advice": coming.advice, **codec.plain(coming.repeat or {})},
+        "check": told.numbers,
+    }
+    return beside, files
 
 
 def _control(found: Diagnosis) -> tuple[ControllerCheck | None, str]:

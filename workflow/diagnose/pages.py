@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib import metadata
 from math import copysign
 from typing import Any
@@ -18,8 +18,6 @@ from diagnosis.machine.rounding import rounding_effect
 from diagnosis.where.findings import Where
 from diagnosis.where.where import motion_of, over_levels, where, where_in_records
 from plant.effects import EFFECTS
-from workflow.diagnose.case_files import LoadedCase
-from workflow.diagnose.controller_check import ControllerCheck
 from workflow.diagnose.following import Following
 from workflow.diagnose.stick_figures import moving_figures
 from workflow.diagnose.words import FILTERS
@@ -27,30 +25,17 @@ from workflow.report.rendering import render_page
 from workflow.text.templates import RunSummary
 
 
-@dataclass(frozen=True, eq=False)
-class CasePage:
-    """Everything the page is made of.
+def case_page(found: Diagnosis, progress: Callable[[float, str], None] | None = None, **page: object) -> str:
+    """One self-contained HTML page; equal content gives equal bytes.
 
-    where: of the gap that is left when the nominal parameters are re-estimated within their tolerances;
-    remains: of what the effects leave. check is None where there was nothing to compare, no_check says why.
+    page: the loaded case; where the gap is when the nominal parameters are re-estimated within their
+    tolerances, and what remains of it; next_experiment; the controller's check, or None and no_check, why;
+    rig_text and effects_text of the files.
     """
-
-    loaded: LoadedCase
-    found: Diagnosis
-    where: Where
-    remains: Where
-    next_experiment: Following
-    check: ControllerCheck | None
-    no_check: str
-    rig_text: str
-    effects_text: str
-
-
-def case_page(page: CasePage, progress: Callable[[float, str], None] | None = None) -> str:
-    """One self-contained HTML page; equal content gives equal bytes."""
     versions = [(name, metadata.version(name)) for name in ("flexlink", "numpy", "scipy", "numba")]
     versions.append(("python", sys.version.split()[0]))
-    return _rendered("diagnosis/case.html.j2", page.found, progress, page=page, versions=versions)
+    page["found"] = found
+    return _rendered("diagnosis/case.html.j2", found, progress, page=page, versions=versions)
 
 
 def plant_page(
