@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,6 @@ from ident.checks.answer import explains_nothing
 from ident.checks.input_checks import advice, refuse_unusable
 from ident.checks.plausible_modes import implausible_pairs, pole_warnings
 from ident.checks.prior_tests import (
-    NuisanceTest,
     best_under_relative_degree,
     clearly_left_out,
     delay_test,
@@ -36,7 +35,7 @@ from ident.fit.refinement import Refined, free_optimality
 from ident.fit.regression import prepare, restructured, thinned
 from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
 from ident.identification import Identification
-from ident.search.dead_time import first_answer, seek
+from ident.search.dead_time import SearchOutcome, first_answer, seek
 from ident.search.order_selection import OrderSelection, Progress, silent
 from ident.search.pole_search import Fitted, PoleSearch, PolishedMinimum, SearchTrace
 
@@ -141,23 +140,11 @@ def _behind_dead_time(
     found = seek(records, plain, starts) if plain.search.options.delay_left_to_data else None
     if found is None:
         return plain, at_once
-    best, told = found
-    search = best.search
+    search = found.search
     search.minima = [*plain.search.minima, *search.minima]
     search.stages = [*plain.search.stages, *search.stages]
     search.evaluations += plain.search.evaluations
-    return SearchOutcome(search, best.end, best.selection, dead_time=told), False
-
-
-@dataclass(frozen=True, eq=False)
-class SearchOutcome(Fitted):
-    """A search at its end on one structure. from_rest: the test that left initial states out; free: the end
-    of a descent with them, where it took one; dead_time: the delay that was found."""
-
-    selection: OrderSelection
-    free: Refined | None = None
-    from_rest: NuisanceTest | None = None
-    dead_time: Finding | None = None
+    return found, False
 
 
 def _searched(
@@ -189,7 +176,7 @@ def _searched_with_initial_state(
         without = Fitted(rest, rest.descend(end.poles, "from rest"))
     else:
         if without.poles.order > 0 and (clear := clearly_left_out("initial state", without, free)):
-            return replace(outcome, from_rest=clear)
+            return replace(outcome, from_rest=clear.finding)
         end = polished = search.descend(without.poles, "with initial state")
         # Transients no larger than the noise leave the search from rest its bearings: go on from its poles.
         start = end if without.end.rss < _MISLED * end.rss else None
@@ -213,7 +200,7 @@ def fitted_on_all(records: Sequence[Record], outcome: SearchOutcome) -> tuple[Fi
         # The search put this question to the very same records.
         again = key == "estimate_initial_state" and here is outcome
         if again and outcome.from_rest:
-            verdicts.append(outcome.from_rest.finding)
+            verdicts.append(outcome.from_rest)
             continue
         present = getattr(here.data.structure, key)
         changed: dict[str, Any] = {key: not present}

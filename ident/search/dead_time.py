@@ -15,9 +15,11 @@ from scipy.signal import correlate
 from scipy.stats import chi2
 
 from ident.basis.poles import DEADBEAT
+from ident.data.ellipses import LEVEL
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.fit.least_squares import EXPLAINED, Regression
+from ident.fit.refinement import Refined
 from ident.fit.regression import prepare_inputs
 from ident.search.order_selection import OrderSelection
 from ident.search.pole_search import Fitted, PoleSearch
@@ -35,13 +37,11 @@ _NEIGHBOURS = ((-1, False), (1, False), *((step, True) for step in (-3, -2, -1, 
 _ROUNDS = 6
 # -2 log of a Bayes factor: strong from 6 on (Kass and Raftery, JASA 90(430), 1995); a fast pole is likelier.
 _STRONG = 6.0
-# Numbers of samples that the data do not refuse beside the best one.
-_LEVEL = 0.95
 
 
-def seek(records: Sequence[Record], plain: Fitted, starts: Sequence[int]) -> tuple[Selected, Finding] | None:
+def seek(records: Sequence[Record], plain: Fitted, starts: Sequence[int]) -> SearchOutcome | None:
     """The model behind a delay that the criterion of the order prefers to `plain`, the end of a search
-    without one on these records, and the finding that says so; None where there is none.
+    without one on these records; None where there is none.
 
     records: one input each. starts: where the search begins, as of `first_answer`.
     """
@@ -61,7 +61,7 @@ def seek(records: Sequence[Record], plain: Fitted, starts: Sequence[int]) -> tup
             break
         best = other
     _, known = _moved(records, best)
-    limit = float(chi2.ppf(_LEVEL, 1))
+    limit = float(chi2.ppf(LEVEL, 1))
     likely = [delay for delay, other in known.items() if gain(best, other) <= limit]
     if min(likely) < _delay(best):
         # Ellipses hold a response that begins later than the delay, never one that begins earlier.
@@ -70,7 +70,7 @@ def seek(records: Sequence[Record], plain: Fitted, starts: Sequence[int]) -> tup
     # The poles that were left may also do without a delay, in a place that the first search has missed.
     if best.gain_over(_behind(records, best, 0)) <= _STRONG:
         return None
-    return best, finding(
+    told = finding(
         FindingKind.DEAD_TIME,
         delay=_delay(best),
         delay_ms=1e3 * _delay(best) * best.data.dt_s,
@@ -81,6 +81,7 @@ def seek(records: Sequence[Record], plain: Fitted, starts: Sequence[int]) -> tup
         order_without=plain.poles.order,
         gain=best.gain_over(plain),
     )
+    return replace(best, dead_time=told)
 
 
 def first_answer(records: Sequence[Record]) -> tuple[tuple[int, ...], bool]:
@@ -124,10 +125,14 @@ def first_answer(records: Sequence[Record]) -> tuple[tuple[int, ...], bool]:
 
 
 @dataclass(frozen=True, eq=False)
-class Selected(Fitted):
-    """An order selected behind a delay."""
+class SearchOutcome(Fitted):
+    """A search at its end on one structure. from_rest: what the test said that left initial states out; free:
+    the end of a descent with them, where it took one; dead_time: the delay that was found."""
 
     selection: OrderSelection
+    free: Refined | None = None
+    from_rest: Finding | None = None
+    dead_time: Finding | None = None
 
     def gain_over(self, other: Fitted) -> float:
         """By how much the criterion of the order is lower; a delay of d samples costs 2 ln(1 + d), as an
@@ -137,17 +142,17 @@ class Selected(Fitted):
         return gain(self, other) + fewer * float(np.log(self.worth())) - 2 * longer
 
 
-def _behind(records: Sequence[Record], near: Fitted, delay: int, again: bool = False) -> Selected:
+def _behind(records: Sequence[Record], near: Fitted, delay: int, again: bool = False) -> SearchOutcome:
     """Order and poles selected behind a delay, from the poles of a model with another one or from the
     start."""
     search = _search(records, near, max(delay, 0))
     selection = OrderSelection(search)
     known = near.poles.order > search.fixed.order and not again
     start = search.descend(near.poles, f"delay {delay}") if known else None
-    return Selected(search, selection.run(start), selection)
+    return SearchOutcome(search, selection.run(start), selection)
 
 
-def _better_neighbour(records: Sequence[Record], found: Selected) -> Selected | None:
+def _better_neighbour(records: Sequence[Record], found: SearchOutcome) -> SearchOutcome | None:
     """The order selected again, at neighbours and from the start: a pole too many stands for what is wrong
     with the number of samples. None where nothing is better."""
     _, known = _moved(records, found)
