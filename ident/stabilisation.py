@@ -34,7 +34,6 @@ _BEYOND_CHOSEN = 3  # pairs: stable in two fits beyond the model's shows in thes
 # More samples than this say no more about which modes stay, and a dozen fits of order 20 take their time.
 _MOST_SAMPLES = 10_000
 _MOST_PAIRS = 12  # as many as `IdentOptions.n_pairs` takes
-_FEWEST_ORDERS = 2  # in one alone nothing has stayed
 
 
 class StableMode(NamedTuple):
@@ -85,7 +84,7 @@ class Stabilisation:
         modes = []
         for start in np.unique(chain):
             here = np.flatnonzero((chain == start) & self.stable & self.needed)
-            if here.size >= _FEWEST_ORDERS:
+            if here.size > 1:  # in one fit alone nothing has stayed
                 omega, zeta = np.mean(self.omega_rad_s[here]), np.mean(self.zeta[here])
                 modes.append(StableMode(float(omega), float(zeta)))
         return tuple(sorted(modes))

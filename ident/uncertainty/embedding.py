@@ -7,7 +7,7 @@ for the rest, everything conditioned on the data, averaged over one mode that th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -104,14 +104,13 @@ def tangent_beside(
     rows = replace(rows, n_known=n_known, missed_above=missed_above, classes=tuple(classes))
     # Coloured noise taken for white passes for modes: none are added before it has been whitened.
     first = options.model_copy(update={"prior_missed_mode": 0.0}) if options.coloured_noise else options
-    solved = _solve(rows, first)
+    whole, reduced, kernel, missed = _solve(rows, first)
     if options.coloured_noise:
         for _ in range(NOISE_ROUNDS):
-            residuals, absorbed = gls_residuals(solved.rows, solved.reduced, solved.kernel)
-            whitening = fit_autoregression(residuals, options.max_ar_order, solved.rows.whitening, absorbed)
-            solved = _solve(replace(solved.rows, whitening=whitening), options)
-    poles = solved.rows.poles
-    reduced, kernel, missed = solved.reduced, solved.kernel, solved.missed
+            residuals, absorbed = gls_residuals(whole, reduced, kernel)
+            whitening = fit_autoregression(residuals, options.max_ar_order, whole.whitening, absorbed)
+            whole, reduced, kernel, missed = _solve(replace(whole, whitening=whitening), options)
+    poles, without_pairs = whole.poles, (reduced, kernel)
     if missed is not None and missed.poles.size:
         reduced, kernel = (
             replace(reduced, r12=np.hstack([reduced.r12, missed.onto])),
@@ -119,29 +118,27 @@ def tangent_beside(
         )
         poles = Poles(poles.real, np.concatenate([poles.pairs, missed.poles]))
     # The columns beside the basis functions are no part of the response.
-    after = solved.rows.poles.order + int(rows.structure.feedthrough)
+    after = whole.poles.order + int(rows.structure.feedthrough)
     joint, beside_rows = joint_factor(reduced, kernel), slice(after + n_off, after + rows.n_beside)
     if rows.classes:
         # The kernel's normals stay: what it leaves open above the excitation would drown everything.
         own, rest = np.split(joint[1], [reduced.n_regressors], axis=1)
-        scores = solved.rows.scores(joint_factor(solved.reduced, solved.kernel)[0])
+        scores = whole.scores(joint_factor(*without_pairs)[0])
         scores = scores @ own[: reduced.n_columns] / kernel.noise_variance
         joint = joint[0], np.hstack([sandwiched(own, scores), rest])
     mean, factor = (np.delete(part, slice(after, after + rows.n_beside), axis=0) for part in joint)
     if missed is not None and missed.poles.size:
-        mean, factor = (
-            _pairs_after_poles(part, solved.rows.poles.order, missed.poles) for part in (mean, factor)
-        )
+        mean, factor = (_pairs_after_poles(part, whole.poles.order, missed.poles) for part in (mean, factor))
     off = slice(after, after + n_off)
     mean, factor = np.concatenate([mean, joint[0][off]]), np.concatenate([factor, joint[1][off]])
     report = embedding_report(
         "tangent embedding",
         reduced,
         kernel,
-        ar_coefficients=tuple(float(a) for a in solved.rows.whitening[1:]),
+        ar_coefficients=tuple(float(a) for a in whole.whitening[1:]),
         probability_missed_mode=missed.probability if missed else 0.0,
         missed_mode_rad_s=missed.most_probable_rad_s(model.dt_s) if missed else 0.0,
-        n_added_modes=(solved.rows.poles.order - rows.poles.order) // 4,
+        n_added_modes=(whole.poles.order - rows.poles.order) // 4,
     )
     posterior = _posterior(model, poles, rows.structure.feedthrough, rows.fir_length, mean, factor, report)
     return posterior, joint[0][beside_rows], joint[1][beside_rows]
@@ -255,18 +252,11 @@ def tangent_rows(
     return EmbeddingRows(tuple(records), structure, poles, length, np.ones(1), tuple(beside))
 
 
-@dataclass(frozen=True, eq=False)
-class _Solved:
-    """Posterior without a missed mode, and the pairs that may be missing (None: not looked for)."""
-
-    rows: EmbeddingRows
-    reduced: ReducedRegression
-    kernel: KernelPosterior
-    missed: PairMixture | None = None
-
-
-def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
-    """Posterior on these rows; modes that an order selection would have kept are added to their poles."""
+def _solve(
+    rows: EmbeddingRows, options: EmbeddingOptions
+) -> tuple[EmbeddingRows, ReducedRegression, KernelPosterior, PairMixture | None]:
+    """Posterior on these rows without a missed mode, and the pairs that may be missing (None: not looked
+    for); modes that an order selection would have kept are added to the poles of the rows."""
     n_added = 0
     while True:
         stacked = stack_blocks(rows.record_blocks())
@@ -276,14 +266,14 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solved:
         grid = kernel_grid(reduced, _SHAPES, order_given=bool(options.order_given))
         kernel = conditional_posterior(grid, *grid_weights(grid, options.no_remainder))
         if not options.prior_missed_mode > 0:
-            return _Solved(rows, reduced, kernel)
+            return rows, reduced, kernel, None
         poles, prior = candidate_pairs(max(record.n_samples for record in rows.records), rows.missed_above)
         statistics = pair_statistics(rows.pair_blocks(), reduced, poles)
         odds = options.prior_missed_mode / (1 - options.prior_missed_mode)
         log_rest = total_log_evidence(grid, options.no_remainder)
         missed = pair_mixture(poles, prior, statistics, reduced.degrees_of_freedom, log_rest, odds)
         if missed.visible is None or n_added == _MOST_ADDED:
-            return _Solved(rows, reduced, kernel, missed)
+            return rows, reduced, kernel, missed
         # Twice: the pair's first-order movement is in the regressors too.
         pair = refined_pair(rows.pair_blocks, reduced, missed.visible)
         rows = replace(rows, poles=rows.poles.appended(Poles(pairs=np.array([pair, pair]))))
