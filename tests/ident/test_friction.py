@@ -7,7 +7,6 @@ import control
 import numpy as np
 import pytest
 
-from benchmarks.at_an_amplitude import recorded as small_and_large
 from benchmarks.closed_loop_machines.simulator import Law, Plant, response
 from benchmarks.without_friction import with_friction
 from ident import GobfModel, IdentOptions, Poles, Record, Structure, identify
@@ -29,12 +28,14 @@ from ident.friction.gauss_newton import linearised
 from ident.friction.posterior import of_force
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.pole_intervals import pole_intervals
-from plant import parse_effect, simulate
+from plant import parse_effect, parse_effects, simulate
 from plant.excitation import multisine, multisine_lines
 from plant.modal import linear_arm
 from plant.presets import paper_link
+from plant.simulation import quantised
 from validation.blind.truth import Truth
 from workflow.config.run_config import SimulatedSource, built_in_config
+from workflow.tasks.simulated_rig import OUTPUT_NAMES, rig_of
 
 RIG = paper_link()
 VOLTS_PER_NM = 1 / RIG.motor.torque_per_volt_Nm_V
@@ -93,7 +94,14 @@ def test_a_pair_that_does_not_swing_takes_no_mode_from_the_arm() -> None:
     Stribeck excess that is not there, and no mode at 33 Hz."""
     source = built_in_config()[0].source
     assert isinstance(source, SimulatedSource)
-    records = small_and_large(with_friction(source, 0.1, 16384), 38)
+    source = with_friction(source, 0.1, 16384)
+    lines = multisine_lines(1000, 0.005, (0.2, 95.0), "odd_random", np.random.default_rng(99))
+    rng, records = np.random.default_rng([8, 38]), []
+    for k, rms_V in enumerate((2.0, 2.0, 6.0, 6.0)):
+        u = multisine(lines, 1000, rms_V, rng, periods=2, draws=20)
+        y = simulate(rig_of(source), u, parse_effects(source.effects), rng=rng).output
+        y = quantised(y, source.encoder_step_rad)
+        records.append(Record(f"record {k}", u[:, None], y, 0.005, ("voltage_V",), OUTPUT_NAMES))
     options = OPTIONS.model_copy(update={"input_delay_samples": 1})
     found = fit_friction([record.siso("voltage_V", "hub_angle_rad") for record in records], options)
     assert found.level == pytest.approx(0.1 * VOLTS_PER_NM, rel=0.003)

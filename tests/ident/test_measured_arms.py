@@ -161,8 +161,8 @@ def test_krauss_arm_warns_of_the_band_that_was_not_excited(sweeps):
 def test_krauss_arm_says_that_its_second_mode_falls_with_amplitude(sweeps):
     records = channel(sweeps, "accel_counts")
     told = only(distortion_findings(records, (), repeats_of(records)), FindingKind.AMPLITUDE_EFFECT)
-    # Fitted sweep by sweep: 18.07, 18.02 and 18.03 Hz at 50 counts, 17.92, 17.93 and 17.94 Hz at 75, -0.61 %
-    # (benchmarks/repeat_scatter.py); 12.5 % apart around the mode, 13 times their scatter.
+    # Fitted sweep by sweep: 18.07, 18.02 and 18.03 Hz at 50 counts, 17.92, 17.93 and 17.94 Hz at 75,
+    # -0.61 %; 12.5 % apart around the mode, 13 times their scatter.
     assert told["shift_percent"] == pytest.approx(-0.61, abs=0.15)
     assert told["most_from_Hz"] < 17.98 < told["most_to_Hz"]
     assert 10 < told["percent"] < 25
