@@ -7,6 +7,7 @@ The machine is two inertias on a spring with dry friction, from the independent 
 
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -100,6 +101,26 @@ def taken(flexlink, tmp_path, up_to_design):
 
 
 @pytest.fixture
+def records(flexlink, tmp_path, monkeypatch, unidentified):
+    """Records that `run` makes of logs, and its configuration; nothing is identified."""
+    seen = []
+
+    def stop(stage):
+        seen.append((stage.results.records.records, stage.config))
+        raise InputError(REACHED)
+
+    stages = [replace(one, run=stop) if one.name == "identify" else one for one in pipeline.STAGES]
+    monkeypatch.setattr(pipeline, "STAGES", tuple(stages))
+
+    def run(paths):
+        answer = flexlink("run", *paths, "--out", tmp_path / "out")
+        assert REACHED in answer.err, answer.err
+        return seen.pop()
+
+    return run
+
+
+@pytest.fixture
 def line(flexlink, tmp_path, up_to_design):
     """The one line with which `run` refuses logs; nothing is left of it."""
 
@@ -134,20 +155,35 @@ def test_two_controllers_are_taken(taken, tmp_path):
     assert_right(taken(written(tmp_path, made)))
 
 
-@pytest.mark.slow
-def test_a_turned_sign_is_turned_back(taken, tmp_path):
-    """Of the encoder; of the command: tests/workflow/test_init.py."""
-    made = [{**one, "y": -one["y"]} for one in logs(levels=(0.2, 0.15))]
-    assert_right(taken(written(tmp_path, made)))
+def faster(one):
+    """Of a logger that writes every sample four times."""
+    several = {key: np.repeat(values, 4) for key, values in one.items()}
+    return several | {"t": np.arange(several["t"].size) * DT_S / 4}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("column", [pytest.param("u", marks=pytest.mark.long), "applied"])
-def test_a_limit_of_the_amplifier_is_seen_before_and_after_it(taken, tmp_path, column):
+# Of the encoder; a turned sign of the command: tests/workflow/test_init.py.
+@pytest.mark.parametrize(
+    ("change", "side"), [(lambda one: {**one, "y": -one["y"]}, -1), (faster, 1)], ids=["turned", "faster"]
+)
+def test_what_a_log_is_otherwise_is_taken_back(records, tmp_path, change, side):
+    """A model of the same signals is the same: the records are those of the logs as they are, or command and
+    encoder have both the other sign."""
+    made = logs(levels=(0.2, 0.15))
+    plain, _ = records(written(tmp_path, made))
+    found, _ = records(written(tmp_path, map(change, made)))
+    for own, other in zip(found, plain, strict=True):
+        assert own.record.dt_s == other.record.dt_s
+        np.testing.assert_array_equal(side * own.record.output, other.record.output)
+        np.testing.assert_allclose(side * own.record.input, other.record.input, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("column", ["u", "applied"])
+def test_a_limit_of_the_amplifier_is_seen_before_and_after_it(records, tmp_path, column):
     made = logs(levels=(0.2, 0.2), machine=plant(limit=0.5))
-    results = taken(written(tmp_path, made, COLUMNS | {"i_cmd_A": column}))
-    assert_right(results)
-    assert "input_limit = 0.5" in (tmp_path / "out" / "config.toml").read_text()
+    found, config = records(written(tmp_path, made, COLUMNS | {"i_cmd_A": column}))
+    assert config.source.input_limit == 0.5
+    for item, one in zip(found, made, strict=True):
+        np.testing.assert_allclose(item.record.input[:, 0], one["applied"], rtol=1e-6)
 
 
 @pytest.mark.long
@@ -156,20 +192,14 @@ def test_a_noisy_sensor_without_a_reference_widens(taken, tmp_path):
     assert_right(taken(written(tmp_path, logs(noise=0.02), NO_REFERENCE)), share=0.05, friction=0.1)
 
 
-@pytest.mark.slow
-def test_rows_that_a_fast_logger_repeats_are_taken_once(taken, tmp_path):
-    made = [{key: np.repeat(values, 4) for key, values in one.items()} for one in logs(levels=(0.2, 0.15))]
-    for one in made:
-        one["t"] = np.arange(one["t"].size) * DT_S / 4
-    assert_right(taken(written(tmp_path, made)))
-
-
-@pytest.mark.slow
-def test_one_log_has_its_last_part_validate(taken, tmp_path):
+def test_one_log_has_its_last_part_validate(records, tmp_path):
     reference = np.tile(multisine(np.random.default_rng(1), 0.2), 2)
-    results = taken(written(tmp_path, [log(1, reference=reference)]))
-    assert [item.role for item in results.records.records] == ["estimation", "validation"]
-    assert_right(results)
+    made = log(1, reference=reference)
+    found, _ = records(written(tmp_path, [made]))
+    assert [item.role for item in found] == ["estimation", "validation"]
+    first, last = (item.record.input[:, 0] for item in found)
+    np.testing.assert_allclose(np.append(first, last), made["u"], rtol=1e-6)
+    assert 0.2 < last.size / made["u"].size < 0.5
 
 
 def sine(k):
@@ -206,9 +236,10 @@ def test_few_frequencies_are_refused(line, refused, tmp_path, reference, law, ma
         assert "sine or a limit cycle" in refused("identify", *paths, *named)
 
 
-def test_two_references_are_asked_about(line, tmp_path):
+def test_two_references_are_asked_about(line, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # long paths cut the words
     made = [{**one, "s": 0.9 * one["r"]} for one in logs(levels=(0.2, 0.1))]
-    said = line(written(tmp_path, made, COLUMNS | {"soll_rad": "s"}))
+    said = line(written(Path(), made, COLUMNS | {"soll_rad": "s"}))
     assert "ref_rad and soll_rad may be the reference of 'enc_rad'" in said
     assert "--reference ref_rad" in said
 
