@@ -39,16 +39,6 @@ def complaint(path, **kwargs):
     return message
 
 
-def test_csv_is_read(good):
-    record = read(good)
-    assert record.name == "log"
-    assert record.dt_s == 0.01
-    np.testing.assert_array_equal(record.input[:, 0], [1, -1, 1, -1, 1, -1])
-    np.testing.assert_array_equal(record.output[:, 0], 0.5 * np.arange(6))
-    assert (record.input_names, record.output_names) == ((U,), (Y,))
-    np.testing.assert_allclose(record.time_s, 0.01 * np.arange(6))
-
-
 def test_time_need_not_start_at_zero_and_may_jitter(tmp_path):
     rng = np.random.default_rng(0)
     stamps = 5.0 + 1e-3 * np.arange(50) + rng.uniform(-5e-8, 5e-8, 50)

@@ -85,7 +85,11 @@ def by_run(
 
 @pytest.mark.parametrize(
     "case",
-    ["in a band", *(pytest.param(k, marks=pytest.mark.slow) for k in CASES if k != "in a band")],
+    [
+        "in a band",  # of an open loop
+        pytest.param("open loop", marks=pytest.mark.long),
+        *(pytest.param(k, marks=pytest.mark.slow) for k in ("reference", "friction")),
+    ],
 )
 def test_the_same_numbers_by_identify_and_by_run(case, tmp_path):
     made, reference, settings, way = CASES[case]

@@ -14,12 +14,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ident.data.finding import FindingKind
 from plant import linear_arm
 from plant.presets import paper_link
 from tests.golden import margins
 from tests.workflow.command import FAST_ARM, ROOT
-from workflow.config.run_config import load_config
+from workflow.config.run_config import built_in_config, load_config
+from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.exports import read_model
+from workflow.tasks.results import RunResults
+from workflow.tasks.simulated_rig import rig_of
 
 README, COMMANDS_PAGE, MAKEFILE = (
     (ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/commands.md", "Makefile")
@@ -153,6 +157,14 @@ def test_make_run_gives_the_numbers_of_the_readme(flexlink):
     off = margins.moved("default_arm", margins.of_run(Path("runs/default")))
     assert not off, f"measured against golden: {off}; if meant, rerun python -m tests.golden.margins"
     assert Path("runs/default/figures/overview.svg").is_file()
+    # The level of the configuration, and no warning that the binary input is clipped.
+    results, rig = RunResults(RunDirectory.open(Path("runs/default"))), rig_of(built_in_config()[0].source)
+    torque_Nm = results.identify.friction.level * rig.motor.torque_per_volt_Nm_V
+    assert torque_Nm == pytest.approx(0.02, rel=0.03)
+    for found, spread in zip(results.identify.channels, results.uncertainty.channels, strict=True):
+        assert not [w for w in found.identification.warnings if w.kind is FindingKind.CLIPPED]
+        assert spread.intervals is not None
+        assert spread.bands[0].median_radius_percent < 0.1
     (command,) = re.findall(r"`flexlink (report runs/default .*?)`", COMMANDS_PAGE)
     assert flexlink(*command.split()).code == 0
     assert Path("runs/default/figures/overview.pdf").read_bytes().startswith(b"%PDF")

@@ -209,21 +209,6 @@ def test_json_round_trip_keeps_nan_and_infinity(document, tmp_path_factory):
     assert _same(document, storage.read_json(path))
 
 
-def test_failed_write_keeps_the_old_file_and_leaves_no_temporary(tmp_path, monkeypatch):
-    path = tmp_path / "a.json"
-    storage.write_json(path, {"version": 1})
-
-    def no_space(descriptor):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", no_space)
-    with pytest.raises(InputError, match="No space left"):
-        storage.write_json(path, {"version": 2})
-    monkeypatch.undo()
-    assert storage.read_json(path) == {"version": 1}
-    assert [entry.name for entry in tmp_path.iterdir()] == ["a.json"]
-
-
 def test_a_reader_never_sees_half_a_file_while_the_writer_is_killed(tmp_path):
     """Kill -9 a process that rewrites one file without pause; whatever is there must be whole."""
     path = tmp_path / "a.npz"

@@ -16,7 +16,6 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
 from matplotlib.colors import to_hex
 
 from control_design.analysis.margins import Margins
@@ -120,19 +119,6 @@ def test_front_of_a_known_set():
         _row(7, 3.0, 0.5),  # as good as 4: neither beats the other
     ]
     assert pareto_front(rows, _PLOT) == [1, 2, 4, 7]
-
-
-@given(places=st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), max_size=12))
-def test_front_by_sweeping(places):
-    # Independent: along falling bandwidth the margin must reach a new maximum.
-    rows = [_row(index, float(x), float(y)) for index, (x, y) in enumerate(places)]
-    expected, best = [], -1
-    for x in sorted({x for x, _ in places}, reverse=True):
-        top = max(y for other, y in places if other == x)
-        if top > best:
-            best = top
-            expected += [index for index, place in enumerate(places) if place == (x, top)]
-    assert sorted(pareto_front(rows, _PLOT)) == sorted(expected)
 
 
 def test_smaller_is_better_where_it_says_so():
