@@ -159,7 +159,7 @@ def test_a_wrong_unit_is_doubted_and_the_next_command_states_it(
     # Limits of the terminal cut sentences into lines.
     seen = flexlink("look", logs[0]).out
     assert words in " ".join(seen.replace("│", " ").split())
-    assert seen.splitlines()[-1] == f"flexlink init {logs[0]} {typed} --out my.toml"
+    assert seen.splitlines()[-1] == f"flexlink run {logs[0]} {typed} --out runs/arm"
     doubted = " ".join(flexlink("init", *logs, "--out", tmp_path / "a.toml").out.replace("│", " ").split())
     assert words in doubted
     assert typed in doubted

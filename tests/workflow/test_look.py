@@ -99,7 +99,7 @@ def test_a_cell_without_a_number_is_taken_out_and_filled_in(cell, flexlink, refu
     path.write_text("\n".join(["t_s,u_V,y_rad", *(row for row in rows if cell not in row.split(","))]) + "\n")
     seen = " ".join(flexlink("look", path).out.replace("│", " ").split())
     assert "1 row missing" in seen
-    assert "flexlink init takes that by itself, identify with --repair" in seen
+    assert "flexlink run takes that by itself, identify with --repair" in seen
     answer = flexlink("init", path, "--out", tmp_path / "a.toml")
     assert answer.code == 0
     assert "none shows: give further logs" in answer.out

@@ -301,7 +301,7 @@ def test_a_real_arm_of_one_channel_is_not_said_to_have_run(unbuilt, tmp_path):
     assert "Nothing was run on the real machine here." in page.text
     assert "The controller has not run on the real machine." in page.text
     assert "on the simulated arm settle" not in page.text
-    assert "Sensitivity on the arm" not in page.text
+    assert "Sensitivity measured on the arm" not in page.text
     assert "The loop under other conditions" not in page.text
 
 

@@ -70,7 +70,7 @@ def _next(found: LogLook) -> str:
         return f"{found.path}, {why[0]}"
     doubted = [str(doubt.values["options"]) for doubt in found.doubts if "options" in doubt.values]
     if roles.reference or roles.doubts:  # made in closed loop
-        return " ".join(["flexlink init", log, *doubted, "--out my.toml"])
+        return " ".join(["flexlink run", log, *doubted, "--out runs/arm"])
     named = {"--input": roles.input, "--output": roles.output, "--time": roles.time}
     options = [f"{option} {shlex.quote(name)}" for option, name in named.items() if name]
     mend = found.time.option if found.time and found.time.option.startswith("--") else ""

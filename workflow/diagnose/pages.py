@@ -67,7 +67,7 @@ def plant_page(
         "where": place,
         "remains": remains,
         "next_experiment": coming,
-        "told": told,
+        "can_show": told,
         "model_error": model_error,
         "repaired": repaired,
         "moving": moving_figures(found),

@@ -258,7 +258,7 @@ def draw_friction(run: RunView) -> Figure | None:
         errors.plot(*outline(time_s, error, 400), **look, label=words)
     for sign in (-1, 1) if found.error_at_rest > 0 else ():
         errors.axhline(
-            sign * found.error_at_rest, **style.LIMIT_LINE, label="largest error that friction can hold"
+            sign * found.error_at_rest, **style.LIMIT_LINE, label="largest error at rest (friction)"
         )
     errors.set(xlabel="time [s]", title="Error on a sine")
     errors.set_xlim(0.0, float(time_s[-1]))
