@@ -499,7 +499,7 @@ def design(
     _leave(summary)
 
 
-@app.command(short_help="Certify a controller that is there; hold its margins against a baseline.")
+@app.command(short_help="Certify an existing controller; hold its margins against a baseline.")
 @with_fields(files=("controller", "baseline", "write_baseline"))
 def certify(
     source: Source,

@@ -114,8 +114,8 @@ def draw_case_gaps(cases: Sequence[Any]) -> Figure:
     axes.axvline(floor, **gap_style.FLOOR, zorder=0)
     axes.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(2 * floor, *before)))
     axes.set_yticks(at, [f"{style.plain(c.name, 34)}: {style.plain(c.answer, 44)}" for c in cases])
-    axes.set(ylim=(len(cases) - 0.5, -0.5), xlabel=f"held-out {gap_style.RESIDUAL_AXIS}")
-    axes.set_title("How far each gap shrinks")
+    axes.set(ylim=(len(cases) - 0.5, -0.5), xlabel=f"validation {gap_style.RESIDUAL_AXIS}")
+    axes.set_title("Model error, nominal and with effects")
     return figure
 
 

@@ -163,7 +163,7 @@ def _criterion(axes: Axes, steps: Sequence[OrderStep], chosen: tuple[int, int]) 
     axes.set_ylim(-0.15 * _LINEAR, max(2.5 * above.max(), 1.5 * _LINEAR))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_xlim(order.min() - 0.6, order.max() + 0.6)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     axes.set(xlabel="searched poles [1]", ylabel="criterion above the best [1]")
 
 
@@ -202,7 +202,7 @@ def _stabilisation(axes: Axes, plot: Stabilisation, response: FrequencyUncertain
             )
     axes.axhline(plot.chosen, color=style.HIGHLIGHT, lw=5, alpha=0.35, label="number of pairs in the model")
     axes.set_ylim(-0.4, max(plot.rss.size - 1, 1) + 0.6)
-    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     if response is None and omega.size:
         axes.set_xlim(omega.min() / 1.5, omega.max() * 1.5)
     axes.set_title("Stabilisation: which modes stay")
