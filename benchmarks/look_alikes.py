@@ -83,6 +83,8 @@ def run(out: Print, *, single: int = 20, unlisted: int = 16, models: int = 40) -
             sure += max(there.values(), default=0.0) > SURE
             said = ", ".join(f"{name} {p:.3f}" for name, p in there.items()) or found.verdict
             out(f"{name} {cause:24s} -> {said}   ({seconds:.0f} s)")
+        if not cases:
+            continue
         out(f"named above {SURE}: {sure}")
         named = ", ".join(f"{name} {n}" for name, n in sorted(stood_in.items()))
         out(f"{cases} cases of {machine}; named: {named}")

@@ -183,12 +183,13 @@ def judged(search: Search) -> JudgedSets:
     )
     answer = probabilities.counting_as_unknown(untried).answer
     accepted = _accepted(probabilities, answer, sets, beside)
-    # Where something is missing, what stands in for it is weighed already (`_genuine`).
+    # Where something is missing, what stands in for it is weighed already (`_genuine`); of what cannot be
+    # tried (`untried`) nothing is known.
     there, whole = probabilities.presence, sum(one.weight * one.explains for one in sets)
     acting = {
         name: p * whole * acts_like(name, weighing.listed, weighing.counted)
         for name, p in there.items()
-        if weighing.counted and name not in beside
+        if weighing.counted and name in weighing.listed and name not in beside
     }
     probabilities = replace(probabilities, presence={n: p - acting.get(n, 0.0) for n, p in there.items()})
     return JudgedSets(
