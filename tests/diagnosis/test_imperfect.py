@@ -766,6 +766,15 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
     )
 
 
+def test_of_what_cannot_be_tried_no_look_alike_is_counted():
+    search = _searched({(): (0.0, 0.5, 0.5), ("gravity",): (400.0, 0.001, 0.001)})
+    search.untried = {"cable_drag": "a cable"}
+    said = judged(search)
+    assert {"gravity", "cable_drag"} <= said.probabilities.presence.keys()
+    assert set(said.acts_alike) == set(EFFECTS)
+    assert said.probabilities.presence["gravity"] == pytest.approx(0.608, abs=0.02)
+
+
 def test_what_makes_validation_records_worse_is_not_there():
     nothing, dry, both = (0.0, 0.5, 0.5), ("coulomb_friction",), ("coulomb_friction", "gravity")
     sets = {(): nothing, ("gravity",): nothing, dry: (400.0, 0.1, 0.1), both: (900.0, 0.01, 0.01)}
