@@ -95,7 +95,7 @@ class IdentOptions(Settings):
         4,
         ge=1,
         le=20,
-        description="points of a global search that are refined",
+        description="points of a global search that are refined; five times as many if the first disagree",
     )
 
     omega_min_rad_s: float | None = Field(

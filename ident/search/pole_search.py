@@ -31,10 +31,17 @@ GAIN = 1e-6
 _ROUNDS = 6
 # Descents that only compare starts stop when this share of J is left to gain.
 ROUGH = 1e-3
+# So many starts that end in one place make further ones and a rescan superfluous.
+_STARTS_TO_AGREE = 3
+# Where they disagree, so many times the starts asked for are tried.
+_PATIENCE = 5
+# Cost evaluations for one more pair when the rest is frozen: two unknowns.
+_PAIR_EVALUATIONS = 240
 _REAL_GRID = 9  # levels of a real pole: two a decade over the box of a record of 10 000 samples
 _PAIR_GRID = (40, 2)
-# Real poles whose decays differ by less than this share of the faster one are about to meet.
-_SAME_POLE = 0.1
+# Ends of rough descents are one optimum if J and poles differ by no more than this.
+_SAME_COST = 3 * ROUGH
+_SAME_POLE = 0.1  # see `_SAME_COST`
 # Up to this share of the output's power a residual is little: with more noise many minima lie together.
 _LITTLE_NOISE = 0.02
 
@@ -56,20 +63,40 @@ class PoleSearch(Generic[Problem]):
         unbounded = options.omega_max_rad_s is None and options.coordinates == "log"
         if unbounded and data.omega_max_rad_s is not None:
             self._box = options.model_copy(update={"omega_max_rad_s": data.omega_max_rad_s})
+        self._settled: Refined | None = None
         self._coloured: tuple[Refined, ResidualColour] | None = None
 
     def space(self, n_real: int, n_pairs: int) -> SearchSpace:
         return search_space(n_real, n_pairs, self.data.longest, self.data.dt_s, self._box)
 
     def joint(self, n_real: int, n_pairs: int) -> Refined:
-        """Best poles of a joint global search over n_real real poles and n_pairs pairs."""
+        """Best poles of a joint global search over n_real real poles and n_pairs pairs. It has settled if
+        the first starts, far from each other, all end in one place that can be trusted (`is_trusted`: a
+        broad wrong minimum catches several, but leaves dynamics); else `_PATIENCE` times as many starts
+        are tried."""
         title = f"{n_real} real, {n_pairs} pairs"
         if n_real + n_pairs == 0:
             return self.descend(self.fixed, title)
         space = self.space(n_real, n_pairs)
         cost = self.data.candidate_cost(space, self.fixed, self.fixed)
-        points = self._global(title, cost, self.options.evaluations, self.options.starts)
-        return self._best_descent([self.fixed.appended(space.poles(point)) for point in points], title)
+        few = min(self.options.starts, _STARTS_TO_AGREE)
+        points = self._global(title, cost, self.options.evaluations, self.options.starts * _PATIENCE)
+
+        def starts(chosen: RealArray) -> list[Poles]:
+            return [self.fixed.appended(space.poles(point)) for point in chosen]
+
+        known = len(self.minima)
+        best = self._best_descent(starts(points[:few]), title)
+        ends = self.minima[known : known + len(points[:few])]
+        agreed = len(ends) == _STARTS_TO_AGREE and all(self._is_same(end, best) for end in ends)
+        if agreed and self.is_trusted(best):
+            self._settled = best
+            return best
+        if len(points) > few:
+            other = self._best_rough(starts(points[few:]), title)
+            if other.rss < best.rss * (1 - GAIN):
+                best = min(best, self.descend(other.poles, title), key=lambda end: end.rss)
+        return best
 
     def is_trusted(self, best: Refined) -> bool:
         """Whether `best` leaves little of the output, the rest white, and is no saddle of equal real
@@ -81,12 +108,23 @@ class PoleSearch(Generic[Problem]):
         )
         return not meeting and best.rss <= _LITTLE_NOISE * self.data.power and self.colour(best).white
 
+    def _is_same(self, end: PolishedMinimum, best: Refined) -> bool:
+        """Whether a rough descent was on its way to `best`."""
+        if end.rss > best.rss * (1 + _SAME_COST):
+            return False
+        return all(
+            abs(ours - theirs) <= _SAME_POLE * theirs + self._slowest
+            for ours, theirs in zip(_rates(end.poles), _rates(best.poles), strict=True)
+        )
+
     def add_pair(self, poles: Poles) -> Refined:
         """Best descent from the given poles and one more pair, sought on what their tangent space leaves."""
         title = f"pair {poles.pairs.size - self.fixed.pairs.size + 1}"
         space = self.space(0, 1)
         cost = self.data.candidate_cost(space, poles.doubled(), poles)
-        points = self._global(title, cost, self.options.evaluations, self.options.starts)
+        points = self._global(
+            title, cost, min(_PAIR_EVALUATIONS, self.options.evaluations), self.options.starts
+        )
         return self._best_descent([poles.appended(space.poles(point)) for point in points], title)
 
     def add_real(self, poles: Poles) -> Refined:
@@ -111,7 +149,9 @@ class PoleSearch(Generic[Problem]):
 
     def rescan(self, best: Refined) -> Refined:
         """Look at each block on a grid with the rest frozen, descend from what is found, until a round gains
-        nothing."""
+        nothing; not if the joint search settled on `best`."""
+        if best is self._settled:
+            return best
         n_fixed_real, n_fixed_pairs = self.fixed.counts
         n_real, n_pairs = best.poles.counts
         # Up to two real poles are looked at together: one alone can be held by the other.
@@ -216,6 +256,16 @@ class Fitted:
             data = replace(data, polynomials=self.data.polynomials)
         search = PoleSearch(data, self.search.options.model_copy(update=changed))
         return Fitted(search, search.descend(start, "other structure"))
+
+
+def _rates(poles: Poles) -> list[float]:
+    """Decays of the real poles, frequencies of the pairs and their decays per sample, each by size."""
+    pairs = [cmath.log(pole) for pole in poles.pairs.tolist()]
+    return [
+        *sorted(1 - a for a in poles.real.tolist()),
+        *sorted(abs(log) for log in pairs),
+        *sorted(-log.real for log in pairs),
+    ]
 
 
 @cache
