@@ -18,12 +18,13 @@ from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import NO_POLES, Poles
 from ident.basis.structure import Structure, filter_input
+from ident.checks.prior_tests import ROUGH
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
 from ident.fit.least_squares import Regression, project
 from ident.fit.regression import prepare, prepare_inputs, thinned
 from ident.search.order_selection import OrderSelection
-from ident.search.pole_search import ROUGH, PoleSearch
+from ident.search.pole_search import PoleSearch
 
 # Numbers of real poles and pairs that are tried; the criterion of the order chooses.
 _STRUCTURES = ((2, 0), (2, 1), (2, 2), (2, 3), (2, 4))

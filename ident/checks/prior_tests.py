@@ -29,8 +29,10 @@ from ident.fit.refinement import Refined, free_optimality
 from ident.fit.regression import prepare
 from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
 from ident.search.order_selection import OrderSelection
-from ident.search.pole_search import ROUGH, Fitted, PoleSearch
+from ident.search.pole_search import Fitted, PoleSearch
 
+# Descents that only compare starts stop when this fraction of J is left to gain.
+ROUGH = 1e-4
 # Slow poles that freed integrators start from, as decays over the whole record.
 _SLOW_STARTS = {
     1: ((0.1,), (1.0,), (5.0,), (20.0,)),
