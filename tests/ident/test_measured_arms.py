@@ -64,7 +64,7 @@ def test_robot_arm_fitted_on_the_sweep_down_predicts_the_sweep_up_and_back(robot
     down, up = robot_arm.slice(0, 256), robot_arm.slice(256, 512)
     for part, fresh, reach in ((down, up, least[0]), (up, down, least[1])):
         model = identify([part], robot_arm_options(n_pairs)).model
-        assert fit_on_fresh_data(model, fresh, estimate_offset=False).fit_percent > reach
+        assert fit_on_fresh_data(model, fresh).fit_percent > reach
 
 
 def test_robot_arm_known_at_every_second_line_is_known_between_them(robot_arm):

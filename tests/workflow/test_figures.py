@@ -369,8 +369,8 @@ def test_every_gap_is_inside_its_panel(model_error, floor, repaired):
     right = draw_waterfall(found).axes[1]
     low, high = right.get_xlim()
     drawn = np.concatenate([np.atleast_1d(line.get_xdata()) for line in right.lines])
-    # What leaves nothing beyond noise is drawn at a fiftieth of the floor: the axis is logarithmic.
-    assert np.min(drawn) == pytest.approx(max(repaired, floor / 50))
+    # What leaves nothing beyond noise is drawn at a twentieth of the floor: the axis is logarithmic.
+    assert np.min(drawn) == pytest.approx(max(repaired, floor / 20))
     assert low < np.min(drawn)
     assert high > np.max(drawn)
 
