@@ -96,6 +96,10 @@ class Judge(ABC, Generic[E]):
     complete: float
 
     @abstractmethod
+    def answer(self, rng: np.random.Generator) -> Diagnosis:
+        """`recorded`, with what only this judge knows."""
+
+    @abstractmethod
     def holding(self, name: str) -> E | None:
         """Where an effect is fitted best; None where no size of it was worth a fit."""
 
