@@ -104,12 +104,9 @@ class Judge(ABC, Generic[E]):
         """Where an effect is fitted best; None where no size of it was worth a fit."""
 
     @abstractmethod
-    def covariance(self, found: E) -> Real:
-        """Of all its unknowns (M, M), as far as the records tell."""
-
-    def further(self, found: E, k: int) -> Real | float:
-        """What the records do not tell of the k-th effect's coordinates: covariance (A, A) to be added."""
-        return 0.0
+    def covariance(self, found: E, k: int) -> tuple[Real, Real]:
+        """Of all its unknowns (M, M) as far as the records tell, and (A, A) of the k-th effect's coordinates
+        from all sources."""
 
     @abstractmethod
     def explains(self, found: E, name: str) -> tuple[float, float, float]:
@@ -177,8 +174,7 @@ class Judge(ABC, Generic[E]):
         if best is not None:
             end, k = best.end, best.names.index(name)
             candidate, at, rows = end.candidates[k], end.coordinates_of(k), end.rows_of(k)
-            told = self.covariance(best)
-            whole = told[rows, rows] + self.further(best, k)
+            told, whole = self.covariance(best, k)
             intervals = parameter_intervals(candidate, at, whole, rng)
             widest = widened_by(told, end.deviations.size, rows.start, float(whole[0, 0]))
             entry = replace(

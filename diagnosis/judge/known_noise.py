@@ -63,7 +63,10 @@ class KnownNoise(Judge[Hypothesis]):
             weighed = weighed.with_untried(untried, larger=True)
         # What was not tried counts as unknown.
         answer = weighed.counting_as_unknown(untried).answer
-        alike = self._as_good(accepted) if answer != "unknown" else ()
+        # Of sets of the same number that fit as well as the accepted one.
+        sets = [h for h in self.found if h.is_answer and 0 < len(accepted.names) == len(h.names)]
+        near = [h for h in sets if h.end.loss <= accepted.end.loss + SUBSTANTIAL and answer != "unknown"]
+        alike = tuple(name for h in sorted(near, key=lambda h: h.end.loss) for name in h.names)
         self.said = Judgement(
             weighed, answer, together, untried, rounding, alike, converged=last.converged or late
         )
@@ -89,14 +92,15 @@ class KnownNoise(Judge[Hypothesis]):
         holding = [h for h in self.found if h.is_answer and name in h.names]
         return max(holding, key=lambda h: h.log_weight) if holding else None
 
-    def covariance(self, found: Hypothesis) -> Real:
+    def covariance(self, found: Hypothesis, k: int) -> tuple[Real, Real]:
         """What is left beyond the noise widens intervals in proportion, as does what solvers disagree about:
         where contacts switch, that is correlated over a record."""
         end, samples = found.end, np.mean([len(record.output) for record in self.search.case.estimation])
         # .674: median of a half-normal prior.
         usual = 0.674 * DISAGREEMENT["non-smooth"] if end.non_smooth else 0.0
         wider = max(1.0, end.rms**2) * (1 + usual**2 * float(samples))
-        return wider * np.asarray(np.linalg.pinv(end.hessian, hermitian=True), dtype=np.float64)
+        told = wider * np.asarray(np.linalg.pinv(end.hessian, hermitian=True), dtype=np.float64)
+        return told, told[end.rows_of(k), end.rows_of(k)]
 
     def explains(self, found: Hypothesis, name: str) -> tuple[float, float, float]:
         """Of the energy of the validation error beyond noise, without an interval."""
@@ -111,12 +115,6 @@ class KnownNoise(Judge[Hypothesis]):
     def _gap(self, found: Hypothesis) -> float:
         case = self.search.case
         return held_out_gap(case, self.search.whitened(found, case.held_out))
-
-    def _as_good(self, accepted: Hypothesis) -> tuple[str, ...]:
-        """Effects of sets of the same number that fit as well as the accepted one."""
-        others = [h for h in self.found if h.is_answer and 0 < len(accepted.names) == len(h.names)]
-        near = [h for h in others if h.end.loss <= accepted.end.loss + SUBSTANTIAL]
-        return tuple(name for h in sorted(near, key=lambda h: h.end.loss) for name in h.names)
 
     def _competing(self) -> tuple[CompetingHypothesis, ...]:
         """What the next experiment is to separate; what is unknown is one where it has a name (a

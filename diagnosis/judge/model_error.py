@@ -114,18 +114,17 @@ class BesideModelError(Judge[Explanation]):
         judged = [one.explanation for one in self.said.judged]
         return next((e for e in (self.repaired, *judged, *self.sets.values()) if name in e.names), None)
 
-    def covariance(self, found: Explanation) -> Real:
-        likely = np.linalg.pinv(found.end.normal(self.search.records).hessian, hermitian=True)
-        return judging.TEMPER * np.asarray(likely, dtype=np.float64)
-
-    def further(self, found: Explanation, k: int) -> Real:
-        """From imperfections of the model that may act as the effect does."""
-        candidate, coordinates = found.end.candidates[k], found.end.coordinates_of(k)
+    def covariance(self, found: Explanation, k: int) -> tuple[Real, Real]:
+        """Imperfections of the model that may act as the effect does widen it."""
+        end = found.end
+        likely = np.linalg.pinv(end.normal(self.search.records).hessian, hermitian=True)
+        told = judging.TEMPER * np.asarray(likely, dtype=np.float64)
         rest = judging.best_without(self.sets, found, found.names[k])
         alike = judging.LITTLE * self.search.case.machine.weighing.model_error
         share = max(judging.share_beside(rest, found), alike)
-        sizes = alike / share * np.array([_size(candidate, i, x) for i, x in enumerate(coordinates)])
-        return np.outer(sizes, sizes)
+        changes = [_size(end.candidates[k], i, x) for i, x in enumerate(end.coordinates_of(k))]
+        sizes = alike / share * np.array(changes)
+        return told, told[end.rows_of(k), end.rows_of(k)] + np.outer(sizes, sizes)
 
     def explains(self, found: Explanation, name: str) -> tuple[float, float, float]:
         rest = judging.best_without(self.sets, found, name)

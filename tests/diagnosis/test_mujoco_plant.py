@@ -132,19 +132,16 @@ def test_an_effect_that_changes_as_much_at_no_size_is_not_offered():
         assert ("smaller steps" in plant.inactive.get("hinge.backlash", "")) != tried
 
 
-@pytest.mark.parametrize("step", ["0.001", "0.005"])
 @pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
-def test_a_lag_is_tried_whatever_integrates_it(integrator, step):
-    stepped = ROD.replace('timestep="0.001"', f'timestep="{step}" integrator="{integrator}"')
+def test_a_lag_is_tried_whatever_integrates_it(integrator):
+    """At its least it is next to nothing: no more than a lag of a step of the simulation is."""
+    stepped = ROD.replace('timestep="0.001"', f'timestep="0.005" integrator="{integrator}"')
     arm = MujocoArm(mujoco.MjSpec.from_string(stepped), ("hinge",), DT_S)
     plant, inputs = plant_of(arm, steps(), turned(steps()))
     (lag,) = (effect for effect in plant.effects if effect.name == "motor.lag")
-    stated, least, whole = (
-        plant.simulated([Change("motor.lag", {"time_constant_s": s})] if s else [])(inputs)
-        for s in (0.0, lag.parameters[0].low, 10 * DT_S)
-    )
-    # At its least it is next to nothing: no more than a lag of a step of the simulation is.
-    assert np.std(least - stated) < float(step) / (10 * DT_S) * 1.5 * np.std(whole - stated)
+    least, whole = (Change("motor.lag", {"time_constant_s": s}) for s in (lag.parameters[0].low, 0.1))
+    stated, least, whole = (plant.simulated(effects)(inputs) for effects in ((), (least,), (whole,)))
+    assert np.std(least - stated) < 0.075 * np.std(whole - stated)
 
 
 def as_begun(plant):
