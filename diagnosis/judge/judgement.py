@@ -109,8 +109,8 @@ class Judge(ABC, Generic[E]):
         from all sources."""
 
     @abstractmethod
-    def explains(self, found: E, name: str) -> tuple[float, float, float]:
-        """See `NamedEffect.explains`."""
+    def explains(self, found: E, name: str, gap_after: float) -> tuple[float, float, float]:
+        """See `NamedEffect.explains`; gap_after: that of `found`."""
 
     def recorded(self, rng: np.random.Generator, **more: Any) -> Diagnosis:
         """more: fields of `Diagnosis` that only one judge knows."""
@@ -176,13 +176,14 @@ class Judge(ABC, Generic[E]):
             candidate, at, rows = end.candidates[k], end.coordinates_of(k), end.rows_of(k)
             told, whole = self.covariance(best, k)
             intervals = parameter_intervals(candidate, at, whole, rng)
+            gap = held_out_gap(search.case, search.whitened(best, search.case.held_out))
             widest = widened_by(told, end.deviations.size, rows.start, float(whole[0, 0]))
             entry = replace(
                 entry,
                 parameters=candidate.parameters(at),
                 intervals=intervals,
-                gap_after=held_out_gap(search.case, search.whitened(best, search.case.held_out)),
-                explains=self.explains(best, name),
+                gap_after=gap,
+                explains=self.explains(best, name, gap),
                 remarks=remarks(candidate, at, intervals),
                 widened_by="" if widest is None else keys[widest],
             )

@@ -102,15 +102,14 @@ class KnownNoise(Judge[Hypothesis]):
         told = wider * np.asarray(np.linalg.pinv(end.hessian, hermitian=True), dtype=np.float64)
         return told, told[end.rows_of(k), end.rows_of(k)]
 
-    def explains(self, found: Hypothesis, name: str) -> tuple[float, float, float]:
+    def explains(self, found: Hypothesis, name: str, gap_after: float) -> tuple[float, float, float]:
         """Of the energy of the validation error beyond noise, without an interval."""
         rest = {n for n in found.names if n != name}
         without = [self._gap(h) for h in self.found if h.is_answer and rest == {*h.names}]
         before = min(without, default=np.nan) if rest else self.gap_refit
         energy = self.gap_refit**2 - self.floor**2
-        explained = before**2 - self._gap(found) ** 2
-        share = float(np.clip(explained / energy, 0.0, 1.0)) if energy > 0 else float("nan")
-        return share, float("nan"), float("nan")
+        explained = (before**2 - gap_after**2) / energy if energy > 0 else float("nan")
+        return float(np.clip(explained, 0.0, 1.0)), float("nan"), float("nan")
 
     def _gap(self, found: Hypothesis) -> float:
         case = self.search.case

@@ -126,7 +126,7 @@ class BesideModelError(Judge[Explanation]):
         sizes = alike / share * np.array(changes)
         return told, told[end.rows_of(k), end.rows_of(k)] + np.outer(sizes, sizes)
 
-    def explains(self, found: Explanation, name: str) -> tuple[float, float, float]:
+    def explains(self, found: Explanation, name: str, gap_after: float) -> tuple[float, float, float]:
         rest = judging.best_without(self.sets, found, name)
         closes = [closed_by(self.search, e, self.refit) for e in (found, rest)]
         alone = (max(closes[0] - closes[1], 0.0), float("nan"), float("nan"))

@@ -66,7 +66,7 @@ def _size(
     starts: tuple[float, float] = (3e-3, 0.6),
 ) -> EffectParameter:
     """A range in multiples of a magnitude, or of one of that name, and six starts in its lower part."""
-    spread = (starts[0], min(starts[1], 0.6 * span[1]), 6)
+    spread = (max(starts[0], span[0]), min(starts[1], 0.6 * span[1]), 6)
     if isinstance(unit, str):
         return EffectParameter(name, *span, unit=unit, spread=spread)
     return EffectParameter(name, *span, spread=spread).times(unit)
@@ -192,10 +192,8 @@ class Quantities:
             # Integrated as all else is, a filter that is faster than a step runs away.
             explicit = option.integrator == mujoco.mjtIntegrator.mjINT_RK4 or one.dyntype == LAGS[1]
             least = max(0.02, option.timestep / self.model.dt_s) if explicit else 0.02
-            size = late(
-                "time_constant_s", span=(least, longest), starts=(max(0.2, least), min(20.0, longest))
-            )
-            yield _number(f"{one.name}.lag", lag, partial(put_lag, one.name), size, group="actuator")
+            put, size = partial(put_lag, one.name), late("time_constant_s", span=(least, longest))
+            yield _number(f"{one.name}.lag", lag, put, size, group="actuator")
         put = partial(put_delay, "actuator", one.name, option.timestep)
         yield _number(f"{one.name}.delay", float(one.delay), put, late("delay_s"), group="actuator")
 
