@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import expm
 
 from ident.basis.functions import all_pass_response, basis_response
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure, filter_input, front_response
 from ident.data.arrays import BoolArray, ComplexArray, RealArray, kernel_array, real_rows
 from ident.data.record import Record
-from ident.friction.kernel import STEPS, STRIDES, step_through
+from ident.friction.kernel import STEPS, STRIDES, ArmSteps, step_through
 
 # A pole at zero is a delay, which no motion in continuous time has: the fastest rate that is stepped.
 FASTEST_POLE = 2e-3
@@ -57,8 +58,10 @@ class FrictionLaw:
 class SteppedArm:
     """Poles of an arm, each taken twice, as states in continuous time behind a zero-order hold.
 
-    poles: each once. rates (N,), chain (N,) as in `step_through`; weights (N, P) complex map the P = 2 order
-    coefficients on the basis functions of the doubled poles to the states.
+    poles: each once. A state j with rate s_j (1/s) obeys x' = s_j x + e, e the effort, or, where chain[j] is
+    true, x' = s_j x + x_before with x_before the state before it (a pole taken twice). The position is the
+    real part of the sum of weights x; weights (N, P) complex map the P = 2 order coefficients on the basis
+    functions of the doubled poles to the states.
     """
 
     poles: Poles
@@ -105,17 +108,46 @@ class SteppedArm:
         weights[twofold] += 1j * solved[rates.size :]
         return cls(poles, structure, dt_s, rates, chain, weights)
 
+    def parts(self, states: ComplexArray | BoolArray) -> RealArray:
+        """(M,) real parts of a number of each state (N,), and imaginary ones of those that swing."""
+        return np.concatenate([states.real, states.imag[self.rates.imag != 0]]).astype(np.float64)
+
+    @property
+    def once(self) -> BoolArray:
+        """(M,) real states of each pole taken once."""
+        return np.concatenate([~self.chain, ~self.chain[self.rates.imag != 0]])
+
     @cached_property
-    def moves(self) -> ComplexArray:
-        """(2, 3, N): over a step, and a stride, a state's decay, a unit of effort onto it, the state before
-        it onto it."""
-        length = self.dt_s / np.array([[STEPS], [STRIDES]])
-        decay = np.exp(self.rates * length)
-        carried = np.where(self.chain, length * decay, 0)
-        rates = np.where(self.rates == 0, 1, self.rates)
-        onto = np.where(self.rates == 0, length, (decay - 1) / rates)
-        onto = np.where(self.chain, (carried - onto) / rates, onto)
-        return np.stack([decay, onto, carried], axis=1)
+    def _flow(self) -> RealArray:
+        """(M + 1, M + 1) derivative of the real states, and of a held effort behind them."""
+        rates = np.diag(self.rates) + np.diag(self.chain[1:], -1)
+        kept = np.append(np.full(self.rates.size, True), self.rates.imag != 0)
+        both = np.block([[rates.real, -rates.imag], [rates.imag, rates.real]])[np.ix_(kept, kept)]
+        onto = np.column_stack([both, self.parts(~self.chain)])
+        return np.vstack([onto, np.zeros(len(onto) + 1)])
+
+    def over(self, length_s: float) -> RealArray:
+        """(M + 1, M + 1) what a time makes of the real states and a held effort."""
+        return np.asarray(expm(self._flow * length_s))
+
+    @cached_property
+    def _powers(self) -> RealArray:
+        """(S + 1, M + 1, M + 1) after no step, and after each of a stride."""
+        step = self.over(self.dt_s / STEPS)
+        return np.array([np.linalg.matrix_power(step, k) for k in range(STEPS // STRIDES + 1)])
+
+    def stepped(self, weights: ComplexArray) -> ArmSteps:
+        """What the kernels ask of an arm with weights (N,) of its states."""
+        out, powers = self.parts(weights.conj()), self._powers
+        pulses = powers[:-1, :-1, :-1] @ powers[1, :-1, -1]
+        return ArmSteps(
+            stride=powers[-1, :-1, :-1].copy(),
+            held=powers[-1, :-1, -1].copy(),
+            pushes=pulses[::-1].copy(),
+            ahead=out @ powers[1:, :-1, :-1],
+            pulse=pulses @ out,
+            slope=out @ self._flow[:-1],
+        )
 
     def run(
         self,
@@ -129,16 +161,16 @@ class SteppedArm:
         a correction (N,) that of an observer of the measured position (T,): the one it predicts."""
         weights = self.weights @ coefficients
         position, friction = np.empty(voltage.size), np.empty(voltage.size)
+        gain = np.zeros(0)
+        if correction is not None:
+            gain = np.append(self.parts(correction), (weights * correction).real.sum())
         step_through(
             kernel_array(filter_input(voltage, 0, self.structure.input_delay_samples)),
-            self.moves,
-            self.rates,
-            self.chain,
-            weights,
+            self.stepped(weights),
             self.dt_s,
             law.array,
             kernel_array(voltage if measured is None else measured),
-            np.zeros(0, np.complex128) if correction is None else correction,
+            gain,
             position,
             friction,
         )

@@ -1,9 +1,7 @@
 """The compiled time stepper of a linear arm with dry friction at its shaft, alone and in a sampled control
 loop.
 
-A state j with rate s_j (1/s) obeys x' = s_j x + e, or, where chain[j] is true, x' = s_j x + x_before with
-x_before the state before it (a pole taken twice); e = drive - friction; the position is the real part of sum
-weights_j x_j.
+The arm is linear in real states, driven by drive - friction (`ArmSteps`).
 
 Friction is an elastic element whose force is limited: to level + excess exp(-|v| / fall) at the speed v
 before a step (Stribeck), reached after a deflection by `presliding`; law is (level, presliding, excess,
@@ -17,7 +15,7 @@ before - M of the sample after) / 2, M the first moment of the force about the m
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -31,78 +29,86 @@ _OVER = 8.0  # speeds, in units of `fall`, from which on the excess is gone
 _TINY = np.finfo(np.float64).tiny
 
 
+class ArmSteps(NamedTuple):
+    """What the kernels know of a linear arm of M real states, input held over a step, and over a stride.
+
+    stride (M, M): states over a stride, held (M,) what a unit of effort adds to them; pushes (S, M) by the
+    end of a stride of S steps, of a unit of effort in one step. ahead (S, M): of the states onto the position
+    after each step; pulse (S,): of a unit of effort in one step, after so many more. slope (M + 1,): of
+    states and effort onto the speed.
+    """
+
+    stride: Any
+    held: Any
+    pushes: Any
+    ahead: Any
+    pulse: Any
+    slope: Any
+
+
 @numba.njit(**INSIDE)
-def advance(
-    drive: float,
-    state: Any,
-    shaft: Any,
-    moves: Any,
-    rates: Any,
-    chain: Any,
-    weights: Any,
-    dt_s: float,
-    law: Any,
-) -> Any:
-    """One sample: mean and first moment (in samples) of the friction. Changes state (N,) and shaft (3,), its
-    position, deflection and speed, in place."""
-    n = rates.size
-    tried = np.empty(n, dtype=np.complex128)
-    decay, onto, carried = moves[0, 0], moves[0, 1], moves[0, 2]
-    # What a unit of effort adds to the position in one step.
-    gain = _TINY
-    for j in range(n):
-        gain += (weights[j] * onto[j]).real
-    gain = max(gain, _TINY)
+def advance(drive: float, state: Any, shaft: Any, free: Any, arm: ArmSteps, dt_s: float, law: Any) -> Any:
+    """One sample: mean and first moment (in samples) of the friction. Changes state (M,) and shaft (3,), its
+    position, deflection and speed, in place; free (S + M,) is room to work in."""
+    n = state.size
+    gain = max(arm.pulse[0], _TINY)  # what a unit of effort adds to the position in one step
     level, presliding, excess, fall = law[0], law[1], law[2], law[3]
     position, deflection, speed = shaft[0], shaft[1], shaft[2]
     breakaway = max(level + excess, _TINY)
-    stiffness, limit, step_s = breakaway / presliding, level, dt_s / STEPS
-    most = presliding * max(limit, _TINY) / breakaway
+    stiffness, limit, per_s = breakaway / presliding, level, STEPS / dt_s
+    most = max(limit, _TINY) / stiffness
+    soft, yields, fading = stiffness / (1 + 0.5 * stiffness * gain), 1 / stiffness, -1 / fall
     total, moment = 0.0, 0.0
     for stride in range(STRIDES):
-        constant = excess == 0 or abs(speed) > _OVER * fall
-        if constant and abs(deflection) >= presliding * max(level, _TINY) / breakaway:
-            force = level if deflection > 0 else -level
-            new, speed = 0.0, 0.0
+        # Positions that the arm would have without friction, from the state on.
+        pulses = 0.0
+        for i in range(_STEPS):
+            pulses += arm.pulse[i]
+            free[i] = pulses * drive
             for j in range(n):
-                tried[j] = moves[1, 0, j] * state[j] + moves[1, 1, j] * (drive - force)
-                pushed = tried[j - 1] if chain[j] else drive - force + 0j
-                if chain[j]:
-                    tried[j] += moves[1, 2, j] * state[j - 1]
-                new += (weights[j] * tried[j]).real
-                speed += (weights[j] * (rates[j] * tried[j] + pushed)).real
+                free[i] += arm.ahead[i, j] * state[j]
+        constant = excess == 0 or abs(speed) > _OVER * fall
+        if constant and abs(deflection) >= max(level, _TINY) / stiffness:
+            force = level if deflection > 0 else -level
+            new = free[_STEPS - 1] - pulses * force
+            start = speed = arm.slope[n] * (drive - force)
+            for i in range(n):
+                start += arm.slope[i] * state[i]
+                free[_STEPS + i] = arm.held[i] * (drive - force)
+                for j in range(n):
+                    free[_STEPS + i] += arm.stride[i, j] * state[j]
+                speed += arm.slope[i] * free[_STEPS + i]
             still = excess == 0 or abs(speed) > _OVER * fall
             if (new - position) * deflection > 0 and speed * deflection > 0 and still:
-                for j in range(n):  # state[:] = tried compiles for two seconds
-                    state[j] = tried[j]
+                for j in range(n):  # state[:] = ... compiles for two seconds
+                    state[j] = free[_STEPS + j]
                 position = new
                 total += _STEPS * force
                 moment += _STEPS * force * (_STEPS * (stride + 0.5) - 0.5 * STEPS)
                 continue
-            speed = 0.0
+            speed = start
+        for i in range(n):
+            free[_STEPS + i] = arm.held[i] * drive
             for j in range(n):
-                pushed = state[j - 1] if chain[j] else drive - force + 0j
-                speed += (weights[j] * (rates[j] * state[j] + pushed)).real
+                free[_STEPS + i] += arm.stride[i, j] * state[j]
         for step in range(_STEPS):
             if excess != 0:
-                limit = max(level + excess * np.exp(-abs(speed) / fall), 0.0)
-                most = presliding * max(limit, _TINY) / breakaway
-            free = gain * drive
-            for j in range(n - 1, -1, -1):
-                state[j] *= decay[j]
-                if chain[j]:
-                    state[j] += carried[j] * state[j - 1]
-                free += (weights[j] * state[j]).real
-            force = stiffness * (deflection + 0.5 * (free - position)) / (1 + 0.5 * stiffness * gain)
+                limit = max(level + excess * np.exp(abs(speed) * fading), 0.0)
+                most = yields * max(limit, _TINY)
+            force = soft * (deflection + 0.5 * (free[step] - position))
             force = min(max(force, -limit), limit)
             total += force
             moment += force * (_STEPS * stride + step + 0.5 - 0.5 * STEPS)
-            new = free - gain * force
+            new = free[step] - gain * force
             deflection = min(max(deflection + new - position, -most), most)
-            speed = (new - position) / step_s
+            speed = (new - position) * per_s
             position = new
+            for i in range(step + 1, _STEPS):
+                free[i] -= arm.pulse[i - step] * force
             for j in range(n):
-                state[j] += onto[j] * (drive - force)
+                free[_STEPS + j] -= arm.pushes[step, j] * force
+        for j in range(n):
+            state[j] = free[_STEPS + j]
     shaft[0], shaft[1], shaft[2] = position, deflection, speed
     return total / STEPS, moment / STEPS**2
 
@@ -110,10 +116,7 @@ def advance(
 @numba.njit(**COMPILED)
 def step_through(
     drive: Any,
-    moves: Any,
-    rates: Any,
-    chain: Any,
-    weights: Any,
+    arm: ArmSteps,
     dt_s: float,
     law: Any,
     measured: Any,
@@ -123,20 +126,21 @@ def step_through(
 ) -> None:
     """Fill position (T,) and the friction (T,), held over every sample, for a drive (T,) held over each.
 
-    At every sample the states take correction (N,) times what the measured (T,) position is off the one
-    predicted, which is the one that is told; correction of size 0: a free run. moves, rates, chain:
-    of `ident.friction.arm.SteppedArm`.
+    At every sample the states take correction (M,) times what the measured (T,) position is off the one
+    predicted, which is the one that is told, and the position correction[M] times that; correction of size 0:
+    a free run.
     """
     moments = np.empty(drive.size)
-    state, shaft = np.zeros(rates.size, dtype=np.complex128), np.zeros(3)
+    n = arm.held.size
+    state, shaft, free = np.zeros(n), np.zeros(3), np.empty(_STEPS + n)
     for k in range(drive.size):
         position[k] = shaft[0]
         if correction.size:
             off = measured[k] - shaft[0]
-            for j in range(rates.size):
+            for j in range(n):
                 state[j] += correction[j] * off
-                shaft[0] += (weights[j] * correction[j]).real * off
-        friction[k], moments[k] = advance(drive[k], state, shaft, moves, rates, chain, weights, dt_s, law)
+            shaft[0] += correction[n] * off
+        friction[k], moments[k] = advance(drive[k], state, shaft, free, arm, dt_s, law)
     for k in range(1, drive.size - 1):
         friction[k] += 0.5 * (moments[k - 1] - moments[k + 1])
 
@@ -188,10 +192,7 @@ def loop_through(
     delay: int,
     input_delay: int,
     lag: float,
-    moves: Any,
-    rates: Any,
-    chain: Any,
-    weights: Any,
+    arm: ArmSteps,
     dt_s: float,
     law_of_friction: Any,
     spring: Any,
@@ -211,8 +212,8 @@ def loop_through(
     a sample after its motion.
     """
     order = law.shape[0] - 1
-    state, x, later = np.zeros(rates.size, dtype=np.complex128), np.zeros(order), np.zeros(order)
-    shaft, last = np.zeros(3), 0.0
+    state, x, later = np.zeros(arm.held.size), np.zeros(order), np.zeros(order)
+    shaft, free, last = np.zeros(3), np.empty(_STEPS + arm.held.size), 0.0
     load, held, applied = np.zeros(4), 0.0, 0.0
     queue, waiting = np.zeros(delay + 1), np.zeros(input_delay + 1)
     for k in range(reference.size):
@@ -240,6 +241,6 @@ def loop_through(
         waiting[k % (input_delay + 1)] = u
         applied += (waiting[(k + 1) % (input_delay + 1)] - applied) / (1 + lag)
         before = shaft[0]
-        advance(applied - held, state, shaft, moves, rates, chain, weights, dt_s, law_of_friction)
+        advance(applied - held, state, shaft, free, arm, dt_s, law_of_friction)
         if spring[5] > 0:
             held = spring[5] * hold_load(load, before, shaft[0], spring, dt_s)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import block_diag, solve_discrete_are
+from scipy.linalg import solve_discrete_are
 from scipy.signal import sosfilt, zpk2sos
 
 from ident.data.arrays import ComplexArray, RealArray
@@ -42,26 +42,16 @@ def correction_of(arm: SteppedArm, coefficients: RealArray, ratio: float) -> Com
     a, b, c = a * (size / size[:, None]), b / size, c * size
     noise = ratio**2 * (np.outer(b, b) + _OWN * np.eye(b.size))
     p = solve_discrete_are(a.T, c[:, None], noise, np.ones((1, 1)))
-    gain = iter((size * (p @ c) / (c @ p @ c + 1)).tolist())
-    found = np.zeros(arm.rates.size, np.complex128)
-    for j in np.flatnonzero(~arm.chain):
-        found[j] = next(gain) if arm.rates[j].imag == 0 else next(gain) + 1j * next(gain)
+    gain, found = size * (p @ c) / (c @ p @ c + 1), np.zeros(arm.rates.size, np.complex128)
+    found[~arm.chain] = gain[: np.sum(~arm.chain)]
+    found[~arm.chain & (arm.rates.imag != 0)] += 1j * gain[np.sum(~arm.chain) :]
     return found
 
 
 def _real_form(arm: SteppedArm, coefficients: RealArray) -> tuple[RealArray, RealArray, RealArray]:
     """A, B, C of the sampled arm with each pole once and real states."""
-    weights, decay = arm.weights @ coefficients, np.exp(arm.rates * arm.dt_s)
-    still = arm.rates == 0
-    onto = np.where(still, arm.dt_s, (decay - 1) / np.where(still, 1, arm.rates))
-    blocks, into, out = list[RealArray](), list[float](), list[float]()
-    for j in np.flatnonzero(~arm.chain):
-        p, b, w = decay[j], onto[j], weights[j]
-        single = arm.rates[j].imag == 0
-        blocks.append(np.array([[p.real]] if single else [[p.real, -p.imag], [p.imag, p.real]]))
-        into += [b.real] if single else [b.real, b.imag]
-        out += [w.real] if single else [w.real, -w.imag]
-    return np.asarray(block_diag(*blocks)), np.array(into), np.array(out)
+    whole, out = arm.over(arm.dt_s)[:-1], arm.parts((arm.weights @ coefficients).conj())
+    return whole[np.ix_(arm.once, np.append(arm.once, False))], whole[arm.once, -1], out[arm.once]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +67,7 @@ class ObserverFilter:
         assert found.correction is not None
         arm = found.arm
         a, _, c = _real_form(arm, found.coefficients)
-        states = [(z, arm.rates[j].imag) for j, z in enumerate(found.correction) if not arm.chain[j]]
-        gain = np.concatenate([[z.real, z.imag] if swings else [z.real] for z, swings in states])
+        gain = arm.parts(found.correction)[arm.once]
         inner = np.linalg.eigvals(a - np.outer(a @ gain, c)).astype(np.complex128)
         zeros = np.linalg.eigvals(a).astype(np.complex128)
         slowest = min(float(np.max(np.abs(inner))), 1 - 1e-9)
