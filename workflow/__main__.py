@@ -22,7 +22,8 @@ def main() -> int:
             sys.stderr.write(f"flexlink: {short}\n")
             return 2
         interrupts.watch(later=True)
-        collect_seldom()
+        # What is imported stays: looking through it for garbage takes a seventh of the imports' time.
+        gc.set_threshold(50_000)
         from workflow.cli import main as command  # half a second, then it knows what continues
 
         code = command()
@@ -50,12 +51,6 @@ _PLAIN = dict(zip("▁▂▃▄▅▆▇█µμ–−·×", "_.-=+*%#uu-- x", st
     "³": "^3",
     "→": "->",
 }
-
-
-def collect_seldom() -> None:
-    """Look for garbage at every 50 000 new objects: what is imported stays, and looking through it takes a
-    seventh of the imports' time."""
-    gc.set_threshold(50_000)
 
 
 # What the libraries alone take of the address space; with less OpenBLAS tries for ever to get its buffers.

@@ -887,10 +887,6 @@ def _interrupted(arguments: Sequence[str], out: Path | None = None) -> int:
     return _complain(f"{interrupts.words()}{hint}", interrupts.exit_code())
 
 
-# Options of development versions that reports of users still type.
-_REPLACED = {"--promise": "--response"}
-
-
 def _help(error: Exception) -> str:
     """What to type for the help of the command that complains."""
     context = getattr(error, "ctx", None)
@@ -900,8 +896,6 @@ def _help(error: Exception) -> str:
 def _explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, (InputError, StageError)):
         return str(error), error.exit_code
-    if replaced := _REPLACED.get(getattr(error, "option_name", "")):
-        return f"No such option: {error.option_name}; it is now {replaced} ({_help(error)})", EXIT_BAD_INPUT  # type: ignore[attr-defined]
     called = getattr(getattr(error, "ctx", None), "info_name", "")
     key = getattr(error, "option_name", "").removeprefix("--").replace("-", "_")
     if called in ("check", "diagnose") and key in resolve_name(SETTINGS["simulator"]).model_fields:

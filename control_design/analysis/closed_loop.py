@@ -21,12 +21,13 @@ from ident.data.shown import Shown
 
 
 class MeasuredMachine(Protocol):
-    """A machine that is measured every dt_s."""
+    """A machine that is measured every dt_s, and holds its commands until then: one, or one of each joint."""
 
     @property
     def dt_s(self) -> float: ...
     def reset(self) -> None: ...
     def measure(self) -> Real: ...
+    def advance(self, u: Any, /) -> None: ...
 
 
 class SampledMachine(MeasuredMachine, Protocol):
@@ -299,14 +300,8 @@ def law_arrays(controller: Controller) -> tuple[Real, Real]:
     return law, np.concatenate([controller.limits("input_limit"), change])
 
 
-class JointsMachine(MeasuredMachine, Protocol):
-    """A machine with several commands and measurements, as `SampledMachine` has one command."""
-
-    def advance(self, u: Real, /) -> None: ...
-
-
 def simulate_joints(
-    controller: Controller, machine: JointsMachine, reference: Real, input_disturbance: Real | None = None
+    controller: Controller, machine: MeasuredMachine, reference: Real, input_disturbance: Real | None = None
 ) -> tuple[Real, Real]:
     """Run u = K (r - y) from rest for references (T, Y): measured outputs (T, Y), applied commands (T, U).
 

@@ -123,7 +123,16 @@ def with_effects(
         inactive |= {prefix + kind.name: _NEEDS_MOTION for kind in unmoved}
     inactive = {name: needs for name, needs in inactive.items() if name not in there}
     equipped = replace(plant, effects=tuple(found), dt_s=dt_s, inactive=inactive)
-    _try(equipped, experiments[0], body)
+    for effect in equipped.effects if body is not None else ():
+        if effect.place is not body:
+            continue
+        candidate = effect.candidates()[0]
+        moderate = candidate.effect_at(np.array(candidate.starts[len(candidate.starts) // 2]))
+        if not np.all(np.isfinite(equipped.simulated([moderate])(experiments[0].input))):
+            raise ValueError(
+                f"plant: {effect.name} cannot be put around this simulation (experiment "
+                f"{experiments[0].name}: its force and the motion do not settle); write its equation into it"
+            )
     smooth = [
         kind.name
         for kind in chosen
@@ -183,17 +192,3 @@ def _motion(plant: Plant, experiment: PlantExperiment, column: int) -> Real:
             f"plant: motion or drive is column {column} of a simulation that returns {simulated.shape}"
         )
     return np.asarray(simulated[:, column])
-
-
-def _try(plant: Plant, experiment: PlantExperiment, body: Place | None) -> None:
-    """Raises ValueError where the simulation does not follow a moderate force on the body."""
-    for effect in plant.effects:
-        if body is None or effect.place is not body:
-            continue
-        candidate = effect.candidates()[0]
-        change = candidate.effect_at(np.array(candidate.starts[len(candidate.starts) // 2]))
-        if not np.all(np.isfinite(plant.simulated([change])(experiment.input))):
-            raise ValueError(
-                f"plant: {effect.name} cannot be put around this simulation (experiment {experiment.name}: "
-                "its force and the motion do not settle); write its equation into it"
-            )

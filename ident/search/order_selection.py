@@ -20,8 +20,6 @@ Progress = Callable[[float, str], None]
 
 # Exchanges of a pole for another at most.
 _EXCHANGES = 4
-# Optima of equal order whose -2 log likelihoods differ by less fit equally well: friction decides.
-_LIKELIER = 2.0
 # Damping ratio above which a pair does what real poles do, and how far apart two of them begin.
 _NO_OVERSHOOT, _APART = 0.9, 1.5
 # Poles have met if they differ by less than this share of their distance from one.
@@ -165,13 +163,11 @@ class OrderSelection:
         return best
 
     def _split(self, smaller: Refined, best: Refined) -> Refined:
-        """`best`, or the smaller model with one pair as two where that is clearly likelier and `best` leaves
-        something to explain."""
+        """`best`, or the smaller model with one pair as two where that leaves less and `best` something to
+        explain."""
         if self.options.n_pairs is None or self.search.is_trusted(best):
             return best
-        found = self.search.split_pair(smaller.poles)
-        samples = self.search.colour(best).effective_samples
-        return self._noted(found) if samples * np.log(best.rss / found.rss) > _LIKELIER else best
+        return min(best, self._noted(self.search.split_pair(smaller.poles)), key=lambda end: end.rss)
 
     def pruned(self, best: Refined) -> Refined:
         """Take out poles whose loss the criterion does not mind, the least needed first."""

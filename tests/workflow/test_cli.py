@@ -139,10 +139,6 @@ def test_unwritable_output_is_refused_before_the_work(refused, tmp_path):
     assert "cannot write" in refused("simulate", "--config", FAST_ARM, "--out", tmp_path / "file" / "x")
 
 
-def test_an_option_of_another_name_is_said_to_be_replaced(refused):
-    assert "it is now --response" in refused("identify", "log.csv", "--promise", "without friction")
-
-
 def test_run_prints_a_table_and_the_page(flexlink, fast_run):
     always = "bandwidth|modulus|overshoot|settling time|peak command|margins|predicted|certified|report."
     more = "Hz, damping|fit, validation|95 % radius|γ|margins, worst case|rise time"

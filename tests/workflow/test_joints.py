@@ -17,10 +17,9 @@ from plant import multisine, multisine_lines, two_link_arm
 from tests.workflow.command import FAST_ARM
 from workflow.cli import main
 from workflow.config.joints_config import load_any
-from workflow.engine import codec
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.joints import _judged
-from workflow.tasks.results import DesignResult, RunResults
+from workflow.tasks.results import RunResults
 from workflow.tasks.simulated_rig import machine_at
 
 _JOINTS = """
@@ -128,13 +127,6 @@ def test_the_ball_holds_the_response_of_small_motions(run_of_the_arm):
     poles = np.linalg.eigvals(a)
     light = np.sort(np.abs(poles[(poles.imag > 0) & (-poles.real < 0.3 * np.abs(poles))]))
     np.testing.assert_allclose(modes, light, rtol=0.01)
-
-
-def test_a_design_that_an_earlier_version_stored_is_read(run_of_the_arm):
-    design = RunResults(RunDirectory(run_of_the_arm)).design
-    document, arrays = codec.pack(design)
-    earlier = {"$type": "JointsDesignResult", "found": document["synthesis"], "reason": design.reason}
-    assert codec.plain(codec.unpack(DesignResult, earlier, arrays)) == codec.plain(design)
 
 
 def test_a_report_and_a_resumed_run_say_the_same(run_of_the_arm, capsys):

@@ -221,7 +221,6 @@ def _unpack(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: str) -
 
 def _unpack_dataclass(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: str) -> Any:
     _expect(isinstance(document, dict), document, at, f"an object with the fields of {kind.__name__}")
-    document = getattr(kind, "of_earlier", dict)(document)  # as a version before named it
     fields = stored_fields(kind)
     strange = sorted(set(document) - set(fields) - {_TYPE})
     # A field that earlier versions did not have comes back as its default.

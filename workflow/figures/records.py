@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ident.data.record import Record
@@ -55,7 +54,22 @@ def draw_records(shown: Sequence[RunRecord], inputs: Sequence[str], outputs: Seq
         right.margins(x=0)
         left.set_ylabel(style.two_lines(name, unit))
         left.set_xlim(0, starts[-1])
-    _name_records(grid[0, 0], shown, starts)
+    # Numbers above the records where names would run into each other.
+    for number, (item, start) in enumerate(zip(shown, starts, strict=False), 1):
+        width = item.duration_s / starts[-1]
+        label = style.plain(item.name, 40)
+        # About 0.0125 of the axis per letter at this size; a table beside the picture has number and name.
+        text = f"{number} {label}" if len(label) + 3 < width / 0.0125 else str(number)
+        if len(text) > 2 or width > 0.012:
+            grid[0, 0].annotate(
+                text,
+                (start, 1.0),
+                xycoords=("data", "axes fraction"),
+                xytext=(1, 3),
+                textcoords="offset points",
+                fontsize=8.5,
+                color="#444444",
+            )
     grid[0, 0].set_title("Records, one after another", pad=16)
     grid[0, 1].set_title("Close-up of record 1", pad=16)
     grid[-1, 0].set_xlabel("time, all records [s]")
@@ -70,25 +84,6 @@ def _signal(record: Record, kind: str, name: str) -> tuple[Real, str]:
         raise ValueError(f"{record.label}: no {kind} column {name!r}; there is {list(names)}")
     column, units = names.index(name), getattr(record, f"{kind}_units")
     return np.asarray(getattr(record, kind)[:, column]), units[column] if units else ""
-
-
-def _name_records(axes: Axes, shown: Sequence[RunRecord], starts: Real) -> None:
-    """Numbers above the records when names would run into each other."""
-    for number, (item, start) in enumerate(zip(shown, starts, strict=False), 1):
-        width = item.duration_s / starts[-1]
-        name = style.plain(item.name, 40)
-        # About 0.0125 of the axis per letter at this size; a table beside the picture has number and name.
-        text = f"{number} {name}" if len(name) + 3 < width / 0.0125 else str(number)
-        if len(text) > 2 or width > 0.012:
-            axes.annotate(
-                text,
-                (start, 1.0),
-                xycoords=("data", "axes fraction"),
-                xytext=(1, 3),
-                textcoords="offset points",
-                fontsize=8.5,
-                color="#444444",
-            )
 
 
 # Panels of one figure; a log of more signals is looked at in parts.

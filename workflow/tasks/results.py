@@ -6,7 +6,6 @@ closed loop (R, T); responses (F,) over frequencies.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Generic, Literal, TypeVar
@@ -337,15 +336,6 @@ class DesignResult:
     reason: str
     jointly: str | None = None
     specification: Specification | None = field(default=None, metadata={"since": 2})
-
-    @staticmethod
-    def of_earlier(document: Mapping[str, Any]) -> Mapping[str, Any]:
-        """What several joints had as a type of their own."""
-        if document.get("$type") != "JointsDesignResult":
-            return document
-        found = document["found"]
-        met = found is not None and found["outcome"] == Outcome.MET_ON_GRID.name
-        return {"synthesis": found, "met": met, "reason": document["reason"], "jointly": None}
 
     @property
     def gamma(self) -> float | None:
