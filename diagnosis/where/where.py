@@ -76,7 +76,9 @@ def where(
 
 def where_in_records(case: CaseOfMachine, residuals: Mapping[str, Real], dt_s: float) -> Where:
     """Of any machine: by sensor, experiment, frequency, and by what its outputs and inputs do (direction,
-    size, rate, time in the record); arguments as of `where`."""
+    size, rate, time in the record); arguments as of `where`. Raises ValueError without a sampling period."""
+    if not dt_s > 0:
+        raise ValueError(f"case {case.name}: state the plant's sampling period (Plant(dt_s=...)) for a page")
     names, rng = case.machine.output_names, np.random.default_rng(0)
     axes = [axes_of_output(case, residuals, dt_s, k) for k in range(len(names))]
     if case.machine.weighing.model_error > 0:

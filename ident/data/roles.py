@@ -182,7 +182,14 @@ def _ask(
         "time": found["time"] or next(iter(times), None),
     }
     options["dt-s"] = None if options["time"] else "SECONDS"
-    raise ValueError(f"{table.path}: which columns? It has {listed}; type: {typed} {_typed(options)}")
+    several = {"input": inputs, "output": outputs}
+    which = [
+        f"which is the {role}" + (", " if names else "") + shown(" or ".join(shown(n, 20) for n in names), 60)
+        for role, names in several.items()
+        if not found[role]
+    ]
+    asked = " and ".join(which) or "which are input and output"
+    raise ValueError(f"{table.path}: {asked}? It has {listed}; type: {typed} {_typed(options)}")
 
 
 def _typed(options: Mapping[str, str | None]) -> str:

@@ -24,8 +24,8 @@ def test_what_is_stated_decides():
     with pytest.raises(ValueError) as caught:
         roles_of(three, "'my log.csv'")
     assert str(caught.value) == (
-        "a.csv: which columns? It has t_s, u_V, hub_rad, tip_m; type: flexlink identify 'my log.csv' "
-        "--input u_V --output hub_rad --time t_s"
+        "a.csv: which is the output, hub_rad or tip_m? It has t_s, u_V, hub_rad, tip_m; type: flexlink "
+        "identify 'my log.csv' --input u_V --output hub_rad --time t_s"
     )
 
 

@@ -72,7 +72,7 @@ def test_table_and_page(log, flexlink, tmp_path, faults_seen):
         ("preamble", "semicolons, decimal comma, names in line 5, numbers from line 6"),
         ("128 Hz rounded to milliseconds", "rounded to their last digit"),
         ("commas", "read in seconds; no jitter; no row missing"),
-        ("no names", "which columns? It has column 1"),
+        ("no names", "which is the input and which is the output? It has column 1"),
         ("words in another column", "note"),
     ],
 )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from workflow.diagnose.following import following
-from workflow.diagnose.pages import plant_page
+from workflow.diagnose.pages import plant_page, remains_of
 
 GUIDE = Path(__file__).resolve().parents[2] / "docs" / "own_plant.md"
 DT_S, SAMPLES = 0.01, 500
@@ -53,6 +53,9 @@ def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path, faults_seen):
     assert f"a delay of the command (over 99.9 %, {found.repair[0].values['delay_s']:.3g} s)" in words.lower()
     assert f"{found.rig.parameters['time_constant_s']:.5g} s" in words
     assert "less noise than specified" not in words
+    unsampled = replace(found, case=replace(found.case, plant=replace(found.case.plant, dt_s=np.nan)))
+    with pytest.raises(ValueError, match=r"state the plant's sampling period \(Plant\(dt_s=...\)\)"):
+        remains_of(unsampled)
     quiet = replace(found, noise_below_stated=(("speed_rad_s", 0.05, 0.5),))
     page = " ".join(re.sub(r"<[^>]+>", " ", plant_page(quiet, following(quiet))).split())
     assert page.count("the noise they show is used: speed 0.05 rad/s (specified: 0.5 rad/s).") == 1

@@ -52,7 +52,7 @@ def draw_simulation(results: PaperResults) -> Figure:
     curves: Curves = {
         "simulated plant": (shown.truth, TRUTH_LINE),
         "GOBF, DIRECT alone in (x, beta, gamma)": (results.recipe.frequency_response(omega), RECIPE_LINE),
-        "GOBF, this project": (ours, METHOD_LINES["GOBF"]),
+        "GOBF, poles by flexlink": (ours, METHOD_LINES["GOBF"]),
     }
     return _bode(shown, curves, "Simulation: plant and GOBF model of order 4")
 

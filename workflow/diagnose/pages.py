@@ -52,11 +52,9 @@ def plant_page(
     beside the page. places: where the error
     lies and what remains lies, where these are known.
 
-    Raises ValueError if the plant does not state its sampling period.
+    Raises ValueError if the plant does not state its sampling period (`where_in_records`).
     """
     dt_s = found.case.dt_s
-    if not dt_s > 0:
-        raise ValueError(f"case {found.case.name}: state the plant's sampling period (dt_s) for a page")
     numbers = {
         "parameters": dict(found.rig.parameters),
         "effects": [change.to_dict() for change in found.repair],
