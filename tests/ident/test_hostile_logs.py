@@ -55,8 +55,7 @@ def damaged(name, folder, count) -> Tally:
 
 
 # That whole ones are read says test_forty_logs.py. Those that a child reads are fewer, a third of a second
-# each. With 93 % 15 of a kind show what one in six
-# does, and the 135 of all kinds what one in fifty does; benchmarks/damaged_files.py reads 100 of each.
+# each. With 93 % 15 of a kind show what one in six does, and the 135 of all kinds what one in fifty does.
 @pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", IN_PROCESS + IN_A_CHILD)
 def test_damaged_bytes(name, many, tmp_path):

@@ -65,7 +65,7 @@ def damaged(name, folder, count) -> Tally:
     return tally(attempt, count, 15)
 
 
-# A process of its own reads a .mat; benchmarks/damaged_files.py has 600 read.
+# A process of its own reads a .mat.
 @pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", WHOLE)
 def test_damaged_bytes(name, many, tmp_path):

@@ -188,7 +188,6 @@ def refusal(arguments: list[str], folder: Path) -> str | None:
 
 
 # A fault that one damage in forty (of a directory: in twenty) shows is found by all of a kind with 95 %.
-# benchmarks/damaged_files.py goes on with these seeds, to one in 150 and one in a hundred.
 @pytest.fixture
 def few(pytestconfig: pytest.Config) -> bool:
     """`make test`, which leaves out what is slow, tries the first of all."""
@@ -394,7 +393,6 @@ def test_tampered_studies_and_diagnoses(replayed, tmp_path, monkeypatch, few):
 @pytest.mark.parametrize("damage", DAMAGE)
 @pytest.mark.usefixtures("cut_off")
 def test_damaged_logs(tmp_path, damage):
-    """420 of each in benchmarks/damaged_files.py."""
     assert damaged_logs(damage, tmp_path, 5, binary=0.2).wrong == []
 
 
