@@ -178,10 +178,19 @@ run_pipeline(load_config(Path(sys.argv[1]))[0], Path(sys.argv[2]), progress=Kill
 """
 
 
+# They name times and processes.
+_DIFFERS = ("manifest.json", "timings.json", "lock")
+
+
+def _contents(folder: Path) -> dict[str, bytes]:
+    """All files but those that name times."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in _DIFFERS)
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
 def resumed() -> Answer:
     """A run that is killed half-way and taken up again: which of its files have other bytes than those of a
     run that was left alone."""
-    from benchmarks.interruptions import contents
     from tests.workflow.command import FAST_ARM
     from workflow.config.run_config import load_config
     from workflow.tasks.pipeline import run_pipeline
@@ -193,7 +202,7 @@ def resumed() -> Answer:
         kept("said", killed=subprocess.run(call, cwd=ROOT, check=False).returncode)
         kept("said", stages_before=sorted(path.name for path in (folder / "stopped" / "stages").iterdir()))
         run_pipeline(config, folder / "stopped", resume=True)
-        whole, taken_up = contents(folder / "whole"), contents(folder / "stopped")
+        whole, taken_up = _contents(folder / "whole"), _contents(folder / "stopped")
     names = sorted(whole.keys() | taken_up.keys())
     kept("said", files=names, other=[name for name in names if whole.get(name) != taken_up.get(name)])
     return kept.answer
@@ -307,8 +316,8 @@ def planned() -> Answer:
 
 
 def identified(**options: Any) -> Answer:
-    """Weak records of the default arm with dry friction, as in `identify_with_friction`."""
-    from benchmarks.identify_with_friction import weak_records
+    """Weak records of the default arm with dry friction, as in `readme_identify`."""
+    from benchmarks.readme_identify import weak_records
     from ident import IdentOptions
     from workflow.config.run_config import SimulatedSource, built_in_config
     from workflow.tasks.log_identification import identify_records
