@@ -4,9 +4,6 @@ A mutant changes one operator, sign, constant or returned value inside a functio
 the checkout, never into the checkout itself; the tests of its room run there up to the first failure, and
 `frozen_answers`, up to the first answer that moved, where they all pass. A test that fails without the
 mutant too is left out. `--list` prints the mutants only.
-
-`--tests-of CHECKOUT` looks for the same statements in another checkout and asks its tests instead; a
-statement that is not there, or there several times, is told.
 """
 
 from __future__ import annotations
@@ -71,14 +68,13 @@ _BRACKETED: Mapping[type[ast.AST], tuple[str, str]] = {
 @dataclass(frozen=True)
 class Mutant:
     """file: below the checkout; function: with its classes; statement: its bytes, the innermost one around
-    the change; number: which one of equal statements of the function; at: of the change in the statement."""
+    the change; at: of the change in the file."""
 
     room: str
     file: str
     line: int
     function: str
     statement: bytes
-    number: int
     at: int
     before: bytes
     after: bytes
@@ -102,7 +98,6 @@ class _Finder(ast.NodeVisitor):
         for line in source.splitlines(keepends=True):
             self._starts.append(self._starts[-1] + len(line))
         self._functions, self._in_function, self._statement = list[str](), False, (0, 0)
-        self._equal: dict[tuple[str, bytes], list[int]] = {}
         self.visit(ast.parse(source))
 
     def span(self, node: ast.AST) -> tuple[int, int]:
@@ -121,8 +116,6 @@ class _Finder(ast.NodeVisitor):
             first, last = self.span(node)
             body = getattr(node, "body", None)  # of a compound statement its head
             self._statement = first, self.span(body[0])[0] if body else last
-            key = ".".join(self._functions), self.source[slice(*self._statement)]
-            self._equal.setdefault(key, []).append(self._statement[0])
         if self._in_function:
             self._at(node)
         for name, value in ast.iter_fields(node):
@@ -187,21 +180,9 @@ class _Finder(ast.NodeVisitor):
         self._add(first, self.source[first:last], after)
 
     def _add(self, at: int, before: bytes, after: str) -> None:
-        first, last = self._statement
-        function, statement = ".".join(self._functions), self.source[first:last]
-        number = self._equal[function, statement].index(first)
+        function, statement = ".".join(self._functions), self.source[slice(*self._statement)]
         line = self.source.count(b"\n", 0, at) + 1
-        self.found.append(
-            Mutant(
-                self.room, self.file, line, function, statement, number, at - first, before, after.encode()
-            )
-        )
-
-    def places(self, function: str, statement: bytes) -> list[int]:
-        """Where this statement begins in the function, or in any one if that is not there."""
-        if found := self._equal.get((function, statement), []):
-            return found
-        return [at for (_, text), places in self._equal.items() if text == statement for at in places]
+        self.found.append(Mutant(self.room, self.file, line, function, statement, at, before, after.encode()))
 
 
 def _is_text(node: ast.AST) -> bool:
@@ -245,28 +226,10 @@ def drawn(root: Path, seed: int, per_room: int, rooms: Sequence[str] = tuple(ROO
 
 
 def changed(mutant: Mutant, source: bytes) -> bytes:
-    """The source text with the mutant in it. Raises ValueError where its statement is not there once."""
-    places = _Finder(mutant.room, mutant.file, source).places(mutant.function, mutant.statement)
-    if len(places) > 1:
-        places = places[mutant.number : mutant.number + 1]
-    if len(places) != 1:
-        raise ValueError(f"{mutant.file}: no such statement")
-    first = places[0] + mutant.at
-    last = first + len(mutant.before)
-    assert source[first:last] == mutant.before
-    return source[:first] + mutant.after + source[last:]
-
-
-def placed(mutant: Mutant, root: Path) -> tuple[Path, bytes]:
-    """File of another checkout and its text with the mutant: the same file, or the only one of the product
-    that holds the statement. Raises ValueError."""
-    files = [root / mutant.file]
-    if not (files[0].is_file() and mutant.statement in files[0].read_bytes()):
-        every = (path for room in ROOMS if "/" not in room for path in (root / room).rglob("*.py"))
-        files = [path for path in every if mutant.statement in path.read_bytes()]
-    if len(files) != 1:
-        raise ValueError(f"its statement is in {len(files)} files of {root}")
-    return files[0], changed(mutant, files[0].read_bytes())
+    """The source text with the mutant in it."""
+    last = mutant.at + len(mutant.before)
+    assert source[mutant.at : last] == mutant.before
+    return source[: mutant.at] + mutant.after + source[last:]
 
 
 class Copy:
@@ -286,10 +249,11 @@ class Copy:
 
     @contextlib.contextmanager
     def holding(self, mutant: Mutant) -> Iterator[Path]:
-        """The copy while the mutant is in it. Raises ValueError where it cannot be placed."""
+        """The copy while the mutant is in it."""
         if left := self.left_behind():
             raise RuntimeError(f"left behind by an earlier mutant: {', '.join(left)}")
-        file, text = placed(mutant, self.path)
+        file = self.path / mutant.file
+        text = changed(mutant, file.read_bytes())
         compiled = b"njit" in text
         try:
             _forget(file)
@@ -355,7 +319,7 @@ class Judge:
         self.copy, self.slow, self.cpu_s, self.fail_anyway = copy, slow, 0.0, set[str]()
 
     def verdict(self, mutant: Mutant, *, frozen: bool) -> str:
-        """Who saw it. Raises ValueError where it cannot be placed, RuntimeError where tests cannot be run."""
+        """Who saw it. Raises RuntimeError where tests cannot be run."""
         while True:
             with self.copy.holding(mutant) as root:
                 failed = self._failed(root, ROOMS[mutant.room])
@@ -400,16 +364,10 @@ def run(
     per_room: int = 2,
     rooms: tuple[str, ...] = tuple(ROOMS),
     list_only: bool = False,
-    tests_of: str = "",
     slow: bool = False,
     frozen: bool = True,
 ) -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # or the copies would stay in /tmp
-    if tests_of and not Path(tests_of, "tests").is_dir():
-        print(
-            f"--tests-of {tests_of}: no tests/ there; expected a checkout of this repository", file=sys.stderr
-        )
-        sys.exit(2)
     mutants = drawn(ROOT, seed, per_room, rooms)
     if list_only:
         for mutant in mutants:
@@ -417,13 +375,10 @@ def run(
         return
     seen = 0
     with tempfile.TemporaryDirectory(prefix="flexlink-mutants-") as folder:
-        judge = Judge(Copy(Path(tests_of).resolve() if tests_of else ROOT, Path(folder)), slow=slow)
+        judge = Judge(Copy(ROOT, Path(folder)), slow=slow)
         for mutant in mutants:
             judge.cpu_s = 0.0
-            try:
-                verdict = judge.verdict(mutant, frozen=frozen)
-            except ValueError as error:
-                verdict = f"cannot be placed: {error}"
+            verdict = judge.verdict(mutant, frozen=frozen)
             seen += "killed by" in verdict
             out(f"{mutant.room:18s} {mutant}\n    {verdict}; {judge.cpu_s:.0f} s CPU")
         if judge.fail_anyway:
