@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from benchmarks.identify_with_friction import weak_records
+from benchmarks.readme_identify import weak_records
 from ident import IdentOptions, identify
 from ident.basis.poles import Poles
 from ident.checks.plausible_modes import PairKind, implausible_pairs, kind_of_pair, pairs_outside
