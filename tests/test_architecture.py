@@ -3,6 +3,8 @@
 import ast
 import subprocess
 import sys
+import tomllib
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -32,6 +34,16 @@ def test_no_file_is_read_as_pickle_and_every_package_has_tests(package):
     for path in (ROOT / package).rglob("*.py"):
         assert "allow_pickle=True" not in path.read_text(encoding="utf-8"), path
     assert list((ROOT / "tests" / package).rglob("test_*.py")), f"tests/{package} has no tests"
+
+
+def test_the_wheel_has_every_file_that_a_package_reads():
+    stated = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]["package-data"]
+    for package in (*PACKAGES, "flexlink"):
+        patterns = stated["*"] + stated.get(package, [])
+        for path in (ROOT / package).rglob("*.*"):
+            name, ours = path.relative_to(ROOT / package).as_posix(), "__pycache__" not in path.parts
+            there = path.suffix == ".py" or any(fnmatch(name, pattern) for pattern in patterns)
+            assert there or not ours, f"{package}/{name} is in no wheel"
 
 
 _OF_NUMBERS = (ast.BinOp, ast.UnaryOp, ast.operator, ast.unaryop, ast.Attribute, ast.Name, ast.expr_context)

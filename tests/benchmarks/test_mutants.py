@@ -37,27 +37,13 @@ def nothing():
 '''
 
 
-def change(mutant):
-    return mutant.before.decode(), mutant.after.decode()
-
-
 def test_every_operator_sign_constant_and_return_inside_functions_and_nothing_else():
-    assert sorted(map(change, mutants_of("plant", "plant/a.py", SOURCE))) == sorted(
-        [
-            (">", "<"),
-            ("0.5", "1.0"),
-            ("-", "+"),
-            ("-", "+"),
-            ("+=", "-="),
-            ("11", "12"),
-            ("(1.5 if a else a) ** 2", "((1.5 if a else a) * 2)"),
-            ("1.5", "3.0"),
-            ("2", "3"),
-            ("b and True", "(b or True)"),
-            ("True", "False"),
-            ("c", "None"),
-        ]
-    )
+    found = mutants_of("plant", "plant/a.py", SOURCE)
+    assert sorted((one.before.decode(), one.after.decode()) for one in found) == sorted(
+        [(">", "<"), ("0.5", "1.0"), ("-", "+"), ("-", "+"), ("+=", "-="), ("11", "12"), ("1.5", "3.0"),
+         ("(1.5 if a else a) ** 2", "((1.5 if a else a) * 2)"), ("2", "3"), ("b and True", "(b or True)"),
+         ("True", "False"), ("c", "None")]
+    )  # fmt: skip
 
 
 CODE = """def area(width, height):
@@ -111,12 +97,9 @@ def test_what_tests_see_and_what_survives_and_the_checkout_stays_as_it_is(checko
     before = texts(checkout)
     copy = Copy(checkout, tmp_path / "copies")
     judge = Judge(copy, slow=False)
-    assert judge.verdict(by_function(checkout, "area"), frozen=False) == (
-        "killed by tests/plant/test_shape.py::test_area"
-    )
-    assert judge.verdict(by_function(checkout, "twice"), frozen=True) == (
-        "survived the tests; no frozen answers are stored"
-    )
+    seen, not_seen = (judge.verdict(by_function(checkout, each), frozen=True) for each in ("area", "twice"))
+    assert seen == "killed by tests/plant/test_shape.py::test_area"
+    assert not_seen == "survived the tests; no frozen answers are stored"
     assert judge.fail_anyway == {"tests/plant/test_shape.py::test_fails_anyway"}
     assert judge.cpu_s > 0
     assert texts(checkout) == before
@@ -126,7 +109,6 @@ def test_what_tests_see_and_what_survives_and_the_checkout_stays_as_it_is(checko
 
 def test_tests_that_cannot_be_run_are_said_instead_of_run_for_ever(checkout, tmp_path):
     (checkout / "tests/plant/test_shape.py").write_text("import nowhere\n")
+    judge = Judge(Copy(checkout, tmp_path / "copies"), slow=False)
     with pytest.raises(RuntimeError, match="cannot be run without a mutant either: tests/plant/test_shape"):
-        Judge(Copy(checkout, tmp_path / "copies"), slow=False).verdict(
-            by_function(checkout, "area"), frozen=False
-        )
+        judge.verdict(by_function(checkout, "area"), frozen=False)
