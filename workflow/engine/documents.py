@@ -18,8 +18,8 @@ MOST_TOML_BYTES = 2**20  # far above what a person writes
 LARGEST_INTEGER = 2**63 - 1  # what numpy holds
 # The parser's time grows with the square of a dotted key's length.
 _LONGEST_TOML_LINE = 20_000
-# Endings that no configuration has.
-_LOGS = (".csv", ".tsv", ".npz", ".mat", ".xlsx", ".parquet", ".h5", ".hdf5", ".mcap", ".bag")
+# Endings of logs that a configuration or a document may have as well.
+_ANY_TEXT = (".txt", ".dat", ".json")
 
 
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
@@ -43,12 +43,17 @@ def at_once(path: str, flags: int) -> int:
 
 def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
     """Text and content of a TOML file. Raises InputError naming the file, for syntax with line and column."""
-    if path.name.lower().removesuffix(".gz").endswith(_LOGS) and path.is_file():
-        command = f"flexlink init {shlex.quote(str(path))} --out my.toml"
-        raise InputError(f"{path}: a log, not a TOML file; write one: {command}")
+    if (ending := Path(path.name.lower().removesuffix(".gz")).suffix) not in (
+        ".toml",
+        *_ANY_TEXT,
+    ) and path.is_file():
+        from ident.data.record_files import READERS  # numpy, which a configuration can do without
+
+        if ending in READERS:
+            command = f"flexlink init {shlex.quote(str(path))} --out my.toml"
+            raise InputError(f"{path}: a log, not a TOML file; write one: {command}")
     text = read_text(path, MOST_TOML_BYTES)
-    longest = max(map(len, text.splitlines()), default=0)
-    if longest > _LONGEST_TOML_LINE:
+    if (longest := max(map(len, text.splitlines()), default=0)) > _LONGEST_TOML_LINE:
         raise InputError(f"{path}: a line of {longest} characters, at most {_LONGEST_TOML_LINE} are read")
     return text, _parsed(tomllib.loads, text, path, "TOML")
 
