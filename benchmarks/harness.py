@@ -1,4 +1,4 @@
-"""What every benchmark shares: options, repetition, times taken in turns, and the results file.
+"""What every benchmark shares: options, CPU times, and the results file.
 
 A benchmark is a module with a function `run(out, *, option=default, ...)` that tells its numbers line by line
 with `out(line)`, and ends with `main(run)`:

@@ -343,6 +343,13 @@ def test_friction_behind_a_play_that_a_known_motion_takes():
     np.testing.assert_allclose(taken, [0.0, 0.0, 2.0, 0.0, 0.0, -2.0])
 
 
+def test_every_listed_force_is_felt_in_a_known_motion():
+    x = 3 * np.sin(DT_S * np.arange(300))
+    for kind in (kind for kind in KINDS.values() if kind.law.where == "body"):
+        forces = BodyForces(**kind.law.forces({one.name: one.high for one in kind.parameters}))
+        assert np.any(forces.overcome(x, np.gradient(x), np.ones_like(x))), kind.name
+
+
 def test_forces_that_a_known_motion_takes():
     x, v, rest = np.array([0.3, -0.2, 0.1]), np.array([2.0, -1.0, 0.5]), np.array([4.0, -3.0, -2.0])
     forces = BodyForces(asymmetry=0.3, drag=0.2)
