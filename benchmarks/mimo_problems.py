@@ -2,7 +2,6 @@
 
 T: two joints with one flexible mode per link and a ball of uncertainty around the response, time in seconds.
 D: the distillation column of Skogestad and Postlethwaite, time in minutes. Negative feedback, u = -K y.
-`python -m benchmarks.mimo_problems` prints the judges' values of the reference controllers.
 """
 
 from __future__ import annotations
@@ -278,12 +277,3 @@ def judge_d(k: Response) -> float:
 def inverse_d(s: Array) -> Array:
     """The check controller of D: .7/s G^-1, its pole at 1e-5."""
     return (0.7 * (75 * s + 1) / (s + 1e-5))[:, None, None] * np.linalg.inv(GAIN_D)
-
-
-if __name__ == "__main__":
-    at = np.array([2j / TS * np.tan(10 * TS / 2)])
-    print("G0(10)", nominal_t(at)[0].round(6).tolist())
-    print("P(10)", (herm(factor_t(at)) @ factor_t(at))[0].tolist())
-    print("reference", judge_t(*reference_t()))
-    print("order 6", judge_t(*order_six_t()))
-    print("D, .7/s G^-1", judge_d(inverse_d))

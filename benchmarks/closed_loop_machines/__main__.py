@@ -30,12 +30,11 @@ def run(
     kinds: str = ",".join(KINDS),
     series: int = 1,
     jobs: int = 2,
-    bla: int = 16,
     keep: str = "",
     judge_only: bool = False,
     make_only: str = "",
 ) -> None:
-    """A line per machine and the table by kind. bla: realisations, 0 for none; keep: where logs, runs and
+    """A line per machine and the table by kind. keep: where logs, runs and
     judged.json stay, to be judged again with judge_only."""
     first, last = map(int, seeds.split(":"))
     cases = [(kind, seed) for kind in kinds.split(",") for seed in range(first, last)]
@@ -45,7 +44,7 @@ def run(
         return
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as scratch, ProcessPoolExecutor(jobs) as pool:
-        one = partial(_one, series=series, folder=Path(keep or scratch), bla=bla, judge_only=judge_only)
+        one = partial(_one, series=series, folder=Path(keep or scratch), judge_only=judge_only)
         found = []
         for row in pool.map(one, cases):
             out(_line(row))
@@ -72,7 +71,7 @@ def _line(row: dict[str, Any]) -> str:
             parts.append(f"{key.replace('_', ' ')} {row[key] * unit:+.2f} %")
     if "damping" in row:
         parts.append(f"damping {row['damping']:.4f} ({row['damping_true']:.4f})")
-    parts += [f"{key} {row[key]:.0%}" for key in ("ellipses", "ellipses_bla") if row.get(key) is not None]
+    parts += [f"ellipses {row['ellipses']:.0%}"] if row.get("ellipses") is not None else []
     return ", ".join(parts) + ("" if row["certified"] else f"; {row['line']}")
 
 

@@ -18,9 +18,7 @@ Violates: the loop with the true friction-free response is unstable, or its modu
 delay margin or bandwidth is more than 1 % worse than the worst case that the certificate states.
 
 Ellipses: share of frequencies of the run's grid, and per half-decade, at which the 95 % ellipse holds the
-true friction-free response, where the recorded command has more than 1e-3 of its largest power density. With
-`bla` realisations also the response at the recorded amplitude, E[Y R*] / E[U R*], by simulation; what these
-leave open is added to the covariance.
+true friction-free response, where the recorded command has more than 1e-3 of its largest power density.
 """
 
 from __future__ import annotations
@@ -46,7 +44,7 @@ _RADIUS_2 = -2 * np.log(0.05)  # chi-square of two degrees of freedom, 95 %
 _STEP = re.compile(r"flexlink \w+|--[a-z]|[a-z]+_[a-z_]+ = |integrators? = |\[\w+\]")
 
 
-def judged(one: Machine, folder: Path, bla: int = 0, judge_only: bool = False) -> dict[str, Any]:
+def judged(one: Machine, folder: Path, judge_only: bool = False) -> dict[str, Any]:
     """Everything the table needs, also written to FOLDER/NAME/judged.json. judge_only: runs are there."""
     work = folder / one.name
     run, told = work / "run", work / "told.json"
@@ -64,7 +62,7 @@ def judged(one: Machine, folder: Path, bla: int = 0, judge_only: bool = False) -
         told.write_text(json.dumps(row, indent=1) + "\n")
     found = json.loads(told.read_text())
     truth = json.loads((folder / "truth" / f"{one.name}.json").read_text())
-    found |= _model(one, truth, run, bla)
+    found |= _model(one, truth, run)
     if found["certified"]:
         found |= controller_on_machine(one, truth, run)
     (work / "judged.json").write_text(json.dumps(found, indent=1, default=float) + "\n")
@@ -170,7 +168,7 @@ def settles(
     )
 
 
-def _model(one: Machine, truth: dict[str, Any], run: Path, bla: int) -> dict[str, Any]:
+def _model(one: Machine, truth: dict[str, Any], run: Path) -> dict[str, Any]:
     """Mode, friction, unstable pole and ellipses of the stages that are there, against the truth."""
     from workflow.engine.run_directory import RunDirectory
     from workflow.tasks.results import RunResults
@@ -205,22 +203,18 @@ def _model(one: Machine, truth: dict[str, Any], run: Path, bla: int) -> dict[str
     ellipses = spread.posterior.at(omega, spread.level)
     a, b, c = (np.array(truth[k]) for k in "ABC")
     excited = _excited(one, omega)
-    inside = _holds(ellipses, response(a, b, c, omega, one.plant.dt_s), 0.0)
+    inside = _holds(ellipses, response(a, b, c, omega, one.plant.dt_s))
     found["ellipses"] = float(np.mean(inside[excited])) if np.any(excited) else None
     band = np.floor(2 * np.log10(omega)).astype(int)
     shares = {k: float(np.mean(inside[excited & (band == k)])) for k in np.unique(band[excited])}
     found["by_half_decade"] = {f"{10 ** (k / 2):.3g} rad/s": share for k, share in shares.items()}
-    if bla:
-        centre, variance = _amplitude_response(one, omega, bla)
-        found["ellipses_bla"] = float(np.mean(_holds(spread.frequency, centre, variance)[excited]))
     return found
 
 
-def _holds(ellipses: Any, g: Array, variance: Array | float) -> Array:
-    """Whether the 95 % ellipse (of response plus a further variance per part) holds g, (F,)."""
+def _holds(ellipses: Any, g: Array) -> Array:
+    """Whether the 95 % ellipse holds g, (F,)."""
     apart = np.stack([(g - ellipses.centre).real, (g - ellipses.centre).imag], axis=1)
-    covariance = ellipses.covariance + np.asarray(variance).reshape(-1, 1, 1) * np.eye(2)
-    return np.einsum("fi,fij,fj->f", apart, np.linalg.pinv(covariance), apart) <= _RADIUS_2
+    return np.einsum("fi,fij,fj->f", apart, np.linalg.pinv(ellipses.covariance), apart) <= _RADIUS_2
 
 
 def _excited(one: Machine, omega: Array) -> Array:
@@ -232,33 +226,3 @@ def _excited(one: Machine, omega: Array) -> Array:
         f, own = scipy.signal.welch(u, 1 / one.plant.dt_s, nperseg=min(u.size, round(4 / one.plant.dt_s)))
         power = power + own
     return np.interp(omega, TAU * f, power) > 1e-3 * np.max(power)
-
-
-def _amplitude_response(one: Machine, omega: Array, realisations: int) -> tuple[Array, Array]:
-    """E[Y R*] / E[U R*] over fresh references of the first log's class, and its variance per part, (F,).
-
-    Relative to the same estimate without friction, whose truth is known: leakage is nearly that of both.
-    """
-    p = one.plant
-    smooth = replace(p, friction=p.friction * 0 + [0, 0, 1, 0, 0], ripple=np.zeros(3))
-    estimates = []
-    for each in (one, replace(one, plant=smooth)):
-        products = []
-        for k in range(realisations):
-            got, begin = each.record(0, one.rng(2000 + k))
-            n = got["r"].size - begin
-            window = np.ones(round(n / 2)) if one.classes[0] == "multisine" else np.hanning(n)  # whole period
-            last = [got[x][-window.size :] for x in ("r", "u", "y")]
-            r, u, y = (np.fft.rfft(window * (signal - signal.mean())) for signal in last)
-            products.append((y * r.conj(), u * r.conj(), np.abs(r) ** 2))
-        power = np.median(np.abs(np.array(products)[:, 2]), axis=0)  # the band of a reference is drawn too
-        used = np.flatnonzero(power > 1e-9 * power.max())  # the same twice, as the references
-        of_y, of_u, _ = np.array(products)[:, :, used].transpose(1, 0, 2)
-        estimates.append((of_y.sum(axis=0) - of_y) / (of_u.sum(axis=0) - of_u))  # all but one
-    f = TAU * np.fft.rfftfreq(window.size, p.dt_s)[used]
-    ratio = estimates[0] / estimates[1]
-    spread = (realisations - 1) * np.var(ratio, axis=0) / 2  # jackknife
-    g = response(*p.sampled(one.draft.q_operating), omega, p.dt_s)
-    middle = ratio.mean(axis=0)
-    centre = np.interp(omega, f, middle.real) + 1j * np.interp(omega, f, middle.imag)
-    return g * centre, np.abs(g) ** 2 * np.interp(omega, f, spread)
