@@ -49,6 +49,7 @@ class FindingKind(Enum):
     UNIT_CONTRADICTED = auto()
     UNIT_CONVERTED = auto()
     UNIT_OF_LOOP = auto()
+    EXCHANGED = auto()
     UNIT_OF_REFERENCE = auto()
     FEW_SAMPLES = auto()
     UNKNOWN_TIME_CONSTANT = auto()

@@ -295,15 +295,15 @@ class Record(Shown):
             found = tuple(units.get(item, "" if item in scale else table.unit(item)) for item in names)
             return found if any(found) else ()
 
-        output = stack(outputs)
+        command, output = stack(inputs, held=True), stack(outputs)
         reference = stack(references, held=True) if references else None
-        if reference is not None and len(references) == len(outputs) == 1:
-            looked = references[0], outputs[0]
-            of = "".join(stated(references)), "".join(stated(outputs))
-            notes += contradicted_by_loop(reference[:, 0], output[:, 0], looked, of, scale)
+        if reference is not None and len(references) == len(outputs) == 1 and inputs:
+            names = (*references, *outputs, inputs[0])
+            of = [units.get(item, "" if item in scale else table.unit(item)) for item in names]
+            notes += contradicted_by_loop(reference[:, 0], output[:, 0], command[:, 0], names, of, scale)
         return cls(
             name=", ".join(filter(None, (table.path.stem, table.run))) if name is None else name,
-            input=stack(inputs, held=True),
+            input=command,
             output=output,
             dt_s=step,
             input_names=tuple(inputs),

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import shlex
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -353,22 +353,34 @@ def followed_times(reference: RealArray, output: RealArray) -> float | None:
 
 def follows_as_it_stands(reference: RealArray, output: RealArray) -> bool:
     """Whether an output (T,) follows its reference (T,) in numbers of one unit."""
-    followed = followed_times(reference, output)
-    return followed is not None and 1 / _FOLLOWS < followed < _FOLLOWS
+    return 1 / _FOLLOWS < (followed_times(reference, output) or 0.0) < _FOLLOWS
 
 
 def contradicted_by_loop(
     reference: RealArray,
     output: RealArray,
-    names: tuple[str, str],
-    units: tuple[str, str],
+    command: RealArray,
+    names: Sequence[str],
+    units: Sequence[str],
     scale: Mapping[str, float],
 ) -> tuple[Finding, ...]:
-    """The finding on an output (T,) that follows its reference (T,) but for the factor between two units.
-    names, units: of reference and output; scale: as stated, by name."""
-    followed = followed_times(reference, output)
-    if followed is None:
-        return ()
+    """The finding on an output (T,) that follows its reference (T,) but for the factor between two units, or
+    on a command (T,) that follows it in the output's place though its unit is of another quantity.
+    names, units: of reference, output and command; scale: as stated, by name."""
+    followed = followed_times(reference, output) or 0.0
+    if (
+        "" != kind_of(units[0]) != kind_of(units[2]) != ""
+        and not 1 / _FOLLOWS < followed < _FOLLOWS and follows_as_it_stands(reference, command)
+    ):  # fmt: skip
+        return (
+            finding(
+                FindingKind.EXCHANGED, reference=names[0], output=names[1], name=names[2],
+                options=shlex.join([
+                    "--input", names[1], "--output", names[2], "--reference", names[0],
+                    "--unit", f"{names[1]}={units[2]}", "--unit", f"{names[2]}={units[1]}",
+                ]),
+            ),
+        )  # fmt: skip
     larger = followed > 1  # the output
     found = [(times if larger else 1 / times, like) for times, like in _TIMES]
     found = [(times, like) for times, like in found if 1 / _FOLLOWS < followed / times < _FOLLOWS]

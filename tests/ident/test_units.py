@@ -88,14 +88,14 @@ def test_a_rate_is_its_quantity_over_its_time():
 )
 def test_an_output_that_follows_but_for_a_unit(gain, units, options):
     """First order at 36 rad/s, sampled at 100 Hz, behind a reference that is white up to 50 Hz."""
-    rng = np.random.default_rng(4)
-    reference, output = rng.standard_normal(4000), np.zeros(4000)
-    for k in range(1, 4000):
-        output[k] = 0.7 * output[k - 1] + 0.3 * reference[k - 1]
-    noise = 0.01 * rng.standard_normal(4000)
-    found = contradicted_by_loop(reference, gain * (output + noise) + 7, ("r", "y"), units, {})
+    reference, noise = np.random.default_rng(4).standard_normal((2, 4000)) * [[1.0], [0.01]]
+    output = np.convolve(reference, np.r_[0, 0.3 * 0.7 ** np.arange(60)])[:4000]
+    output, names, units = gain * (output + noise) + 7, ("r", "y", "u"), (*units, "N m")
+    found = contradicted_by_loop(reference, output, noise, names, units, {})
     assert [item.values["options"] for item in found] == ([options] if options else [])
-    assert contradicted_by_loop(reference, gain * rng.standard_normal(4000), ("r", "y"), units, {}) == ()
+    assert contradicted_by_loop(reference, gain * noise[::-1], noise, names, units, {}) == ()
+    found = contradicted_by_loop(reference, 50 * noise, output / gain, names, units, {})
+    assert [item.kind.name for item in found] == ["EXCHANGED"] * (units[0] != "")
 
 
 @given(st.sampled_from(sorted(PER_SECOND)), st.lists(st.integers(0, 10**6), min_size=1, max_size=9))

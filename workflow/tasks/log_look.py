@@ -141,12 +141,12 @@ def look_at(
 
 
 def _of_the_loop(table: Table, roles: Roles) -> tuple[Finding, ...]:
-    """What reference and output say of their units."""
-    names = roles.reference or "", roles.output
+    """What reference, output and command say of their units."""
+    names = roles.reference or "", roles.output, roles.input
     if not roles.reference or any(_column(table, name).values is None for name in names):
         return roles.doubts
-    reference, output = table.columns(names, roles.output if table.sparse else None).values()
-    return contradicted_by_loop(reference, output, names, (table.unit(names[0]), table.unit(names[1])), {})
+    reference, output, command = table.columns(names, roles.output if table.sparse else None).values()
+    return contradicted_by_loop(reference, output, command, names, [table.unit(n) for n in names], {})
 
 
 def _response(table: Table) -> ResponseLook | None:
