@@ -120,7 +120,8 @@ class TerminalProgress(progress.Progress):
         self._watching.enter_context(event.install_listener("numba:compile", Watch()))
 
     def plan(self, stages: Sequence[tuple[str, float]]) -> None:
-        self._expected = dict(stages)
+        # What an earlier plan has done counts in the whole, as it does in what is done.
+        self._expected = {"": self._done_s, **dict(stages)}
         self._bar.update(self._task, total=sum(self._expected.values()) or 1.0)
         self._watch_compiler()
 
