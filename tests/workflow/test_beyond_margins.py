@@ -151,7 +151,7 @@ def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_h
     asked = SimpleNamespace(bandwidth_rad_s=16.0, lowest_bandwidth_rad_s=1.6)
     lower = replace(design, specification=SimpleNamespace(bandwidth_rad_s=7.43))
     words = verdict_of(lower, certify, SimpleNamespace(check=check), asked=asked)
-    assert "every requirement is met for a bandwidth of 7.43 rad/s (1.6 to 16 asked for), and" in words
+    assert "every requirement is met for a bandwidth of 7.43 rad/s (specified: 1.6 to 16), and" in words
     plants = [SimpleNamespace(bandwidth_rad_s=8.7), SimpleNamespace(bandwidth_rad_s=8.5)]
     proved = replace(certify, certificate=SimpleNamespace(plants=plants))
     numbers = bandwidth_numbers(lower, proved, asked)
