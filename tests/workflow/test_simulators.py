@@ -17,6 +17,8 @@ from diagnosis.machine.plant_effect import Change
 from diagnosis.machine.telling import Alike, Telling
 from tests.workflow.command import ROOT
 from workflow.diagnose import check
+from workflow.diagnose.command import _summary
+from workflow.diagnose.fleet import FleetMachine
 from workflow.diagnose.simulator_case import load_simulator_case
 from workflow.diagnose.simulator_settings import settings_of
 from workflow.diagnose.words import FILTERS
@@ -78,6 +80,10 @@ def test_a_mujoco_model_is_diagnosed_and_comes_back_repaired(tmp_path, flexlink,
     exec(replay, {"print": printed.append})
     # MJCF has six digits.
     assert printed == pytest.approx([case["replayed"]["hinge"]["repaired"]], rel=1e-3)
+    for stated, doubted in ((case["replayed"]["hinge"]["stated"], False), (0.0, True)):
+        case["replayed"]["hinge"]["stated"] = stated
+        (section,) = _summary([case], [FleetMachine.of(case)], [], out / "arm.html").sections
+        assert any("worse than nominal" in row.value for row in section.rows) == doubted
 
 
 def test_a_replay_of_a_delay_starts_with_the_commands_before_it(tmp_path, monkeypatch):
