@@ -214,6 +214,14 @@ SECTIONS = {
             "`{1}`: true response inside its ellipses at {0} % of frequencies",
         ),
         Row(
+            "Drawn for release 0.2.0, each kind twice: certified, and 20 of 20 steps settle",
+            "closed_loop_machines_14",
+            r"^certified and 20 of 20 settle, both lots: (\d+) of (\d+)",
+            "{} of {}",
+            BY_MACHINE,
+            "`{1}`: true response inside its ellipses at {0} % of frequencies",
+        ),
+        Row(
             "Six machines, their logs rounded, thinned, shortened, in other units: certificate or first mode "
             "differs",
             "same_log_otherwise",
