@@ -86,8 +86,9 @@ def without_friction(
         plain, logs = by[:, n::2], STD_LOG * by[:, n + 1 :: 2]
         own = np.outer(found.between * plain[:, 0], np.arange(len(records)) == k)
         beside.append(Beside(by[:, :n], np.hstack([plain, logs, own])))
-    n_known = logs.shape[1] + len(records)
-    response, change, factor = tangent_beside(corrected, found.model, beside, options, n_known=n_known)
+    response, change, factor = tangent_beside(
+        corrected, found.model, beside, options, n_known=logs.shape[1] + len(records)
+    )
     return BehindFriction(response, response, found.level + float(change[0]), factor[0], found)
 
 
@@ -106,7 +107,6 @@ def _behind_observed(
         own = np.outer(found.between * plain[:, 0], np.arange(len(records)) == k)
         beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([plain, logs, own])))
         less.append(found.taken_off(record))
-    known = found.law.n_logs + len(records)
     # What drives an arm away from its simulation is never white: as missed modes five slow ones were added.
     # Above those of the model, where logs excite little, one may be missing.
     coloured = {"coloured_noise": True, "max_ar_order": max(options.max_ar_order, NOISE_ORDERS[-1])}
@@ -117,7 +117,7 @@ def _behind_observed(
         model,
         beside,
         options.model_copy(update=coloured),
-        n_known=known,
+        n_known=found.law.n_logs + len(records),
         missed_above=above,
         classes=[speed_classes(record) for record in records],
     )
@@ -131,8 +131,9 @@ def _behind_observed(
     )
     by_force = _by_linear_force(found, records, less, response)
     response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
-    longest_s = max(record.n_samples for record in less) * model.dt_s
-    response, straight, onto = of_force(response, model.poles, longest_s)
+    response, straight, onto = of_force(
+        response, model.poles, max(record.n_samples for record in less) * model.dt_s
+    )
     both = [0, *([plain.shape[1] - 1] if found.spring is not None else [])]
     spread = np.append(wider * factor[both].sum(axis=0), np.zeros(by_force.shape[1]))
     return BehindFriction(response, straight, found.level + float(change[both].sum()), onto @ spread, found)
@@ -198,10 +199,12 @@ def of_force(
         response, poles=response.poles.appended(poles), mean=nothing[:, 0], covariance_factor=nothing
     )
     wanted = np.column_stack([centre, (moved @ onto[0]) / gain[:, None], *columns])
-    # Nearly equal poles would get large coefficients, and proofs between grid points fail.
-    found = np.linalg.lstsq(
-        real_rows(bent.frequency_rows(omega) / gain[:, None]), real_rows(wanted), rcond=_SMALL**2
-    )[0].astype(np.float64)
+    # Errors as a share of the gain, or of what is not known of it: a zero between the modes would outweigh
+    # them all. Nearly equal poles would get large coefficients, and proofs between grid points fail.
+    each = 1 / np.hypot(1, np.linalg.norm(change, axis=1))[:, None]
+    basis = real_rows(bent.frequency_rows(omega) / gain[:, None] * each)
+    length = np.maximum(np.linalg.norm(basis, axis=0), np.finfo(np.float64).tiny)[:, None]
+    found = np.linalg.lstsq(basis / length.T, real_rows(wanted * each), rcond=_SMALL**2)[0] / length
     bent, normals = replace(bent, mean=found[:, 0], covariance_factor=found[:, 1:]), np.vstack(onto)
     return bent, replace(response, covariance_factor=response.covariance_factor @ normals.T), normals
 
