@@ -36,10 +36,16 @@ def one_line(function: F) -> F:
             with nullcontext() if function.__name__ == "__init__" else threadpool_limits(1):
                 return function(*arguments, **named)
         except TypeError as error:
+            of = function.__qualname__.removesuffix(".__init__")
             unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
+            if re.search(rf"\b{function.__name__}[(][)] (takes|missing)", str(error)):
+                takes = ", ".join(each for each in own if each not in ("self", "cls"))
+                signals = any(isinstance(each, np.ndarray) for each in arguments)
+                hint = "; signals are one argument: flexlink.Record(u=u, y=y, dt_s=dt_s)" if signals else ""
+                raise WrongArgumentError(f"{of}: expected {of}({takes}){hint}") from None
             if unknown is None or unknown[1] not in named:
                 raise
-            name, of = unknown[1], function.__qualname__.removesuffix(".__init__")
+            name = unknown[1]
         known = [each.name for each in own.values() if each.kind is not each.VAR_KEYWORD]
         where = meant(name, [each for each in known if each not in ("self", "cls")], "keywords")
         if len(known) < len(own) and "did you mean" not in where:

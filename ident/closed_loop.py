@@ -221,8 +221,9 @@ def with_controller(record: Record, numerator: Sequence[float], denominator: Seq
     u, y = record.input[:, 0], record.output[:, 0]
     known = np.convolve(u, denominator)[order : u.size]
     known += np.convolve(y, [0.0] * late + list(numerator))[order : u.size]
-    rest = record.slice(order, record.n_samples)
-    return replace(rest, reference=known[:, None], reference_names=("controller",))
+    return replace(
+        record.slice(order, record.n_samples), reference=known[:, None], reference_names=("controller",)
+    )
 
 
 def _opened(records: Sequence[Record], rests: Sequence[RealArray], plant: GobfModel) -> list[Record]:

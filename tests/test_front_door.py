@@ -468,6 +468,8 @@ def test_every_function_refuses_an_unknown_keyword_in_one_line():
         (lambda: flexlink.MultivariableOptions(starts=0), "starts: .*got 0"),
         (lambda: flexlink.identify([1.0]), r"flexlink\.Record\(u=u"),
         (lambda: flexlink.identify(np.ones(9), np.ones(9)), r"flexlink\.Record\(u=u"),
+        (lambda: flexlink.identify(np.ones(9), np.ones(9), 0.1), r"^identify: expected .*Record\(u=u"),
+        (lambda: flexlink.simulate(), r"^simulate: expected simulate\(rig, "),
         (lambda: flexlink.uncertainty(example_record()), "result of flexlink.identify"),
         (lambda: flexlink.uncertainty(None, level=0.9), r"spread\.at"),
         (lambda: flexlink.simulate_loop(TF, flexlink.paper_link(), [1.0]), "SampledArm"),

@@ -67,8 +67,11 @@ class Fmu:
         return fmpy.read_model_description(str(self.path))
 
     def _of(self, *causality: str) -> dict[str, Any]:
-        every = self.description.modelVariables
-        return {v.name: v for v in every if v.causality in causality and v.type == "Real"}
+        return {
+            v.name: v
+            for v in self.description.modelVariables
+            if v.causality in causality and v.type == "Real"
+        }
 
     @property
     def inputs(self) -> tuple[str, ...]:

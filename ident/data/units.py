@@ -202,7 +202,7 @@ def stated_time_unit(stated: str) -> str:
 class TimeColumn:
     """What the time stamps of a log were taken for: unit, one of `KNOWN_TIME_UNITS`; in_header: that in the
     column's name, or empty; stated: by the user, which counts more. doubtful: called seconds, and look like
-    integer milliseconds."""
+    integer milliseconds, or called by a smaller unit and look like seconds."""
 
     name: str
     unit: str
@@ -214,7 +214,7 @@ class TimeColumn:
         """What there is to say of a doubtful column with steps of dt_s."""
         # Machines are logged faster than twice a second: steps of 4 are milliseconds, of 4000 microseconds.
         unit = next((unit for unit in ("ms", "us") if dt_s < LONG_STEP_S * _PER_SECOND[unit]), "ns")
-        options = f"--time-unit {unit}"
+        options = f"--time-unit {unit if self.unit == 's' else 's'}"
         return finding(
             FindingKind.TIME_UNIT, name=self.name, in_header=self.in_header, dt_s=dt_s, options=options
         )
@@ -273,10 +273,13 @@ class TimeColumn:
 
     def doubtful_for(self, stamps: RealArray) -> bool:
         """Whether these increasing stamps, taken as seconds without anybody saying so, look like integers of
-        a smaller unit: steps of half a second and more in a long log, or nothing but integers."""
-        if self.stated or self.unit != "s" or stamps.size < 3:
+        a smaller unit: steps of half a second and more in a long log, or nothing but integers. Of a smaller
+        unit in the header: whether they are sampled faster than 100 kHz, and as seconds like machines are."""
+        if self.stated or stamps.size < 3:
             return False
         step = (stamps[-1] - stamps[0]) / (stamps.size - 1)
+        if self.unit != "s":
+            return bool(self.seconds(step) < 10 * _SHORTEST_S and 1e2 * _SHORTEST_S <= step <= _LONGEST_S)
         integers = bool(np.all(stamps == np.round(stamps)) and stamps[-1] > 1)
         return integers or bool(step >= LONG_STEP_S and stamps.size > _MANY_SAMPLES)
 

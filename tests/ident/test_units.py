@@ -124,10 +124,12 @@ def test_a_written_log_reads_back_with_its_sampling_time(tmp_path_factory, unit,
         ("t", None, 0.25 + 0.5 * np.arange(900), False),
         ("t", None, 0.002 * np.arange(4000), False),
         ("t", "s", 5.0 * np.arange(10), False),
-        ("t_ms", None, 5.0 * np.arange(10), False),
+        *[("t_ms", None, 5.0 * np.arange(10), False), ("t_ms", None, 0.002 * np.arange(10), True)],
+        *[("t_us", None, 0.01 * np.arange(10) + 1, True), ("t_ms", None, 0.02 * np.arange(10), False)],
+        *[("t_us", None, 5.0 * np.arange(10), False), ("t_ms", "ms", 0.002 * np.arange(10), False)],
     ],
 )
-def test_integers_called_seconds_are_doubted(name, stated, stamps, doubtful):
+def test_steps_of_another_unit_are_doubted(name, stated, stamps, doubtful):
     assert TimeColumn.of(name, stated).doubtful_for(stamps) is doubtful
 
 

@@ -130,9 +130,10 @@ def test_smallest_orders_and_silent_signals():
 def test_unusable_input_is_refused_in_one_line():
     record = data(30)
     for call, message in (
-        (lambda: arx(record, -1, 2), "na must be at least 0; got -1"),
-        (lambda: oe(record, 0, 2), "nb must be at least 1"),
-        (lambda: oe(record, 1, 2, delay_samples=-1), "delay_samples must be at least 0"),
+        (lambda: arx(record, -1, 2), "na must be a whole number, at least 0; got -1"),
+        (lambda: oe(record, 0, 2), "nb must be a whole number, at least 1"),
+        (lambda: oe(record, 1, 2, delay_samples=-1), "delay_samples must be a whole number, at least 0"),
+        (lambda: oe(record, "4", 4), "nb must be a whole number, at least 1; got '4'"),
         (lambda: armax(record, 10, 10, 10), "20 equations for 30 unknowns"),
     ):
         with pytest.raises(ValueError, match=message) as caught:

@@ -45,7 +45,7 @@ VALUES = {
 # Other values that lead to other words.
 OTHERWISE = {
     "SLOW_BOUND": [{"integrators": 1}],
-    "TIME_UNIT": [{"in_header": ""}],
+    "TIME_UNIT": [{"in_header": ""}, {"in_header": "ms", "dt_s": 2e-6}],
     "UNIT_OF_LOOP": [{"options": "--scale y=57.3 --unit y=rad"}],
     "UNIT_OF_REFERENCE": [{"same": True, "options": "--reference y --unit y=deg"}],
     "REPAIRED": [{"missing": 0}],

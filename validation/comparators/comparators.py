@@ -31,7 +31,7 @@ def arx(record: Record, na: int, nb: int, *, delay_samples: int = 1) -> Polynomi
     The first max(na, nb - 1) samples of the record serve as past only. Biased when the noise is not 1/A
     filtered white noise. Raises ValueError for orders or a record that cannot be used.
     """
-    u, y = _signals(record, delay_samples, {"na": (na, 0), "nb": (nb, 1)}, lost=max(na, nb - 1))
+    u, y = _signals(record, delay_samples, {"na": (na, 0), "nb": (nb, 1)})
     a, b = arx_polynomials(u, y, na, nb)
     return PolynomialModel(a, b, _ONE, _ONE).of(record, delay_samples)
 
@@ -45,7 +45,7 @@ def oe(
     ever better); the record starts from rest. The minimum is local. Raises ValueError for orders or a record
     that cannot be used.
     """
-    u, y = _signals(record, delay_samples, {"nb": (nb, 1), "nf": (nf, 0)}, lost=max(nf, nb - 1))
+    u, y = _signals(record, delay_samples, {"nb": (nb, 1), "nf": (nf, 0)})
     starts = [steiglitz_mcbride(u, y, nb, nf)]
     if arx_start:
         a, b = arx_polynomials(u, y, nf, nb)
@@ -65,7 +65,7 @@ def armax(
     cannot be used.
     """
     orders = {"na": (na, 0), "nb": (nb, 1), "nc": (nc, 0)}
-    u, y = _signals(record, delay_samples, orders, lost=max(na, nb - 1))
+    u, y = _signals(record, delay_samples, orders)
     a, b = arx_polynomials(u, y, na, nb)
     starts = [PolynomialModel(a, b, monic(np.zeros(nc)), _ONE), _two_stage(u, y, na, nb, nc)]
     if output_error_start:
@@ -88,19 +88,20 @@ def _two_stage(u: RealArray, y: RealArray, na: int, nb: int, nc: int) -> Polynom
 
 
 def _signals(
-    record: Record, delay_samples: int, orders: dict[str, tuple[int, int]], *, lost: int
+    record: Record, delay_samples: int, orders: dict[str, tuple[int, int]]
 ) -> tuple[RealArray, RealArray]:
     """Delayed u and y, (T,) each; ValueError if orders (value, least) or the record do not fit together.
 
-    lost samples at the start of the record give no equation.
+    The first samples of the record, as many as an equation looks back, give none.
     """
     for name, (value, least) in ({"delay_samples": (delay_samples, 0)} | orders).items():
-        if not value >= least:
-            raise ValueError(f"{name} must be at least {least}; got {value}")
+        if not (isinstance(value, (int, np.integer)) and value >= least):
+            raise ValueError(f"{name} must be a whole number, at least {least}; got {value!r}")
     if record.input.shape[1] != 1 or record.output.shape[1] != 1:
         raise ValueError(f"{record.label}: expected one input and one output; choose with siso(...)")
     unknowns = sum(value for value, _ in orders.values())
-    equations = max(record.n_samples - lost, 0)
+    past = max(orders[key][0] - (key == "nb") for key in orders if key != "nc")
+    equations = max(record.n_samples - past, 0)
     if not equations > unknowns:
         raise ValueError(
             f"{record.label}: {equations} equations for {unknowns} unknowns; expected more samples"

@@ -230,8 +230,9 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> ReadCha
         name: stated.units.get(name, "" if name in stated.scale else tables[0].unit(name))
         for name in (roles.input, roles.output)
     }
-    common = with_common_sampling_time(records)
-    return ReadChannel(roles, how, unit_of, common, repeats if not steps else 1, tables)
+    return ReadChannel(
+        roles, how, unit_of, with_common_sampling_time(records), repeats if not steps else 1, tables
+    )
 
 
 def _repeats(record: Record) -> int:

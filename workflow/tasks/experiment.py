@@ -130,8 +130,7 @@ class PlannedExperiment:
     @cached_property
     def radii(self) -> tuple[float, ...]:
         """Expected 95 % radius [rad/V] of the response at every line, per amplitude."""
-        noise_rad = self.noise_std_rad
-        return tuple(self.plan.radius(rms, self.limits.dt_s, noise_rad) for rms in self.plan.rms_V)
+        return tuple(self.plan.radius(rms, self.limits.dt_s, self.noise_std_rad) for rms in self.plan.rms_V)
 
 
 def motion_of(limits: ExperimentLimits) -> Callable[[RealArray], RealArray] | None:

@@ -132,8 +132,7 @@ class FrictionLoop:
         noise, for so many samples (in which the controller's command settles). 0 where none was found."""
 
         def sticks(size: float) -> bool:
-            moved = self.run(np.full(samples, size)).measured
-            return bool(np.max(np.abs(moved)) <= self.friction.presliding)
+            return bool(np.max(np.abs(self.run(np.full(samples, size)).measured)) <= self.friction.presliding)
 
         # While the shaft stands, the command is the controller's answer to a constant error.
         law = self.controller

@@ -126,8 +126,7 @@ class ConditionBench:
         if self.controller.input_limit is not None:
             peak = float(np.max(np.abs(self.predict(shape, law=self._unlimited).command)))
             size = min(_SLEW_SHARE * self.controller.input_limit / peak, 20 * self.step)
-        seconds = length * self.controller.dt_s
-        return self._run("slew", said("smooth_move", seconds), np.asarray(size * shape))
+        return self._run("slew", said("smooth_move", length * self.controller.dt_s), np.asarray(size * shape))
 
     def push(self) -> ConditionRun:
         """A half-sine force at the tip, set point zero."""

@@ -246,8 +246,7 @@ def posterior_of(
             f"uncertainty.method = {options.method!r} needs at least four estimation records; found "
             f"{len(bounded)}"
         )
-    each = record_posteriors(bounded, model, options)
-    return combine_posteriors(each, small_sample_level=options.level)
+    return combine_posteriors(record_posteriors(bounded, model, options), small_sample_level=options.level)
 
 
 def nominal_of(
