@@ -72,7 +72,7 @@ from ident.uncertainty.pole_intervals import laurent_rows
 from ident.unstable import find_unstable
 
 # Rounds of friction and poles in turns, fewer to compare delays; the longest of these, in samples.
-_ROUNDS, _FEW_ROUNDS, _LONGEST_DELAY = 6, 2, 20
+ROUNDS, _FEW_ROUNDS, _LONGEST_DELAY = 6, 2, 20
 # A level that moves by less than the first share stays; by more than the second, or with errors that fall to
 # the third, the order is chosen anew.
 _STAYS, _MOVES, _FALLS_TO = 5e-3, 0.05, 0.5
@@ -405,7 +405,7 @@ def _beyond(found: FrictionFit, options: IdentOptions) -> IdentOptions:
     return options.model_copy(update=update)
 
 
-def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: int = _ROUNDS) -> FrictionFit:
+def _in_turns(logs: _Logs, found: FrictionFit, options: IdentOptions, rounds: int = ROUNDS) -> FrictionFit:
     """Arm and law in turns; the poles are searched for once more where level or errors have moved."""
     search, inside = True, _moving(options)
     for k in range(rounds):
@@ -466,11 +466,7 @@ def _on_moved_poles(logs: _Logs, found: FrictionFit) -> FrictionFit:
     """The fit with its poles where its coefficients on the doubled ones have moved them, at most half of
     their way to the unit circle, and the arm anew on them."""
 
-    def moved(pole: complex) -> complex:
-        simple, double = (rows @ found.coefficients for rows in laurent_rows(found.arm.poles.doubled(), pole))
-        change, most = complex(double / simple) if simple else 0j, 0.5 * (1 - abs(pole))
-        return complex(pole + change * min(1.0, most / max(abs(change), most)))
-
+    moved = partial(moved_pole, found.coefficients, found.arm.poles.doubled())
     poles, images = found.model.poles, found.arm.structure.unstable.values
     real = [pole if np.any(images == pole) or pole <= 0 else moved(pole).real for pole in poles.real.tolist()]
     pairs = [pole if np.any(images == pole) else moved(pole) for pole in poles.pairs.tolist()]
@@ -478,6 +474,14 @@ def _on_moved_poles(logs: _Logs, found: FrictionFit) -> FrictionFit:
     data = prepare(_white(logs, found), replace(found.arm.structure, estimate_initial_state=True))
     model = replace(found.model, poles=poles, coefficients=np.ravel(linear_fit(data, poles).coefficients))
     return observed(_on(found, model), logs.records, nearby=NEARBY[1:2])
+
+
+def moved_pole(coefficients: RealArray, poles: Poles, pole: complex) -> complex:
+    """Where coefficients on poles (each twice) move one of them to first order, at most half of its way to
+    the unit circle."""
+    simple, double = (rows @ coefficients for rows in laurent_rows(poles, pole))
+    change, most = complex(double / simple) if simple else 0j, 0.5 * (1 - abs(pole))
+    return complex(pole + change * min(1.0, most / max(abs(change), most)))
 
 
 def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:

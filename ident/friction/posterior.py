@@ -21,11 +21,12 @@ from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
 from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, linearised
-from ident.friction.in_loop import heterogeneity
+from ident.friction.in_loop import ROUNDS, heterogeneity, moved_pole
 from ident.friction.inverse_dynamics import smoothed, speed_classes
 from ident.response_uncertainty import NOISE_ORDERS
 from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
+from ident.uncertainty.pole_intervals import pole_intervals
 
 # Share of the level that a linear force which shows in no residual may have (deviation).
 _SHAPE = 0.05
@@ -49,7 +50,8 @@ class BehindFriction:
 
     response: from the input to an output, as if there were no dry friction; shaft: the same of the shaft's
     position, to first order; level + level_factor (P',) times unit normals: level of the friction. All three
-    stand on the same P' unit normals.
+    stand on the same P' unit normals. poles: of the arm, which shaft has twice: those of the model, the real
+    ones moved to where the records have them beside an unknown level.
     """
 
     response: ResponsePosterior
@@ -57,6 +59,7 @@ class BehindFriction:
     level: float
     level_factor: RealArray
     friction: FrictionFit
+    poles: Poles
 
 
 def without_friction(
@@ -89,7 +92,9 @@ def without_friction(
     response, change, factor = tangent_beside(
         corrected, found.model, beside, options, n_known=logs.shape[1] + len(records)
     )
-    return BehindFriction(response, response, found.level + float(change[0]), factor[0], found)
+    return BehindFriction(
+        response, response, found.level + float(change[0]), factor[0], found, found.model.poles
+    )
 
 
 def _behind_observed(
@@ -108,19 +113,33 @@ def _behind_observed(
         beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([plain, logs, own])))
         less.append(found.taken_off(record))
     # What drives an arm away from its simulation is never white: as missed modes five slow ones were added.
+    options = options.model_copy(
+        update={"coloured_noise": True, "max_ar_order": max(options.max_ar_order, NOISE_ORDERS[-1])}
+    )
     # Above those of the model, where logs excite little, one may be missing.
-    coloured = {"coloured_noise": True, "max_ar_order": max(options.max_ar_order, NOISE_ORDERS[-1])}
     swinging = model.poles.pairs if model.poles.pairs.size else model.poles.real[model.poles.real > 0]
     above = _BEYOND * float(np.max(np.abs(np.log(swinging)), initial=0.0))
-    response, change, factor = tangent_beside(
-        less,
-        model,
-        beside,
-        options.model_copy(update=coloured),
-        n_known=found.law.n_logs + len(records),
-        missed_above=above,
-        classes=[speed_classes(record) for record in records],
-    )
+    # Viscous and dry friction trade: a pole moved far beyond its interval would turn the tangent round below
+    # the data.
+    poles = model.poles
+    for left in reversed(range(ROUNDS)):
+        response, change, factor = tangent_beside(
+            less,
+            replace(model, poles=poles),
+            beside,
+            options,
+            n_known=found.law.n_logs + len(records),
+            missed_above=above,
+            classes=[speed_classes(record) for record in records],
+        )
+        stable, n = poles.without(model.unstable), response.poles.order
+        moved = [moved_pole(response.mean[:n], response.poles, pole).real for pole in stable.real.tolist()]
+        real = np.where(stable.real > 0, moved, stable.real)
+        rate = -np.log(np.maximum(real, np.finfo(np.float64).tiny))[:, None] / model.dt_s
+        away = rate - pole_intervals(response, stable).decay_per_s
+        if not left or not np.any(away[:, 0] * away[:, 1] > 0):
+            break
+        poles = Poles(real, stable.pairs).appended(model.unstable)
     whitening = np.array([1.0, *(response.report.ar_coefficients if response.report else ())])
     wider = np.sqrt(
         heterogeneity(
@@ -132,11 +151,13 @@ def _behind_observed(
     by_force = _by_linear_force(found, records, less, response)
     response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
     response, straight, onto = of_force(
-        response, model.poles, max(record.n_samples for record in less) * model.dt_s
+        response, poles, max(record.n_samples for record in less) * model.dt_s
     )
     both = [0, *([plain.shape[1] - 1] if found.spring is not None else [])]
     spread = np.append(wider * factor[both].sum(axis=0), np.zeros(by_force.shape[1]))
-    return BehindFriction(response, straight, found.level + float(change[both].sum()), onto @ spread, found)
+    return BehindFriction(
+        response, straight, found.level + float(change[both].sum()), onto @ spread, found, poles
+    )
 
 
 def of_force(
@@ -280,4 +301,4 @@ def other_output_without_friction(
         integrators=found.arm.structure.integrators,
         input_delay_samples=found.arm.structure.input_delay_samples,
     )
-    return BehindFriction(response, shaft, found.level + float(moved[n]), spread[n], found)
+    return BehindFriction(response, shaft, found.level + float(moved[n]), spread[n], found, model.poles)

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from ident.basis.functions import all_pass_response, basis_response
+from ident.basis.functions import all_pass_response
 from ident.basis.model import GobfModel
+from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
-from ident.basis.structure import front_response
 from ident.data.arrays import ComplexArray, RealArray
-from ident.data.ellipses import standard_axes
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
-from ident.fit.frf_regression import THINNEST
+from ident.fit.frf_regression import THINNEST, fit_response, prepare_response
+from ident.search.pole_search import PoleSearch
 
 # A model of a loop's logs outside most of its own ellipses explains nothing: machines whose certificates held
 # had 87 % or more of them around their model, wrong ones 46 % or less (benchmarks.closed_loop_machines).
@@ -31,38 +31,49 @@ def nominal_near(posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.Ar
     P^-1 e, e the error of (Re, Im), P the posterior covariance. Raises ValueError when omega has too few
     frequencies.
     """
-    uncertainty = posterior.at(omega_rad_s)
-    direct = posterior.has_feedthrough
-    omega = uncertainty.omega_rad_s
-    n_coefficients = poles.order + int(direct)
-    if 2 * omega.size < n_coefficients:
-        raise ValueError(f"{omega.size} frequencies do not determine {n_coefficients} coefficients")
-    z = np.exp(1j * omega * posterior.dt_s)
-    columns = basis_response(poles, z)
-    if direct:
-        columns = np.column_stack([columns, np.ones(omega.size)])
-    common = front_response(omega, posterior.dt_s, posterior.integrators, posterior.input_delay_samples)
-    common = common / all_pass_response(posterior.unstable, z)
-    s1, s2, u1 = standard_axes(uncertainty.covariance)
-    floor = THINNEST * np.abs(uncertainty.centre)
-    aligned = (common * u1.conj())[:, None] * columns
-    target = uncertainty.centre * u1.conj()
-    along, across = 1 / np.hypot(s1, floor), 1 / np.hypot(s2, floor)
-    rows = np.vstack([along[:, None] * aligned.real, across[:, None] * aligned.imag])
-    solution, *_ = np.linalg.lstsq(
-        rows, np.concatenate([along * target.real, across * target.imag]), rcond=None
-    )
-    return GobfModel(
-        poles=poles,
-        coefficients=solution[: poles.order],
-        dt_s=posterior.dt_s,
-        feedthrough=float(solution[-1]) if direct else 0.0,
+    return next(nominals_near(posterior, poles, omega_rad_s))
+
+
+def nominals_near(
+    posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.ArrayLike
+) -> Iterator[GobfModel]:
+    """The nearest models (`nominal_near`) on given poles, on those moved to where the posterior has them, and
+    with ever one pair more (`PoleSearch`), up to twice the given order and a pair; unstable poles stay."""
+    response = posterior.at(omega_rad_s)
+    floor = (THINNEST * np.abs(response.centre[:, None, None])) ** 2 * np.eye(2)
+    data = prepare_response(
+        replace(response, covariance=response.covariance + floor),
         integrators=posterior.integrators,
-        input_delay_samples=posterior.input_delay_samples,
-        input_name=posterior.input_name,
-        output_name=posterior.output_name,
-        unstable=posterior.unstable,
+        delay_samples=posterior.input_delay_samples,
+        feedthrough=posterior.has_feedthrough,
     )
+    if data.y.size < poles.order + data.feedthrough:
+        raise ValueError(
+            f"{data.z.size} frequencies do not determine {poles.order + data.feedthrough} coefficients"
+        )
+    data = replace(data, common=data.common / all_pass_response(posterior.unstable, data.z))
+    # An integrator's pole at z = 0 is its zero, no dynamics.
+    known = IdentOptions(integrators=min(posterior.integrators, int(np.count_nonzero(poles.real == 0))))
+    search, most = PoleSearch(data, known.with_unstable(posterior.unstable)), 2 * poles.order
+    while True:
+        fit = fit_response(data, poles)
+        yield GobfModel(
+            poles=poles,
+            coefficients=fit.coefficients,
+            dt_s=posterior.dt_s,
+            feedthrough=fit.feedthrough,
+            integrators=posterior.integrators,
+            input_delay_samples=posterior.input_delay_samples,
+            input_name=posterior.input_name,
+            output_name=posterior.output_name,
+            unstable=posterior.unstable,
+        )
+        if not search.minima:
+            poles = search.descend(search.fixed.appended(poles.without(search.fixed)), "nominal").poles
+        elif poles.order <= most:
+            poles = search.add_pair(poles).poles
+        else:
+            return
 
 
 @dataclass(frozen=True)

@@ -75,6 +75,14 @@ def test_ellipses_and_mode_of_a_belt_are_those_without_friction(belt) -> None:
     ellipses = without_friction(records, found, about.model).response.at(omega)
     assert np.mean(ellipses.contains(true)) > 0.9
     assert np.median(np.abs(ellipses.centre / true - 1)) < 0.005
+    # Viscous friction a fourth of what it is: the level, which is not known either, brings it back.
+    poles = about.model.poles
+    slow = replace(
+        about.model, poles=Poles(np.where(poles.real > 0.9, poles.real**0.25, poles.real), poles.pairs)
+    )
+    behind = without_friction(records, found, slow)
+    assert np.mean(behind.response.at(omega).contains(true)) > 0.9
+    assert behind.poles.real.max() == pytest.approx(poles.real.max(), abs=0.2 * (1 - poles.real.max()))
 
 
 def test_ellipses_hold_a_part_of_the_friction_that_looks_like_damping(belt) -> None:

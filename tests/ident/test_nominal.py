@@ -7,7 +7,7 @@ from ident.basis.functions import basis_response
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
-from ident.uncertainty.nominal import nominal_near
+from ident.uncertainty.nominal import nominal_near, nominals_near
 
 DT = 0.01
 OMEGA = np.geomspace(0.5, 200.0, 60)
@@ -66,3 +66,20 @@ def test_too_few_frequencies_are_refused():
     posterior = ResponsePosterior(POLES, np.zeros(3), np.eye(3), DT)
     with pytest.raises(ValueError, match="do not determine"):
         nominal_near(posterior, POLES.doubled(), OMEGA[:2])
+
+
+@pytest.mark.parametrize("integrators", [0, 1])
+def test_the_nominal_follows_poles_that_the_posterior_moved_and_a_mode_it_adds(integrators):
+    """A real pole three times as fast as the one given, and a mode that nobody gave."""
+    given = Poles([0.0] * integrators + [0.99], [0.9 * np.exp(0.5j)])
+    own = Poles([0.0] * integrators + [0.97], [0.9 * np.exp(0.5j), 0.98 * np.exp(1.5j)])
+    true = GobfModel(own, [1.0] * integrators + [1.0, 0.5, -0.3, 0.1, 0.05], DT, integrators=integrators)
+    posterior = ResponsePosterior(
+        own, true.coefficients, 1e-3 * np.eye(own.order), DT, integrators=integrators
+    )
+    inside, orders = [], []
+    for model in nominals_near(posterior, given, OMEGA):
+        inside.append(np.mean(posterior.at(OMEGA).contains(model.frequency_response(OMEGA))))
+        orders.append(model.poles.order - given.order)
+    assert orders == [0, 0, *range(2, given.order + 3, 2)]
+    assert max(inside[:2]) < 0.9 < inside[2] == 1

@@ -263,15 +263,11 @@ def _save_identification(
 def _save_uncertainty(run: RunDirectory, results: tuple[IdentifiedChannel, ...], scatter: bool) -> None:
     channels = []
     for result in results:
-        omega = uncertainty_stage.display_grid(result.model, result.used)
-        found = uncertainty_stage.uncertain_channel(
-            "tangent",
-            0.95,
-            posterior(result.model),
-            result,
-            omega,
-            tests=residual_tests(posterior(result.model), result.bounded),
-        )
+        omega, poles = uncertainty_stage.display_grid(result.model, result.used), result.model.poles
+        spread = posterior(result.model)
+        tests = residual_tests(spread, result.bounded)
+        more = {"tests": tests, "poles": poles, "linear": spread, "linear_poles": poles}
+        found = uncertainty_stage.uncertain_channel("tangent", 0.95, spread, result, omega, **more)
         rows = tuple(scatter_rows()) if scatter else None
         channels.append(replace(found, nominal=result.model, repeat_scatter=rows))
     run.save_stage("uncertainty", UncertaintyResult(tuple(channels)), "00")

@@ -35,7 +35,7 @@ from ident.response_uncertainty import Tests, with_noise_model
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.conditions import combine_posteriors, record_posteriors, repeat_posteriors
 from ident.uncertainty.embedding import tangent
-from ident.uncertainty.nominal import MOST_INSIDE_PERCENT, NominalAgreement, nominal_near
+from ident.uncertainty.nominal import MOST_INSIDE_PERCENT, NominalAgreement, nominal_near, nominals_near
 from ident.uncertainty.pole_intervals import growth_intervals, pole_intervals
 from workflow.config.run_config import Channel
 from workflow.config.uncertainty_options import UncertaintyOptions
@@ -107,7 +107,8 @@ def uncertainty_of(
     is where at_shaft; equivalent: where it is known from the shaft. Raises ValueError, one line,
     where the model explains nothing.
     """
-    poles, options = result.model.poles, channel.embedding
+    poles = linear_poles = result.model.poles
+    options = channel.embedding
     if friction is None:
         white = whiteness_test(result.identification.residuals).passed
 
@@ -133,8 +134,8 @@ def uncertainty_of(
             return found, residual_tests(found.response, measured, found.friction)
 
         (behind, tests), _ = with_noise_model(options, white, arm_behind)
-        linear = behind.shaft if at_shaft else behind.response
-        posterior = behind.response
+        linear, poles = behind.shaft if at_shaft else behind.response, behind.poles
+        linear_poles, posterior = poles, behind.response
         if channel.uncertainty.response == "this amplitude":
             equivalent = equivalent or equivalent_friction(friction, measured, rng)
             posterior, poles = at_amplitude(behind, equivalent, rng)
@@ -151,6 +152,7 @@ def uncertainty_of(
         omega,
         poles=poles,
         linear=linear,
+        linear_poles=linear_poles,
         tests=tests,
     )
     if observer or (result.closed_loop is not None and result.closed_loop.kind is not FindingKind.DIRECT):
@@ -176,21 +178,23 @@ def uncertain_channel(
     omega: RealArray,
     *,
     tests: Tests,
-    poles: Poles | None = None,
-    linear: ResponsePosterior | None = None,
+    poles: Poles,
+    linear: ResponsePosterior,
+    linear_poles: Poles,
 ) -> UncertainChannel:
     """Everything said about a posterior. omega (F,): shown, and where the nominal has to be right; tests: of
-    the residuals; poles: of the nominal, where they are not the model's; linear: posterior of the model,
-    where that is another one."""
-    model, linear = result.model, linear or posterior
+    the residuals; poles: of the nominal; linear: posterior of the model, which has linear_poles twice."""
+    model = result.model
     doubts = [doubt for record in result.bounded for doubt in record.doubts]
     why = next((words(doubt) for doubt in doubts if doubt.kind is FindingKind.WRAPS), "")
     refuse_unanswered(linear, omega, result.identification.warnings, why=why)
     frequency = posterior.at(omega, level)
     relative = 100 * frequency.ellipse().semi_major / np.abs(frequency.centre)
     bands = pairwise(np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist())  # of equal ratio
-    intervals = intervals_of(linear, model.stable_poles, level)
-    nominal = nominal_of(posterior, poles or model.poles, omega, _untold(model, intervals))
+    intervals = intervals_of(linear, linear_poles.without(model.unstable), level)
+    pairs = model.stable_poles.pairs[np.argsort(model.stable_poles.omega_rad_s(model.dt_s), kind="stable")]
+    told = np.array([mode.told for mode in intervals.modes] if intervals else pairs != 0, dtype=bool)
+    nominal = nominal_of(posterior, poles, omega, pairs[~told])
     return UncertainChannel(
         name=result.name,
         method=method,
@@ -252,27 +256,20 @@ def posterior_of(
 def nominal_of(
     posterior: ResponsePosterior, poles: Poles, omega: RealArray, untold: ComplexArray
 ) -> GobfModel:
-    """Nearest model on the identified poles without the pairs (P,) that the records do not tell, with them,
-    or on every pole taken twice: the first that stays in its ellipses, else the second.
+    """Nearest model on the identified poles without the pairs (P,) that the records do not tell, on those
+    moved or on as few pairs more as keep it in its ellipses; where none does, on the identified poles.
 
     The nominal gives the design its closed-loop poles, so it should be a member of the set it stands for;
-    but a pole taken twice is a mode listed twice, and one that is not told may be none, so they have to earn
-    that.
+    but every further pole costs the controller an order, and a pair that is not told may be no mode.
     """
     told = Poles(poles.real, poles.pairs[~np.isin(poles.pairs, untold)])
-    single, *others = (nominal_near(posterior, each, omega) for each in (poles, told, poles.doubled()))
     ellipses = posterior.at(omega)
-
-    models = (others[0], single, others[1])
-    inside = [float(np.mean(ellipses.contains(each.frequency_response(omega)))) for each in models]
-    return next((each for each, share in zip(models, inside, strict=True) if share >= _SHARE_INSIDE), single)
-
-
-def _untold(model: GobfModel, intervals: Intervals | None) -> ComplexArray:
-    """(P,) pole pairs that the records do not tell."""
-    poles, modes = model.stable_poles, () if intervals is None else intervals.modes
-    by_frequency = np.argsort(poles.omega_rad_s(model.dt_s), kind="stable")
-    return poles.pairs[[i for i, mode in zip(by_frequency, modes, strict=False) if not mode.told]]
+    inside = (
+        model
+        for model in nominals_near(posterior, told, omega)
+        if np.mean(ellipses.contains(model.frequency_response(omega))) >= _SHARE_INSIDE
+    )
+    return next(inside, None) or nominal_near(posterior, poles, omega)
 
 
 def display_grid(model: GobfModel, records: Sequence[Record]) -> RealArray:
