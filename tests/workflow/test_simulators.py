@@ -24,6 +24,11 @@ from workflow.diagnose.simulator_settings import settings_of
 from workflow.diagnose.words import FILTERS
 from workflow.engine.errors import InputError
 
+# A model that multiplies.
+GAIN = """INPUTS, OUTPUTS, PARAMETERS = "motor", "hinge", {"k": 2.0}
+def simulate(p, effects, inputs):
+    return p["k"] * inputs
+"""
 GUIDE, EXAMPLE = ROOT / "docs" / "simulators.md", ROOT / "examples" / "mujoco_arm"
 DT_S = 0.01
 
@@ -35,6 +40,27 @@ HINGE = """<mujoco><option timestep="0.005"/><worldbody><body name="rod">
 
 def snippets(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", GUIDE.read_text(), re.S)
+
+
+def save(path: Path, rows, names: str = "time_s,motor,hinge", fmt: str = "%.18e") -> None:
+    np.savetxt(path, rows, delimiter=",", header=names, comments="", fmt=fmt)
+
+
+def loaded(folder: Path, text: str):
+    """What a case file of this text is read as."""
+    return load_simulator_case(settings_of(tomllib.loads(text), "case.toml"), folder, "case.toml")
+
+
+ONE = 'mjcf = "arm.xml"\nlog = "one.csv"\n'
+
+
+@pytest.fixture
+def arm(tmp_path) -> Path:
+    """A folder with a model and a log of it."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "arm.xml").write_text(HINGE)
+    write_log(tmp_path / "one.csv", 0, 0.1)
+    return tmp_path
 
 
 def write_log(path: Path, seed: int, friction: float, gain: float = 1.0) -> None:
@@ -51,7 +77,7 @@ def write_log(path: Path, seed: int, friction: float, gain: float = 1.0) -> None
             free = v + h / 0.31 * (u - 0.2 * v)
             v = np.sign(free) * max(abs(free) - h / 0.31 * friction, 0.0)
             x += h * v
-    np.savetxt(path, rows, delimiter=",", header="time_s,motor,hinge", comments="")
+    save(path, rows)
 
 
 @pytest.mark.slow
@@ -93,9 +119,8 @@ def test_a_replay_of_a_delay_starts_with_the_commands_before_it(tmp_path, monkey
     write_log(tmp_path / "second.csv", 1, 0.0)
     rows = np.loadtxt(tmp_path / "second.csv", delimiter=",", skiprows=1)
     rows[:, 1] += 0.5  # whatever moved it: the commands before the first are not zero
-    np.savetxt(tmp_path / "second.csv", rows, delimiter=",", header="time_s,motor,hinge", comments="")
-    settings = settings_of({"mjcf": "arm.xml", "log": ["second.csv", "second.csv"]}, "case.toml")
-    case = load_simulator_case(settings, tmp_path, "case.toml").case
+    save(tmp_path / "second.csv", rows)
+    case = loaded(tmp_path, 'mjcf = "arm.xml"\nlog = ["second.csv", "second.csv"]').case
     record = replace(case.held_out[0], name="second")
     changes = (Change("motor.delay", {"delay_s": 0.05}),)
     text = case.plant.simulation.arm.repaired(case.plant, case.plant, changes, (record,))
@@ -141,7 +166,7 @@ def write_pendulum_log(path: Path, seed: int, load_kg: float, friction_Nm: float
             k2 = slope(x + h / 2 * k1, u)
             k3 = slope(x + h / 2 * k2, u)
             x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + slope(x + h * k3, u))
-    np.savetxt(path, rows, delimiter=",", header="time_s,torque,angle", comments="")
+    save(path, rows, "time_s,torque,angle")
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -190,16 +215,16 @@ def test_a_load_and_friction_of_a_pendulum_without_a_site_are_found(
         ('mjcf = "arm.xml"\nlog = "no.csv"', "no.csv: no such file"),
         ('mjcf = "arm.xml"\nfmu = "arm.fmu"\nlog = "one.csv"', "one of mjcf, fmu, python; got mjcf and fmu"),
         ('mjcf = "one.csv"\nlog = "one.csv"', "one.csv: not a model that MuJoCo reads"),
-        ('mjcf = "arm.xml"\nlog = "one.csv"\ncolumns = {hinge = "q"}', "is named after a joint or sensor"),
+        (ONE + 'columns = {hinge = "q"}', "is named after a joint or sensor"),
         ('mjcf = "arm.xml"\nlog = "other.csv"', 'columns = {hinge = "COLUMN"}; the log has t'),
         (
-            'mjcf = "arm.xml"\nlog = "one.csv"\ncolumns = {motor = "u"}',
+            ONE + 'columns = {motor = "u"}',
             "no column for motor: in a case file (.toml) with mjcf = ... and log = [...] write "
             'columns = {motor = "COLUMN"}; the log has time_s',
         ),
-        ('mjcf = "arm.xml"\nlog = "one.csv"\ntolerances = {mass = 0.1}', "no parameter is called 'mass'"),
-        ('mjcf = "arm.xml"\nlog = "one.csv"\nnoise = {elbow = 0.1}', "no output is called 'elbow'"),
-        ('mjcf = "arm.xml"\nlog = "one.csv"\nmodel_err = 0.1', "did you mean model_error?"),
+        (ONE + "tolerances = {mass = 0.1}", "no parameter is called 'mass'"),
+        (ONE + "noise = {elbow = 0.1}", "no output is called 'elbow'"),
+        (ONE + "model_err = 0.1", "did you mean model_error?"),
         ('python = "empty.py"\nlog = "one.csv"', "does not define simulate"),
         (
             'python = "wrong.py"\nlog = "one.csv"',
@@ -217,29 +242,23 @@ def test_a_load_and_friction_of_a_pendulum_without_a_site_are_found(
         ('fmu = "arm.xml"\nlog = "one.csv"', "not a zip archive"),
     ],
 )
-def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, text, complaint):
-    pytest.importorskip("mujoco")
+def test_what_cannot_be_read_is_refused_in_one_line(arm, text, complaint):
     pytest.importorskip("fmpy")
-    (tmp_path / "arm.xml").write_text(HINGE)
-    (tmp_path / "arm.fmu").write_text("")
-    (tmp_path / "empty.py").write_text("")
-    (tmp_path / "wrong.py").write_text("nothing")
-    gain = 'INPUTS, OUTPUTS, PARAMETERS = "motor", "hinge", {"k": 2.0}\n'
-    gain += 'def simulate(p, effects, inputs):\n    return p["k"] * inputs\n'
-    (tmp_path / "gain.py").write_text(gain)
-    (tmp_path / "bug.py").write_text(
-        gain.replace("return", "return shape_of(").rstrip() + ")\ndef shape_of(y):\n    return [y].shape\n"
-    )
-    (tmp_path / "list.py").write_text(gain + 'TOLERANCES = ["k"]\n')
-    (tmp_path / "left.py").write_text("raise SystemExit")
-    write_log(tmp_path / "one.csv", 0, 0.0)
-    text_of = (tmp_path / "one.csv").read_text()
-    (tmp_path / "other.csv").write_text(text_of.replace("motor,hinge", "u1,q1").replace("time_s", "t"))
-    for name, rows in (("short", 13), ("row", 2)):
-        lines = (tmp_path / "one.csv").read_text().splitlines()[:rows]
-        (tmp_path / f"{name}.csv").write_text("\n".join(lines))
+    log, bug = (arm / "one.csv").read_text(), "def shape_of(y):\n    return [y].shape\n"
+    for name, content in {
+        "empty.py": "",
+        "wrong.py": "nothing",
+        "gain.py": GAIN,
+        "bug.py": GAIN.replace("return", "return shape_of(").rstrip() + f")\n{bug}",
+        "list.py": GAIN + 'TOLERANCES = ["k"]\n',
+        "left.py": "raise SystemExit",
+        "other.csv": log.replace("motor,hinge", "u1,q1").replace("time_s", "t"),
+        "short.csv": "\n".join(log.splitlines()[:13]),
+        "row.csv": "\n".join(log.splitlines()[:2]),
+    }.items():
+        (arm / name).write_text(content)
     with pytest.raises(InputError, match=re.escape(complaint)) as raised:
-        load_simulator_case(settings_of(tomllib.loads(text), "case.toml"), tmp_path, "case.toml")
+        loaded(arm, text)
     assert "\n" not in str(raised.value)
     assert "return nan" not in str(raised.value)  # advice on trials; these are the stated values
 
@@ -259,41 +278,33 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, text, complaint):
         ("u", "hinge", "s", {"s": "velocity"}, "has no column 'velocity' (s)"),
     ],
 )
-def test_a_name_that_two_things_have_is_asked_for(tmp_path, motor, hinge, sensor, columns, complaint):
+def test_a_name_that_two_things_have_is_asked_for(arm, motor, hinge, sensor, columns, complaint):
     """Angle, speed and command of the log each end where they belong, or one line asks."""
-    pytest.importorskip("mujoco")
     text = HINGE.replace('name="hinge"', f'name="{hinge}"').replace('joint="hinge"', f'joint="{hinge}"')
     text = text.replace('"motor"', f'"{motor}"')
     if sensor:
         kind, sensor = ("jointpos", hinge) if sensor == "hinge as it is" else ("jointvel", sensor)
         velocity = f'<sensor><{kind} name="{sensor}" joint="{hinge}"/></sensor></mujoco>'
         text = text.replace("</mujoco>", velocity)
-    (tmp_path / "arm.xml").write_text(text)
-    write_log(tmp_path / "one.csv", 0, 0.0)
-    rows = np.loadtxt(tmp_path / "one.csv", delimiter=",", skiprows=1)
+    (arm / "arm.xml").write_text(text)
+    rows = np.loadtxt(arm / "one.csv", delimiter=",", skiprows=1)
     rows = np.column_stack([rows, np.gradient(rows[:, 2], DT_S)])
     angle = "joint hinge" if columns == {"actuator hinge": "u"} else "hinge"
-    header = f"time_s,u,{angle},speed"
-    np.savetxt(tmp_path / "one.csv", rows, delimiter=",", header=header, comments="")
+    save(arm / "one.csv", rows, f"time_s,u,{angle},speed")
     settings = settings_of({"mjcf": "arm.xml", "log": "one.csv", "columns": columns}, "case.toml")
     if complaint:
         with pytest.raises(InputError, match=re.escape(complaint)):
-            load_simulator_case(settings, tmp_path, "case.toml")
+            load_simulator_case(settings, arm, "case.toml")
         return
-    (first, _) = load_simulator_case(settings, tmp_path, "case.toml").case.experiments
+    (first, _) = load_simulator_case(settings, arm, "case.toml").case.experiments
     assert np.array_equal(first.input[:, 0], rows[: len(first.input), 1])
     measured = [3] * any("sensor" in c for c in columns) + [2] * (hinge == "hinge" or "joint a" in columns)
     assert np.array_equal(first.output, rows[: len(first.output), measured])
 
 
-def test_candidates_are_chosen_excluded_and_bounded(tmp_path):
-    pytest.importorskip("mujoco")
-    (tmp_path / "arm.xml").write_text(HINGE)
-    write_log(tmp_path / "one.csv", 0, 0.1)
-
+def test_candidates_are_chosen_excluded_and_bounded(arm):
     def plant_of(more: str):
-        settings = settings_of(tomllib.loads(f'mjcf = "arm.xml"\nlog = "one.csv"\n{more}'), "case.toml")
-        return load_simulator_case(settings, tmp_path, "case.toml").case.plant
+        return loaded(arm, ONE + more).case.plant
 
     every = plant_of("")
     chosen = plant_of(
@@ -304,9 +315,8 @@ def test_candidates_are_chosen_excluded_and_bounded(tmp_path):
     assert [effect.name for effect in chosen.effects] == ["hinge.frictionloss", "hinge.stiffness"]
     (friction,) = chosen.effects[0].parameters
     assert (friction.low, friction.high) == (0.05, 0.2)
-    assert len(chosen.missing) + sum("candidates" in why for why in chosen.inactive.values()) == len(
-        every.missing
-    )
+    left_out = sum("candidates" in why for why in chosen.inactive.values())
+    assert len(chosen.missing) + left_out == len(every.missing)
     # What is left out keeps its stated value.
     assert chosen.parameters == every.parameters
     for more, complaint in (
@@ -348,8 +358,8 @@ def rewritten(path: Path, kind: str) -> str:
     elif kind == "dead":
         header.append("grip")
         rows = np.column_stack([rows, np.zeros(len(rows))])
-    np.savetxt(path, rows, delimiter=",", header=",".join(header), comments="", fmt="%.12g")
-    return more
+    save(path, rows, ",".join(header), "%.12g")
+    return ONE + more
 
 
 KINDS = ["t_ms", "Time [us]", "t", "Zeit", "no time", "hinge_deg", "hinge [mrad]", "counts"]
@@ -357,24 +367,18 @@ KINDS += ["motor [mNm]", "wraps", "jitter", "gap", "dead"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_log_is_read_as_it_is_written(tmp_path, kind):
+def test_a_log_is_read_as_it_is_written(arm, kind):
     """Units of headers, whatever time is called, stamps that jitter, lost rows, a column that is dead."""
-    pytest.importorskip("mujoco")
     grip = '</body><body><joint name="grip"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
-    (tmp_path / "arm.xml").write_text(HINGE.replace("</body>", grip, 1))
-    write_log(tmp_path / "one.csv", 0, 0.1)
-    rows = np.loadtxt(tmp_path / "one.csv", delimiter=",", skiprows=1)
-    more = rewritten(tmp_path / "one.csv", kind)
-    settings = settings_of(tomllib.loads(f'mjcf = "arm.xml"\nlog = "one.csv"\n{more}'), "case.toml")
-    if kind == "dead":
-        with pytest.warns(UserWarning, match="left out: grip"):
-            loaded = load_simulator_case(settings, tmp_path, "case.toml")
-        assert loaded.doubts == ("columns that never change are left out: grip",)
-    else:
-        loaded = load_simulator_case(settings, tmp_path, "case.toml")
-        (doubt,) = loaded.doubts
-        assert "no column measures grip" in doubt
-    case = loaded.case
+    (arm / "arm.xml").write_text(HINGE.replace("</body>", grip, 1))
+    rows = np.loadtxt(arm / "one.csv", delimiter=",", skiprows=1)
+    text = rewritten(arm / "one.csv", kind)
+    dead = "columns that never change are left out: grip"
+    with pytest.warns(UserWarning, match=dead) if kind == "dead" else contextlib.nullcontext():
+        found = loaded(arm, text)
+    (doubt,) = found.doubts
+    assert doubt == dead if kind == "dead" else "no column measures grip" in doubt
+    case = found.case
     assert case.plant.dt_s == pytest.approx(DT_S, rel=1e-4)
     assert case.outputs == ("hinge",)
     first = case.experiments[0]
@@ -382,9 +386,8 @@ def test_a_log_is_read_as_it_is_written(tmp_path, kind):
     loose = {"jitter": 1e-3, "gap": 1e-3, "wraps": 0.02 + 1e-9}.get(kind, 1e-9)
     np.testing.assert_allclose(first.output, rows[: len(first.output), 2:], rtol=0, atol=loose)
     if kind == "wraps":
-        np.testing.assert_allclose(
-            np.diff(first.output[:, 0]), np.diff(rows[: len(first.output), 2]), atol=1e-9
-        )
+        steps = [np.diff(one) for one in (first.output[:, 0], rows[: len(first.output), 2])]
+        np.testing.assert_allclose(*steps, atol=1e-9)
     kept = np.ones(len(first.output), bool)
     kept[[50, 51, 120]] = kind != "gap"
     np.testing.assert_allclose(first.input[kept, 0], rows[: len(first.output)][kept, 1], rtol=1e-9, atol=1e-9)
@@ -399,16 +402,12 @@ def test_a_log_is_read_as_it_is_written(tmp_path, kind):
         ("no time", "state its period (--dt-s, dt_s = ...)"),
     ],
 )
-def test_what_a_log_lacks_is_asked_for_with_options_that_exist(tmp_path, refused, kind, complaint):
-    pytest.importorskip("mujoco")
-    (tmp_path / "arm.xml").write_text(HINGE)
-    write_log(tmp_path / "one.csv", 0, 0.1)
-    rewritten(tmp_path / "one.csv", kind)
-    columns = 'columns = {hinge = "enc [counts]"}' if kind == "counts" else ""
-    (tmp_path / "arm.toml").write_text(f'mjcf = "arm.xml"\nlog = "one.csv"\n{columns}')
-    model = ("--mjcf", tmp_path / "arm.xml", "--log", tmp_path / "one.csv")
-    arguments = (tmp_path / "arm.toml",) if columns else model
-    assert complaint in refused("diagnose", *arguments, "--out", tmp_path / "out")
+def test_what_a_log_lacks_is_asked_for_with_options_that_exist(arm, refused, kind, complaint):
+    rewritten(arm / "one.csv", kind)
+    (arm / "arm.toml").write_text(f'{ONE}columns = {{hinge = "enc [counts]"}}')
+    model = ("--mjcf", arm / "arm.xml", "--log", arm / "one.csv")
+    arguments = (arm / "arm.toml",) if kind == "counts" else model
+    assert complaint in refused("diagnose", *arguments, "--out", arm / "out")
 
 
 REACHES = [
@@ -425,10 +424,9 @@ def test_positions_far_out_of_reach_are_asked_for_before_anything_runs(tmp_path,
     servo = HINGE.replace('<motor name="motor" joint', '<position name="motor" kp="9" joint')
     (tmp_path / "arm.xml").write_text(servo.replace('name="hinge"', f'name="hinge" {joint}', 1))
     rows = [(DT_S * k, size * np.sin(0.05 * k), size * np.sin(0.05 * k)) for k in range(300)]
-    np.savetxt(tmp_path / "one.csv", rows, delimiter=",", header="time_s,motor,hinge", comments="")
-    settings = settings_of({"mjcf": "arm.xml", "log": "one.csv"}, "case.toml")
+    save(tmp_path / "one.csv", rows)
     with pytest.raises(InputError, match=re.escape(asked)) if asked else contextlib.nullcontext():
-        load_simulator_case(settings, tmp_path, "case.toml")
+        loaded(tmp_path, ONE)
 
 
 @pytest.mark.parametrize("model", ['mjcf = "arm.xml"', 'python = "gain.py"'], ids=["mjcf", "python"])
@@ -436,24 +434,16 @@ def test_positions_far_out_of_reach_are_asked_for_before_anything_runs(tmp_path,
     ("header", "per_s", "unit"),
     [("time_s", 1e3, "ms"), ("t", 1e3, "ms"), ("t", 1e6, "us"), ("t", 1 / DT_S, "ms"), ("t_ms", 1.0, "s")],
 )
-def test_time_in_another_unit_is_refused_before_anything_runs(tmp_path, model, header, per_s, unit):
+def test_time_in_another_unit_is_refused_before_anything_runs(arm, model, header, per_s, unit):
     """10 ms are two steps of the model: 10 s, 1 s (counted samples) and 10 us are no sampling of it. Without
     a step whole numbers give it away."""
-    pytest.importorskip("mujoco")
-    (tmp_path / "arm.xml").write_text(HINGE)
-    (tmp_path / "gain.py").write_text(
-        'INPUTS, OUTPUTS, PARAMETERS = "motor", "hinge", {"k": 2.0}\n'
-        'def simulate(p, effects, inputs):\n    return p["k"] * inputs\n'
-    )
-    write_log(tmp_path / "one.csv", 0, 0.1)
-    rows = np.loadtxt(tmp_path / "one.csv", delimiter=",", skiprows=1)
+    (arm / "gain.py").write_text(GAIN)
+    rows = np.loadtxt(arm / "one.csv", delimiter=",", skiprows=1)
     rows[:, 0] = np.round(rows[:, 0] * per_s, 6)
-    names = f"{header},motor,hinge"
-    np.savetxt(tmp_path / "one.csv", rows, delimiter=",", header=names, comments="", fmt="%.8g")
+    save(arm / "one.csv", rows, f"{header},motor,hinge", "%.8g")
 
     def load(more: str = "") -> float:
-        settings = settings_of(tomllib.loads(f'{model}\nlog = "one.csv"\n{more}'), "case.toml")
-        return load_simulator_case(settings, tmp_path, "case.toml").case.dt_s
+        return loaded(arm, f'{model}\nlog = "one.csv"\n{more}').case.dt_s
 
     if "python" in model and header == "t_ms":
         assert load() == pytest.approx(1e-3 * DT_S)  # of 10 us nobody knows that they are wrong
@@ -488,9 +478,8 @@ def test_a_python_file_becomes_a_case(tmp_path):
     for k, u in enumerate(voltage):
         rows.append([k * DT_S, u, speed])
         speed += DT_S / 0.2 * (10 * u - speed)
-    np.savetxt(tmp_path / "run.csv", rows, delimiter=",", header="time_s,voltage_V,speed_rad_s", comments="")
-    settings = settings_of({"python": "motor.py", "log": "run.csv"}, "options")
-    case = load_simulator_case(settings, tmp_path, "options").case
+    save(tmp_path / "run.csv", rows, "time_s,voltage_V,speed_rad_s")
+    case = loaded(tmp_path, 'python = "motor.py"\nlog = "run.csv"').case
     assert [len(e.output) for e in case.experiments] == [200, 100]
     assert [e.role for e in case.experiments] == ["estimation", "held_out"]
     assert {"input_delay", "output_offset"} <= {effect.name for effect in case.plant.effects}
@@ -503,10 +492,7 @@ def test_the_guide_runs_and_its_files_are_those_of_the_example():
 
     assert snippets("toml")[0] == (EXAMPLE / "arm.toml").read_text()
     settings_of(tomllib.loads(snippets("toml")[1]), "guide")
-    settings = settings_of(tomllib.loads(snippets("toml")[0]), "guide")
-    experiments: tuple[PlantExperiment, ...] = load_simulator_case(
-        settings, EXAMPLE, "guide"
-    ).case.experiments
+    experiments: tuple[PlantExperiment, ...] = loaded(EXAMPLE, snippets("toml")[0]).case.experiments
     given = {"MujocoArm": MujocoArm, "np": np, "example": EXAMPLE, "experiments": experiments}
     test = doctest.DocTestParser().get_doctest(GUIDE.read_text(), given, GUIDE.name, str(GUIDE), 0)
     result = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(test)
@@ -584,7 +570,7 @@ def test_sizes_have_the_units_of_inputs_and_outputs(tmp_path, names, motion, uni
     )
     u = np.random.default_rng(0).uniform(-1, 1, 20).repeat(20)
     rows = np.column_stack([0.01 * np.arange(400), u, np.cumsum(u) * 0.01])
-    np.savetxt(tmp_path / "m.csv", rows, delimiter=",", header=f"time_s,{','.join(names)}", comments="")
+    save(tmp_path / "m.csv", rows, f"time_s,{','.join(names)}")
     settings = settings_of({"python": "m.py", "log": "m.csv", "motion": motion}, "here")
     loaded = load_simulator_case(settings, tmp_path, "here")
     for effect, parameter in units.items():
@@ -599,7 +585,7 @@ def test_check_says_what_logs_can_tell(tmp_path, flexlink, refused):
         write_log(tmp_path / name, seed, 0.1)
     rows = np.loadtxt(tmp_path / "two.csv", delimiter=",", skiprows=1)
     rows[:, 1] = np.clip(rows[:, 1] + 1e-3 * np.arange(len(rows)), -0.5, 0.5)
-    np.savetxt(tmp_path / "two.csv", rows, delimiter=",", header="time_s,motor,hinge", comments="")
+    save(tmp_path / "two.csv", rows)
     arguments = ["--mjcf", str(tmp_path / "arm.xml")]
     for name in ("one.csv", "two.csv"):
         arguments += ["--log", str(tmp_path / name)]
@@ -618,7 +604,7 @@ def test_check_says_what_logs_can_tell(tmp_path, flexlink, refused):
     assert again["numbers"]["alike"] == document["numbers"]["alike"]
     rows = np.loadtxt(tmp_path / "one.csv", delimiter=",", skiprows=1)
     rows[:, 2] = np.rad2deg(rows[:, 2])
-    np.savetxt(tmp_path / "one.csv", rows, delimiter=",", header="time_s,motor,hinge", comments="")
+    save(tmp_path / "one.csv", rows)
     (doubt,) = flexlink("check", *arguments, "--json").document()["numbers"]["doubts"]
     assert "is its column in degrees?" in doubt
     (tmp_path / "rig.toml").write_text('rig = "rig.toml"\nexperiments = []\n')
