@@ -28,29 +28,9 @@ from ident.stabilisation import Stabilisation
 from ident.uncertainty import ResponsePosterior
 from workflow.config.run_config import RunConfig
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks import closed_loop as closed_loop_stage, uncertainty as uncertainty_stage
+from workflow.tasks import closed_loop as closed_loop_stage, results as kept, uncertainty as uncertainty_stage
 from workflow.tasks.identification import as_fitted
 from workflow.tasks.loop_conditions import condition_run
-from workflow.tasks.results import (
-    AchievablePerformance,
-    CertifyResult,
-    ClosedLoopResult,
-    ConditionRun,
-    DesignResult,
-    FrictionCheck,
-    IdentifiedChannel,
-    IdentifyResult,
-    LoopCheck,
-    LoopRuns,
-    MeasuredPeak,
-    RecordsResult,
-    ReferenceFilterResult,
-    RunRecord,
-    SampledResponses,
-    SensitivityCheck,
-    SlowSine,
-    UncertaintyResult,
-)
 from workflow.text.templates import said
 
 DT_S = 0.01
@@ -224,10 +204,10 @@ def build_run(
     names = settings.record_names
     roles = [entry.role for entry in settings.source.records]
     records = tuple(
-        RunRecord(record(models, name, seed), role, "same", "a remark", kind="prbs")
+        kept.RunRecord(record(models, name, seed), role, "same", "a remark", kind="prbs")
         for seed, (name, role) in enumerate(zip(names, roles, strict=True), 1)
     )
-    run.save_stage("records", RecordsResult(records), "00")
+    run.save_stage("records", kept.RecordsResult(records), "00")
     results = _save_identification(run, settings, models, records)
     _save_uncertainty(run, results, scatter)
     _save_design(run, settings, gain, impossible, settled)
@@ -237,14 +217,14 @@ def build_run(
 
 
 def _save_identification(
-    run: RunDirectory, settings: RunConfig, models: list[GobfModel], records: tuple[RunRecord, ...]
-) -> tuple[IdentifiedChannel, ...]:
+    run: RunDirectory, settings: RunConfig, models: list[GobfModel], records: tuple[kept.RunRecord, ...]
+) -> tuple[kept.IdentifiedChannel, ...]:
     channels = []
     for channel, of in zip(settings.channels, models, strict=True):
         used = [as_fitted(item.record, channel) for item in records if item.role == "estimation"]
         fresh = [item for item in records if item.role != "estimation"]
         channels.append(
-            IdentifiedChannel(
+            kept.IdentifiedChannel(
                 name=channel.label,
                 identification=identification(of, used),
                 used=tuple(used),
@@ -256,11 +236,11 @@ def _save_identification(
                 stabilisation=stabilisation_plot(),
             )
         )
-    run.save_stage("identify", IdentifyResult(tuple(channels)), "00")
+    run.save_stage("identify", kept.IdentifyResult(tuple(channels)), "00")
     return tuple(channels)
 
 
-def _save_uncertainty(run: RunDirectory, results: tuple[IdentifiedChannel, ...], scatter: bool) -> None:
+def _save_uncertainty(run: RunDirectory, results: tuple[kept.IdentifiedChannel, ...], scatter: bool) -> None:
     channels = []
     for result in results:
         omega, poles = uncertainty_stage.display_grid(result.model, result.used), result.model.poles
@@ -270,17 +250,17 @@ def _save_uncertainty(run: RunDirectory, results: tuple[IdentifiedChannel, ...],
         found = uncertainty_stage.uncertain_channel("tangent", 0.95, spread, result, omega, **more)
         rows = tuple(scatter_rows()) if scatter else None
         channels.append(replace(found, nominal=result.model, repeat_scatter=rows))
-    run.save_stage("uncertainty", UncertaintyResult(tuple(channels)), "00")
+    run.save_stage("uncertainty", kept.UncertaintyResult(tuple(channels)), "00")
 
 
 def _save_design(run: RunDirectory, settings: RunConfig, gain: float, impossible: bool, settled: int) -> None:
     if impossible:
         reason = "plant 'hub': bandwidth_rad_s = 900 lies beyond the Nyquist frequency"
-        run.save_stage("design", DesignResult(None, met=False, reason=reason), "00")
-        run.save_stage("achievable_performance", AchievablePerformance(), "00")
-        run.save_stage("certify", CertifyResult(None, certified=False, reason=reason), "00")
-        run.save_stage("reference_filter", ReferenceFilterResult(), "00")
-        run.save_stage("closed_loop", ClosedLoopResult(skipped=reason), "00")
+        run.save_stage("design", kept.DesignResult(None, met=False, reason=reason), "00")
+        run.save_stage("achievable_performance", kept.AchievablePerformance(), "00")
+        run.save_stage("certify", kept.CertifyResult(None, certified=False, reason=reason), "00")
+        run.save_stage("reference_filter", kept.ReferenceFilterResult(), "00")
+        run.save_stage("closed_loop", kept.ClosedLoopResult(skipped=reason), "00")
         return
     law = controller(gain)
     certificate = certify(
@@ -296,32 +276,32 @@ def _save_design(run: RunDirectory, settings: RunConfig, gain: float, impossible
         gamma_history=(certificate.gamma,),
         grid_points=200,
     )
-    run.save_stage("design", DesignResult(result, met, said("outcome", result)), "00")
+    run.save_stage("design", kept.DesignResult(result, met, said("outcome", result)), "00")
     run.save_stage("achievable_performance", achievable(), "00")
-    run.save_stage("reference_filter", ReferenceFilterResult(), "00")
+    run.save_stage("reference_filter", kept.ReferenceFilterResult(), "00")
     reason = "; ".join(said("requirement", item) for item in certificate.items if not item.met) or "met"
     sampled = sampled_responses(certificate.gamma)
-    run.save_stage("certify", CertifyResult(certificate, certificate.certified, reason, sampled), "00")
-    run.save_stage("closed_loop", ClosedLoopResult(check=loop_check(settings, settled)), "00")
+    run.save_stage("certify", kept.CertifyResult(certificate, certificate.certified, reason, sampled), "00")
+    run.save_stage("closed_loop", kept.ClosedLoopResult(check=loop_check(settings, settled)), "00")
 
 
-def achievable(reached: float = 0.79) -> AchievablePerformance:
+def achievable(reached: float = 0.79) -> kept.AchievablePerformance:
     """What a controller of any order reaches, made up."""
-    return AchievablePerformance(
+    return kept.AchievablePerformance(
         YoulaBracket((PlantBracket("hub", reached - 0.002, reached, reached + 0.002),))
     )
 
 
-def sampled_responses(gamma: float) -> SampledResponses:
+def sampled_responses(gamma: float) -> kept.SampledResponses:
     """Sampled responses, made up: the worst case holds for 990 of 1000."""
     joint = JointCoverage(
         coverage=0.95, draws=1000, gamma=0.99 * gamma, level=0.9, given_level=0.95, gamma_given=gamma,
         coverage_given=0.99, simultaneous_given=0.4, simultaneous_level=0.998, stable_share=1.0,
     )  # fmt: skip
-    return SampledResponses(joint)
+    return kept.SampledResponses(joint)
 
 
-def loop_check(settings: RunConfig, settled: int, draws: int = 3) -> LoopCheck:
+def loop_check(settings: RunConfig, settled: int, draws: int = 3) -> kept.LoopCheck:
     """A well-damped step response for the prediction, noisy copies for the machine."""
     time = np.arange(800) * DT_S
     reference = np.where(time >= 0.4, 0.5, 0.0)
@@ -330,11 +310,11 @@ def loop_check(settings: RunConfig, settled: int, draws: int = 3) -> LoopCheck:
     output = np.where(time >= 0.4, 0.5 * shape, 0.0)
     rng = np.random.default_rng(5)
 
-    def runs(count: int, noise: float) -> LoopRuns:
+    def runs(count: int, noise: float) -> kept.LoopRuns:
         y = output + noise * rng.standard_normal((count, time.size))
         y[:, time >= 4.0] += 0.05 * np.exp(-2 * (time[time >= 4.0] - 4))
         u = np.clip(4 * (reference - y), -24, 24)
-        return LoopRuns(y, u, 0.9 * y if len(settings.channels) > 1 else None, np.abs(u) >= 24)
+        return kept.LoopRuns(y, u, 0.9 * y if len(settings.channels) > 1 else None, np.abs(u) >= 24)
 
     trial = closed_loop_stage.Trial(time, reference, reference, disturbance, 0.5, 400, tracking=True)
     predicted, achieved = runs(1, 0.0), runs(draws, 0.002)
@@ -342,7 +322,7 @@ def loop_check(settings: RunConfig, settled: int, draws: int = 3) -> LoopCheck:
     if settings.machine == "simulated":
         sensitivity, conditions = beyond_the_trial(reference[:400], output[:400])
     rows = closed_loop_stage.describe(achieved, trial)
-    return LoopCheck(
+    return kept.LoopCheck(
         machine=settings.machine, tracking=True, reference_step=0.5, disturbance_step=0.3, quantisation=0.0,
         measurement_step=0.0, input_limit=24.0, filtered=False,
         predicted=closed_loop_stage.describe(predicted, trial)[0],
@@ -353,11 +333,11 @@ def loop_check(settings: RunConfig, settled: int, draws: int = 3) -> LoopCheck:
     )  # fmt: skip
 
 
-def friction_check(sensitivity: SensitivityCheck) -> FrictionCheck:
+def friction_check(sensitivity: kept.SensitivityCheck) -> kept.FrictionCheck:
     """Three sizes, made up; the smallest is measured outside its interval."""
     sizes, peak = np.array([0.2, 0.02, 0.002]), sensitivity.nominal_peak
     error, step = 0.01 * np.sin(np.linspace(0, 6, 500)), 0.2 - 0.2 * np.exp(-np.linspace(0, 6, 100))
-    return FrictionCheck(
+    return kept.FrictionCheck(
         level=0.04, level_interval=(0.039, 0.041), presliding=1e-5, sizes=sizes,
         low=peak * np.array([0.99, 0.95, 0.9]), high=peak * np.array([1.01, 0.98, 0.95]),
         measured=peak * np.array([1.0, 0.97, 0.96]), nominal_peak=peak,
@@ -365,11 +345,11 @@ def friction_check(sensitivity: SensitivityCheck) -> FrictionCheck:
         linear_from=0.01, sticking_step=0.0013, sticking_interval=(0.0012, 0.0014), error_at_rest=0.006,
         error_interval=(0.0058, 0.0062), step=StepMetrics(0.2, 0.1, 10.0, 0.0, 1.5, 0.001, 3.0, 0.0),
         watched_s=20.0, left=0.002, output=step, recorded_output=0.1 + 0.5 * step,
-        tracking=SlowSine(0.05, 0.1, 0.001, error, 0.2 * error, moves_from=0.02),
+        tracking=kept.SlowSine(0.05, 0.1, 0.001, error, 0.2 * error, moves_from=0.02),
     )  # fmt: skip
 
 
-def beyond_the_trial(reference, output) -> tuple[SensitivityCheck, tuple[ConditionRun, ...]]:
+def beyond_the_trial(reference, output) -> tuple[kept.SensitivityCheck, tuple[kept.ConditionRun, ...]]:
     """Two measurements of S and two conditions, as the closed-loop stage leaves them."""
     omega = np.linspace(1.0, 60.0, 40)
     loop = controller().response(omega) * plant().channel.nominal_response(omega)
@@ -377,7 +357,7 @@ def beyond_the_trial(reference, output) -> tuple[SensitivityCheck, tuple[Conditi
     peak, at = float(size.max()), float(omega[np.argmax(size)])
     names = ("arm as identified", "arm as identified, reference ten times smaller")
     rows = [
-        MeasuredPeak(
+        kept.MeasuredPeak(
             name=name, reference_rms=0.2 / 10**number, peak=peak * (1 + off / 100), peak_std=0.002,
             peak_omega_rad_s=at, off_nominal_percent=off, off_certified_percent=off - 0.1, peak_command=12.0,
             limited_fraction=0.0, omega_rad_s=omega, magnitude=size * (1 + off / 100),
@@ -390,4 +370,4 @@ def beyond_the_trial(reference, output) -> tuple[SensitivityCheck, tuple[Conditi
         law = LoopTrajectory(np.arange(400) * DT_S, reference, output[:, None], output, output > 9, DT_S)
         real = replace(law, output=factor * output[:, None])
         conditions.append(condition_run(name, "something <else>", reference, law, real, 0.5))
-    return SensitivityCheck(peak, at, 1.001 * peak, (1.0, 60.0), tuple(rows)), tuple(conditions)
+    return kept.SensitivityCheck(peak, at, 1.001 * peak, (1.0, 60.0), tuple(rows)), tuple(conditions)

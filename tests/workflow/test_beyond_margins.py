@@ -26,36 +26,11 @@ from ident.uncertainty import FrequencyUncertainty
 from ident.uncertainty.nominal import NominalAgreement
 from tests.compiler import compiled, needs_compiler
 from tests.control_design.plants import uncertain_hub
-from tests.workflow.report_examples import (
-    DT_S,
-    achievable,
-    controller,
-    model,
-    plant,
-    posterior,
-    sampled_responses,
-)
+from tests.workflow import report_examples as example
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
 from workflow.engine.errors import InputError
-from workflow.tasks.design import (
-    bracket_numbers,
-    certify_asked,
-    find_bracket,
-    find_design,
-    find_filter,
-    joint_numbers,
-    model_answer,
-    undrawable,
-)
+from workflow.tasks import design as task, results as stored
 from workflow.tasks.exports import filter_file, law_bytes
-from workflow.tasks.results import (
-    AchievablePerformance,
-    CertifyResult,
-    ClosedLoopResult,
-    DesignResult,
-    ReferenceFilterResult,
-    SampledResponses,
-)
 from workflow.tasks.summary import bandwidth_numbers, untold_below_rad_s, verdict_of
 from workflow.text.templates import environment, said
 
@@ -76,13 +51,13 @@ def spec(**changes) -> Specification:
     ],
 )
 def test_shares_of_sampled_responses_have_wilson_intervals(count, total, expected):
-    joint = replace(sampled_responses(0.9).joint, draws=total, coverage_given=count / total)
-    found = joint_numbers(SampledResponses(replace(joint, stable_share=count / total)))
+    joint = replace(example.sampled_responses(0.9).joint, draws=total, coverage_given=count / total)
+    found = task.joint_numbers(stored.SampledResponses(replace(joint, stable_share=count / total)))
     assert found["held_interval"] == found["stable_interval"] == pytest.approx(expected, abs=1e-6)
 
 
 def test_words_of_the_achievable_performance():
-    found = achievable(0.8)
+    found = example.achievable(0.8)
     words = said("any_order", found, 0.88, 4)
     # The bound is 0.798: 9.32 % of 0.88 lie above it.
     assert "order 4 reaches γ = 0.88 (needed: 1 or less); a higher order can gain at most 9.4 %" in words
@@ -90,15 +65,15 @@ def test_words_of_the_achievable_performance():
     below = said("any_order", found, 0.797, 4)
     assert "is approximate" in below
     assert "gain" not in below
-    assert bracket_numbers(found, 0.88)["above_percent"] == pytest.approx(10.0)
+    assert task.bracket_numbers(found, 0.88)["above_percent"] == pytest.approx(10.0)
     assert "some controller of a higher order reaches γ = 0.8" in said("any_order", found, float("inf"), 4)
-    assert said("any_order", AchievablePerformance(), 0.88, 4) == ""
+    assert said("any_order", stored.AchievablePerformance(), 0.88, 4) == ""
 
 
 def test_advice_on_the_order():
-    assert "controller_order = 3 may be too low" in said("order_advice", achievable(0.8), 1.2, 3)
-    assert "a higher order is not enough" in said("order_advice", achievable(1.1), 1.2, 3)
-    assert said("order_advice", AchievablePerformance(), 1.2, 3) == ""
+    assert "controller_order = 3 may be too low" in said("order_advice", example.achievable(0.8), 1.2, 3)
+    assert "a higher order is not enough" in said("order_advice", example.achievable(1.1), 1.2, 3)
+    assert said("order_advice", stored.AchievablePerformance(), 1.2, 3) == ""
 
 
 def test_a_number_that_is_enough_on_the_grid_and_not_proved_says_so():
@@ -115,18 +90,18 @@ def test_a_number_that_is_enough_on_the_grid_and_not_proved_says_so():
 
 
 def test_verdict_of_a_missed_specification_says_whether_a_higher_order_helps():
-    design = DesignResult(SimpleNamespace(gamma=1.2), met=False, reason="gamma 1.2")
-    rest = CertifyResult(None, certified=False, reason=""), ClosedLoopResult()
-    words = verdict_of(design, *rest, achievable(0.8), 3)
+    design = stored.DesignResult(SimpleNamespace(gamma=1.2), met=False, reason="gamma 1.2")
+    rest = stored.CertifyResult(None, certified=False, reason=""), stored.ClosedLoopResult()
+    words = verdict_of(design, *rest, example.achievable(0.8), 3)
     assert words.startswith("specification not met: gamma 1.2; controller_order = 3 may be too low")
-    assert verdict_of(design, *rest, AchievablePerformance(), 3) == "specification not met: gamma 1.2"
+    assert verdict_of(design, *rest, stored.AchievablePerformance(), 3) == "specification not met: gamma 1.2"
     lost = replace(design, synthesis=SimpleNamespace(gamma=float("inf")))
-    assert "does not prove that none exists" in verdict_of(lost, *rest, achievable(0.8), 3)
+    assert "does not prove that none exists" in verdict_of(lost, *rest, example.achievable(0.8), 3)
 
 
 def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_have_none():
-    design = DesignResult(SimpleNamespace(gamma=0.9), met=True, reason="")
-    certify = CertifyResult(None, certified=True, reason="")
+    design = stored.DesignResult(SimpleNamespace(gamma=0.9), met=True, reason="")
+    certify = stored.CertifyResult(None, certified=True, reason="")
     check = SimpleNamespace(
         settled_draws=20, draws=20, friction=None, machine="identified", waits_for_friction=False
     )
@@ -170,23 +145,25 @@ def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_h
 
 def test_achievable_performance_not_asked_for_or_impossible_says_why():
     off = AchievableOptions.model_validate({"compute": False})
-    assert "compute = false" in str(find_bracket([plant()], spec(), off).reason)
+    assert "compute = false" in str(task.find_bracket([example.plant()], spec(), off).reason)
     on = AchievableOptions.model_validate({})
-    impossible = find_bracket([plant()], spec(bandwidth_rad_s=1e4), on)
+    impossible = task.find_bracket([example.plant()], spec(bandwidth_rad_s=1e4), on)
     assert impossible.bracket is None
     assert "Nyquist" in str(impossible.reason)
 
 
 def test_whole_responses_agree_with_drawing_them_here():
     options = CertificateOptions.model_validate({"joint_draws": 400})
-    found = certify_asked(controller(), [plant()], spec(), options, np.random.default_rng(3))
-    certificate, numbers = found.certificate, joint_numbers(found.sampled)
+    found = task.certify_asked(
+        example.controller(), [example.plant()], spec(), options, np.random.default_rng(3)
+    )
+    certificate, numbers = found.certificate, task.joint_numbers(found.sampled)
     # Here: the same posterior, drawn with other numbers; gamma on a grid of its own.
-    uncertain, law = posterior(model()), controller()
-    omega = np.geomspace(1e-3, np.pi / DT_S, 3000)
+    uncertain, law = example.posterior(example.model()), example.controller()
+    omega = np.geomspace(1e-3, np.pi / example.DT_S, 3000)
     drawn = uncertain.sample(np.random.default_rng(11), 200)
     loop = uncertain.response_of(drawn, omega) * law.response(omega)
-    weight = spec().magnitude(plant(), omega, LoopFunction.SENSITIVITY)
+    weight = spec().magnitude(example.plant(), omega, LoopFunction.SENSITIVITY)
     gamma = np.max(weight / np.abs(1 + loop), axis=1)
     # Both are shares of about all draws: 1 % is two draws of 200.
     assert abs(np.mean(gamma <= certificate.gamma) - numbers["held_share"]) < 0.02
@@ -205,9 +182,11 @@ def test_without_calibration_the_ellipses_keep_their_level(monkeypatch):
     found = {}
     for wanted in (False, True):
         options = CertificateOptions.model_validate({"calibrate": wanted, "joint_draws": 100})
-        found[wanted] = certify_asked(controller(), [plant()], spec(), options, np.random.default_rng(1))
+        found[wanted] = task.certify_asked(
+            example.controller(), [example.plant()], spec(), options, np.random.default_rng(1)
+        )
     kept, raised = found[False], found[True]
-    assert kept.certificate == certify(controller(), [plant()], spec())
+    assert kept.certificate == certify(example.controller(), [example.plant()], spec())
     assert raised.certificate.gamma > kept.certificate.gamma, "ellipses of 99 % are larger"
     assert not raised.certified, "99 % of the draws are stable, and 99.9 % are an item"
     assert (kept.sampled.calibrated, raised.sampled.calibrated) == (False, True)
@@ -234,14 +213,14 @@ def test_calibration_is_designed_for(monkeypatch):
 
     monkeypatch.setattr("workflow.tasks.design.synthesise_widest", plain)
     monkeypatch.setattr("workflow.tasks.design.synthesise_jointly", jointly)
-    exact = UncertainPlant("exact", model().to_control())
+    exact = UncertainPlant("exact", example.model().to_control())
     options = CertificateOptions.model_validate({"calibrate": True})
     rng, how = np.random.default_rng(1), SynthesisOptions()
-    jointly_said = find_design([plant()], spec(), how, options, rng).jointly
+    jointly_said = task.find_design([example.plant()], spec(), how, options, rng).jointly
     assert jointly_said == "2 of 10000 models drawn from the posterior are unstable (enough are stable)"
-    assert find_design([exact], spec(), how, options, rng).jointly is None
+    assert task.find_design([exact], spec(), how, options, rng).jointly is None
     kept = CertificateOptions.model_validate({})
-    assert find_design([plant()], spec(), how, kept, rng).jointly is None
+    assert task.find_design([example.plant()], spec(), how, kept, rng).jointly is None
     # The joint design begins with the plain one.
     assert asked == ["plain", "jointly", "plain", "plain"]
 
@@ -255,7 +234,7 @@ def test_a_missed_specification_says_what_would_meet_it(open_):
 
     def found(wish):
         wish = Specification.model_validate(wish)
-        return find_design([uncertain_hub(0.03)], wish, how, options, np.random.default_rng(0))
+        return task.find_design([uncertain_hub(0.03)], wish, how, options, np.random.default_rng(0))
 
     missed = found(asked | open_)
     assert not missed.met
@@ -267,28 +246,28 @@ def test_a_missed_specification_says_what_would_meet_it(open_):
 
 def test_words_of_sampled_responses():
     def words(found):
-        return said("sampled", found, joint_numbers(found))
+        return said("sampled", found, task.joint_numbers(found))
 
-    found = sampled_responses(0.9)
+    found = example.sampled_responses(0.9)
     assert "of 1000 models drawn from the posterior" in words(found)
     assert "99 % stay within the worst case" in words(found)
     assert "98.17 % to 99.46 % with 95 % confidence" in words(found)
     assert "100 % give a stable loop" in words(found)
-    assert words(SampledResponses()) == ""
+    assert words(stored.SampledResponses()) == ""
     lost = replace(found, joint=replace(found.joint, gamma_given=float("inf")))
     assert "no worst case of the ellipses" in words(lost)
 
 
 def test_what_cannot_be_drawn_says_why():
-    exact = UncertainPlant("exact", model().to_control())
-    assert "nothing to draw" in str(undrawable([exact]))
+    exact = UncertainPlant("exact", example.model().to_control())
+    assert "nothing to draw" in str(task.undrawable([exact]))
     omega = np.array([1.0, 2.0, 5.0])
-    measured = posterior(model()).at(omega, 0.95)
-    own = UncertainPlant("measured", model().to_control(), measured)
-    assert "its own frequencies only" in str(undrawable([own]))
-    assert undrawable([plant()]) is None
-    found = certify_asked(
-        controller(), [exact], spec(), CertificateOptions.model_validate({}), np.random.default_rng(1)
+    measured = example.posterior(example.model()).at(omega, 0.95)
+    own = UncertainPlant("measured", example.model().to_control(), measured)
+    assert "its own frequencies only" in str(task.undrawable([own]))
+    assert task.undrawable([example.plant()]) is None
+    found = task.certify_asked(
+        example.controller(), [exact], spec(), CertificateOptions.model_validate({}), np.random.default_rng(1)
     )
     assert found.certificate.joint is None
     assert "no uncertainty is specified" in said("sampled", found.sampled, {})
@@ -304,9 +283,8 @@ def test_weight_of_a_reference_filter_is_for_steps_unless_said():
     steps = ReferenceFilterSettings.model_validate({"corner_rad_s": 3.0}).error_weight
     assert steps is not None
     assert np.abs(steps.at(1j * np.array([0.0, 3e4]))) == pytest.approx([100.0, 1.0])
-    assert (
-        ReferenceFilterSettings.model_validate({"corner_rad_s": 3.0, "weight": "flat"}).error_weight is None
-    )
+    settings = ReferenceFilterSettings.model_validate({"corner_rad_s": 3.0, "weight": "flat"})
+    assert settings.error_weight is None
     # Of a model given as it is, the corner is where |1/(s/5 + 1)| has fallen by 3 dB: 5 rad/s.
     lag = {"numerator": [1.0], "denominator": [0.2, 1.0]}
     weight = ReferenceFilterSettings.model_validate({"model": lag}).error_weight
@@ -319,29 +297,29 @@ def test_weight_of_a_reference_filter_is_for_steps_unless_said():
 
 def test_answer_of_the_model_settles_as_it_should():
     lag = RationalWeight(numerator=(1.0,), denominator=(0.5, 1.0))
-    step = model_answer(lag, np.ones(400), DT_S)
-    time = np.arange(400) * DT_S
+    step = task.model_answer(lag, np.ones(400), example.DT_S)
+    time = np.arange(400) * example.DT_S
     # Tustin's map of a lag of 50 samples: the step enters half a sample early.
-    assert step == pytest.approx(1 - np.exp(-(time + DT_S / 2) / 0.5), abs=1e-3)
+    assert step == pytest.approx(1 - np.exp(-(time + example.DT_S / 2) / 0.5), abs=1e-3)
 
 
 @pytest.fixture(scope="module")
-def filtered() -> ReferenceFilterResult:
+def filtered() -> stored.ReferenceFilterResult:
     settings = ReferenceFilterSettings.model_validate(
         {"corner_rad_s": 1.0, "grid_points": 60, "mode_points": 20, "dense_points": 1000}
     )
-    return find_filter(controller(), [plant()], settings)
+    return task.find_filter(example.controller(), [example.plant()], settings)
 
 
 def test_reference_filter_of_an_unstable_loop_is_a_reason_and_a_bad_pole_an_error():
     settings = ReferenceFilterSettings.model_validate({"corner_rad_s": 1.0})
-    result = find_filter(controller(500.0), [plant()], settings)
+    result = task.find_filter(example.controller(500.0), [example.plant()], settings)
     assert result.filter is None
     assert said("reference_filter", result).startswith("no reference filter: plant 'hub'")
-    assert find_filter(controller(), [plant()], None).reason is None
+    assert task.find_filter(example.controller(), [example.plant()], None).reason is None
     late = ReferenceFilterSettings.model_validate({"corner_rad_s": 1.0, "poles_rad_s": [900.0]})
     with pytest.raises(InputError, match=r"reference_filter\.poles_rad_s: 900 is not between"):
-        find_filter(controller(), [plant()], late)
+        task.find_filter(example.controller(), [example.plant()], late)
 
 
 def test_filter_files(filtered, tmp_path):
@@ -376,9 +354,9 @@ def test_a_verdict_says_up_to_where_the_logs_tell_nothing():
     assert untold_below_rad_s(found) == 1.0
     assert untold_below_rad_s(replace(found, covariance=covariance / 1e6)) == 0.0
     assert untold_below_rad_s(replace(found, covariance=covariance * 1e6)) == 100.0
-    design = DesignResult(SimpleNamespace(gamma=1.2), met=False, reason="gamma 1.2")
-    rest = CertifyResult(None, certified=False, reason="NOT met"), ClosedLoopResult()
+    design = stored.DesignResult(SimpleNamespace(gamma=1.2), met=False, reason="gamma 1.2")
+    rest = stored.CertifyResult(None, certified=False, reason="NOT met"), stored.ClosedLoopResult()
     for met, begins in ((False, "specification not met: gamma 1.2; "), (True, "not certified: NOT met; ")):
-        words = verdict_of(replace(design, met=met), *rest, achievable(0.8), 3, 1.0)
+        words = verdict_of(replace(design, met=met), *rest, example.achievable(0.8), 3, 1.0)
         assert words.startswith(f"{begins}below 1 rad/s (0.159 Hz) the logs do not show the response")
         assert "flexlink excite" in words

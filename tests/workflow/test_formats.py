@@ -11,23 +11,7 @@ from matplotlib.figure import Figure
 import workflow.study.page  # noqa: F401 (a drawing outside workflow.figures)
 from workflow.figures.style import drawings
 from workflow.report import rendering
-from workflow.text.formats import (
-    count,
-    decibels,
-    extent,
-    frequency,
-    interval,
-    listing,
-    number,
-    percent,
-    portion,
-    sentence,
-    setting,
-    share,
-    si,
-    signed,
-    yes_no,
-)
+from workflow.text import formats
 from workflow.text.templates import environment as shared, render_text
 
 
@@ -46,48 +30,48 @@ from workflow.text.templates import environment as shared, render_text
     ],
 )
 def test_numbers_in_words(value, text):
-    assert number(value) == text
+    assert formats.number(value) == text
 
 
 def test_small_phrases():
-    assert listing([]) == ""
-    assert listing(["a"]) == "a"
-    assert listing(["a", "b", "c"]) == "a, b and c"
-    assert count(0, "run") == "no runs"
-    assert count(1, "run") == "1 run"
-    assert count(2, "entry", "entries") == "2 entries"
-    assert decibels(2.0) == "2 (+6.0 dB)"
-    assert decibels(0.0) == "no lower limit"
-    assert frequency(2 * np.pi) == "6.28 rad/s (1 Hz)"
-    assert sentence("hub: it is") == "hub: it is."
-    assert sentence("integrators = 1 accepted") == "integrators = 1 accepted."
-    assert sentence("elbow.damping is large") == "elbow.damping is large."
-    assert sentence("stop!") == "Stop!"
-    assert sentence(" two \n lines ") == "Two lines."
-    assert sentence(Markup("<b>x</b> ")) == Markup("<b>x</b>.")
-    assert isinstance(sentence(Markup("a")), Markup)
+    assert formats.listing([]) == ""
+    assert formats.listing(["a"]) == "a"
+    assert formats.listing(["a", "b", "c"]) == "a, b and c"
+    assert formats.count(0, "run") == "no runs"
+    assert formats.count(1, "run") == "1 run"
+    assert formats.count(2, "entry", "entries") == "2 entries"
+    assert formats.decibels(2.0) == "2 (+6.0 dB)"
+    assert formats.decibels(0.0) == "no lower limit"
+    assert formats.frequency(2 * np.pi) == "6.28 rad/s (1 Hz)"
+    assert formats.sentence("hub: it is") == "hub: it is."
+    assert formats.sentence("integrators = 1 accepted") == "integrators = 1 accepted."
+    assert formats.sentence("elbow.damping is large") == "elbow.damping is large."
+    assert formats.sentence("stop!") == "Stop!"
+    assert formats.sentence(" two \n lines ") == "Two lines."
+    assert formats.sentence(Markup("<b>x</b> ")) == Markup("<b>x</b>.")
+    assert isinstance(formats.sentence(Markup("a")), Markup)
 
 
 def test_numbers_with_units_and_ranges():
-    assert si(1.2345, "N m") == "1.23 N m"
-    assert si(2.0, "") == "2"
-    assert si(None, "V") == "–"
-    assert percent(4.5678, 2) == "4.6 %"
-    assert share(0.95) == "95 %"
-    assert share(None) == "–"
-    assert [portion(value) for value in (-0.2, 0.004, 0.567, 1.01)] == ["0 %", "0 %", "57 %", "100 %"]
-    assert signed(-0.125, "%") == "-0.12 %"
-    assert extent([2.0, 1.0, 3.0]) == "1 to 3"
-    assert extent([1.00001, 1.0]) == "1"
-    assert interval((7.6123, 7.6191)) == "7.6123 to 7.6191"
-    assert interval((0.0801, 0.1072)) == "0.080 to 0.107"
-    assert interval((10.0, 90.0)) == "10 to 90"
-    assert interval((0.0, float("inf"))) == "not known"
-    assert interval((1.0, 1.0)) == "1 to 1"
-    assert interval((1.23456, 2.0), 3) == "1.23 to 2"
-    assert [yes_no(state) for state in (True, False, None)] == ["yes", "NO", "–"]
-    assert setting({"name": "coulomb", "level_Nm": 0.1, "on": True}) == "level_Nm = 0.1, on = True"
-    assert setting((1.0, 2.5)) == "1 to 2.5"
+    assert formats.si(1.2345, "N m") == "1.23 N m"
+    assert formats.si(2.0, "") == "2"
+    assert formats.si(None, "V") == "–"
+    assert formats.percent(4.5678, 2) == "4.6 %"
+    assert formats.share(0.95) == "95 %"
+    assert formats.share(None) == "–"
+    assert [formats.portion(value) for value in (-0.2, 0.004, 0.567, 1.01)] == ["0 %", "0 %", "57 %", "100 %"]
+    assert formats.signed(-0.125, "%") == "-0.12 %"
+    assert formats.extent([2.0, 1.0, 3.0]) == "1 to 3"
+    assert formats.extent([1.00001, 1.0]) == "1"
+    assert formats.interval((7.6123, 7.6191)) == "7.6123 to 7.6191"
+    assert formats.interval((0.0801, 0.1072)) == "0.080 to 0.107"
+    assert formats.interval((10.0, 90.0)) == "10 to 90"
+    assert formats.interval((0.0, float("inf"))) == "not known"
+    assert formats.interval((1.0, 1.0)) == "1 to 1"
+    assert formats.interval((1.23456, 2.0), 3) == "1.23 to 2"
+    assert [formats.yes_no(state) for state in (True, False, None)] == ["yes", "NO", "–"]
+    assert formats.setting({"name": "coulomb", "level_Nm": 0.1, "on": True}) == "level_Nm = 0.1, on = True"
+    assert formats.setting((1.0, 2.5)) == "1 to 2.5"
 
 
 PAGE = """

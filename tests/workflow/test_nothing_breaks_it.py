@@ -24,20 +24,12 @@ import workflow.tasks.simulated_rig
 from control_design.controllers.controller import Controller
 from tests.ident.mutations import DAMAGE, Tally, tally
 from tests.ident.test_forty_logs import LOGS, Log
+from tests.workflow import test_design_sources as sources
 from tests.workflow.command import FAST_ARM, ROOT, build_nothing, draw_nothing, without_progress
 from tests.workflow.diagnosis_examples import FRICTION, write_case
 from tests.workflow.mutations import spoilt, tamper
 from tests.workflow.study_examples import SMALL_STUDY, TWO_POINTS, write_study
 from tests.workflow.test_cli import good_table, write_case as write_own
-from tests.workflow.test_design_sources import (
-    QUICK,
-    WISH,
-    arm,
-    document,
-    model_file,
-    write_repeats,
-    write_response,
-)
 from workflow.cli import main
 from workflow.engine.executor import LocalProcesses
 
@@ -102,13 +94,15 @@ def good_files(folder: Path) -> dict[str, Kind]:
     (folder / "simulate" / "tiny.toml").write_text(TINY_SIMULATION)
     (folder / "study" / "study.toml").write_text(SMALL_STUDY)
     uncertain = "[plant]\ndt_s = 0.05\n[uncertainty]\nmultiplicative = 0.1\n"
-    (folder / "design" / "wish.toml").write_text(WISH + uncertain + QUICK)
-    (folder / "design" / "arm.json").write_text(json.dumps(document(arm()), indent=1))
-    (folder / "design" / "model.json").write_text(model_file().to_json())
-    (folder / "frf" / "wish.toml").write_text(WISH + '[plant]\ndt_s = 0.05\nnominal = "arm.json"\n' + QUICK)
-    (folder / "frf" / "arm.json").write_text(json.dumps(document(arm()), indent=1))
-    write_response(folder / "frf" / "response.csv")
-    write_repeats(folder / "frf" / "repeats.csv")
+    (folder / "design" / "wish.toml").write_text(sources.WISH + uncertain + sources.QUICK)
+    (folder / "design" / "arm.json").write_text(json.dumps(sources.document(sources.arm()), indent=1))
+    (folder / "design" / "model.json").write_text(sources.model_file().to_json())
+    (folder / "frf" / "wish.toml").write_text(
+        sources.WISH + '[plant]\ndt_s = 0.05\nnominal = "arm.json"\n' + sources.QUICK
+    )
+    (folder / "frf" / "arm.json").write_text(json.dumps(sources.document(sources.arm()), indent=1))
+    sources.write_response(folder / "frf" / "response.csv")
+    sources.write_repeats(folder / "frf" / "repeats.csv")
     write_case(folder / "case" / "c", {"name": "coulomb_friction", "torque_Nm": 0.05})
 
     def run(name: str) -> Callable[[Path], list[str]]:
@@ -347,7 +341,7 @@ def _content(log: Log) -> bytes:
 
 def spoilt_controllers(count: int) -> Tally:
     """As a library call, which says ValueError."""
-    system = arm()
+    system = sources.arm()
     laws = (
         Controller.proportional(2.0, 0.01, input_limit=3.0),
         Controller(system.A, system.B, system.C, system.D, 0.05, input_limit=3.0),

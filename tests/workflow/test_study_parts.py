@@ -35,14 +35,7 @@ from workflow.study.page import PointRow, StudyView, draw_pareto, pareto_front, 
 from workflow.study.points import Point, PointMaker, load_base, short
 from workflow.study.settings import ParetoPlot, StudyAxis, last_name, load_study, parse_key, tidy, with_values
 from workflow.study.task import PointTask
-from workflow.tasks.results import (
-    AchievablePerformance,
-    CertifyResult,
-    ClosedLoopResult,
-    DesignResult,
-    ReferenceFilterResult,
-    RunResults,
-)
+from workflow.tasks import results as kept
 
 
 def test_keys_reach_into_tables_and_lists():
@@ -128,7 +121,7 @@ def test_smaller_is_better_where_it_says_so():
 
 def design_of(gamma):
     """A design of this gamma: nothing else of it is looked at."""
-    return DesignResult(SimpleNamespace(gamma=gamma), met=False, reason="")
+    return kept.DesignResult(SimpleNamespace(gamma=gamma), met=False, reason="")
 
 
 def test_margins_in_the_units_of_the_table():
@@ -140,13 +133,13 @@ def test_margins_in_the_units_of_the_table():
         closed_loop_modes=(Mode(40.0, 0.2), Mode(200.0, 0.1)),
     )
     certificate = SimpleNamespace(plants=(verdict,), gamma=math.inf, gamma_bound=None)
-    certify = CertifyResult(certificate, certified=False, reason="")
+    certify = kept.CertifyResult(certificate, certified=False, reason="")
     results = SimpleNamespace(
         design=design_of(0.8),
-        achievable_performance=AchievablePerformance(),
+        achievable_performance=kept.AchievablePerformance(),
         certify=certify,
-        reference_filter=ReferenceFilterResult(),
-        closed_loop=ClosedLoopResult(skipped="why not"),
+        reference_filter=kept.ReferenceFilterResult(),
+        closed_loop=kept.ClosedLoopResult(skipped="why not"),
     )
     asked = SimpleNamespace(specification=SimpleNamespace(mode_band_rad_s=(30.0, 100.0)))
     found = numbers_of(results, asked)
@@ -157,7 +150,7 @@ def test_margins_in_the_units_of_the_table():
     assert found["worst_gamma"] is None
     assert (found["mode_damping"], found["mode_omega_rad_s"]) == (0.2, 40.0)
     assert (found["design_gamma"], found["any_order_gamma"], found["matching_error"]) == (0.8, None, None)
-    results.design = DesignResult(None, met=False, reason="")
+    results.design = kept.DesignResult(None, met=False, reason="")
     asked.specification.mode_band_rad_s = None
     assert numbers_of(results, asked)["mode_damping"] == 0.1
 
@@ -175,9 +168,9 @@ def test_numbers_beyond_the_margins():
     results = SimpleNamespace(
         design=design_of(0.88),
         achievable_performance=achievable(0.8),
-        certify=CertifyResult(None, certified=False, reason="", sampled=sampled_responses(0.9)),
-        reference_filter=ReferenceFilterResult(filtered),
-        closed_loop=ClosedLoopResult(check=check),
+        certify=kept.CertifyResult(None, certified=False, reason="", sampled=sampled_responses(0.9)),
+        reference_filter=kept.ReferenceFilterResult(filtered),
+        closed_loop=kept.ClosedLoopResult(check=check),
     )
     found = numbers_of(results, SimpleNamespace(specification=SimpleNamespace(mode_band_rad_s=None)))
     assert found["any_order_gamma"] == 0.8
@@ -376,14 +369,14 @@ def test_tables_show_what_was_asked_for_and_no_empty_column():
 def test_a_loop_at_rest_beside_its_reference_does_not_settle(offset, state, tmp_path):
     """Three runs at rest, of which the last stays a tenth of the step away."""
     run = build_run(tmp_path / "run", example_config(), settled=3)
-    found = RunResults(run)
+    found = kept.RunResults(run)
     check = found.closed_loop.check
     times = (0.5, 0.6, None if offset else 0.7)
     achieved = tuple(
         replace(row, settled=True, settling_time_s=time)
         for row, time in zip(check.achieved, times, strict=True)
     )
-    run.save_stage("closed_loop", ClosedLoopResult(check=replace(check, achieved=achieved)), "00")
+    run.save_stage("closed_loop", kept.ClosedLoopResult(check=replace(check, achieved=achieved)), "00")
     run.save_stage("certify", replace(found.certify, certified=True), "00")
     designed_for = Specification(bandwidth_rad_s=1.0)
     run.save_stage("design", replace(found.design, specification=designed_for), "00")
