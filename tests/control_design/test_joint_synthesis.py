@@ -4,15 +4,7 @@ import control
 import numpy as np
 import pytest
 
-from control_design import (
-    Guard,
-    Specification,
-    SynthesisOptions,
-    UncertainPlant,
-    certify,
-    synthesise,
-    synthesise_jointly,
-)
+import control_design
 from control_design.analysis.joint_coverage import unstable_draws
 from control_design.analysis.stability import winds
 from control_design.plants.frequency_grid import checked_grid
@@ -22,7 +14,7 @@ from control_design.plants.plant_set import frequency_response
 from .plants import random_stable, uncertain_lag
 
 _DT = 0.005
-_QUICK = SynthesisOptions(
+_QUICK = control_design.SynthesisOptions(
     starts=2, exchange_rounds=1, dense_points=2000, grid_points=60, sufficient_gamma=0.9
 )
 
@@ -36,14 +28,16 @@ def _radius(controller, gain: float) -> float:
     return float(np.max(np.abs(np.linalg.eigvals(loop.A))))
 
 
-_FAST = Specification(bandwidth_rad_s=40.0, modulus_margin=0.3, controller_order=2)
+_FAST = control_design.Specification(bandwidth_rad_s=40.0, modulus_margin=0.3, controller_order=2)
 
 
 def test_winding_of_random_loops_is_that_of_their_poles():
     rng = np.random.default_rng(5)
     seen = set()
     for _ in range(40):
-        plant = UncertainPlant("random", random_stable(rng, 4, _DT) * 10 ** rng.uniform(-1.5, 0.5))
+        plant = control_design.UncertainPlant(
+            "random", random_stable(rng, 4, _DT) * 10 ** rng.uniform(-1.5, 0.5)
+        )
         grid = checked_grid(plant, plant.modes, 1200, 400)
         stable, _ = winds(frequency_response(plant.nominal, grid)[None], integrators=0, unstable_poles=0)
         poles = np.linalg.eigvals(control.feedback(plant.nominal, 1).A)
@@ -53,8 +47,8 @@ def test_winding_of_random_loops_is_that_of_their_poles():
 
 
 def test_a_guard_is_kept_stable_and_costs_no_weight():
-    plant = UncertainPlant("lag", _lag())
-    free = synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(1))
+    plant = control_design.UncertainPlant("lag", _lag())
+    free = control_design.synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(1))
     # The gain at which the free design is just unstable, by bisection on its poles.
     low, high = 1.0, 100.0
     assert _radius(free.controller, high) > 1
@@ -63,10 +57,10 @@ def test_a_guard_is_kept_stable_and_costs_no_weight():
         low, high = (middle, high) if _radius(free.controller, middle) < 1 else (low, middle)
     gain = 1.2 * high
     grid = checked_grid(plant, plant.modes, 1200, 400)
-    guard = Guard(0, grid, gain * frequency_response(_lag(), grid))
-    guarded = synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(1), guards=[guard])
+    guard = control_design.Guard(0, grid, gain * frequency_response(_lag(), grid))
+    guarded = control_design.synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(1), guards=[guard])
     assert _radius(guarded.controller, gain) < 1
-    certificate = certify(guarded.controller, [plant], _FAST)
+    certificate = control_design.certify(guarded.controller, [plant], _FAST)
     assert certificate.gamma == pytest.approx(guarded.gamma, rel=0.01)
 
 
@@ -74,11 +68,11 @@ def test_a_guard_is_kept_stable_and_costs_no_weight():
 def test_joint_design_is_stable_for_the_share_asked():
     plant = uncertain_lag(0.5, 0.2)
     rng = np.random.default_rng(3)
-    free = synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(3))
+    free = control_design.synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(3))
     count, guards = unstable_draws(free.controller, [plant], _FAST, rng=rng, draws=1000, most=3)
     assert count > 30  # ellipses at 20 % say little about the whole
     assert 1 <= len(guards) <= 3
-    design = synthesise_jointly(
+    design = control_design.synthesise_jointly(
         [plant], _FAST, _QUICK, rng=np.random.default_rng(3), stable_share=0.97, draws=1000
     )
     assert design.reached
@@ -92,8 +86,10 @@ def test_joint_design_is_stable_for_the_share_asked():
 
 def test_certificate_asks_for_the_stable_share():
     plant = uncertain_lag(0.5, 0.2)
-    free = synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(3))
-    found = certify(free.controller, [plant], _FAST, joint_coverage=0.5, rng=np.random.default_rng(1))
+    free = control_design.synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(3))
+    found = control_design.certify(
+        free.controller, [plant], _FAST, joint_coverage=0.5, rng=np.random.default_rng(1)
+    )
     item = next(item for item in found.items if "sampled responses" in item.requirement)
     assert found.joint is not None
     assert item.achieved == found.joint.stable_share < 0.999
@@ -111,10 +107,10 @@ def test_different_responses_come_first_from_far_apart():
 def test_bad_input_is_refused():
     plant = uncertain_lag(0.1, 0.95)
     with pytest.raises(ValueError, match="at least 1000 are needed"):
-        synthesise_jointly([plant], _FAST, rng=np.random.default_rng(0), draws=500)
+        control_design.synthesise_jointly([plant], _FAST, rng=np.random.default_rng(0), draws=500)
     with pytest.raises(ValueError, match="stable_share must lie in"):
-        synthesise_jointly([plant], _FAST, rng=np.random.default_rng(0), stable_share=1.0)
+        control_design.synthesise_jointly([plant], _FAST, rng=np.random.default_rng(0), stable_share=1.0)
     with pytest.raises(ValueError, match="one shape"):
-        Guard(0, np.array([1.0, 2.0]), np.array([1.0 + 0j]))
+        control_design.Guard(0, np.array([1.0, 2.0]), np.array([1.0 + 0j]))
     with pytest.raises(ValueError, match="ascending"):
-        Guard(0, np.array([2.0, 1.0]), np.array([1.0 + 0j, 1.0]))
+        control_design.Guard(0, np.array([2.0, 1.0]), np.array([1.0 + 0j, 1.0]))

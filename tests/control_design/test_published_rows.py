@@ -9,23 +9,14 @@ import control
 import numpy as np
 import pytest
 
-from control_design import (
-    LoopFunction,
-    RationalWeight,
-    ReferenceFilterOptions,
-    SynthesisOptions,
-    UncertainPlant,
-    certify,
-    design_reference_filter,
-    synthesise,
-)
+import control_design
 from validation.example_plants import flexible_link, flexible_link_specification
 
 pytestmark = pytest.mark.slow
 
 # Damping of the mode, and max(|W1 S|, |W3 K S|) of the full-order controllers that were published.
 PUBLISHED = ((0.015, 0.965), (0.028, 1.137), (0.050, 1.40))
-MODEL = RationalWeight(numerator=(1.0,), denominator=(0.25, 1.0, 1.0))
+MODEL = control_design.RationalWeight(numerator=(1.0,), denominator=(0.25, 1.0, 1.0))
 
 
 @pytest.mark.parametrize(("scenario", "youla"), [("A", 0.931), ("B", 1.065), ("C", 1.268)])
@@ -34,8 +25,8 @@ def test_order_6_comes_within_2_percent_of_what_any_order_was_published_to_reach
     plant, specification = flexible_link(scenario), flexible_link_specification(6)
     limit = 1.02 * youla
     for seed in (2, 1):
-        result = synthesise([plant], specification, rng=np.random.default_rng(seed))
-        certificate = certify(result.controller, [plant], specification)
+        result = control_design.synthesise([plant], specification, rng=np.random.default_rng(seed))
+        certificate = control_design.certify(result.controller, [plant], specification)
         assert certificate.plants[0].all_frequencies.proved
         if certificate.gamma <= limit:
             break
@@ -46,9 +37,11 @@ def test_damping_of_the_mode_costs_less_than_published_for_a_full_order_controll
     """One design with the peak halved lies below all three published points: damping 0.05 and more at less
     than the cost published for 0.015."""
     link = flexible_link("A")
-    plant = UncertainPlant("link without ellipses", link.nominal)
+    plant = control_design.UncertainPlant("link without ellipses", link.nominal)
     specification = flexible_link_specification(6).model_copy(update={"mode_peak_ratio": 0.5})
-    result = synthesise([plant], specification, SynthesisOptions(starts=2), rng=np.random.default_rng(1))
+    result = control_design.synthesise(
+        [plant], specification, control_design.SynthesisOptions(starts=2), rng=np.random.default_rng(1)
+    )
     # Poles and responses by python-control: a controller could put a badly damped pole beside the mode.
     law = result.controller.to_control(include_delay=True)
     z = control.feedback(plant.nominal, law).poles()
@@ -60,7 +53,8 @@ def test_damping_of_the_mode_costs_less_than_published_for_a_full_order_controll
     omega = np.unique(np.r_[np.geomspace(1e-4, plant.nyquist_rad_s * (1 - 1e-9), 30_000), around])
     k, g = (control.frequency_response(one, omega).complex.ravel() for one in (law, plant.nominal))
     w1, w3 = (
-        specification.magnitude(plant, omega, f) for f in (LoopFunction.SENSITIVITY, LoopFunction.EFFORT)
+        specification.magnitude(plant, omega, f)
+        for f in (control_design.LoopFunction.SENSITIVITY, control_design.LoopFunction.EFFORT)
     )
     cost = np.max(np.maximum(w1, w3 * np.abs(k)) / np.abs(1 + g * k))
     assert cost <= min(cost for _, cost in PUBLISHED)
@@ -68,9 +62,9 @@ def test_damping_of_the_mode_costs_less_than_published_for_a_full_order_controll
 
 def test_first_order_reference_filter_of_scenario_b_divides_the_worst_matching_error_by_four():
     plant, specification = flexible_link("B"), flexible_link_specification(5)
-    result = synthesise([plant], specification, rng=np.random.default_rng(1))
-    reference_filter = design_reference_filter(
-        result.controller, plant, MODEL, ReferenceFilterOptions(order=1)
+    result = control_design.synthesise([plant], specification, rng=np.random.default_rng(1))
+    reference_filter = control_design.design_reference_filter(
+        result.controller, plant, MODEL, control_design.ReferenceFilterOptions(order=1)
     )
     assert reference_filter.error_before >= 4.0 * reference_filter.error_after
     assert reference_filter.error_after <= 0.23

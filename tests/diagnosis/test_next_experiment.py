@@ -11,13 +11,7 @@ from diagnosis.evidence.hypotheses import Hypothesis
 from diagnosis.fit.nominal import LogNormalParameters
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.plant_effect import Change, EffectParameter
-from diagnosis.next_experiment.discrimination import (
-    CompetingHypothesis,
-    competing_hypotheses,
-    competing_hypothesis,
-    distances,
-    fitted_hypothesis,
-)
+from diagnosis.next_experiment import discrimination
 from diagnosis.next_experiment.experiment_choices import Limits, excitations
 from diagnosis.next_experiment.next_experiment import next_experiment
 from diagnosis.next_experiment.repeat import best_repeat
@@ -37,7 +31,9 @@ CASE = made(white(np.random.default_rng(0)))
 
 def _competing(*effects, rig=RIG):
     """With nothing free."""
-    return tuple(CompetingHypothesis(1 / len(effects), rig, () if e is None else (e,)) for e in effects)
+    return tuple(
+        discrimination.CompetingHypothesis(1 / len(effects), rig, () if e is None else (e,)) for e in effects
+    )
 
 
 def _candidate(effect, case=CASE):
@@ -53,13 +49,13 @@ def _vague(*effects, rig=RIG):
         x = np.array([axis.coordinate(effect.parameters()[axis.parameter]) for axis in candidate.axes])
         known = np.hstack([np.zeros((x.size, P)), np.eye(x.size)])
         end = end_of_fit((candidate,), [x], np.zeros(x.size), known, np.zeros(P))
-        found.append(competing_hypothesis(case, end, 1 / len(effects)))
+        found.append(discrimination.competing_hypothesis(case, end, 1 / len(effects)))
     return tuple(found)
 
 
 def _distance(competing, voltage):
     whitened = [(simulate(c.rig, voltage, c.effects).output / NOISE).ravel() for c in competing]
-    return distances(competing, voltage, whitened)[0][0]
+    return discrimination.distances(competing, voltage, whitened)[0][0]
 
 
 def test_what_differs_only_at_high_voltage_gets_high_voltage():
@@ -75,8 +71,8 @@ def test_what_differs_only_at_high_voltage_gets_high_voltage():
 
 
 def test_what_the_records_decided_is_said():
-    first = CompetingHypothesis(0.97, RIG, (TipPayload(mass_kg=0.01),))
-    second = CompetingHypothesis(0.001, RIG)
+    first = discrimination.CompetingHypothesis(0.97, RIG, (TipPayload(mass_kg=0.01),))
+    second = discrimination.CompetingHypothesis(0.001, RIG)
     assert next_experiment((first, second), Limits(1.0)).decided
 
 
@@ -184,11 +180,11 @@ def test_records_sharpen_the_separation():
         candidate = _candidate(name, case)
         start = np.array([candidate.axes[0].coordinate(0.006)])
         fits.append(fitted_to(ResidualModel(case), (candidate,), start, np.zeros(0)))
-    known = [competing_hypothesis(case, f, 0.5) for f in fits]
+    known = [discrimination.competing_hypothesis(case, f, 0.5) for f in fits]
     vague = [replace(one, precision=np.eye(1)) for one in known]
     voltage = prbs(9, 4, Limits.of_records(case).voltage_V / 2, 700)
     assert _distance(known, voltage) > _distance(vague, voltage) * (1 - 1e-6)
-    ordered = competing_hypotheses(case, [Hypothesis(f, -f.cost, -np.inf) for f in fits], {})
+    ordered = discrimination.competing_hypotheses(case, [Hypothesis(f, -f.cost, -np.inf) for f in fits], {})
     assert [r.name for r in ordered] == ["input_delay", "actuator_lag"]
 
 
@@ -200,7 +196,7 @@ def test_sets_that_name_the_same_cause_do_not_compete():
         start = np.array([c.axes[0].coordinate(0.004) for c in candidates])
         end = fitted_to(ResidualModel(CASE), candidates, start, np.zeros(0))
         found.append(Hypothesis(end, np.log(p), -np.inf))
-    competing = competing_hypotheses(CASE, found, sets)
+    competing = discrimination.competing_hypotheses(CASE, found, sets)
     assert competing[0].name == "input_delay"
     assert {r.name for r in competing[1:]} == {"actuator_lag", "no effect"}
 
@@ -215,7 +211,7 @@ def test_effort_is_bounded(monkeypatch):
 
     monkeypatch.setattr("diagnosis.next_experiment.discrimination.simulate", counted)
     competing = _vague(CoulombFriction(torque_Nm=0.01), ViscousFriction(coefficient_Nms=0.006), rig=TOLERANT)
-    next_experiment((*competing, CompetingHypothesis(0.5, TOLERANT)), Limits(1.0, 0.3, 0.05))
+    next_experiment((*competing, discrimination.CompetingHypothesis(0.5, TOLERANT)), Limits(1.0, 0.3, 0.05))
     # At most five scalings of 15, and 2 tolerances and one size for every hypothesis.
     assert len(calls) <= 15 * 3 * 5 + 16 * 3 * 3
 
@@ -243,7 +239,7 @@ def test_excitations_fit_their_voltage_and_length():
         (lambda: Limits(0.0), "limit voltage_V must be positive"),
         (lambda: Limits(1.0, np.nan), "limit hub_angle_rad must be positive"),
         (lambda: next_experiment(_competing(None), Limits(1.0)), "at least two hypotheses; got 1"),
-        (lambda: CompetingHypothesis(1.5, RIG), "lies between 0 and 1; got"),
+        (lambda: discrimination.CompetingHypothesis(1.5, RIG), "lies between 0 and 1; got"),
         (lambda: excitations(1.0, 50, DT, np.random.default_rng(0)), "at least 100 samples; got 50"),
         (
             lambda: next_experiment(_competing(None, CoulombFriction(torque_Nm=0.01)), Limits(1.0, 1e-9)),
@@ -260,7 +256,7 @@ def test_bad_requests_are_one_clear_line(call, message):
 def test_a_fitted_rig_competes_with_the_values_it_was_fitted_with():
     """Beside a model error a deviation multiplies a value by exp(t d); else it divides it by 1 + t d."""
     nominal, d = LogNormalParameters(FlexibleArm(TOLERANT)), np.array([1.5, -0.5])
-    found = fitted_hypothesis(nominal, (), d, np.zeros(0), np.eye(2), 0.5, NOISE, ("none",))
+    found = discrimination.fitted_hypothesis(nominal, (), d, np.zeros(0), np.eye(2), 0.5, NOISE, ("none",))
     for key, tolerance, deviation in zip(TOLERANT.tolerances, TOLERANT.tolerances.values(), d, strict=True):
         assert found.rig.value(key) == pytest.approx(TOLERANT.value(key) * np.exp(tolerance * deviation))
 
@@ -288,7 +284,7 @@ def _open(*changes, free=False):
     noise = np.array([0.02])
     follows = {"directions": lambda u: u / noise, "precision": np.zeros((1, 1))} if free else {}
     competing = tuple(
-        CompetingHypothesis(0.5, plant, (change,) if change else (), noise=noise, **follows)
+        discrimination.CompetingHypothesis(0.5, plant, (change,) if change else (), noise=noise, **follows)
         for change in changes
     )
     return PlantCase("valve", plant, records), competing

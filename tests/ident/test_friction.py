@@ -9,19 +9,9 @@ import pytest
 
 from benchmarks.closed_loop_machines.simulator import Law, Plant, response
 from benchmarks.without_friction import with_friction
-from ident import GobfModel, IdentOptions, Poles, Record, Structure, identify
+from ident import GobfModel, IdentOptions, Poles, Record, Structure, friction as dry, identify
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import ComplexArray, RealArray, real_rows
-from ident.friction import (
-    EquivalentFriction,
-    FrictionFit,
-    at_amplitude,
-    equivalent_friction,
-    fit_friction,
-    other_output_without_friction,
-    refuse_unseen_shaft,
-    without_friction,
-)
 from ident.friction.amplitude import damped_poles, more_at_a_strong_line
 from ident.friction.arm import FrictionLaw, SteppedArm
 from ident.friction.gauss_newton import linearised
@@ -73,14 +63,14 @@ def true_response(omega_rad_s: RealArray) -> ComplexArray:
 
 
 @cache
-def rubbing(torque_Nm: float = 0.1) -> tuple[list[Record], FrictionFit]:
+def rubbing(torque_Nm: float = 0.1) -> tuple[list[Record], dry.FrictionFit]:
     records = recorded(torque_Nm, 5)
-    return records, fit_friction(records, OPTIONS)
+    return records, dry.fit_friction(records, OPTIONS)
 
 
 @pytest.mark.parametrize("torque_Nm", [0.02, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_level_is_found_with_its_standard_deviation(torque_Nm: float) -> None:
-    found = fit_friction(recorded(torque_Nm, 5, independent=True), OPTIONS)
+    found = dry.fit_friction(recorded(torque_Nm, 5, independent=True), OPTIONS)
     off = found.level - torque_Nm * VOLTS_PER_NM
     assert found.significant
     assert abs(off) < 0.02 * torque_Nm * VOLTS_PER_NM
@@ -103,7 +93,7 @@ def test_a_pair_that_does_not_swing_takes_no_mode_from_the_arm() -> None:
         y = quantised(y, source.encoder_step_rad)
         records.append(Record(f"record {k}", u[:, None], y, 0.005, ("voltage_V",), OUTPUT_NAMES))
     options = OPTIONS.model_copy(update={"input_delay_samples": 1})
-    found = fit_friction([record.siso("voltage_V", "hub_angle_rad") for record in records], options)
+    found = dry.fit_friction([record.siso("voltage_V", "hub_angle_rad") for record in records], options)
     assert found.level == pytest.approx(0.1 * VOLTS_PER_NM, rel=0.003)
     assert found.law.excess == 0
     # 205.6 in these records.
@@ -123,7 +113,7 @@ def test_friction_that_falls_with_speed_is_told_from_coulomb_friction() -> None:
         measured = simulate(RIG, voltage, [effect], rng=rng).output
         signals = voltage[:, None], measured[:, [0]]
         records.append(Record(f"{rms}", *signals, RIG.sampling.dt_s, ("voltage_V",), ("y",)))
-    found = fit_friction(records, OPTIONS)
+    found = dry.fit_friction(records, OPTIONS)
     truth = np.array([0.05 * VOLTS_PER_NM, np.log(1e-5), 0.05 * VOLTS_PER_NM, np.log(0.05)])
     law = found.law
     off = np.array([law.level, np.log(law.presliding), law.excess, np.log(law.fall)]) - truth
@@ -137,7 +127,7 @@ def test_ellipses_hold_the_arm_behind_its_friction(torque_Nm: float) -> None:
     """As recorded, hardly any ellipse of these records does."""
     records, found = rubbing(torque_Nm)
     truth, _ = true_response(LOW_RAD_S)
-    ellipses = without_friction(records, found).response.at(LOW_RAD_S)
+    ellipses = dry.without_friction(records, found).response.at(LOW_RAD_S)
     as_recorded = tangent(records, identify(records, OPTIONS).model).at(LOW_RAD_S)
     assert np.mean(ellipses.contains(truth)) > 0.8
     assert np.mean(as_recorded.contains(truth)) < 0.5
@@ -150,7 +140,7 @@ def test_friction_of_the_shaft_is_taken_off_the_tip_too() -> None:
     found, tip = rubbing(0.02)[1], recorded(0.02, 5, output=1)
     model = identify([found.taken_off(record) for record in tip], OPTIONS).model
     _, truth = true_response(LOW_RAD_S)
-    ellipses = other_output_without_friction(tip, found, model).response.at(LOW_RAD_S)
+    ellipses = dry.other_output_without_friction(tip, found, model).response.at(LOW_RAD_S)
     assert np.mean(ellipses.contains(truth)) > 0.7
     # What is not known of the friction widens the ellipses.
     known = tangent([found.taken_off(record) for record in tip], model).at(LOW_RAD_S)
@@ -162,18 +152,18 @@ def test_where_friction_acts_as_none_the_ellipses_at_an_amplitude_are_those_with
     found, tip = rubbing()[1], recorded(0.1, 5, output=1)
     three = OPTIONS.model_copy(update={"n_pairs": 3})
     model = identify([found.taken_off(record) for record in tip], three).model
-    behind = other_output_without_friction(tip, found, model)
+    behind = dry.other_output_without_friction(tip, found, model)
     none, lines = np.zeros(5), np.array([1.0, 300.0])
-    equivalent = EquivalentFriction(found, 1.0, lines, np.zeros(2), none, none, np.zeros((5, 5)))
+    equivalent = dry.EquivalentFriction(found, 1.0, lines, np.zeros(2), none, none, np.zeros((5, 5)))
     omega = np.geomspace(1.0, 500.0, 100)
-    posterior, _ = at_amplitude(behind, equivalent, np.random.default_rng(1))
+    posterior, _ = dry.at_amplitude(behind, equivalent, np.random.default_rng(1))
     ratio = posterior.at(omega).enclosing_radius() / behind.response.at(omega).enclosing_radius()
     # 400 draws leave 1 / sqrt(800) of a standard deviation open.
     assert np.all(np.abs(ratio - 1) < 4 / np.sqrt(800))
 
 
 def test_no_friction_is_not_significant() -> None:
-    found = fit_friction(recorded(0.0, 5), OPTIONS)
+    found = dry.fit_friction(recorded(0.0, 5), OPTIONS)
     assert not found.significant
     assert found.level < 4 * found.level_std < 0.01 * 6.0
 
@@ -203,7 +193,7 @@ def test_stepped_between_the_samples_without_friction_is_the_discrete_model(
 def test_held_friction_moves_the_arm_as_far_as_the_one_that_turns_within_a_sample() -> None:
     """To four millionths of a motion of 1 rad."""
     records = recorded(0.1, 1)
-    found = fit_friction(records, OPTIONS)
+    found = dry.fit_friction(records, OPTIONS)
     arm = GobfModel(found.arm.poles.doubled(), found.coefficients, records[0].dt_s, integrators=1)
     for record in records:
         position, friction = found.motion(record)
@@ -214,7 +204,7 @@ def test_derivatives_are_those_of_the_simulation() -> None:
     """Against the simulation with another coefficient, and with another level."""
     u = np.repeat(np.sign(np.random.default_rng(1).standard_normal(150)), 4) * 5.0
     record = recorded(0.02, 1)[0]
-    found = fit_friction([record], OPTIONS)
+    found = dry.fit_friction([record], OPTIONS)
     _, _, by, _ = linearised(found.arm, found.coefficients, found.law, u)
     for j in (0, 3):
         step = np.zeros(found.coefficients.size)
@@ -268,10 +258,10 @@ def test_friction_is_viscous_on_average_at_an_amplitude_that_was_not_recorded() 
         u = multisine(lines, period, rms, rng, periods=2)
         y = simulate(RIG, u, friction, rng=rng).output[:, :1]
         records.append(Record(str(k), u[:, None], y, dt_s, ("voltage_V",), ("hub_angle_rad",)))
-    found = fit_friction(records, OPTIONS)
+    found = dry.fit_friction(records, OPTIONS)
     rng = np.random.default_rng(9)
-    equivalent = equivalent_friction(found, records, rng)
-    posterior, _ = at_amplitude(without_friction(records, found), equivalent, rng)
+    equivalent = dry.equivalent_friction(found, records, rng)
+    posterior, _ = dry.at_amplitude(dry.without_friction(records, found), equivalent, rng)
 
     ratios = []
     for _ in range(300):
@@ -334,7 +324,7 @@ def test_a_strong_line_meets_more_friction_in_the_response_too() -> None:
     u = np.fft.irfft(spectrum, period)
     u *= np.std(records[0].input) / np.std(u)
     record = replace(records[0], input=np.tile(u, 2)[:, None], output=np.tile(u, 2)[:, None])
-    equivalent = equivalent_friction(found, [record], rng)
+    equivalent = dry.equivalent_friction(found, [record], rng)
     at = 2 * np.pi * lines / (period * record.dt_s)
     values = equivalent.drawn(np.zeros(200), at, rng).mean(axis=0).real
     strong = int(np.flatnonzero(lines == 7)[0])
@@ -352,10 +342,10 @@ def test_what_no_poles_follow_of_strong_lines_is_small_beside_the_ellipses() -> 
     largest = []
     for seed in (2, 3, 4):
         records = recorded(0.1, seed)
-        found = fit_friction(records, OPTIONS)
-        behind = without_friction(records, found)
-        equivalent = EquivalentFriction(found, 1.0, omega, stronger, mean, np.zeros(5), np.zeros((5, 5)))
-        posterior, _ = at_amplitude(behind, equivalent, np.random.default_rng(1))
+        found = dry.fit_friction(records, OPTIONS)
+        behind = dry.without_friction(records, found)
+        equivalent = dry.EquivalentFriction(found, 1.0, omega, stronger, mean, np.zeros(5), np.zeros((5, 5)))
+        posterior, _ = dry.at_amplitude(behind, equivalent, np.random.default_rng(1))
         met = n * (1 + stronger) * 1j * omega * behind.shaft.centre(omega)
         off = np.abs(posterior.centre(omega) - behind.response.centre(omega) / (1 + met))
         largest.append(np.max(off / posterior.at(omega).enclosing_radius()))
@@ -367,7 +357,7 @@ def test_modes_narrower_than_the_grid_stay_what_they_are() -> None:
     """G / (1 + j omega N G_shaft) also at and between the modes that may have been missed: several lightly
     damped pairs side by side, for one."""
     records, found = rubbing()
-    behind = without_friction(records, found)
+    behind = dry.without_friction(records, found)
     linear, dt_s, rng = behind.response, found.model.dt_s, np.random.default_rng(3)
     z = np.exp((-0.01 + 1j) * np.geomspace(32.0, 37.0, 12) * dt_s)
     at, count = linear.poles.order, 2 * z.size
@@ -382,8 +372,8 @@ def test_modes_narrower_than_the_grid_stay_what_they_are() -> None:
     )
     n, lines, none = 0.03, np.array([1.0, 300.0]), np.zeros(5)
     mean = np.array([n, 0.0, 0.0, 0.0, 0.0])
-    equivalent = EquivalentFriction(found, 2.0, lines, np.zeros(2), mean, none, np.zeros((5, 5)))
-    posterior, _ = at_amplitude(replace(behind, response=linear), equivalent, rng)
+    equivalent = dry.EquivalentFriction(found, 2.0, lines, np.zeros(2), mean, none, np.zeros((5, 5)))
+    posterior, _ = dry.at_amplitude(replace(behind, response=linear), equivalent, rng)
     omega = np.linspace(20.0, 60.0, 4000)
     speed = 1j * omega * behind.shaft.centre(omega)
     expected = linear.centre(omega) / (1 + n * speed)
@@ -395,26 +385,26 @@ def test_modes_narrower_than_the_grid_stay_what_they_are() -> None:
 def test_a_stuck_shaft_and_an_output_that_is_no_position_are_refused() -> None:
     record = recorded(0.0, 1)[0]
     with pytest.raises(ValueError, match="the shaft does not move"):
-        fit_friction([replace(record, output=np.zeros_like(record.output))], OPTIONS)
+        dry.fit_friction([replace(record, output=np.zeros_like(record.output))], OPTIONS)
     with pytest.raises(ValueError, match="at most one integrator and no direct term"):
-        fit_friction([record], OPTIONS.model_copy(update={"integrators": 2}))
+        dry.fit_friction([record], OPTIONS.model_copy(update={"integrators": 2}))
 
 
 @pytest.mark.slow
 def test_a_shaft_that_the_records_do_not_show_is_refused() -> None:
     records, found = rubbing()
-    refuse_unseen_shaft(found, records)
+    dry.refuse_unseen_shaft(found, records)
     steps = np.ptp(records[0].output) / 8
     coarse = [replace(record, output=steps * np.round(record.output / steps)) for record in records]
     with pytest.raises(ValueError, match=r"takes 9 different values only.*response = 'as recorded'"):
-        refuse_unseen_shaft(found, coarse)
+        dry.refuse_unseen_shaft(found, coarse)
     one = records[0]
     stuck = [replace(one, input=one.input / 1000, output=one.output - found.motion(one)[0][:, None])]
     with pytest.raises(ValueError, match="is lost in its noise"):
-        refuse_unseen_shaft(fit_friction(stuck, OPTIONS), stuck)
+        dry.refuse_unseen_shaft(dry.fit_friction(stuck, OPTIONS), stuck)
     tip = recorded(0.1, 5, output=1)[:1]
     with pytest.raises(ValueError, match=r"'y' is no position of the driven shaft, or .* degrees"):
-        refuse_unseen_shaft(fit_friction(tip, OPTIONS), tip)
+        dry.refuse_unseen_shaft(dry.fit_friction(tip, OPTIONS), tip)
 
 
 @pytest.mark.slow
@@ -429,11 +419,11 @@ def test_an_observer_follows_what_a_free_run_does_not_explain():
     volts = 0.245 * np.cos(np.outer(turn, np.arange(1, 300)) + phases).sum(axis=1)
     angle = plant.run(through, volts, 0.0, np.zeros(volts.size))["y"]
     record = Record("log", volts[:, None], angle[:, None], 1e-3, ("motor_V",), ("angle_rad",))
-    found = fit_friction([record], IdentOptions(integrators=1))
+    found = dry.fit_friction([record], IdentOptions(integrators=1))
     assert found.observed
     assert found.law.level == pytest.approx(2.9e-3 / 0.02, rel=0.05)
     assert found.beyond == pytest.approx(1.3e-3 / 0.02, rel=0.05)
-    omega, behind = np.geomspace(2 * np.pi, 200 * np.pi, 100), without_friction([record], found)
+    omega, behind = np.geomspace(2 * np.pi, 200 * np.pi, 100), dry.without_friction([record], found)
     truth = response(*plant.sampled(), omega, 1e-3)
     assert np.mean(behind.response.at(omega, 0.95).contains(truth)) >= 0.93
     assert np.all(pole_intervals(behind.shaft, found.model.poles).omega_rad_s < 1e3)

@@ -10,16 +10,7 @@ from ident.basis.options import IdentOptions
 from ident.data.finding import FindingKind
 from ident.fit.problem import residual_colour
 from ident.one_input import identify
-from tests.ident.benchmark_plants import (
-    P2_HZ,
-    P2_ZETA,
-    P3_MODES,
-    as_record,
-    p1,
-    p2,
-    p3,
-    run,
-)
+from tests.ident import benchmark_plants as plants
 from tests.ident.findings import kinds
 from tests.workflow.test_codec import same
 
@@ -34,7 +25,7 @@ def relative_error(truth, model, omega=OMEGA[MIDDLE]):
 
 @pytest.fixture(scope="module")
 def p2_fit():
-    truth = p2(0)
+    truth = plants.p2(0)
     return truth, identify([truth.record])
 
 
@@ -46,7 +37,7 @@ def test_p1_without_prior_knowledge():
     """
     errors = []
     for seed in range(3):
-        truth = p1(seed)
+        truth = plants.p1(seed)
         result = identify([truth.record])
         poles = result.model.poles
         assert (poles.real.size, poles.pairs.size) == (2, 1)
@@ -57,11 +48,11 @@ def test_p1_without_prior_knowledge():
     assert np.median(errors) < 0.06
 
 
-@pytest.mark.parametrize("n_modes", P3_MODES)
+@pytest.mark.parametrize("n_modes", plants.P3_MODES)
 def test_p3_the_global_optimum_is_found(n_modes):
     """Three and five modes beside 1/(s^2 + 0.3 s): within 2 % of the variance of the noise."""
     for snr_db in (30, 50):
-        truth = p3(n_modes, 0, snr_db)
+        truth = plants.p3(n_modes, 0, snr_db)
         found = identify([truth.record], IdentOptions(n_real=2, n_pairs=n_modes))
         assert found.rss <= 1.02 * truth.clean.size * truth.noise_std**2
 
@@ -70,8 +61,8 @@ def test_p2_all_modes_are_found_without_being_told(p2_fit):
     truth, result = p2_fit
     poles = result.model.poles
     order = np.argsort(poles.omega_rad_s(0.005))
-    np.testing.assert_allclose(poles.omega_rad_s(0.005)[order] / 2 / np.pi, P2_HZ, rtol=0.01)
-    np.testing.assert_allclose(poles.zeta()[order], P2_ZETA, atol=0.008)
+    np.testing.assert_allclose(poles.omega_rad_s(0.005)[order] / 2 / np.pi, plants.P2_HZ, rtol=0.01)
+    np.testing.assert_allclose(poles.zeta()[order], plants.P2_ZETA, atol=0.008)
     np.testing.assert_allclose(np.sort(poles.decay_per_s(0.005)), [0.1, 25], rtol=0.1)
     # sqrt(1/2N) = 1.6 %, four of them.
     assert result.noise_std == pytest.approx(truth.noise_std, rel=0.065)
@@ -99,14 +90,15 @@ def test_p2_residuals_and_fit_belong_together(p2_fit):
 
 
 def test_the_same_data_give_the_same_numbers():
-    truth = p1(4)
+    truth = plants.p1(4)
     options = IdentOptions(n_real=2, n_pairs=1, algorithm="GN_DIRECT_L_RAND")
     assert same(*(identify([truth.record], options) for _ in range(2)))
 
 
 def test_progress_is_reported():
     seen = []
-    identify([p1(0).record], IdentOptions(n_real=2, n_pairs=1), progress=lambda f, m: seen.append((f, m)))
+    options = IdentOptions(n_real=2, n_pairs=1)
+    identify([plants.p1(0).record], options, progress=lambda f, m: seen.append((f, m)))
     fractions = [fraction for fraction, _ in seen]
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1.0
@@ -115,7 +107,7 @@ def test_progress_is_reported():
 
 def test_unknown_initial_states_and_offsets_are_taken_care_of():
     """The middle of a record starts from a state nobody knows, on an output with a bias."""
-    truth = p2(1, 3000)
+    truth = plants.p2(1, 3000)
     pieces = [truth.record.slice(1000, 2000), truth.record.slice(2000, 3000)]
     pieces = [
         replace(piece, output=piece.output + bias) for piece, bias in zip(pieces, (2.0, -1.0), strict=True)
@@ -131,7 +123,7 @@ def test_unknown_initial_states_and_offsets_are_taken_care_of():
 
 
 def test_long_records_are_searched_on_a_part_and_polished_on_all():
-    truth = p2(3, 6000)
+    truth = plants.p2(3, 6000)
     whole = identify([truth.record], IdentOptions(n_real=2, n_pairs=3))
     part = identify([truth.record], IdentOptions(n_real=2, n_pairs=3, search_samples=2000))
     assert part.rss == pytest.approx(whole.rss, rel=1e-6)
@@ -139,11 +131,13 @@ def test_long_records_are_searched_on_a_part_and_polished_on_all():
 
 
 def test_noise_free_data_end_at_rounding_without_spurious_poles():
-    truth = p2(0)
-    clean = as_record(truth.record.input[:, 0], truth.clean)
+    truth = plants.p2(0)
+    clean = plants.as_record(truth.record.input[:, 0], truth.clean)
     result = identify([clean])
     assert np.sqrt(result.rss) < 1e-6 * np.linalg.norm(truth.clean)
-    np.testing.assert_allclose(np.sort(result.model.poles.omega_rad_s(0.005)) / 2 / np.pi, P2_HZ, rtol=1e-4)
+    np.testing.assert_allclose(
+        np.sort(result.model.poles.omega_rad_s(0.005)) / 2 / np.pi, plants.P2_HZ, rtol=1e-4
+    )
 
 
 def test_delay_and_feedthrough():
@@ -151,7 +145,7 @@ def test_delay_and_feedthrough():
     u = rng.normal(size=800)
     y = scipy.signal.lfilter([0, 0, 0, 0.5, 0.3], [1, -0.8], u) + 0.01 * rng.normal(size=800)
     result = identify(
-        [as_record(u, y)], IdentOptions(n_real=1, n_pairs=0, input_delay_samples=3, feedthrough=True)
+        [plants.as_record(u, y)], IdentOptions(n_real=1, n_pairs=0, input_delay_samples=3, feedthrough=True)
     )
     assert result.model.poles.real[0] == pytest.approx(0.8, abs=0.005)
     assert result.model.feedthrough == pytest.approx(0.5, abs=0.002)
@@ -160,7 +154,7 @@ def test_delay_and_feedthrough():
 
 
 def test_known_poles_stay_where_they_are():
-    truth = p1(0)
+    truth = plants.p1(0)
     slow = 1 - 1e-6
     result = identify(
         [truth.record], IdentOptions(fixed_poles=((slow, 0.0), (slow, 0.0)), n_real=0, n_pairs=1)
@@ -189,14 +183,14 @@ def test_bad_options_are_refused_by_name(options, message):
 def test_constant_signals_are_refused():
     k = np.arange(100.0)
     with pytest.raises(ValueError, match=r"record 'test': input column 'u' is constant \(2\)"):
-        identify([as_record(np.full(100, 2.0), k)])
+        identify([plants.as_record(np.full(100, 2.0), k)])
     with pytest.raises(ValueError, match="output column 'y' is constant"):
-        identify([as_record(k, np.full(100, 2.0))])
+        identify([plants.as_record(k, np.full(100, 2.0))])
 
 
 def test_too_few_samples_for_the_order_are_refused():
     rng = np.random.default_rng(0)
-    record = as_record(rng.normal(size=12), rng.normal(size=12))
+    record = plants.as_record(rng.normal(size=12), rng.normal(size=12))
     with pytest.raises(
         ValueError, match=r"record 'test': 12 samples are too few for order 8, which has 17 unknowns"
     ):
@@ -204,7 +198,7 @@ def test_too_few_samples_for_the_order_are_refused():
 
 
 def test_poles_at_a_bound_come_with_advice():
-    truth = p1(1)
+    truth = plants.p1(1)
     result = identify([truth.record], IdentOptions(n_real=2, n_pairs=1, omega_min_rad_s=20.0))
     assert FindingKind.FREQUENCY_BOUND in kinds(result.warnings)
     result = identify([truth.record], IdentOptions(n_real=2, n_pairs=1, zeta_min=0.05))
@@ -215,7 +209,7 @@ def test_an_overdamped_pair_is_named():
     rng = np.random.default_rng(0)
     u = rng.normal(size=1000)
     y = scipy.signal.lfilter([0, 1, 0.4], np.polymul([1, -0.95], [1, -0.6]), u) + 0.05 * rng.normal(size=1000)
-    result = identify([as_record(u, y)], IdentOptions(n_real=0, n_pairs=1))
+    result = identify([plants.as_record(u, y)], IdentOptions(n_real=0, n_pairs=1))
     assert FindingKind.OVERDAMPED_PAIR in kinds(result.warnings)
 
 
@@ -236,7 +230,7 @@ def test_a_free_decay_is_recognised():
     k = np.arange(600)
     u = 1e-3 * rng.normal(size=600)
     y = 0.99**k * np.cos(0.2 * k) + 1e-3 * rng.normal(size=600)
-    result = identify([as_record(u, y)])
+    result = identify([plants.as_record(u, y)])
     assert result.structure.estimate_initial_state
     # Standard deviation of the decay rate about 1e-3 times the rate's square root over the amplitude: 1e-5.
     assert np.min(np.abs(result.model.poles.pairs - 0.99 * np.exp(0.2j))) < 1e-4
@@ -244,17 +238,19 @@ def test_a_free_decay_is_recognised():
 
 def test_unrelated_signals_give_no_poles_and_say_so():
     rng = np.random.default_rng(0)
-    result = identify([as_record(rng.normal(size=500), rng.normal(size=500))])
+    result = identify([plants.as_record(rng.normal(size=500), rng.normal(size=500))])
     assert result.model.order == 0
     assert FindingKind.NO_POLE in kinds(result.warnings)
 
 
 def test_a_search_in_mid_record_does_not_change_what_was_asked_for():
-    truth = p2(0, 3000)
+    truth = plants.p2(0, 3000)
     u = np.concatenate([np.zeros(3000), truth.record.input[:, 0]])
-    y = run(truth.system, u) + truth.noise_std * np.random.default_rng(1).normal(size=6000)
+    y = plants.run(truth.system, u) + truth.noise_std * np.random.default_rng(1).normal(size=6000)
     options = IdentOptions(n_real=2, n_pairs=3, search_samples=2000, estimate_initial_state=False)
-    result = identify([as_record(u, y)], options)
+    result = identify([plants.as_record(u, y)], options)
     assert not result.structure.estimate_initial_state
     assert np.all(np.diff(result.model.poles.omega_rad_s(0.005)) > 0)
-    np.testing.assert_allclose(result.model.poles.omega_rad_s(0.005)[:2] / 2 / np.pi, P2_HZ[:2], rtol=0.01)
+    np.testing.assert_allclose(
+        result.model.poles.omega_rad_s(0.005)[:2] / 2 / np.pi, plants.P2_HZ[:2], rtol=0.01
+    )

@@ -34,6 +34,7 @@ from ident.search.direct import minimise
 from ident.search.error_surface import error_surface
 from ident.search.pole_search import PoleSearch
 from tests.ident import (
+    paper_oracles as oracles,
     test_basis,
     test_candidate_cost,
     test_error_surface,
@@ -42,15 +43,6 @@ from tests.ident import (
     test_pole_search,
 )
 from tests.ident.benchmark_plants import as_record
-from tests.ident.paper_oracles import (
-    combination,
-    complex_realisation,
-    kautz_numerators,
-    pair_metric,
-    paper_numerators,
-    real_realisation,
-    rotated_numerators,
-)
 from validation.comparators.comparators import arx
 
 DT_S = 0.005
@@ -69,24 +61,24 @@ EQUATIONS = (
         [test_model.test_simulation_agrees_with_control]),
     ((4,), "orthonormal on the unit circle", [basis_response],
         [test_basis.test_basis_is_orthonormal_on_the_circle, test_basis.test_kernel_identity]),
-    ((5,), "the generalised basis", [basis_response, all_pass_response, complex_realisation],
+    ((5,), "the generalised basis", [basis_response, all_pass_response, oracles.complex_realisation],
         [test_basis.test_real_poles_give_the_printed_formula,
         test_basis.test_paper_complex_states_are_the_printed_functions]),
     ((6,), "Laguerre: one real pole repeated", [basis_response, regressor],
         [test_basis.test_laguerre_by_transfer_functions]),
-    ((7, 8, 9, 10), "real pair as unitary combinations of the complex functions", [combination],
+    ((7, 8, 9, 10), "real pair as unitary combinations of the complex functions", [oracles.combination],
         [test_basis.test_paper_state_space_gives_the_same_basis]),
-    ((11, 12), "each function from the one before", [basis_response, complex_realisation], []),
-    ((13,), "m1 q + m2 behind the all-pass of the poles before", [regressor, combination], []),
-    ((14, 15, 16), "x_k' M x_k = |1 - xi^2|^2, x_1' M x_2 = 0, and M", [pair_metric], []),
-    ((17,), "x_2 from x_1 by a quarter turn in the space of M", [rotated_numerators], []),
-    ((18, 19), "the solution with m2 = 0", [paper_numerators], []),
+    ((11, 12), "each function from the one before", [basis_response, oracles.complex_realisation], []),
+    ((13,), "m1 q + m2 behind the all-pass of the poles before", [regressor, oracles.combination], []),
+    ((14, 15, 16), "x_k' M x_k = |1 - xi^2|^2, x_1' M x_2 = 0, and M", [oracles.pair_metric], []),
+    ((17,), "x_2 from x_1 by a quarter turn in the space of M", [oracles.rotated_numerators], []),
+    ((18, 19), "the solution with m2 = 0", [oracles.paper_numerators], []),
     ((20,), "J, the mean square of the residual", [fit, error_surface],
         [test_error_surface.test_surface_is_the_fit_at_every_point]),
     ((21,), "linear regression phi' theta", [regressor, GobfModel.simulate], []),
-    ((22, 23, 24), "difference equations of the states, solved for x(k+1)", [complex_realisation],
+    ((22, 23, 24), "difference equations of the states, solved for x(k+1)", [oracles.complex_realisation],
         [test_basis.test_paper_complex_states_are_the_printed_functions]),
-    ((25, 26), "real states by the block diagonal T", [real_realisation, basis_state_space],
+    ((25, 26), "real states by the block diagonal T", [oracles.real_realisation, basis_state_space],
         [test_basis.test_paper_state_space_gives_the_same_basis,
         test_basis.test_realisation_is_lossless_next_to_the_circle]),
     ((27,), "least-squares coefficients", [fit],
@@ -133,16 +125,16 @@ def test_2_zero_poles_are_the_fir_model():
 
 
 SOLUTIONS = {
-    "paper (18)-(19)": paper_numerators,
-    "rotated by 0.7": lambda pole: rotated_numerators(pole, 0.7),
-    "rotated by 2.9": lambda pole: rotated_numerators(pole, 2.9),
-    "Kautz": kautz_numerators,
+    "paper (18)-(19)": oracles.paper_numerators,
+    "rotated by 0.7": lambda pole: oracles.rotated_numerators(pole, 0.7),
+    "rotated by 2.9": lambda pole: oracles.rotated_numerators(pole, 2.9),
+    "Kautz": oracles.kautz_numerators,
 }
 
 
 def test_11_12_functions_follow_from_the_one_before():
     xi, z = MIXED.values, Z
-    A, B = complex_realisation(MIXED)
+    A, B = oracles.complex_realisation(MIXED)
     functions = np.array([np.linalg.solve(value * np.eye(xi.size) - A, B)[:, 0] for value in z])
     for i in range(1, xi.size):
         ratio = np.sqrt((1 - abs(xi[i]) ** 2) / (1 - abs(xi[i - 1]) ** 2))

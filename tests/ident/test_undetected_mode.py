@@ -10,19 +10,10 @@ from ident.basis.options import EmbeddingOptions
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.record import Record
+from ident.uncertainty import undetected_mode
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.embedding_algebra import KernelPosterior, reduce_regression
 from ident.uncertainty.embedding_rows import EmbeddingRows
-from ident.uncertainty.undetected_mode import (
-    PairMixture,
-    candidate_pairs,
-    cascade_coordinates,
-    pair_evidence,
-    pair_mixture,
-    pair_statistics,
-    refined_pair,
-    with_pairs,
-)
 
 from .benchmark_plants import DT_S as DT
 from .test_residual_noise import covariance
@@ -87,8 +78,8 @@ def setup(whitening):
 def test_evidence_and_amplitudes_equal_the_dense_ones(whitening):
     records, rows = setup(whitening)
     reduced = reduce_regression(rows.blocks())
-    statistics = pair_statistics(rows.pair_blocks(), reduced, TRIAL)
-    evidence = pair_evidence(statistics, reduced.degrees_of_freedom)
+    statistics = undetected_mode.pair_statistics(rows.pair_blocks(), reduced, TRIAL)
+    evidence = undetected_mode.pair_evidence(statistics, reduced.degrees_of_freedom)
 
     everything = [*REAL, PAIR, np.conj(PAIR)]
     flat, columns, output = [], [], []
@@ -141,11 +132,13 @@ def test_evidence_and_amplitudes_equal_the_dense_ones(whitening):
 def test_coordinates_in_the_cascade_give_the_same_response():
     poles = np.array([0.97 * np.exp(0.5j), 0.96 * np.exp(0.52j), 0.8 * np.exp(2.0j)])
     z = np.exp(1j * np.linspace(0.01, np.pi, 40))
-    cascade = basis_response(Poles(np.zeros(0), poles), z) @ cascade_coordinates(poles)
+    cascade = basis_response(Poles(np.zeros(0), poles), z) @ undetected_mode.cascade_coordinates(poles)
     alone = np.hstack([basis_response(Poles(np.zeros(0), poles[i : i + 1]), z) for i in range(3)])
     np.testing.assert_allclose(cascade, alone, rtol=0, atol=1e-12 * np.abs(alone).max())
     # Orthonormal on both sides pair by pair: the columns of a pair have length 1.
-    np.testing.assert_allclose(np.linalg.norm(cascade_coordinates(poles), axis=0), 1, rtol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.norm(undetected_mode.cascade_coordinates(poles), axis=0), 1, rtol=1e-12
+    )
 
 
 def test_moments_are_those_of_the_mixture():
@@ -154,12 +147,12 @@ def test_moments_are_those_of_the_mixture():
     factor = rng.standard_normal((length, length))
     rest = KernelPosterior(rng.standard_normal(length), factor, 0.5, 1.0, 0.9, 0.4, 0.0)
     half = rng.standard_normal((k, 2, 2))
-    mixture = PairMixture(
+    mixture = undetected_mode.PairMixture(
         poles=TRIAL, weight=np.array([0.3, 0.1]), mean=rng.standard_normal((k, 2)),
         covariance=half @ half.transpose(0, 2, 1), noise_variance=np.array([0.4, 0.7]), onto=np.zeros((1, 4)),
         probability=0.45, visible=None,
     )  # fmt: skip
-    found = with_pairs(rest, mixture)
+    found = undetected_mode.with_pairs(rest, mixture)
     hypotheses = [(0.6, np.concatenate([rest.kernel_mean, np.zeros(4)]), np.zeros((7, 7)))]
     hypotheses[0][2][:3, :3] = factor @ factor.T
     for i in range(k):
@@ -179,10 +172,12 @@ def test_weights_are_prior_times_evidence():
     _, rows = setup(np.ones(1))
     reduced = reduce_regression(rows.blocks())
     prior = np.array([0.25, 0.75])
-    statistics = pair_statistics(rows.pair_blocks(), reduced, TRIAL)
-    evidence = pair_evidence(statistics, reduced.degrees_of_freedom)
+    statistics = undetected_mode.pair_statistics(rows.pair_blocks(), reduced, TRIAL)
+    evidence = undetected_mode.pair_evidence(statistics, reduced.degrees_of_freedom)
     log_rest = float(evidence.log_likelihood.max())  # so that neither side is negligible
-    mixture = pair_mixture(TRIAL, prior, statistics, reduced.degrees_of_freedom, log_rest, 3.0)
+    mixture = undetected_mode.pair_mixture(
+        TRIAL, prior, statistics, reduced.degrees_of_freedom, log_rest, 3.0
+    )
     raw = 3.0 * prior[:, None] * evidence.prior * np.exp(evidence.log_likelihood - log_rest)
     assert evidence.prior.sum() == pytest.approx(1.0)
     assert mixture.probability == pytest.approx(raw.sum() / (1 + raw.sum()), rel=1e-12)
@@ -190,7 +185,7 @@ def test_weights_are_prior_times_evidence():
 
 
 def test_grid_covers_the_box_and_never_leaves_the_circle():
-    poles, prior = candidate_pairs(1000)
+    poles, prior = undetected_mode.candidate_pairs(1000)
     rate = np.log(poles)
     omega, zeta = np.abs(rate), -rate.real / np.abs(rate)
     assert prior.sum() == pytest.approx(1.0)
@@ -204,7 +199,7 @@ def test_grid_covers_the_box_and_never_leaves_the_circle():
 
 def test_a_mode_is_missing_only_above_what_is_asked():
     for above in (0.3, 3.1):  # the second, beyond the highest, leaves that one
-        poles, prior = candidate_pairs(1000, above)
+        poles, prior = undetected_mode.candidate_pairs(1000, above)
         assert np.all(np.abs(np.log(poles)) >= min(above, 0.9 * np.pi) * (1 - 1e-9))
         assert prior.sum() == pytest.approx(1.0)
 
@@ -249,10 +244,10 @@ def test_refined_pair_is_at_the_minimum_of_the_residual():
     rows = EmbeddingRows((arm.record,), Structure(estimate_offset=True), poles, 20, np.ones(1))
     reduced = reduce_regression(rows.blocks())
     start = arm.poles[4] * np.exp(0.01j)
-    found = refined_pair(rows.pair_blocks, reduced, start)
+    found = undetected_mode.refined_pair(rows.pair_blocks, reduced, start)
 
     def explained(pair):
-        s = pair_statistics(rows.pair_blocks(), reduced, np.array([pair]))
+        s = undetected_mode.pair_statistics(rows.pair_blocks(), reduced, np.array([pair]))
         return float(s.projection[0] @ np.linalg.solve(s.gram[0], s.projection[0]))
 
     best = explained(found)

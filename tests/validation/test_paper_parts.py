@@ -8,20 +8,12 @@ from ident.data.record import Record
 from ident.search.error_surface import ErrorSurface
 from validation.comparators.prediction_error import arx_polynomials
 from validation.example_arms import paper_example
+from validation.paper import surface as paper
 from validation.paper.bounds import coverage_of
 from validation.paper.experiments import frequencies
 from validation.paper.machines import NOISE_STD, SNR_DB, LinkExperiment, SimulationExample
 from validation.paper.methods import fit_percent, is_mode, score
 from validation.paper.settings import DT_S, PaperSettings
-from validation.paper.surface import (
-    MinimaCount,
-    SearchShares,
-    _count,
-    minima_along,
-    resonant_record,
-    slices,
-    true_pair,
-)
 from validation.paper.usual_starts import instrumental_variables, usual_oe
 
 
@@ -148,11 +140,11 @@ def test_output_error_from_usual_starts_finds_a_well_damped_plant():
 
 
 def test_resonance_lies_in_the_paper_s_window():
-    pole = true_pair().pairs[0]
+    pole = paper.true_pair().pairs[0]
     gamma = abs(pole) ** 2
     assert 0.98 < 2 * pole.real / (1 + gamma) < 1
     assert 0.9988 < gamma < 1
-    record = resonant_record(np.random.default_rng(0))
+    record = paper.resonant_record(np.random.default_rng(0))
     assert np.var(record.output) == pytest.approx(0.04, rel=0.01)
 
 
@@ -165,16 +157,16 @@ def test_minima_inside_are_counted_apart_from_the_border():
     def surface(values):
         return ErrorSurface(x, y, ("a", "b"), values, (0.0, 0.0))
 
-    assert _count(surface(bowl)) == MinimaCount(121, 3, 0)
-    assert _count(surface(valley)) == MinimaCount(121, 0, 3)
-    ((at, along),) = slices(surface(valley), [-0.99])
+    assert paper._count(surface(bowl)) == paper.MinimaCount(121, 3, 0)
+    assert paper._count(surface(valley)) == paper.MinimaCount(121, 0, 3)
+    ((at, along),) = paper.slices(surface(valley), [-0.99])
     assert at == -1
-    assert minima_along(along) == 3
+    assert paper.minima_along(along) == 3
 
 
 def test_shares_are_over_all_variants():
     hits = {("order 2", "raw", "A"): 4, ("order 2", "raw", "B"): 1, ("order 4", "raw", "A"): 0}
-    shares = SearchShares(5, 500, hits)
+    shares = paper.SearchShares(5, 500, hits)
     assert shares.share_percent("order 2", "raw") == 50
     assert shares.share_percent("order 4", "raw") == 0
 
