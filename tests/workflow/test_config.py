@@ -93,27 +93,21 @@ def test_contradictions_in_the_source(tmp_path, old, new, complaint):
         minimal(tmp_path, MINIMAL.replace(old, new))
 
 
+SIZE = {"amplitude_V": 2.0, "samples": 100}
+
+
 @pytest.mark.parametrize(
-    "table",
+    ("kind", "name", "table"),
     [
-        {"kind": "prbs", "amplitude_V": 2.0, "samples": 100},
-        {"kind": "multisine", "rms_V": 1.0, "period_samples": 100, "from_Hz": 2.0, "to_Hz": 50.0},
-        {"kind": "log_chirp", "amplitude_V": 2.0, "samples": 100, "from_Hz": 1.0, "to_Hz": 40.0},
-        {"kind": "doublet", "amplitude_V": 2.0, "samples": 100, "pulse_s": 0.1},
-        {"kind": "bang_bang", "amplitude_V": 2.0, "samples": 100, "slew_s": 0.2},
+        (Prbs, "prbs", SIZE),
+        (Multisine, "multisine", {"rms_V": 1.0, "period_samples": 100, "from_Hz": 2.0, "to_Hz": 50.0}),
+        (LogChirp, "log_chirp", SIZE | {"from_Hz": 1.0, "to_Hz": 40.0}),
+        (Doublet, "doublet", SIZE | {"pulse_s": 0.1}),
+        (BangBang, "bang_bang", SIZE | {"slew_s": 0.2}),
     ],
-    ids=lambda table: table["kind"],
 )
-def test_every_excitation_gives_its_samples_and_its_size(table):
-    kinds = {
-        "prbs": Prbs,
-        "multisine": Multisine,
-        "log_chirp": LogChirp,
-        "doublet": Doublet,
-        "bang_bang": BangBang,
-    }
-    excitation = check(kinds[table["kind"]], table, source="x")
-    signal = excitation.signal(0.005, np.random.default_rng(1))
+def test_every_excitation_gives_its_samples_and_its_size(kind, name, table):
+    signal = check(kind, {"kind": name, **table}, source="x").signal(0.005, np.random.default_rng(1))
     assert signal.shape == (100,)
     if "rms_V" in table:
         np.testing.assert_allclose(np.sqrt(np.mean(signal**2)), table["rms_V"], rtol=1e-12)

@@ -30,8 +30,6 @@ from workflow.tasks.stage import StageInput
 from workflow.tasks.stages import design_filter
 from workflow.tasks.uncertainty import posterior_of
 
-_IN_OUT = "voltage_V", "hub_angle_rad"
-
 
 @pytest.fixture(scope="module")
 def run(fast_run) -> RunResults:
@@ -55,19 +53,16 @@ def test_records_are_the_simulated_arm_and_its_sensor_noise(run):
     noise = records[0].record.output - clean.output
     sensors = paper_link().sensors
     # 700 samples: the standard deviation is known to 2.7 %; 5 sigma.
-    np.testing.assert_allclose(
-        noise.std(axis=0), [sensors.hub_angle_noise_rad, sensors.tip_noise_m], rtol=0.14
-    )
+    stated = [sensors.hub_angle_noise_rad, sensors.tip_noise_m]
+    np.testing.assert_allclose(noise.std(axis=0), stated, rtol=0.14)
 
 
 def test_commands_beyond_what_the_amplifier_gives_are_taken_as_that(run):
     """The arm behind it is then the same: `test_identify_command.py`."""
     source = config_of(run.run).source
     entry = source.records[0]
-    effects = (
-        *source.effects,
-        {"name": "actuator_saturation", "limit_V": 0.7 * entry.excitation.amplitude_V},
-    )
+    limit = {"name": "actuator_saturation", "limit_V": 0.7 * entry.excitation.amplitude_V}
+    effects = (*source.effects, limit)
     loud = config_of(run.run).model_copy(update={"source": source.model_copy(update={"effects": effects})})
     first = make_records(StageInput(loud, run, Progress())).records[0]
     commanded = run.records.records[0].record

@@ -32,12 +32,14 @@ ARRAYS = {
 
 
 def test_npz_round_trip_is_exact(tmp_path):
+    """By us and by numpy itself."""
     storage.write_bytes(tmp_path / "a.npz", storage.npz_bytes(ARRAYS))
-    back = storage.read_npz(tmp_path / "a.npz")
-    assert back.keys() == ARRAYS.keys()
-    for name, array in ARRAYS.items():
-        assert back[name].dtype == array.dtype
-        np.testing.assert_array_equal(back[name], array)
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
+        for back in (storage.read_npz(tmp_path / "a.npz"), dict(archive)):
+            assert back.keys() == ARRAYS.keys()
+            for name, array in ARRAYS.items():
+                assert back[name].dtype == array.dtype
+                np.testing.assert_array_equal(back[name], array)
 
 
 def test_equal_arrays_give_equal_bytes(monkeypatch):
@@ -46,16 +48,9 @@ def test_equal_arrays_give_equal_bytes(monkeypatch):
     assert storage.npz_bytes({name: array.copy() for name, array in ARRAYS.items()}) == first
 
 
-def test_numpy_itself_reads_the_file(tmp_path):
-    storage.write_bytes(tmp_path / "a.npz", storage.npz_bytes(ARRAYS))
-    with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
-        np.testing.assert_array_equal(archive["response"], ARRAYS["response"])
-
-
-def test_objects_are_refused_on_writing(tmp_path):
+def test_objects_are_refused_on_writing():
     with pytest.raises(TypeError, match=r"'bad'.*pickle"):
         storage.npz_bytes({"bad": np.array([{"a": 1}], dtype=object)})
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_pickle_is_refused_on_reading(tmp_path):
