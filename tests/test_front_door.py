@@ -367,9 +367,8 @@ def test_a_time_response_of_python_control_is_a_record():
     u = np.r_[np.ones(20), -np.ones(30)]
     record = flexlink.Record(control.forced_response(TF, inputs=u), name="simulated", input_names="voltage_V")
     np.testing.assert_array_equal(record.input[:, 0], u)
-    np.testing.assert_allclose(
-        record.output[:, 0], lfilter([0.1, 0.05], [1.0, -1.5, 0.6], np.r_[0.0, u[:-1]])
-    )
+    expected = lfilter([0.1, 0.05], [1.0, -1.5, 0.6], np.r_[0.0, u[:-1]])
+    np.testing.assert_allclose(record.output[:, 0], expected)
     assert record.dt_s == pytest.approx(0.01)
     assert record.input_names == ("voltage_V",)
 
@@ -380,9 +379,8 @@ def test_one_name_may_stand_by_itself(tmp_path):
     assert (record.input_names, record.output_names) == (("voltage_V",), ("angle",))
     assert flexlink.Record([1.0, 2.0], [3.0, 4.0], 0.1, output_names="angle").output_names == ("angle",)
     table = record.table()
-    assert flexlink.Record.from_table(table, ["voltage_V"], ["angle"], time="time_s").output_names == (
-        "angle",
-    )
+    again = flexlink.Record.from_table(table, ["voltage_V"], ["angle"], time="time_s")
+    assert again.output_names == ("angle",)
 
 
 TWO = control.ss(np.eye(2) / 2, np.eye(2), np.eye(2), np.zeros((2, 2)), 0.01)

@@ -15,9 +15,7 @@ from .plants import random_stable
 
 
 def _controller(system: control.StateSpace, delay: int) -> Controller:
-    return Controller(
-        system.A, system.B, system.C, system.D, float(system.dt), computational_delay_samples=delay
-    )
+    return Controller(*control.ssdata(system), float(system.dt), computational_delay_samples=delay)
 
 
 def _count(controller: Controller, plant: UncertainPlant) -> bool:

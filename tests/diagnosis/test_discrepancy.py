@@ -16,9 +16,8 @@ def _noise(rng):
 
 
 def test_white_noise_leaves_nothing():
-    gains = np.array(
-        [discrepancy(_noise(np.random.default_rng(seed)), SEGMENTS).log_gain for seed in range(60)]
-    )
+    generators = map(np.random.default_rng, range(60))
+    gains = np.array([discrepancy(_noise(rng), SEGMENTS).log_gain for rng in generators])
     # A Bayes factor above 20 against the truth comes in fewer than 1 of 20 cases, whatever the alternatives.
     assert np.mean(gains > np.log(20)) <= 0.05
     assert np.median(gains) < 0

@@ -12,9 +12,8 @@ def test_slope_and_curvature_are_derivatives_of_the_cost(d):
     below, here, above = (prior_cost(np.array([v])) for v in (d - h, d, d + h))
     assert (above - below) / (4 * h) == pytest.approx(prior_slope(np.array([d]))[0], abs=1e-6)
     # Exact for a piecewise parabola; 1e-8 / h^2 of rounding.
-    assert (above - 2 * here + below) / (2 * h**2) == pytest.approx(
-        prior_curvature(np.array([d]))[0], abs=1e-5
-    )
+    curvature = (above - 2 * here + below) / (2 * h**2)
+    assert curvature == pytest.approx(prior_curvature(np.array([d]))[0], abs=1e-5)
 
 
 def test_it_is_gaussian_within_two_tolerances_and_stricter_beyond():

@@ -171,9 +171,8 @@ def test_a_damping_nobody_can_tell_is_named():
 
 
 def test_few_samples_for_the_unknowns():
-    assert (
-        only(warnings_of(p2(0, 80).record, n_real=2, n_pairs=1), FindingKind.FEW_SAMPLES)["n_samples"] == 80
-    )
+    found = only(warnings_of(p2(0, 80).record, n_real=2, n_pairs=1), FindingKind.FEW_SAMPLES)
+    assert found["n_samples"] == 80
 
 
 # Trend and offset

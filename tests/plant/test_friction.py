@@ -52,9 +52,8 @@ def test_steady_speed_is_what_is_left_of_the_torque(friction, level):
 def test_stribeck_friction_without_a_fall_is_coulomb_friction():
     voltage = prbs(7, 5, 1.5, 600)
     same = STRIBECK.model_copy(update={"coulomb_torque_Nm": LEVEL})
-    np.testing.assert_array_equal(
-        simulate(RIG, voltage, [same]).output, simulate(RIG, voltage, [COULOMB]).output
-    )
+    runs = [simulate(RIG, voltage, [friction]).output for friction in (same, COULOMB)]
+    np.testing.assert_array_equal(*runs)
 
 
 def test_after_a_push_the_arm_comes_to_rest_and_stays():

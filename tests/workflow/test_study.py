@@ -88,10 +88,8 @@ def test_points_open_with_the_usual_tools(small_study, tmp_path, flexlink):
         by_number = out / "points" / row["number"]
         assert by_number.exists() == (row["state"] != "failed"), row
         assert by_number.resolve().name == row["name"]
-    assert (
-        RunDirectory.open(out / "points" / "1").config_document()
-        == RunDirectory.open(point).config_document()
-    )
+    again, other = (RunDirectory.open(path).config_document() for path in (out / "points" / "1", point))
+    assert again == other
 
 
 def test_points_of_one_design_share_controller_and_plant(small_study):
@@ -341,9 +339,8 @@ def test_places_that_are_taken_are_refused(refused, small_study, tmp_path):
     study = write_study(tmp_path)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").write_text("")
-    assert "not empty (it holds 'thesis.tex')" in refused(
-        "study", "--config", study, "--out", tmp_path / "other"
-    )
+    line = refused("study", "--config", study, "--out", tmp_path / "other")
+    assert "not empty (it holds 'thesis.tex')" in line
     line = refused("study", "--config", study, "--out", small_study[0])
     assert "an earlier study is there" in line
     assert "--resume" in line
