@@ -32,6 +32,7 @@ SIGNALS = (
 SIGNALS += "Strom~in~A Weg~in~mm A mm|cmd~[mV] ω~[rad/s] mV rad/s|u y  "
 START = np.datetime64("2024-02-29T23:59:58.500", "ns")  # passes midnight, in a leap year
 ANSWERS = ("read", "ask", "refuse")
+MATLAB_MARK = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"  # before HDF5
 
 
 class UnfitError(Exception):
@@ -171,9 +172,8 @@ def comment_names(log: Log) -> None:
 
 
 def comment_between(log: Log) -> None:
-    log.between[len(log.rows) // 2] = comment(
-        log, str(log.rng.choice(["gripper closed", "restarted", "ok"]))
-    )[0]
+    words = str(log.rng.choice(["gripper closed", "restarted", "ok"]))
+    (log.between[len(log.rows) // 2],) = comment(log, words)
 
 
 def rows_out(log: Log) -> None:
@@ -230,9 +230,8 @@ def column(log: Log, name: str, cell: Callable[[int], str], answer: str = "read"
 
 
 def hole(log: Log) -> None:
-    log.rows[len(log.rows) // 3][2] = str(
-        log.rng.choice(["", "nan", "NaN"] if log.separator != " " else ["nan"])
-    )
+    words = ["", "nan", "NaN"] if log.separator != " " else ["nan"]
+    log.rows[len(log.rows) // 3][2] = str(log.rng.choice(words))
     log.needs("refuse")
 
 
@@ -333,9 +332,7 @@ def plain(log: Log) -> dict[str, Any]:
 
 def float32(log: Log) -> dict[str, Any]:
     log.u, log.y = log.u.astype("f4").astype(float), log.y.astype("f4").astype(float)
-    return {
-        name: values.astype("f4") if k else values for k, (name, values) in enumerate(log.columns.items())
-    }
+    return log.columns | {name: log.columns[name].astype("f4") for name in log.names[1:]}
 
 
 def epoch_ns(log: Log) -> dict[str, Any]:
@@ -409,8 +406,7 @@ def mat73(log: Log, columns: Columns) -> bytes:
         for name, values in columns(log).items():
             file[name] = np.atleast_2d(values).T if log.rng.random() < 0.5 else np.atleast_2d(values)
             file[name].attrs["MATLAB_class"] = np.bytes_("double")
-    mark = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
-    return mark + stream.getvalue()[len(mark) :]
+    return MATLAB_MARK + stream.getvalue()[len(MATLAB_MARK) :]
 
 
 def hdf5(log: Log, columns: Columns) -> bytes:

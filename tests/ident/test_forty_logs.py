@@ -26,6 +26,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
 from ident.data.record import Record
+from tests.ident.generated_logs import MATLAB_MARK, written
 
 N, DT_S = 60, 0.01
 K = np.arange(N)
@@ -75,35 +76,28 @@ def clock(form: str) -> Callable[[float], str]:
 
 
 def npz(**arrays) -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    return buffer.getvalue()
+    return written(np.savez, **arrays)
 
 
 def mat(**variables) -> bytes:
-    buffer = io.BytesIO()
-    scipy.io.savemat(buffer, variables, do_compression=True)
-    return buffer.getvalue()
+    return written(scipy.io.savemat, variables, do_compression=True)
 
 
 def sheet(*rows) -> bytes:
-    book, buffer = openpyxl.Workbook(), io.BytesIO()
+    book = openpyxl.Workbook()
     book.create_sheet("Data")
     for row in rows:
         book.worksheets[1].append(row)
-    book.save(buffer)
-    return buffer.getvalue()
+    return written(book.save)
 
 
 def parquet(units=("", "", ""), **columns) -> bytes:
-    sink = pa.BufferOutputStream()
     arrays = [pa.array(values) for values in columns.values()]
     fields = [
         pa.field(name, array.type, metadata={"unit": unit})
         for name, array, unit in zip(columns, arrays, units, strict=False)
     ]
-    pq.write_table(pa.table(arrays, pa.schema(fields)), sink)
-    return sink.getvalue().to_pybytes()
+    return written(lambda stream: pq.write_table(pa.table(arrays, pa.schema(fields)), stream))
 
 
 def hdf5(matlab=False, **datasets) -> bytes:
@@ -118,7 +112,7 @@ def hdf5(matlab=False, **datasets) -> bytes:
                 data.attrs["MATLAB_class"] = np.bytes_("double")
             elif name.endswith("tip"):
                 data.attrs["unit"] = "mm"
-    mark = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" if matlab else b""
+    mark = MATLAB_MARK if matlab else b""
     return mark + buffer.getvalue()[len(mark) :]
 
 

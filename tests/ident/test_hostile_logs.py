@@ -92,18 +92,22 @@ def test_sizes_are_limited(tmp_path, monkeypatch):
         read_table(tmp_path / "a.csv")
 
 
-def test_entities_that_grow_do_not_fill_the_memory(tmp_path):
-    """A spreadsheet is XML: each of ten entities is ten of the one before."""
-    source, bomb = LOGS["a spreadsheet"].content, io.BytesIO()
-    entities = "".join(f'<!ENTITY a{k + 1} "{f"&a{k};" * 10}">' for k in range(10))
-    with zipfile.ZipFile(io.BytesIO(source)) as old, zipfile.ZipFile(bomb, "w") as new:
+def spreadsheet(path, change) -> None:
+    """A good one but for the text of its sheet."""
+    with (
+        zipfile.ZipFile(io.BytesIO(LOGS["a spreadsheet"].content)) as old,
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as new,
+    ):
         for entry in old.infolist():
             text = old.read(entry)
-            if entry.filename == "xl/worksheets/sheet2.xml":
-                head = f'<!DOCTYPE worksheet [<!ENTITY a0 "aaaaaaaaaa">{entities}]>'.encode()
-                text = head + text.replace(b">t_s<", b">&a10;<")
-            new.writestr(entry, text)
-    (tmp_path / "a.xlsx").write_bytes(bomb.getvalue())
+            new.writestr(entry, change(text) if entry.filename == "xl/worksheets/sheet2.xml" else text)
+
+
+def test_entities_that_grow_do_not_fill_the_memory(tmp_path):
+    """A spreadsheet is XML: each of ten entities is ten of the one before."""
+    entities = "".join(f'<!ENTITY a{k + 1} "{f"&a{k};" * 10}">' for k in range(10))
+    head = f'<!DOCTYPE worksheet [<!ENTITY a0 "aaaaaaaaaa">{entities}]>'.encode()
+    spreadsheet(tmp_path / "a.xlsx", lambda text: head + text.replace(b">t_s<", b">&a10;<"))
     with pytest.raises(ValueError, match=r"a\.xlsx: "):
         read_table(tmp_path / "a.xlsx").columns(["t_s"])
 
@@ -125,16 +129,9 @@ def test_a_sheet_without_end_is_refused_within_seconds(tmp_path, monkeypatch, la
         child = child.replace(limit, f"{limit} // {smaller}")
     monkeypatch.setattr(foreign_files, "_SCRIPT", tmp_path / "child.py")
     foreign_files._SCRIPT.write_text(child)
-    last = 100 + last // smaller
-    source, long = LOGS["a spreadsheet"].content, io.BytesIO()
-    rows = b"".join(b'<row r="%d">%b</row>' % (k, row(k)) for k in range(100, last))
-    with zipfile.ZipFile(io.BytesIO(source)) as old, zipfile.ZipFile(long, "w", zipfile.ZIP_DEFLATED) as new:
-        for entry in old.infolist():
-            text = old.read(entry)
-            if entry.filename == "xl/worksheets/sheet2.xml":
-                text = text.replace(b"</sheetData>", rows + b"</sheetData>")
-            new.writestr(entry, text)
-    (tmp_path / "a.xlsx").write_bytes(long.getvalue())
+    rows = b"".join(b'<row r="%d">%b</row>' % (k, row(k)) for k in range(100, 100 + last // smaller))
+    end = b"</sheetData>"
+    spreadsheet(tmp_path / "a.xlsx", lambda text: text.replace(end, rows + end))
     began_s = sum(os.times()[:4])
     with pytest.raises(ValueError, match=r"a\.xlsx: more than .* cells.*: save it as CSV"):
         read_table(tmp_path / "a.xlsx")
