@@ -25,6 +25,12 @@ from .plants import RelativeDisc, hub_arm, tip_acceleration, uncertain_hub
 _QUICK = SynthesisOptions(starts=2, exchange_rounds=1, dense_points=2000, sufficient_gamma=0.97)
 
 
+def _certified(plants, specification, options, seed):
+    """A design and its certificate."""
+    result = synthesise(plants, specification, options, rng=np.random.default_rng(seed))
+    return result, certify(result.controller, plants, specification)
+
+
 def test_link_scenario_a_at_order_5_reaches_the_published_worst_case():
     """Direction: certified worst case at most 0.94 (exact-ellipse bound of any controller 0.931)."""
     plant, specification = flexible_link("A"), flexible_link_specification(5)
@@ -67,8 +73,7 @@ def integrating_arm(integrators):
         effort_rolloff_rad_s=100.0, controller_order=5, input_limit=10.0,
     )  # fmt: skip
     options = SynthesisOptions(starts=12, exchange_rounds=2, sufficient_gamma=0.97)
-    result = synthesise([plant], specification, options, rng=np.random.default_rng(2))
-    return plant, result, certify(result.controller, [plant], specification)
+    return plant, *_certified([plant], specification, options, 2)
 
 
 @pytest.mark.parametrize("integrators", [1, 2])
@@ -98,10 +103,7 @@ def test_active_damping_through_the_tip_without_tracking():
     specification = Specification(
         mode_peak_ratio=0.4, effort_limit=60.0, effort_rolloff_rad_s=100.0, controller_order=4
     )
-    result = synthesise(
-        [plant], specification, SynthesisOptions(sufficient_gamma=0.97), rng=np.random.default_rng(1)
-    )
-    certificate = certify(result.controller, [plant], specification)
+    _, certificate = _certified([plant], specification, SynthesisOptions(sufficient_gamma=0.97), 1)
     assert certificate.certified
     near = [m for m in certificate.plants[0].closed_loop_modes if 12 < m.omega_rad_s < 20]
     assert near
@@ -112,8 +114,7 @@ def test_two_plants_are_met_by_one_controller():
     heavy = hub_arm() * 0.6
     plants = [uncertain_hub(0.03), UncertainPlant("heavy", heavy, RelativeDisc(heavy, 0.03, 60.0))]
     specification = Specification(bandwidth_rad_s=2.0, effort_limit=60.0, controller_order=3)
-    result = synthesise(plants, specification, _QUICK, rng=np.random.default_rng(4))
-    certificate = certify(result.controller, plants, specification)
+    _, certificate = _certified(plants, specification, _QUICK, 4)
     assert certificate.certified
     assert [v.plant for v in certificate.plants] == ["hub", "heavy"]
 
@@ -124,12 +125,8 @@ def test_a_requirement_out_of_reach_names_how_far_and_where():
     specification = Specification(
         bandwidth_rad_s=3.9, modulus_margin=0.5, controller_order=2, computational_delay_samples=0
     )
-    result = synthesise(
-        [plant],
-        specification,
-        SynthesisOptions(starts=1, exchange_rounds=0, dense_points=2000),
-        rng=np.random.default_rng(1),
-    )
+    options = SynthesisOptions(starts=1, exchange_rounds=0, dense_points=2000)
+    result, certificate = _certified([plant], specification, options, 1)
     assert result.outcome is Outcome.NOT_MET
     assert result.gamma > 1.2
     worst = result.blocking[0]
@@ -137,7 +134,7 @@ def test_a_requirement_out_of_reach_names_how_far_and_where():
     assert worst.weight in ("tracking", "modulus")
     assert worst.value == pytest.approx(result.gamma)
     assert 0.1 < worst.omega_rad_s < 60
-    assert not certify(result.controller, [plant], specification).certified
+    assert not certificate.certified
 
 
 _FRUITLESS = SynthesisOptions(starts=1, exchange_rounds=0)
@@ -173,8 +170,7 @@ def test_damping_of_the_measured_output_over_ellipses():
     """Scenario A, published weights, mode peak halved: certified at a few per cent more gamma than 0.931."""
     plant = flexible_link("A")
     specification = flexible_link_specification(6).model_copy(update={"mode_peak_ratio": 0.5})
-    result = synthesise([plant], specification, rng=np.random.default_rng(0))
-    certificate = certify(result.controller, [plant], specification)
+    _, certificate = _certified([plant], specification, SynthesisOptions(), 0)
     assert certificate.certified
     assert certificate.gamma < 0.97
     mode = min(certificate.plants[0].closed_loop_modes, key=lambda m: abs(m.omega_rad_s - 15))
@@ -191,11 +187,10 @@ def test_controller_keeps_the_damping_of_its_own_poles_that_was_asked_for():
     damping = {}
     for asked in (None, 0.7):
         specification = Specification(**fields, controller_damping=asked)
-        result = synthesise([uncertain_hub(0.03)], specification, _QUICK, rng=np.random.default_rng(3))
+        result, certificate = _certified([uncertain_hub(0.03)], specification, _QUICK, 3)
         poles = np.linalg.eigvals(result.controller.A)
         w = (poles - 1) / (poles + 1)  # Tustin's plane up to a factor: angles are what counts
         damping[asked] = min(np.cos(np.pi - np.abs(np.angle(w))))
-        certificate = certify(result.controller, [uncertain_hub(0.03)], specification)
         said = [item for item in certificate.items if "own poles" in item.requirement]
         assert len(said) == (asked is not None)
         if said:

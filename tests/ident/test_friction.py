@@ -18,13 +18,13 @@ from ident.friction.gauss_newton import linearised
 from ident.friction.posterior import of_force
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.pole_intervals import pole_intervals
-from plant import parse_effect, parse_effects, simulate
+from plant import Effect, parse_effect, parse_effects, simulate
 from plant.excitation import multisine, multisine_lines
 from plant.modal import linear_arm
 from plant.presets import paper_link
 from plant.simulation import quantised
 from validation.blind.truth import Truth
-from workflow.config.run_config import SimulatedSource, built_in_config
+from workflow.config.run_config import built_in_config
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, rig_of
 
 RIG = paper_link()
@@ -56,6 +56,12 @@ def recorded(torque_Nm: float, seed: int, output: int = 0, *, independent: bool 
     return records
 
 
+def rubbed(name: str, voltage: RealArray, effect: Effect, rng: np.random.Generator) -> Record:
+    """Hub angle of the arm with one effect."""
+    y = simulate(RIG, voltage, [effect], rng=rng).output[:, :1]
+    return Record(name, voltage[:, None], y, RIG.sampling.dt_s, ("voltage_V",), ("hub_angle_rad",))
+
+
 def true_response(omega_rad_s: RealArray) -> ComplexArray:
     """Held voltage to hub angle and tip (2, F) of the linear arm."""
     sampled = linear_arm(RIG).sample(RIG.sampling.dt_s, method="zoh")
@@ -83,7 +89,6 @@ def test_a_pair_that_does_not_swing_takes_no_mode_from_the_arm() -> None:
     """Records of the default arm whose start has two overdamped pairs: their fit had a level 2 % too low, a
     Stribeck excess that is not there, and no mode at 33 Hz."""
     source = built_in_config()[0].source
-    assert isinstance(source, SimulatedSource)
     source = with_friction(source, 0.1, 16384)
     lines = multisine_lines(1000, 0.005, (0.2, 95.0), "odd_random", np.random.default_rng(99))
     rng, records = np.random.default_rng([8, 38]), []
@@ -107,12 +112,8 @@ def test_friction_that_falls_with_speed_is_told_from_coulomb_friction() -> None:
     wanted = {"static_torque_Nm": 0.1, "coulomb_torque_Nm": 0.05, "stribeck_velocity_rad_s": 0.05}
     effect = parse_effect({"name": "stribeck_friction", **wanted})
     lines = multisine_lines(1000, RIG.sampling.dt_s, (0.2, 60.0), "odd")
-    records = []
-    for rms in (2.0, 4.0, 7.0):
-        voltage = multisine(lines, 1000, rms, rng, periods=2)
-        measured = simulate(RIG, voltage, [effect], rng=rng).output
-        signals = voltage[:, None], measured[:, [0]]
-        records.append(Record(f"{rms}", *signals, RIG.sampling.dt_s, ("voltage_V",), ("y",)))
+    voltages = (multisine(lines, 1000, rms, rng, periods=2) for rms in (2.0, 4.0, 7.0))
+    records = [rubbed(f"{k}", voltage, effect, rng) for k, voltage in enumerate(voltages)]
     found = dry.fit_friction(records, OPTIONS)
     truth = np.array([0.05 * VOLTS_PER_NM, np.log(1e-5), 0.05 * VOLTS_PER_NM, np.log(0.05)])
     law = found.law
@@ -251,13 +252,10 @@ def test_friction_is_viscous_on_average_at_an_amplitude_that_was_not_recorded() 
     period, dt_s, torque_Nm = 500, RIG.sampling.dt_s, 0.05
     lines = multisine_lines(period, dt_s, (0.5, 45.0), "odd")
     omega = 2 * np.pi * lines / (period * dt_s)
-    friction = [parse_effect({"name": "coulomb_friction", "torque_Nm": torque_Nm})]
-    records = []
+    friction, records = [parse_effect({"name": "coulomb_friction", "torque_Nm": torque_Nm})], []
     for k, rms in enumerate((2.0, 2.0, 6.0, 6.0)):
         rng = np.random.default_rng(k)
-        u = multisine(lines, period, rms, rng, periods=2)
-        y = simulate(RIG, u, friction, rng=rng).output[:, :1]
-        records.append(Record(str(k), u[:, None], y, dt_s, ("voltage_V",), ("hub_angle_rad",)))
+        records.append(rubbed(str(k), multisine(lines, period, rms, rng, periods=2), friction[0], rng))
     found = dry.fit_friction(records, OPTIONS)
     rng = np.random.default_rng(9)
     equivalent = dry.equivalent_friction(found, records, rng)

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import scipy.io
 
-from control_design.controllers.controller import Controller
+from control_design import Controller
 from control_design.convex.reference_filter import ReferenceFilter
-from ident.basis.model import GobfModel
+from ident import GobfModel, Poles
 from ident.basis.model_files import ModelFile
-from ident.basis.poles import Poles
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 
 DT_S = 0.05
@@ -86,7 +85,8 @@ def model_file(*, ellipses=True) -> ModelFile:
 
 @pytest.fixture
 def wish(tmp_path):
-    """A design file made of the usual wishes and more."""
+    """A design file made of the usual wishes and more, beside a file of `arm`."""
+    write_json(tmp_path / "arm.json", document(arm()))
 
     def write(more: str = "", wishes: str = WISH):
         path = tmp_path / "wish.toml"
@@ -102,7 +102,6 @@ def numbers(answer, code=0):
 
 def test_state_space_with_stated_uncertainty(flexlink, wish, tmp_path):
     """JSON and MAT give one controller, certified between grid points, and true for members of the set."""
-    write_json(tmp_path / "arm.json", document(arm()))
     system = arm()
     variables = {"A": system.A, "B": system.B, "C": system.C, "D": system.D, "Ts": DT_S}
     scipy.io.savemat(tmp_path / "arm.mat", variables)
@@ -123,7 +122,6 @@ def test_state_space_with_stated_uncertainty(flexlink, wish, tmp_path):
 
 
 def test_design_says_how_far_it_is_from_any_order_and_brings_its_reference_filter(flexlink, wish, tmp_path):
-    write_json(tmp_path / "arm.json", document(arm()))
     more = (
         "[uncertainty]\nmultiplicative = 0.1\n[reference_filter]\ncorner_rad_s = 2.0\ndense_points = 1000\n"
     )
@@ -145,7 +143,6 @@ def test_design_says_how_far_it_is_from_any_order_and_brings_its_reference_filte
 
 
 def test_model_without_uncertainty_says_what_its_certificate_holds_for(flexlink, wish, tmp_path):
-    write_json(tmp_path / "arm.json", document(arm()))
     found = numbers(flexlink("design", tmp_path / "arm.json", "--spec", wish(), "--json"))
     assert "exactly this model" in found["plants"][0]["remarks"][0]
     assert found["certificate"]["plants"][0]["stated"] is False
@@ -164,7 +161,6 @@ def test_exported_model_brings_its_ellipses(flexlink, wish, tmp_path, ending):
 def test_measured_response_on_its_own_grid_and_fitted(flexlink, wish, tmp_path):
     """With a model given for the poles and with a fitted one."""
     write_response(tmp_path / "frf.csv")
-    write_json(tmp_path / "arm.json", document(arm()))
     fit = 'fit = { n_real = 1, n_pairs = 1 }\nbetween_points = "nothing"\n'
     for more, origin, proved in (
         ('nominal = "arm.json"\n', "measured response", True),
@@ -186,14 +182,14 @@ def test_repeated_measurements(flexlink, wish, tmp_path):
 
 
 def test_several_plants_share_one_controller(flexlink, wish, tmp_path):
-    for name, system in (("light", arm(1.0, 12.0)), ("heavy", arm(0.8, 9.0))):
-        write_json(tmp_path / f"{name}.json", document(system))
-    out = tmp_path / "controller.json"
-    files = [tmp_path / "light.json", tmp_path / "heavy.json"]
+    systems, out = {"light": arm(1.0, 12.0), "heavy": arm(0.8, 9.0)}, tmp_path / "controller.json"
+    files = [tmp_path / f"{name}.json" for name in systems]
+    for file, system in zip(files, systems.values(), strict=True):
+        write_json(file, document(system))
     found = numbers(flexlink("design", *files, "--spec", wish(), "--out", out, "--json"))
     assert [verdict["plant"] for verdict in found["certificate"]["plants"]] == ["light", "heavy"]
     law = Controller.from_json(out.read_text()).to_control(include_delay=True)
-    for system in (arm(1.0, 12.0), arm(0.8, 9.0)):
+    for system in systems.values():
         assert np.all(np.abs(control.feedback(law * system, 1).poles()) < 1)
 
 
@@ -206,7 +202,6 @@ def test_integrating_plant_when_told(flexlink, wish, tmp_path):
 
 def test_order_too_low_is_said_with_what_a_higher_one_reaches(flexlink, wish, tmp_path):
     """Exit code 3: there is a best point, its certificate says no, and the file says so too."""
-    write_json(tmp_path / "arm.json", document(arm()))
     wishes = WISH.replace("0.7", "3.0").replace("controller_order = 3", "controller_order = 1")
     out = tmp_path / "controller.json"
     answer = flexlink("design", tmp_path / "arm.json", "--spec", wish("", wishes), "--out", out, "--json")
@@ -243,7 +238,6 @@ def test_no_stable_start_means_no_controller(flexlink, wish, tmp_path, monkeypat
 
     monkeypatch.setattr(OrderSearch, "run", lambda self: OrderResult(None, (), ()))
     monkeypatch.setattr(OrderSearch, "quick", lambda self, free: (OrderResult(None, (), ()), False))
-    write_json(tmp_path / "arm.json", document(arm()))
     out = tmp_path / "controller.json"
     answer = flexlink("design", tmp_path / "arm.json", "--spec", wish(), "--out", out)
     assert answer.code == 3
@@ -340,7 +334,6 @@ def test_covariance_of_an_exported_model_is_checked(refused, wish, tmp_path):
 
 
 def test_sources_that_do_not_go_together_are_refused(refused, wish, tmp_path):
-    write_json(tmp_path / "arm.json", document(arm()))
     write_json(tmp_path / "slow.json", changed(dt_s=0.1))
     both = (tmp_path / "arm.json", tmp_path / "slow.json")
     assert "sampling time 0.1 s" in refused("design", *both, "--spec", wish())
