@@ -6,10 +6,8 @@ import control
 import numpy as np
 import pytest
 
-from control_design import Specification, SpecificationError, UncertainPlant
+from control_design import Specification, SpecificationError, SynthesisOptions, UncertainPlant, synthesise
 from control_design.synthesis.bandwidth import synthesise_widest
-from control_design.synthesis.synthesis import synthesise
-from control_design.synthesis.synthesis_options import SynthesisOptions
 
 _DT = 0.01
 _EFFORT = SynthesisOptions(starts=2, grid_points=80, dense_points=2000)

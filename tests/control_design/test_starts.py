@@ -4,10 +4,9 @@ import control
 import numpy as np
 import pytest
 
-from control_design import Specification, SynthesisOptions, UncertainPlant, certify, synthesise
+from control_design import LoopFunction, Specification, SynthesisOptions, UncertainPlant, certify, synthesise
 from control_design.controllers.biquads import Cascade
 from control_design.plants.ellipses import distance_to_minus_one, largest_disturbance_gain
-from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.descent import MinimaxDescent
 from control_design.synthesis.problem import Problem
 from control_design.synthesis.rows import LoopRows

@@ -4,13 +4,9 @@ import control
 import numpy as np
 import pytest
 
-from control_design.analysis.certificate import certify
-from control_design.controllers.controller import Controller
+from control_design import Controller, RationalWeight, Specification, UncertainPlant, certify
 from control_design.plants.first_order import FrequencyIntervals
-from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.stated_uncertainty import StatedDiscs
-from control_design.plants.weights import RationalWeight
-from control_design.specification import Specification
 
 DT_S = 0.05
 WEIGHT = RationalWeight(numerator=(0.2, 0.1), denominator=(0.1, 1.0))

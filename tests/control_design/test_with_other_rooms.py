@@ -6,8 +6,7 @@ import pytest
 
 import control_design
 from control_design.plants.frequency_grid import GridOptions, checked_grid, programme_grid
-from ident.basis.model import GobfModel
-from ident.basis.poles import Poles
+from ident import GobfModel, Poles
 from ident.basis.posterior import ResponsePosterior
 from plant import SampledArm, linear_arm, paper_link
 

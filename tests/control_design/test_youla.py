@@ -4,13 +4,9 @@ import control
 import numpy as np
 import pytest
 
-from control_design.convex.convex_options import YoulaOptions
-from control_design.convex.youla import youla_bracket
+from control_design import RationalWeight, Specification, UncertainPlant, YoulaOptions, youla_bracket
 from control_design.convex.youla_basis import coprime_factors
-from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.stated_uncertainty import StatedDiscs
-from control_design.plants.weights import RationalWeight
-from control_design.specification import Specification
 from validation.example_plants import flexible_link, flexible_link_specification
 
 from .plants import RelativeDisc, hub_arm

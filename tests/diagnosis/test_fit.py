@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from diagnosis import Experiment
+from diagnosis import Experiment, ResidualModel
 from diagnosis.fit import starts as starts_module
 from diagnosis.fit.coordinates import widened_by
 from diagnosis.fit.levels import Levels
 from diagnosis.fit.likelihood import White
-from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.starts import points_of
 from diagnosis.search.white import fitted_to
 from tests.diagnosis.recorded import simulated_case

@@ -13,9 +13,8 @@ import pytest
 
 pytest.importorskip("fmpy")
 
-from diagnosis import PlantCase, PlantExperiment, diagnose
+from diagnosis import Plant, PlantCase, PlantExperiment, diagnose
 from diagnosis.machine.fmu_plant import Fmu
-from diagnosis.machine.own_plant import Plant
 
 HERE = Path(__file__).parent / "fmu"
 DT_S = 0.02

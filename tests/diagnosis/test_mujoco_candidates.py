@@ -15,10 +15,9 @@ import pytest
 
 mujoco = pytest.importorskip("mujoco")
 
-from diagnosis import PlantExperiment, diagnose  # noqa: E402
+from diagnosis import Change, PlantExperiment, diagnose  # noqa: E402
 from diagnosis.machine import mujoco_simulation  # noqa: E402
 from diagnosis.machine.mujoco_plant import MujocoArm  # noqa: E402
-from diagnosis.machine.plant_effect import Change  # noqa: E402
 from tests.workflow.command import ROOT  # noqa: E402
 from workflow.diagnose.simulator_case import SimulatorCase, load_simulator_case  # noqa: E402
 from workflow.diagnose.simulator_settings import settings_of  # noqa: E402

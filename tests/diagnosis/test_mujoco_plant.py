@@ -11,10 +11,9 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 
 from benchmarks import mujoco_cases as cases  # noqa: E402
-from diagnosis import PlantCase, PlantExperiment, diagnose  # noqa: E402
+from diagnosis import Change, PlantCase, PlantExperiment, diagnose  # noqa: E402
 from diagnosis.machine import mujoco_quantities  # noqa: E402
 from diagnosis.machine.mujoco_plant import MujocoArm  # noqa: E402
-from diagnosis.machine.plant_effect import Change  # noqa: E402
 
 DT_S = 0.01
 # A rod on a hinge that lies flat; the force on it does all that moves it.

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from diagnosis import Plant, PlantCase, PlantEffect, PlantExperiment, ResidualModel
+from diagnosis import Change, EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, ResidualModel
 from diagnosis.evidence.hypotheses import Hypothesis
 from diagnosis.fit.nominal import LogNormalParameters
 from diagnosis.machine.flexible_arm import FlexibleArm
-from diagnosis.machine.plant_effect import Change, EffectParameter
 from diagnosis.next_experiment import discrimination
 from diagnosis.next_experiment.experiment_choices import Limits, excitations
 from diagnosis.next_experiment.next_experiment import next_experiment

@@ -7,8 +7,7 @@ import pytest
 
 from diagnosis import Case, Experiment
 from diagnosis.machine.plausible import refuse_implausible
-from plant import parse_effects, simulate
-from plant.presets import paper_link
+from plant import paper_link, parse_effects, simulate
 from plant.simulation import Simulator
 from workflow.diagnose.case_files import load_case
 

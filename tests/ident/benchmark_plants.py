@@ -10,8 +10,7 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 
-from ident.basis.poles import Poles
-from ident.data.record import Record
+from ident import Poles, Record
 
 DT_S = 0.005
 

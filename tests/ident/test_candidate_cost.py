@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 
+from ident import IdentOptions, Poles, Record, Structure
 from ident.basis.coordinates import search_space
-from ident.basis.options import IdentOptions
-from ident.basis.poles import Poles
-from ident.basis.structure import Structure
-from ident.data.record import Record
 from ident.fit.least_squares import fit
 from ident.fit.regression import prepare, prepare_inputs
 from tests.ident.benchmark_plants import as_record, p2

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.basis.options import EmbeddingOptions, IdentOptions
+from ident import IdentOptions, Record, identify
+from ident.basis.options import EmbeddingOptions
 from ident.checks.residual_tests import fed_back
 from ident.closed_loop import controller_of, two_stage, with_controller
-from ident.data.record import Record
-from ident.one_input import identify
 from ident.uncertainty.embedding import tangent
 from ident.unstable import find_unstable
 from tests.ident.test_unstable import looped, sampled

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from ident.basis.options import IdentOptions
+from ident import IdentOptions, Record
 from ident.closed_loop import two_stage_several
-from ident.data.record import Record
 from ident.several_outputs import identify_mimo
 from ident.uncertainty.matrix_response import matrix_posterior
 from tests.ident.test_several_outputs import DT_S, NAMES, OMEGA, response, structure

@@ -5,8 +5,7 @@ import pytest
 import scipy.signal
 
 from benchmarks.readme_identify import weak_records
-from ident import IdentOptions, identify
-from ident.basis.poles import Poles
+from ident import IdentOptions, Poles, identify
 from ident.checks.plausible_modes import PairKind, implausible_pairs, kind_of_pair, pairs_outside
 from ident.coloured_noise import long_arx_filter, prewhitened
 from ident.data.finding import FindingKind

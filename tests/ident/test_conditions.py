@@ -5,11 +5,9 @@ import pytest
 from scipy import signal
 from scipy.stats import chi2, f
 
-from ident.basis.model import GobfModel
+from ident import GobfModel, Poles, Record
 from ident.basis.options import EmbeddingOptions
-from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
-from ident.data.record import Record
 from ident.uncertainty.conditions import combine_posteriors, record_posteriors, repeat_posteriors
 
 DT = 0.01

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.basis.options import IdentOptions
+from ident import IdentOptions, Record, identify
 from ident.data.finding import FindingKind
-from ident.data.record import Record
-from ident.one_input import identify
 
 from .findings import kinds, only
 

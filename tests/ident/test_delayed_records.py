@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.basis.options import EmbeddingOptions, IdentOptions
+from ident import IdentOptions, Record, identify
+from ident.basis.options import EmbeddingOptions
 from ident.checks.residual_tests import independence_test, whiteness_test
 from ident.checks.validation import fit_on_fresh_data
-from ident.data.record import Record
 from ident.friction import fit_friction
-from ident.one_input import identify
 from ident.uncertainty.embedding import tangent
 
 DT = 0.001

@@ -16,9 +16,8 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import ident
-from ident.basis.options import IdentOptions
+from ident import IdentOptions, identify
 from ident.data.arrays import kernel_array
-from ident.one_input import identify
 from ident.several_outputs import identify_mimo
 from ident.uncertainty.embedding import tangent
 from tests.ident.benchmark_plants import p1, p1_friction, p2, p3

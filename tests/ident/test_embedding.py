@@ -4,12 +4,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.basis.model import GobfModel
-from ident.basis.options import EmbeddingOptions, IdentOptions
-from ident.basis.poles import Poles
-from ident.data.record import Record
-from ident.data.signal_filter import band_limited
-from ident.one_input import identify
+from ident import GobfModel, IdentOptions, Poles, Record, band_limited, identify
+from ident.basis.options import EmbeddingOptions
 from ident.uncertainty import embedding
 from ident.uncertainty.autoregression import fit_autoregression
 from ident.uncertainty.embedding import tangent, tangent_beside

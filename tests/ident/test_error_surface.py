@@ -1,12 +1,9 @@
 import numpy as np
 import pytest
 
-from ident.basis.model import GobfModel
-from ident.basis.poles import Poles
-from ident.basis.structure import Structure
+from ident import GobfModel, Poles, Structure, error_surface
 from ident.fit.least_squares import fit
 from ident.fit.regression import prepare
-from ident.search.error_surface import error_surface
 from tests.ident.benchmark_plants import as_record, max_length_sequence, run
 
 POLE = Poles.from_continuous(omega_rad_s=[15.0], zeta=[0.015], dt_s=0.005)

@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 
-from control_design.plants.plant_set import UncertainPlant
-from ident.basis.options import IdentOptions
-from ident.basis.poles import Poles
+from control_design import UncertainPlant
+from ident import IdentOptions, Poles, identify_frf
 from ident.data.finding import FindingKind
 from ident.fit.frf_regression import fit_response, prepare_response
 from ident.fit.pole_unknowns import free_parameters, set_poles
 from ident.fit.refinement import pole_system
-from ident.frequency_fit import identify_frf
 from ident.uncertainty import FrequencyUncertainty
 from tests.ident.benchmark_plants import DT_S, P2_HZ, P2_ZETA, p2
 from tests.ident.findings import only

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from ident.basis.options import IdentOptions
+from ident import IdentOptions, identify_frf
 from ident.data.frf_records import FrfRepeats
-from ident.frequency_fit import identify_frf
 from ident.uncertainty import FrequencyUncertainty
 
 DT = 0.01

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from ident.basis.options import IdentOptions
+from ident import IdentOptions, identify
 from ident.data.finding import FindingKind
 from ident.fit.problem import residual_colour
-from ident.one_input import identify
 from tests.ident import benchmark_plants as plants
 from tests.ident.findings import kinds
 from tests.workflow.test_codec import same

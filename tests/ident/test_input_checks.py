@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from ident import IdentOptions, identify
+from ident import IdentOptions, Record, identify
 from ident.checks.input_checks import clipped_share, excitation_limit_rad_s
 from ident.data.finding import FindingKind
-from ident.data.record import Record
 from tests.ident.benchmark_plants import DT_S, as_record, p1, p2
 from tests.ident.findings import kinds, only
 from tests.ident.three_mode_arm import random_arm

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from numpy.linalg import lstsq
 
-from ident.basis.functions import free_response, regressor
-from ident.basis.options import IdentOptions
-from ident.basis.poles import Poles
-from ident.basis.structure import Structure, filter_input
-from ident.data.record import Record
+from ident import IdentOptions, Poles, Record, Structure, regressor
+from ident.basis.functions import free_response
+from ident.basis.structure import filter_input
 from ident.fit.least_squares import fit, linearisation, project
 from ident.fit.refinement import Bounds, free_optimality, pole_system, refine
 from ident.fit.regression import prepare, prepare_inputs, thinned

@@ -6,19 +6,16 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from ident import IdentOptions, Record, band_limited, identify, identify_frf
 from ident.basis.functions import free_response
-from ident.basis.options import EmbeddingOptions, IdentOptions
+from ident.basis.options import EmbeddingOptions
 from ident.checks.distortion_findings import distortion_findings
 from ident.checks.validation import fit_on_fresh_data, repeat_scatter
 from ident.closed_loop import two_stage
 from ident.data.finding import FindingKind
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
-from ident.data.record import Record
 from ident.data.repeats import repeats_of
-from ident.data.signal_filter import band_limited
-from ident.frequency_fit import identify_frf
-from ident.one_input import identify
 from ident.uncertainty.conditions import combine_posteriors, record_posteriors
 from tests.ident.findings import only
 

@@ -2,9 +2,7 @@ import control
 import numpy as np
 import pytest
 
-from ident.basis.functions import basis_response
-from ident.basis.model import GobfModel
-from ident.basis.poles import Poles
+from ident import GobfModel, Poles, basis_response
 
 MODEL = GobfModel(
     poles=Poles([0.5, 0.98], [0.97 * np.exp(0.3j)]), coefficients=[0.3, -0.2, 0.5, 0.1], dt_s=0.01,

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from ident.basis.functions import basis_response
-from ident.basis.model import GobfModel
-from ident.basis.poles import Poles
+from ident import GobfModel, Poles, basis_response
 from ident.basis.posterior import ResponsePosterior
 from ident.uncertainty.nominal import nominal_near, nominals_near
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from ident import GobfModel, IdentOptions, Poles, identify
-from ident.basis.functions import basis_response
+from ident import GobfModel, IdentOptions, Poles, basis_response, identify
 from ident.basis.posterior import ResponsePosterior
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.pole_intervals import pole_intervals

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.basis.model import GobfModel
-from ident.basis.poles import Poles
+from ident import GobfModel, Poles
 from ident.uncertainty import EmbeddingReport, ResponsePosterior
 
 DT = 0.02

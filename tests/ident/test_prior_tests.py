@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from ident.basis.options import IdentOptions
+from ident import IdentOptions, identify
 from ident.data.finding import FindingKind
-from ident.one_input import identify
 from tests.ident.benchmark_plants import DT_S, as_record, p1, p1_friction
 from tests.ident.findings import kinds, only
 

@@ -5,9 +5,7 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
-from ident.basis.functions import basis_response, basis_state_space
-from ident.basis.model import GobfModel
-from ident.basis.poles import Poles
+from ident import GobfModel, Poles, basis_response, basis_state_space
 from ident.basis.relative_degree import conditions, conditions_with_sensitivities, null_space
 from tests.ident.benchmark_plants import DT_S, by_factors
 

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from ident import Poles, Record, Structure
 from ident.basis.options import EmbeddingOptions
-from ident.basis.poles import Poles
-from ident.basis.structure import Structure
-from ident.data.record import Record
 from ident.uncertainty.autoregression import (
     absorbed_gradient,
     autocovariance,

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.basis.options import EmbeddingOptions, IdentOptions
+from ident import IdentOptions, Record, identify
+from ident.basis.options import EmbeddingOptions
 from ident.coloured_noise import long_arx_filter
-from ident.data.record import Record
-from ident.one_input import identify
 from ident.uncertainty.embedding import tangent
 
 OMEGA = np.geomspace(1, 300, 40)

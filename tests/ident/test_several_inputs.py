@@ -4,14 +4,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ident.basis.model import MisoModel
-from ident.basis.options import IdentOptions
-from ident.basis.poles import Poles
+from ident import IdentOptions, MisoModel, Poles, Record, identify
 from ident.checks.input_checks import alike_inputs
 from ident.data.finding import FindingKind
-from ident.data.record import Record
 from ident.fit.regression import prepare_inputs
-from ident.one_input import identify
 from ident.several_outputs import identify_mimo
 from ident.uncertainty.matrix_response import matrix_posterior
 from tests.ident.benchmark_plants import p3

@@ -8,11 +8,8 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.signal import dlsim
 
+from ident import IdentOptions, MisoModel, Poles, Record
 from ident.basis.mimo_model import MimoModel
-from ident.basis.model import MisoModel
-from ident.basis.options import IdentOptions
-from ident.basis.poles import Poles
-from ident.data.record import Record
 from ident.several_outputs import identify_mimo
 from ident.uncertainty.matrix_response import matrix_posterior
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from ident.basis.options import IdentOptions
-from ident.data.signal_filter import band_limited, increments
-from ident.one_input import identify
+from ident import IdentOptions, band_limited, identify
+from ident.data.signal_filter import increments
 from tests.ident.benchmark_plants import as_record
 
 

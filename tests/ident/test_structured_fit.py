@@ -6,9 +6,7 @@ import scipy.linalg
 import scipy.optimize
 import scipy.signal
 
-from ident.basis.options import IdentOptions
-from ident.basis.poles import Poles
-from ident.basis.structure import Structure
+from ident import IdentOptions, Poles, Structure
 from ident.fit.least_squares import fit
 from ident.fit.refinement import Bounds, pole_system
 from ident.fit.regression import prepare

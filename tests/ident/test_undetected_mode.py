@@ -5,11 +5,8 @@ import pytest
 from scipy import signal
 from scipy.stats import multivariate_normal
 
-from ident.basis.functions import basis_response
+from ident import Poles, Record, Structure, basis_response
 from ident.basis.options import EmbeddingOptions
-from ident.basis.poles import Poles
-from ident.basis.structure import Structure
-from ident.data.record import Record
 from ident.uncertainty import undetected_mode
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.embedding_algebra import KernelPosterior, reduce_regression

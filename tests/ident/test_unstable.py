@@ -7,15 +7,12 @@ import pytest
 from scipy import signal
 
 from control_design import Controller, Specification, UncertainPlant, certify
+from ident import GobfModel, IdentOptions, MisoModel, Poles, Record, identify
 from ident.basis.functions import all_pass_response, all_pass_signal, all_pass_slopes, log_all_pass_slopes
-from ident.basis.model import GobfModel, MisoModel
 from ident.basis.model_files import ModelFile
-from ident.basis.options import EmbeddingOptions, IdentOptions
-from ident.basis.poles import Poles
+from ident.basis.options import EmbeddingOptions
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.validation import fit_on_fresh_data
-from ident.data.record import Record
-from ident.one_input import identify
 from ident.uncertainty.conditions import combine_posteriors, repeat_posteriors
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.nominal import nominal_near

@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from ident.basis.model import GobfModel
-from ident.basis.poles import Poles
+from ident import GobfModel, Poles, Record
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.validation import fit_on_fresh_data, repeat_scatter
 from ident.data.frequency_uncertainty import FrequencyUncertainty
-from ident.data.record import Record
 from tests.ident.benchmark_plants import as_record
 
 DT = 0.01

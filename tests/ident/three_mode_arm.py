@@ -6,9 +6,7 @@ import numpy as np
 
 from benchmarks.coverage_p2 import BANDS, OMEGA
 from benchmarks.p2_plants import Setting, draw
-from ident.basis.model import GobfModel
-from ident.basis.poles import Poles
-from ident.data.record import Record
+from ident import GobfModel, Poles, Record
 from tests.ident.benchmark_plants import DT_S
 
 

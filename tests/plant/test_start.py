@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from plant.effects import parse_effect
+from plant import paper_link, parse_effect, simulate
 from plant.machine import Machine
 from plant.modal import default_n_modes, equations_of_motion
-from plant.presets import paper_link
-from plant.simulation import Simulator, Start, simulate
+from plant.simulation import Simulator, Start
 
 N_MODES = 3
 

@@ -11,9 +11,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from plant.effects import parse_effects
-from plant.rig import Rig
-from plant.simulation import simulate
+from plant import Rig, parse_effects, simulate
 from validation.blind.cases import NOT_TOGETHER, SHARES, schedule
 from validation.blind.generate import answer_toml, folder_hash, generate
 from validation.blind.protocol import run_blind

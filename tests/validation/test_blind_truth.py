@@ -5,10 +5,8 @@ import tomllib
 import numpy as np
 import pytest
 
-from plant.effects import EFFECTS, parse_effects
+from plant import EFFECTS, Rig, parse_effects, simulate
 from plant.effects.joint import AttachedBody, GroundSpring
-from plant.rig import Rig
-from plant.simulation import simulate
 from validation.blind.beam import link_basis
 from validation.blind.truth import LISTED, UNLISTED, Feedback, Truth
 

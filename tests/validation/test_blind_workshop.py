@@ -7,8 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from plant.effects import parse_effects
-from plant.rig import Rig
+from plant import Rig, parse_effects
 from plant.simulation import Simulator, Start
 from validation.blind.generate import generate
 from validation.blind.truth import LISTED, WORKSHOP_UNLISTED, Background, Before, Feedback, Truth

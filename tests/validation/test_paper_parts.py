@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from ident.data.record import Record
-from ident.search.error_surface import ErrorSurface
+from ident import ErrorSurface, Record
 from validation.comparators.prediction_error import arx_polynomials
 from validation.example_arms import paper_example
 from validation.paper import surface as paper

@@ -7,13 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from diagnosis.answer import Diagnosis, NamedEffect, Shares, completeness_of
-from diagnosis.fit.residual import ResidualModel, pooled_rms
-from diagnosis.machine.case import Case
+from diagnosis import Case, Diagnosis, NamedEffect, ResidualModel, pooled_rms
+from diagnosis.answer import Shares, completeness_of
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
-from plant import EFFECTS, Rig, parse_effects, simulate
-from plant.effects import Effect
-from plant.presets import paper_link
+from plant import EFFECTS, Effect, Rig, paper_link, parse_effects, simulate
 
 FRICTION = {"name": "coulomb_friction", "torque_Nm": 0.05}
 _SAMPLES = 240

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from control_design.controllers.controller import Controller
-from ident.basis.options import IdentOptions
+from control_design import Controller
+from ident import IdentOptions, Record
 from ident.data.finding import FindingKind
-from ident.data.record import Record
 from tests.workflow.test_init import DT_S, recorded, write
 from workflow.commands.logs import read_logs
 from workflow.config.run_config import ClosedLoopData, RunConfig

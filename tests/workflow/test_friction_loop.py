@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 
 from benchmarks.closed_loop_machines.simulator import Law, Plant, response
-from control_design import Controller, simulate
-from control_design.analysis.closed_loop import measure_sensitivity, step_metrics
+from control_design import Controller, simulate, step_metrics
+from control_design.analysis.closed_loop import measure_sensitivity
 from control_design.controllers.controller import FrictionFeedforward
 from ident import GobfModel, IdentOptions, Poles, Record, Structure
 from ident.friction import FrictionFit, FrictionLaw, fit_friction
 from ident.friction.arm import SteppedArm
 from ident.friction.spring import Spring
-from plant import SampledArm, parse_effect
-from plant.presets import paper_link
+from plant import SampledArm, paper_link, parse_effect
 from workflow.config.run_config import built_in_config
 from workflow.tasks.friction_loop import (
     FrictionLoop,

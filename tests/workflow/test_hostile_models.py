@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import scipy.io
 
-from ident.basis.model import GobfModel
+from ident import GobfModel, Poles
 from ident.basis.model_files import ModelFile
-from ident.basis.poles import Poles
 from ident.basis.posterior import EmbeddingReport, ResponsePosterior
 from ident.data import foreign_files
 from tests.ident.mutations import Tally, mutated, tally

@@ -5,9 +5,8 @@ import pytest
 from scipy import signal
 
 from flexlink import Record as FrontRecord, identify as front_identify
-from ident.basis.options import IdentOptions
+from ident import IdentOptions, Record
 from ident.data.finding import FindingKind
-from ident.data.record import Record
 from workflow.engine.errors import InputError
 from workflow.tasks.log_identification import identify_records
 

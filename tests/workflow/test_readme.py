@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 from ident.data.finding import FindingKind
-from plant import linear_arm
-from plant.presets import paper_link
+from plant import linear_arm, paper_link
 from tests.golden import margins
 from tests.workflow.command import FAST_ARM, ROOT
 from workflow.config.run_config import built_in_config, load_config

@@ -4,9 +4,8 @@ import control
 import numpy as np
 import pytest
 
-from control_design.analysis.closed_loop import LinearMachine, simulate
-from control_design.controllers.controller import Controller
-from ident.basis.poles import Poles
+from control_design import Controller, LinearMachine, simulate
+from ident import Poles
 from ident.uncertainty import ResponsePosterior
 from workflow.tasks.sampled_plant import FINITE, realise, simulate_plant
 

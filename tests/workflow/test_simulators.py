@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from diagnosis import PlantExperiment
-from diagnosis.machine.plant_effect import Change
+from diagnosis import Change, PlantExperiment
 from diagnosis.machine.telling import Alike, Telling
 from tests.workflow.command import ROOT
 from workflow.diagnose import check

@@ -7,12 +7,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from control_design.analysis.certificate import certify
-from ident.basis.options import IdentOptions
-from ident.data.record import Record
-from ident.one_input import identify
-from plant import linear_arm, parse_effect, simulate
-from plant.presets import paper_link
+from control_design import certify
+from ident import IdentOptions, Record, identify
+from plant import linear_arm, paper_link, parse_effect, simulate
 from tests.workflow.command import FAST_ARM
 from workflow.config.design_options import ReferenceFilterSettings
 from workflow.config.run_config import Channel, FileRecord, FileSource, load_config
