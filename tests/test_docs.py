@@ -47,8 +47,6 @@ def pages() -> Any:
     """The hook that makes pages of the site from the code."""
     pytest.importorskip("mkdocs")
     found = importlib.util.spec_from_file_location("build_pages", DOCS / "build_pages.py")
-    assert found is not None
-    assert found.loader is not None
     module = importlib.util.module_from_spec(found)
     found.loader.exec_module(module)
     return module

@@ -128,7 +128,6 @@ def test_weights_are_the_formulas_of_their_words(slow_poles):
         expected = expected * ((s + corner / 5) / (s + pole) if pole < corner / 5 else 1.0)
     np.testing.assert_allclose(spec.tracking_weight(plant).at(s), expected, rtol=1e-6)
     limit = spec.limit_weight()
-    assert limit is not None
     np.testing.assert_allclose(limit.at(s), (s / 40 + 1) / (s / 1600 + 1) / 5.0, rtol=1e-12)
     # Without an integrator of its own the controller is not asked for integral action.
     plain = Specification(bandwidth_rad_s=3.0, modulus_margin=0.4, low_frequency_rejection=0.01)

@@ -147,7 +147,6 @@ def test_files_of_an_fmu_leave_with_a_command_that_is_killed(carriage: Path) -> 
     process = subprocess.Popen(
         [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=HERE.parents[2]
     )
-    assert process.stdout is not None
     assert process.stdout.readline() == b"ready\n"
     assert len(unpacked() - before) == 1
     process.kill()

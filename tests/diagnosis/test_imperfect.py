@@ -946,7 +946,6 @@ def test_gain_and_zeros_of_a_strain_gauge_and_a_tachometer():
     assert high - low < 0.2
     # Over windows as in a free run: the gain closes the gap of the deflection.
     shares = found.shares
-    assert shares is not None
     assert shares.horizon_closed > 0.95
     assert found.gap_closed > 0.95
 

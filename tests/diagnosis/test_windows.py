@@ -111,7 +111,6 @@ def test_a_drift_alone_makes_no_effect():
 def test_what_a_state_does_is_left_out_but_for_the_first_window():
     case = _case(_motor, {"time_s": 0.2, "gain": 10.0}, _rubbing_motor, names=["input_delay"])
     windows = Windows.of(case)
-    assert windows is not None
     # Three time constants at least, and the shorter the more windows.
     assert 3 * 0.2 / DT_S - 1 <= windows.samples <= SAMPLES // 3
     # No window is longer than what states are known to do, of a record of any length.

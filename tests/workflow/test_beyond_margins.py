@@ -281,17 +281,14 @@ def test_model_of_a_corner_is_a_power_of_a_lag():
 
 def test_weight_of_a_reference_filter_is_for_steps_unless_said():
     steps = ReferenceFilterSettings.model_validate({"corner_rad_s": 3.0}).error_weight
-    assert steps is not None
     assert np.abs(steps.at(1j * np.array([0.0, 3e4]))) == pytest.approx([100.0, 1.0])
     settings = ReferenceFilterSettings.model_validate({"corner_rad_s": 3.0, "weight": "flat"})
     assert settings.error_weight is None
     # Of a model given as it is, the corner is where |1/(s/5 + 1)| has fallen by 3 dB: 5 rad/s.
     lag = {"numerator": [1.0], "denominator": [0.2, 1.0]}
     weight = ReferenceFilterSettings.model_validate({"model": lag}).error_weight
-    assert weight is not None
     assert weight.numerator[1] == pytest.approx(5.0, rel=0.01)
     given = ReferenceFilterSettings.model_validate({"corner_rad_s": 3.0, "weight": lag}).error_weight
-    assert given is not None
     assert given.denominator == (0.2, 1.0)
 
 
@@ -324,7 +321,6 @@ def test_reference_filter_of_an_unstable_loop_is_a_reason_and_a_bad_pole_an_erro
 
 def test_filter_files(filtered, tmp_path):
     found = filtered.filter
-    assert found is not None
     assert filter_file(Path("k.json")) == Path("k_reference_filter.json")
     again = ReferenceFilter.from_json(law_bytes(found, ".JSON").decode())
     assert np.array_equal(again.A, found.A)
@@ -336,7 +332,6 @@ def test_filter_files(filtered, tmp_path):
 @needs_compiler
 def test_reference_filter_in_c_agrees_to_1e_12(filtered, tmp_path):
     found = filtered.filter
-    assert found is not None
     code = compiled(law_bytes(found, ".c").decode(), tmp_path)
     code.reference_filter_step.restype = ctypes.c_double
     code.reference_filter_step.argtypes = [ctypes.c_void_p, ctypes.c_double]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from diagnosis import Change, PlantExperiment
+from diagnosis import Change
 from diagnosis.machine.telling import Alike, Telling
 from tests.workflow.command import ROOT
 from workflow.diagnose import check
@@ -491,7 +491,7 @@ def test_the_guide_runs_and_its_files_are_those_of_the_example():
 
     assert snippets("toml")[0] == (EXAMPLE / "arm.toml").read_text()
     settings_of(tomllib.loads(snippets("toml")[1]), "guide")
-    experiments: tuple[PlantExperiment, ...] = loaded(EXAMPLE, snippets("toml")[0]).case.experiments
+    experiments = loaded(EXAMPLE, snippets("toml")[0]).case.experiments
     given = {"MujocoArm": MujocoArm, "np": np, "example": EXAMPLE, "experiments": experiments}
     test = doctest.DocTestParser().get_doctest(GUIDE.read_text(), given, GUIDE.name, str(GUIDE), 0)
     result = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(test)

@@ -92,12 +92,10 @@ def test_certificate_is_that_of_the_stored_controller(run):
 
 def test_every_design_is_compared_with_any_order_and_sampled_whole(run):
     bracket, gamma = run.achievable_performance.bracket, run.design.gamma
-    assert bracket is not None
     assert bracket.floor <= bracket.ellipse <= bracket.enclosing
     # The design knows more requirements than the bracket, which therefore reaches lower.
     assert bracket.ellipse < 1.001 * gamma
     joint = run.certify.sampled.joint
-    assert joint is not None
     assert joint.draws == 2000
     assert joint.stable_share > 0.999
 
@@ -111,7 +109,6 @@ def test_reference_filter_takes_the_reference_step_to_the_loop(run, tmp_path):
     stage = StageInput(config, copy, Progress())
     result = design_filter(stage)
     found = result.filter
-    assert found is not None
     assert found.error_after < found.error_before
     copy.run.save_stage("reference_filter", result, "00")
     filtered, plain = run_closed_loop(stage).check, run.closed_loop.check

@@ -286,7 +286,6 @@ def test_it_needs_one_source(refused, folder):
 def test_ctrl_c_ends_it(folder):
     spec = ["--spec", folder / "spec.toml", "--no-browser", "--quiet"]
     process = start_flexlink("tune", folder / "arm.json", *spec)
-    assert process.stdout is not None
     address = process.stdout.readline().decode()
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]+\n", address)
     process.send_signal(signal.SIGINT)
@@ -299,7 +298,6 @@ def test_ctrl_c_ends_it(folder):
 @pytest.mark.long
 def test_the_demo_is_the_built_in_arm(tmp_path):
     process = start_flexlink("tune", "--demo", "--no-browser", "--quiet", "--out", tmp_path / "saved")
-    assert process.stdout is not None
     assert process.stdout.readline().startswith(b"http://127.0.0.1:")
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=60)
