@@ -1,5 +1,6 @@
 """The running controller against python-control, anti-windup against its limits, exact round trips."""
 
+import io
 import json
 from dataclasses import replace
 
@@ -10,6 +11,8 @@ import scipy.io
 import scipy.signal
 
 import flexlink
+from benchmarks import mimo_problems as problems
+from benchmarks.mimo_designs import TS, tustin
 from control_design import Controller
 from control_design.controllers.controller import FrictionFeedforward
 
@@ -218,3 +221,28 @@ def test_a_transfer_function_keeps_its_integrators(order):
     z = np.exp(1j * omega * dt_s)
     exact = 5 * ((z - 0.998) / (z - 1)) ** order
     np.testing.assert_allclose(found.controller.response(omega, with_delay=False), exact, rtol=1e-6)
+
+
+def controller(**settings) -> Controller:
+    return Controller(*tustin(*problems.order_six_t(), TS), TS, computational_delay_samples=0, **settings)
+
+
+LIMITS = {"input_limit": (24.0, None), "rate_limit": (None, 50.0)}
+
+
+def test_json_and_mat_keep_everything():
+    given = controller(**LIMITS)
+    again = Controller.from_json(given.to_json())
+    for name in ("A", "B", "C", "D", "anti_windup_gain"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(given, name))
+    assert (again.input_limit, again.rate_limit) == (given.input_limit, given.rate_limit)
+    mat = scipy.io.loadmat(io.BytesIO(given.to_mat()))
+    np.testing.assert_array_equal(mat["B"], given.B)
+    np.testing.assert_array_equal(mat["input_limit"], [[24.0, np.inf]])
+    assert given.to_control().ninputs == 2
+
+
+@pytest.mark.parametrize("limit", [(24.0,), 24.0, (24.0, -1.0)])
+def test_limits_that_do_not_fit_are_refused(limit):
+    with pytest.raises(ValueError, match="input_limit"):
+        controller(input_limit=limit)

@@ -1,11 +1,14 @@
 """The seams: an identified posterior as uncertain plant, the nonlinear arm as sampled machine."""
 
+import re
+
 import control
 import numpy as np
 import pytest
 
 import control_design
 from control_design.plants.frequency_grid import GridOptions, checked_grid, programme_grid
+from examples import two_joints
 from ident import GobfModel, Poles
 from ident.basis.posterior import ResponsePosterior
 from plant import SampledArm, linear_arm, paper_link
@@ -63,3 +66,15 @@ def test_the_arm_without_effects_answers_like_its_linear_model_and_saturates_wit
     )
     assert np.max(np.abs(limited.command)) == pytest.approx(1.0)
     assert control_design.step_metrics(limited).limited_fraction > 0
+
+
+@pytest.mark.long
+def test_logs_of_two_joints_become_a_certified_controller(tmp_path, capsys):
+    two_joints.run(tmp_path)
+    said = capsys.readouterr().out
+    assert "certified: True" in said
+    assert float(re.search(r"worst case ([\d.]+)", said)[1]) < 1
+    assert float(re.search(r"largest pole ([\d.]+)", said)[1]) < 1
+    # 2 free joints, 2 friction poles, 5 pairs: n + integrators, not twice as many.
+    assert 12 <= int(re.search(r"model: (\d+) states", said)[1]) <= 15
+    assert (tmp_path / "two_joints.c").read_text().count("limit") > 1
