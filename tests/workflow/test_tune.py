@@ -7,7 +7,7 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -312,16 +312,20 @@ def test_the_demo_is_the_built_in_arm(tmp_path):
 # -- page ----------------------------------------------------------------------------------------------------
 
 
-def designed(browser: Browser, number: int) -> None:
-    for _ in range(1200):
-        if browser.ask("document.body?.dataset.designed") == str(number):
-            return
-        time.sleep(0.05)
-    raise AssertionError(browser.ask("document.getElementById('state').textContent"))
-
-
 def text(browser: Browser, name: str) -> str:
     return str(browser.ask(f"document.getElementById('{name}').textContent"))
+
+
+def wait_until(browser: Browser, condition: Callable[[], bool]) -> None:
+    for _ in range(1200):
+        if condition():
+            return
+        time.sleep(0.05)
+    raise AssertionError(text(browser, "state"))
+
+
+def designed(browser: Browser, number: int) -> None:
+    wait_until(browser, lambda: browser.ask("document.body?.dataset.designed") == str(number))
 
 
 @pytest.mark.skipif(PROGRAM is None, reason="chromium is not installed")
@@ -361,19 +365,12 @@ def test_the_page_saves_and_says_what_is_wrong(server, browser, session):
     browser.ask(
         "document.getElementById('name').value = 'by-hand-3'; document.getElementById('save').click()"
     )
-    for _ in range(600):
-        if text(browser, "state").startswith("saved"):
-            break
-        time.sleep(0.05)
+    wait_until(browser, lambda: text(browser, "state").startswith("saved"))
     assert (session.out / "by-hand-3" / "controller.json").is_file()
     assert browser.ask("document.getElementById('name').value") == "by-hand-4"
     box = "document.querySelector('#c-modulus_margin + input')"
     browser.ask(f"{box}.value = 3; {box}.dispatchEvent(new Event('change'))")
-    for _ in range(600):
-        if "less than 1" in text(browser, "state"):
-            return
-        time.sleep(0.05)
-    raise AssertionError(text(browser, "state"))
+    wait_until(browser, lambda: "less than 1" in text(browser, "state"))
 
 
 def test_controls_are_made_of_the_specification(session):
