@@ -1,5 +1,6 @@
-"""Units in headers: what is recognised, what is refused, and that seconds come back with their very bits."""
+"""Units in headers, columns found by them, logs in different ones: recognised, refused, kept to the bit."""
 
+import re
 from fractions import Fraction
 from pathlib import Path
 
@@ -7,8 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from ident.data.record import Record
-from ident.data.roles import roles_of, time_of
+import flexlink
+from ident.data.finding import FindingKind
+from ident.data.record import Record, in_one_unit
+from ident.data.roles import Roles, is_position, roles_of, time_of
 from ident.data.table import Table
 from ident.data.units import TimeColumn, contradicted_by_loop, kind_of, per, says_time, size_of, written_unit
 
@@ -143,3 +146,196 @@ def test_a_unit_without_a_time_column_is_refused(tmp_path):
     path.write_text("u,y\n1,2\n3,4\n")
     with pytest.raises(ValueError, match="without a time column"):
         Record.from_file(path, ["u"], ["y"], dt_s=0.1, time_unit="ms")
+
+
+def table(*names: str, **units: str) -> Table:
+    return Table("a.csv", {name: np.sin(np.arange(5.0) + k) for k, name in enumerate(names)}, units=units)
+
+
+def test_units_beside_the_names():
+    log = table("hub", "motor", "clock", hub="rad", motor="Nm", clock="s")
+    assert roles_of(log, "a.csv") == Roles("clock", "motor", "hub")
+
+
+def test_what_is_stated_decides():
+    three = table("t_s", "u_V", "hub_rad", "tip_m")
+    assert roles_of(three, "a.csv", output="tip_m") == Roles("t_s", "u_V", "tip_m")
+    with pytest.raises(ValueError) as caught:
+        roles_of(three, "'my log.csv'")
+    assert str(caught.value) == (
+        "a.csv: which is the output, hub_rad or tip_m? It has t_s, u_V, hub_rad, tip_m; type: flexlink "
+        "identify 'my log.csv' --input u_V --output hub_rad --time t_s"
+    )
+
+
+def test_of_two_columns_without_a_known_name_the_follower_is_the_output():
+    wave = np.cumsum(np.random.default_rng(3).standard_normal(400))
+    columns = {"t_s": np.arange(400) * 0.01, "a_deg": wave[5:], "b_deg": wave[:-5], "i_A": np.sin(wave)}
+    shortest = min(column.size for column in columns.values())
+    log = Table("a.csv", {name: column[:shortest] for name, column in columns.items()}, units={})
+    with pytest.raises(ValueError, match=r"--input i_A --output b_deg --reference a_deg --time t_s$"):
+        roles_of(log, "a.csv", "init")
+
+
+def test_a_first_column_that_rises_may_be_time_but_a_rows_number_is_none():
+    for dt, typed in ((0.002, "--time a$"), (1.0, "--dt-s SECONDS$")):
+        log = Table(
+            "a.csv", {"a": np.arange(9) * dt, "u_V": np.arange(9) % 3, "b": np.arange(9) % 4}, units={}
+        )
+        with pytest.raises(ValueError, match=typed):
+            roles_of(log, "a.csv")
+
+
+def test_nothing_is_guessed():
+    with pytest.raises(ValueError, match="--input NAME --output NAME --dt-s SECONDS"):
+        roles_of(table("a", "b", "c"), "a.csv")
+
+
+def test_many_long_names_stay_on_a_line():
+    with pytest.raises(ValueError) as caught:
+        roles_of(table(*(f"channel {k} " + "x" * 500 for k in range(300))), "a.csv")
+    assert len(str(caught.value)) <= 300
+
+
+# Time, input, output and reference, and what else is there.
+FOUND = """
+t_ms,i_cmd_A,enc_rad,ref_rad|t_s,torque_Nm,pos_mm,cmd_pos|t_s,v_drive_counts,theta_rad,u_ref_rad|t_s,u,y,r,e
+t_s,tau_Nm,q_rad,q_des_rad,err_rad|t_s,u_V,pos_rad,pos_ref_rad,vel_rad_s|t_s,u_ref_V,hub_rad,|t_s,u_V,pos_rad,posRef_rad
+t_s,Commanded_PWM,Motor_Speed(RPM),|t_s,Strom Soll [A],Istwinkel [deg],Sollwinkel [deg]|t_s,i_A,PV_mm,SP_mm
+t_s,current_A,angle_deg,set_deg|t_s,Courant [A],Mesure [deg],Consigne [deg]
+t_s,电流(A),实际角度(deg),给定角度(deg)
+t,/cmd/voltage,/joint_states/motor/position,,bus.count|t,PLC_PRG.rVoltage,PLC_PRG.rAngle,|t,bus.command,bus.theta,
+t,MAIN.fTorque,MAIN.lrPosition,|t_ms,torque_cmd_%,x_mm,x_ref_mm|t_us,dac_cnt,enc_cnt,ref_cnt|t_s,foo,pv_deg,sp,note
+t_us,out_cnt,pv_cnt,sp_cnt|t_s,output_%,position_mm,setpoint_mm
+t_s,u,current_position,target,v_est|t_s,cmd,pos,ref,vel_est|t_s,pid_out,y_deg,r_deg
+t_s,u_V,meas,ref_deg,temp|t_s,i_A,alpha,alpha_cmd,alpha_err,index
+Zeit [ms],Spannung [V],Winkel [°],|,voltage,angle,,temperature"""
+ASKED = """
+t_s,i_meas_A,i_cmd_A,pos_rad>--input i_cmd_A --output pos_rad|t_s,u_ref_rad,u_cmd>--input u_cmd --output NAME
+t_s,temperature,angle_rad>name it: flexlink init a.csv --input NAME
+t_s,foo,angle_rad>--input foo --output angle_rad
+t_s,accel_counts>no column looks like an input|t_s,cmd_deg,pos_deg>--input cmd_deg --output pos_deg
+t_s,ref_rad,foo,bar,y_rad>--input NAME --output y_rad --reference ref_rad
+t_s,ref_rad,temp_°C,y_rad>--input NAME"""
+
+
+@pytest.mark.parametrize("case", re.split(r"[|\n]", (FOUND + ASKED).strip()))
+@pytest.mark.parametrize("turned", [False, True])
+def test_roles_by_name_and_unit_in_any_order(case, turned):
+    """A reference is in the unit of the output; of a name the last word counts."""
+    names, _, asked = case.partition(">")
+    order = [name for name in names.split(",")[:: -1 if turned else 1] if name]
+    columns = {name: np.sin(k + np.arange(50.0)) for k, name in enumerate(order)}
+    columns |= {name: np.arange(50.0) for name in order if re.fullmatch(r"t(_m?u?s)?|Zeit.*", name)}
+    log = Table("a.csv", columns | ({"note": ("ok",) * 50} if "note" in order else {}), units={})
+    if asked:
+        with pytest.raises(ValueError, match=asked):
+            roles_of(log, "a.csv", "init")
+        return
+    time, input_, output, reference, *_ = names.split(",")
+    assert roles_of(log, "a.csv", "init") == Roles(time or None, input_, output, reference or None)
+
+
+def test_two_references_are_asked_for_with_all_that_was_said():
+    two = table("t_s", "i_A", "a_ref_rad", "b_ref_rad", "a_rad", "b_rad")
+    with pytest.raises(
+        ValueError, match=r"a_ref_rad and b_ref_rad may be .* --output a_rad --reference a_ref_rad$"
+    ):
+        roles_of(two, "a.csv", "init", output="a_rad")
+    assert roles_of(two, "a.csv", "init", output="a_rad", reference="b_ref_rad").reference == "b_ref_rad"
+
+
+@pytest.mark.parametrize("case", ["q rad 1", "q rad/s ", "speed  ", "angle  1", "n rpm "])
+def test_speeds_are_no_positions(case):
+    name, unit, position = case.split(" ")
+    assert is_position(name, unit) == bool(position)
+
+
+N, DT_S = 400, 0.005
+U = np.repeat(np.random.default_rng(3).choice([-2.0, 2.0], N // 4), 4)
+Y = 0.05 * np.convolve(U, np.r_[0, 0.3 * 0.7 ** np.arange(N)])[:N] + 1e-4 * np.random.default_rng(
+    4
+).standard_normal(N)
+
+
+def written(folder, name, units=("V", "rad"), sizes=(1.0, 1.0), reference=None):
+    """Where a file has a reference it is in its own unit: (unit, size)."""
+    unit, size = reference or ("", 1.0)
+    rows = (
+        f"{DT_S * k:.3f},{u / sizes[0]:.9g},{y / sizes[1]:.9g},{u / size:.9g}"
+        for k, (u, y) in enumerate(zip(U, Y, strict=True))
+    )
+    path = folder / name
+    path.write_text("\n".join(["time,voltage,angle,wish", ",".join(["s", *units, unit]), *rows]) + "\n")
+    return path
+
+
+def read(path, **more):
+    return Record.from_file(path, ["voltage"], ["angle"], time="time", **more)
+
+
+@pytest.mark.parametrize(
+    ("units", "sizes", "said"),
+    [
+        (("V", "deg"), (1, np.pi / 180), {"angle"}),
+        (("mV", "rad"), (1e-3, 1), {"voltage"}),
+        (("kV", "rev"), (1e3, 2 * np.pi), {"angle", "voltage"}),
+        (("Volts", "mrad"), (1, 1e-3), {"angle"}),
+        (("V", ""), (1, 1), set()),
+        (("V", "radians"), (1, 1), set()),
+    ],
+)
+def test_records_of_one_set_are_in_the_unit_of_the_first(tmp_path, units, sizes, said):
+    first = read(written(tmp_path, "a.csv"))
+    one, other = in_one_unit([first, read(written(tmp_path, "b.csv", units, sizes))])
+    assert one is first
+    np.testing.assert_allclose(other.input, one.input, rtol=1e-7)
+    np.testing.assert_allclose(other.output, one.output, rtol=1e-7, atol=1e-12)
+    notes = [note for note in other.notes if note.kind is FindingKind.UNIT_CONVERTED]
+    assert {note.values["name"] for note in notes} == said
+    assert in_one_unit([one, other]) == [one, other]
+
+
+def test_a_reference_is_converted_with_its_output(tmp_path):
+    loop = {"references": ["wish"]}
+    first = read(written(tmp_path, "a.csv", reference=("rad", 1.0)), **loop)
+    turned = written(tmp_path, "b.csv", ("V", "deg"), (1, np.pi / 180), ("deg", np.pi / 180))
+    other = in_one_unit([first, read(turned, **loop)])[1]
+    np.testing.assert_allclose(other.reference, first.reference, rtol=1e-7)
+    assert other.output_units == ("rad",)
+
+
+@pytest.mark.parametrize(("unit", "more"), [("counts", {}), ("ell", {}), ("deg", {"scale": {"angle": 2.0}})])
+def test_units_of_two_quantities_or_one_scale_for_two_are_refused(tmp_path, unit, more):
+    records = [read(written(tmp_path, f"{own}.csv", ("V", own)), **more) for own in ("rad", unit)]
+    with pytest.raises(ValueError, match=rf"{unit}.csv: 'angle' is in .*{unit}, in \S*rad.csv in .*rad"):
+        in_one_unit(records)
+    with pytest.raises(ValueError, match="'angle' is in"):
+        flexlink.identify(records, n_pairs=0, n_real=1)
+    stated = [
+        read(written(tmp_path, f"{own}.csv", ("V", own)), units={"angle": "rad"}) for own in ("rad", unit)
+    ]
+    assert in_one_unit(stated) == stated
+
+
+def test_commands_read_all_logs_in_one_unit(tmp_path, flexlink, refused):
+    """Also those for validation, and the limit of the input is in the unit of the first."""
+    a, b = written(tmp_path, "a.csv"), written(tmp_path, "b.csv", ("mV", "deg"), (1e-3, np.pi / 180))
+    c = written(tmp_path, "c.csv", ("V", "counts"))
+    named = ("--input", "voltage", "--output", "angle", "--time", "time", "--real", "1", "--pairs", "0")
+    answer = flexlink("identify", a, "--validation", b, *named, "--input-limit", "1.5", "--json")
+    assert "b.csv: 'voltage' is in mV, in the first log in V" in answer.out
+    assert answer.out.count('"input_cut_samples": 400') == 2
+    assert "'angle' is in counts" in refused("identify", a, "--validation", c, *named)
+    assert "'angle' is in counts" in refused("init", a, c, "--out", tmp_path / "new.toml")
+    configuration = tmp_path / "run.toml"
+    records = "".join(
+        f'[[source.records]]\npath = "{log.name}"\nrole = "{role}"\n'
+        for log, role in ((a, "estimation"), (c, "validation"))
+    )
+    configuration.write_text(
+        f'[source]\nkind = "files"\ntime = "time"\n{records}'
+        '[[channels]]\ninput = "voltage"\noutput = "angle"\n'
+        "[specification]\nbandwidth_rad_s = 4.0\n"
+    )
+    assert "'angle' is in counts" in refused("run", "--config", configuration, "--out", tmp_path / "out")
