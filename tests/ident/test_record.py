@@ -100,11 +100,6 @@ def test_a_faulty_log_is_one_line_with_file_and_place(tmp_path, fault):
         assert word in message
 
 
-def test_missing_column_lists_those_there(good):
-    with pytest.raises(ValueError, match="no column 'w'; the file has t_s, u_V, y_rad"):
-        Record.from_file(good, ["w"], [Y], time=T)
-
-
 def test_one_column_is_not_two_things(good):
     with pytest.raises(ValueError, match="as input and output"):
         Record.from_file(good, [U], [U], time=T)

@@ -79,20 +79,12 @@ def test_a_log_in_place_of_a_configuration_and_a_missing_option_say_what_to_type
 
 
 BAD_CONFIGS = {
-    "unknown key": ("+", "[synthesis]\nstart = 3", "unknown key synthesis.start (did you mean starts?)"),
-    "bad value": (
-        "+",
-        "[closed_loop]\ndraws = 0",
-        "closed_loop.draws: input should be greater than or equal to 1",
-    ),
     "contradiction": ("+", "effort_rolloff_rad_s = 3.0", "effort_rolloff_rad_s needs effort_limit"),
     "syntax": ("+", "[closed_loop\n", "own.toml: not valid TOML"),
     "wrong machine": ("+", "[closed_loop]\nmachine = 'simulated'", "needs [source] kind = 'simulated'"),
     "no period": ('time = "t_s"', "dt_s = 0.0", "source.dt_s: input should be greater than 0, got 0.0"),
     "no time": ('time = "t_s"', "", "no time base"),
-    "no file": ('"log.csv"', '"absent.csv"', "source.records[0].path: no such file"),
     "no log": ('"log.csv"', '"own.toml"', "unknown kind of file"),
-    "bad pole": ("n_pairs = 0", "fixed_poles = [[1.2, 0.0]]", "inside the unit circle"),
     "too few": ("n_real = 1", "n_real = 8", "12 samples are too few for order 8"),
     "bad effect": ("coefficient_Nms = 0.02", "coefficient_Nms = -1.0", "source.effects[0]"),
     "no effect": ('"viscous_friction"', '"vicious_friction"', "unknown effect 'vicious_friction'"),
