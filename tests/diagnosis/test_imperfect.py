@@ -1,7 +1,5 @@
 """Diagnosis beside a model error: levels learned from the records, starts and zeros that nobody knows."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -77,23 +77,21 @@ OTHERWISE = {
 }
 
 
-def test_every_kind_has_its_sentences():
-    said = [
-        words(finding(kind, **(VALUES | other)))
+def sentences(**more):
+    return [
+        words(finding(kind, **(VALUES | other | more)))
         for kind in FindingKind
         for other in ({}, *OTHERWISE.get(kind.name, ()))
     ]
-    assert said == STORED.read_text(encoding="utf-8").splitlines()
+
+
+def test_every_kind_has_its_sentences():
+    assert sentences() == STORED.read_text(encoding="utf-8").splitlines()
 
 
 def every_sentence():
     priors = ("integrators = 2", "fixed_poles", "input_delay_samples = 3", "relative_degree = 2")
-    return [
-        words(finding(kind, **(VALUES | other | {"prior": prior, "friction": True})))
-        for kind in FindingKind
-        for other in ({}, *OTHERWISE.get(kind.name, ()))
-        for prior in priors
-    ]
+    return [one for prior in priors for one in sentences(prior=prior, friction=True)]
 
 
 def options_of(command):
@@ -113,13 +111,13 @@ def test_hints_of_a_command_name_its_own_options(command):
         r"\w+( = \S+)? \(in a configuration of flexlink run\)|uncertainty\.method = 'records'"
     )
     with speaking(command):
-        sentences = every_sentence()
-    named = {name for sentence in sentences for name in re.findall(r"--[a-z][a-z-]*", sentence)}
+        told = every_sentence()
+    named = {name for sentence in told for name in re.findall(r"--[a-z][a-z-]*", sentence)}
     assert named <= options_of(command)
     # Every option that the table knows is really an option, and the sentences reach most of them.
     assert {text.split()[0] for text in OPTIONS[command].values()} <= options_of(command)
     assert {"--delay", "--feedthrough", "--noise-order", "--zeta-max", "--response"} <= named
-    for sentence in sentences:
+    for sentence in told:
         rest = elsewhere.sub("", sentence)
         assert not {key for key in KEYS if "_" in key} & set(re.findall(r"\w+", rest)), sentence
 
