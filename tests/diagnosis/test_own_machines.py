@@ -93,38 +93,31 @@ def _late_motor(voltage, delay_s=0.033, angle=False):
     return fine[::parts, 0 if angle else 1]
 
 
+# Stated values and their tolerances.
+PENDULUM = (
+    {"inertia_kg_m2": 1.0, "damper_Nms": 0.3, "gravity_Nm": 20.0},
+    {"inertia_kg_m2": 0.05, "damper_Nms": 0.2, "gravity_Nm": 0.03},
+)
+CARRIAGE = (
+    {"mass_kg": 2.0, "damper_Ns_m": 3.0, "spring_N_m": 80.0},
+    {"mass_kg": 0.03, "damper_Ns_m": 0.2, "spring_N_m": 0.05},
+)
+MOTOR = {"time_constant_s": 0.2, "gain_rad_Vs": 10.0}, {"time_constant_s": 0.1, "gain_rad_Vs": 0.05}
 CASES = {
     "coulomb_friction": (
-        _pendulum,
-        {"inertia_kg_m2": 1.0, "damper_Nms": 0.3, "gravity_Nm": 20.0},
-        {"inertia_kg_m2": 0.05, "damper_Nms": 0.2, "gravity_Nm": 0.03},
-        lambda u: rubbing(_gravity, u, DT_S, lambda v: 1.0 / 1.03)[:, 0],
-        (6.0, 9.0, 7.5),
-        2e-3,
-        ("force", 1.0),
+        _pendulum, *PENDULUM, lambda u: rubbing(_gravity, u, DT_S, lambda v: 1.0 / 1.03)[:, 0],
+        (6.0, 9.0, 7.5), 2e-3, ("force", 1.0),
     ),
     "backlash": (
-        _carriage,
-        {"mass_kg": 2.0, "damper_Ns_m": 3.0, "spring_N_m": 80.0},
-        {"mass_kg": 0.03, "damper_Ns_m": 0.2, "spring_N_m": 0.05},
-        lambda u: _play(rubbing(_sprung, u, DT_S)[:, 0], 0.02),
-        (4.5, 9.0, 6.0),
-        5e-4,
-        ("gap", 0.02),
+        _carriage, *CARRIAGE, lambda u: _play(rubbing(_sprung, u, DT_S)[:, 0], 0.02),
+        (4.5, 9.0, 6.0), 5e-4, ("gap", 0.02),
     ),
     "actuator_dead_zone": (
-        _carriage,
-        {"mass_kg": 2.0, "damper_Ns_m": 3.0, "spring_N_m": 80.0},
-        {"mass_kg": 0.03, "damper_Ns_m": 0.2, "spring_N_m": 0.05},
+        _carriage, *CARRIAGE,
         lambda u: rubbing(_sprung, np.sign(u) * np.maximum(np.abs(u) - 0.7, 0), DT_S)[:, 0],
-        (4.5, 9.0, 6.0),
-        5e-4,
-        ("width", 0.7),
+        (4.5, 9.0, 6.0), 5e-4, ("width", 0.7),
     ),
-    "input_delay": (
-        _shaft, {"time_constant_s": 0.2, "gain_rad_Vs": 10.0}, {"time_constant_s": 0.1, "gain_rad_Vs": 0.05},
-        _late_motor, (1.5, 3.0, 2.2), 0.05, ("delay_s", 0.033),
-    ),
+    "input_delay": (_shaft, *MOTOR, _late_motor, (1.5, 3.0, 2.2), 0.05, ("delay_s", 0.033)),
 }  # fmt: skip
 
 
@@ -227,11 +220,7 @@ def test_what_is_wrong_is_named_beside_a_bias_that_drifts():
         u = amplitude * rng.uniform(-1, 1, SAMPLES // 20).repeat(20)
         y = _late_motor(u + 0.01, angle=True) + 1e-3 * rng.standard_normal(SAMPLES)
         experiments.append(PlantExperiment(f"up to {amplitude:g}", role, u[:, None], y[:, None]))
-    stated, tolerances = (
-        {"time_constant_s": 0.2, "gain_rad_Vs": 10.0},
-        {"time_constant_s": 0.1, "gain_rad_Vs": 0.05},
-    )
-    plant = Plant(_turning, stated, tolerances, ("angle_rad",), np.array([1e-3]))
+    plant = Plant(_turning, *MOTOR, ("angle_rad",), np.array([1e-3]))
     plant = with_effects(plant, "all", experiments, dt_s=DT_S, body=Body("angle_rad"))
     case = PlantCase("turning motor", plant, tuple(experiments))
     free = BesideModelError(Search(case, lambda done, what: None).run_in_time(), rng).answer(rng)
@@ -367,10 +356,9 @@ def _noisy_motor():
     records = []
     for name, role, size in (("a", "estimation", 0.8), ("b", "estimation", 1.2), ("c", "held_out", 1.0)):
         voltage = size * rng.choice([-1.0, 1.0], 30).repeat(20)[:, None]
-        speed = _shaft({"time_constant_s": 0.2, "gain": 10.0}, {}, voltage) + 6.0
+        speed = _shaft(MOTOR[0], {}, voltage) + 6.0
         records.append(PlantExperiment(name, role, voltage, speed + noise * rng.standard_normal(speed.shape)))
-    stated, known = {"time_constant_s": 0.2, "gain": 10.0}, {"time_constant_s": 0.1, "gain": 0.05}
-    return Plant(_shaft, stated, known, ("speed_rad_s",), np.array([noise]), model_error=0.05), records
+    return Plant(_shaft, *MOTOR, ("speed_rad_s",), np.array([noise]), model_error=0.05), records
 
 
 def test_noise_is_no_model_error_in_where_and_what_remains():
