@@ -7,6 +7,7 @@ import pytest
 
 from plant import EFFECTS, Rig, parse_effects, simulate
 from plant.effects.joint import AttachedBody, GroundSpring
+from tests.plant.test_effects import EXAMPLES
 from validation.blind.beam import link_basis
 from validation.blind.truth import LISTED, UNLISTED, Feedback, Truth
 
@@ -30,35 +31,12 @@ RIG = {
     "sensors": {"hub_angle_noise_rad": 0.001, "tip_noise_m": 0.001},
     "sampling": {"dt_s": 0.005},
 }
-# Sizes that change these records by 1 to 20 noise deviations.
-EFFECTS_HERE = {
+# Sizes that change these records by a noise deviation at least.
+EFFECTS_HERE = EXAMPLES | {
     "coulomb_friction": {"torque_Nm": 0.02},
-    "stribeck_friction": {
-        "static_torque_Nm": 0.03,
-        "coulomb_torque_Nm": 0.015,
-        "stribeck_velocity_rad_s": 0.08,
-    },
-    "viscous_friction": {"coefficient_Nms": 0.02},
-    "backlash": {"gap_rad": 0.01},
+    "stribeck_friction": {name: 0.2 * size for name, size in EXAMPLES["stribeck_friction"].items()},
     "actuator_saturation": {"limit_V": 0.9},
-    "actuator_dead_zone": {"width_V": 0.08},
-    "actuator_lag": {"time_constant_s": 0.008},
-    "input_delay": {"delay_s": 0.0123},
-    "actuator_gain": {"ratio": 1.1},
-    "torque_ripple": {"amplitude_Nm": 0.05, "cycles_per_rev": 12.0, "phase_rad": 0.7},
-    "joint_compliance": {"stiffness_Nm_rad": 60.0, "damping_Nms": 0.08},
-    "tip_payload": {"mass_kg": 0.02},
-    "link_stiffness": {"ratio": 0.9},
     "structural_damping": {"ratio": 3.0},
-    "hardening_spring": {"cubic_Nm_rad3": 3.0},
-    "gravity": {"acceleration_m_s2": 0.5},
-    "sensor_lag": {"time_constant_s": 0.004},
-    "sensor_gain": {"ratio": 0.95},
-    "sensor_drift": {"rate_m_s": 0.002},
-    "quantisation": {"step_m": 0.004},
-    "periodic_disturbance": {"amplitude_Nm": 0.05, "frequency_Hz": 2.3, "phase_rad": 1.0},
-    "base_compliance": {"stiffness_Nm_rad": 120.0, "damping_Nms": 0.5, "inertia_kg_m2": 0.05},
-    "hub_inertia": {"ratio": 1.2},
 }
 
 
