@@ -5,38 +5,21 @@ import tomllib
 import numpy as np
 import pytest
 
-from plant import EFFECTS, Rig, parse_effects, simulate
+from plant import EFFECTS, Rig, paper_link, parse_effects, simulate
 from plant.effects.joint import AttachedBody, GroundSpring
 from tests.plant.test_effects import EXAMPLES
 from validation.blind.beam import link_basis
 from validation.blind.truth import LISTED, UNLISTED, Feedback, Truth
 
-RIG = {
-    "link": {
-        "length_m": 0.8,
-        "width_m": 0.02,
-        "thickness_m": 0.003,
-        "density_kg_m3": 2700.0,
-        "youngs_modulus_Pa": 7e10,
-        "kelvin_voigt_s": 0.001,
-    },
-    "hub": {"inertia_kg_m2": 0.02, "radius_m": 0.05, "viscous_friction_Nms": 0.01},
-    "motor": {
-        "torque_constant_Nm_A": 0.025,
-        "back_emf_Vs_rad": 0.025,
-        "resistance_ohm": 2.5,
-        "gear_ratio": 25.0,
-    },
-    "payload": {"mass_kg": 0.01},
-    "sensors": {"hub_angle_noise_rad": 0.001, "tip_noise_m": 0.001},
-    "sampling": {"dt_s": 0.005},
-}
+LINK = {"link.length_m": 0.8, "link.width_m": 0.02, "link.thickness_m": 0.003, "payload.mass_kg": 0.01}
+RIG = paper_link().perturbed(LINK).model_dump(exclude={"tolerances"})
 # Sizes that change these records by a noise deviation at least.
 EFFECTS_HERE = EXAMPLES | {
     "coulomb_friction": {"torque_Nm": 0.02},
     "stribeck_friction": {name: 0.2 * size for name, size in EXAMPLES["stribeck_friction"].items()},
     "actuator_saturation": {"limit_V": 0.9},
     "structural_damping": {"ratio": 3.0},
+    "joint_compliance": {"stiffness_Nm_rad": 60.0, "damping_Nms": 0.08},
 }
 
 
@@ -132,7 +115,7 @@ def test_every_cause_beyond_the_list_changes_the_record(name, parameters):
 
 
 def test_friction_holds_a_voltage_below_its_level():
-    # 0.2 V make 0.05 Nm; the hub may give way by the ten microradian of pre-sliding, no more.
+    # 0.2 V make 0.11 Nm; the hub may give way by the ten microradian of pre-sliding, no more.
     voltage = np.full(400, 0.2)
     record = Truth(RIG, [{"name": "coulomb_friction", "torque_Nm": 0.2}]).record(voltage)
     assert np.max(np.abs(record.hub_angle_rad)) < 1e-5
