@@ -20,14 +20,8 @@ OPEN = Law(np.zeros((1, 1)), np.zeros((1, 2)), np.zeros(1), np.array([1.0, 0.0])
 
 def bare(plant: Plant) -> Plant:
     """Without friction, ripple, play, encoder and limit."""
-    return replace(
-        plant,
-        friction=plant.friction * 0 + NO_FRICTION,
-        ripple=plant.ripple * [0, 1, 1],
-        springs=plant.springs * [1, 1, 1, 1, 0],
-        count=0.0,
-        limit=np.inf,
-    )
+    without = {"ripple": plant.ripple * [0, 1, 1], "springs": plant.springs * [1, 1, 1, 1, 0]}
+    return replace(plant, friction=plant.friction * 0 + NO_FRICTION, **without, count=0.0, limit=np.inf)
 
 
 @pytest.mark.parametrize("kind", ["belt", "link", "screw"])

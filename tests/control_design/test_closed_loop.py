@@ -13,15 +13,8 @@ _DT = 0.005
 
 
 def _controller(delay: int = 1, **fields) -> Controller:
-    return Controller(
-        [[0.8, 0.05], [0, 0.95]],
-        [[1.0], [0.2]],
-        [[0.3, 0.5]],
-        [[1.5]],
-        _DT,
-        computational_delay_samples=delay,
-        **fields,
-    )
+    law = [[0.8, 0.05], [0, 0.95]], [[1.0], [0.2]], [[0.3, 0.5]], [[1.5]]
+    return Controller(*law, _DT, computational_delay_samples=delay, **fields)
 
 
 @pytest.mark.parametrize("delay", [0, 1, 3])
@@ -62,13 +55,11 @@ def test_hub_torque_reaches_the_second_input():
 
 
 def test_limits_and_quantisation_are_where_they_belong():
-    trajectory = simulate(
+    law, steps = (
         _controller(input_limit=0.05, rate_limit=1.0),
-        LinearMachine(hub_arm()),
-        np.ones(400),
-        measurement_step=1e-3,
-        command_step=0.01,
+        {"measurement_step": 1e-3, "command_step": 0.01},
     )
+    trajectory = simulate(law, LinearMachine(hub_arm()), np.ones(400), **steps)
     assert np.all(np.abs(trajectory.command) <= 0.05 + 1e-12)
     steps = trajectory.command / 0.01
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
@@ -171,15 +162,8 @@ def _analytic_sensitivity(omega):
 
 def test_measured_sensitivity_of_a_linear_machine_is_the_analytic_one():
     """Without noise only the lead-in's rest is left: pole radius 0.9932, 30 s, far below rounding."""
-    found = measure_sensitivity(
-        _GAIN,
-        LinearMachine(hub_arm()),
-        np.random.default_rng(1),
-        rms=0.1,
-        band_rad_s=(1.0, 100.0),
-        period_samples=2000,
-        lead_in_periods=3,
-    )
+    played = {"rms": 0.1, "band_rad_s": (1.0, 100.0), "period_samples": 2000, "lead_in_periods": 3}
+    found = measure_sensitivity(_GAIN, LinearMachine(hub_arm()), np.random.default_rng(1), **played)
     expected = _analytic_sensitivity(found.omega_rad_s)
     np.testing.assert_allclose(found.response, expected, atol=1e-6)
     assert found.omega_rad_s[0] >= 1.0

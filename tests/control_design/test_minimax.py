@@ -42,15 +42,8 @@ def test_real_ratio_agrees_with_bisection_over_linear_programmes():
     basis = a + 1j * slope
     keep_real = np.zeros((size, 2, 2))
     keep_real[:, 0, 0] = 1.0
-    rows = PlaneRows(
-        np.arange(size),
-        keep_real,
-        plane(b + 0j),
-        e,
-        np.tile([0.0, 1.0], (size, 1)),
-        0 * keep_real,
-        np.zeros((size, 2)),
-    )
+    right, none = np.tile([0.0, 1.0], (size, 1)), np.zeros((size, 2))
+    rows = PlaneRows(np.arange(size), keep_real, plane(b + 0j), e, right, 0 * keep_real, none)
     got = smallest_ratio(basis, rows).gamma
     low, high = 0.0, 10.0
     for _ in range(40):
@@ -73,15 +66,9 @@ def test_reach_makes_a_norm_constraint():
 
 def test_denominators_that_start_negative_are_made_positive_first():
     # m = 1 - |y - 3| and 1.5 - |y - 3.4 - 0.5j| are both positive near 3 only, the numerator is |y - 1.5|.
-    rows = PlaneRows(
-        np.zeros(2, int),
-        np.tile(np.eye(2), (2, 1, 1)),
-        np.array([[-1.5, 0.0], [-1.5, 0.0]]),
-        np.array([1.0, 1.5]),
-        np.zeros((2, 2)),
-        np.tile(np.eye(2), (2, 1, 1)),
-        np.array([[-3.0, 0.0], [-3.4, -0.5]]),
-    )
+    eyes, at = np.tile(np.eye(2), (2, 1, 1)), np.array([[-3.0, 0.0], [-3.4, -0.5]])
+    level, zero = np.array([1.0, 1.5]), np.zeros((2, 2))
+    rows = PlaneRows(np.zeros(2, int), eyes, np.array([[-1.5, 0.0]] * 2), level, zero, eyes, at)
     point = smallest_ratio(np.array([[1.0 + 0j, 1j]]), rows, np.array([0.0, 0.0]))
     y = np.linspace(2, 4, 801)[:, None] + 1j * np.linspace(-0.5, 0.5, 401)
     m = np.minimum(1 - np.abs(y - 3), 1.5 - np.abs(y - 3.4 - 0.5j))

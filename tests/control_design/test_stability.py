@@ -80,13 +80,8 @@ def test_worst_margins_over_ellipses_agree_with_sampled_members():
     for _ in range(60):
         centre = np.array([rng.uniform(-1.5, 0.5) + 1j * rng.uniform(-1.2, 1.2)])
         major = np.array([rng.uniform(0.05, 0.8)])
-        e = Ellipses(
-            np.array([2.0]),
-            centre,
-            major,
-            major * rng.uniform(0.05, 1),
-            np.exp(1j * rng.uniform(0, 2 * np.pi, 1)),
-        )
+        minor, turned = major * rng.uniform(0.05, 1), np.exp(1j * rng.uniform(0, 2 * np.pi, 1))
+        e = Ellipses(np.array([2.0]), centre, major, minor, turned)
         k = np.array([1.0 + 0j])
         distance = distance_to_minus_one(k, e)
         margins = ellipse_margins(k, e, distance)

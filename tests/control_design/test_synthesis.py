@@ -181,12 +181,8 @@ def test_damping_of_the_measured_output_over_ellipses():
 
 
 def test_controller_keeps_the_damping_of_its_own_poles_that_was_asked_for():
-    fields = {
-        "bandwidth_rad_s": 3.0,
-        "effort_limit": 8.0,
-        "effort_rolloff_rad_s": 60.0,
-        "controller_order": 4,
-    }
+    effort = {"effort_limit": 8.0, "effort_rolloff_rad_s": 60.0}
+    fields = {"bandwidth_rad_s": 3.0, "controller_order": 4} | effort
     damping = {}
     for asked in (None, 0.7):
         specification = Specification(**fields, controller_damping=asked)

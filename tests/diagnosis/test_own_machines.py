@@ -243,14 +243,11 @@ def _pumped():
         voltage = rng.uniform(2.0, 8.0, SAMPLES // 20).repeat(20)
         speed = _motor(voltage - 0.5, 0.2, 10.0)[:, 0] + 1.2 * t + 0.05 * rng.standard_normal(SAMPLES)
         records.append(PlantExperiment(name, role, voltage[:, None], speed[:, None]))
-    plant = Plant(
-        _shaft,
+    stated, known = (
         {"time_constant_s": 0.21, "gain_rad_Vs": 10.0},
         {"time_constant_s": 0.1, "gain_rad_Vs": 0.01},
-        ("speed_rad_s",),
-        np.array([0.05]),
-        model_error=0.05,
     )
+    plant = Plant(_shaft, stated, known, ("speed_rad_s",), np.array([0.05]), model_error=0.05)
     names = ["actuator_dead_zone", "input_offset", "output_drift", "input_drift", "actuator_lag"]
     return PlantCase("pump", with_effects(plant, names, records, dt_s=DT_S), tuple(records))
 

@@ -136,12 +136,8 @@ def test_response_at_zero_and_nyquist_counts_once(plant):
     response = plant.response(omega)
     covariance = np.stack([np.eye(2) * (0.02 * abs(g)) ** 2 for g in response])
     covariance[0, 1, 1] = covariance[-1, 1, 1] = 0.0
-    data = prepare_response(
-        FrequencyUncertainty(omega, response, covariance, DT_S),
-        integrators=0,
-        delay_samples=0,
-        feedthrough=False,
-    )
+    measured = FrequencyUncertainty(omega, response, covariance, DT_S)
+    data = prepare_response(measured, integrators=0, delay_samples=0, feedthrough=False)
     assert data.n_samples == 2 * omega.size - 2
 
 

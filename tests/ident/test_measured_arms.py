@@ -186,15 +186,8 @@ CHANNELS = {
 @pytest.mark.parametrize("output", CHANNELS)
 def test_single_link_bounds_hold_the_record_left_out(sweeps, output):
     setting = CHANNELS[output]
-    options = IdentOptions(
-        integrators=setting["integrators"],
-        feedthrough=True,
-        n_real=1,
-        n_pairs=2,
-        estimate_initial_state=False,
-        omega_min_rad_s=4.0,
-        omega_max_rad_s=260.0,
-    )
+    band = {"omega_min_rad_s": 4.0, "omega_max_rad_s": 260.0, "integrators": setting["integrators"]}
+    options = IdentOptions(**band, feedthrough=True, n_real=1, n_pairs=2, estimate_initial_state=False)
     bounds = EmbeddingOptions(fir_length=60, coloured_noise=True, max_ar_order=20)
     records = channel(sweeps, output)
     stage = two_stage([band_limited(r, 0.8 * HZ, 30 * HZ) for r in records], options)

@@ -41,14 +41,8 @@ def test_box_comes_from_length_and_sampling_time():
 
 
 def test_given_bounds_replace_the_sides_of_the_box():
-    options = IdentOptions(
-        omega_min_rad_s=5,
-        omega_max_rad_s=50,
-        zeta_min=0.01,
-        zeta_max=0.1,
-        decay_min_per_s=1,
-        decay_max_per_s=20,
-    )
+    pairs = {"omega_min_rad_s": 5, "omega_max_rad_s": 50, "zeta_min": 0.01, "zeta_max": 0.1}
+    options = IdentOptions(**pairs, decay_min_per_s=1, decay_max_per_s=20)
     space = search_space(1, 1, 1000, 0.01, options)
     corners = 10 ** space.coordinates(np.array([[0.0, 0, 0], [1, 1, 1]]))
     np.testing.assert_allclose(corners[0], [1 - np.exp(-0.01), 5, 0.01])

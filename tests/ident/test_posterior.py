@@ -55,14 +55,11 @@ def test_covariance_is_that_of_sampled_responses():
 def test_simulation_from_rest_has_the_impulse_response_of_the_centre(integrators, delay, direct):
     p = posterior(3, integrators, delay, direct)
     u = np.random.default_rng(4).standard_normal(200)
-    model = GobfModel(
-        POLES,
-        p.mean[:3],
-        DT,
+    feedthrough, how = (
         p.mean[3] if direct else 0.0,
-        integrators=integrators,
-        input_delay_samples=delay,
+        {"integrators": integrators, "input_delay_samples": delay},
     )
+    model = GobfModel(POLES, p.mean[:3], DT, feedthrough, **how)
     filtered = np.concatenate([np.zeros(delay), u])[:200]
     for _ in range(integrators):
         filtered = signal.lfilter([1.0], [1.0, -1.0], filtered)

@@ -29,26 +29,14 @@ def moved(poles, n_fixed_real, n_fixed_pairs, index, step):
     return Poles(real, np.exp(log))
 
 
+MODE, UNKNOWN = 0.99 * np.exp(0.08j), {"estimate_offset": True, "estimate_initial_state": True}
+LATE = Structure(integrators=1, estimate_initial_state=True, input_delay_samples=2)
+# Structure, poles, how many of the real ones and of the pairs are fixed.
 CASES = {
-    "from rest": (Structure(), Poles([0.998, 0.9], [0.99 * np.exp(0.08j)]), 0, 0),
-    "offset, initial state": (
-        Structure(estimate_offset=True, estimate_initial_state=True),
-        Poles([0.998, 0.9], [0.99 * np.exp(0.08j)]),
-        0,
-        0,
-    ),
-    "integrators, a fixed pole": (
-        Structure(integrators=2),
-        Poles([0.0, 0.0, 0.95, 0.8], [0.99 * np.exp(0.08j)]),
-        3,
-        0,
-    ),
-    "integrator, initial state, a fixed pair, delay": (
-        Structure(integrators=1, estimate_initial_state=True, input_delay_samples=2),
-        Poles([0.0, 0.99], [0.98 * np.exp(0.2j), 0.99 * np.exp(0.08j)]),
-        1,
-        1,
-    ),
+    "from rest": (Structure(), Poles([0.998, 0.9], [MODE]), 0, 0),
+    "offset, initial state": (Structure(**UNKNOWN), Poles([0.998, 0.9], [MODE]), 0, 0),
+    "integrators, a fixed pole": (Structure(integrators=2), Poles([0.0, 0.0, 0.95, 0.8], [MODE]), 3, 0),
+    "a fixed pair": (LATE, Poles([0.0, 0.99], [0.98 * np.exp(0.2j), MODE]), 1, 1),
 }
 
 

@@ -97,11 +97,9 @@ class TestContract:
         if neutral is None:
             assert name in ("joint_compliance", "base_compliance", "backlash")
             return
+        sizes = dict.fromkeys(EXAMPLES[name], 0.0) | neutral
         np.testing.assert_allclose(
-            _output(parse_effect({"name": name, **dict.fromkeys(EXAMPLES[name], 0.0), **neutral})),
-            nominal,
-            rtol=0,
-            atol=1e-12,
+            _output(parse_effect({"name": name, **sizes})), nominal, rtol=0, atol=1e-12
         )
 
     def test_the_outputs_depend_on_every_parameter_as_claimed(self, name):

@@ -9,14 +9,8 @@ from plant.modal import link_modes
 RIG = paper_link()
 LEVEL = 0.3
 COULOMB = parse_effect({"name": "coulomb_friction", "torque_Nm": LEVEL})
-STRIBECK = parse_effect(
-    {
-        "name": "stribeck_friction",
-        "static_torque_Nm": LEVEL,
-        "coulomb_torque_Nm": 0.2,
-        "stribeck_velocity_rad_s": 0.05,
-    }
-)
+_FALLING = {"static_torque_Nm": LEVEL, "coulomb_torque_Nm": 0.2, "stribeck_velocity_rad_s": 0.05}
+STRIBECK = parse_effect({"name": "stribeck_friction", **_FALLING})
 STALL = RIG.motor.torque_per_volt_Nm_V
 
 

@@ -171,12 +171,8 @@ def test_generated_cases_load_and_hold_what_their_answers_say(tmp_path):
 
 def test_scores_of_folders(tmp_path):
     labelled, found = tmp_path / "labelled", tmp_path / "found"
-    truths = {
-        "a": ("none", []),
-        "b": ("effect", ["gravity"]),
-        "c": ("effect", ["backlash", "actuator_lag"]),
-        "d": ("unknown", []),
-    }
+    truths = {"a": ("none", []), "b": ("effect", ["gravity"]), "d": ("unknown", [])}
+    truths["c"] = ("effect", ["backlash", "actuator_lag"])
     for name, (verdict, effects) in truths.items():
         (labelled / name).mkdir(parents=True)
         listed = "".join(f'[[effects]]\nname = "{e}"\n[effects.parameters]\n' for e in effects)

@@ -37,14 +37,8 @@ def write_case(
         run = simulate(rig, voltage, parse_effects(effects), rng=rng)
         table = np.column_stack([run.time_s, voltage, run.output])
         name = f"experiments/{number:02d}_prbs.csv"
-        np.savetxt(
-            folder / name,
-            table,
-            delimiter=",",
-            header="time_s,voltage_V,hub_angle_rad,tip_m",
-            comments="",
-            fmt="%.9g",
-        )
+        header = "time_s,voltage_V,hub_angle_rad,tip_m"
+        np.savetxt(folder / name, table, delimiter=",", header=header, comments="", fmt="%.9g")
         lines += ["", "[[experiments]]", f'file = "{name}"', f'role = "{role}"', 'kind = "prbs"']
         lines += [f"samples = {samples}", "closed_loop = false"]
     (folder / "case.toml").write_text("\n".join(lines) + "\n")

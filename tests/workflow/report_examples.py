@@ -115,14 +115,7 @@ def stabilisation_plot() -> Stabilisation:
 
 def controller(gain: float = 1.5) -> Controller:
     """A lead that costs the slow mode a quarter of its damping and leaves the other alone."""
-    return Controller(
-        A=np.array([[0.7]]),
-        B=np.array([[1.0]]),
-        C=np.array([[-0.25 * gain]]),
-        D=np.array([[gain]]),
-        dt_s=DT_S,
-        input_limit=24.0,
-    )
+    return Controller([[0.7]], [[1.0]], [[-0.25 * gain]], [[gain]], DT_S, input_limit=24.0)
 
 
 def plant(*, performance: bool = True) -> UncertainPlant:

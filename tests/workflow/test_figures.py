@@ -313,15 +313,11 @@ LABELS = {"output": ("hub", "rad"), "performance": ("tip", "m"), "command": ("vo
 
 
 def loop_figure(loop: LoopCheck, others: LoopRuns) -> Figure:
-    return draw_closed_loop(
-        loop.time_s,
-        loop.reference,
-        loop.predicted_runs,
-        LABELS,
-        others=others,
-        machine="arm",
-        command_limit=24.0,
+    signals, more = (
+        (loop.time_s, loop.reference, loop.predicted_runs),
+        {"machine": "arm", "command_limit": 24.0},
     )
+    return draw_closed_loop(*signals, LABELS, others=others, **more)
 
 
 def test_a_run_that_leaves_the_scene_does_not_flatten_the_others():
@@ -359,12 +355,8 @@ def test_stabilisation_marks_say_what_the_record_says():
 @pytest.mark.parametrize(("model_error", "floor", "repaired"), [(0.05, 5.0, 0.02), (0.0, 1.0, 0.97)])
 def test_every_gap_is_inside_its_panel(model_error, floor, repaired):
     gaps = {"stated": 28.0, "refit": 21.0, "repaired": repaired}
-    found = SimpleNamespace(
-        gaps=gaps,
-        gap_by_experiment={"a": gaps, "b": gaps},
-        noise_floor=floor,
-        case=SimpleNamespace(model_error=model_error),
-    )
+    case, both = SimpleNamespace(model_error=model_error), {"a": gaps, "b": gaps}
+    found = SimpleNamespace(gaps=gaps, gap_by_experiment=both, noise_floor=floor, case=case)
     right = draw_waterfall(found).axes[1]
     low, high = right.get_xlim()
     drawn = np.concatenate([np.atleast_1d(line.get_xdata()) for line in right.lines])

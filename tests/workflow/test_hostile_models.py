@@ -21,15 +21,8 @@ from workflow.tasks.results import IdentifiedPlant
 
 MODEL = GobfModel(Poles([0.9, 0.5], [0.8 + 0.3j]), [1.0, 2.0, 3.0, 4.0], 0.005, 0.0, 1, 2, "u_V", "y_rad")
 REPORT = EmbeddingReport("tangent", 0.1, 1.0, 0.9, 0.5, 3.0, 100, 4)
-POSTERIOR = ResponsePosterior(
-    MODEL.poles,
-    MODEL.coefficients,
-    0.01 * np.eye(4),
-    0.005,
-    integrators=1,
-    input_delay_samples=2,
-    report=REPORT,
-)
+HOW = {"integrators": 1, "input_delay_samples": 2, "report": REPORT}
+POSTERIOR = ResponsePosterior(MODEL.poles, MODEL.coefficients, 0.01 * np.eye(4), 0.005, **HOW)
 ARRAYS = codec.to_arrays(IdentifiedPlant(MODEL, POSTERIOR, 0.95))
 DOCUMENT = json.loads(ARRAYS[codec.DOCUMENT].tobytes())
 WHOLE = {

@@ -84,14 +84,9 @@ def write(folder, signals, names, units=(1.0, 1.0, 1.0, 1.0), separator=","):
     for k, columns in enumerate(signals, 1):
         kept = [(n, c * u) for n, c, u in zip(names, columns, units, strict=True) if n]
         path = folder / f"run{k}.csv"
-        np.savetxt(
-            path,
-            np.column_stack([values for _, values in kept]),
-            "%.9g",
-            delimiter=separator,
-            header=separator.join(name for name, _ in kept),
-            comments="",
-        )
+        header = separator.join(name for name, _ in kept)
+        rows = np.column_stack([values for _, values in kept])
+        np.savetxt(path, rows, "%.9g", delimiter=separator, header=header, comments="")
         paths.append(path)
     return paths
 
