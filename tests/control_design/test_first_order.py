@@ -147,11 +147,8 @@ def test_weights_as_rational_functions_are_those_of_the_specification(integrator
         limit = specification.limit_weight()
         if limit is not None:
             effort = RationalResponse.from_weight(limit, _DT)
-            np.testing.assert_allclose(
-                np.abs(effort.at(omega)),
-                specification.magnitude(plant, omega, LoopFunction.EFFORT),
-                rtol=1e-9,
-            )
+            wanted = specification.magnitude(plant, omega, LoopFunction.EFFORT)
+            np.testing.assert_allclose(np.abs(effort.at(omega)), wanted, rtol=1e-9)
     assert Specification().tracking_weight() is None
     assert Specification().limit_weight() is None
 
@@ -205,11 +202,8 @@ def test_own_grid_with_the_straight_line_assumption_is_the_sum_of_neighbours():
     own = np.linspace(5.0, 50.0, 10)
     covariance = np.array([[[1.0, 0.2], [0.2, 0.5]]]) * (own[:, None, None] / 50) ** 2
     arm = hub_arm()
-    record = type(
-        "Record",
-        (),
-        {"omega_rad_s": own, "centre": frequency_response(arm, own), "covariance": covariance, "level": 0.95},
-    )()
+    values = {"omega_rad_s": own, "centre": frequency_response(arm, own), "covariance": covariance}
+    record = type("Record", (), {**values, "level": 0.95})()
     channel = PlantChannel(arm, record)
     nominal = RationalResponse.from_state_space(arm, 1)
     left, right = channel.at(own[2:3]), channel.at(own[3:4])

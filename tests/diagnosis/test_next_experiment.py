@@ -119,11 +119,8 @@ def _gain(voltage, truth, hypothesis, seed):
 def test_chosen_experiment_separates_delay_from_lag_better_than_a_record_when_fitted():
     truth = InputDelay(delay_s=0.006)
     record = inputs()["prbs_high"]
-    chosen = next_experiment(
-        (*_competing(truth), *_vague(ActuatorLag(time_constant_s=0.006))),
-        Limits(float(np.max(record))),
-        n_samples=record.size,
-    )
+    hypotheses = (*_competing(truth), *_vague(ActuatorLag(time_constant_s=0.006)))
+    chosen = next_experiment(hypotheses, Limits(float(np.max(record))), n_samples=record.size)
 
     def mean_gain(voltage):
         return np.mean([_gain(voltage, truth, lambda s: ActuatorLag(time_constant_s=s), k) for k in range(3)])

@@ -134,11 +134,8 @@ def test_effects_that_change_the_motion_most_are_no_fault():
     ):
         run = simulate(RIG, voltage, parse_effects([effect]), rng=np.random.default_rng(4))
         record = Experiment("a", "estimation", voltage, run.output)
-        case = Case(
-            "arm",
-            RIG.perturbed({"sensors.tip_noise_m": 1e-3}),
-            (record, replace(record, name="b", role="held_out")),
-        )
+        rig = RIG.perturbed({"sensors.tip_noise_m": 1e-3})
+        case = Case("arm", rig, (record, replace(record, name="b", role="held_out")))
         refuse_implausible(case)
 
 

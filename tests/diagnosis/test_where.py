@@ -371,11 +371,8 @@ def test_of_records_shorter_than_a_second_no_growth_with_the_input_is_said(sampl
         return SimpleNamespace(name=name, kind="prbs", closed_loop=False, voltage_V=voltage)
 
     sampling = SimpleNamespace(dt_s=0.005)
-    case = SimpleNamespace(
-        experiments=(record("low", 1.0), record("high", 3.0)),
-        outputs=("hub_angle_rad",),
-        rig=SimpleNamespace(sampling=sampling),
-    )
+    rig, records = SimpleNamespace(sampling=sampling), (record("low", 1.0), record("high", 3.0))
+    case = SimpleNamespace(experiments=records, outputs=("hub_angle_rad",), rig=rig)
     residuals = {name: size * rng.standard_normal((samples, 1)) for name, size in (("low", 3), ("high", 9))}
     found = amplitude_finding(case, residuals, 0.05, rng)
     assert (found is not None) == said

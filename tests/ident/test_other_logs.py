@@ -84,13 +84,10 @@ def test_a_matrix_is_offered_by_its_signals(tmp_path, shape):
 def test_nanoseconds_since_1970_keep_their_digits(tmp_path, dtype, step_ns):
     """As doubles they are multiples of 256."""
     stamps = (EPOCH_NS + step_ns * K).astype(dtype)
-    holds(
-        as_parquet(tmp_path / "a.parquet", ["t_ns", "u_V", "y_rad"], stamps, U, Y),
-        dt_s=1e-9 * step_ns,
-        names=("t_ns", "u_V", "y_rad"),
-    )
+    names, path = ("t_ns", "u_V", "y_rad"), tmp_path / "a.parquet"
+    holds(as_parquet(path, [*names], stamps, U, Y), dt_s=1e-9 * step_ns, names=names)
     path = written(tmp_path / "a.npz", np.savez, t_ns=stamps, u_V=U, y_rad=Y)
-    holds(path, dt_s=1e-9 * step_ns, names=("t_ns", "u_V", "y_rad"))
+    holds(path, dt_s=1e-9 * step_ns, names=names)
     with pytest.raises(ValueError, match="expected increasing time"):
         record(written(tmp_path / "b.npz", np.savez, t_ns=stamps[::-1], u_V=U, y_rad=Y), time="t_ns")
 

@@ -154,14 +154,8 @@ class Slider:
 def lead(gain=12.0, integral=0.0, idle=0, **fields) -> Controller:
     """`controller`, with integral action beside it, and idle states."""
     rest = [0.0] * idle
-    return Controller(
-        np.diag([0.8, 1.0, *rest]),
-        [[1.0], [1.0], *([0.0] for _ in rest)],
-        [[-1.4, integral, *rest]],
-        [[gain]],
-        DT_S,
-        **fields,
-    )
+    A, B = np.diag([0.8, 1.0, *rest]), [[1.0], [1.0], *([0.0] for _ in rest)]
+    return Controller(A, B, [[-1.4, integral, *rest]], [[gain]], DT_S, **fields)
 
 
 def stage_of(found, records=(), step=0.02):
@@ -172,11 +166,8 @@ def stage_of(found, records=(), step=0.02):
     results = SimpleNamespace(
         identify=SimpleNamespace(friction=found), records=SimpleNamespace(fitted=lambda channel: records)
     )
-    return SimpleNamespace(
-        config=config.model_copy(update={"specification": asked, "closed_loop": loop}),
-        results=results,
-        plant=None,
-    )
+    config = config.model_copy(update={"specification": asked, "closed_loop": loop})
+    return SimpleNamespace(config=config, results=results, plant=None)
 
 
 def test_the_recorded_loop_stands_beside_the_new_one():
