@@ -117,8 +117,9 @@ class FirstOrder:
 
     def scaled(self, factor: complex) -> FirstOrder:
         """Times a constant."""
-        size = abs(factor)
-        return FirstOrder(self.value * factor, self.slope * factor, self.remainder * size, self.half_width)
+        return FirstOrder(
+            self.value * factor, self.slope * factor, self.remainder * abs(factor), self.half_width
+        )
 
     def end(self, side: int) -> Complex:
         """The linear part at the upper (side = 1) or lower (side = -1) end of the interval."""

@@ -241,8 +241,9 @@ class StraightBetween:
             for part, size in zip(parts, sizes, strict=True)
         )
         covariance = np.where(inside[:, None, None], covariance, 0.0)
-        dt_s = self.channel.dt_s
-        return FrequencyUncertainty(omega, centre, covariance, dt_s, level=level, method="straight between")
+        return FrequencyUncertainty(
+            omega, centre, covariance, self.channel.dt_s, level=level, method="straight between"
+        )
 
 
 def with_straight_between(plant: UncertainPlant) -> UncertainPlant:

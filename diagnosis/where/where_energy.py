@@ -118,9 +118,8 @@ def band_gaps(
             squares[s] += np.bincount(band, weights=spectrum[:, s], minlength=counts.size)
     energies = [[Energy(float(v), int(n)) for v, n in zip(row, counts, strict=True)] for row in squares]
     whole = total([energy for row in energies for energy in row])
-    each = level / squares.size
     return tuple(
-        BandGap(sensor, edges[b], edges[b + 1], part_gap(energy, whole, each))
+        BandGap(sensor, edges[b], edges[b + 1], part_gap(energy, whole, level / squares.size))
         for sensor, row in zip(sensors, energies, strict=True)
         for b, energy in enumerate(row)
     )

@@ -86,8 +86,9 @@ class FrequencyUncertainty:
     def normalised_distance(self, response: npt.ArrayLike) -> RealArray:
         """Distance (F,) of a response (F,) from the centre in units of the ellipse: 1 on its boundary."""
         response = self._matching(response)
-        magnitude = np.abs(self.centre) + np.abs(response)
-        return ellipse_distance(response - self.centre, self.ellipse(), magnitude)
+        return ellipse_distance(
+            response - self.centre, self.ellipse(), np.abs(self.centre) + np.abs(response)
+        )
 
     def contains(self, response: npt.ArrayLike) -> BoolArray:
         """(F,) whether a response (F,) lies in the ellipse of its frequency."""

@@ -127,8 +127,9 @@ class MatrixPosterior(Shown):
         weights = np.linalg.svd(np.concatenate([flat.real, flat.imag], axis=1), compute_uv=False) ** 2
         squares = np.random.default_rng(0).standard_normal((_DRAWS, weights.shape[1])) ** 2
         radius: RealArray = np.sqrt(np.quantile(weights @ squares.T, self.level, axis=1)).astype(np.float64)
-        centre = model.frequency_response(omega)
-        return MatrixUncertainty(omega, centre, self.output_factor, upper, radius, model.dt_s, self.level)
+        return MatrixUncertainty(
+            omega, model.frequency_response(omega), self.output_factor, upper, radius, model.dt_s, self.level
+        )
 
 
 def matrix_posterior(

@@ -37,8 +37,9 @@ def check(
     """`document` as a `model`. Raises InputError: `source`, dotted key and what was expected in one line."""
     try:
         # As JSON, whose strict reading takes `true` for no 1.0 and "2" for no 2, but a list for a tuple.
-        text = to_json(document, inf_nan_mode="constants")
-        return model.model_validate_json(text, strict=True, context=dict(context or {}))
+        return model.model_validate_json(
+            to_json(document, inf_nan_mode="constants"), strict=True, context=dict(context or {})
+        )
     except ValidationError as error:
         raise InputError(f"{source}: {first_complaint(model, error)}") from error
 

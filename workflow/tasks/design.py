@@ -158,8 +158,12 @@ def certify_asked(
             coverage=options.joint_coverage,
             draws=options.joint_draws,
         )
-    sampled = SampledResponses(joint, calibrated, reason)
-    return CertifyResult(certificate, certificate.certified, said("certificate_reason", certificate), sampled)
+    return CertifyResult(
+        certificate,
+        certificate.certified,
+        said("certificate_reason", certificate),
+        SampledResponses(joint, calibrated, reason),
+    )
 
 
 def undrawable(plants: Sequence[UncertainPlant]) -> str | None:
