@@ -80,8 +80,10 @@ def fit_friction(
         if free:
             raise
         return fit_friction_in_loop(records, options, progress=progress)
-    residuals = [found.residual(record) for record in records]
-    if not free and found.significant and not whiteness_test(residuals).passed:
+    white = whiteness_test([found.residual(record) for record in records])
+    n = sum(record.n_samples for record in records)
+    # Schwarz's price of as many lags: long records are not white by a trace, which leaves a free run right.
+    if not free and found.significant and n * white.predictable_share > white.lags.size * np.log(n):
         # What is wrong with arm or law adds up in a free run, whose first order does not reach far then.
         with suppress(ValueError):
             followed = fit_friction_in_loop(records, options, progress=progress)

@@ -466,7 +466,11 @@ def _on_moved_poles(logs: _Logs, found: FrictionFit) -> FrictionFit:
     """The fit with its poles where its coefficients on the doubled ones have moved them, at most half of
     their way to the unit circle, and the arm anew on them."""
 
-    moved = partial(moved_pole, found.coefficients, found.arm.poles.doubled())
+    def moved(pole: complex) -> complex:
+        simple, double = (rows @ found.coefficients for rows in laurent_rows(found.arm.poles.doubled(), pole))
+        change, most = complex(double / simple) if simple else 0j, 0.5 * (1 - abs(pole))
+        return complex(pole + change * min(1.0, most / max(abs(change), most)))
+
     poles, images = found.model.poles, found.arm.structure.unstable.values
     real = [pole if np.any(images == pole) or pole <= 0 else moved(pole).real for pole in poles.real.tolist()]
     pairs = [pole if np.any(images == pole) else moved(pole) for pole in poles.pairs.tolist()]
@@ -474,14 +478,6 @@ def _on_moved_poles(logs: _Logs, found: FrictionFit) -> FrictionFit:
     data = prepare(_white(logs, found), replace(found.arm.structure, estimate_initial_state=True))
     model = replace(found.model, poles=poles, coefficients=np.ravel(linear_fit(data, poles).coefficients))
     return observed(_on(found, model), logs.records, nearby=NEARBY[1:2])
-
-
-def moved_pole(coefficients: RealArray, poles: Poles, pole: complex) -> complex:
-    """Where coefficients on poles (each twice) move one of them to first order, at most half of its way to
-    the unit circle."""
-    simple, double = (rows @ coefficients for rows in laurent_rows(poles, pole))
-    change, most = complex(double / simple) if simple else 0j, 0.5 * (1 - abs(pole))
-    return complex(pole + change * min(1.0, most / max(abs(change), most)))
 
 
 def _stepped(logs: _Logs, found: FrictionFit) -> FrictionFit:

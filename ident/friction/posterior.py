@@ -21,12 +21,12 @@ from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
 from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, linearised
-from ident.friction.in_loop import ROUNDS, heterogeneity, moved_pole
+from ident.friction.in_loop import ROUNDS, heterogeneity
 from ident.friction.inverse_dynamics import smoothed, speed_classes
 from ident.response_uncertainty import NOISE_ORDERS
 from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
-from ident.uncertainty.pole_intervals import pole_intervals
+from ident.uncertainty.pole_intervals import laurent_rows, pole_intervals
 
 # Share of the level that a linear force which shows in no residual may have (deviation).
 _SHAPE = 0.05
@@ -133,12 +133,15 @@ def _behind_observed(
             classes=[speed_classes(record) for record in records],
         )
         stable, n = poles.without(model.unstable), response.poles.order
-        moved = [moved_pole(response.mean[:n], response.poles, pole).real for pole in stable.real.tolist()]
-        real = np.where(stable.real > 0, moved, stable.real)
-        rate = -np.log(np.maximum(real, np.finfo(np.float64).tiny))[:, None] / model.dt_s
-        away = rate - pole_intervals(response, stable).decay_per_s
-        if not left or not np.any(away[:, 0] * away[:, 1] > 0):
+        real, slow = stable.real.copy(), stable.real > 0
+        parts = [laurent_rows(response.poles, pole) for pole in real[slow].tolist()]
+        simple, double = np.einsum("rkp,p->kr", np.reshape(parts, (-1, 2, n)).real, response.mean[:n])
+        # Of the logarithm of the decay rate, as its interval.
+        log = double / simple / (real[slow] * np.log(real[slow]))
+        widest = pole_intervals(response, stable).decay_per_s[slow, 1] * model.dt_s / -np.log(real[slow])
+        if not left or not np.any(np.abs(log) > np.log(widest)):
             break
+        real[slow] **= np.exp(np.clip(log, -1, 1))
         poles = Poles(real, stable.pairs).appended(model.unstable)
     whitening = np.array([1.0, *(response.report.ar_coefficients if response.report else ())])
     wider = np.sqrt(

@@ -40,9 +40,9 @@ def nominals_near(
     """The nearest models (`nominal_near`) on given poles, on those moved to where the posterior has them, and
     with ever one pair more (`PoleSearch`), up to twice the given order and a pair; unstable poles stay."""
     response = posterior.at(omega_rad_s)
-    floor = (THINNEST * np.abs(response.centre[:, None, None])) ** 2 * np.eye(2)
+    thinnest = (THINNEST * np.abs(response.centre[:, None, None])) ** 2 * np.eye(2)
     data = prepare_response(
-        replace(response, covariance=response.covariance + floor),
+        replace(response, covariance=response.covariance + thinnest),
         integrators=posterior.integrators,
         delay_samples=posterior.input_delay_samples,
         feedthrough=posterior.has_feedthrough,
@@ -51,10 +51,13 @@ def nominals_near(
         raise ValueError(
             f"{data.z.size} frequencies do not determine {poles.order + data.feedthrough} coefficients"
         )
-    data = replace(data, common=data.common / all_pass_response(posterior.unstable, data.z))
     # An integrator's pole at z = 0 is its zero, no dynamics.
-    known = IdentOptions(integrators=min(posterior.integrators, int(np.count_nonzero(poles.real == 0))))
-    search, most = PoleSearch(data, known.with_unstable(posterior.unstable)), 2 * poles.order
+    held = min(posterior.integrators, int(np.count_nonzero(poles.real == 0)))
+    data = replace(data, common=data.common / all_pass_response(posterior.unstable, data.z))
+    search, most = (
+        PoleSearch(data, IdentOptions(integrators=held).with_unstable(posterior.unstable)),
+        2 * poles.order,
+    )
     while True:
         fit = fit_response(data, poles)
         yield GobfModel(

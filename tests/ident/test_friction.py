@@ -84,6 +84,21 @@ def test_level_is_found_with_its_standard_deviation(torque_Nm: float) -> None:
     assert found.level_std < 0.02 * found.level
 
 
+def test_a_trace_of_colour_in_long_records_leaves_a_free_run_as_it_is(monkeypatch) -> None:
+    """Noise of which its past predicts .0036, which long records tell from white; a third of what would pay
+    for its lags."""
+    records, found = rubbing()
+    rng, longer = np.random.default_rng(4), []
+    for record in (
+        replace(r, input=np.tile(r.input, (4, 1)), output=np.zeros((4 * r.n_samples, 1))) for r in records
+    ):
+        noise = found.noise_std * rng.standard_normal(record.output.shape)
+        noise[1:] += 0.06 * noise[:-1]
+        longer.append(replace(record, output=found.motion(record)[0][:, None] + noise))
+    monkeypatch.setattr("ident.friction.fit.fit_friction_in_loop", lambda *_, **__: pytest.fail("observed"))
+    assert dry.fit_friction(longer, OPTIONS).level == pytest.approx(found.level, rel=0.02)
+
+
 @pytest.mark.slow
 def test_a_pair_that_does_not_swing_takes_no_mode_from_the_arm() -> None:
     """Records of the default arm whose start has two overdamped pairs: their fit had a level 2 % too low, a
@@ -424,7 +439,7 @@ def test_an_observer_follows_what_a_free_run_does_not_explain():
     omega, behind = np.geomspace(2 * np.pi, 200 * np.pi, 100), dry.without_friction([record], found)
     truth = response(*plant.sampled(), omega, 1e-3)
     assert np.mean(behind.response.at(omega, 0.95).contains(truth)) >= 0.93
-    assert np.all(pole_intervals(behind.shaft, found.model.poles).omega_rad_s < 1e3)
+    assert np.all(pole_intervals(behind.shaft, behind.poles).omega_rad_s < 1e3)
 
 
 @pytest.mark.parametrize(("wide", "share"), [(0.3, 0.95), (1.0, 0.7)])

@@ -107,8 +107,7 @@ def uncertainty_of(
     is where at_shaft; equivalent: where it is known from the shaft. Raises ValueError, one line,
     where the model explains nothing.
     """
-    poles = linear_poles = result.model.poles
-    options = channel.embedding
+    poles, linear_poles, options = result.model.poles, result.model.poles, channel.embedding
     if friction is None:
         white = whiteness_test(result.identification.residuals).passed
 
@@ -134,8 +133,8 @@ def uncertainty_of(
             return found, residual_tests(found.response, measured, found.friction)
 
         (behind, tests), _ = with_noise_model(options, white, arm_behind)
-        linear, poles = behind.shaft if at_shaft else behind.response, behind.poles
-        linear_poles, posterior = poles, behind.response
+        linear = behind.shaft if at_shaft else behind.response
+        poles, linear_poles, posterior = behind.poles, behind.poles, behind.response
         if channel.uncertainty.response == "this amplitude":
             equivalent = equivalent or equivalent_friction(friction, measured, rng)
             posterior, poles = at_amplitude(behind, equivalent, rng)
@@ -262,11 +261,12 @@ def nominal_of(
     The nominal gives the design its closed-loop poles, so it should be a member of the set it stands for;
     but every further pole costs the controller an order, and a pair that is not told may be no mode.
     """
-    told = Poles(poles.real, poles.pairs[~np.isin(poles.pairs, untold)])
     ellipses = posterior.at(omega)
     inside = (
         model
-        for model in nominals_near(posterior, told, omega)
+        for model in nominals_near(
+            posterior, Poles(poles.real, poles.pairs[~np.isin(poles.pairs, untold)]), omega
+        )
         if np.mean(ellipses.contains(model.frequency_response(omega))) >= _SHARE_INSIDE
     )
     return next(inside, None) or nominal_near(posterior, poles, omega)
