@@ -37,12 +37,16 @@ def nominal_near(posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.Ar
 def nominals_near(
     posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.ArrayLike
 ) -> Iterator[GobfModel]:
-    """The nearest models (`nominal_near`) on given poles, on those moved to where the posterior has them, and
-    with ever one pair more (`PoleSearch`), up to twice the given order and a pair; unstable poles stay."""
+    """The nearest models (`nominal_near`) on given poles, on each taken twice, on those moved to where the
+    posterior has them, and with ever one pair more (`PoleSearch`), up to twice the given order and a pair;
+    unstable poles stay."""
     response = posterior.at(omega_rad_s)
-    thinnest = (THINNEST * np.abs(response.centre[:, None, None])) ** 2 * np.eye(2)
     data = prepare_response(
-        replace(response, covariance=response.covariance + thinnest),
+        replace(
+            response,
+            covariance=response.covariance
+            + (THINNEST * np.abs(response.centre[:, None, None])) ** 2 * np.eye(2),
+        ),
         integrators=posterior.integrators,
         delay_samples=posterior.input_delay_samples,
         feedthrough=posterior.has_feedthrough,
@@ -54,29 +58,26 @@ def nominals_near(
     # An integrator's pole at z = 0 is its zero, no dynamics.
     held = min(posterior.integrators, int(np.count_nonzero(poles.real == 0)))
     data = replace(data, common=data.common / all_pass_response(posterior.unstable, data.z))
-    search, most = (
-        PoleSearch(data, IdentOptions(integrators=held).with_unstable(posterior.unstable)),
-        2 * poles.order,
-    )
+    search = PoleSearch(data, IdentOptions(integrators=held).with_unstable(posterior.unstable))
+    tried: tuple[Poles, ...] = (poles, poles.doubled())
     while True:
-        fit = fit_response(data, poles)
-        yield GobfModel(
-            poles=poles,
-            coefficients=fit.coefficients,
-            dt_s=posterior.dt_s,
-            feedthrough=fit.feedthrough,
-            integrators=posterior.integrators,
-            input_delay_samples=posterior.input_delay_samples,
-            input_name=posterior.input_name,
-            output_name=posterior.output_name,
-            unstable=posterior.unstable,
-        )
-        if not search.minima:
-            poles = search.descend(search.fixed.appended(poles.without(search.fixed)), "nominal").poles
-        elif poles.order <= most:
-            poles = search.add_pair(poles).poles
-        else:
+        for each in tried:
+            fit = fit_response(data, each)
+            yield GobfModel(
+                poles=each,
+                coefficients=fit.coefficients,
+                dt_s=posterior.dt_s,
+                feedthrough=fit.feedthrough,
+                integrators=posterior.integrators,
+                input_delay_samples=posterior.input_delay_samples,
+                input_name=posterior.input_name,
+                output_name=posterior.output_name,
+                unstable=posterior.unstable,
+            )
+        if search.minima and each.order > 2 * poles.order:
             return
+        start = search.fixed.appended(poles.without(search.fixed))
+        tried = ((search.add_pair(each) if search.minima else search.descend(start, "nominal")).poles,)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 
@@ -255,18 +255,17 @@ def posterior_of(
 def nominal_of(
     posterior: ResponsePosterior, poles: Poles, omega: RealArray, untold: ComplexArray
 ) -> GobfModel:
-    """Nearest model on the identified poles without the pairs (P,) that the records do not tell, on those
-    moved or on as few pairs more as keep it in its ellipses; where none does, on the identified poles.
+    """Nearest model on the identified poles without the pairs (P,) that the records do not tell, with them,
+    or as `nominals_near` goes on: the first that stays in its ellipses, else the second.
 
     The nominal gives the design its closed-loop poles, so it should be a member of the set it stands for;
-    but every further pole costs the controller an order, and a pair that is not told may be no mode.
+    but a pole taken twice is a mode listed twice, and one that is not told or was not given may be none, so
+    they have to earn that.
     """
-    ellipses = posterior.at(omega)
+    told, ellipses = Poles(poles.real, poles.pairs[~np.isin(poles.pairs, untold)]), posterior.at(omega)
     inside = (
         model
-        for model in nominals_near(
-            posterior, Poles(poles.real, poles.pairs[~np.isin(poles.pairs, untold)]), omega
-        )
+        for model in chain([nominal_near(posterior, told, omega)], nominals_near(posterior, poles, omega))
         if np.mean(ellipses.contains(model.frequency_response(omega))) >= _SHARE_INSIDE
     )
     return next(inside, None) or nominal_near(posterior, poles, omega)
