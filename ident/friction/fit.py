@@ -32,7 +32,7 @@ from ident.friction.gauss_newton import (
     simulated_rss,
     started,
 )
-from ident.friction.in_loop import fit_friction_in_loop, recorded_in_loop
+from ident.friction.in_loop import BY_CHANCE, fit_friction_in_loop, recorded_in_loop
 from ident.friction.inverse_dynamics import presliding_of, with_measured_direction
 from ident.one_input import untested_model
 from ident.search.order_selection import Progress
@@ -80,10 +80,9 @@ def fit_friction(
         if free:
             raise
         return fit_friction_in_loop(records, options, progress=progress)
-    white = whiteness_test([found.residual(record) for record in records])
-    n = sum(record.n_samples for record in records)
-    # Schwarz's price of as many lags: long records are not white by a trace, which leaves a free run right.
-    if not free and found.significant and n * white.predictable_share > white.lags.size * np.log(n):
+    residuals = [found.residual(record) for record in records]
+    # At the level of the report one good free run in a hundred would be given up.
+    if not free and found.significant and whiteness_test(residuals).probability < BY_CHANCE:
         # What is wrong with arm or law adds up in a free run, whose first order does not reach far then.
         with suppress(ValueError):
             followed = fit_friction_in_loop(records, options, progress=progress)

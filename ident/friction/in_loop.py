@@ -76,8 +76,9 @@ ROUNDS, _FEW_ROUNDS, _LONGEST_DELAY = 6, 2, 20
 # A level that moves by less than the first share stays; by more than the second, or with errors that fall to
 # the third, the order is chosen anew.
 _STAYS, _MOVES, _FALLS_TO = 5e-3, 0.05, 0.5
-# Lags by which a command follows; a residual that is rounding; one log in a million is taken for a loop.
-_CAUSES, _NOTHING, _BY_CHANCE = 8, 1e-5, 1e-6
+# Lags by which a command follows; a residual that is rounding; one log in a million is taken for a loop,
+# or its free run for a wrong one.
+_CAUSES, _NOTHING, BY_CHANCE = 8, 1e-5, 1e-6
 _FEW_LEVELS = 16  # of a binary or staircase signal, at most
 # Largest step of the level, as a share of it; parts of a step that are tried.
 _LARGEST_STEP = 0.3
@@ -136,7 +137,7 @@ def with_commands_in_time(records: Sequence[Record]) -> list[Record]:
 def _follows(record: Record, late: int, among: int) -> bool:
     """Whether the command, taken so many samples earlier, is told by the position, of one of so many logs."""
     u, y = record.input[late:, 0], record.output[: record.n_samples - late, 0]
-    return bool(chi2.sf(_told_by_position(u, y), _CAUSES) * among < _BY_CHANCE)
+    return bool(chi2.sf(_told_by_position(u, y), _CAUSES) * among < BY_CHANCE)
 
 
 def _answers_at_once(record: Record, late: int) -> bool:

@@ -85,15 +85,14 @@ def test_level_is_found_with_its_standard_deviation(torque_Nm: float) -> None:
 
 
 def test_a_trace_of_colour_in_long_records_leaves_a_free_run_as_it_is(monkeypatch) -> None:
-    """Noise of which its past predicts .0036, which long records tell from white; a third of what would pay
-    for its lags."""
+    """Noise of which its past predicts .002: long records tell it from white, as one in some hundred are."""
     records, found = rubbing()
     rng, longer = np.random.default_rng(4), []
     for record in (
         replace(r, input=np.tile(r.input, (4, 1)), output=np.zeros((4 * r.n_samples, 1))) for r in records
     ):
         noise = found.noise_std * rng.standard_normal(record.output.shape)
-        noise[1:] += 0.06 * noise[:-1]
+        noise[1:] += 0.045 * noise[:-1]
         longer.append(replace(record, output=found.motion(record)[0][:, None] + noise))
     monkeypatch.setattr("ident.friction.fit.fit_friction_in_loop", lambda *_, **__: pytest.fail("observed"))
     assert dry.fit_friction(longer, OPTIONS).level == pytest.approx(found.level, rel=0.02)
