@@ -172,7 +172,7 @@ SECTIONS = {
     "Control": (
         Row(
             "Random designs: certified loops that were unstable",
-            "random_designs",
+            "random_designs_1300",
             r"designs (\d+), met (\d+), .*?unstable (\d+),",
             "{2} of {1} certified ({0} designs)",
             r"designs (\d+), met (\d+)",
@@ -215,7 +215,7 @@ SECTIONS = {
         ),
         Row(
             "Drawn for release 0.2.0, each kind twice: certified, and 20 of 20 steps settle",
-            "closed_loop_machines_14",
+            "closed_loop_machines_15",
             r"^certified and 20 of 20 settle, both lots: (\d+) of (\d+)",
             "{} of {}",
             BY_MACHINE,
