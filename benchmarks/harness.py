@@ -79,7 +79,9 @@ def main(
     given = vars(parser.parse_args(arguments))
     options = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
     target = options.pop("name") or (module if writes and options == defaults else None)
-    command = shlex.join(["python", "-m", f"benchmarks.{module}", *arguments])
+    # No path of the machine it ran on.
+    shown = [os.path.relpath(each) if os.path.isabs(each) else each for each in arguments]
+    command = shlex.join(["python", "-m", f"benchmarks.{module}", *shown])
     threads = os.environ.get("OMP_NUM_THREADS")
     rests_on = seeds.format(**options) if seeds is not None else _seeds(options)
     out = Results(

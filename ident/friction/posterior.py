@@ -121,7 +121,7 @@ def _behind_observed(
     above = _BEYOND * float(np.max(np.abs(np.log(swinging)), initial=0.0))
     # Viscous and dry friction trade: a pole moved far beyond its interval would turn the tangent round below
     # the data.
-    poles = model.poles
+    poles, classes = model.poles, [speed_classes(record) for record in records]
     for left in reversed(range(ROUNDS)):
         response, change, factor = tangent_beside(
             less,
@@ -130,18 +130,20 @@ def _behind_observed(
             options,
             n_known=found.law.n_logs + len(records),
             missed_above=above,
-            classes=[speed_classes(record) for record in records],
+            classes=classes,
         )
         stable, n = poles.without(model.unstable), response.poles.order
         real, slow = stable.real.copy(), stable.real > 0
-        parts = [laurent_rows(response.poles, pole) for pole in real[slow].tolist()]
-        simple, double = np.einsum("rkp,p->kr", np.reshape(parts, (-1, 2, n)).real, response.mean[:n])
+        simple, double = np.reshape(
+            [np.real(laurent_rows(response.poles, pole)) @ response.mean[:n] for pole in real[slow].tolist()],
+            (-1, 2),
+        ).T
         # Of the logarithm of the decay rate, as its interval.
-        log = double / simple / (real[slow] * np.log(real[slow]))
-        widest = pole_intervals(response, stable).decay_per_s[slow, 1] * model.dt_s / -np.log(real[slow])
-        if not left or not np.any(np.abs(log) > np.log(widest)):
+        log, rate = double / simple / (real[slow] * np.log(real[slow])), -np.log(real[slow]) / model.dt_s
+        outside = np.abs(log) > np.log(pole_intervals(response, stable).decay_per_s[slow, 1] / rate)
+        if not left or not outside.any():
             break
-        real[slow] **= np.exp(np.clip(log, -1, 1))
+        real[slow] **= np.exp(np.where(outside, np.clip(log, -1, 1), 0.0))
         poles = Poles(real, stable.pairs).appended(model.unstable)
     whitening = np.array([1.0, *(response.report.ar_coefficients if response.report else ())])
     wider = np.sqrt(

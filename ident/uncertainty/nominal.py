@@ -55,10 +55,11 @@ def nominals_near(
         raise ValueError(
             f"{data.z.size} frequencies do not determine {poles.order + data.feedthrough} coefficients"
         )
-    # An integrator's pole at z = 0 is its zero, no dynamics.
-    held = min(posterior.integrators, int(np.count_nonzero(poles.real == 0)))
+    # An integrator's pole at z = 0 is its zero, no dynamics. What is held stands first, in its own digits.
+    held = Poles(np.zeros(min(posterior.integrators, int(np.count_nonzero(poles.real == 0)))))
+    known = IdentOptions(integrators=held.order).with_unstable(posterior.unstable)
     data = replace(data, common=data.common / all_pass_response(posterior.unstable, data.z))
-    search = PoleSearch(data, IdentOptions(integrators=held).with_unstable(posterior.unstable))
+    search, held = PoleSearch(data, known), held.appended(posterior.unstable)
     tried: tuple[Poles, ...] = (poles, poles.doubled())
     while True:
         for each in tried:
@@ -76,7 +77,7 @@ def nominals_near(
             )
         if search.minima and each.order > 2 * poles.order:
             return
-        start = search.fixed.appended(poles.without(search.fixed))
+        start = held.appended(poles.without(held))
         tried = ((search.add_pair(each) if search.minima else search.descend(start, "nominal")).poles,)
 
 

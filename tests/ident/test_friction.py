@@ -11,6 +11,7 @@ from benchmarks.closed_loop_machines.simulator import Law, Plant, response
 from benchmarks.without_friction import with_friction
 from ident import GobfModel, IdentOptions, Poles, Record, Structure, friction as dry, identify
 from ident.basis.posterior import ResponsePosterior
+from ident.checks.residual_tests import whiteness_test
 from ident.data.arrays import ComplexArray, RealArray, real_rows
 from ident.friction.amplitude import damped_poles, more_at_a_strong_line
 from ident.friction.arm import FrictionLaw, SteppedArm
@@ -87,13 +88,14 @@ def test_level_is_found_with_its_standard_deviation(torque_Nm: float) -> None:
 def test_a_trace_of_colour_in_long_records_leaves_a_free_run_as_it_is(monkeypatch) -> None:
     """Noise of which its past predicts .002: long records tell it from white, as one in some hundred are."""
     records, found = rubbing()
-    rng, longer = np.random.default_rng(4), []
-    for record in (
-        replace(r, input=np.tile(r.input, (4, 1)), output=np.zeros((4 * r.n_samples, 1))) for r in records
-    ):
-        noise = found.noise_std * rng.standard_normal(record.output.shape)
-        noise[1:] += 0.045 * noise[:-1]
-        longer.append(replace(record, output=found.motion(record)[0][:, None] + noise))
+    rng, longer, coloured = np.random.default_rng(4), [], []
+    for record in records:
+        driven = replace(record, input=np.tile(record.input, (4, 1)), output=np.tile(record.output, (4, 1)))
+        noise = found.noise_std * rng.standard_normal(driven.output.shape)
+        coloured.append(noise[1:, 0] + 0.045 * noise[:-1, 0])
+        noise[1:, 0] = coloured[-1]
+        longer.append(replace(driven, output=found.motion(driven)[0][:, None] + noise))
+    assert not whiteness_test(coloured).passed
     monkeypatch.setattr("ident.friction.fit.fit_friction_in_loop", lambda *_, **__: pytest.fail("observed"))
     assert dry.fit_friction(longer, OPTIONS).level == pytest.approx(found.level, rel=0.02)
 

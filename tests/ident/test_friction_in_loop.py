@@ -77,10 +77,8 @@ def test_ellipses_and_mode_of_a_belt_are_those_without_friction(belt) -> None:
     assert np.median(np.abs(ellipses.centre / true - 1)) < 0.005
     # Viscous friction a fourth of what it is: the level, which is not known either, brings it back.
     poles = about.model.poles
-    slow = replace(
-        about.model, poles=Poles(np.where(poles.real > 0.9, poles.real**0.25, poles.real), poles.pairs)
-    )
-    behind = without_friction(records, found, slow)
+    slow = Poles(poles.real ** np.where(poles.real > 0.9, 0.25, 1.0), poles.pairs)
+    behind = without_friction(records, found, replace(about.model, poles=slow))
     assert np.mean(behind.response.at(omega).contains(true)) > 0.9
     assert behind.poles.real.max() == pytest.approx(poles.real.max(), abs=0.2 * (1 - poles.real.max()))
 
@@ -250,19 +248,17 @@ def test_small_changes_of_the_force_are_inside_the_bent_ellipses(unstable: bool)
 def test_a_light_mode_survives_where_the_arm_hardly_answers() -> None:
     """Ellipses of an arm on a spring, and of a kernel of noise far above its gain where it hardly answers:
     bending them moves the light mode by less than its ellipse."""
-    dt_s, n_kernel = 0.002, 20
-    rates = np.array([-0.16 + 3.98j, -3.7 + 120j])
+    dt_s, n_kernel, rates = 0.002, 20, np.array([-0.16 + 3.98j, -3.7 + 120j])
     poles = Poles(np.array([np.exp(-10.7 * dt_s)]), np.exp(rates * dt_s))
     nothing = np.zeros((poles.doubled().order + n_kernel, 1))
     plain = ResponsePosterior(poles.doubled(), nothing[:, 0], nothing, dt_s, n_kernel)
-    omega = np.geomspace(1e-3, 1500.0, 900)
-    s, rows = 1j * omega, plain.frequency_rows(omega)
+    s = 1j * np.geomspace(1e-3, 1500.0, 900)
+    rows = plain.frequency_rows(s.imag)
     arm = 3000 / np.prod([(s - r) * (s - r.conj()) for r in rates], axis=0)
     wanted = np.column_stack([arm, *(0.03 * s**k * 16 ** (1 - k / 2) / 60 * arm**2 for k in (0, 1))])
     found = np.linalg.lstsq(real_rows(rows / arm[:, None]), real_rows(wanted / arm[:, None]), rcond=1e-9)[0]
-    kernel = np.eye(nothing.size)[:, -n_kernel:] * 1e-4
-    plain = replace(plain, mean=found[:, 0], covariance_factor=np.hstack([found[:, 1:], kernel]))
-    around = np.geomspace(3.5, 4.5, 40)
+    factor = np.hstack([found[:, 1:], 1e-4 * np.eye(nothing.size)[:, -n_kernel:]])
+    plain, around = replace(plain, mean=found[:, 0], covariance_factor=factor), np.geomspace(3.5, 4.5, 40)
     bent, straight = of_force(plain, poles, 30.0)[0].at(around), plain.at(around)
     assert np.max(np.abs(bent.centre - straight.centre) / straight.ellipse().semi_major) < 1
     assert bent.ellipse().semi_major == pytest.approx(straight.ellipse().semi_major, rel=0.3)

@@ -5,6 +5,7 @@ import pytest
 
 from ident import GobfModel, Poles, basis_response
 from ident.basis.posterior import ResponsePosterior
+from ident.data.arrays import real_rows
 from ident.uncertainty.nominal import nominal_near, nominals_near
 
 DT = 0.01
@@ -41,19 +42,13 @@ def test_low_order_model_goes_where_the_ellipses_are_small():
     # The true model in the doubled basis, plus an error of three standard deviations in the wide direction.
     big = basis_response(doubled, z)
     target = true.frequency_response(OMEGA)
-    coefficients, *_ = np.linalg.lstsq(
-        np.vstack([big.real, big.imag]), np.concatenate([target.real, target.imag]), rcond=None
-    )
+    coefficients = np.linalg.lstsq(real_rows(big), real_rows(target))[0]
     posterior = ResponsePosterior(
         doubled, coefficients + 3 * wide[:, 0], np.hstack([wide, 1e-3 * np.eye(6)]), DT
     )
     model = nominal_near(posterior, POLES, OMEGA)
     weighted = posterior.at(OMEGA).normalised_distance(model.frequency_response(OMEGA))
-    plain, *_ = np.linalg.lstsq(
-        np.vstack([(b := basis_response(POLES, z)).real, b.imag]),
-        np.concatenate([(c := posterior.centre(OMEGA)).real, c.imag]),
-        rcond=None,
-    )
+    plain = np.linalg.lstsq(real_rows(basis_response(POLES, z)), real_rows(posterior.centre(OMEGA)))[0]
     unweighted = posterior.at(OMEGA).normalised_distance(
         GobfModel(POLES, plain, DT).frequency_response(OMEGA)
     )
@@ -75,9 +70,16 @@ def test_the_nominal_follows_poles_that_the_posterior_moved_and_a_mode_it_adds(i
     posterior = ResponsePosterior(
         own, true.coefficients, 1e-3 * np.eye(own.order), DT, integrators=integrators
     )
-    inside, orders = [], []
-    for model in nominals_near(posterior, given, OMEGA):
-        inside.append(np.mean(posterior.at(OMEGA).contains(model.frequency_response(OMEGA))))
-        orders.append(model.poles.order - given.order)
-    assert orders == [0, given.order, 0, *range(2, given.order + 3, 2)]
+    models, ellipses = list(nominals_near(posterior, given, OMEGA)), posterior.at(OMEGA)
+    inside = [np.mean(ellipses.contains(model.frequency_response(OMEGA))) for model in models]
+    extra = [model.poles.order - given.order for model in models]
+    assert extra == [0, given.order, 0, *range(2, given.order + 3, 2)]
     assert max(inside[:3]) < 0.9 < inside[3] == 1
+
+
+def test_an_unstable_pole_stays_in_its_own_digits():
+    """The mirror image of an unstable pole, whose inverse of the inverse is another number."""
+    image = next(a for a in np.linspace(0.9, 0.95, 99) if 1 / (1 / a) != a)
+    given, off = Poles([image, 0.7], [0.9 * np.exp(0.5j)]), Poles([image])
+    posterior = ResponsePosterior(given.doubled(), np.ones(9), 1e-3 * np.eye(9), DT, unstable=off)
+    assert sum(image in model.poles.real for model in nominals_near(posterior, given, OMEGA)) > 3

@@ -192,8 +192,8 @@ def uncertain_channel(
     bands = pairwise(np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist())  # of equal ratio
     intervals = intervals_of(linear, linear_poles.without(model.unstable), level)
     pairs = model.stable_poles.pairs[np.argsort(model.stable_poles.omega_rad_s(model.dt_s), kind="stable")]
-    told = np.array([mode.told for mode in intervals.modes] if intervals else pairs != 0, dtype=bool)
-    nominal = nominal_of(posterior, poles, omega, pairs[~told])
+    untold = [i for i, mode in enumerate(intervals.modes if intervals else ()) if not mode.told]
+    nominal = nominal_of(posterior, poles, omega, pairs[untold])
     return UncertainChannel(
         name=result.name,
         method=method,
