@@ -18,8 +18,7 @@ export NO_MKDOCS_2_WARNING := 1
 unexport PYTHONDONTWRITEBYTECODE
 # A process a core, from two to four: each takes .8 GB.
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$((n < 2 ? 2 : n > 4 ? 4 : n)))
-# Times of all tests are kept: `python -m benchmarks.durations` tells where they go.
-PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -q --junitxml=build/tests.xml
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -q
 
 .PHONY: help install run test test-all test-long lint types wheel dist check docs clean
 
@@ -66,8 +65,7 @@ test-all: $(STAMP) $(PACKAGES)
 
 # Monte Carlo that decides nothing from day to day: hours apart, its results kept with commit and seeds.
 test-long: $(STAMP) $(PACKAGES)
-	$(PYTEST) -m long --junitxml=build/long.xml
-	$(BIN)/python -m benchmarks.durations --junit build/long.xml --name long_tests
+	$(PYTEST) -m long
 
 # In six minutes of two cores; exit code 1 where an answer moved. Measured machines: FLEXLINK_DATA, or ../shared/data.
 frozen: $(STAMP) $(PACKAGES)

@@ -18,23 +18,6 @@ from workflow.cli import main
 settings.register_profile("flexlink", deadline=None, derandomize=True)
 settings.load_profile("flexlink")
 
-_BEGAN = pytest.StashKey[float]()
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_setup(item: pytest.Item) -> Iterator[None]:
-    item.stash[_BEGAN] = sum(os.times()[:4])
-    return (yield)
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
-    """CPU seconds of test, fixtures and processes that have ended, for `python -m benchmarks.durations`."""
-    done = yield
-    item.user_properties.append(("cpu_s", f"{sum(os.times()[:4]) - item.stash[_BEGAN]:.2f}"))
-    return done
-
-
 _SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
