@@ -1,0 +1,367 @@
+"""What the command of a log does between two rows, and what that makes of the records and of the ellipses.
+
+A model of records takes the command as held from row to row. A drive that controls faster than it logs holds
+its command for its own period Tc and logs every T / Tc-th value; with w the frequency, such a command moves
+the arm as
+
+    H(Tc) / H(T) = 1 / S(w),    S(w) = (1 - e^{-jwT}) / (N (1 - e^{-jwTc})),   N = T / Tc,
+
+times the logged command held for T would (H(h) = (1 - e^{-jwh}) / (jwh): zero-order hold; S is the mean over
+the N commands of a step). The logged command is filtered with 1 / S, and everything after it may take it as
+held from row to row. A drive that logs the mean of the N commands adds a second factor 1 / S.
+
+Neglected: what the command has above the Nyquist frequency of the log, which the rows do not show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+
+from ident.basis.posterior import ResponsePosterior
+from ident.data.arrays import ComplexArray, RealArray, real_rows
+from ident.data.ellipses import LEVEL, chi2_radius
+from ident.data.finding import FindingKind, finding
+from ident.data.record import Record
+from ident.recorded_law import RecordedLaw, law_of
+
+# Rows before and after one that its equivalent command is made of. With four on each side the filter is
+# within .1 % of 1 / S up to 1 rad of w T, and within .5 % up to half the Nyquist frequency.
+ROWS_BESIDE = 4
+# Highest frequency times step up to which the filter is fitted, rad: above it most logs hold noise alone.
+FITTED_UP_TO_RAD = 2.0
+# Taps by which an ellipse follows a phase that grows with frequency.
+TAPS = 8
+# Ellipses of noise and timing add as variances, but an interval of the timing has ends that are as likely as
+# its middle: with 1.5 times its half width the sum of both is held while the noise is up to .6 of it.
+BEYOND_ENDS = 1.5
+# Ellipses are at least so wide along the gain, as a share of their width along the phase: twice the error
+# with which the basis follows a fraction of a step.
+GAIN_OF_PHASE = 0.1
+# Of the gaps between changes of a command that repeats, this share is a multiple of its period: single rows
+# may be lost.
+NEARLY_ALL = 0.99
+# A stated period agrees with whole rows within this share.
+SAME_PERIOD = 1e-3
+
+
+class TimingSource(Enum):
+    """How the period of the controller is known."""
+
+    STATED = "stated"
+    LAW = "law"
+    REPEATS = "repeats"
+    OPEN_LOOP = "open loop"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class Hold:
+    """One possibility of what the command did between two rows.
+
+    Attributes
+    ----------
+    share : float
+        Period of the controller over the step of the log; 0: it changed all the time.
+    averaged : bool
+        The log holds the mean of the commands since the row before, not the last one.
+    """
+
+    share: float
+    averaged: bool = False
+
+    def response(self, angle_rad: RealArray) -> ComplexArray:
+        """1 / S, or its square where averaged, at w T (F,), 0 < w T <= pi."""
+        step = -np.expm1(-1j * angle_rad)
+        if self.share > 0:
+            mean = self.share * step / -np.expm1(-1j * angle_rad * self.share)
+        else:
+            mean = step / (1j * angle_rad)
+        return np.asarray(mean ** (-2 if self.averaged else -1), dtype=np.complex128)
+
+
+# A command that is held from row to row.
+HELD = Hold(1.0)
+
+
+@dataclass(frozen=True)
+class CommandTiming:
+    """What the command does between two rows, as far as it is known.
+
+    Attributes
+    ----------
+    source : TimingSource
+    row_step_s : float
+        Step of the rows, s.
+    period_s : float or None
+        Period of the controller that made the log, s; None: not known.
+    taken : Hold
+        What the records are corrected for.
+    possible : tuple of Hold
+        What the ellipses have to hold; empty where the period is known.
+    middle : Hold
+        Of what is possible: what the ellipses are about.
+    rows_per_command : int
+        Rows that were logged for each command; above 1 only the rows at which it changes are used.
+    first_row : tuple of int
+        First of these rows, per record.
+    law : RecordedLaw or None
+        Read off the records; None where there is none, or where it does not repeat the command.
+    """
+
+    source: TimingSource
+    row_step_s: float
+    period_s: float | None
+    taken: Hold = HELD
+    possible: tuple[Hold, ...] = ()
+    middle: Hold = HELD
+    rows_per_command: int = 1
+    first_row: tuple[int, ...] = ()
+    law: RecordedLaw | None = None
+
+    @property
+    def known(self) -> bool:
+        return not self.possible
+
+    @property
+    def acts_at_once(self) -> bool:
+        """The rows tell that the command of a row was made of the output of the same row."""
+        return self.law is not None and self.law.tells_period and self.law.acts_at_once
+
+
+def timing_of(
+    records: Sequence[Record],
+    *,
+    in_loop: bool,
+    stated_period_s: float | None = None,
+    averaged: bool = False,
+) -> CommandTiming:
+    """What the command of SISO records does between two rows.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        As logged, of one sampling time.
+    in_loop : bool
+        The records were made in closed loop. In open loop a command is taken as held from row to row.
+    stated_period_s : float, optional
+        Period of the controller that made the records, s.
+    averaged : bool
+        The drive logs the mean of its commands over each step.
+
+    Returns
+    -------
+    CommandTiming
+
+    Raises
+    ------
+    ValueError
+        The log contradicts the stated period.
+    """
+    step_s = records[0].dt_s
+    rows_per_command = min(_rows_per_command(record) for record in records)
+    if stated_period_s is not None:
+        _refuse_contradiction(records[0], stated_period_s, rows_per_command)
+        law = law_of(records) if in_loop else None
+        if law is not None and not (law.repeats_command and stated_period_s >= step_s * (1 - SAME_PERIOD)):
+            law = None
+        if stated_period_s < step_s * (1 - SAME_PERIOD):
+            taken = Hold(stated_period_s / step_s, averaged)
+        else:
+            taken = HELD
+        rows = round(stated_period_s / step_s) if in_loop else 1
+        return _thinned(
+            CommandTiming(TimingSource.STATED, step_s, stated_period_s, taken, law=law), records, rows
+        )
+    if not in_loop:
+        return CommandTiming(TimingSource.OPEN_LOOP, step_s, None)
+    if rows_per_command > 1:
+        found = CommandTiming(TimingSource.REPEATS, step_s, rows_per_command * step_s)
+        return _thinned(found, records, rows_per_command)
+
+    law = law_of(records)
+    if law is None or not law.repeats_command:
+        # It may have changed all the time, and the log may hold its mean over a step, or the output may have
+        # been read later in the step than the command: delays of up to a step, which a hold does not have.
+        possible = (HELD, Hold(0.0), Hold(0.0, averaged=True))
+        return CommandTiming(TimingSource.UNKNOWN, step_s, None, possible=possible, middle=Hold(0.0))
+    if law.tells_period:
+        return CommandTiming(TimingSource.LAW, step_s, step_s, law=law)
+    possible = (HELD, Hold(0.0))
+    return CommandTiming(TimingSource.UNKNOWN, step_s, None, possible=possible, middle=Hold(0.5), law=law)
+
+
+def _rows_per_command(record: Record) -> int:
+    """Rows after which the command changes while the output goes on; 1 where it changes from row to row."""
+    changes = np.flatnonzero(np.any(np.diff(record.input, axis=0) != 0, axis=1))
+    gaps = np.diff(changes)
+    if gaps.size < 10:
+        return 1
+    usual = int(np.median(gaps))
+    if usual > 1 and np.mean(gaps % usual == 0) > NEARLY_ALL:
+        return usual
+    return 1
+
+
+def _thinned(timing: CommandTiming, records: Sequence[Record], rows: int) -> CommandTiming:
+    """The timing with the rows that are used where a command stands for several; law: of these rows."""
+    if rows <= 1:
+        return timing
+    first = []
+    for record in records:
+        changes = 1 + np.flatnonzero(np.any(np.diff(record.input, axis=0) != 0, axis=1))
+        first.append(int(np.bincount(changes % rows, minlength=rows).argmax()))
+    timing = replace(timing, rows_per_command=rows, first_row=tuple(first))
+    law = law_of([_every(record, start, rows) for record, start in zip(records, first, strict=True)])
+    if law is not None and not law.repeats_command:
+        law = None
+    return replace(timing, law=law)
+
+
+def _every(record: Record, start: int, rows: int) -> Record:
+    thinned = record.each(lambda signal: signal[start::rows])
+    return replace(thinned, dt_s=record.dt_s * rows)
+
+
+def _refuse_contradiction(record: Record, period_s: float, rows_per_command: int) -> None:
+    """Raise ValueError where the log shows that the stated period is not that of its controller."""
+    step_s = record.dt_s
+    option = "controller_period_s, --controller-period-s"
+    share = step_s / period_s
+    if share > 2 and abs(share - round(share)) > SAME_PERIOD * share:
+        raise ValueError(
+            f"{record.label}: a controller every {period_s:.6g} s does not meet the rows every "
+            f"{step_s:.6g} s: expected a whole part of the log's step, such as "
+            f"{step_s / round(share):.6g} ({option})"
+        )
+    longest = rows_per_command * step_s
+    if period_s > longest * (1 + SAME_PERIOD):
+        raise ValueError(
+            f"{record.label}: the command changes every {longest:.6g} s, more often than a controller every "
+            f"{period_s:.6g} s could: expected at most {longest:.6g} ({option})"
+        )
+
+
+def with_equivalent_command(records: Sequence[Record], timing: CommandTiming) -> list[Record]:
+    """The records with a command that, held from row to row, moves the arm as the one that was logged did.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        As logged, of the sampling time of the timing; those that `timing_of` saw first.
+    timing : CommandTiming
+
+    Returns
+    -------
+    list of Record
+        With the rows at which the command changes, where it stands for several; filtered with 1 / S
+        (module's docstring) where the controller was faster than the log. A note says what is not known.
+    """
+    changed = []
+    for place, record in enumerate(records):
+        if timing.rows_per_command > 1:
+            start = timing.first_row[place] if place < len(timing.first_row) else 0
+            record = _every(record, start, timing.rows_per_command)
+        if timing.taken != HELD:
+            record = replace(record, input=filtered(record.input, timing.taken))
+        changed.append(record)
+    if not timing.known:
+        note = finding(
+            FindingKind.CONTROLLER_PERIOD,
+            step_s=timing.row_step_s,
+            repeats=timing.law is not None,
+            reference=records[0].reference is not None,
+        )
+        changed[0] = replace(changed[0], notes=(*changed[0].notes, note))
+    return changed
+
+
+def filtered(command: RealArray, hold: Hold) -> RealArray:
+    """Commands (T, U) filtered with 1 / S forwards and backwards in time; the ends are repeated."""
+    angle = np.linspace(0.0, FITTED_UP_TO_RAD, 400)[1:]
+    lags = np.arange(-ROWS_BESIDE, ROWS_BESIDE + 1)
+    # Where the motion is large, at low frequency, the filter has to be exact; a constant stays one.
+    weight = 1 / angle[:, None]
+    rows = np.exp(1j * np.outer(angle, lags)) - 1
+    wanted = hold.response(angle) - 1
+    taps = np.linalg.lstsq(real_rows(rows * weight), real_rows(wanted[:, None] * weight), rcond=None)[0][:, 0]
+    taps[ROWS_BESIDE] = 1 - (taps.sum() - taps[ROWS_BESIDE])
+    padded = np.pad(command, ((ROWS_BESIDE, ROWS_BESIDE), (0, 0)), mode="edge")
+    columns = [np.convolve(column, taps[::-1], mode="valid") for column in padded.T]
+    return np.column_stack(columns)
+
+
+def with_unknown_timing(posterior: ResponsePosterior, timing: CommandTiming) -> ResponsePosterior:
+    """The posterior with ellipses that hold the response whatever the command did between two rows.
+
+    Parameters
+    ----------
+    posterior : ResponsePosterior
+        Of records whose command was taken as held from row to row.
+    timing : CommandTiming
+
+    Returns
+    -------
+    ResponsePosterior
+        About the response of `timing.middle`, with two more directions of its covariance, along the phase and
+        along the gain. Each is as wide as the largest difference between the middle and what is possible,
+        times `BEYOND_ENDS`. The posterior itself where the timing is known.
+
+    Notes
+    -----
+    What is possible has the response S times the one that was identified, to first order in what its rows do
+    not show. S and the differences are fitted by the basis functions and a few taps, relative to the
+    response, up to the Nyquist frequency of the rows. The filter stands behind the identification, not
+    before it: dry friction is told from a command that leads the motion, and a filtered one may come too
+    early.
+    """
+    if timing.known:
+        return posterior
+    angle = np.geomspace(1e-4, 0.98 * np.pi, 600)
+    omega = angle / posterior.dt_s
+    middle = 1 / timing.middle.response(angle)
+    ratios = [1 / hold.response(angle) / middle for hold in timing.possible]
+    phase = np.max([np.abs(ratio.imag) for ratio in ratios], axis=0)
+    gain = np.max([np.abs(ratio.real - 1) for ratio in ratios], axis=0)
+    # The basis follows S to a twentieth of the phase, in both directions.
+    gain = np.maximum(gain, GAIN_OF_PHASE * phase)
+
+    # Taps stand behind the basis and before what unstable poles add, which stays as it is.
+    n_stable = posterior.mean.size - posterior.unstable.order
+    more = max(TAPS - posterior.fir_length, 0)
+    wider = replace(
+        posterior,
+        mean=np.insert(posterior.mean, [n_stable] * more, 0.0),
+        covariance_factor=np.insert(posterior.covariance_factor, [n_stable] * more, 0.0, axis=0),
+        fir_length=posterior.fir_length + more,
+    )
+    rows = wider.frequency_rows(omega)[:, : n_stable + more]
+    centre = posterior.centre(omega)
+
+    def fitted(wanted: ComplexArray, scale: RealArray) -> RealArray:
+        """Coefficients (P, N) of responses (F, N), errors as a share of a scale (F,), less above the data."""
+        weight = 1 / (scale * (1 + (angle / FITTED_UP_TO_RAD) ** 4))[:, None]
+        length = np.maximum(np.linalg.norm(rows * weight, axis=0), np.finfo(np.float64).tiny)
+        left = real_rows(rows * weight / length)
+        return np.asarray(np.linalg.lstsq(left, real_rows(wanted * weight), rcond=1e-12)[0] / length[:, None])
+
+    late = middle[:, None] * rows
+    mean = fitted(late @ wider.mean[: n_stable + more, None], np.abs(phase * centre))
+    factor = fitted(late @ wider.covariance_factor[: n_stable + more], np.abs(centre))
+    ends = BEYOND_ENDS / chi2_radius(LEVEL) * middle * centre
+    along_phase = fitted((1j * phase * ends)[:, None], np.abs(phase * centre))
+    along_gain = fitted((gain * ends)[:, None], np.abs(gain * centre))
+    nothing = np.zeros((posterior.unstable.order, 2))
+    return replace(
+        wider,
+        mean=np.append(mean[:, 0], posterior.mean[n_stable:]),
+        covariance_factor=np.hstack(
+            [
+                np.vstack([factor, posterior.covariance_factor[n_stable:]]),
+                np.vstack([np.hstack([along_phase, along_gain]), nothing]),
+            ]
+        ),
+    )

@@ -1,0 +1,175 @@
+"""What a command does between two rows: the response that is identified is the one of a held command."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.linalg
+from scipy import signal
+
+from ident import IdentOptions, Poles, Record, identify
+from ident.basis.posterior import ResponsePosterior
+from ident.command_timing import (
+    HELD,
+    CommandTiming,
+    Hold,
+    TimingSource,
+    filtered,
+    timing_of,
+    with_equivalent_command,
+    with_unknown_timing,
+)
+from ident.data.arrays import real_rows
+from tests.ident.test_recorded_law import loop_log, pid
+
+STEP_S = 0.002
+# 5 rad/s and a mode at 120 rad/s, damping .05: continuous A, B, C from command to position.
+A = scipy.linalg.block_diag([[-5.0]], [[0.0, 1.0], [-(120.0**2), -12.0]])
+B = np.array([[5.0], [0.0], [120.0**2]])
+C = np.array([[1.0, 0.5, 0.0]])
+OMEGA = np.geomspace(1.0, 700.0, 80)
+
+
+def sampled(period_s):
+    """Discrete A, B of a command held for a period."""
+    held = scipy.linalg.expm(np.block([[A, B], [np.zeros((1, 4))]]) * period_s)
+    return held[:3, :3], held[:3, 3:]
+
+
+def response(period_s, omega=OMEGA):
+    a, b = sampled(period_s)
+    z = np.exp(1j * omega * period_s)
+    return np.array([(C @ np.linalg.solve(x * np.eye(3) - a, b)).item() for x in z])
+
+
+def fast_log(rows, averaged=False, n=6000, seed=5):
+    """A band-limited command that changes `rows` times between two rows, and the motion at the rows."""
+    rng = np.random.default_rng(seed)
+    sos = signal.butter(4, 0.4 / rows, output="sos")
+    u = signal.sosfiltfilt(sos, rng.standard_normal(n * rows))
+    a, b = sampled(STEP_S / rows)
+    x, y = np.zeros(3), np.zeros(u.size)
+    for k, command in enumerate(u):
+        y[k] = (C @ x).item()
+        x = a @ x + b[:, 0] * command
+    if averaged:
+        u = np.convolve(u, np.full(rows, 1 / rows))[: u.size]
+    every = slice(0, None, rows)
+    return Record("log", u[every, None], y[every, None], STEP_S, ("u",), ("y",))
+
+
+@pytest.mark.parametrize(("rows", "averaged"), [(2, False), (5, False), (4, True)])
+def test_the_arm_identified_from_a_slower_log_is_the_arm_under_a_held_command(rows, averaged):
+    record = fast_log(rows, averaged)
+    timing = timing_of([record], in_loop=False, stated_period_s=STEP_S / rows, averaged=averaged)
+    options = IdentOptions(n_real=1, n_pairs=1, input_delay_samples=0)
+    found = identify(with_equivalent_command([record], timing), options).model
+    as_logged = identify([record], options).model
+    exact = response(STEP_S)
+    error = np.abs(found.frequency_response(OMEGA) / exact - 1)
+    before = np.abs(as_logged.frequency_response(OMEGA) / exact - 1)
+    within = OMEGA < 400
+    assert np.max(error[within]) < 0.01
+    assert np.max(before[within]) > 0.1
+
+
+@pytest.mark.parametrize("hold", [Hold(0.5), Hold(0.2), Hold(0.0), Hold(0.25, averaged=True)])
+def test_the_filter_is_one_over_the_mean_of_the_commands_of_a_step(hold):
+    """Up to half the Nyquist frequency to half a per cent; a constant stays exactly one."""
+    pulse = np.zeros((2048, 1))
+    pulse[1024] = 1.0
+    angle = 2 * np.pi * np.arange(1, 512) / 2048
+    spectrum = np.fft.fft(np.roll(filtered(pulse, hold)[:, 0], -1024))[1:512]
+    np.testing.assert_allclose(spectrum, hold.response(angle), rtol=5e-3)
+    np.testing.assert_allclose(filtered(np.full((50, 1), 3.0), hold), 3.0, rtol=1e-12)
+
+
+def test_the_mean_is_that_of_so_many_commands():
+    """S of four commands a step by its definition."""
+    angle = np.linspace(0.1, 3.0, 20)
+    mean = np.mean([np.exp(-1j * angle * k / 4) for k in range(4)], axis=0)
+    np.testing.assert_allclose(Hold(0.25).response(angle), 1 / mean)
+    np.testing.assert_allclose(Hold(1e-6).response(angle), Hold(0.0).response(angle), rtol=1e-5)
+    np.testing.assert_allclose(Hold(1.0).response(angle), 1.0)
+
+
+def test_the_period_is_read_off_or_not_known():
+    every = timing_of([loop_log(*pid())], in_loop=True)
+    assert every.source is TimingSource.LAW
+    assert every.period_s == pytest.approx(0.001)
+    assert every.known
+    faster = timing_of([loop_log(*pid(), rows=2)], in_loop=True)
+    assert faster.source is TimingSource.UNKNOWN
+    assert faster.law is None
+    assert faster.possible
+    open_loop = timing_of([fast_log(2)], in_loop=False)
+    assert open_loop.source is TimingSource.OPEN_LOOP
+    assert open_loop.taken == HELD
+
+
+def test_a_command_logged_several_times_is_used_at_the_rows_where_it_changes():
+    """A log at three times the rate of its controller: the law and the period are those of the controller."""
+    slow = loop_log(*pid())
+    rows = 3
+    command = np.repeat(slow.input, rows, axis=0)
+    # The position goes on in between; at the rows of the controller it is what the controller read.
+    fine = np.arange(rows * slow.n_samples) / rows
+    output = np.interp(fine, np.arange(slow.n_samples), slow.output[:, 0])[:, None]
+    reference = np.repeat(slow.reference, rows, axis=0)
+    log = Record(
+        "fast", command, output, 0.001 / rows, ("u",), ("y",), reference=reference, reference_names=("r",)
+    )
+    log = log.slice(1, log.n_samples)
+    timing = timing_of([log], in_loop=True)
+    assert timing.source is TimingSource.REPEATS
+    assert timing.period_s == pytest.approx(0.001)
+    assert timing.law is not None
+    (used,) = with_equivalent_command([log], timing)
+    assert used.dt_s == pytest.approx(0.001)
+    np.testing.assert_array_equal(used.output, slow.output[1 : 1 + used.n_samples])
+    np.testing.assert_array_equal(used.input, slow.input[1 : 1 + used.n_samples])
+
+
+@pytest.mark.parametrize(
+    ("period_s", "said"),
+    [
+        (0.0003, "a whole part of the log's step, such as 0.000333333"),
+        (0.004, "more often than a controller"),
+    ],
+)
+def test_a_period_that_the_log_contradicts_is_refused_in_one_line(period_s, said):
+    with pytest.raises(ValueError, match=said) as refused:
+        timing_of([loop_log(*pid())], in_loop=True, stated_period_s=period_s)
+    assert "--controller-period" in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("integrators", [0, 1])
+def test_ellipses_of_an_unknown_period_hold_the_response_of_each(integrators):
+    """Narrow ellipses hold every possibility then, up to half the Nyquist frequency; those of a known period
+    stay as they are."""
+    poles = Poles([np.exp(-5 * STEP_S)], [np.exp((-6 + 120j) * STEP_S)])
+    doubled = poles.doubled()
+    unknown = ResponsePosterior(
+        doubled, np.ones(doubled.order), np.eye(doubled.order), STEP_S, integrators=integrators
+    )
+    grid = np.geomspace(0.5, 1000.0, 300)
+    arm = response(STEP_S, grid) / (1j * grid) ** integrators
+    rows = real_rows(unknown.frequency_rows(grid) / arm[:, None])
+    mean = np.linalg.lstsq(rows, real_rows(np.ones((grid.size, 1), complex)), rcond=None)[0][:, 0]
+    narrow = replace(unknown, mean=mean, covariance_factor=1e-4 * np.diag(np.abs(mean)))
+    possible = (HELD, Hold(0.0), Hold(0.0, averaged=True))
+    timing = CommandTiming(TimingSource.UNKNOWN, STEP_S, None, possible=possible, middle=Hold(0.0))
+    wide = with_unknown_timing(narrow, timing)
+    omega = np.geomspace(1.0, 0.5 * np.pi / STEP_S, 100)
+    middle = narrow.centre(omega) / timing.middle.response(omega * STEP_S)
+    # Off by less than what the ellipses are wide along the gain.
+    assert np.all(np.abs(wide.centre(omega) / middle - 1) < 0.1 * omega * STEP_S / 2 + 1e-3)
+    ellipses = wide.at(omega)
+    for hold in possible:
+        assert np.all(ellipses.contains(narrow.centre(omega) / hold.response(omega * STEP_S)))
+    # Nor wider than what a delay of two steps would ask for.
+    late = np.exp(-2j * omega * STEP_S) * narrow.centre(omega)
+    assert not np.any(ellipses.contains(late)[(omega > 50) & (omega < 400)])
+    known = replace(timing, possible=())
+    assert with_unknown_timing(narrow, known) is narrow
