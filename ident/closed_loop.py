@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from ident.basis.functions import all_pass_signal
 from ident.basis.mimo_model import MimoModel
@@ -37,9 +36,6 @@ from ident.unstable import quick_poles
 EXPLAINED_PERCENT = 50.0
 # The same for balls: with 89 % they held a response at .90 of the frequencies, not .95, with 70 % at .40.
 _ENOUGH_FOR_BALLS = 90.0
-# The controller of a log: states that are sought; what it leaves of the command's rms, beyond which it is
-# none; of the least that any order leaves, as more states average the log's rounding.
-_CONTROLLER_STATES, _LEFT, _OF_LEAST = 4, 0.01, 3.0
 _FIRST_STAGE = EmbeddingOptions(coloured_noise=True, prior_missed_mode=0.0, fir_length=1)
 
 
@@ -168,43 +164,6 @@ def _unexplained(record: Record) -> RealArray:
         input_units=(), output_units=(),
     )  # fmt: skip
     return np.asarray(identify_mimo([loop], IdentOptions(feedthrough=True), free_shapes=True).residuals[0])
-
-
-def controller_of(records: Sequence[Record]) -> tuple[RealArray, RealArray] | None:
-    """Numerator and denominator, in z, highest power first, of the K that made SISO records: u = K (r - y).
-
-    Least squares of the command on its own past and the error, which a linear controller makes it of exactly,
-    but for the rounding of the log; rows at the command's limit tell nothing. The lowest order, integrating
-    where it may. None without a reference, or where none of a few states explains the command.
-    """
-    if not records or any(record.reference is None for record in records):
-        return None
-    limit = 0.999 * max(float(np.max(np.abs(record.input))) for record in records)
-    found: list[tuple[float, RealArray, RealArray]] = []
-    for order in range(1, _CONTROLLER_STATES + 1):
-        tried = []
-        for own in (order, order - 1):
-            rows = []
-            for record in records:
-                u, error = record.input[:, 0], (np.asarray(record.reference) - record.output)[:, 0]
-                command = np.diff(u, n=order - own, prepend=np.zeros(order - own))
-                past = [sliding_window_view(signal, order + 1) for signal in (command, error)]
-                row = np.hstack([past[0][:, order - own :], past[1]])
-                rows.append(row[sliding_window_view(np.abs(u) < limit, order + 1).all(axis=1)])
-            matrix = np.concatenate(rows)
-            if len(matrix) < _CONTROLLER_STATES * matrix.shape[1]:
-                return None
-            target, matrix = matrix[:, own], np.delete(matrix, own, axis=1)
-            scale = np.maximum(np.linalg.norm(matrix, axis=0), np.finfo(np.float64).tiny)
-            solved = np.linalg.lstsq(matrix / scale, target, rcond=None)[0] / scale
-            left = float(np.std(target - matrix @ solved)) * (1 + own * np.log(target.size) / target.size)
-            poles = np.convolve(np.append(1.0, -solved[:own][::-1]), [1.0, -1.0][: 1 + order - own])
-            tried.append((left, solved[own:][::-1], poles))
-        found.append(min(tried, key=lambda one: one[0]))
-    least = min(left for left, _, _ in found)
-    if not least < _LEFT * float(np.std(np.concatenate([record.input for record in records]))):
-        return None
-    return next((k, poles) for left, k, poles in found if left <= _OF_LEAST * least)
 
 
 def with_controller(record: Record, numerator: Sequence[float], denominator: Sequence[float]) -> Record:

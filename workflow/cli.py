@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 _READING = (
     *("input_name", "output_name", "reference", "time", "time_unit", "dt_s"),
-    *("scale", "units", "unwrap", "decimal", "input_limit"),
+    *("scale", "units", "unwrap", "decimal", "input_limit", "controller_period_s", "command_averaged"),
 )
 _SIMULATOR = ("mjcf", "fmu", "python", "motion", "log", "dt_s", "repair", "resample_s")
 _MANIFESTS = ("manifest.json", "study.json", "diagnose.json", "blind.json")  # of what can be continued
@@ -449,6 +449,8 @@ _OF_LOGS = (
     "offset",
     "units",
     "repair",
+    "controller_period_s",
+    "command_averaged",
     "closed_loop_data.method",
 )
 
@@ -735,8 +737,8 @@ def _c_code(prefix: str | None, single: bool | None) -> dict[str, Any]:
 
 
 def _stated(given: Mapping[str, Any]) -> dict[str, Any]:
-    """What is there of some options."""
-    return {name: value for name, value in given.items() if value is not None}
+    """What is there of some options; a switch that is off was not given."""
+    return {name: value for name, value in given.items() if value is not None and value is not False}
 
 
 def _reading(given: Mapping[str, Any]) -> Reading:

@@ -159,6 +159,7 @@ def certify(
     """
     if not plants:
         raise ValueError("certify needs at least one plant")
+    specification.refuse_other_rate(plants)
     if controller.computational_delay_samples != specification.computational_delay_samples:
         raise ValueError(
             f"the controller has {controller.computational_delay_samples} samples of computational delay, "

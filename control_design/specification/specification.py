@@ -119,6 +119,11 @@ class Specification(Settings):
         "resonance at a notch of the plant, which would ring in closed loop (default: none; for plants known "
         "on their own frequencies only, half the relative spacing of these)",
     )
+    controller_dt_s: _Positive | None = Field(
+        default=None,
+        description="period of the new controller, s: a whole multiple or part of the step of the logs; "
+        "default: that step (certificate, simulation and C code are about this rate)",
+    )
     computational_delay_samples: int = Field(
         default=1,
         ge=0,
@@ -223,6 +228,17 @@ class Specification(Settings):
         ]
         return np.max(sizes, axis=0) if sizes else np.zeros(np.shape(omega_rad_s))
 
+    def refuse_other_rate(self, plants: Sequence[UncertainPlant]) -> None:
+        """Raise SpecificationError, one line, where a plant has another step than the controller."""
+        wanted_s = self.controller_dt_s
+        for plant in plants:
+            if wanted_s is not None and abs(plant.dt_s - wanted_s) > 1e-6 * wanted_s:
+                raise SpecificationError(
+                    f"controller_dt_s = {wanted_s:.6g} s, but plant {plant.name!r} is sampled every "
+                    f"{plant.dt_s:.6g} s: leave controller_dt_s out, or give it to flexlink run, which "
+                    "brings the arm to this rate"
+                )
+
     def check_against(self, plants: Sequence[UncertainPlant]) -> None:
         """Refuse a specification that no controller can meet, before optimising.
 
@@ -239,6 +255,7 @@ class Specification(Settings):
                 f"the plants differ in sampling time: {[p.dt_s for p in plants]} s; sample all "
                 "with one period"
             )
+        self.refuse_other_rate(plants)
         for plant in plants:
             _refuse_frequencies(self, plant)
             _refuse_zeros(self, plant)

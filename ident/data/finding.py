@@ -44,6 +44,7 @@ class FindingKind(Enum):
     HELD = auto()
     WRAPS = auto()
     LATE_COMMAND = auto()
+    CONTROLLER_PERIOD = auto()
     SPIKES = auto()
     LONG_STEPS = auto()
     UNIT_CONTRADICTED = auto()

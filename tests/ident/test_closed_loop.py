@@ -9,7 +9,7 @@ from scipy import signal
 from ident import IdentOptions, Record, identify
 from ident.basis.options import EmbeddingOptions
 from ident.checks.residual_tests import fed_back
-from ident.closed_loop import controller_of, two_stage, with_controller
+from ident.closed_loop import two_stage, with_controller
 from ident.uncertainty.embedding import tangent
 from ident.unstable import find_unstable
 from tests.ident.test_unstable import looped, sampled
@@ -100,35 +100,6 @@ def test_a_known_controller_tells_the_reference():
     np.testing.assert_allclose(np.diff(u)[1:] + np.convolve(y, num)[1:499], late.reference[:, 0])
     with pytest.raises(ValueError, match="at least the numerator's degree"):
         with_controller(record, [1.0, 2.0], [1.0])
-
-
-@pytest.mark.parametrize("law", ["pid", "lead", "clipped", "relay"])
-def test_logs_tell_the_linear_controller_that_made_them(law):
-    """Of a command of four decimals, in a loop with noise: its response, to what rounding leaves."""
-    rng, n, pole = np.random.default_rng(11), 4000, 0.82
-    num, den = (
-        np.convolve([1.0, -0.995], [60.0, -59.5]),
-        np.convolve([1.0, -1.0 if law == "pid" else -0.97], [1.0, -pole]),
-    )
-    r, y, u, free = np.cumsum(rng.standard_normal(n)) * 0.02, np.zeros(n), np.zeros(n), np.zeros(n)
-    for k in range(2, n):
-        y[k] = 1.95 * y[k - 1] - 0.9505 * y[k - 2] + 2e-4 * u[k - 1] + 1e-3 * rng.standard_normal()
-        e = (r - y)[k - 2 : k + 1][::-1]
-        free[k] = num @ e - den[1] * u[k - 1] - den[2] * u[k - 2]
-        limit = 6.0 if law == "clipped" else 50.0
-        u[k] = np.round(np.clip(free[k], -limit, limit), 4) if law != "relay" else np.sign(e[0])
-    record = Record(
-        "log", u[:, None], y[:, None], DT, ("u",), ("y",), reference=r[:, None], reference_names=("r",)
-    )
-    assert controller_of([replace(record, reference=None, reference_names=())]) is None
-    found = controller_of([record])
-    if law == "relay":
-        assert found is None
-        return
-    z = np.exp(1j * np.geomspace(1e-3, 3.0, 50))
-    exact = np.polyval(num, z) / np.polyval(den, z)
-    np.testing.assert_allclose(np.polyval(found[0], z) / np.polyval(found[1], z), exact, rtol=5e-3)
-    assert np.any(np.isclose(np.roots(found[1]), 1.0, atol=1e-9)) == (law == "pid")
 
 
 def test_what_is_fed_back_is_seen_in_radii_of_the_ellipses():

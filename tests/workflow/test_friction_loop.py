@@ -11,6 +11,7 @@ from control_design import Controller, simulate, step_metrics
 from control_design.analysis.closed_loop import measure_sensitivity
 from control_design.controllers.controller import FrictionFeedforward
 from ident import GobfModel, IdentOptions, Poles, Record, Structure
+from ident.command_timing import timing_of
 from ident.friction import FrictionFit, FrictionLaw, fit_friction
 from ident.friction.arm import SteppedArm
 from ident.friction.spring import Spring
@@ -163,8 +164,10 @@ def stage_of(found, records=(), step=0.02):
     config = built_in_config()[0]
     asked = config.specification.model_copy(update={"lowest_bandwidth_rad_s": 1.0})
     loop = config.closed_loop.model_copy(update={"reference_step": step, "measurement_step": 0.0})
+    timing = timing_of(records, in_loop=True) if records else None
     results = SimpleNamespace(
-        identify=SimpleNamespace(friction=found), records=SimpleNamespace(fitted=lambda channel: records)
+        identify=SimpleNamespace(friction=found),
+        records=SimpleNamespace(fitted=lambda channel: records, timing=timing),
     )
     config = config.model_copy(update={"specification": asked, "closed_loop": loop})
     return SimpleNamespace(config=config, results=results, plant=None)

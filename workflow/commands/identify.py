@@ -7,13 +7,15 @@ from pathlib import Path
 
 from ident.basis.model_files import ModelFile
 from ident.basis.options import IdentOptions
+from ident.command_timing import timing_of, with_equivalent_command
 from workflow.commands.logs import Logs
 from workflow.config.run_config import ClosedLoopData
 from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.engine import codec, interrupts, storage
-from workflow.engine.errors import InputError
+from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
 from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
+from workflow.tasks.identification import made_in_loop
 from workflow.tasks.log_identification import identify_records
 from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
 from workflow.tasks.results import IdentifiedPlant
@@ -51,6 +53,15 @@ def identify_logs(
     for record in logs.measured:
         refuse_constant_input(record)
     common = with_common_sampling_time([*logs.measured, *logs.fresh])
+    in_loop = loop is not None and loop.stated
+    with speaking("identify"), naming("identify"):
+        timing = timing_of(
+            common,
+            in_loop=in_loop or made_in_loop(common[: len(logs.measured)]),
+            stated_period_s=logs.controller_period_s,
+            averaged=logs.command_averaged,
+        )
+        common = with_equivalent_command(common, timing)
     with speaking("identify"):
         result = identify_records(
             common[: len(logs.measured)],
@@ -60,6 +71,7 @@ def identify_logs(
             band_rad_s=band_rad_s,
             loop=loop,
             with_plot=report is not None,
+            timing=timing,
             progress=progress,
         )
     result = replace(result, true_modes=beside(result.about, true_modes), input_limit=logs.input_limit)

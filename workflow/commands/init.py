@@ -142,7 +142,11 @@ def drafted(
     output, unit_of = read.roles.output, read.unit_of
     with naming(command):
         draft = draft_of(
-            read.records, position=is_position(output, unit_of[output]), limit=stated.input_limit
+            read.records,
+            position=is_position(output, unit_of[output]),
+            limit=stated.input_limit,
+            controller_period_s=stated.controller_period_s,
+            command_averaged=stated.command_averaged,
         )
     scale, units = dict(stated.scale), dict(stated.units)
     if draft.look.turned:

@@ -84,6 +84,8 @@ class Logs:
     fresh: tuple[Record, ...]
     files: tuple[Path, ...]
     input_limit: float | None
+    controller_period_s: float | None = None
+    command_averaged: bool = False
 
 
 def to_type(logs: Sequence[Path]) -> str:
@@ -114,4 +116,11 @@ def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: S
     runs = [table.runs(how.time) for table in tables]
     records = tuple(how.records([run for parts in runs for run in parts]))
     n_measured = sum(map(len, runs[: len(logs)]))
-    return Logs(records[:n_measured], records[n_measured:], (*logs, *validation), how.input_limit)
+    return Logs(
+        records[:n_measured],
+        records[n_measured:],
+        (*logs, *validation),
+        how.input_limit,
+        how.controller_period_s,
+        how.command_averaged,
+    )

@@ -39,6 +39,16 @@ class LogReading(Section):
         gt=0,
         description="limit of the amplifier: larger commands in the logs are clipped to it",
     )
+    controller_period_s: float | None = Field(
+        None,
+        gt=0,
+        description="period of the controller that made the logs [s], where its command was held for another "
+        "time than from row to row: 0.001 of a drive at 1 kHz that logs every second sample; default: as the "
+        "logs tell",
+    )
+    command_averaged: bool = Field(
+        False, description="the drive logs the mean of its commands since the row before, not the last one"
+    )
     scale: Mapping[str, Scale] = Field(
         default_factory=dict, description="factor per column: quantity = scale * column + offset"
     )

@@ -58,7 +58,7 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
             return ClosedLoopResult(skipped="the nominal closed loop is unstable")
         reference_filter = results.reference_filter.filter
         trial = make_trial(stage, controller.dt_s, radius, reference_filter)
-        channels, performance = results.uncertainty.channels, config.performance_index
+        channels, performance = results.uncertainty.seen_by_controller(config), config.performance_index
         posterior = channels[config.control_index].posterior
         tip = None if performance is None else channels[performance].posterior
         mean = (posterior, posterior.mean[None]), None if tip is None else (tip, tip.mean[None])

@@ -12,7 +12,7 @@ from scipy.signal import butter, sosfiltfilt
 from diagnosis.machine.quantisation_grid import grid_step
 from ident.checks.input_checks import refuse_few_lines
 from ident.checks.plausible_modes import LIGHT
-from ident.closed_loop import controller_of
+from ident.command_timing import CommandTiming, timing_of
 from ident.data.arrays import clipped_share
 from ident.data.record import Record
 from ident.friction import recorded_in_loop
@@ -48,7 +48,8 @@ class Draft:
     else the largest command. in_loop: a reference was recorded, or the command follows the position. step: of
     the output's quantisation, 0 without one. specification: keys of [specification]. reference_step: half the
     rms motion, or, beside an unstable pole, what the effort limit answers with the largest command.
-    recorded_rad_s: bandwidth of the loop that made the logs, 0 where they do not tell it."""
+    timing: of the command between two rows. recorded_rad_s: bandwidth of the loop that made the logs, 0 where
+    they do not tell it."""
 
     look: FirstLook
     position: bool
@@ -61,6 +62,7 @@ class Draft:
     specification: Mapping[str, Any]
     reference_step: float
     unstable_per_s: float
+    timing: CommandTiming
     recorded_rad_s: float = 0.0
 
     @property
@@ -70,14 +72,25 @@ class Draft:
         return self.position and motion is not None and motion.friction.shown and motion.friction.value > 0
 
 
-def draft_of(records: Sequence[Record], *, position: bool, limit: float | None = None) -> Draft:
+def draft_of(
+    records: Sequence[Record],
+    *,
+    position: bool,
+    limit: float | None = None,
+    controller_period_s: float | None = None,
+    command_averaged: bool = False,
+) -> Draft:
     """Of SISO records of one sampling time, of which the last validates; of one the last part, where that is
-    honest. limit: of the amplifier, if it is known. Raises ValueError, one line, where the logs of a loop
-    excite few frequencies."""
+    honest. limit: of the amplifier; controller_period_s, command_averaged: of the controller that made the
+    logs (`timing_of`), as far as they are known. Raises ValueError, one line, where the logs of a loop excite
+    few frequencies, or contradict the period."""
     fitted = list(records[:-1]) or list(records)
     in_loop = all(record.reference is not None for record in fitted) or recorded_in_loop(fitted)
     if in_loop:
         refuse_few_lines(fitted)
+    timing = timing_of(
+        records, in_loop=in_loop, stated_period_s=controller_period_s, averaged=command_averaged
+    )
     look = first_look(fitted, position=position)
     highest = max(float(np.max(np.abs(record.input))) for record in records)
     at_limit, unseen = _limit(records), None
@@ -102,9 +115,10 @@ def draft_of(records: Sequence[Record], *, position: bool, limit: float | None =
         at_limit is not None,
         unseen is not None,
         grid_step([record.output[:, 0] for record in records], np.finfo(np.float64).tiny),
-        _specification(look, effort, reached, unstable),
+        _specification(look, timing, effort, reached, unstable),
         _rounded(reached / effort if unstable or not spread > 0 else 0.5 * spread),
         unstable,
+        timing,
     )
 
 
@@ -112,9 +126,14 @@ def informed(draft: Draft, found: IdentifiedChannel, spread: UncertainChannel) -
     """The same with the specification that follows from the model that came out of the logs: its first mode
     that swings and whose damping is told, its first notch, the band that its ellipses tell."""
     look, model, omega = draft.look, found.model, spread.frequency.omega_rad_s
-    law, effort, recorded = controller_of(look.records), 0.0, 0.0
-    if law is not None:  # largest |K S| of the recorded loop on the model, and where its |S| rises to -3 dB
-        k = np.divide(*(np.polyval(part, np.exp(1j * omega * model.dt_s)) for part in law))
+    effort = 0.0
+    recorded = 0.0
+    law = draft.timing.law
+    if law is not None and law.on_error is not None:
+        # Largest |K S| of the recorded loop on the model, and where its |S| rises to -3 dB.
+        numerator, denominator = law.on_error
+        z = np.exp(1j * omega * law.dt_s)
+        k = np.polyval(numerator, z) / np.polyval(denominator, z)
         sensitivity = 1 / np.abs(1 + k * model.frequency_response(omega))
         effort = float(np.max(np.abs(k) * sensitivity))
         recorded = float(omega[np.argmax(sensitivity > np.sqrt(0.5))])
@@ -137,7 +156,12 @@ def informed(draft: Draft, found: IdentifiedChannel, spread: UncertainChannel) -
         draft,
         look=look,
         specification=_specification(
-            look, max(draft.specification["effort_limit"], effort), draft.limit, unstable, recorded
+            look,
+            draft.timing,
+            max(draft.specification["effort_limit"], effort),
+            draft.limit,
+            unstable,
+            recorded,
         ),
         unstable_per_s=unstable,
         recorded_rad_s=recorded,
@@ -184,14 +208,21 @@ def _rounded(value: float) -> float:
 
 
 def _specification(
-    look: FirstLook, effort: float, limit: float, unstable: float, recorded: float = 0.0
+    look: FirstLook,
+    timing: CommandTiming,
+    effort: float,
+    limit: float,
+    unstable: float,
+    recorded: float = 0.0,
 ) -> dict[str, Any]:
     """Requirements that leave the bandwidth to what the identified arm allows; no less is asked for than the
     recorded loop had."""
-    dt_s = look.records[0].dt_s
+    dt_s = look.records[0].dt_s * timing.rows_per_command
     highest = look.told_rad_s[1] if look.told_rad_s else 0.05 * np.pi / dt_s
     base = look.mode[0] if look.mode else look.notch or highest
     bandwidth = max(base / _PART, _BEYOND_UNSTABLE * unstable, recorded)
+    # The rows hold all of the delay from a command to the motion, and this loop waits for nothing else.
+    at_once = {"computational_delay_samples": 0} if timing.acts_at_once else {}
     band = {
         "mode_peak_ratio": 1.0,
         "mode_band_rad_s": [_rounded(base / 1.5), _rounded(min(1.5 * base, 0.95 * np.pi / dt_s))],
@@ -208,4 +239,5 @@ def _specification(
         "integrator": True,
         "input_limit": limit,
         "controller_order": _ORDER,
+        **at_once,
     }

@@ -24,11 +24,11 @@ from control_design.analysis.closed_loop import (
 from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller, FrictionFeedforward
 from control_design.specification import Specification
-from ident.closed_loop import controller_of
 from ident.data.arrays import RealArray, kernel_array
 from ident.data.ellipses import LEVEL
 from ident.friction import FrictionFit, FrictionLaw
 from ident.friction.kernel import loop_through
+from ident.resampling import resampled_friction
 from workflow.tasks.loop_sensitivity import (
     SMALL,
     measured_on_arm,
@@ -221,9 +221,10 @@ def check_friction(
     """What friction does to the loop of this controller (without feed-forward), predicted and, where
     `sensitivity` was measured on the simulated arm, measured. reference (T,): a step and the time in which
     the linear loop settles; given (T,): what a reference filter makes of it."""
-    found, certificate = stage.results.identify.friction, stage.results.certify.certificate
-    assert found is not None
+    certificate = stage.results.certify.certificate
+    assert stage.results.identify.friction is not None
     assert certificate is not None
+    found = resampled_friction(stage.results.identify.friction, controller.dt_s)
     steps = converter_steps(stage.config.closed_loop)
     loops = drawn(controller, found, stage.rng("closed_loop", "friction"), _DRAWS, **steps)
     plan = sensitivity_plan(stage, controller, reference.size)
@@ -282,24 +283,38 @@ def check_friction(
 def beside_recorded(stage: StageInput, loop: FrictionLoop, step: RealArray) -> dict[str, Any]:
     """The loop that made the logs on the same step (T,), and both on the reference of the first log: fields
     of `FrictionCheck`."""
-    own, first = recorded_loop(stage, loop), stage.results.records.fitted(stage.config.control_channel)[0]
-    if own is None or first.reference is None:
+    recorded = recorded_loop(stage, loop)
+    record = stage.results.records.fitted(stage.config.control_channel)[0]
+    if recorded is None or record.reference is None:
         return {}
-    reference = first.reference[:, 0] - first.reference[0, 0]
-    runs = (float(np.std(reference - one.run(reference).measured)) for one in (own, loop))
-    errors, run = (float(np.std(first.reference - first.output)), *runs), own.answer(step)
-    return {"recorded": step_metrics(run), "recorded_output": run.measured[: step.size], "errors": errors}
+    reference = record.reference[:, 0] - record.reference[0, 0]
+    errors = (
+        float(np.std(record.reference - record.output)),
+        float(np.std(reference - recorded.run(reference).measured)),
+        float(np.std(reference - loop.run(reference).measured)),
+    )
+    answer = recorded.answer(step)
+    return {
+        "recorded": step_metrics(answer),
+        "recorded_output": answer.measured[: step.size],
+        "errors": errors,
+    }
 
 
 def recorded_loop(stage: StageInput, loop: FrictionLoop) -> FrictionLoop | None:
-    """The controller that made the logs in the place of the loop's, its command not limited; None where they
-    do not tell it."""
-    records = stage.results.records.fitted(stage.config.control_channel)
-    law = controller_of(records)
-    if law is None:
+    """The controller that made the logs in the place of the loop's, its command not limited.
+
+    None where the logs do not tell it: a law that does not repeat the recorded command is not the one that
+    ran, nor is one that ran at another step than the arm is stepped.
+    """
+    timing = stage.results.records.timing
+    law = None if timing is None else timing.law
+    if law is None or law.on_error is None or abs(law.dt_s - loop.controller.dt_s) > 1e-6 * law.dt_s:
         return None
-    own = Controller(*scipy.signal.tf2ss(*law), records[0].dt_s, computational_delay_samples=0)
-    return replace(loop, controller=own)
+    numerator, denominator = law.on_error
+    state_space = scipy.signal.tf2ss(numerator, denominator)
+    recorded = Controller(*state_space, loop.controller.dt_s, computational_delay_samples=0)
+    return replace(loop, controller=recorded)
 
 
 def soonest(
@@ -313,6 +328,7 @@ def soonest(
     asked, law = config.specification, first.controller
     if not first.met or found is None or law is None or asked.lowest_bandwidth_rad_s is None:
         return first
+    found = resampled_friction(found, law.dt_s)
     records = stage.results.records.fitted(config.control_channel)
     size = config.closed_loop.reference_step or 0.5 * rms_of([record.output for record in records])
     radius = float(np.max(np.abs(closed_loop_poles(law, stage.plant))))
@@ -358,8 +374,8 @@ def holds_from(sizes: Sequence[float] | RealArray, excess: RealArray) -> float |
 def slow_sine(stage: StageInput, controller: Controller, amplitude: float, *, on_arm: bool) -> SlowSine:
     """The error on a slow sine without feed-forward and with it, on the simulated arm as identified or on the
     identified arm with its friction; after the first quarter of a period."""
-    found = stage.results.identify.friction
-    assert found is not None
+    assert stage.results.identify.friction is not None
+    found = resampled_friction(stage.results.identify.friction, controller.dt_s)
     forward = friction_feedforward(controller, found)
     period = int(min(_SLOW * forward.lag_s / controller.dt_s, _LONGEST))
     omega = 2 * np.pi / (period * controller.dt_s)

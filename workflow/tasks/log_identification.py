@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pydantic import ValidationError
 
 from ident.basis.options import IdentOptions
+from ident.command_timing import CommandTiming
 from ident.data.finding import Finding
 from ident.data.record import Record
 from ident.friction import EquivalentFriction, FrictionFit
@@ -58,12 +59,13 @@ def identify_records(
     band_rad_s: tuple[float, float] | None = None,
     loop: ClosedLoopData | None = None,
     with_plot: bool = True,
+    timing: CommandTiming | None = None,
     progress: Progress | None = None,
 ) -> LogIdentification:
     """Identify one channel from SISO records, as a run with these settings does; nothing is written.
 
-    described: what the ellipses are about, and their level; loop: how to use logs made in closed loop.
-    Raises InputError.
+    described: what the ellipses are about, and their level; loop: how to use logs made in closed loop;
+    timing: of the command between two rows, for which the records are corrected. Raises InputError.
     """
     progress, described = progress or Progress(), described or UncertaintyOptions()
     loop = loop or ClosedLoopData()
@@ -93,7 +95,7 @@ def identify_records(
         )
     with naming("identify"), progress.stage("uncertainty"):
         rng = stage_rng(RunSection().seed, "uncertainty", channel.label)
-        spread, equivalent = uncertainty_of(channel, about, measured, rng, friction=friction)
+        spread, equivalent = uncertainty_of(channel, about, measured, rng, friction=friction, timing=timing)
     return LogIdentification(
         measured=tuple(measured),
         fresh_records=tuple(fresh_records),

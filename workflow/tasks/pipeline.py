@@ -218,7 +218,8 @@ def _keep_files(results: RunResults, config: AnyConfig, dialect: Dialect) -> lis
     """controller.json, .mat, .c and .h; of one loop with those of its reference filter, and model.json."""
     second, kept = ReferenceFilterResult(), list[Path]()
     if isinstance(config, RunConfig):
-        second, found = results.reference_filter, results.uncertainty.channels[config.control_index]
+        second = results.reference_filter
+        found = results.uncertainty.seen_by_controller(config)[config.control_index]
         kept = [results.run.path / "model.json"]
         storage.write_together({kept[0]: model_bytes(kept[0], ModelFile(found.nominal, found.frequency))})
     if (controller := results.design.controller) is None:

@@ -10,11 +10,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ident.data.record import Record, in_one_unit
-from workflow.config.joints_config import Joint, OperatingPoint
-from workflow.config.run_config import Channel, FileRecord, FileSource, SimulatedRecord, record_name
+from workflow.config.joints_config import AnyConfig, Joint, OperatingPoint
+from workflow.config.run_config import (
+    Channel,
+    FileRecord,
+    FileSource,
+    RunConfig,
+    SimulatedRecord,
+    record_name,
+)
 from workflow.engine.errors import InputError, naming
 
 if TYPE_CHECKING:
+    from ident.command_timing import CommandTiming
     from workflow.tasks.results import RecordsResult
     from workflow.tasks.stage import StageInput
 
@@ -29,6 +37,8 @@ def make_records(stage: StageInput) -> RecordsResult:
     identify from whose inputs all stand still.
     """
     # Late: logs are read and refused before what computes is loaded, which takes seconds.
+    from ident.command_timing import with_equivalent_command
+    from ident.resampling import ratio_of
     from workflow.tasks.results import RecordsResult, RunRecord
     from workflow.tasks.simulated_rig import simulated_records
 
@@ -38,11 +48,19 @@ def make_records(stage: StageInput) -> RecordsResult:
         made = simulated_records(stage.config, stage.called, partial(stage.progress.update, "records"))
     elif not made:
         made = read_records(source, stage.config.columns)
-    limit, records = source.input_limit or np.inf, list[RunRecord]()
-    for about, record in zip(entries, with_common_sampling_time(made), strict=True):
+    limit = source.input_limit or np.inf
+    timed = [record.limited(limit) for record in with_common_sampling_time(made)]
+    timing = command_timing(stage.config, timed)
+    if timing is not None:
+        timed = with_equivalent_command(timed, timing)
+    if isinstance(stage.config, RunConfig) and stage.config.specification.controller_dt_s is not None:
+        with naming("specification"):
+            ratio_of(timed[0].dt_s, stage.config.specification.controller_dt_s)
+    records = list[RunRecord]()
+    for about, record in zip(entries, timed, strict=True):
         of: Any = getattr(about, "excitation", about)
-        records.append(RunRecord(record.limited(limit), about.role, about.condition, about.remark, of.kind))
-    result = RecordsResult(tuple(records))
+        records.append(RunRecord(record, about.role, about.condition, about.remark, of.kind))
+    result = RecordsResult(tuple(records), timing)
     for item in result.of_role("estimation"):
         if not np.ptp(item.record.input, axis=0).any():
             refuse_constant_input(item.record)
@@ -84,6 +102,37 @@ def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channe
         if entry.start_sample or entry.stop_sample is not None:
             record = record.slice(entry.start_sample, entry.stop_sample or record.n_samples)
     return record.each(lambda signal: -signal) if entry.mirrored else record
+
+
+def command_timing(config: AnyConfig, records: Sequence[Record]) -> CommandTiming | None:
+    """What the command of a run's records does between two rows; None of simulated records.
+
+    records: all of the configuration, as logged. Several joints: held from row to row unless a period is
+    stated, for a law of several inputs is not read off. Raises InputError for a period that the logs
+    contradict.
+    """
+    from ident.command_timing import timing_of
+    from workflow.tasks.identification import made_in_loop
+
+    source = config.source
+    if not isinstance(source, FileSource):
+        return None
+    in_loop = False
+    if isinstance(config, RunConfig):
+        shaft = config.control_channel
+        records = [record.siso(shaft.input, shaft.output) for record in records]
+        fitted = [
+            record
+            for record, entry in zip(records, source.records, strict=True)
+            if entry.role == "estimation"
+        ]
+        in_loop = config.closed_loop_data.stated or made_in_loop(fitted)
+    stated_s = source.controller_period_s
+    if stated_s is None and isinstance(config, RunConfig) and config.closed_loop_data.controlled:
+        # A controller that is stated in z is one that runs at the step of the log.
+        stated_s = records[0].dt_s
+    with naming(""):
+        return timing_of(records, in_loop=in_loop, stated_period_s=stated_s, averaged=source.command_averaged)
 
 
 def refuse_constant_input(record: Record) -> None:

@@ -26,16 +26,18 @@ from ident.basis.model import GobfModel
 from ident.checks.plausible_modes import PairKind, kind_of_pair
 from ident.checks.residual_tests import conditions_of
 from ident.checks.validation import FreshFit, ScatterRow
+from ident.command_timing import CommandTiming
 from ident.data.arrays import BoolArray, RealArray
 from ident.data.ellipses import chi2_radius
 from ident.data.finding import Finding, distinct
 from ident.data.record import Record
 from ident.friction import EquivalentFriction, FrictionFit
 from ident.identification import Identification
+from ident.resampling import ratio_of, resampled, resampled_poles
 from ident.response_uncertainty import Tests
 from ident.stabilisation import Stabilisation
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
-from ident.uncertainty.nominal import NominalAgreement
+from ident.uncertainty.nominal import NominalAgreement, nominal_near
 from workflow.config.run_config import Channel, Role, RunConfig
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.point_models import JointsCertificate, JointsLoopResult, PointModels
@@ -74,9 +76,11 @@ class RunRecord:
 
 @dataclass(frozen=True, eq=False)
 class RecordsResult:
-    """All records."""
+    """All records. timing: what their command did between two rows, for which they are corrected; None of
+    simulated ones, whose command is held from row to row."""
 
     records: tuple[RunRecord, ...]
+    timing: CommandTiming | None = field(default=None, metadata={"since": 2})
 
     def of_role(self, role: Role) -> list[RunRecord]:
         return [item for item in self.records if item.role == role]
@@ -269,6 +273,23 @@ class UncertainChannel:
         report = self.posterior.report
         return 0 if report is None else len(report.ar_coefficients)
 
+    def at_rate(self, controller_dt_s: float | None) -> UncertainChannel:
+        """The channel as a controller of this period sees it; None: of the step of the logs."""
+        step_s = self.posterior.dt_s
+        if controller_dt_s is None or ratio_of(step_s, controller_dt_s) == (1, 1):
+            return self
+        posterior = resampled(self.posterior, controller_dt_s)
+        # Where the logs and the new controller both tell a response.
+        omega = self.frequency.omega_rad_s
+        omega = omega[omega < 0.99 * np.pi / max(step_s, controller_dt_s)]
+        poles = resampled_poles(self.nominal.poles, step_s, controller_dt_s)
+        return replace(
+            self,
+            posterior=posterior,
+            nominal=nominal_near(posterior, poles, omega),
+            frequency=posterior.at(omega, self.level),
+        )
+
     def in_plant(self) -> PlantChannel:
         return PlantChannel(self.nominal.to_control(), self.posterior, self.level)
 
@@ -287,22 +308,36 @@ class UncertaintyResult:
             [found for k in used if k is not None for found in conditions_of(self.channels[k].advice)]
         )
 
+    def seen_by_controller(self, config: RunConfig) -> tuple[UncertainChannel, ...]:
+        """The channels at the rate of the new controller."""
+        controller_dt_s = config.specification.controller_dt_s
+        if controller_dt_s not in self._channels_at:
+            self._channels_at[controller_dt_s] = tuple(
+                channel.at_rate(controller_dt_s) for channel in self.channels
+            )
+        return self._channels_at[controller_dt_s]
+
     def plant(self, config: RunConfig) -> UncertainPlant:
-        """What the controller is designed for: control channel and first performance channel."""
-        key = config.control_index, config.performance_index
+        """What the controller is designed for: control channel and first performance channel, at its rate."""
+        channels = self.seen_by_controller(config)
+        key = config.control_index, config.performance_index, config.specification.controller_dt_s
         if key not in self._plants:
-            control = self.channels[key[0]].in_plant()
+            control = channels[key[0]].in_plant()
             self._plants[key] = UncertainPlant(
                 name=config.control_channel.label,
                 nominal=control.nominal,
                 uncertainty=control.uncertainty,
-                performance=None if key[1] is None else self.channels[key[1]].in_plant(),
+                performance=None if key[1] is None else channels[key[1]].in_plant(),
                 level=control.level,
             )
         return self._plants[key]
 
     @cached_property
-    def _plants(self) -> dict[tuple[int, int | None], UncertainPlant]:
+    def _plants(self) -> dict[tuple[int, int | None, float | None], UncertainPlant]:
+        return {}
+
+    @cached_property
+    def _channels_at(self) -> dict[float | None, tuple[UncertainChannel, ...]]:
         return {}
 
 

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 
 from control_design.specification import Specification
+from ident.resampling import resampled_friction
 from workflow.engine.errors import naming
 from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.design import UNKNOWN_TO_BRACKET, certify_asked, find_bracket, find_design, find_filter
@@ -69,7 +70,7 @@ def design_filter(stage: StageInput) -> ReferenceFilterResult:
         found = find_filter(law, [stage.plant], settings)
     friction = stage.results.identify.friction
     if stage.config.closed_loop.friction_feedforward and friction is not None:
-        found = replace(found, feedforward=friction_feedforward(law, friction))
+        found = replace(found, feedforward=friction_feedforward(law, resampled_friction(friction, law.dt_s)))
     return found
 
 

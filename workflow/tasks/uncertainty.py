@@ -16,6 +16,7 @@ from ident.basis.poles import Poles
 from ident.checks.answer import refuse_unanswered
 from ident.checks.residual_tests import residual_advice, residual_tests, whiteness_test
 from ident.checks.validation import ScatterRow, repeat_scatter
+from ident.command_timing import CommandTiming, with_unknown_timing
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.distortion import distortion_of
 from ident.data.finding import FindingKind, finding
@@ -83,6 +84,7 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
                 friction=friction,
                 at_shaft=k == control,
                 equivalent=equivalent,
+                timing=records.timing,
             )
             bands = [(band.from_rad_s, band.to_rad_s) for band in found.bands]
             scatter = scatter_of(channel, result, records.records, bands, friction)
@@ -99,13 +101,14 @@ def uncertainty_of(
     friction: FrictionFit | None = None,
     at_shaft: bool = True,
     equivalent: EquivalentFriction | None = None,
+    timing: CommandTiming | None = None,
 ) -> tuple[UncertainChannel, EquivalentFriction | None]:
     """Ellipses of one channel, as `flexlink run` and `flexlink identify` have them, and the viscous friction
     that acts like the dry one where they are about an amplitude.
 
     measured: SISO estimation records as recorded; friction: of the shaft, whose position the channel's output
-    is where at_shaft; equivalent: where it is known from the shaft. Raises ValueError, one line,
-    where the model explains nothing.
+    is where at_shaft; equivalent: where it is known from the shaft; timing: of the command between two rows.
+    Raises ValueError, one line, where the model explains nothing.
     """
     poles, linear_poles, options = result.model.poles, result.model.poles, channel.embedding
     if friction is None:
@@ -138,6 +141,8 @@ def uncertainty_of(
         if channel.uncertainty.response == "this amplitude":
             equivalent = equivalent or equivalent_friction(friction, measured, rng)
             posterior, poles = at_amplitude(behind, equivalent, rng)
+    if timing is not None:
+        posterior = with_unknown_timing(posterior, timing)
     band, omega = result.data_band_rad_s, display_grid(result.model, result.bounded)
     if band is not None:  # the nominal model has to be right there, and need not elsewhere
         omega = omega[(omega >= band[0]) & (omega <= band[1])]

@@ -31,6 +31,7 @@ OPTIONS: Mapping[str, Mapping[str, str]] = {
         "response": "--response",
         "band_rad_s": "--band",
         "resample_s": "--resample-s",
+        "controller_period_s": "--controller-period",
         "validation": "--validation",
         "closed_loop_data.method": "--loop-method",
     },
