@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from control_design.controllers.law import Law, in_sections
-from control_design.plants.ellipses import Complex, Real
+from control_design.controllers.anti_windup import anti_windup_gain, anti_windup_radius
+from control_design.controllers.law import Law
+from control_design.plants.ellipses import Boolean, Complex, Real
 from control_design.plants.plant_set import delayed
 from ident.data.arrays import lock
 
@@ -21,19 +22,13 @@ if TYPE_CHECKING:
 else:
     Limit = float | tuple[float | None, ...] | None
 
-_NO_GAIN = (
-    "no anti-windup gain found for the limits: the controller has a marginal mode that its output does not "
-    "show, or too many poles close together for its state space; give it in sections, or anti_windup_gain"
-)
-
-
 @dataclass(frozen=True, eq=False)
 class Controller(Law):
     """u = K (r - y): x+ = A x + B e + M (u_limited - u), u = C x + D e, of Y errors and U commands.
 
     A (n, n), B (n, Y), C (U, n), D (U, Y); dt_s > 0. input_limit, rate_limit: saturation (both signs) and
     largest change per second of the command, or None; with U > 1 a tuple of these. anti_windup_gain M (n, U):
-    back-calculation in observer form, A - M C stable; default `observer_gain`, without limits zero.
+    what the states learn of an active limit, A - M C stable; default that of `anti_windup`, without limits zero.
     computational_delay_samples: from measurement to command. feedforward: joins u before it is limited, or
     None. signals: the columns and units of error and command, in words.
     """
@@ -51,39 +46,70 @@ class Controller(Law):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        n, inputs = self.order, self.D.shape[0]
         delay = self.computational_delay_samples
         if not (delay >= 0 and int(delay) == delay):
             raise ValueError(f"computational_delay_samples must not be negative, and whole; got {delay}")
         object.__setattr__(self, "computational_delay_samples", int(delay))
         for name in ("input_limit", "rate_limit"):
-            value = getattr(self, name)
-            several = isinstance(value, tuple | list) or np.ndim(value) > 0
-            each = tuple(None if one is None else float(one) for one in (value if several else (value,)))
-            if (several or (value is not None and inputs > 1)) and len(each) != inputs:
-                raise ValueError(f"{name} needs one value for each of {inputs} actuators; got {value!r:.80}")
-            if not all(one is None or one > 0 for one in each):
-                raise ValueError(f"{name} must be positive or None; got {value}")
-            object.__setattr__(self, name, each if several else each[0])
+            object.__setattr__(self, name, self._checked_limit(name))
         if self.feedforward is not None and self.D.size > 1:
             raise ValueError("a friction feed-forward is for one loop; got a controller of several")
-        limited = bool(np.isfinite([self.limits("input_limit"), self.limits("rate_limit")]).any())
+
+        # The gain: as given, or one that suits the limits.
         gain = self.anti_windup_gain
         if gain is None:
-            gain = observer_gain(self.A, self.B, self.C, self.D) if limited else np.zeros((n, inputs))
-        gain, sought = np.asarray(gain, dtype=float), gain is not self.anti_windup_gain
-        object.__setattr__(self, "anti_windup_gain", gain)
+            gain = self._gain_for_limits()
+        object.__setattr__(self, "anti_windup_gain", np.asarray(gain, dtype=float))
         lock(self, "anti_windup_gain")
-        if gain.shape != (n, inputs) or not np.all(np.isfinite(gain)):
-            raise ValueError(f"anti_windup_gain must be finite and ({n}, {inputs}); got shape {gain.shape}")
-        if n and limited:
-            with np.errstate(over="ignore", invalid="ignore"):
-                inner = self.A - gain @ self.C
-            finite = bool(np.all(np.isfinite(inner)))
-            radius = float(np.max(np.abs(np.linalg.eigvals(inner)))) if finite else np.inf
+        assert self.anti_windup_gain is not None
+        shape = (self.order, self.D.shape[0])
+        if self.anti_windup_gain.shape != shape or not np.all(np.isfinite(self.anti_windup_gain)):
+            found = self.anti_windup_gain.shape
+            raise ValueError(f"anti_windup_gain must be finite and {shape}; got shape {found}")
+
+        # One that leaves the states a mode that grows while a limit is active is refused.
+        if self.order and self.limited_commands.any():
+            radius = anti_windup_radius(self.A, self.C, self.anti_windup_gain)
             if not radius < 1:
-                told = f"anti_windup_gain leaves a pole of A - M C at radius {radius:.6g}: it would wind up"
-                raise ValueError(_NO_GAIN if sought else told)
+                raise ValueError(
+                    f"anti_windup_gain leaves a pole of A - M C at radius {radius:.6g}: it would wind up"
+                )
+
+    def _checked_limit(self, name: str) -> Limit:
+        """A limit as a number or None, of several commands as a tuple of them. Raises ValueError."""
+        value = getattr(self, name)
+        inputs = self.D.shape[0]
+        several = isinstance(value, tuple | list) or np.ndim(value) > 0
+        if not several:
+            if value is not None and inputs > 1:
+                raise ValueError(f"{name} needs one value for each of {inputs} actuators; got {value!r:.80}")
+            each: tuple[float | None, ...] = (None if value is None else float(value),)
+        else:
+            each = tuple(None if limit is None else float(limit) for limit in value)
+            if len(each) != inputs:
+                raise ValueError(f"{name} needs one value for each of {inputs} actuators; got {value!r:.80}")
+        if not all(limit is None or limit > 0 for limit in each):
+            raise ValueError(f"{name} must be positive or None; got {value}")
+        return each if several else each[0]
+
+    def _gain_for_limits(self) -> Real:
+        """Gain (n, U) that suits the limits: of the commands that have one, zero without. Raises ValueError."""
+        gain = np.zeros((self.order, self.D.shape[0]))
+        limited = self.limited_commands
+        if limited.any():
+            try:
+                gain[:, limited] = anti_windup_gain(self.A, self.B, self.C[limited], self.D[limited])
+            except ValueError:
+                if limited.all():
+                    raise
+                # A mode that only commands without a limit show: it cannot wind up, but A - M C needs them.
+                return anti_windup_gain(self.A, self.B, self.C, self.D)
+        return gain
+
+    @property
+    def limited_commands(self) -> Boolean:
+        """Whether a command has a limit, (U,)."""
+        return np.asarray(np.isfinite(np.minimum(self.limits("input_limit"), self.limits("rate_limit"))))
 
     @classmethod
     def proportional(cls, gain: float, dt_s: float, **settings: Any) -> Controller:
@@ -193,31 +219,6 @@ class ControllerStepper:
         self._x = k.A @ self._x + k.B @ errors + k.anti_windup_gain @ (command - wanted)
         self._last = command
         return command if np.ndim(error) else float(command[0])
-
-
-def observer_gain(A: Real, B: Real, C: Real, D: Real) -> Real:
-    """Back-calculation gain M (n, U) with A - M C stable: a Kalman gain for state noise through B and output
-    noise D. (M = B/D would place A - M C at the controller's zeros, which may lie outside the circle.)"""
-    from scipy.linalg import solve_discrete_are
-
-    n = A.shape[0]
-    if n == 0:
-        return np.zeros((0, C.shape[0]))
-    # States and output in units of their own, in which the equation is the same and well scaled.
-    state_unit = float(np.linalg.norm(B)) or 1.0
-    output_unit = float(np.linalg.norm(C)) * state_unit or float(np.linalg.norm(D)) or 1.0
-    B, C, D = B / state_unit, C * (state_unit / output_unit), D / output_unit
-    state_noise = B @ B.T + 1e-6 * (float(np.linalg.norm(B)) ** 2 or 1.0) * np.eye(n)
-    output_noise = D @ D.T + 1e-4 * (float(np.trace(C @ state_noise @ C.T)) or 1.0) * np.eye(C.shape[0])
-    # In companion form poles that are close together leave nothing of the equation but rounding.
-    own, there, back = in_sections(A)
-    seen = C @ there
-    try:
-        p = solve_discrete_are(own.T, seen.T, back @ state_noise @ back.T, output_noise)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise ValueError(_NO_GAIN) from error
-    gain = there @ np.linalg.solve(seen @ p @ seen.T + output_noise, (own @ p @ seen.T).T).T
-    return np.asarray(gain * (state_unit / output_unit), dtype=np.float64)
 
 
 @dataclass(frozen=True)
