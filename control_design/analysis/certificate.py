@@ -11,6 +11,7 @@ import numpy as np
 
 from control_design.analysis.between_grid_points import AllFrequencies, Obstacle, bound_all_frequencies
 from control_design.analysis.joint_coverage import JointCoverage, at_level, joint_coverage as calibrate
+from control_design.analysis.limited_loop import ERROR_LEFT, LimitedLoop, limited_loops
 from control_design.analysis.margins import Margins, ellipse_margins, nominal_margins
 from control_design.analysis.stability import (
     ModeChange,
@@ -85,6 +86,8 @@ class Certificate(Shown):
     weighted worst case on the dense grid (<= 1 met). gamma_bound: upper bound of it for all frequencies, or
     None where some plant allows no proof. joint: calibration of the ellipses to posterior samples, where
     specified; the ellipses checked are then those of the calibrated level where it is above the given one.
+    limited: the limited controller and its loops, empty without limits, None where nobody looked (by an
+    earlier version).
     resonances: pole pairs of the controller with a damping ratio below `LIGHT_CONTROLLER_POLES`. controller,
     uncertain_plants, specification: what it is about; not stored.
 
@@ -101,6 +104,7 @@ class Certificate(Shown):
     gamma_bound: float | None = None
     joint: JointCoverage | None = None
     resonances: tuple[Resonance, ...] = ()
+    limited: tuple[LimitedLoop, ...] | None = field(default=None, metadata={"since": 10})
     controller: Controller | None = field(default=None, compare=False, metadata=NOT_STORED)
     uncertain_plants: tuple[UncertainPlant, ...] = field(default=(), compare=False, metadata=NOT_STORED)
     specification: Specification | None = field(default=None, compare=False, metadata=NOT_STORED)
@@ -122,6 +126,10 @@ class Certificate(Shown):
 
 LIGHT_CONTROLLER_POLES = 1e-3
 """Damping ratio; less is narrower than what anybody measures a machine on, and is told."""
+
+
+_LIMITED_COMMAND = "limited command under a constant error: distance from its end, share of the limit"
+_LIMITED_LOOP = "limited loop after a step beyond the limit: distance from its end, share of the step"
 
 
 def certify(
@@ -149,6 +157,9 @@ def certify(
 
     joint_coverage: probability with which the weighted worst case shall hold for a whole response; needs rng
     and draws `joint_draws` responses (`joint_coverage.joint_coverage`). None: each frequency by itself.
+
+    A controller with limits is also simulated at them, on the nominal plants (`limited_loop`): constant errors
+    and reference steps beyond the limit have to end where they must.
 
     joint_stable_share: with a joint coverage, share of those responses that must be stable. It is a
     requirement of its own: ellipses propagate parameters to first order, and no level of theirs speaks for
@@ -187,6 +198,16 @@ def certify(
         found_share, enough = joint.stable_share, bool(joint.stable_share >= joint_stable_share)
         share = SpecificationItem(caption, name, joint_stable_share, found_share, "", enough)
         items.append(replace(share, at_least=True, about="sampled responses"))
+    # The nominal loops at the controller's limits.
+    limited = limited_loops(controller, plants)
+    for loop in limited:
+        if loop.steps:
+            alone = loop is limited[0]
+            caption = _LIMITED_COMMAND if alone else _LIMITED_LOOP
+            about: Literal["controller", "nominal loop"] = "controller" if alone else "nominal loop"
+            found_loop = SpecificationItem(caption, loop.plant, ERROR_LEFT, loop.worst, "", loop.ends)
+            items.append(replace(found_loop, about=about))
+
     robust = all(v.stable and v.nyquist.matches and v.worst_margins.modulus > 0 for v in verdicts)
     proofs = [v.all_frequencies for v in verdicts]
     robust = robust and all(proof.proved or not proof.possible for proof in proofs)
@@ -202,6 +223,7 @@ def certify(
             for mode in modes_of(controller.poles, controller.dt_s, zeta_below=LIGHT_CONTROLLER_POLES)
             if mode.omega_rad_s < np.pi / controller.dt_s
         ),
+        limited=limited,
         controller=controller,
         uncertain_plants=asked,
         specification=specification,

@@ -16,6 +16,7 @@ import numpy as np
 import scipy.linalg
 
 from control_design.analysis.between_grid_points import EXCESS, LEAST_EXCESS
+from control_design.analysis.limited_loop import LimitedLoop, limited_joints
 from control_design.analysis.stability import NominalLoop, NyquistCount, nyquist_count
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Complex, Real
@@ -69,7 +70,8 @@ class MultivariableVerdict:
     frequencies from from_rad_s to Nyquist, inf where none was proved; obstacle says why. stability_radius:
     factor by which the uncertainty may grow before a member is unstable (inf without uncertainty), on the
     grid. input_disk, output_disk: of the nominal loop, on the grid.
-    exact: the worst case is exact at a frequency, not an upper bound (up to two blocks).
+    exact: the worst case is exact at a frequency, not an upper bound (up to two blocks). limited: the nominal
+    loop at the controller's limits, None without limits.
     """
 
     plant: str
@@ -87,6 +89,7 @@ class MultivariableVerdict:
     frequencies: int
     exact: bool
     worst_joint: dict[str, int] = field(default_factory=dict, metadata={"since": 2})
+    limited: LimitedLoop | None = field(default=None, metadata={"since": 10})
 
     @property
     def proved(self) -> bool:
@@ -95,8 +98,9 @@ class MultivariableVerdict:
 
     @property
     def met(self) -> bool:
-        """Proved at or below 1."""
-        return self.proved and max(self.bounds.values()) <= 1.0
+        """Proved at or below 1, and the loop at its limits ends where it has to."""
+        limited_ends = self.limited is None or self.limited.ends
+        return self.proved and max(self.bounds.values()) <= 1.0 and limited_ends
 
 
 @dataclass(frozen=True, repr=False)
@@ -217,6 +221,7 @@ def _verdict(
         plant.name, stable, radius, winding, worst, worst_at, bounds, start, obstacle,
         1.0 / largest if largest > 0 else float("inf"), _disk(at_input), _disk(sensitivity), int(omega.size),
         blocks <= 2, worst_joint,
+        limited_joints(controller, plant) if controller.limited_commands.any() else None,
     )  # fmt: skip
 
 

@@ -21,9 +21,15 @@ from control_design.controllers.law import in_sections
 from control_design.plants.ellipses import Complex, Real
 
 _LOG_POINTS = 200  # frequencies at which V is looked at, on a logarithmic scale; 400 chose the same gains
-_LOWEST_SHARE = 1e-5  # of the Nyquist frequency, the lowest of them: 0.5 rad/min at 1 kHz, slower than any loop
-_LINEAR_POINTS = 400  # midpoints on a linear scale, for the mean of log |V|; the mean moves by 1 % from 200 on
-_LARGEST_V = 2.0  # |V| at most, on the circle: an error of the limited command enters w as 1 - V, 3-fold at most
+_LOWEST_SHARE = (
+    1e-5  # of the Nyquist frequency, the lowest of them: 0.5 rad/min at 1 kHz, slower than any loop
+)
+_LINEAR_POINTS = (
+    400  # midpoints on a linear scale, for the mean of log |V|; the mean moves by 1 % from 200 on
+)
+_LARGEST_V = (
+    2.0  # |V| at most, on the circle: an error of the limited command enters w as 1 - V, 3-fold at most
+)
 _SCAN_FACTOR = 10.0  # between two reference gains tried first; V changes over a decade of its reference gain
 _HALVINGS = 3  # of that decade, on a logarithmic scale: the reference gain is found within a third
 _SLOW = 1e-4  # distance from z = 1 below which a pole acts as an integrator in the test of V
@@ -150,7 +156,9 @@ def anti_windup_gain(A: Real, B: Real, C: Real, D: Real, *, slower: float = 1.0)
             closed = np.linalg.eigvals(law.A - gain @ law.C)
             slowest = closed[np.argsort(np.abs(closed - 1.0))][:extra_integrators]
             radii = np.exp(-np.abs(np.log(slowest)))  # of a pair both as if damped
-            correction = correction * np.prod((z[:, None] - radii) / (z[:, None] - 1.0), axis=1)[:, None, None]
+            correction = (
+                correction * np.prod((z[:, None] - radii) / (z[:, None] - 1.0), axis=1)[:, None, None]
+            )
         hermitian = 0.5 * (correction + np.conj(np.swapaxes(correction, -2, -1)))
         smallest = np.linalg.eigvalsh(hermitian)[:, 0]
         return float(np.max(-smallest / np.linalg.norm(correction, ord=2, axis=(-2, -1))))

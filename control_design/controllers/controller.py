@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 else:
     Limit = float | tuple[float | None, ...] | None
 
+
 @dataclass(frozen=True, eq=False)
 class Controller(Law):
     """u = K (r - y): x+ = A x + B e + M (u_limited - u), u = C x + D e, of Y errors and U commands.
@@ -58,7 +59,7 @@ class Controller(Law):
         # The gain: as given, or one that suits the limits.
         gain = self.anti_windup_gain
         if gain is None:
-            gain = self._gain_for_limits()
+            gain = self.gain_for_limits()
         object.__setattr__(self, "anti_windup_gain", np.asarray(gain, dtype=float))
         lock(self, "anti_windup_gain")
         assert self.anti_windup_gain is not None
@@ -92,18 +93,23 @@ class Controller(Law):
             raise ValueError(f"{name} must be positive or None; got {value}")
         return each if several else each[0]
 
-    def _gain_for_limits(self) -> Real:
-        """Gain (n, U) that suits the limits: of the commands that have one, zero without. Raises ValueError."""
+    def gain_for_limits(self, slower: float = 1.0) -> Real:
+        """Anti-windup gain (n, U) that suits the limits: of the commands that have one, zero without.
+
+        slower: as of `anti_windup.anti_windup_gain`. Raises ValueError where there is none.
+        """
         gain = np.zeros((self.order, self.D.shape[0]))
         limited = self.limited_commands
         if limited.any():
             try:
-                gain[:, limited] = anti_windup_gain(self.A, self.B, self.C[limited], self.D[limited])
+                gain[:, limited] = anti_windup_gain(
+                    self.A, self.B, self.C[limited], self.D[limited], slower=slower
+                )
             except ValueError:
                 if limited.all():
                     raise
                 # A mode that only commands without a limit show: it cannot wind up, but A - M C needs them.
-                return anti_windup_gain(self.A, self.B, self.C, self.D)
+                return anti_windup_gain(self.A, self.B, self.C, self.D, slower=slower)
         return gain
 
     @property

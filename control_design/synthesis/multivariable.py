@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from control_design.analysis.limited_loop import limited_joints, with_safe_limits
 from control_design.analysis.stability import NominalLoop
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Real
@@ -302,6 +303,9 @@ class Programme:
             computational_delay_samples=self.spec.computational_delay_samples,
             input_limit=None if not any(limits) else limits, rate_limit=None if not any(rates) else rates,
         )  # fmt: skip
+        controller = with_safe_limits(
+            controller, lambda law: [limited_joints(law, plant) for plant in self.plants]
+        )
         outcome = Outcome.NOT_CONVERGED if not np.isfinite(gamma) else Outcome.NOT_MET
         outcome = Outcome.MET_ON_GRID if gamma <= 1.0 else outcome
         blocking.sort(key=lambda point: -point.value)

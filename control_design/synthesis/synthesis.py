@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from control_design.analysis.limited_loop import limited_loops, with_safe_limits
 from control_design.controllers.biquads import Cascade, SectionKind
 from control_design.controllers.controller import Controller
 from control_design.convex.convex_options import YoulaOptions
@@ -189,7 +190,9 @@ def _told(
     tell(1.0, f"gamma {best.gamma:.4g}")
     return SynthesisResult(
         outcome=Outcome.MET_ON_GRID if best.gamma <= 1.0 else Outcome.NOT_MET,
-        controller=problem.controller(cascade, best.parameters),
+        controller=with_safe_limits(
+            problem.controller(cascade, best.parameters), lambda law: limited_loops(law, problem.plants)
+        ),
         gamma=best.gamma,
         blocking=_blocking(problem, cascade, best),
         starts=reports,

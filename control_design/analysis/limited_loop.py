@@ -1,0 +1,337 @@
+"""What a controller does at its limits: simulated, from rest, without noise and without friction.
+
+Two questions. A constant error that asks for more than the limit: does the command reach the limit and stay
+there? A reference step that meets the limit: does the loop end where it has to? On a stable plant that is at
+the reference, or, where the reference cannot be reached, with the command at its limit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import control
+import numpy as np
+
+from control_design.analysis.closed_loop import LinearMachine, simulate, simulate_joints
+from control_design.analysis.stability import NominalLoop
+from control_design.controllers.controller import Controller
+from control_design.plants.ellipses import Real
+from control_design.plants.multivariable import MultivariablePlant
+from control_design.plants.plant_set import UncertainPlant, delayed
+
+ERROR_LEFT = 0.02
+"""Of the step and of the limit: the band of a settling time, in which the limited loop has to end."""
+
+_LONGEST = 200_000  # samples of a simulation, 40 ms of computation for ten states: 200 s at 1 kHz
+_SHORTEST = 400  # samples of a simulation: what deadbeat loops need to be seen at rest
+_DECAY = 1e-3  # of a mode, after which it counts as gone; a tenth of `ERROR_LEFT` would be 0.002
+_LONGER = (4, 16)  # times the linear loop's time; a limited loop still away after the second does not settle
+_TAIL = 0.1  # share of a simulation in which the loop has to be at its end
+_ERRORS = (1.5, 15.0, 150.0)  # times the error for which the command just reaches its limit
+_STEPS = (1.5, 4.0)  # times the step for which the command just reaches its limit
+_REACHABLE = 0.9  # of the limit, the command at rest after the largest step that is to be followed
+_CLOSE = 0.5  # of the limit, the command at rest above which the plant's own slowness counts
+_UNREACHABLE = 1.5  # of the limit, the command that a step asks for which cannot be followed
+_SLOWER = (4.0, 16.0, 64.0)  # factors on the reference gain of `anti_windup_gain`, tried in this order
+
+
+class LimitedObstacle(Enum):
+    """Why nothing is said of a limited loop."""
+
+    LOOP_UNSTABLE = "the nominal loop is not stable"
+    PLANT_UNSTABLE = "the nominal plant is not stable: no controller follows every step with a limit"
+    TOO_SLOW = "the nominal loop takes too long to settle"
+    ALGEBRAIC = "the plant answers in the same sample"
+    ENDS_UNKNOWN = "the command does not say what it ends at"
+
+
+@dataclass(frozen=True)
+class LimitedLoop:
+    """A loop with limits, simulated on the nominal plant.
+
+    plant: its name, or "controller" for the controller alone under constant errors. steps: sizes of the
+    reference steps (constant errors), in the unit of the error. error_left: per step, the largest distance
+    from where the loop has to end in the last tenth of the simulation: of the output as a share of the step,
+    of the command as a share of its limit; the larger one. obstacle: why nothing is said, else None.
+    """
+
+    plant: str
+    steps: tuple[float, ...] = ()
+    error_left: tuple[float, ...] = ()
+    obstacle: LimitedObstacle | None = None
+
+    @property
+    def worst(self) -> float:
+        """Largest error left, 0 where no step was simulated."""
+        return max(self.error_left, default=0.0)
+
+    @property
+    def ends(self) -> bool:
+        """Whether every step ends where it has to; true where nothing is said."""
+        return bool(self.worst <= ERROR_LEFT)
+
+
+def limited_controller(controller: Controller) -> LimitedLoop:
+    """The controller of one loop by itself under constant errors beyond its limits.
+
+    Parameters
+    ----------
+    controller : Controller
+        With one error and one command, and a limit.
+
+    Returns
+    -------
+    LimitedLoop
+        Of the plant "controller". The command has to end at what the linear controller ends at, clipped: with
+        an integrator at the limit. Where only its rate is limited and it integrates, at the largest rate.
+    """
+    name = "controller"
+    law = _alone(controller)
+    linear = replace(law, input_limit=None, rate_limit=None)
+    silent = LinearMachine(control.ss([[0.0]], [[0.0]], [[1.0]], [[0.0]], law.dt_s))
+    speeds = np.concatenate([law.poles, np.linalg.eigvals(law.A - _gain(law) @ law.C)])
+    if np.any(np.abs(law.poles) > 1.0 + 1e-6):
+        return LimitedLoop(name, obstacle=LimitedObstacle.ENDS_UNKNOWN)
+    decaying = np.abs(speeds[np.abs(speeds) < 1.0 - 1e-6])
+    samples = _samples_to_settle(float(np.max(decaying, initial=0.0)))
+    if samples is None:
+        return LimitedLoop(name, obstacle=LimitedObstacle.TOO_SLOW)
+    samples *= _LONGER[0]
+
+    # What the linear controller asks for under an error of one.
+    asked = simulate(linear, silent, np.ones(samples)).command
+    tail = slice(-max(1, int(_TAIL * samples)), None)
+    limit = float(law.limits("input_limit")[0])
+    change = float(law.limits("rate_limit")[0]) * law.dt_s
+    largest = float(np.max(np.abs(asked)))
+    integrates = bool(abs(asked[-1] - asked[tail][0]) > ERROR_LEFT * abs(asked[-1]))
+    if not largest or not np.all(np.sign(asked[tail]) == np.sign(asked[-1])):
+        return LimitedLoop(name, obstacle=LimitedObstacle.ENDS_UNKNOWN)  # as that of a differentiator: zero
+
+    # Errors that ask for more than the limit at the end, and where the command has to end then.
+    sizes: list[float] = []
+    left: list[float] = []
+    if np.isfinite(limit):
+        ramp = int(np.ceil(limit / change)) if np.isfinite(change) else 0
+        if samples + ramp > _LONGEST:
+            return LimitedLoop(name, obstacle=LimitedObstacle.TOO_SLOW)
+        for factor in _ERRORS:
+            size = factor * limit / abs(float(asked[-1]))
+            command = simulate(law, silent, np.full(samples + ramp, size)).command
+            sizes.append(size)
+            left.append(float(np.max(np.abs(command[tail] / limit - np.sign(asked[-1])))))
+    else:
+        increments = np.diff(asked)
+        for factor in _ERRORS if integrates else ():
+            size = factor * change / abs(float(increments[-1]))
+            command = simulate(law, silent, np.full(samples, size)).command
+            sizes.append(size)
+            left.append(float(np.max(np.abs(np.diff(command)[tail] / change - np.sign(increments[-1])))))
+    return LimitedLoop(name, tuple(sizes), tuple(left))
+
+
+def limited_loop(controller: Controller, plant: UncertainPlant) -> LimitedLoop:
+    """Reference steps that meet the limits, on the nominal plant.
+
+    Parameters
+    ----------
+    controller : Controller
+        With one error and one command, and a limit.
+    plant : UncertainPlant
+        Its nominal model, with the controller's computational delay.
+
+    Returns
+    -------
+    LimitedLoop
+        Steps at which the command reaches its limit and which the plant can follow, and one that it cannot
+        follow where the plant does not integrate.
+    """
+    law = _alone(controller)
+    system = delayed(plant.nominal, controller.computational_delay_samples)
+    if np.any(np.asarray(system.D) != 0):
+        return LimitedLoop(plant.name, obstacle=LimitedObstacle.ALGEBRAIC)
+    poles = NominalLoop(plant, controller.computational_delay_samples).poles(law.A, law.B, law.C, law.D)
+    radius = float(np.max(np.abs(poles), initial=0.0))
+    if not radius < 1.0:
+        return LimitedLoop(plant.name, obstacle=LimitedObstacle.LOOP_UNSTABLE)
+    if plant.unstable_poles:
+        return LimitedLoop(plant.name, obstacle=LimitedObstacle.PLANT_UNSTABLE)
+    samples = _samples_to_settle(radius)
+    if samples is None:
+        return LimitedLoop(plant.name, obstacle=LimitedObstacle.TOO_SLOW)
+    machine = LinearMachine(system)
+
+    # The linear loop after a step of one: what it asks for, and where it ends.
+    linear = simulate(replace(law, input_limit=None, rate_limit=None), machine, np.ones(samples))
+    peak = float(np.max(np.abs(linear.command)))
+    largest_output = float(np.max(np.abs(linear.measured)))
+    if not peak or not largest_output:
+        return LimitedLoop(plant.name)
+    limit = float(law.limits("input_limit")[0])
+    rate = float(law.limits("rate_limit")[0])
+    command_at_end = 0.0 if plant.n_integrators else float(linear.command[-1])
+
+    # Steps that the plant can follow with its limits.
+    largest = limit / abs(command_at_end) if command_at_end else np.inf
+    sizes: list[float] = []
+    if np.isfinite(limit):
+        sizes += [min(factor * limit / peak, _REACHABLE * largest) for factor in _STEPS]
+        sizes = [size for size in dict.fromkeys(sizes) if size * peak > limit]
+        if np.isfinite(largest):
+            sizes.append(_UNREACHABLE * largest)
+    if np.isfinite(rate):
+        # The way to the peak at the largest rate takes as long as the linear loop's rise.
+        risen = int(np.argmax(np.abs(linear.measured) >= _REACHABLE * abs(linear.measured[-1]))) or 1
+        sizes.append(min(rate * law.dt_s * risen / peak, _REACHABLE * largest))
+
+    # Next to its limit the command moves the plant no faster than the plant moves by itself.
+    by_itself = _samples_to_settle(float(np.max(np.abs(plant.poles), initial=0.0)))
+    if by_itself is None:
+        sizes = [size for size in sizes if size < _CLOSE * largest]
+
+    left: list[float] = []
+    for size in sizes:
+        share = min(size, largest)
+        output_at_end = share * float(linear.measured[-1])
+        unit = limit if np.isfinite(limit) else size * peak
+        worst = np.inf
+        needed = samples if size < _CLOSE * largest else max(samples, by_itself or 0)
+        for longer in _LONGER:
+            run = simulate(law, machine, np.full(min(longer * needed, _LONGEST), size))
+            tail = slice(-max(1, int(_TAIL * run.command.size)), None)
+            off_output = np.max(np.abs(run.measured[tail] - output_at_end)) / (size * largest_output)
+            off_command = np.max(np.abs(run.command[tail] - share * command_at_end)) / unit
+            worst = float(np.nan_to_num(max(off_output, off_command), nan=np.inf))
+            if worst <= ERROR_LEFT or run.command.size == _LONGEST:
+                break
+        left.append(worst)
+    return LimitedLoop(plant.name, tuple(sizes), tuple(left))
+
+
+def limited_joints(controller: Controller, plant: MultivariablePlant) -> LimitedLoop:
+    """A step of each reference by itself that meets a limit, on the nominal plant.
+
+    Parameters
+    ----------
+    controller : Controller
+        Of any number of errors and commands, with a limit on one of them.
+    plant : MultivariablePlant
+        Its nominal model, with the controller's computational delay.
+
+    Returns
+    -------
+    LimitedLoop
+        Steps that the plant can follow, one reference after the other; `limited_loop` has steps beyond, too.
+        Without limits no steps.
+    """
+    if not controller.limited_commands.any():
+        return LimitedLoop(plant.name)
+    law = _alone(controller)
+    system = delayed(plant.nominal, controller.computational_delay_samples)
+    if np.any(np.asarray(system.D) != 0):
+        return LimitedLoop(plant.name, obstacle=LimitedObstacle.ALGEBRAIC)
+    poles = NominalLoop(plant, controller.computational_delay_samples).poles(law.A, law.B, law.C, law.D)
+    radius = float(np.max(np.abs(poles), initial=0.0))
+    if not radius < 1.0:
+        return LimitedLoop(plant.name, obstacle=LimitedObstacle.LOOP_UNSTABLE)
+    if np.any(np.abs(plant.poles) > 1.0 + 1e-6):
+        return LimitedLoop(plant.name, obstacle=LimitedObstacle.PLANT_UNSTABLE)
+    samples = _samples_to_settle(radius)
+    if samples is None:
+        return LimitedLoop(plant.name, obstacle=LimitedObstacle.TOO_SLOW)
+    machine = LinearMachine(system)
+    linear_law = replace(law, input_limit=None, rate_limit=None)
+    limits = law.limits("input_limit")
+    changes = law.limits("rate_limit") * law.dt_s
+
+    sizes: list[float] = []
+    left: list[float] = []
+    for channel in range(plant.outputs):
+        one = np.zeros(plant.outputs)
+        one[channel] = 1.0
+        linear_output, linear_command = simulate_joints(linear_law, machine, np.tile(one, (samples, 1)))
+        peak = np.max(np.abs(linear_command), axis=0)
+        rises = np.abs(linear_output[:, channel]) >= _REACHABLE * abs(linear_output[-1, channel])
+        risen = int(np.argmax(rises)) or 1
+        with np.errstate(divide="ignore"):
+            to_limit = float(np.min(limits / peak))
+            to_rate = float(np.min(changes * risen / peak))
+            largest = float(np.min(limits / np.abs(linear_command[-1])))
+        reached = [factor * to_limit for factor in _STEPS] if np.isfinite(to_limit) else []
+        reached += [to_rate] if np.isfinite(to_rate) else []
+        for size in dict.fromkeys(min(step, _REACHABLE * largest) for step in reached):
+            worst = np.inf
+            for longer in _LONGER:
+                steps = min(longer * samples, _LONGEST)
+                output, command = simulate_joints(law, machine, np.tile(size * one, (steps, 1)))
+                tail = slice(-max(1, int(_TAIL * steps)), None)
+                scale = size * float(np.max(np.abs(linear_output)))
+                off_output = np.max(np.abs(output[tail] - size * linear_output[-1])) / scale
+                off = np.abs(command[tail] - size * linear_command[-1])
+                off_command = np.max(off / np.where(np.isfinite(limits), limits, size * np.max(peak)))
+                worst = float(np.nan_to_num(max(off_output, off_command), nan=np.inf))
+                if worst <= ERROR_LEFT or steps == _LONGEST:
+                    break
+            sizes.append(size)
+            left.append(worst)
+    return LimitedLoop(plant.name, tuple(sizes), tuple(left))
+
+
+def limited_loops(controller: Controller, plants: Sequence[UncertainPlant]) -> tuple[LimitedLoop, ...]:
+    """The controller alone under constant errors, then the loop with every plant; none without limits."""
+    if not controller.limited_commands.any():
+        return ()
+    return (limited_controller(controller), *(limited_loop(controller, plant) for plant in plants))
+
+
+def with_safe_limits(
+    controller: Controller, check: Callable[[Controller], Iterable[LimitedLoop]]
+) -> Controller:
+    """The controller with the first anti-windup gain whose limited loops end where they have to.
+
+    Parameters
+    ----------
+    controller : Controller
+        With or without limits.
+    check : callable
+        Its limited loops, as those of `limited_loops`.
+
+    Returns
+    -------
+    Controller
+        With its own gain, else a slower one, else none where the controller is stable by itself. With its own
+        gain where none of them does: the certificate then says so.
+    """
+    if all(loop.ends for loop in check(controller)):
+        return controller
+    gains = [controller.gain_for_limits(factor) for factor in _SLOWER]
+    if np.all(np.abs(controller.poles) < 1.0):
+        gains.append(np.zeros_like(gains[0]))
+    for gain in gains:
+        tried = replace(controller, anti_windup_gain=gain)
+        if all(loop.ends for loop in check(tried)):
+            return tried
+    return controller
+
+
+def _alone(controller: Controller) -> Controller:
+    """The controller without what the simulated plant has (the delay), or friction would need."""
+    return replace(controller, computational_delay_samples=0, feedforward=None)
+
+
+def _gain(controller: Controller) -> Real:
+    """Its anti-windup gain, (n, U)."""
+    assert controller.anti_windup_gain is not None
+    return controller.anti_windup_gain
+
+
+def _samples_to_settle(radius: float) -> int | None:
+    """Samples until a mode of this pole radius has decayed to `_DECAY`; None for more than can be simulated."""
+    if radius >= 1.0:
+        return None
+    samples = _SHORTEST
+    if radius > 0.0:
+        samples = max(_SHORTEST, int(np.ceil(np.log(_DECAY) / np.log(radius))))
+    return samples if _LONGER[0] * samples <= _LONGEST else None
