@@ -158,8 +158,8 @@ def certify(
     joint_coverage: probability with which the weighted worst case shall hold for a whole response; needs rng
     and draws `joint_draws` responses (`joint_coverage.joint_coverage`). None: each frequency by itself.
 
-    A controller with limits is also simulated at them, on the nominal plants (`limited_loop`): constant errors
-    and reference steps beyond the limit have to end where they must.
+    A controller with limits is also simulated at them, on the nominal plants (`limited_loop`): constant
+    errors and reference steps beyond the limit have to end where they must.
 
     joint_stable_share: with a joint coverage, share of those responses that must be stable. It is a
     requirement of its own: ellipses propagate parameters to first order, and no level of theirs speaks for

@@ -24,17 +24,31 @@ from control_design.plants.plant_set import UncertainPlant, delayed
 ERROR_LEFT = 0.02
 """Of the step and of the limit: the band of a settling time, in which the limited loop has to end."""
 
-_LONGEST = 200_000  # samples of a simulation, 40 ms of computation for ten states: 200 s at 1 kHz
-_SHORTEST = 400  # samples of a simulation: what deadbeat loops need to be seen at rest
-_DECAY = 1e-3  # of a mode, after which it counts as gone; a tenth of `ERROR_LEFT` would be 0.002
-_LONGER = (4, 16)  # times the linear loop's time; a limited loop still away after the second does not settle
-_TAIL = 0.1  # share of a simulation in which the loop has to be at its end
-_ERRORS = (1.5, 15.0, 150.0)  # times the error for which the command just reaches its limit
-_STEPS = (1.5, 4.0)  # times the step for which the command just reaches its limit
-_REACHABLE = 0.9  # of the limit, the command at rest after the largest step that is to be followed
-_CLOSE = 0.5  # of the limit, the command at rest above which the plant's own slowness counts
-_UNREACHABLE = 1.5  # of the limit, the command that a step asks for which cannot be followed
-_SLOWER = (4.0, 16.0, 64.0)  # factors on the reference gain of `anti_windup_gain`, tried in this order
+# Samples of the longest simulation: 200 s at 1 kHz, and 0.1 s of computation for ten states.
+_LONGEST = 200_000
+# Samples of the shortest one, in which deadbeat loops are seen at rest.
+_SHORTEST = 400
+# Share to which the slowest mode of a loop that counts as settled has decayed: a twentieth of `ERROR_LEFT`.
+_DECAY = 1e-3
+# Lengths tried, in settling times of the linear loop: a limited loop moves slower. One that is not there
+# after the second does not settle.
+_LONGER = (4, 16)
+# Share of a simulation, its end, in which the loop has to be at rest.
+_TAIL = 0.1
+# Constant errors, in errors with which the command just reaches its limit in the time simulated.
+_ERRORS = (1.5, 15.0, 150.0)
+# Reference steps, in steps with which the linear command's peak just reaches the limit. Larger ones are those
+# of nobody who chose the limit for the machine.
+_STEPS = (1.5, 4.0)
+# Command at rest after the largest step that has to be followed, as a share of the limit; also the share of
+# its way after which a step counts as risen.
+_REACHABLE = 0.9
+# Command at rest, as a share of the limit, above which the time that the plant takes by itself counts, too.
+_CLOSE = 0.5
+# Command that a step asks for which cannot be followed, as a share of the limit.
+_UNREACHABLE = 1.5
+# Factors on the reference gain of `anti_windup_gain`, tried in this order: from half a decade to almost two.
+_SLOWER = (4.0, 16.0, 64.0)
 
 
 class LimitedObstacle(Enum):
@@ -328,7 +342,7 @@ def _gain(controller: Controller) -> Real:
 
 
 def _samples_to_settle(radius: float) -> int | None:
-    """Samples until a mode of this pole radius has decayed to `_DECAY`; None for more than can be simulated."""
+    """Samples until a mode of this pole radius has decayed to `_DECAY`; None if too many to simulate."""
     if radius >= 1.0:
         return None
     samples = _SHORTEST

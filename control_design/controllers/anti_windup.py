@@ -5,10 +5,10 @@ outside, M is one transfer function, V(z) = (I + C (zI - A)^-1 M)^-1, and
 
     w = V K e + (I - V) u.
 
-V holds the poles of K as its zeros and the eigenvalues of A - M C as its poles. M = 0 is V = I: the command is
-clipped and the states wind up. V = D K^-1 is the conditioned technique of Hanus, Kinnaert and Henrotte (1987).
-All choices of M are those of Kothare, Campo, Morari and Nett (1994), "A unified framework for the study of
-anti-windup designs", Automatica 30(12), with H2 = I. docs/theory/control.md has the mathematics of this file.
+V has the poles of K as its zeros and the eigenvalues of A - M C as its poles. M = 0 is V = I: the command is
+clipped and the states wind up. V = D K^-1 is the conditioned technique of Hanus, Kinnaert and Henrotte
+(1987). Every M is one of the designs of Kothare, Campo, Morari and Nett (1994), "A unified framework for the
+study of anti-windup designs", Automatica 30(12), with H2 = I. docs/theory/control.md has the mathematics.
 """
 
 from __future__ import annotations
@@ -20,21 +20,25 @@ import numpy as np
 from control_design.controllers.law import in_sections
 from control_design.plants.ellipses import Complex, Real
 
-_LOG_POINTS = 200  # frequencies at which V is looked at, on a logarithmic scale; 400 chose the same gains
-_LOWEST_SHARE = (
-    1e-5  # of the Nyquist frequency, the lowest of them: 0.5 rad/min at 1 kHz, slower than any loop
-)
-_LINEAR_POINTS = (
-    400  # midpoints on a linear scale, for the mean of log |V|; the mean moves by 1 % from 200 on
-)
-_LARGEST_V = (
-    2.0  # |V| at most, on the circle: an error of the limited command enters w as 1 - V, 3-fold at most
-)
-_SCAN_FACTOR = 10.0  # between two reference gains tried first; V changes over a decade of its reference gain
-_HALVINGS = 3  # of that decade, on a logarithmic scale: the reference gain is found within a third
-_SLOW = 1e-4  # distance from z = 1 below which a pole acts as an integrator in the test of V
-_ROUNDING = 1e-6  # relative: Re V of an integrator's V is 0 at z = 1, where only rounding has a sign
-_BALANCING_ROUNDS = 20  # of rows and columns in turn; each halves what is left of their differences
+# Frequencies at which V is looked at, on a logarithmic scale: 40 a decade, several across a damped mode.
+_LOG_POINTS = 200
+# Share of the Nyquist frequency at which they begin: 0.03 rad/s at 1 kHz, below the band of any loop.
+_LOWEST_SHARE = 1e-5
+# Midpoints on a linear scale for the mean of log |V|, which sets a bound only; twice as many move it by 1 %.
+_LINEAR_POINTS = 400
+# Largest |V| on the circle. The limited command enters the wanted one by I - V, so at most threefold. With 1
+# nothing but clipping is left; a large value corrects within a sample, on noise, too.
+_LARGEST_V = 2.0
+# Ratio of two reference gains tried first: V changes little within a decade.
+_SCAN_FACTOR = 10.0
+# Halvings of that decade (of its logarithm): the reference gain is then known within a third.
+_HALVINGS = 3
+# Distance from z = 1 below which a pole counts as an integrator in the test of V: 0.1 rad/s at 1 kHz.
+_SLOW = 1e-4
+# Relative: an integrator makes Re V = 0 at z = 1, where only rounding has a sign.
+_ROUNDING = 1e-6
+# Rounds of scaling rows and columns in turn; each at least halves what is left of their differences.
+_BALANCING_ROUNDS = 20
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,7 @@ def anti_windup_gain(A: Real, B: Real, C: Real, D: Real, *, slower: float = 1.0)
     A, B, C, D : arrays (n, n), (n, Y), (U, n), (U, Y)
         The controller, in any states; rows of C and D: the commands that have limits.
     slower : float
-        Factor on the reference gain k0 of the notes: above 1 the states follow the limited command more slowly.
+        Factor on the reference gain k0 of the notes: above 1 the states follow the limit more slowly.
 
     Returns
     -------
@@ -120,7 +124,8 @@ def anti_windup_gain(A: Real, B: Real, C: Real, D: Real, *, slower: float = 1.0)
     Raises
     ------
     ValueError
-        If a mode on or outside the unit circle cannot be corrected: no command shows it, or no error moves it.
+        If a mode on or outside the unit circle cannot be corrected: no command shows it, or no error
+        moves it.
 
     Notes
     -----
@@ -128,17 +133,17 @@ def anti_windup_gain(A: Real, B: Real, C: Real, D: Real, *, slower: float = 1.0)
 
         V V* = c (I + K K* / k0^2)^-1,
 
-    for one command |V| = sqrt(c) / sqrt(1 + |K|^2 / k0^2): where the controller's gain is above k0, the
-    command follows its limit, elsewhere it is clipped. It solves a Kalman filter's Riccati equation with state
-    noise B, output noise D, and k0 for the noise of the limited command. k0 is the smallest gain for which
+    for one command |V| = sqrt(c) / sqrt(1 + |K|^2 / k0^2): at frequencies where the controller's gain is
+    above k0 its states follow the limited command, elsewhere the command is only clipped. M is the gain of a
+    Kalman filter with state noise B, output noise D and measurement noise k0. k0 is the smallest gain with
 
-    - V + V* >= 0 on the unit circle. The inner loop w -> u -> w is then incrementally stable for every
-      saturation between 0 and 1 (circle criterion), so a constant error cannot make it hunt. A
-      controller with several integrators cannot meet this; all but one of them are left out of the test, with
-      as many of the slowest eigenvalues of A - M C;
-    - |V| <= 2 on the circle. The mean of log |V| over the circle is 0 (Jensen), which tells c from k0.
+    - V + V* >= 0 on the unit circle. The inner loop w -> u -> w is then stable for every saturation between
+      0 and 1, also for the difference of two of its trajectories (circle criterion), so a constant error
+      cannot make it hunt. A controller with several integrators cannot meet this; all but one of them are
+      left out of the test, with as many of the slowest eigenvalues of A - M C;
+    - |V| <= 2 on the circle. The mean of log |V| over the circle is 0 (Jensen), so c follows from k0.
 
-    If none passes, the one whose V comes nearest. Neglected: the plant. `limited_loop` checks the closed loop.
+    If none passes, the one whose V comes nearest. Neglected: the plant; `limited_loop` checks the loop.
     """
     n = A.shape[0]
     if n == 0:
@@ -155,10 +160,10 @@ def anti_windup_gain(A: Real, B: Real, C: Real, D: Real, *, slower: float = 1.0)
         if extra_integrators:
             closed = np.linalg.eigvals(law.A - gain @ law.C)
             slowest = closed[np.argsort(np.abs(closed - 1.0))][:extra_integrators]
-            radii = np.exp(-np.abs(np.log(slowest)))  # of a pair both as if damped
-            correction = (
-                correction * np.prod((z[:, None] - radii) / (z[:, None] - 1.0), axis=1)[:, None, None]
-            )
+            with np.errstate(divide="ignore"):
+                radii = np.exp(-np.abs(np.log(slowest)))  # of a pair as of two real ones equally fast
+            left_out = np.prod((z[:, None] - radii) / (z[:, None] - 1.0), axis=1)
+            correction = correction * left_out[:, None, None]
         hermitian = 0.5 * (correction + np.conj(np.swapaxes(correction, -2, -1)))
         smallest = np.linalg.eigvalsh(hermitian)[:, 0]
         return float(np.max(-smallest / np.linalg.norm(correction, ord=2, axis=(-2, -1))))
@@ -200,16 +205,19 @@ def anti_windup_gain(A: Real, B: Real, C: Real, D: Real, *, slower: float = 1.0)
         if law.radius(np.zeros((n, C.shape[0]))) < 1.0:
             return np.zeros((n, C.shape[0]))
         raise ValueError(
-            "no anti-windup gain found for the limits: the controller has a marginal mode that its output does "
-            "not show or its error does not move, or too many poles close together for its state space; give "
-            "it in sections, or anti_windup_gain"
+            "no anti-windup gain found for the limits: the controller has a marginal mode that its output "
+            "does not show or its error does not move, or too many poles close together for its state space; "
+            "give it in sections, or anti_windup_gain"
         )
     return np.asarray(law.states @ passed[1] / law.command_unit, dtype=np.float64)
 
 
 def _least_reference(law: SectionedLaw) -> float:
-    """Reference gain k0 at which |V| reaches `_LARGEST_V` on the circle: of V V* = c (I + K K*/k0^2)^-1 the mean
-    of log det is 0, so log c is the mean of log det(I + K K*/k0^2), for each command."""
+    """Reference gain k0 at which |V| reaches `_LARGEST_V` on the circle.
+
+    The mean of log det V V* is 0 there, so with V V* = c (I + K K*/k0^2)^-1 and U commands U log c is the
+    mean of log det(I + K K*/k0^2).
+    """
     angles = np.pi * (np.arange(_LINEAR_POINTS) + 0.5) / _LINEAR_POINTS
     gains = np.linalg.svd(law.response(np.exp(1j * angles)), compute_uv=False)
     largest = float(np.max(gains))

@@ -29,7 +29,7 @@ class Controller(Law):
 
     A (n, n), B (n, Y), C (U, n), D (U, Y); dt_s > 0. input_limit, rate_limit: saturation (both signs) and
     largest change per second of the command, or None; with U > 1 a tuple of these. anti_windup_gain M (n, U):
-    what the states learn of an active limit, A - M C stable; default that of `anti_windup`, without limits zero.
+    what an active limit does to the states, A - M C stable; None takes that of `anti_windup`.
     computational_delay_samples: from measurement to command. feedforward: joins u before it is limited, or
     None. signals: the columns and units of error and command, in words.
     """

@@ -143,7 +143,15 @@ def certify_controller(
     doubts = [words(doubt) for doubt in done.certificate.warnings]
     return RunSummary(
         title=f"certificate of {controller}",
-        sections=rows_of("summary/certify.j2", sources=sources, law=law, worst=worst, found=found, held=held),
+        sections=rows_of(
+            "summary/certify.j2",
+            sources=sources,
+            law=law,
+            worst=worst,
+            found=found,
+            held=held,
+            certificate=done.certificate,
+        ),
         numbers={
             "plants": [{"plant": source.plant.name, "origin": source.origin} for source in sources],
             "controller": str(controller),

@@ -144,7 +144,8 @@ class TuningSession:
             if all(np.all(np.abs(closed_loop_poles(law, plant)) < 1) for plant in plants):
                 margins = [loop_margins(law, p, one)[1:] for p, one in zip(plants, worst, strict=True)]
                 numbers = {"gain": gain, "gamma": gamma, "certified": None}
-                return {**_finite(numbers), **self._seen(law, plants, specification, gamma, margins)}
+                seen = self._seen(law, plants, specification, gamma, margins, said("limits_not_looked_at"))
+                return {**_finite(numbers), **seen}
         raise InputError("no gain keeps the last controller stable with these settings")
 
     def near(self, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -193,7 +194,8 @@ class TuningSession:
             still()
             self._last = law
         margins = [(verdict.worst_margins, verdict.bandwidth_rad_s) for verdict in certificate.plants]
-        seen = self._seen(law, plants, used, certificate.gamma, margins)
+        at_limits = said("limited_loops", certificate)
+        seen = self._seen(law, plants, used, certificate.gamma, margins, at_limits)
         items = [
             {
                 "requirement": item.requirement + (f" ({item.plant})" if len(plants) > 1 else ""),
@@ -244,9 +246,10 @@ class TuningSession:
         specification: Specification,
         gamma: float,
         margins: Sequence[tuple[Margins, float]],
+        at_limits: str,
     ) -> dict[str, Any]:
         """Numbers (words, value) and curves of a loop. margins: over the ellipses of each plant, with its
-        bandwidth [rad/s]."""
+        bandwidth [rad/s]. at_limits: what is said of the loop at the controller's limits."""
         runs = [self._steps(law, plant) for plant in plants]
         table = rows_of(
             "summary/tune.j2",
@@ -256,6 +259,7 @@ class TuningSession:
             steps=[step_metrics(nominal) for nominal, *_ in runs],
             unit=self._units[0],
             order=law.order,
+            limits=at_limits,
         )
         curves = []
         for plant, (nominal, *drawn) in zip(plants, runs, strict=True):
