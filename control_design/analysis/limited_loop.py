@@ -121,8 +121,9 @@ def limited_controller(controller: Controller) -> LimitedLoop:
     change = float(law.limits("rate_limit")[0]) * law.dt_s
     largest = float(np.max(np.abs(asked)))
     integrates = bool(abs(asked[-1] - asked[tail][0]) > ERROR_LEFT * abs(asked[-1]))
-    if not largest or not np.all(np.sign(asked[tail]) == np.sign(asked[-1])):
-        return LimitedLoop(name, obstacle=LimitedObstacle.ENDS_UNKNOWN)  # as that of a differentiator: zero
+    one_sign = bool(np.all(np.sign(asked[tail]) == np.sign(asked[-1])))
+    if not one_sign or not abs(asked[-1]) > _DECAY * largest:  # a differentiator ends at zero
+        return LimitedLoop(name, obstacle=LimitedObstacle.ENDS_UNKNOWN)
 
     # Errors that ask for more than the limit at the end, and where the command has to end then.
     sizes: list[float] = []

@@ -35,8 +35,9 @@ _SCAN_FACTOR = 10.0
 _HALVINGS = 3
 # Distance from z = 1 below which a pole counts as an integrator in the test of V: 0.1 rad/s at 1 kHz.
 _SLOW = 1e-4
-# Relative: an integrator makes Re V = 0 at z = 1, where only rounding has a sign.
-_ROUNDING = 1e-6
+# Of |V|, by which Re V may fall below zero: an integrator makes both zero at z = 1, and next to it rounding
+# of a companion form decides the sign. 0.06 deg of phase beyond 90 deg.
+_ROUNDING = 1e-3
 # Rounds of scaling rows and columns in turn; each at least halves what is left of their differences.
 _BALANCING_ROUNDS = 20
 

@@ -99,6 +99,8 @@ class Law:
         n = values["C"].size // u
         shapes = {"A": (n, n), "B": (n, y), "C": (u, n), "D": (u, y), "anti_windup_gain": (n, u)}
         for name in shapes.keys() & values.keys():
+            if values[name] is None:
+                continue
             if values[name].size != np.prod(shapes[name]):
                 raise ValueError(f"{cls.kind} file: {name} has {values[name].size} numbers, C has {n}")
             values[name] = values[name].reshape(shapes[name])
@@ -108,6 +110,8 @@ class Law:
     def _read(cls, name: str, hint: Any, data: Mapping[str, Any]) -> Any:
         """A field of a file: an array of numbers, or what its annotation says."""
         value = data[name]
+        if value is None and name == "anti_windup_gain":  # to be found from the rest
+            return None
         try:
             if _holds_truth(value):
                 raise TypeError
