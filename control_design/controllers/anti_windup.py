@@ -38,6 +38,8 @@ _SLOW = 1e-4
 # Of |V|, by which Re V may fall below zero: an integrator makes both zero at z = 1, and next to it rounding
 # of a companion form decides the sign. 0.06 deg of phase beyond 90 deg.
 _ROUNDING = 1e-3
+# Distance from z = -1 below which a pole (of a derivative by the trapezoidal rule) has no place in s.
+_AT_MINUS_ONE = 1e-6
 # Rounds of scaling rows and columns in turn; each at least halves what is left of their differences.
 _BALANCING_ROUNDS = 20
 
@@ -242,13 +244,22 @@ def _spectral_gain(law: SectionedLaw, reference: float) -> Real | None:
 
     Solved in the plane s = (z - 1)/((z + 1) scale), in which slow poles of a fast controller lie apart.
     """
-    from scipy.linalg import solve_continuous_are
+    from scipy.linalg import solve_continuous_are, solve_discrete_are
 
     n = law.A.shape[0]
     commands = law.C.shape[0]
     identity = np.eye(n)
+    poles = np.linalg.eigvals(law.A)
     try:
-        inverse = np.linalg.inv(law.A + identity)  # a pole at z = -1 has no s
+        if np.min(np.abs(poles + 1.0)) < _AT_MINUS_ONE:
+            b = law.B / reference
+            d = law.D / reference
+            output_noise = np.eye(commands) + d @ d.T
+            covariance = solve_discrete_are(law.A.T, law.C.T, b @ b.T, output_noise, s=b @ d.T)
+            seen = law.C @ covariance @ law.C.T + output_noise
+            gain = np.linalg.solve(seen, law.C @ covariance @ law.A.T + d @ b.T).T
+            return gain if law.radius(gain) < 1.0 else None
+        inverse = np.linalg.inv(law.A + identity)
         a = inverse @ (law.A - identity)
         speeds = np.abs(np.linalg.eigvals(a))
         scale = float(np.exp(np.mean(np.log(np.clip(speeds, _LOWEST_SHARE, 1.0)))))

@@ -39,6 +39,10 @@ def _companion(top, bottom, dt_s, method="zoh"):
         above, below, _ = scipy.signal.cont2discrete((top, bottom), dt_s, method)
         above = above.ravel()
         above[0] *= len(top) == len(bottom)  # else rounding
+    return _companion_in_z(above, below)
+
+
+def _companion_in_z(above, below):
     direct = above[0]
     a = np.eye(below.size - 1, k=-1)
     a[0] = -below[1:]
@@ -92,6 +96,13 @@ def _two_integrators():
 def _without_integrator():
     """A slow lag in place of the integrator, with a roll-off: asks for 10 times the error at rest."""
     return _companion(2 * np.array([1.0, 5.0]), np.polymul([1.0, 1.0], _rolled_off(3)), 1e-3)
+
+
+def _trapezoidal_derivative():
+    """PID with an unfiltered derivative by the trapezoidal rule: poles at z = 1 and at z = -1."""
+    top = _product([1 / 8.0, 1.0], [1 / 8.0, 1.0])
+    above, below = scipy.signal.bilinear(top, [1.0, 0.0], 1e3)
+    return _companion_in_z(above, below)
 
 
 LAWS = {
@@ -295,3 +306,10 @@ def test_units_of_several_commands_do_not_matter():
     scaled = anti_windup_gain(a, b @ size, size @ c, size @ d @ size)
     np.testing.assert_allclose(scaled @ size, gain, rtol=0, atol=1e-5 * np.max(np.abs(gain)))
     assert np.max(np.abs(np.linalg.eigvals(a - gain @ c))) < 1
+
+
+def test_a_pole_at_minus_one_is_corrected_too():
+    law = Controller(*_trapezoidal_derivative(), 1e-3, input_limit=1.0, computational_delay_samples=0)
+    assert np.min(np.abs(law.poles + 1)) < 1e-9
+    assert np.max(np.abs(np.linalg.eigvals(law.A - law.anti_windup_gain @ law.C))) < 1
+    np.testing.assert_array_equal(_commands(law, np.full(6000, 0.3))[-1000:], 1.0)
