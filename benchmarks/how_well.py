@@ -179,6 +179,15 @@ SECTIONS = {
             "{1} of {0} certified: the others are refused with their active constraint",
         ),
         Row(
+            "Controllers with limits as compiled C code, constant errors and steps beyond the limit: wrong",
+            "limited_controllers",
+            r"^wrong: (\d+) of (\d+) laws, in (\d+) runs",
+            "{} of {} controllers, {} runs",
+            r"^(?:companion|sections|tf2ss|random states|  \w[\w ]*?) +(\d+) of (\d+)$",
+            "{} of {}",
+            largest=True,
+        ),
+        Row(
             "Numbers of certificates of controllers made by hand, against eigenvalues: false",
             "controllers_by_hand",
             r"^(\d+) controllers.*?; (\d+) numbers checked\nfalse: (\d+);",

@@ -108,11 +108,10 @@ def limited_controller(controller: Controller) -> LimitedLoop:
     speeds = np.concatenate([law.poles, np.linalg.eigvals(law.A - _gain(law) @ law.C)])
     if np.any(np.abs(law.poles) > 1.0 + 1e-6):
         return LimitedLoop(name, obstacle=LimitedObstacle.ENDS_UNKNOWN)
-    decaying = np.abs(speeds[np.abs(speeds) < 1.0 - 1e-6])
-    samples = _samples_to_settle(float(np.max(decaying, initial=0.0)))
-    if samples is None:
-        return LimitedLoop(name, obstacle=LimitedObstacle.TOO_SLOW)
-    samples *= _LONGER[0]
+    # A pole too slow to be seen decay acts as an integrator for as long as is simulated.
+    slowest = np.exp(np.log(_DECAY) * _LONGER[0] / _LONGEST)
+    decaying = np.abs(speeds[np.abs(speeds) < slowest])
+    samples = _LONGER[0] * (_samples_to_settle(float(np.max(decaying, initial=0.0))) or _SHORTEST)
 
     # What the linear controller asks for under an error of one.
     asked = simulate(linear, silent, np.ones(samples)).command

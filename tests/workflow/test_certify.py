@@ -86,6 +86,24 @@ def test_what_cannot_be_compared_is_bad_input(refused, example, file, old, new, 
     assert re.search(words, refused(*example, "controller.json", "--baseline", "margins.toml"))
 
 
+def test_what_is_said_of_a_limited_loop(flexlink, example):
+    """Nothing without a limit; with one that it ends where it must, or that it does not, which is no
+    certificate."""
+    told = flexlink(*example, "controller.json")
+    assert "nothing is said: the controller has no input_limit and no rate_limit" in " ".join(
+        told.out.split()
+    )
+    law = Controller.from_json(Path("controller.json").read_text())
+    open_gain = law.to_dict() | {"input_limit": 1.0, "anti_windup_gain": None}
+    Path("limited.json").write_text(json.dumps(open_gain))
+    told = flexlink(*example, "limited.json", "--json").document()["numbers"]["certificate"]
+    alone, loop = told["limited"]
+    assert (alone["plant"], loop["plant"]) == ("controller", "arm")
+    assert max(alone["error_left"] + loop["error_left"]) < 0.02
+    about = {item["requirement"] for item in told["items"] if "limited" in item["requirement"]}
+    assert len(about) == 2
+
+
 def test_what_is_no_controller_is_bad_input(refused, example, fast_run):
     assert "holds a model" in refused(*example, fast_run[0] / "model.json")
     Path("law.json").write_text('{"zeros": [[0.5, 0.1]], "poles": [1], "gain": 1, "dt_s": 0.005}')

@@ -190,6 +190,18 @@ def test_several_plants_share_a_design(folder):
     assert found["plants"][0]["nyquist"] != found["plants"][1]["nyquist"]
 
 
+def test_a_design_says_what_is_said_of_its_limits(session):
+    free = dict(session.design({})["numbers"])
+    assert "no input_limit" in free["at the limits"]
+    limited = session.design({"input_limit": 2.0})
+    assert "end where they must" in dict(limited["numbers"])["at the limits"]
+    assert sum("limited" in item["requirement"] for item in limited["items"]) == 2, dict(limited["numbers"])[
+        "at the limits"
+    ]
+    assert all(item["met"] for item in limited["items"])
+    assert "before the design ends" in dict(session.scaled({"input_limit": 2.0})["numbers"])["at the limits"]
+
+
 def test_a_specification_that_contradicts_itself_is_a_result(session):
     found = session.design({"bandwidth_rad_s": 60.0, "effort_limit": None})
     assert found["certified"] is False
