@@ -257,8 +257,9 @@ def _spectral_gain(law: SectionedLaw, reference: float) -> Real | None:
             output_noise = np.eye(commands) + d @ d.T
             covariance = solve_discrete_are(law.A.T, law.C.T, b @ b.T, output_noise, s=b @ d.T)
             seen = law.C @ covariance @ law.C.T + output_noise
-            gain = np.linalg.solve(seen, law.C @ covariance @ law.A.T + d @ b.T).T
-            return gain if law.radius(gain) < 1.0 else None
+            predicted = law.C @ covariance @ law.A.T + d @ b.T
+            discrete: Real = np.asarray(np.linalg.solve(seen, predicted).T, dtype=np.float64)
+            return discrete if law.radius(discrete) < 1.0 else None
         inverse = np.linalg.inv(law.A + identity)
         a = inverse @ (law.A - identity)
         speeds = np.abs(np.linalg.eigvals(a))

@@ -261,7 +261,7 @@ def test_a_design_that_takes_damping_from_a_mode_says_so(unbuilt, tmp_path):
         lost = "mode at 33 Hz loses damping: 0.02 in open loop, 0.011 in closed loop"
         text, summary = text_of(run, settings), summarise(RunResults(run), settings)
         assert (f"The {lost}" in text) == ("the loop takes damping from a mode" in text) == told
-        assert ("Certified: all 2 requirements are met" in text) == (not told)
+        assert ("Certified: all 4 requirements are met" in text) == (not told)
         assert (lost in summary.verdict) == told
         changes = summary.numbers["certificate"]["plants"][0]["mode_changes"]
         assert changes[1]["closed_loop"]["zeta"] == after
@@ -272,7 +272,7 @@ def test_a_design_that_takes_damping_from_a_mode_says_so(unbuilt, tmp_path):
     run.save_stage("uncertainty", replace(spread, channels=doubted), "x")
     text, summary = text_of(run, settings), summarise(RunResults(run), settings)
     assert "Certified, but the ellipses are in doubt" in text
-    assert "Certified: all 2 requirements are met" not in text
+    assert "Certified: all 4 requirements are met" not in text
     told = summary.numbers["certificate_conditions"]
     assert [words[:31] for words in told] == ["dry friction was not identified"]
     assert "But dry friction was not identified" in summary.verdict
