@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import firwin
 
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
@@ -28,15 +27,15 @@ from ident.friction import FrictionFit
 SAME_RATIO = 1e-3
 # Taps beyond those of the posterior: what a delay of a part of a step leaves behind the poles.
 TAPS = 6
-# Length of the high-pass that tells what was measured from what was not, in steps of the log: its transition
-# is then a quarter of the log's Nyquist frequency wide (Hamming window: 3.3 over the length).
-HIGH_PASS_STEPS = 13
-# Middle of that transition, as a share of the log's Nyquist frequency: up to a third of it what was folded
-# back from above is less than 1 % of the response of an inertia.
-KNOWN_UP_TO = 0.6
+# Power of sin(w Td / 2) with which ellipses open towards the log's Nyquist frequency, where they are as wide
+# as the response: 1 % of it at .3 of that frequency. A filter of few taps; a steeper one ripples above, and
+# proofs between grid points do not get through.
+OPENING_POWER = 4
 # Ellipses hold so many times (w T / 2 pi)^2 of the response for what was folded back: an arm that falls with
 # 1/w has 1.4 of it at .3 of the log's Nyquist frequency.
 FOLDED_BACK = 1.5
+# Share of a response below which what was folded back does not count: a tenth of what most logs tell.
+LEAST_FOLDED = 1e-4
 # Weight of a response of this size above the log's Nyquist frequency, beside relative errors below: it
 # decides only what the data leave open.
 FALLS_WEIGHT = 0.02
@@ -95,7 +94,7 @@ def resampled(posterior: ResponsePosterior, controller_dt_s: float) -> ResponseP
     -------
     ResponsePosterior
         With dt_s = controller_dt_s. Of a faster controller the ellipses above the log's Nyquist frequency are
-        as wide as the response, which continues as the modes do: nothing was measured there.
+        wider than the response, which continues as the modes do: nothing was measured there.
 
     Raises
     ------
@@ -115,7 +114,7 @@ def resampled(posterior: ResponsePosterior, controller_dt_s: float) -> ResponseP
     delay = int(np.floor(delay_s / controller_dt_s * (1 + 1e-9)))
     n_taps = int(np.ceil(posterior.fir_length / power)) + TAPS
     # The last taps are left to what is not known of a faster controller's response: a filter of the rest.
-    n_left = HIGH_PASS_STEPS * up + up + 1 if up > 1 else 0
+    n_left = OPENING_POWER + up if up > 1 else 0
     n_taps = min(n_taps, MOST_TAPS) + n_left
     poles = resampled_poles(posterior.poles, posterior.dt_s, controller_dt_s)
     size = poles.order + int(posterior.has_feedthrough) + n_taps
@@ -145,9 +144,10 @@ def resampled(posterior: ResponsePosterior, controller_dt_s: float) -> ResponseP
         shorter = Hold(1 / up).response(omega * posterior.dt_s)
         wanted = (posterior.frequency_rows(omega) @ known) * shorter[:, None]
         omega, wanted = _falling_above(omega, wanted, posterior.dt_s, up)
-    size_there = np.abs(wanted[:, :1])
-    weight = 1 / size_there
+    weight = 1 / np.abs(wanted[:, :1])
     if up > 1:
+        # Exact where nothing was folded back; elsewhere as exact as what was.
+        weight /= np.maximum((omega * posterior.dt_s / (2 * np.pi))[:, None] ** 2, LEAST_FOLDED)
         above = omega > np.pi / posterior.dt_s
         weight[above] *= FALLS_WEIGHT
         wanted[above] = 0.0
@@ -200,18 +200,17 @@ def _held(posterior: ResponsePosterior, omega: RealArray, steps: int) -> Complex
 def _unknown_above(posterior: ResponsePosterior, log_dt_s: float, up: int) -> RealArray:
     """(P, 4) directions of what the log does not show of a faster controller's response.
 
-    Two are as wide as the response above the log's Nyquist frequency, and of no width below. Two hold what
-    was folded back: at w the log has seen what the arm does at 2 pi / T - w, too, which is up to
+    Two are as wide as the response at the log's Nyquist frequency, wider above, and close below. Two hold
+    what was folded back: at w the log has seen what the arm does at 2 pi / T - w, too, which is up to
     (w T / 2 pi)^2 of the response where it falls with 1/w or faster. The response times a few taps lies in
-    the span of poles and taps; the same a sample of the log later is the other direction of an ellipse.
+    the span of poles and taps; the same a sample later is the other direction of an ellipse.
     """
     angle = np.union1d(np.geomspace(LOWEST_ANGLE_RAD, 0.99 * np.pi, 600), np.linspace(0.0, 3.1, 600)[1:])
     omega = angle / posterior.dt_s
     later = np.exp(-1j * omega * posterior.dt_s)
-    taps = firwin(HIGH_PASS_STEPS * up // 2 * 2 + 1, KNOWN_UP_TO / up, pass_zero=False)
-    high_pass = np.polyval(taps[::-1], later)
+    opening = ((1 - later) / (2 * np.sin(np.pi / (2 * up)))) ** OPENING_POWER
     folded = FOLDED_BACK * (up / np.pi) ** 2 * (1 - later) ** 2
-    wanted = np.column_stack([high_pass, high_pass * later, folded, folded * later**up]) / chi2_radius(LEVEL)
+    wanted = np.column_stack([opening, opening * later, folded, folded * later**up]) / chi2_radius(LEVEL)
     rows = posterior.frequency_rows(omega) / posterior.centre(omega)[:, None]
     length = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(np.float64).tiny)
     solved = np.linalg.lstsq(real_rows(rows / length), real_rows(wanted), rcond=1e-11)[0]
