@@ -9,6 +9,7 @@ import numpy as np
 from ident.basis.coordinates import ZETA_LIMIT
 from ident.basis.model import GobfModel, MisoModel
 from ident.basis.poles import DEADBEAT, Poles
+from ident.data.arrays import BoolArray, ComplexArray, RealArray
 from ident.data.finding import Finding, FindingKind, finding
 from ident.fit.refinement import Bounds
 
@@ -16,6 +17,8 @@ from ident.fit.refinement import Bounds
 FEWEST_PERIODS = 3.0
 # Above it (overshoot of a step below 10 %) a pair swings no more than two real poles do.
 LARGEST_DAMPING = 0.6
+# Relative: a pole that a search holds at its least width is within it; exp and log round on the way.
+_HELD_AT_BOUND = 1 + 1e-6
 # Lightly damped: above it a pair's peak, or notch, is less than 1.75 of the gain at rest, 1 / (2 zeta).
 LIGHT = 0.3
 
@@ -52,6 +55,36 @@ def implausible_pairs(poles: Poles, fixed: Poles, dt_s: float, longest_s: float)
         elif kind is PairKind.OVERDAMPED:
             found.append(finding(FindingKind.DAMPED_PAIR, **pair, largest_zeta=LARGEST_DAMPING))
     return found
+
+
+def poles_without_data(poles: Poles, fixed: Poles, measured_rad: RealArray) -> Poles:
+    """Searched poles that have no measured band within their half-power width.
+
+    Parameters
+    ----------
+    poles, fixed : Poles
+        All poles of a fit, the known ones (fixed) first of each type.
+    measured_rad : (K, 2) array
+        Low and high end of each measured band in rad/sample, from 0 to pi; a single frequency has both ends.
+
+    Returns
+    -------
+    Poles
+        Those whose decay per sample, -ln |p|, is smaller than the distance of their angle to every band. A
+        positive real pole stands at angle 0, a negative one at pi.
+    """
+    real = poles.real[fixed.real.size :]
+    pairs = poles.pairs[fixed.pairs.size :]
+    low, high = measured_rad.T
+
+    def without(values: ComplexArray) -> BoolArray:
+        # A pole at zero has no angle and an infinite width.
+        decay = -np.log(np.maximum(np.abs(values), np.finfo(float).tiny))
+        angle = np.abs(np.angle(values))[:, None]
+        distance = np.maximum(np.maximum(low - angle, angle - high), 0.0).min(axis=1)
+        return np.asarray(distance > decay * _HELD_AT_BOUND)
+
+    return Poles(real[without(real.astype(np.complex128))], pairs[without(pairs)])
 
 
 def pairs_outside(poles: Poles, fixed: Poles, dt_s: float, band_rad_s: tuple[float, float]) -> list[Finding]:

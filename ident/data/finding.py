@@ -83,6 +83,8 @@ class FindingKind(Enum):
     NOMINAL_OUTSIDE = auto()
     NOT_INDEPENDENT = auto()
     CHI_SQUARE = auto()
+    ASSUMED_OUTSIDE = auto()
+    RESPONSE_AT_ONCE = auto()
     # Records made in closed loop.
     TWO_STAGE = auto()
     INDIRECT = auto()

@@ -17,15 +17,34 @@ from ident.fit.kernels import backward, factorise, forward, schur_drop
 
 # Order of the numbers in an array of bounds (see `ident.fit.refinement.Bounds`).
 _DISTANCE_MIN, _DISTANCE_MAX, _OMEGA_MIN, _OMEGA_MAX, _ZETA_MIN, _ZETA_MAX, _S_MIN = range(7)
+# Whatever follows these seven are measured bands [rad/sample], low and high in turn; `narrowest` reads them.
+_FIRST_BAND = 7
 # Pieces of the two compiled functions at the end: as functions of their own they would be compiled twice.
 _inlined = numba.njit(**COMPILED, inline="always")
 _CLOSE = 1e-7  # poles pass through exp and log on their way to a bound
 
 
 @_inlined
+def narrowest(f: float, bounds: Any) -> float:
+    """Least decay per sample of a pair at angle f [rad/sample]: its distance to the nearest measured band.
+
+    A resonance is 2 s wide at half its power, so something measured then lies within that width. 0 where the
+    bounds list no measured bands.
+    """
+    if bounds.size <= _FIRST_BAND:
+        return 0.0
+    distance = np.inf
+    for i in range(_FIRST_BAND, bounds.size, 2):
+        distance = min(distance, max(bounds[i] - f, f - bounds[i + 1], 0.0))
+    return distance
+
+
+@_inlined
 def clip_parameters(x: Any, n_free_real: int, bounds: Any) -> Any:
-    """The unknowns (1 - a; s, f) inside the bounds; frequency and damping are clipped, then s and f
-    formed."""
+    """The unknowns (1 - a; s, f) inside the bounds; frequency and damping are clipped, then s and f formed.
+
+    A pair that is narrower than its distance to the data is widened, but never beyond the largest damping.
+    """
     inside = np.empty_like(x)
     for i in range(n_free_real):
         inside[i] = min(max(x[i], bounds[_DISTANCE_MIN]), bounds[_DISTANCE_MAX])
@@ -36,6 +55,8 @@ def clip_parameters(x: Any, n_free_real: int, bounds: Any) -> Any:
         omega = min(max(omega, bounds[_OMEGA_MIN]), bounds[_OMEGA_MAX])
         inside[i] = max(zeta * omega, bounds[_S_MIN])
         inside[i + 1] = min(omega * math.sqrt(1 - zeta * zeta), 0.995 * np.pi)
+        widest = inside[i + 1] * bounds[_ZETA_MAX] / math.sqrt(1 - bounds[_ZETA_MAX] ** 2)
+        inside[i] = max(inside[i], min(narrowest(inside[i + 1], bounds), widest))
     return inside
 
 
@@ -53,7 +74,8 @@ def blocked(x: Any, gradient: Any, n_free_real: int, bounds: Any) -> Any:
         omega = math.hypot(x[i], x[i + 1])
         zeta = x[i] / omega
         if gradient[i] < 0:
-            held[i] = x[i] <= bounds[_S_MIN] * low or zeta <= bounds[_ZETA_MIN] * low
+            least = max(bounds[_S_MIN], narrowest(x[i + 1], bounds))
+            held[i] = x[i] <= least * low or zeta <= bounds[_ZETA_MIN] * low
         elif gradient[i] > 0:
             held[i] = zeta >= bounds[_ZETA_MAX] * high
         if gradient[i + 1] < 0:

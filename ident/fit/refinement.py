@@ -8,7 +8,7 @@ p = exp(-s +- j f) of a pair.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -30,8 +30,10 @@ _GROWTH = 4.0
 class Bounds:
     """Sides that a refined pole keeps: user bounds, and the circle itself.
 
-    decay: 1 - a of real poles; omega: |log p|, zeta; s_min: least decay per sample of a pair. Compiled code
-    takes them in this order (`ident.fit.pole_unknowns`).
+    distance: 1 - a of real poles; omega: |log p|, zeta; s_min: least decay per sample of a pair.
+    measured_rad: bands (low, high) [rad/sample] of which one has to come within the half-power width of every
+    pole; none: poles may be as narrow as the other bounds allow. Compiled code takes all of them in this
+    order (`ident.fit.pole_unknowns`).
     """
 
     distance_min: float
@@ -41,6 +43,7 @@ class Bounds:
     zeta_min: float
     zeta_max: float
     s_min: float
+    measured_rad: tuple[tuple[float, float], ...] = ()
 
     @classmethod
     def from_options(cls, options: IdentOptions, longest: int, dt_s: float) -> Bounds:
@@ -65,10 +68,35 @@ class Bounds:
             s_min=still,
         )
 
+    def shown_by(self, measured_rad: RealArray) -> Bounds:
+        """These bounds for poles that have a measured band within their half-power width.
+
+        measured_rad: (K, 2) low and high end of each band, ascending, from 0 to pi rad/sample. A real pole
+        a > 0 is a resonance at 0 whose half-power width is -ln a, one with a < 0 is a resonance at pi of
+        width -ln |a|.
+        """
+        slowest = float(measured_rad[0, 0])
+        fastest = np.pi - float(measured_rad[-1, 1])
+        return replace(
+            self,
+            distance_min=max(self.distance_min, -float(np.expm1(-slowest))),
+            distance_max=min(self.distance_max, 1 + float(np.exp(-fastest))),
+            measured_rad=tuple((float(low), float(high)) for low, high in measured_rad),
+        )
+
     @cached_property
     def array(self) -> RealArray:
-        """In the order of the fields."""
-        return np.array([getattr(self, name) for name in self.__dataclass_fields__])
+        """In the order of the fields, the measured bands one by one."""
+        scalars = [
+            self.distance_min,
+            self.distance_max,
+            self.omega_min,
+            self.omega_max,
+            self.zeta_min,
+            self.zeta_max,
+            self.s_min,
+        ]
+        return np.array([*scalars, *(end for band in self.measured_rad for end in band)])
 
 
 @dataclass(frozen=True, eq=False)

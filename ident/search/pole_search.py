@@ -47,13 +47,16 @@ _LITTLE_NOISE = 0.02
 
 
 class PoleSearch(Generic[Problem]):
-    """The search on one problem, with its trace. Fixed poles come first of each type and are never moved."""
+    """The search on one problem, with its trace. Fixed poles come first of each type and are never moved.
 
-    def __init__(self, data: Problem, options: IdentOptions) -> None:
+    bounds: sides that refined poles keep; default: those that the options state.
+    """
+
+    def __init__(self, data: Problem, options: IdentOptions, bounds: Bounds | None = None) -> None:
         self.data = data
         self.options = options
         self.fixed = options.fixed()
-        self.bounds = Bounds.from_options(options, data.longest, data.dt_s)
+        self.bounds = bounds or Bounds.from_options(options, data.longest, data.dt_s)
         self.stages: list[SearchStage] = []
         self.minima: list[PolishedMinimum] = []
         self.evaluations = 0

@@ -1,11 +1,13 @@
 """GOBF models from measured frequency responses: known plants by scipy, derivatives, coverage, bad input."""
 
+import control
 import numpy as np
 import pytest
 
 from control_design import UncertainPlant
 from ident import IdentOptions, Poles, identify_frf
 from ident.data.finding import FindingKind
+from ident.data.frf_records import FrfRepeats
 from ident.fit.frf_regression import fit_response, prepare_response
 from ident.fit.pole_unknowns import free_parameters, set_poles
 from ident.fit.refinement import pole_system
@@ -189,3 +191,100 @@ def test_ellipses_cover_and_pole_deviations_are_right_over_many_seeds(plant, run
     assert covered.mean(axis=0).min() > 0.95 - 3.5 * np.sqrt(0.95 * 0.05 / runs)
     # The sampling error of a standard deviation is 1 / sqrt(2 n); 3 of those.
     np.testing.assert_allclose(np.std(scores, axis=0), 1.0, atol=3 / np.sqrt(2 * right))
+
+
+def two_lags(slow_per_s=6.0, fast_per_s=150.0):
+    """Response of a motor as a bench measures it, in continuous time: gain 1.2 and two lags."""
+    return lambda omega: 1.2 / ((1j * omega / slow_per_s + 1) * (1j * omega / fast_per_s + 1))
+
+
+def stated(response, omega, relative, dt_s):
+    """Exact values, their relative standard deviation as somebody states it."""
+    values = response(omega)
+    covariance = (relative * np.abs(values))[:, None, None] ** 2 * np.eye(2)
+    return FrequencyUncertainty(omega, values, covariance, dt_s)
+
+
+BENCH_DT_S = 0.002
+# PI controller 4 (z - .975) / (z - 1) of these lags: the loop stays .85 away from -1.
+BENCH_LAW = control.tf([4.0, -3.9], [1.0, -1.0], BENCH_DT_S)
+
+
+@pytest.mark.parametrize(
+    ("lags", "band", "n", "relative"),
+    [
+        ((6.0, 150.0), (2.0, 400.0), 90, 0.008),
+        ((6.0, 150.0), (2.0, 400.0), 90, 0.0004),
+        ((3.0, 200.0), (2.0, 400.0), 90, 0.008),
+        ((6.0, 150.0), (2.0, 600.0), 90, 0.008),
+        ((6.0, 150.0), (20.0, 400.0), 40, 0.008),
+        ((6.0, 150.0), (2.0, 400.0), 12, 0.008),
+        ((6.0, 1e6), (2.0, 400.0), 40, 0.008),
+    ],
+    ids=["one sweep", "precise", "other lags", "further", "no slow points", "few points", "one lag"],
+)
+def test_no_loop_hangs_on_a_pole_that_no_data_shows(lags, band, n, relative):
+    response = two_lags(*lags)
+    omega = np.geomspace(*band, n)
+    found = identify_frf(stated(response, omega, relative, BENCH_DT_S))
+    loop = found.model.to_control() * BENCH_LAW
+    assert np.all(np.abs(control.feedback(loop, 1).poles()) < 1)
+    # The fitted loop is as far from -1 as the measured one: 2 % of it, as its coarsest points are apart.
+    fine = np.geomspace(band[0], np.pi / BENCH_DT_S, 4000)
+    nearest = np.abs(1 + loop(np.exp(1j * fine * BENCH_DT_S))).min()
+    measured_nearest = np.abs(1 + response(omega) * BENCH_LAW(np.exp(1j * omega * BENCH_DT_S))).min()
+    assert nearest == pytest.approx(measured_nearest, rel=0.02)
+
+
+def test_a_noisy_repeated_sweep_has_no_pole_above_it():
+    rng = np.random.default_rng(0)
+    omega = np.repeat(np.geomspace(2.0, 400.0, 60), 6)
+    noise = 1 + 0.003 * (rng.standard_normal(omega.size) + 1j * rng.standard_normal(omega.size))
+    found = identify_frf(FrfRepeats(omega, two_lags()(omega) * noise).mean(BENCH_DT_S))
+    assert found.model.poles.pairs.size == 0
+    assert np.all(found.model.poles.real > 0)
+    loop = found.model.to_control() * BENCH_LAW
+    assert np.all(np.abs(control.feedback(loop, 1).poles()) < 1)
+
+
+def held_mode(omega_rad_s, zeta, dt_s):
+    """Discrete response of a lag and a light mode behind a zero-order hold."""
+    mode = control.tf([0.05 * omega_rad_s**2], [1.0, 2 * zeta * omega_rad_s, omega_rad_s**2])
+    system = control.sample_system(control.ss(control.tf([1.0], [0.1, 1.0]) + mode), dt_s)
+    return lambda omega: np.asarray(system(np.exp(1j * omega * dt_s)))
+
+
+@pytest.mark.parametrize(
+    ("mode_rad_s", "points"), [(460.0, 80), (61.0, 25)], ids=["above the last", "between two"]
+)
+def test_a_mode_whose_flanks_are_measured_is_kept(mode_rad_s, points):
+    """Above the last frequency, or between two that are many of its widths apart."""
+    zeta = 0.004
+    omega = np.geomspace(1.0, 400.0, points)
+    assert np.abs(omega - mode_rad_s).min() > 5 * zeta * mode_rad_s
+    response = stated(held_mode(mode_rad_s, zeta, BENCH_DT_S), omega, 0.001, BENCH_DT_S)
+    found = identify_frf(response, IdentOptions(n_real=1, n_pairs=1))
+    modes = found.model.poles.omega_rad_s(BENCH_DT_S)
+    nearest = int(np.argmin(np.abs(modes - mode_rad_s)))
+    assert modes[nearest] == pytest.approx(mode_rad_s, rel=1e-3)
+    assert found.model.poles.zeta()[nearest] == pytest.approx(zeta, rel=0.2)
+
+
+def test_a_stated_direct_term_is_kept_whatever_the_poles_do():
+    omega = np.geomspace(2.0, 400.0, 60)
+    response = stated(two_lags(), omega, 0.008, BENCH_DT_S)
+    assert identify_frf(response, IdentOptions(feedthrough=False)).model.feedthrough == 0.0
+    free = identify_frf(response)
+    said = only(free.verdicts, FindingKind.RESPONSE_AT_ONCE)
+    assert said["direct_term"] == free.model.feedthrough != 0.0
+
+
+def test_what_the_model_assumes_outside_the_table_is_said():
+    omega = np.geomspace(2.0, 400.0, 60)
+    found = identify_frf(stated(two_lags(), omega, 0.008, BENCH_DT_S))
+    said = only(found.verdicts, FindingKind.ASSUMED_OUTSIDE)
+    assert (said["low_rad_s"], said["high_rad_s"]) == pytest.approx((2.0, 400.0))
+    assert said["largest_below"] == pytest.approx(1.2, rel=0.01)
+    assert said["gain_at_high"] == pytest.approx(abs(two_lags()(400.0)), rel=0.02)
+    # Two lags fall on and on: nothing above the table is larger than its last point.
+    assert said["largest_above"] == said["gain_at_high"] > said["gain_at_nyquist"]

@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import scipy.io
 import scipy.signal
@@ -109,3 +110,33 @@ def test_what_is_no_controller_is_bad_input(refused, example, fast_run):
     Path("law.json").write_text('{"zeros": [[0.5, 0.1]], "poles": [1], "gain": 1, "dt_s": 0.005}')
     assert "no more zeros than poles" in refused(*example, "law.json")
     assert "give --controller" in refused(*example[:-1])
+
+
+def test_one_sweep_of_two_lags_is_judged_by_its_points_and_says_what_is_assumed_beyond(flexlink, tmp_path):
+    """An exact sweep of 1.2 / ((s/6 + 1) (s/150 + 1)); the loop's distances are those of its own points."""
+    dt_s = 0.002
+    omega = np.geomspace(2.0, 400.0, 90)
+    response = 1.2 / ((1j * omega / 6 + 1) * (1j * omega / 150 + 1))
+    rows = zip(omega, 20 * np.log10(np.abs(response)), np.degrees(np.angle(response)), strict=True)
+    table = tmp_path / "sweep.csv"
+    lines = [",".join(f"{value:.6g}" for value in row) for row in rows]
+    table.write_text("\n".join(["Frequency [rad/s],Magnitude [dB],Phase [deg]", *lines]) + "\n")
+    law = {"dt_s": dt_s, "numerator": [4.0, -3.9], "denominator": [1.0, -1.0]}
+    (tmp_path / "law.json").write_text(json.dumps(law))
+    (tmp_path / "asked.toml").write_text(
+        "[specification]\nmodulus_margin = 0.5\ncomputational_delay_samples = 0\ncontroller_order = 2\n"
+        f"[plant]\ndt_s = {dt_s}\n[uncertainty]\nmultiplicative = 0.02\n"
+    )
+    command = ["certify", table, "--controller", tmp_path / "law.json", "--spec", tmp_path / "asked.toml"]
+    assert "outside 2 to 400 rad/s nothing was measured" in " ".join(flexlink(*command).out.split())
+    (verdict,) = flexlink(*command, "--json").document()["numbers"]["certificate"]["plants"]
+
+    z = np.exp(1j * omega * dt_s)
+    loop = response * (4.0 * z - 3.9) / (z - 1)
+    assert verdict["stable"] is True
+    assert verdict["nominal_margins"]["modulus"] == pytest.approx(np.abs(1 + loop).min(), rel=0.01)
+    # Where the gain crosses 1, between two points.
+    crossing = np.interp(0.0, -np.log(np.abs(loop)), np.unwrap(np.angle(loop)))
+    assert verdict["nominal_margins"]["phase_rad"] == pytest.approx(np.pi + crossing, abs=0.02)
+    # Two per cent of uncertainty takes no more than 2 % of |L| off the distance.
+    assert 0.95 < verdict["worst_margins"]["modulus"] / verdict["nominal_margins"]["modulus"] < 1.0

@@ -40,6 +40,8 @@ VALUES = {
     "most_to_Hz": 22.0, "chance_percent": 0.81, "shift_percent": -0.65, "shift_from_Hz": 16.2,
     "shift_to_Hz": 22.0, "gain_percent": 4.86, "gain_from_Hz": 2.2, "gain_to_Hz": 2.9, "reference": "r",
     "like": "degrees and radians", "of": "deg", "options": "--scale y=57.3",
+    "nyquist_rad_s": 1571.0, "largest_below": 1.2, "gain_at_high": 0.0063, "gain_at_nyquist": 0.0007,
+    "largest_above": 0.0063, "largest_above_rad_s": 400.0, "direct_term": 0.000366,
     "outside_percent": 51.0, "at_rad_s": 12.0, "same": False,
 }  # fmt: skip
 # Other values that lead to other words.
@@ -69,6 +71,7 @@ OTHERWISE = {
     ],
     "DIRECT": [{"why": "small", "times": 0.42}, {"why": "spoilt", "stated": True}],
     "CHI_SQUARE": [{"chi_square": 100.0}, {"chi_square": 400.0}],
+    "ASSUMED_OUTSIDE": [{"integrators": 1}, {"largest_above": 0.5, "largest_above_rad_s": 620.0}],
     "DISTORTED": [{"trend": "grows"}, {"parity": "both", "trend": "unknown"}, {"parity": "unknown"}],
     "ONE_REALISATION": [{"lines": 0}],
     "NOT_PERIODIC": [{"from_Hz": 0.0, "to_Hz": 0.0}],

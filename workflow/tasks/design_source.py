@@ -21,6 +21,7 @@ from control_design.plants.plant_set import UncertainPlant, count_integrators, f
 from control_design.plants.stated_uncertainty import StatedDiscs
 from ident.basis.model_files import FORMAT
 from ident.data.ellipses import chi2_radius
+from ident.data.finding import FindingKind
 from ident.data.frf_records import is_response, measured_response
 from ident.data.record_files import READERS
 from ident.frequency_fit import identify_frf
@@ -185,7 +186,8 @@ def _measured(path: Path, design: DesignFile) -> DesignSource:
             nominal, origin = found.model.to_control(), "measured response, poles of a fitted model"
             if stated:
                 # Chi-square tells nothing of an uncertainty that somebody stated.
-                said = (*(words(item) for item in found.warnings), *_inside(response, nominal))
+                told = [item for item in found.verdicts if item.kind is not FindingKind.CHI_SQUARE]
+                said = (*(words(item) for item in (*told, *found.warnings)), *_inside(response, nominal))
                 return replace(_stated(path.stem, nominal, design, origin), remarks=said)
             said = tuple(words(item) for item in (*found.verdicts, *found.warnings))
             if about.ellipses == "fitted":
