@@ -24,18 +24,54 @@ _STEPS, _MIXED, _STANDS = 200, 8, 1e-9
 _MISSED = 0.05
 # Share of the largest early motion after a pulse that is one.
 _SHOWS = 0.05
-# Simulations without the forces that are kept: those of one set of parameters.
+# Simulations that are kept of each kind: those of one set of parameters, beside sixteen records at most.
 _KEPT = 16
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A key that equals another only where both hold the same object, which it keeps alive.
+
+    The bare id of an object that is gone may be that of a new one.
+    """
+
+    held: Any
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Identity) and self.held is other.held
+
+    def __hash__(self) -> int:
+        return id(self.held)
 
 
 @dataclass(frozen=True, eq=False)
 class Started:
-    """A simulation from a start, the same from rest; what it depends on besides its inputs, and its start."""
+    """A simulation from a start, and the same from rest.
+
+    key : all that `at_rest` depends on besides its inputs: simulation, parameters, effects in and around it.
+    start : the start of `run`, beyond the key.
+    """
 
     run: Run
     at_rest: Run
     key: Hashable
     start: Hashable
+
+
+class Remembered:
+    """The last `_KEPT` values that were computed, each under everything it was computed from."""
+
+    def __init__(self) -> None:
+        self._values = dict[Hashable, Any]()
+
+    def value(self, key: Hashable, compute: Callable[[], Any]) -> Any:
+        """What stands under the key, else what `compute` gives, which is kept."""
+        if key not in self._values:
+            value = compute()
+            if len(self._values) >= _KEPT:
+                self._values.pop(next(iter(self._values)))
+            self._values[key] = value
+        return self._values[key]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,15 +88,22 @@ class Body:
     force: int | None = None
     largest_force: float | None = None
     dt_s: float = float("nan")
-    _kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
+    _pulse_responses: Remembered = field(default_factory=Remembered, init=False, repr=False)
+    _runs_without: Remembered = field(default_factory=Remembered, init=False, repr=False)
+    _doubts: set[str] = field(default_factory=set, init=False, repr=False)
 
     def under(self, started: Started, forces: BodyForces) -> Run:
         """The simulation with forces on the body; not a number where none were found that it follows."""
         run, force_at, motion_at = started.run, int(self.force or 0), int(self.motion)
 
         def simulated(inputs: Real) -> Real:
-            asked = (started.key, inputs.shape)
-            response, sign = self._remembered(asked, lambda: self._response(started.at_rest, inputs))
+            # The response to a pulse is taken with the other inputs held at their first row.
+            others = np.array(inputs[:1], dtype=np.float64)
+            others[:, force_at] = 0.0
+            response, sign = self._pulse_responses.value(
+                (started.key, len(inputs), others.tobytes()),
+                lambda: self._response(started.at_rest, others, len(inputs)),
+            )
 
             def under(force: Real) -> tuple[Real, Real]:
                 moved = inputs.copy()
@@ -69,7 +112,9 @@ class Body:
                 return found, sign * found[:, motion_at]
 
             command = inputs[:, force_at]
-            free = self._remembered((started.key, started.start, inputs.tobytes()), lambda: under(command))
+            free = self._runs_without.value(
+                (started.key, started.start, inputs.shape, inputs.tobytes()), lambda: under(command)
+            )
 
             def placed(outputs: Real, motion: Real) -> Real:
                 found = outputs.copy()
@@ -85,29 +130,27 @@ class Body:
     @property
     def doubt(self) -> str:
         """Why smooth forces act less exactly on some motion seen so far, "" where they do not."""
-        tried = (kept[0] for kept in self._kept.values())
-        return max((one.doubt for one in tried if isinstance(one, PulseResponse)), default="")
+        return max(self._doubts, default="")
 
-    def _response(self, run: Run, inputs: Real) -> tuple[PulseResponse, float]:
-        """From rest, other inputs as at the start; -1 where force and motion count opposite ways, else 1."""
-        force_at, motion_at = int(self.force or 0), int(self.motion)
+    def _response(self, run: Run, others: Real, n_samples: int) -> tuple[PulseResponse, float]:
+        """Response (n_samples,) of the motion to a pulse of force, from rest, and the sign between the two.
+
+        others (1, U): the other inputs, held throughout, with zero force. The sign is -1 where force and
+        motion count opposite ways.
+        """
+        force_at = int(self.force or 0)
+        motion_at = int(self.motion)
         pulse = self.largest_force or 1.0
-        still = np.repeat(inputs[:1], len(inputs), axis=0)
-        still[:, force_at] = 0.0
+        still = np.repeat(others, n_samples, axis=0)
         pushed = still.copy()
         pushed[1, force_at] = pulse
         moved = (run(pushed) - run(still))[:, motion_at] / pulse
         first = np.abs(moved[:5])
         # The first that shows: at few samples per period the largest is on the way back.
         sign = float(np.sign(moved[np.argmax(first > _SHOWS * np.max(first))]))
-        return PulseResponse.of(sign * moved, self.dt_s, of_speed=self.motion_is == "speed"), sign
-
-    def _remembered(self, key: Hashable, compute: Callable[[], Any]) -> Any:
-        if key not in self._kept:
-            if len(self._kept) >= _KEPT:
-                self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = compute()
-        return self._kept[key]
+        response = PulseResponse.of(sign * moved, self.dt_s, of_speed=self.motion_is == "speed")
+        self._doubts.add(response.doubt)
+        return response, sign
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +232,7 @@ class Actuator:
     drive: str | int | None = None
     at_rest_before: bool = True
     dt_s: float = float("nan")
-    _kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
+    _responses: Remembered = field(default_factory=Remembered, init=False, repr=False)
 
     def under(self, started: Started, acting: Sequence[Acting], run: Run) -> Run:
         """The simulation with effects on the signal, in the order given; not a number where no fixed point
@@ -210,10 +253,12 @@ class Actuator:
                 found = run(moved)
                 return found, found[:, signal]
 
-            asked = (started.key, inputs.shape)
-            if asked not in self._kept:
-                self._kept[asked] = self._response(started.at_rest, inputs)
-            response, extra = self._kept[asked], np.zeros(len(inputs))
+            # The loop need not be linear: its response is that beside these inputs.
+            response = self._responses.value(
+                (started.key, inputs.shape, inputs.tobytes()),
+                lambda: self._response(started.at_rest, inputs),
+            )
+            extra = np.zeros(len(inputs))
             found, command = with_added(extra)
             for _ in range(_ROUNDS):
                 alone = command - scipy.signal.fftconvolve(response, extra)[: extra.size]
@@ -287,14 +332,16 @@ def around(started: Started, acting: Sequence[Acting]) -> Run:
                 sizes[name] = value + (sizes.get(name, 0.0) if name != "stribeck_velocity" else 0.0)
     inner = started
     for body, sizes in bodies.values():
-        forces, known = BodyForces(**sizes), (inner.key, tuple(sizes.items()))
+        forces = BodyForces(**sizes)
+        known = (inner.key, Identity(body), tuple(sizes.items()))
         at_rest = body.under(replace(inner, run=inner.at_rest, start=None), forces)
         inner = Started(body.under(inner, forces), at_rest, known, inner.start)
 
     for drive, effects in drives.values():
-        by = tuple((id(law), *values.items()) for law, _, values in effects)
-        outer = drive.under(inner, effects, inner.run), drive.under(inner, effects, inner.at_rest)
-        inner = Started(*outer, (inner.key, by), inner.start)
+        laws = tuple((Identity(law), *values.items()) for law, _, values in effects)
+        run = drive.under(inner, effects, inner.run)
+        at_rest = drive.under(inner, effects, inner.at_rest)
+        inner = Started(run, at_rest, (inner.key, Identity(drive), laws), inner.start)
 
     def simulated(inputs: Real) -> Real:
         return _changed(inner.run(_changed(inputs, acting, Actuator)), acting, Sensor)

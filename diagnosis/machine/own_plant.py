@@ -22,7 +22,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from diagnosis.machine.around import MeasuredBody, Started, around
+from diagnosis.machine.around import Identity, MeasuredBody, Started, around
 from diagnosis.machine.machine_protocol import (
     KNOWN_START,
     Real,
@@ -234,7 +234,11 @@ class Plant:
             for kind in self.effects
             if kind.place is not None and kind.name in inside
         ]
-        known = (tuple(self.parameters.items()), tuple((k, tuple(v.items())) for k, v in inside.items()))
+        known = (
+            Identity(self.simulation),
+            tuple(self.parameters.items()),
+            tuple((name, tuple(values.items())) for name, values in inside.items()),
+        )
 
         def simulation_itself(begun: tuple[float, ...], inputs: Real) -> Real:
             start = (dict(zip(self.start, begun, strict=True)),) if self.start else ()

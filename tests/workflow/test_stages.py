@@ -2,12 +2,15 @@
 
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
+import control
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from control_design import certify
+from control_design.plants.plant_set import PlantChannel
 from ident import IdentOptions, Record, identify
 from plant import linear_arm, paper_link, parse_effect, simulate
 from tests.workflow.command import FAST_ARM
@@ -21,7 +24,7 @@ from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.identification import as_bounded, as_fitted
 from workflow.tasks.pipeline import config_of
 from workflow.tasks.records import make_records, read_record, with_common_sampling_time
-from workflow.tasks.results import RunResults
+from workflow.tasks.results import RunResults, UncertaintyResult
 from workflow.tasks.simulated_rig import encoded_arm, rig_of
 from workflow.tasks.stage import StageInput
 from workflow.tasks.stages import design_filter
@@ -299,3 +302,24 @@ def test_a_configuration_resamples_and_unwraps(tmp_path):
     truth = 2000 * np.sin(3 * (time[0] + record.time_s)) + 3000
     # Half a count, and a straight line between readings 12 ms apart: (3 h)^2 / 8 of 2000.
     np.testing.assert_allclose(record.output[:, 0], truth, atol=0.5 + 2000 * (3 * 0.012) ** 2 / 8)
+
+
+def test_a_plant_is_kept_under_all_that_it_was_made_of():
+    """Two configurations that call the same channel differently get plants of their own names."""
+    plant = PlantChannel(control.ss([[0.9]], [[1.0]], [[0.1]], [[0.0]], 0.01))
+    channel = SimpleNamespace(in_plant=lambda: plant)
+    channel.at_rate = lambda dt_s: channel
+    result = UncertaintyResult((channel,))
+
+    def named(label):
+        return SimpleNamespace(
+            control_channel=SimpleNamespace(label=label),
+            control_index=0,
+            performance_index=None,
+            specification=SimpleNamespace(controller_dt_s=None),
+        )
+
+    hub, tip = named("hub"), named("tip")
+    assert result.plant(hub).name == "hub"
+    assert result.plant(tip).name == "tip"
+    assert result.plant(hub) is result.plant(hub)

@@ -319,21 +319,27 @@ class UncertaintyResult:
 
     def plant(self, config: RunConfig) -> UncertainPlant:
         """What the controller is designed for: control channel and first performance channel, at its rate."""
-        channels = self.seen_by_controller(config)
-        key = config.control_index, config.performance_index, config.specification.controller_dt_s
+        name = config.control_channel.label
+        performance_index = config.performance_index
+        key = name, config.control_index, performance_index, config.specification.controller_dt_s
         if key not in self._plants:
-            control = channels[key[0]].in_plant()
+            channels = self.seen_by_controller(config)
+            control = channels[config.control_index].in_plant()
+            performance = None
+            if performance_index is not None:
+                performance = channels[performance_index].in_plant()
             self._plants[key] = UncertainPlant(
-                name=config.control_channel.label,
+                name=name,
                 nominal=control.nominal,
                 uncertainty=control.uncertainty,
-                performance=None if key[1] is None else channels[key[1]].in_plant(),
+                performance=performance,
                 level=control.level,
             )
         return self._plants[key]
 
     @cached_property
-    def _plants(self) -> dict[tuple[int, int | None, float | None], UncertainPlant]:
+    def _plants(self) -> dict[tuple[str, int, int | None, float | None], UncertainPlant]:
+        """Plants by name, control and performance channel and rate: stages and figures ask for one again."""
         return {}
 
     @cached_property
