@@ -35,6 +35,7 @@ from control_design.synthesis.synthesis_options import MultivariableOptions, Syn
 from control_design.synthesis.synthesis_result import SynthesisResult
 from flexlink.keywords import WrongArgumentError, options_of, refuse_rate
 from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.frequency_fit import FrfIdentification
 from ident.response_uncertainty import Uncertainty
 from ident.uncertainty.matrix_response import MatrixPosterior
 
@@ -139,7 +140,8 @@ class UncertainPlant(plant_set.UncertainPlant):
     """A nominal state space and the ellipses around its response, for which a controller is designed.
 
     plant : Uncertainty, or a discrete system of python-control (ss, tf), or a model with `to_control()`
-        An `Uncertainty` has its own ellipses; anything else is exact unless you give `uncertainty`.
+        An `Uncertainty` has its own ellipses, the result of `identify_frf` those of its posterior; anything
+        else is exact unless you give `uncertainty`.
     uncertainty : as in `control_design.UncertainPlant`, or a `control.frd` (measured response, exact).
 
     Other arguments as in `control_design.UncertainPlant`.
@@ -170,6 +172,8 @@ class UncertainPlant(plant_set.UncertainPlant):
             uncertainty = measured_response(uncertainty, f"the response of plant {name!r}")
         if uncertainty is None and isinstance(given, Uncertainty):
             uncertainty = given
+        if uncertainty is None and isinstance(given, FrfIdentification):
+            uncertainty = given.posterior
         super().__init__(
             name=name,
             nominal=state_space(given, f"plant {name!r}"),

@@ -24,7 +24,7 @@ from ident.data.record import Record as PlainRecord, in_one_unit
 from ident.data.signal_filter import band_limited
 from ident.data.table import Table
 from ident.data.units import refuse_step
-from ident.frequency_fit import identify_frf
+from ident.frequency_fit import FrfIdentification, identify_frf
 from ident.identification import Identification, MimoIdentification
 from ident.one_input import identify as identify_records
 from ident.response_uncertainty import Uncertainty
@@ -378,6 +378,11 @@ def _records(records: Any) -> tuple[PlainRecord, ...]:
 def _records_of(identification: Any, records: Any) -> tuple[PlainRecord, ...]:
     """These records or those of the identification, of one input and one output."""
     model = getattr(identification, "model", None)
+    if isinstance(identification, FrfIdentification):
+        raise ValueError(
+            "a fitted response brings its uncertainty: fitted.posterior, "
+            "or its ellipses, fitted.posterior.at(omega_rad_s)"
+        )
     if isinstance(identification, MimoIdentification):
         raise ValueError("several inputs or outputs: use flexlink.matrix_posterior(records, identification)")
     if not isinstance(model, GobfModel):

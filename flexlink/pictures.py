@@ -21,6 +21,7 @@ from flexlink.machines import Simulation
 from ident.basis.model import GobfModel
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
+from ident.frequency_fit import FrfIdentification
 from ident.identification import Identification
 from ident.search.error_surface import ErrorSurface
 from ident.uncertainty import ResponsePosterior
@@ -244,6 +245,11 @@ def _poles(found: Identification) -> Figure:
     from workflow.figures.poles import draw_poles
 
     return draw_poles(found.model)
+
+
+@plot.register(FrfIdentification)
+def _fitted_response(found: FrfIdentification) -> Figure:
+    return compare(found.response, found.model, names=("measured", "fitted"), omega_rad_s=found.omega_rad_s)
 
 
 for kind in (GobfModel, ResponsePosterior, FrequencyUncertainty):

@@ -13,9 +13,14 @@ from ident.data.shown import Shown
 
 
 def text(result: object) -> str:
-    """The sentences of a result: the macro in results.j2 that has the name of its class."""
+    """The sentences of a result: the macro in results.j2 that has the name of its class, or of a base of it.
+
+    A class without one, as that of somebody who derives from `Shown`, prints as any object does.
+    """
     macros = _macros()
-    name = next(kind.__name__ for kind in type(result).__mro__ if hasattr(macros, kind.__name__))
+    name = next((kind.__name__ for kind in type(result).__mro__ if hasattr(macros, kind.__name__)), None)
+    if name is None:
+        return object.__repr__(result)
     said = str(getattr(macros, name)(result))
     return "\n".join(line.rstrip() for line in said.splitlines() if line.strip())
 

@@ -20,6 +20,7 @@ from ident.basis.poles import Poles
 from ident.data.arrays import ComplexArray
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
+from ident.frequency_fit import FrfIdentification
 from ident.identification import Identification, MimoIdentification
 from ident.search.error_surface import ErrorSurface
 from ident.uncertainty import ResponsePosterior
@@ -32,7 +33,8 @@ __all__ = ["table"]
 def table(result: object) -> pd.DataFrame:
     """Return a result as `pandas.DataFrame`, with units in the column names; also `result.table()`.
 
-    Record, simulation, closed loop: a row per sample. Model, identification: a row per mode or real pole.
+    Record, simulation, closed loop: a row per sample. Model, identification: a row per mode or real pole, of
+    a measured response with their standard deviations.
     Uncertainty, measured response: a row per frequency, with the range of gain and phase over the ellipse.
     Certificate: a row per requirement. Synthesis: a row per active constraint. Diagnosis: a row per effect
     and parameter, with its 95 % interval and two probabilities: that the effect is `present`, and that it is
@@ -87,6 +89,20 @@ def _modes(poles: Poles, dt_s: float, unstable: ComplexArray | tuple[()] = ()) -
     rows = pd.concat([part for part in (modes, decays, growing) if len(part)] or [modes], ignore_index=True)
     rows = rows.reindex(columns=["kind", "omega_rad_s", "frequency_Hz", "zeta", "decay_per_s"])
     return rows.assign(frequency_Hz=rows["omega_rad_s"] / (2 * np.pi))
+
+
+@table.register(FrfIdentification)
+def _fitted_response(found: FrfIdentification) -> pd.DataFrame:
+    rows = _modes(found.model.poles, found.model.dt_s)
+    is_mode = rows["kind"] == "mode"
+    deviations = {
+        "omega_std_rad_s": (is_mode, found.omega_std_rad_s),
+        "zeta_std": (is_mode, found.zeta_std),
+        "decay_std_per_s": (~is_mode, found.decay_std_per_s),
+    }
+    for name, (of_kind, values) in deviations.items():
+        rows.loc[of_kind, name] = values
+    return rows
 
 
 @table.register(ErrorSurface)

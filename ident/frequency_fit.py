@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from ident.checks.plausible_modes import pairs_outside, pole_warnings, poles_wit
 from ident.data.arrays import RealArray, lock
 from ident.data.finding import TEST_LEVEL, Finding, FindingKind, distinct, finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.shown import Shown
 from ident.fit.frf_regression import FrfRegression, fit_response, prepare_response
 from ident.fit.refinement import Bounds, Refined, pole_system
 from ident.one_input import in_order
@@ -26,8 +28,8 @@ from ident.uncertainty.embedding import embed_response
 __all__ = ["FrfIdentification", "identify_frf"]
 
 
-@dataclass(frozen=True, eq=False)
-class FrfIdentification:
+@dataclass(frozen=True, eq=False, repr=False)
+class FrfIdentification(Shown):
     """A model fitted to a measured frequency response (F,), and how well it fits.
 
     posterior: tangent embedding on the same rows. residual (F,): measured minus fitted; distance (F,): its
@@ -64,6 +66,19 @@ class FrfIdentification:
     def warnings(self) -> tuple[Finding, ...]:
         """What to look at before trusting the model."""
         return self.search.warnings
+
+    @property
+    def share_inside(self) -> float:
+        """Share of the measured points whose ellipses, of the measurement's own level, hold the model."""
+        return float(np.mean(self.distance <= 1.0))
+
+    def to_control(self) -> Any:
+        """The model as `control.StateSpace`."""
+        return self.model.to_control()
+
+    def save(self, path: str | Path) -> None:
+        """Write the model as `GobfModel.save`."""
+        self.model.save(path)
 
 
 def identify_frf(

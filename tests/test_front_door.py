@@ -19,6 +19,8 @@ from scipy.signal import dlti, lfilter, lti
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import flexlink
+from flexlink.shown import _macros
+from ident.data.shown import Shown
 from tests.workflow.diagnosis_examples import KnownAnswer, write_case
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -269,6 +271,73 @@ def test_results_show_draw_and_convert():
     for call in (flexlink.plot, flexlink.bode, flexlink.table):
         with pytest.raises(TypeError, match="int"):
             call(1)
+
+
+def fitted_response():
+    """A model of one mode, 20 rad/s, fitted to its exact response."""
+    omega = np.geomspace(1.0, 300.0, 60)
+    response = 1 / (1 - (omega / 20) ** 2 + 0.1j * omega / 20)
+    data = flexlink.FrequencyUncertainty(omega, response, np.tile(1e-4 * np.eye(2), (60, 1, 1)), dt_s=0.005)
+    return flexlink.identify_frf(data, flexlink.IdentOptions(n_real=0, n_pairs=1))
+
+
+def test_a_fitted_response_shows_draws_and_converts_as_other_results(tmp_path):
+    fitted = fitted_response()
+    for text in (repr(fitted), str(fitted), f"{fitted}", repr([fitted])):
+        assert "mode at 20 rad/s" in text
+        assert "inside 100 % of 60 ellipses, 1 to 300 rad/s" in text
+        assert "object at" not in text
+    assert fitted._repr_html_().startswith("<p><b>")
+    assert isinstance(fitted.plot(), Figure)
+    row = fitted.table().iloc[0]
+    assert (row["omega_rad_s"], row["zeta_std"]) == (
+        fitted.model.poles.omega_rad_s(0.005)[0],
+        fitted.zeta_std[0],
+    )
+    fitted.save(tmp_path / "fitted.json")
+    assert (tmp_path / "fitted.json").stat().st_size > 100
+    np.testing.assert_array_equal(fitted.to_control().A, fitted.model.to_control().A)
+    # A plant of it has its ellipses, and what already is an uncertainty is not estimated again.
+    assert flexlink.UncertainPlant(fitted).uncertainty is fitted.posterior
+    with pytest.raises(ValueError, match=r"brings its uncertainty: fitted\.posterior"):
+        flexlink.uncertainty(fitted)
+
+
+def test_every_public_result_prints():
+    """Every class of results has its sentences; a result without any prints as an object, never fails."""
+    for name in flexlink.__all__:
+        getattr(flexlink, name)
+
+    def derived(kind):
+        for child in kind.__subclasses__():
+            yield child
+            yield from derived(child)
+
+    ours = {
+        kind
+        for kind in derived(Shown)
+        if kind.__module__.split(".")[0] in {"control_design", "diagnosis", "flexlink", "ident", "plant"}
+    }
+    abstract = {"FittedRecords"}  # its two kinds are shown
+    without = {
+        kind.__name__ for kind in ours if not any(hasattr(_macros(), k.__name__) for k in kind.__mro__)
+    }
+    assert without == abstract
+
+    class Own(Shown):
+        pass
+
+    assert "Own object" in repr(Own())
+
+    fitted = fitted_response()
+    repeats = flexlink.FrfRepeats(np.repeat(fitted.omega_rad_s, 3), np.repeat(fitted.response.centre, 3))
+    found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
+    intervals = flexlink.pole_intervals(fitted.posterior, fitted.model.poles)
+    for result in (
+        fitted, fitted.posterior, fitted.response, fitted.search, fitted.order_table, fitted.verdicts,
+        repeats, found.search, found.structure, intervals, found.model.poles,
+    ):  # fmt: skip
+        assert "object at" not in repr(result).splitlines()[0]
 
 
 def test_tables_say_what_the_results_say():

@@ -128,7 +128,7 @@ def test_one_sweep_of_two_lags_is_judged_by_its_points_and_says_what_is_assumed_
         f"[plant]\ndt_s = {dt_s}\n[uncertainty]\nmultiplicative = 0.02\n"
     )
     command = ["certify", table, "--controller", tmp_path / "law.json", "--spec", tmp_path / "asked.toml"]
-    assert "outside 2 to 400 rad/s nothing was measured" in " ".join(flexlink(*command).out.split())
+    assert "Outside 2 to 400 rad/s nothing was measured" in " ".join(flexlink(*command).out.split())
     (verdict,) = flexlink(*command, "--json").document()["numbers"]["certificate"]["plants"]
 
     z = np.exp(1j * omega * dt_s)
