@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from functools import wraps
 from typing import Any, TypeVar
@@ -39,7 +39,7 @@ def one_line(function: F) -> F:
             of = function.__qualname__.removesuffix(".__init__")
             unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
             if re.search(rf"\b{function.__name__}[(][)] (takes|missing)", str(error)):
-                takes = ", ".join(each for each in own if each not in ("self", "cls"))
+                takes = _call_of(own.values())
                 signals = any(isinstance(each, np.ndarray) for each in arguments)
                 hint = "; signals are one argument: flexlink.Record(u=u, y=y, dt_s=dt_s)" if signals else ""
                 raise WrongArgumentError(f"{of}: expected {of}({takes}){hint}") from None
@@ -58,6 +58,23 @@ def one_line(function: F) -> F:
         raise WrongArgumentError(f"{of}: unknown keyword {name} ({where})")
 
     return called  # type: ignore[return-value]
+
+
+def _call_of(parameters: Iterable[inspect.Parameter]) -> str:
+    """How a function is called: names of what may stand by itself, NAME=... of what needs its keyword."""
+    parts = []
+    for parameter in parameters:
+        if parameter.name in ("self", "cls"):
+            continue
+        if parameter.kind is parameter.VAR_POSITIONAL:
+            parts.append(f"*{parameter.name}")
+        elif parameter.kind is parameter.VAR_KEYWORD:
+            parts.append("...")
+        elif parameter.kind is parameter.KEYWORD_ONLY:
+            parts.append(f"{parameter.name}=...")
+        else:
+            parts.append(parameter.name)
+    return ", ".join(parts)
 
 
 def refuse_rate(dt_s: Any, slowest_s: float = 20.0) -> None:

@@ -496,6 +496,30 @@ def test_another_sampling_time_is_refused_with_what_to_do():
         flexlink.simulate_loop(slow, example_plant(), [1.0] * 3)
 
 
+def test_what_needs_its_keyword_is_shown_with_it():
+    with pytest.raises(ValueError, match=r"expected UncertainPlant\(plant, name=\.\.\., uncertainty=\.\.\."):
+        flexlink.UncertainPlant(example_plant().nominal, "motor", None)
+    with pytest.raises(ValueError, match=r"expected bode\(result, ax=\.\.\., dB=\.\.\."):
+        flexlink.bode(example_plant(), 3)
+    with pytest.raises(ValueError, match=r"expected identify\(records, options, \.\.\.\)"):
+        flexlink.identify()
+
+
+@pytest.mark.parametrize("n_samples", [12, 22, 23])
+def test_a_record_too_short_for_an_uncertainty_is_refused_with_what_helps(n_samples):
+    rng = np.random.default_rng(1)
+    u = rng.standard_normal(n_samples)
+    y = lfilter([0.0, 0.5], [1.0, -0.5], u) + 0.01 * rng.standard_normal(n_samples)
+    found = flexlink.identify(flexlink.Record(u, y, 0.01), n_real=1, n_pairs=0)
+    with pytest.raises(
+        ValueError, match=rf"{n_samples} samples are too few.*at least 24.*prior_missed_mode = 0"
+    ):
+        flexlink.uncertainty(found)
+    assert flexlink.uncertainty(found, prior_missed_mode=0).dt_s == 0.01
+    longer = flexlink.Record(np.tile(u, 2), np.tile(y, 2), 0.01)
+    assert flexlink.uncertainty(flexlink.identify(longer, n_real=1, n_pairs=0)).dt_s == 0.01
+
+
 def test_every_function_refuses_an_unknown_keyword_in_one_line():
     functions = list(filter(inspect.isfunction, (getattr(flexlink, name) for name in flexlink.__all__)))
     assert len(functions) > 25

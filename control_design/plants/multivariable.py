@@ -179,7 +179,7 @@ class MultivariablePlant(NominalPlant):
 
     def blocks(self, omega_rad_s: Real, delay_samples: int = 0) -> tuple[Complex, Complex, Complex]:
         """Nominal response (F, Y, U) behind the delay, and the Gram matrices seen (F, N, U, U) and entering
-        (F, N, Y, Y) of `scaled_bound.Rows`: the ball first, actuators, sensors."""
+        (F, N, Y, Y) of `scaled_bound.BoundRows`: the ball first, actuators, sensors."""
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         late = np.exp(-1j * omega * self.dt_s * delay_samples)[:, None, None]
         G = matrix_response(self.nominal, omega) * late

@@ -78,11 +78,10 @@ class Specification(Settings):
     delay_margin_s: _Positive | None = Field(
         default=None, description="extra loop delay that the loop must tolerate, s"
     )
-    mode_peak_ratio: float | None = Field(
+    mode_peak_ratio: _Positive | None = Field(
         default=None,
-        gt=0,
-        le=1,
-        description="peak of |Gp S| in the mode's band over the open-loop peak of |Gp| there (damping)",
+        description="peak of |Gp S| in the mode's band over the open-loop peak of |Gp| there: below 1 the "
+        "loop has to damp the mode, above 1 it may raise it by that much",
     )
     mode_damping: float | None = Field(
         default=None,
@@ -188,8 +187,11 @@ class Specification(Settings):
         return (*head, *real, *([pair] * ((rest - len(real)) // 2)))
 
     def tracking_weight(self, plant: UncertainPlant | None = None) -> RationalWeight | None:
-        """W1 without the modulus margin, or None without a tracking requirement; None for a plant that does
-        not integrate."""
+        """W1 without the modulus margin; None without a tracking requirement.
+
+        plant: whose slow poles add to the slope that an integrator of the controller asks for; None: a plant
+        without any.
+        """
         if self.sensitivity_weight is not None or self.bandwidth_rad_s is None:
             return self.sensitivity_weight
         slow: tuple[float, ...] = ()

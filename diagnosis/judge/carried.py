@@ -36,8 +36,8 @@ def shares_of(
 
     Carried is the Shapley value of every effect of the repaired model, small ones included: what it closes,
     averaged over the orders in which they could be added, so that it depends on none and all together are
-    what the model closes; intervals by bootstrap over blocks of samples. None where a time limit left no time
-    for the parts of the model.
+    what the model closes; intervals by bootstrap over blocks of samples. Empty where a time limit left no
+    time for the parts of the model.
     """
     held, fitted = search.held_out, [name for name in matter if name in accepted.names]
     names = (*fitted, *(name for name in accepted.names if name not in fitted))

@@ -53,7 +53,7 @@ class PlantEffect:
     check : str. What to do to see whether it is there: a command in a sentence; "" says nothing.
     law : EffectLaw. What it does to a simulation that does not know it; default: the simulation is told.
     place : Place or None. Where a law acts around a simulation (`with_effects`).
-    multiplies : str or None. Stated value that its only parameter, a ratio, multiplies (`wrong_value`).
+    multiplies : str or None. Stated value that its only parameter, a ratio, multiplies (`wrong_values`).
     tried : where nobody chose it, "always", "with several outputs" (from one alone it cannot be told from its
         twin at the input), or "by name" only.
     stated : of a number of a model, what the model has; 0: nothing, the effect may be missing. A number that

@@ -109,7 +109,10 @@ def _shown(column: Real, samples: Sequence[int]) -> float:
 
 
 def _alike(columns: Mapping[str, Real]) -> tuple[Alike, ...]:
-    """Of every column the fewest others that do the same, found one by one by what they leave."""
+    """Of every column few others that together do the same.
+
+    They are added one by one, each time the one that leaves least: not always the fewest there are.
+    """
     names, found = list(columns), list[Alike]()
     if len(names) < 2:
         return ()
@@ -131,7 +134,10 @@ def _alike(columns: Mapping[str, Real]) -> tuple[Alike, ...]:
 
 
 def _replacing(gram: Real, j: int, others: Sequence[int]) -> tuple[list[int], float]:
-    """The fewest of the others that do what the j-th does, and what they leave of it."""
+    """Up to `_MOST` of the others that do what the j-th does, and what they leave of it.
+
+    Greedy: each next one is that which leaves least beside those before it, until little is left.
+    """
     chosen, left = list[int](), 1.0
     for _ in range(min(_MOST, len(others))):
         rest = [k for k in others if k not in chosen]

@@ -52,9 +52,11 @@ def with_effects(
     Warns where springs and viscous friction have fewer than six samples per period, or the response to a
     pulse of force is not of a few poles.
 
-    Raises ValueError, one line: an unknown name, column or output, a command of zeros, a simulation that
-    friction and springs cannot be put around.
+    Raises ValueError, one line: no experiment, an unknown name, column or output, a command of zeros, a
+    simulation that friction and springs cannot be put around.
     """
+    if not experiments:
+        raise ValueError("plant: with_effects needs at least one experiment, whose signals give the sizes")
     for name in () if names == "all" else names:
         if name not in KINDS:
             raise ValueError(f"plant: no listed effect is called {name!r}; there are {', '.join(KINDS)}")
@@ -63,11 +65,14 @@ def with_effects(
     drive = replace(drive, drive=signal, dt_s=dt_s)
     force = body.force if isinstance(body, Body) and body.force is not None else drive.column
     measured = (body.position, body.speed) if isinstance(body, MeasuredBody) else ()
+    n_inputs = experiments[0].input.shape[1]
     for column in (drive.column, force, *measured):
-        if not 0 <= column < experiments[0].input.shape[1]:
-            count = experiments[0].input.shape[1]
-            raise ValueError(f"plant: there is no input {column}; the records have {count}, from 0 on")
+        if not 0 <= column < n_inputs:
+            raise ValueError(f"plant: there is no input {column}; the records have {n_inputs}, from 0 on")
     seen = 0 if sensor is None else _column(plant, sensor.column)
+    if not 0 <= seen < len(plant.output_names):
+        listed = ", ".join(plant.output_names)
+        raise ValueError(f"plant: the sensor is output {seen}; those there are, from 0 on: {listed}")
     commanded = None if signal is None else _largest(_motion(plant, e, signal) for e in experiments)
     sizes = Magnitudes()
     if isinstance(body, Body):
@@ -184,6 +189,8 @@ def _of_body(
 
 
 def _motion(plant: Plant, experiment: PlantExperiment, column: int) -> Real:
+    if column < 0:
+        raise ValueError(f"plant: motion or drive is column {column}; columns count from 0 on")
     if column < len(plant.output_names):
         return experiment.output[:, column]
     simulated = np.asarray(plant.simulation(plant.parameters, {}, experiment.input))

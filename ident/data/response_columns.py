@@ -214,8 +214,6 @@ def _unit(name: str, stated: str) -> str:
         last = "/".join(word for word in words[-count:] if word)
         if len(words) >= count and last in known and not (last == "abs" and len(words) == 1):
             return last
-    if bracket and len(bracket[1]) <= 2 and bracket[1].isalpha() and not text:
-        return ""
     return "" if bracket and text == bracket[1] and re.fullmatch(r"\w", text) else text
 
 

@@ -82,8 +82,10 @@ _CAUSES, _NOTHING, BY_CHANCE = 8, 1e-5, 1e-6
 _FEW_LEVELS = 16  # of a binary or staircase signal, at most
 # Largest step of the level, as a share of it; parts of a step that are tried.
 _LARGEST_STEP = 0.3
-# How dead time and lag are changed, samples: later, a lag in place of dead time, a first lag, the reverse.
-_SIZES = (1.1, 1 / 1.1, 1.02, 1 / 1.02)  # of the friction as a whole
+# Factors by which the friction as a whole is tried larger and smaller, coarse ones first.
+_SIZES = (1.1, 1 / 1.1, 1.02, 1 / 1.02)
+# How dead time and lag of the drive are changed, samples each: later, a lag in place of dead time, a first
+# lag, dead time in place of a lag.
 _SHIFTS = ((1, 0.0), (-1, 1.0), (0, 0.5), (1, -1.0))
 # Lowest further pair, as a share of the first mode: friction that is left over looks like slow poles.
 _LOWEST_PAIR, _ABOVE_NOISE = 0.4, 1.2

@@ -102,8 +102,18 @@ def candidate_pairs(n_samples: int, above: float = 0.0) -> tuple[ComplexArray, R
     From six periods in the record, or `above` [rad/sample], to nine tenths of the Nyquist frequency.
     Free oscillations of a candidate fall to e^-2 within the record: a sharper peak could stand between the
     frequencies that the record resolves, as high as one likes, and no data would contradict it.
+
+    Raises ValueError for a record in which not even the most damped and fastest candidate falls that far.
     """
-    low, high, rate = 2 * np.pi * _FEWEST_PERIODS / n_samples, _HIGHEST, _DECAY / n_samples
+    fewest_samples = int(np.ceil(_DECAY / (_ZETA[-1] * _HIGHEST)))
+    if n_samples < fewest_samples:
+        raise ValueError(
+            f"{n_samples} samples are too few to tell whether a mode is missing; expected at least "
+            f"{fewest_samples}: record longer, or set prior_missed_mode = 0 if you know of none"
+        )
+    low = 2 * np.pi * _FEWEST_PERIODS / n_samples
+    high = _HIGHEST
+    rate = _DECAY / n_samples
     low = min(max(low, above), high)
     poles, prior = [], []
     for lower, zeta in zip((0.0, *_ZETA[:-1]), _ZETA, strict=True):

@@ -89,6 +89,18 @@ def test_damping_number_is_the_sampled_worst_case_of_the_measured_output():
     assert worst >= item.achieved * 0.999
 
 
+@pytest.mark.parametrize("ratio", [1.0, 1.5, 4.0])
+def test_a_mode_may_be_raised_by_as_much_as_is_allowed(ratio):
+    """The weighted peak falls as the allowance grows: |Gp S| itself does not depend on it."""
+    plant = uncertain_hub(0.05)
+    found = {}
+    for asked in (0.5, ratio):
+        certificate = certify(gain(0.3), [plant], Specification(mode_peak_ratio=asked))
+        (found[asked],) = [i for i in certificate.items if i.requirement.startswith("damping")]
+    assert found[ratio].achieved * ratio == pytest.approx(0.5 * found[0.5].achieved, rel=1e-6)
+    assert found[ratio].met == (found[ratio].achieved <= 1)
+
+
 def test_uncertainty_on_its_own_grid_is_named():
     own = np.geomspace(0.5, 200.0, 800)
     record: ResponseRecord = RelativeDisc(hub_arm(), 0.02, 60.0).at(own, 0.95)

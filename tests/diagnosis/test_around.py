@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from diagnosis import Plant, PlantExperiment, with_effects
-from diagnosis.machine.around import Actuator, Body, Remembered
+from diagnosis.machine.around import Actuator, Body, Remembered, Sensor
 from diagnosis.machine.plant_effect import Change
 
 DT_S = 0.01
@@ -118,6 +118,31 @@ def test_the_order_of_records_does_not_change_a_drive_inside_a_loop(gain):
     used = plant()
     used.simulated(weak)(inputs(1.0))
     np.testing.assert_array_equal(used.simulated(weak)(inputs(gain)), plant().simulated(weak)(inputs(gain)))
+
+
+@pytest.mark.parametrize(
+    ("where", "words"),
+    [
+        ({"sensor": Sensor(7)}, "sensor is output 7; those there are, from 0 on: x_m"),
+        ({"sensor": Sensor(-1)}, "sensor is output -1"),
+        ({"body": Body(-1)}, "column -1; columns count from 0 on"),
+        ({"body": Body(3)}, "column 3 of a simulation that returns"),
+        ({"actuator": Actuator(0, drive=-2)}, "column -2"),
+        ({"actuator": Actuator(5)}, "no input 5; the records have 2"),
+    ],
+)
+def test_a_place_that_is_not_there_is_refused(where, words):
+    plant = Plant(slide, {"g": 1.0}, {}, ("x_m",), np.array([1e-4]))
+    inputs = record(1.0)
+    found = [PlantExperiment("a", "estimation", inputs, slide({"g": 1.0}, {}, inputs))]
+    with pytest.raises(ValueError, match=words):
+        with_effects(plant, "all", found, dt_s=DT_S, **where)
+
+
+def test_effects_without_any_record_are_refused():
+    plant = Plant(slide, {"g": 1.0}, {}, ("x_m",), np.array([1e-4]))
+    with pytest.raises(ValueError, match="at least one experiment"):
+        with_effects(plant, "all", [], dt_s=DT_S)
 
 
 def test_what_is_remembered_is_computed_once_and_forgotten_in_its_turn():
