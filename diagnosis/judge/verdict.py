@@ -221,9 +221,14 @@ def acts_like(name: str, listed: tuple[str, ...], machines: str) -> float:
 
 
 def kind_of(name: str) -> str:
-    """Of an effect, whichever joint, actuator, link or sensor of a model it is of; stated values that may be
-    wrong too."""
-    return name.removeprefix("wrong_").rpartition(".")[2]
+    """Kind of an effect, or of a stated value that may be wrong, whichever part of a model it is of.
+
+    "hinge.mass" and "wrong_rod.mass" are of the kind "mass". A value of somebody's own simulation is of no
+    part of a model, and its name is anybody's choice: it is a kind of its own, also where an effect is called
+    so.
+    """
+    value = name.removeprefix("wrong_")
+    return value.rpartition(".")[2] if "." in value else name
 
 
 def _accepted(

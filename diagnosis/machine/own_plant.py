@@ -155,6 +155,16 @@ class Plant:
         return (*self.effects, *wrong_values(self.tolerances))
 
     @cached_property
+    def value_candidates(self) -> dict[str, str]:
+        """Name among the candidates -> parameter, for every stated value with a tolerance.
+
+        It is the parameter's own name, or "wrong_NAME", by which a diagnosis names it, where an effect is
+        called so.
+        """
+        effects = {effect.name for effect in self.effects}
+        return {f"wrong_{name}" if name in effects else name: name for name in self.tolerances}
+
+    @cached_property
     def weighing(self) -> Weighing:
         stated = self.model_error is not None
         model_error = _USUAL_MODEL_ERROR if self.model_error is None else float(self.model_error)

@@ -38,7 +38,8 @@ class Alike:
 
 @dataclass(frozen=True)
 class Telling:
-    """least : candidate -> smallest size that shows: of a stated value relative, of an effect in its unit;
+    """least : candidate (`Plant.value_candidates`, and effects) -> smallest size that shows: of a stated
+    value relative, of an effect in its unit;
     of one that does less where it is larger, as a limit, the largest; inf where it does nothing.
     hidden : candidates that show at no size that is searched. alike : groups.
     unlooked : candidates that a deadline left out."""
@@ -59,10 +60,11 @@ def telling(case: PlantCase, deadline_s: float = np.inf) -> Telling:
     ]
     stated = _outputs(plant, (), records)
     columns, sizes, most = dict[str, Real](), dict[str, float](), dict[str, float]()
-    names = [*plant.tolerances, *(effect.name for effect in plant.effects)]
-    for name in plant.tolerances:
+    values = plant.value_candidates
+    names = [*values, *(effect.name for effect in plant.effects)]
+    for name, parameter in values.items():
         if time.monotonic() < deadline_s:
-            moved = _outputs(plant.scaled({name: 1 + _STEP}), (), records)
+            moved = _outputs(plant.scaled({parameter: 1 + _STEP}), (), records)
             columns[name], sizes[name], most[name] = _over(moved, stated, levels), _STEP, _FARTHEST
     for effect in plant.effects:
         if time.monotonic() < deadline_s:

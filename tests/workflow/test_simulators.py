@@ -3,6 +3,7 @@
 import contextlib
 import doctest
 import re
+import runpy
 import shlex
 import tomllib
 from dataclasses import replace
@@ -13,7 +14,8 @@ import pytest
 from scipy.signal import lfilter
 
 from diagnosis import Change
-from diagnosis.machine.telling import Alike, Telling
+from diagnosis.judge.verdict import acts_like
+from diagnosis.machine.telling import Alike, Telling, telling
 from tests.workflow.command import ROOT
 from workflow.diagnose import check
 from workflow.diagnose.command import _summary
@@ -611,6 +613,84 @@ def test_check_says_what_logs_can_tell(tmp_path, flexlink, refused):
     next_command = shlex.join(["flexlink", "diagnose", *arguments])
     assert document["verdict"].endswith(f"Next: {next_command} --out found")
     assert again["verdict"].endswith(f"Next: flexlink diagnose {tmp_path / 'arm.toml'} --out found")
+
+
+SWIVEL = """
+import numpy as np
+INPUTS, OUTPUTS = ("torque_Nm",), ("angle_rad",)
+PARAMETERS = {"J": 0.02, NAME: 1.5, "damp": 0.04}
+def simulate(p, effects, u):
+    angle, speed, found = 0.0, 0.0, []
+    for torque in u[:, 0]:
+        found.append([angle])
+        for _ in range(4):
+            speed += 0.0025 * (torque - p[NAME] * angle - p["damp"] * speed) / p["J"]
+            angle += 0.0025 * speed
+    return np.array(found)
+"""
+
+
+def swivel_case(folder, name, more=""):
+    """A motor on a spring whose stiffness has this name; the logs are of a spring 10 % stiffer."""
+    (folder / "swivel.py").write_text(SWIVEL.replace("NAME", repr(name)))
+    simulate = runpy.run_path(str(folder / "swivel.py"))["simulate"]
+    for seed, log in enumerate(("one.csv", "two.csv")):
+        rng = np.random.default_rng(seed)
+        torque = rng.uniform(-1, 1, 15).repeat(20)[:, None]
+        angle = simulate({"J": 0.02, name: 1.65, "damp": 0.04}, {}, torque)
+        angle = angle + 1e-3 * rng.standard_normal(angle.shape)
+        rows = np.column_stack([0.01 * np.arange(len(torque)), torque, angle])
+        save(folder / log, rows, "time_s,torque_Nm,angle_rad")
+    text = f'python = "swivel.py"\nlog = ["one.csv", "two.csv"]\n{more}'
+    return load_simulator_case(settings_of(tomllib.loads(text), "here"), folder, "here")
+
+
+@pytest.mark.parametrize("name", ["spring", "input_delay", "ratio", "wrong_J", "coulomb_friction"])
+def test_candidates_are_the_same_whatever_a_parameter_is_called(tmp_path, name):
+    """Of a parameter that is called like a listed effect, and of one that nothing is called."""
+    plain = telling(swivel_case(tmp_path, "zeta").case)
+    found = telling(swivel_case(tmp_path, name).case)
+    assert len(found.least) == len(plain.least)
+    called = f"wrong_{name}" if name in plain.least else name
+    assert {**plain.least, called: plain.least["zeta"]} == {**found.least, "zeta": found.least[called]}
+    assert len(found.alike) == len(plain.alike)
+
+
+def test_an_effect_and_a_value_of_one_name_are_left_out_one_by_one(tmp_path):
+    every = swivel_case(tmp_path, "spring").case.plant
+    assert "spring" in every.tolerances
+    assert "spring" in {effect.name for effect in every.effects}
+    for pattern, value, effect in (("wrong_spring", False, True), ("spring", True, False)):
+        plant = swivel_case(tmp_path, "spring", f'exclude = ["{pattern}"]').case.plant
+        assert ("spring" in plant.tolerances) is value
+        assert ("spring" in {effect.name for effect in plant.effects}) is effect
+        assert "candidates" in plant.inactive["wrong_spring" if effect else "spring"]
+    for pattern in ("J", "wrong_J"):
+        assert "J" not in swivel_case(tmp_path, "spring", f'exclude = ["{pattern}"]').case.plant.tolerances
+
+
+def test_a_symbol_with_an_index_states_no_unit(tmp_path):
+    """k_s is a stiffness as likely as a value in seconds; time_constant_s states what it is in."""
+    for name, said in (
+        ("k_s", "of 1.5"),
+        ("k1_m", "of 1.5"),
+        ("k_Nm_rad", "of 1.5 N m/rad"),
+        ("free_s", "of 1.5 s"),
+    ):
+        loaded = swivel_case(tmp_path, name)
+        summary = check.of_case(loaded, telling(loaded.case))
+        (sizes,) = [section for section in summary.sections if section.title == "smallest size that shows"]
+        assert {row.label: row.value for row in sizes.rows}[name].endswith(said)
+
+
+@pytest.mark.parametrize("name", ["spring", "gain", "mass"])
+def test_the_prior_of_a_value_does_not_depend_on_its_name(name):
+    listed = ("spring", "input_delay", "wrong_J")
+    as_named = acts_like(f"wrong_{name}", (*listed, f"wrong_{name}"), "models")
+    assert as_named == acts_like("wrong_k_s", (*listed, "wrong_k_s"), "models")
+    assert acts_like("spring", (*listed, f"wrong_{name}"), "rigs") == acts_like(
+        "spring", (*listed, "wrong_k_s"), "rigs"
+    )
 
 
 def test_advice_stays_a_sentence_and_names_are_those_of_the_model():

@@ -62,6 +62,12 @@ def of_case(loaded: SimulatorCase, found: Telling) -> RunSummary:
     of = getattr(case.plant.simulation, "quantities", {})  # of MuJoCo, whose names have no units
     logs = [_log(loaded, k) for k in range(len(case.experiments))]
     doubts = (*loaded.doubts, *doubtful_columns(case))
+    # A stated value goes by its own name unless an effect, tried or not, is called so.
+    effects = {effect.name for effect in case.plant.effects} | set(case.plant.inactive)
+    untried = {}
+    for name, needs in case.plant.inactive.items():
+        value = name.removeprefix("wrong_")
+        untried[name if value in effects else value] = needs
     alike = tuple(sorted(found.alike, key=lambda one: (len(one.names), one.left)))
     shown = dict(sorted(found.least.items(), key=lambda item: item[1]))
     first = replace(found, least=shown, alike=alike[:_MOST_SHOWN])
@@ -80,12 +86,12 @@ def of_case(loaded: SimulatorCase, found: Telling) -> RunSummary:
         },
         "limits": [effect.name for effect in case.plant.effects if not effect.grows],
         "units": case.units,
-        "values": dict(case.plant.parameters),
+        "values": {name: case.plant.value(key) for name, key in case.plant.value_candidates.items()},
         "value_names": {
-            key: next((one.name for one in of[key].parameters), "") if key in of else key
-            for key in case.plant.parameters
+            name: next((one.name for one in of[key].parameters), "") if key in of else key
+            for name, key in case.plant.value_candidates.items()
         },
-        "untried": dict(case.plant.inactive),
+        "untried": untried,
         "advice": list(dict.fromkeys(_advice(first)))[:_MOST_ADVICE],
     }
     return RunSummary(

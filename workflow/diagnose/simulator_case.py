@@ -177,18 +177,26 @@ def with_units(found: Diagnosis, units: Mapping[str, Mapping[str, str]]) -> Diag
 
 
 def _chosen(plant: Plant, settings: SimulatorSettings) -> Plant:
-    """With the candidates that a case file leaves, each within its bounds; all else is as stated."""
-    there = [*(effect.name for effect in plant.effects), *plant.tolerances]
+    """With the candidates that a case file leaves, each within its bounds; all else is as stated.
+
+    A pattern names an effect or a stated value, which is also called "wrong_NAME"; it is called only so where
+    an effect has its name.
+    """
+    values = plant.value_candidates
+    there = [*(effect.name for effect in plant.effects), *values]
+    called = {name: {name} for name in there}
+    for name, parameter in values.items():
+        called[name].add(f"wrong_{parameter}")
     for key in ("candidates", "exclude"):
         for pattern in getattr(settings, key):
-            if not fnmatch.filter(there, pattern):
+            if not any(fnmatch.filter(names, pattern) for names in called.values()):
                 raise ValueError(
                     f"{key}: {pattern!r} matches nothing that shows in the logs; there are {listing(there)}"
                 )
 
-    def taken(name: str) -> bool:
+    def taken(candidate: str) -> bool:
         def within(patterns: Sequence[str]) -> bool:
-            return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
+            return any(fnmatch.filter(called[candidate], pattern) for pattern in patterns)
 
         return within(settings.candidates) and not within(settings.exclude)
 
@@ -202,16 +210,16 @@ def _chosen(plant: Plant, settings: SimulatorSettings) -> Plant:
         size, *rest = effects[name].parameters
         bounded = replace(size, low=low, high=high, starts=tuple(geometric(low, high, 8)[1:-1]))
         effects[name] = replace(effects[name], parameters=(bounded, *rest))
-    left = {name: "the case file to allow it (candidates, exclude)" for name in there if not taken(name)}
-    tolerances = {name: value for name, value in plant.tolerances.items() if taken(name)}
+
+    # What is left out is listed under the names that a diagnosis gives it.
+    allowed_by = "the case file to allow it (candidates, exclude)"
+    left_out = {effect.name: allowed_by for effect in plant.effects if not taken(effect.name)}
+    left_out |= {f"wrong_{key}": allowed_by for name, key in values.items() if not taken(name)}
     return replace(
         plant,
         effects=tuple(effects.values()),
-        tolerances=tolerances,
-        inactive={
-            **plant.inactive,
-            **{f"wrong_{n}" if n in plant.tolerances else n: why for n, why in left.items()},
-        },
+        tolerances={key: plant.tolerances[key] for name, key in values.items() if taken(name)},
+        inactive={**plant.inactive, **left_out},
     )
 
 

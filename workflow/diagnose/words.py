@@ -9,14 +9,14 @@ from typing import Any
 
 from plant.effects import in_words
 from workflow.text.formats import MISSING, fixed, interval, listing, number, si
-from workflow.text.names import name_words, unit_of
+from workflow.text.names import name_words, stated_name, stated_unit, unit_of
 
 _SURE = {0.99: "practically certain", 0.9: "very likely", 0.66: "likely", 0.33: "possible", 0.0: "unlikely"}
 
 
 def parameter_words(parameter: str, value: float, bounds: Sequence[float] | None = None) -> str:
     """Name, value, unit and 95 % interval."""
-    text = f"{name_words(parameter)} {si(value, unit_of(parameter), 4)}"
+    text = f"{stated_name(parameter)} {si(value, stated_unit(parameter), 4)}"
     return text if bounds is None else f"{text} (95 %: {interval(bounds, 4)})"
 
 
@@ -24,7 +24,7 @@ def key_words(key: str) -> str:
     """A key of the rig file, "hub.inertia_kg_m2" as "inertia (hub)"; of one's own plant without a section."""
     section, _, name = key.rpartition(".")
     if not section:
-        return name_words(name)
+        return stated_name(name)
     what = name_words(name)
     return what if re.search(rf"\b{section}\b", what) else f"{what} ({section})"
 
@@ -96,12 +96,12 @@ def closure_words(document: Mapping[str, Any]) -> str:
 def trend_words(found: Any) -> str:
     """A `fleet.Trend` in one sentence."""
     what = (
-        f"{in_words(found.effect)}: {name_words(found.parameter)}"
+        f"{in_words(found.effect)}: {stated_name(found.parameter)}"
         if found.effect
         else key_words(found.parameter)
     )
     grows = "grows" if found.tau > 0 else "falls"
-    slope = si(abs(found.per_number), unit_of(found.parameter), 3)
+    slope = si(abs(found.per_number), stated_unit(found.parameter), 3)
     return (
         f"{what} {grows} with the number in the name, by {slope} per number (Kendall's tau {found.tau:.2f}, "
         f"p = {found.p:.1g}, {found.machines} machines)"
@@ -113,6 +113,8 @@ FILTERS: Mapping[str, Callable[..., Any]] = {
     "parameter_unit": unit_of,
     "parameter": parameter_words,
     "parameter_name": name_words,
+    "value_unit": stated_unit,
+    "value_name": stated_name,
     "rig_key": key_words,
     "setting_of": setting_words,
     "probability": probability_words,

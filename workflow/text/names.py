@@ -8,6 +8,8 @@ import re
 _FACTORS = r"(?:(?:rad|ohm|kg|Pa|Hz|N|m|s|V|A)[23]?)"
 _UNIT = re.compile(rf"_({_FACTORS}+)(?:_({_FACTORS}+))?$")
 _POWERS = str.maketrans("23", "²³")
+# A letter with a letter behind "_" is a symbol with its index, k_s or J_m, as likely as a value with a unit.
+_SYMBOL = re.compile(r"[^\W\d_]\d*_[^\W\d_]")
 
 
 def unit_of(parameter: str) -> str:
@@ -20,6 +22,16 @@ def unit_of(parameter: str) -> str:
     over, under = (" ".join(re.findall(_FACTORS, part or "")).translate(_POWERS) for part in found.groups())
     # An inertia is the one product that is written with a "_" between.
     return f"{over} {under}" if (over, under) == ("kg", "m²") else f"{over}/{under}" if under else over
+
+
+def stated_unit(parameter: str) -> str:
+    """Unit of a parameter whose name states one without doubt: none of a symbol with an index, as k_s."""
+    return "" if _SYMBOL.fullmatch(parameter) else unit_of(parameter)
+
+
+def stated_name(parameter: str) -> str:
+    """Name of a parameter without the unit that it states: "torque_Nm" as "torque", but k_s as it is."""
+    return parameter if _SYMBOL.fullmatch(parameter) else name_words(parameter)
 
 
 def name_words(parameter: str) -> str:
