@@ -18,7 +18,7 @@ from diagnosis.judge.model_error import (
 )
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import CaseOfMachine
-from diagnosis.machine.own_plant import PlantCase
+from diagnosis.machine.own_plant import PlantCase, SimulationError
 from diagnosis.machine.probed import doubts_about
 from diagnosis.search.loop import Progress
 from diagnosis.search.search import Search
@@ -47,16 +47,30 @@ def diagnose(
     time_limit_s : After it nothing more is tried, and the answer says what was not.
     rng : Of interval draws and bootstrap; without it a fixed sequence, so that one case has one answer.
 
+    A candidate with which a simulation of one's own fails is left out, and a doubt of the answer says so.
+
     Warns where the records of an own machine show less noise than is stated, and an effect in what that hid,
     and of what makes its answer doubtful (`doubts_about`, which raises ValueError where it is random).
     """
     rng = np.random.default_rng(0) if rng is None else rng
     progress = progress or (lambda fraction, message: None)
     deadline_s = time.monotonic() + _SEARCHED * time_limit_s
-    doubts = doubts_about(case, deadline_s) if isinstance(case, PlantCase) else ()
+    if not isinstance(case, PlantCase):
+        answer = _at_noise_seen(case, progress, rng, deadline_s)
+        return replace(answer, doubts=(*_asked_of(case, answer), *answer.doubts))
+
+    # Every failure takes one candidate off the list: there are no more rounds than candidates.
+    left_out: tuple[str, ...] = ()
+    while True:
+        try:
+            doubts = (*left_out, *doubts_about(case, deadline_s))
+            answer = _at_noise_seen(case, progress, rng, deadline_s)
+            break
+        except SimulationError as error:
+            case, said = case.without_failing(error)
+            left_out = (*left_out, said)
     for doubt in doubts:
         warnings.warn(f"plant: {doubt}", stacklevel=2)
-    answer = _at_noise_seen(case, progress, rng, deadline_s)
     return replace(answer, doubts=(*doubts, *_asked_of(case, answer), *answer.doubts))
 
 

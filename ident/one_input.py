@@ -223,12 +223,16 @@ def fitted_on_all(records: Sequence[Record], outcome: SearchOutcome) -> tuple[Fi
 def _priors_judged(
     records: Sequence[Record], part: Sequence[Record], outcome: SearchOutcome, fitted: Fitted
 ) -> tuple[Fitted, tuple[PriorTest, ...]]:
-    """Test what the options state as known, and impose the relative degree. Each test starts from a model
+    """Test what somebody stated as known, and impose the relative degree.
+
+    What the program chose from the data, in options of its own, is not tested. Each test starts from a model
     that the data have not refused: with integrators refused, relative degree is judged with slow poles in
-    their place."""
+    their place.
+    """
     options = outcome.search.options
-    stated = options.integrators or options.fixed_poles or options.relative_degree is not None
-    delay_stated = not options.delay_left_to_data and outcome.dead_time is None
+    integrators_stated = options.integrators > 0 and options.is_stated("integrators")
+    delay_stated = options.is_stated("input_delay_samples") and outcome.dead_time is None
+    stated = integrators_stated or options.fixed_poles or options.relative_degree is not None
     if fitted.poles.order == 0 or not (stated or delay_stated):
         return fitted, ()
     search = PoleSearch(fitted.data, options)
@@ -236,7 +240,7 @@ def _priors_judged(
     given = judged = Fitted(search, fitted.end)
     searched = part, outcome.data.structure
     tests: list[PriorTest] = []
-    if options.integrators:
+    if integrators_stated:
         test, free = integrators_test(records, searched, given)
         tests.append(test)
         outcome.search.evaluations += free.search.evaluations

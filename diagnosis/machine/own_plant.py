@@ -52,6 +52,21 @@ RUNAWAY = 1e12
 _NUMERICAL = (ArithmeticError, RuntimeWarning, np.linalg.LinAlgError)
 
 
+class SimulationError(ValueError):
+    """A simulation that ended with an error which is not numerical, or gave outputs of another shape.
+
+    reason : what happened, to follow "the simulation". parameters, changes : with which it was run.
+    """
+
+    def __init__(
+        self, message: str, reason: str, parameters: Mapping[str, float], changes: Sequence[Change]
+    ) -> None:
+        super().__init__(message)
+        self.reason = reason
+        self.parameters = parameters
+        self.changes = tuple(changes)
+
+
 def place_of(error: BaseException, file: str = "") -> str:
     """The last line of a user's file on the way to an error, as " (FILE, line N)". file : that file;
     by default the one that is called first from where the error is caught."""
@@ -260,19 +275,17 @@ class Plant:
             except _NUMERICAL:
                 raise
             except (Exception, SystemExit) as error:
-                at = place_of(error)
-                reason = " ".join(f"{type(error).__name__}: {error}".split())
-                raise ValueError(
-                    f"{self._at(effects)} the simulation ended with {reason}{at}{OF_TRIAL}"
-                ) from error
+                reason = " ".join(f"ended with {type(error).__name__}: {error}".split()) + place_of(error)
+                message = f"{self._at(effects)} the simulation {reason}{OF_TRIAL}"
+                raise SimulationError(message, reason, self.parameters, effects) from error
             asked = (len(inputs), self.noise.size)
             if found.shape == asked[:1] and asked[1] == 1:
                 found = found[:, None]
             if found.ndim != 2 or len(found) != len(inputs) or found.shape[1] < self.noise.size:
                 turned = "; transpose it" if found.shape == asked[::-1] else ""
-                raise ValueError(
-                    f"{self._at(effects)} the simulation must give outputs {asked}; got {found.shape}{turned}"
-                )
+                reason = f"must give outputs {asked}; got {found.shape}{turned}"
+                message = f"{self._at(effects)} the simulation {reason}"
+                raise SimulationError(message, reason, self.parameters, effects)
             return found
 
         run, at_rest = (partial(simulation_itself, b) for b in (begun, (0.0,) * len(self.start)))
@@ -344,6 +357,53 @@ class PlantCase(RecordedCase[PlantExperiment]):
                 raise ValueError(
                     f"{where}: two simulations as stated differ by up to {differ:.3g}; is something random?"
                 )
+
+    def without_failing(self, error: SimulationError) -> tuple[PlantCase, str]:
+        """The case without the candidate that a simulation failed with, and a sentence that says so.
+
+        Of several effects it is the first that fails alone, else the last; without effects the stated value
+        that was moved by most of its tolerances. Raises the error where nothing was changed or nothing is
+        left.
+        """
+        plant = self.plant
+        if error.changes:
+            failing = next((c for c in error.changes if self._fails(c)), error.changes[-1]).id
+        else:
+            moved = {
+                key: abs(np.log(max(error.parameters[key] / plant.parameters[key], np.finfo(float).tiny)))
+                / tolerance
+                for key, tolerance in plant.tolerances.items()
+                if error.parameters[key] != plant.parameters[key]
+            }
+            if not moved:
+                raise error
+            failing = f"wrong_{max(moved, key=lambda key: moved[key])}"
+
+        # A value that is not judged stays as it is stated.
+        multiplied = {kind.id: str(kind.multiplies) for kind in wrong_values(plant.tolerances)}
+        value = multiplied.get(failing, failing.removeprefix("wrong_"))
+        effects = tuple(effect for effect in plant.effects if effect.name != failing)
+        tolerances = dict(plant.tolerances)
+        if len(effects) == len(plant.effects):
+            tolerances.pop(value, None)
+        if not effects:
+            raise error
+        needs = "a simulation that runs with it"
+        reduced = replace(
+            plant, effects=effects, tolerances=tolerances, inactive={**plant.inactive, failing: needs}
+        )
+        said = f"{failing} is left out, the simulation fails with it: it {error.reason}"
+        return replace(self, plant=reduced), said
+
+    def _fails(self, change: Change) -> bool:
+        """Whether the simulation as stated fails in some record with this effect alone."""
+        run = self.plant.simulator([change])
+        for e in self.estimation:
+            try:
+                run(e.input)
+            except SimulationError:
+                return True
+        return False
 
     @property
     def machine(self) -> Plant:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.machine.own_plant import Plant, PlantCase
+from diagnosis.machine.own_plant import Plant, PlantCase, SimulationError
 
 # Of a stated value, the relative change that is simulated; records that are simulated, the longest.
 _STEP, _RECORDS = 0.02, 2
@@ -42,16 +42,22 @@ class Telling:
     value relative, of an effect in its unit;
     of one that does less where it is larger, as a limit, the largest; inf where it does nothing.
     hidden : candidates that show at no size that is searched. alike : groups.
-    unlooked : candidates that a deadline left out."""
+    unlooked : candidates that a deadline left out. failed : candidate with which the simulation fails -> how
+    it does.
+    """
 
     least: Mapping[str, float]
     hidden: tuple[str, ...]
     alike: tuple[Alike, ...]
     unlooked: tuple[str, ...] = ()
+    failed: Mapping[str, str] = field(default_factory=dict)
 
 
 def telling(case: PlantCase, deadline_s: float = np.inf) -> Telling:
-    """deadline_s : of time.monotonic(); what is left then is not looked at."""
+    """What the longest estimation records of a case can tell of every candidate.
+
+    deadline_s : of time.monotonic(); what is left then is not looked at.
+    """
     plant = case.plant
     records = sorted(case.estimation, key=lambda e: -len(e.output))[:_RECORDS]
     levels = [
@@ -59,37 +65,68 @@ def telling(case: PlantCase, deadline_s: float = np.inf) -> Telling:
         for e in records
     ]
     stated = _outputs(plant, (), records)
-    columns, sizes, most = dict[str, Real](), dict[str, float](), dict[str, float]()
+    columns = dict[str, Real]()
+    sizes = dict[str, float]()
+    largest = dict[str, float]()
+    failed = dict[str, str]()
+
+    # To first order: every stated value moved by a small step.
     values = plant.value_candidates
-    names = [*values, *(effect.name for effect in plant.effects)]
     for name, parameter in values.items():
-        if time.monotonic() < deadline_s:
+        if time.monotonic() > deadline_s:
+            break
+        try:
             moved = _outputs(plant.scaled({parameter: 1 + _STEP}), (), records)
-            columns[name], sizes[name], most[name] = _over(moved, stated, levels), _STEP, _FARTHEST
+        except SimulationError as error:
+            failed[name] = error.reason
+            continue
+        columns[name] = _over(moved, stated, levels)
+        sizes[name] = _STEP
+        largest[name] = _FARTHEST
+
+    # Every effect at the middle one of its starts.
     for effect in plant.effects:
-        if time.monotonic() < deadline_s:
-            candidate, size = effect.candidates()[0], effect.parameters[0]
-            change = candidate.effect_at(np.array(candidate.starts[len(candidate.starts) // 2]))
+        if time.monotonic() > deadline_s:
+            break
+        candidate = effect.candidates()[0]
+        change = candidate.effect_at(np.array(candidate.starts[len(candidate.starts) // 2]))
+        try:
             moved = _outputs(plant, (change,), records)
-            columns[effect.name] = _over(moved, stated, levels)
-            sizes[effect.name], most[effect.name] = abs(change.values[size.name]), size.high
+        except SimulationError as error:
+            failed[effect.name] = error.reason
+            continue
+        columns[effect.name] = _over(moved, stated, levels)
+        sizes[effect.name] = abs(change.values[effect.parameters[0].name])
+        largest[effect.name] = effect.parameters[0].high
     samples = [len(e.output) for e in records]
     shows = {name: _shown(column, samples) for name, column in columns.items()}
     least = {name: sizes[name] / shows[name] if shows[name] > 0 else np.inf for name in columns}
-    limits = (one for one in plant.effects if not one.grows and one.name in columns)
-    for effect in (one for one in limits if time.monotonic() < deadline_s):
-        (candidate, *_), first = effect.candidates(), effect.parameters[0].name
+
+    # A limit shows from some size down, which no slope tells: its range in steps.
+    for effect in plant.effects:
+        if effect.grows or effect.name not in columns or time.monotonic() > deadline_s:
+            continue
+        candidate = effect.candidates()[0]
         # Of a range of twenty to one, steps of an eighth.
         grid = [np.array([x, *candidate.starts[0][1:]]) for x in np.linspace(*candidate.axes[0].box, 24)]
         changes = [candidate.effect_at(x) for x in grid]
-        done = [_over(_outputs(plant, (change,), records), stated, levels) for change in changes]
+        try:
+            done = [_over(_outputs(plant, (change,), records), stated, levels) for change in changes]
+        except SimulationError as error:
+            failed[effect.name] = error.reason
+            del columns[effect.name], least[effect.name]
+            continue
+        first = effect.parameters[0].name
         seen = {abs(c.values[first]): d for c, d in zip(changes, done, strict=True) if _shown(d, samples) > 1}
         least[effect.name] = max(seen, default=np.inf)
         if seen and not np.any(columns[effect.name]):
             columns[effect.name] = seen[least[effect.name]]
-    hidden = tuple(name for name in columns if not least[name] < most[name])
+
+    hidden = tuple(name for name in columns if not least[name] < largest[name])
     told = {name: c / np.linalg.norm(c) for name, c in columns.items() if name not in hidden}
-    return Telling(least, hidden, _alike(told), tuple(name for name in names if name not in columns))
+    names = [*values, *(effect.name for effect in plant.effects)]
+    unlooked = tuple(name for name in names if name not in columns and name not in failed)
+    return Telling(least, hidden, _alike(told), unlooked, failed)
 
 
 def _outputs(plant: Plant, changes: Sequence[object], records: Sequence[object]) -> list[Real]:

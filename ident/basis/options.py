@@ -7,7 +7,7 @@ from numbers import Complex
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
@@ -160,6 +160,16 @@ class IdentOptions(Settings):
                     f"relative_degree = {self.relative_degree} needs at least that many poles, integrators "
                     f"counted; got {order}"
                 )
+
+    # What somebody set when these settings were made. A copy that the program changes keeps it.
+    _stated: frozenset[str] = PrivateAttr(default=frozenset())
+
+    def model_post_init(self, context: Any) -> None:
+        self._stated = frozenset(self.model_fields_set)
+
+    def is_stated(self, key: str) -> bool:
+        """Whether somebody set this key; what the program chose for a copy, from the data, nobody did."""
+        return key in self._stated
 
     def fixed(self) -> Poles:
         """The fixed poles, mirror images of unstable ones last; ValueError if one is not inside the circle.

@@ -19,7 +19,7 @@ class _Fields(ModelMetaclass):
     """`help` lists what a reader sets, which stands in the docstring, and nothing of pydantic's."""
 
     def __dir__(self) -> list[str]:
-        return list(self.__annotations__)
+        return [name for name in self.__annotations__ if not name.startswith("_")]
 
 
 class Settings(BaseModel, metaclass=_Fields):

@@ -230,3 +230,31 @@ def test_error_rates_of_the_verdicts(colour, runs):
         counts["wrong"] += refused(identify([plain], three))["relative_degree = 3"]
     assert counts["true"] <= 0.05 * 2 * len(seeds)
     assert counts["wrong"] == 2 * len(seeds)
+
+
+def test_what_the_program_chose_is_not_called_specified():
+    """The wrong integrator and delay of a slow plant: refused where somebody states them, else not judged."""
+    truth = p1_friction(0)
+    wrong = {"integrators": 2, "input_delay_samples": 3, "n_real": 0, "n_pairs": 1}
+    stated = identify([truth.record], IdentOptions(**wrong))
+    assert refused(stated)["integrators = 2"]
+    assert "input_delay_samples = 3" in refused(stated)
+    chosen = identify([truth.record], IdentOptions(n_real=0, n_pairs=1).model_copy(update=wrong))
+    assert refused(chosen) == {}
+    judged = {FindingKind.INTEGRATORS, FindingKind.SPARE_INTEGRATORS, FindingKind.DELAY}
+    assert not judged & (kinds(chosen.verdicts) | kinds(chosen.warnings))
+    # It is the same model; of a mix only what was stated is judged.
+    assert chosen.rss == pytest.approx(stated.rss, rel=1e-9)
+    mixed = IdentOptions(integrators=2, n_real=0, n_pairs=1).model_copy(update={"input_delay_samples": 3})
+    assert set(refused(identify([truth.record], mixed))) == {"integrators = 2"}
+
+
+def test_a_copy_keeps_what_was_stated():
+    stated = IdentOptions(integrators=1)
+    copy = stated.with_delay_stated().model_copy(update={"n_real": 2})
+    assert [copy.is_stated(key) for key in ("integrators", "input_delay_samples", "n_real")] == [
+        True,
+        False,
+        False,
+    ]
+    assert not copy.delay_left_to_data
