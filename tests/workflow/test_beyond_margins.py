@@ -242,6 +242,44 @@ def test_a_missed_specification_says_what_would_meet_it(open_):
     met = found(asked | open_ | {key: float(value)})
     assert met.met
     assert "would meet" not in met.reason
+    wish = met.specification
+    assert task.certify_asked(
+        met.controller, [uncertain_hub(0.03)], wish, options, np.random.default_rng(0)
+    ).certified
+
+
+@pytest.mark.parametrize("fails", ["design", "certificate"])
+def test_a_hint_that_was_not_designed_and_certified_is_not_given(monkeypatch, fails):
+    """A quick design that meets a larger limit is no answer where the whole one or its certificate fails."""
+    quick = SimpleNamespace(gamma=0.5, outcome=Outcome.MET_ON_GRID, blocking=())
+    whole = SimpleNamespace(gamma=1.2, outcome=Outcome.NOT_MET, blocking=(), controller="law")
+    tried = []
+
+    def widest(plants, specification, options, *, rng, progress=None):
+        tried.append(specification.effort_limit)
+        first = len(tried) == 1 or fails == "design"
+        return specification, whole if first else SimpleNamespace(**{**vars(whole), "gamma": 0.9})
+
+    verdict = SimpleNamespace(certified=False)
+    monkeypatch.setattr("workflow.tasks.design.synthesise", lambda *_, **__: quick)
+    monkeypatch.setattr("workflow.tasks.design.synthesise_widest", widest)
+    monkeypatch.setattr("workflow.tasks.design.certify_asked", lambda *_, **__: verdict)
+    monkeypatch.setattr("workflow.tasks.design.said", lambda name, *given: f"{name} {given[0]}")
+    options = CertificateOptions.model_validate({})
+
+    def design():
+        tried.clear()
+        asked = spec().model_copy(update={"effort_limit": 10.0, "bandwidth_rad_s": None})
+        return task.find_design(
+            [example.plant()], asked, SynthesisOptions(), options, np.random.default_rng(0)
+        )
+
+    assert design().reason.endswith("would_meet None")
+    # The design that missed, and two whole ones with larger limits.
+    assert tried == [10.0, 18.0, 36.0]
+    if fails == "certificate":
+        verdict.certified = True
+        assert design().reason.endswith("would_meet ('effort_limit', 18.0)")
 
 
 def test_words_of_sampled_responses():

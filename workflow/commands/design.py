@@ -47,7 +47,13 @@ def _design(
     nothing = AchievablePerformance(), ReferenceFilterResult()
     with naming("design"):
         design = find_design(
-            plants, specification, asked.synthesis, asked.certificate, stage_rng(seed, "design"), report
+            plants,
+            specification,
+            asked.synthesis,
+            asked.certificate,
+            stage_rng(seed, "design"),
+            report,
+            between_own_points=asked.plant.between_points,
         )
         specification = design.specification or specification
         none = CertifyResult(None, certified=False, reason=design.reason)

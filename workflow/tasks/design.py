@@ -3,6 +3,7 @@ controller of any order could reach, and the reference filter (u = K (F r - y)),
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
@@ -47,8 +48,10 @@ UNKNOWN_TO_BRACKET = (
     "rate_limit",
 )
 
-# Worst case of a quick design that the whole design then meets, too.
+# Worst case of a quick design that the whole design then meets, too, as a rule.
 _CLEARLY = 0.97
+# Whole designs at most that verify a hint: each takes as long as the one that missed.
+_MOST_WHOLE_DESIGNS = 2
 
 
 def find_design(
@@ -60,9 +63,10 @@ def find_design(
     progress: Callable[[float, str], None] | None = None,
     *,
     advise: bool = True,
+    between_own_points: Literal["nothing", "linear"] = "linear",
 ) -> DesignResult:
     """One controller for all plants; `reason` says in one line how it stands against the specification, with
-    `advise` also what would be met instead.
+    `advise` also what would be met instead. between_own_points: of the certificate that this was tried with.
 
     With `calibrate`, and plants to draw from, one whose sampled responses are stable as often as the
     certificate then asks. A specification that no controller can meet is a result, not an error.
@@ -71,7 +75,8 @@ def find_design(
     specification = Specification.model_validate(
         specification.model_dump(include=set(Specification.model_fields))
     )
-    left_open = specification.lowest_bandwidth_rad_s is not None
+    stated = specification
+    at_start = copy.deepcopy(rng)
     try:
         if options.calibrate and undrawable(plants) is None:
             parts = [part_of(progress, number, 2) if progress else None for number in range(2)]
@@ -91,12 +96,15 @@ def find_design(
         return DesignResult(None, met=False, reason=str(impossible), specification=specification)
     reason = said("outcome", result)
     if advise and 1.0 < result.gamma < math.inf:
-        meets = would_meet(plants, specification, result.gamma, synthesis, rng)
-        if meets is not None and left_open and meets[0] == "bandwidth_rad_s":
-            meets = (
-                "lowest_bandwidth_rad_s",
-                meets[1],
-            )  # the one tried is the lowest: a lower one is to be stated
+        meets = would_meet(
+            plants,
+            stated,
+            result.gamma,
+            synthesis,
+            options,
+            at_start,
+            between_own_points=between_own_points,
+        )
         reason += said("would_meet", meets)
     return DesignResult(result, result.gamma <= 1.0, reason, jointly, specification)
 
@@ -106,23 +114,59 @@ def would_meet(
     specification: Specification,
     gamma: float,
     synthesis: SynthesisOptions,
+    options: CertificateOptions,
     rng: np.random.Generator,
+    *,
+    between_own_points: Literal["nothing", "linear"] = "linear",
 ) -> tuple[str, float] | None:
-    """A key of the specification, and the first value of it with which a quick design meets the rest: a
-    larger effort_limit, else a smaller bandwidth_rad_s; None where none of a few does. gamma: worst case."""
-    root = int(rng.integers(2**63))
+    """A key of the specification, and a value of it with which a design is certified, the rest as it is.
+
+    A larger effort_limit, else a smaller bandwidth (where the lowest one is stated, a smaller lowest one);
+    None where none of a few is. Quick designs find what may do; it is told only once it was designed and
+    certified as a user would who typed it. gamma: worst case of the design that missed. rng: as that design
+    had it when it began; it is not moved on.
+    """
+    root = int(copy.deepcopy(rng).integers(2**63))
     quick = synthesis.model_copy(update={"sufficient_gamma": _CLEARLY})
+    # Of a range of bandwidths it is the lowest that was missed.
+    left_open = specification.lowest_bandwidth_rad_s is not None
+    missed = specification
+    if left_open:
+        lowest = {"bandwidth_rad_s": specification.lowest_bandwidth_rad_s, "lowest_bandwidth_rad_s": None}
+        missed = specification.model_copy(update=lowest)
+    whole_designs = 0
     for key, factors in (("effort_limit", (1.5 * gamma, 3 * gamma)), ("bandwidth_rad_s", (0.5, 0.25))):
-        stated = getattr(specification, key)
+        stated = getattr(missed, key)
         for factor in factors if stated is not None else ():
             value = float(f"{factor * stated:.2g}")
-            asked = specification.model_copy(update={key: value, "lowest_bandwidth_rad_s": None})
+
+            asked = missed.model_copy(update={key: value})
             try:
                 found = synthesise(plants, asked, quick, rng=np.random.default_rng(root), thorough=False)
             except SpecificationError:
                 continue
-            if found.gamma <= _CLEARLY:
-                return key, value
+            if not found.gamma <= _CLEARLY:
+                continue
+
+            # As a user would who typed it.
+            if whole_designs == _MOST_WHOLE_DESIGNS:
+                return None
+            whole_designs += 1
+            typed = "lowest_bandwidth_rad_s" if left_open and key == "bandwidth_rad_s" else key
+            wished = specification.model_copy(update={typed: value})
+            design = find_design(plants, wished, synthesis, options, copy.deepcopy(rng), advise=False)
+            if not design.met or design.controller is None:
+                continue
+            certified = certify_asked(
+                design.controller,
+                plants,
+                design.specification or wished,
+                options,
+                copy.deepcopy(rng),
+                between_own_points=between_own_points,
+            )
+            if certified.certified:
+                return typed, value
     return None
 
 
