@@ -19,9 +19,10 @@ from control_design.plants.frequency_grid import around_maxima, joined
 
 _TOUCHES = 1e-9  # relative distance from the real axis or the unit circle that counts as a crossing without
 # a change of sign: the finest the search between the points resolves
-# Rounds of the search between grid points, of the so many smallest minima. Nine new points between the two
-# neighbours of a minimum leave it two neighbours a fifth as far apart: four rounds, a 625th.
+# Rounds of the search between grid points. Nine new points between the two neighbours of a minimum leave it
+# two neighbours a fifth as far apart: after four rounds, a 625th.
 _ROUNDS = 4
+# Minima that are searched, the smallest: more of them than a loop of any order here has near -1.
 _MINIMA = 16
 _ROUNDED = 1e-6  # relative; what the search may miss of a smallest value, taken off the margins of ellipses
 
