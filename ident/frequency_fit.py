@@ -264,7 +264,8 @@ def _limited_to_data(
     """The fit, or one whose poles all have a band of measured_rad (K, 2) within their half-power width.
 
     The limited fits compete by the criterion of the order selection. The best of them replaces the given fit
-    unless that is better by more than chance makes the unknowns of its poles without data. also_direct_term:
+    unless that is better by more than chance makes the unknowns of its poles without data; one with more
+    unknowns than the given fit has to be better. also_direct_term:
     limited fits with a direct term compete, too, which does what poles near pi/dt do for a response without
     the half sample of a hold.
     """
@@ -279,20 +280,24 @@ def _limited_to_data(
     # The criterion of every fit is read from the residual of the given one, so that they can be compared.
     worth = fit.search.colour(fit.end).effective_samples
     scale_of = (fit.end.rss, fit.end.poles.order, worth)
-    allowed = fit.data.criterion(*scale_of)(fit.end.rss, fit.end.poles.order)
-    allowed += float(chi2.ppf(TEST_LEVEL, unshown_poles.order))
+    given_criterion = fit.data.criterion(*scale_of)(fit.end.rss, fit.end.poles.order)
+    given_unknowns = fit.data.n_parameters(fit.end.poles.order)
+    by_chance = float(chi2.ppf(TEST_LEVEL, unshown_poles.order))
     best_fit = fit
+    best_criterion = np.inf
     for structure in structures:
         # Poles of a fit with a direct term are others; without one the given poles are near those sought.
         start = None if also_direct_term else fit.end.poles
         limited_fit = _OrderFit.of(_prepared(response, structure), structure, measured_rad, start)
         end = limited_fit.end
+        criterion = limited_fit.data.criterion(*scale_of)(end.rss, end.poles.order)
+        more_unknowns = limited_fit.data.n_parameters(end.poles.order) > given_unknowns
+        allowed = given_criterion if more_unknowns else given_criterion + by_chance
         # A pair is never damped beyond its largest ratio, not even where it should be wider.
         complies = poles_without_data(end.poles, limited_fit.search.fixed, measured_rad).order == 0
-        limited_criterion = limited_fit.data.criterion(*scale_of)(end.rss, end.poles.order)
-        if complies and limited_criterion <= allowed:
+        if complies and criterion <= min(allowed, best_criterion):
             best_fit = limited_fit
-            allowed = limited_criterion
+            best_criterion = criterion
     return best_fit
 
 
