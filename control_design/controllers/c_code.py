@@ -78,8 +78,8 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
 
     Same law and same order of operations as `ControllerStepper`: x+ = A x + B e + M (u_limited - u). In
     `double` the two differ by the rounding of sums only; `float` may have other states: see `law_in`. The
-    computational delay is not in the code: a real-time loop that writes its command one sample later has it
-    by itself.
+    code is `K_without_delay` of `Controller.to_control`: the computational delay, which margins are about, is
+    the machine's. A real-time loop that writes its command one sample later has it by itself.
 
     No fixed point: word lengths that keep the certificate depend on the scaling on the processor. An error
     that is not finite gives NaN, limits or not, which states keep until `<prefix>_reset`: check the sensor.
@@ -199,6 +199,7 @@ def _filled(template: str, controller: Controller, **values: object) -> str:
         "breakaway": given is not None and given.excess != 0,
         "matrix": controller.D.size > 1,
         "signals": bool(controller.signals),
+        "delay": controller.computational_delay_samples > 0,
     }
     lines = []
     for line in _template(template):

@@ -32,10 +32,16 @@ class Controller(Law):
     what an active limit does to the states, A - M C stable; None takes that of `anti_windup`.
     computational_delay_samples: from measurement to command. feedforward: joins u before it is limited, or
     None. signals: the columns and units of error and command, in words.
+
+    A, B, C, D are `K_without_delay`, the law that a processor runs: the machine adds the computational delay.
+    Margins and certificates are about `K_with_delay` = z^-computational_delay_samples K_without_delay.
     """
 
     kind = "controller"
-    equations = "u = C x + D e; x+ = A x + B e + M (u_limited - u); e = reference - measurement"
+    equations = (
+        "u = C x + D e; x+ = A x + B e + M (u_limited - u); e = reference - measurement. A, B, C, D: "
+        "K_without_delay, the machine adds the delay; the margins are those of K_with_delay"
+    )
 
     computational_delay_samples: int = 1
     input_limit: Limit = None
@@ -160,12 +166,38 @@ class Controller(Law):
         )
 
     def to_control(self, *, include_delay: bool = False) -> control.StateSpace:
-        """Linear part as `control.StateSpace`; with include_delay the delay's states come after K's."""
-        return delayed(super().to_control(), self.computational_delay_samples if include_delay else 0)
+        """Linear part as `control.StateSpace`, named after what it is.
+
+        Parameters
+        ----------
+        include_delay : bool
+            False: `K_without_delay` = C (z I - A)^-1 B + D, which the C code runs. Its margins are better
+            than those of the loop. True: `K_with_delay`, which margins and certificates are about; the
+            delay's states come after those of A. Without computational delay both are the same, and named
+            `K`.
+        """
+        delay = self.computational_delay_samples
+        system = delayed(super().to_control(), delay if include_delay else 0)
+        if delay == 0:
+            system.name = "K"
+        else:
+            system.name = "K_with_delay" if include_delay else "K_without_delay"
+        return system
+
+    def named_systems(self) -> dict[str, dict[str, Any]]:
+        """`K_without_delay` and `K_with_delay` of `to_control` for files: each as A, B, C, D and dt_s [s]."""
+        systems = {
+            "K_without_delay": self.to_control(),
+            "K_with_delay": self.to_control(include_delay=True),
+        }
+        return {
+            name: {matrix: np.asarray(getattr(system, matrix)) for matrix in "ABCD"} | {"dt_s": self.dt_s}
+            for name, system in systems.items()
+        }
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Inverse of `to_dict`, as of `Law`; a file may lack feed-forward and signals."""
+        """Inverse of `to_dict`, as of `Law`; a file may lack feed-forward, signals and `named_systems`."""
         given = data.get("feedforward")
         try:
             made = None if given is None else FrictionFeedforward(**given)

@@ -77,7 +77,13 @@ class Law:
             key: value.tolist() if isinstance(value, np.ndarray) else value
             for key, value in asdict(self).items()
         }
+        for name, system in self.named_systems().items():
+            plain[name] = {key: value.tolist() if key in _ARRAYS else value for key, value in system.items()}
         return {"format": self.format_name(), "law": self.equations, **plain}
+
+    def named_systems(self) -> dict[str, dict[str, Any]]:
+        """State spaces (A, B, C, D, dt_s) that files hold by name beside the fields; reading ignores them."""
+        return {}
 
     @classmethod
     def format_name(cls) -> str:
@@ -127,8 +133,8 @@ class Law:
         return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
 
     def to_mat(self) -> bytes:
-        """MATLAB 5 file of all fields; a limit that is None is infinite (one per actuator: a row), a
-        feed-forward that is None and signals that nobody named are left out."""
+        """MATLAB 5 file of all fields and `named_systems` (structs); a limit that is None is infinite (one
+        per actuator: a row), a feed-forward that is None and signals that nobody named are left out."""
         values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
         given = values.pop("feedforward", None)
         if given is not None:
@@ -139,7 +145,7 @@ class Law:
             if isinstance(value, tuple):
                 values[name] = np.array([np.inf if one is None else one for one in value])
         values = {name: np.inf if value is None else value for name, value in values.items()}
-        return mat_bytes(values, f"flexlink {self.kind}")
+        return mat_bytes(values | self.named_systems(), f"flexlink {self.kind}")
 
     @classmethod
     def from_json(cls, text: str) -> Self:

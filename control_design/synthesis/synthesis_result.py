@@ -79,6 +79,7 @@ class SynthesisResult(Shown):
     plants: tuple[UncertainPlant, ...] = field(default=(), compare=False, metadata=NOT_STORED)
     specification: Specification | None = field(default=None, compare=False, metadata=NOT_STORED)
 
-    def to_control(self) -> Any:
-        """The controller as `control.StateSpace`, without its computational delay and limits."""
-        return self.controller.to_control()
+    def to_control(self, *, include_delay: bool = False) -> Any:
+        """The controller as `control.StateSpace` without its limits: `K_without_delay`, or with include_delay
+        `K_with_delay`, which the margins are about (`Controller.to_control`)."""
+        return self.controller.to_control(include_delay=include_delay)

@@ -116,6 +116,35 @@ def from_mat(path) -> Controller:
     return Controller.from_dict({"format": Controller.format_name(), "feedforward": None, **found})
 
 
+@pytest.mark.parametrize("delay", [0, 1, 3])
+@pytest.mark.parametrize("order", [0, 1])
+def test_files_name_the_law_with_its_delay_and_without(order, delay, tmp_path):
+    law = _pi() if order else Controller.proportional(2.0, _DT)
+    law = replace(law, computational_delay_samples=delay)
+    omega = np.array([0.1, 3.0, 0.9 * np.pi / _DT])
+    (tmp_path / "k.mat").write_bytes(law.to_mat())
+    mat = scipy.io.loadmat(tmp_path / "k.mat", simplify_cells=True)
+
+    for document in (json.loads(law.to_json()), mat):
+        for name, with_delay in (("K_with_delay", True), ("K_without_delay", False)):
+            part = document[name]
+            n = law.order + (delay if with_delay else 0)
+            shapes = ((n, n), (n, 1), (1, n), (1, 1))
+            matrices = [np.reshape(part[m], shape) for m, shape in zip("ABCD", shapes, strict=True)]
+            found = control.ss(*matrices, part["dt_s"])(np.exp(1j * omega * _DT))
+            np.testing.assert_allclose(found, law.response(omega, with_delay=with_delay), rtol=1e-9)
+
+    names = [law.to_control(include_delay=both).name for both in (False, True)]
+    assert names == (["K", "K"] if delay == 0 else ["K_without_delay", "K_with_delay"])
+
+
+def test_a_file_from_before_the_names_is_read():
+    document = json.loads(_pi().to_json())
+    older = {name: value for name, value in document.items() if not name.startswith("K_")}
+    assert older.keys() < document.keys()
+    assert Controller.from_dict(older).to_dict() == document
+
+
 def test_json_and_mat_round_trip_exactly(tmp_path):
     for controller in (
         _random(np.random.default_rng(3), input_limit=5.0, rate_limit=100.0, name="hub"),

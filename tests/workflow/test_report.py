@@ -1,5 +1,6 @@
 """The page: its numbers are the stages', it fetches nothing, escapes everything, suits every outcome."""
 
+import html
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from control_design.analysis.stability import ModeChange
+from control_design.controllers.c_code import Dialect
 from control_design.convex.reference_filter import ReferenceFilter
 from control_design.plants.plant_set import Mode
 from ident.data.finding import FindingKind, finding
@@ -17,6 +19,8 @@ from tests.workflow import report_examples as example
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import drawings
 from workflow.report.pages import write_report
+from workflow.tasks import pipeline
+from workflow.tasks.exports import Logged
 from workflow.tasks.results import ClosedLoopResult, ReferenceFilterResult, RunResults
 from workflow.tasks.summary import summarise
 from workflow.text.formats import at_least, at_most, bound
@@ -398,3 +402,54 @@ def test_a_lowered_bandwidth_says_which_of_the_three_is_which():
     assert told.startswith("bandwidth_rad_s = 19 was not met; ")
     assert told.endswith("designed for 8.82 rad/s; reaches at least 12.2 rad/s")
     assert said("lowered", asked, asked, [], 12.2) == ""
+
+
+@pytest.mark.parametrize(("delay", "scales"), [(0, (1.0, 1.0)), (1, (57.3, -2.0))])
+def test_two_lines_typed_give_the_margins_of_the_certificate(
+    delay, scales, tmp_path, undrawn, monkeypatch, capsys
+):
+    """With the files of the run, also where they are in other columns than the model."""
+    own = replace(example.controller(), computational_delay_samples=delay)
+    monkeypatch.setattr(example, "controller", lambda gain=1.5: own)
+    logged = Logged((scales[0],), (scales[1],), "columns as logged")
+    monkeypatch.setattr(Logged, "of", classmethod(lambda cls, config, records: logged))
+    settings = example.config()
+    specification = settings.specification.model_copy(update={"computational_delay_samples": delay})
+    settings = settings.model_copy(update={"specification": specification})
+    run = example.build_run(tmp_path / "run", settings)
+    pipeline._keep_files(RunResults(run), settings, Dialect())
+    text = write_report(RunResults(run), settings).read_text(encoding="utf-8")
+
+    typed, printed = re.search(r'<pre class="typed">(.*?)</pre>\s*<pre>(.*?)</pre>', text, re.S).groups()
+    assert len(html.unescape(typed).splitlines()) == 2
+    monkeypatch.chdir(run.path)
+    exec(html.unescape(typed), {})
+
+    def read(table):
+        rows = (line.split() for line in table.strip().splitlines())
+        return {name: [float(value) for value in values] for name, *values in rows}
+
+    found = read(capsys.readouterr().out)
+    for name, values in read(printed).items():
+        assert found[name] == pytest.approx(values, rel=2e-4), name
+    nominal = RunResults(run).certify.certificate.plants[0].nominal_margins
+    known = [nominal.gain_up, np.degrees(nominal.phase_rad), nominal.modulus]
+    assert found["K_with_delay"] == pytest.approx(known, rel=5e-3)
+    if delay == 0:
+        assert found["K_without_delay"] == found["K_with_delay"]
+    else:
+        assert min(np.subtract(found["K_without_delay"], known)) > 0.01
+
+
+@pytest.mark.parametrize(
+    ("delay", "words"), [(0, "K has no computational delay"), (1, "K has its 1 sample of")]
+)
+def test_captions_say_where_the_delay_is(delay, words, tmp_path, undrawn, monkeypatch):
+    own = replace(example.controller(), computational_delay_samples=delay)
+    monkeypatch.setattr(example, "controller", lambda gain=1.5: own)
+    settings = example.config()
+    specification = settings.specification.model_copy(update={"computational_delay_samples": delay})
+    text = page_for(tmp_path, settings.model_copy(update={"specification": specification})).text
+    assert words in text
+    assert ("K_with_delay = K_without_delay * control.tf([1], [1, 0], 0.01)" in text) == (delay == 1)
+    assert ("K = control.zpk(" in text) == (delay == 0)

@@ -177,13 +177,14 @@ def draw_loop(run: RunView) -> Figure:
     law = replace(
         loop, centre=run.controller.response(loop.omega_rad_s), covariance=np.zeros_like(loop.covariance)
     )
+    delay = run.controller.computational_delay_samples
     figure, grid = style.panels(6.4, 2, 2, sharex=True, height_ratios=[1.3, 1.0])
     filled = style.BAND | {"label": f"{share(loop.level)} ellipses"}
     for (gain, phase), response, of, title in zip(
         grid.T,
         (law, loop),
         (style.ratio_unit(run.input_unit, run.output_unit), "1"),
-        ("Controller K", "Loop K G"),
+        ("Controller K with its computational delay" if delay else "Controller K", "Loop K G"),
         strict=True,
     ):
         band = _draw(gain, phase, response, style.PREDICTED_LINE | {"label": "nominal"}, filled)

@@ -8,17 +8,18 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from scipy import signal
 
-from control_design.analysis.stability import closed_loop_poles
+from control_design.analysis.margins import nominal_margins
+from control_design.analysis.stability import closed_loop_poles, loop_integrators
 from control_design.controllers.controller import Controller
 from control_design.controllers.law import Law
-from control_design.plants.frequency_grid import frequency_grid
-from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
+from control_design.plants.frequency_grid import checked_grid, frequency_grid
+from control_design.plants.plant_set import Mode, UncertainPlant, frequency_response, modes_of
 from control_design.specification import Specification
 from ident.basis.options import IdentOptions
 from ident.checks.distortion_findings import distortion_findings
@@ -238,6 +239,61 @@ class RunView(AnyRunView):
     def logged_controller(self) -> Controller:
         """As the run's files have it."""
         return Logged.of(self.config, self.results.records).law(self.controller)
+
+    @property
+    def loop_factor(self) -> float:
+        """What `model.json` times the K of `controller.json` lacks of the loop gain: the controller's files
+        take and give the columns as logged, the model is in quantities."""
+        logged = Logged.of(self.config, self.results.records)
+        return logged.command[0] / logged.error[0]
+
+    def model_margins(self) -> dict[str, tuple[tuple[float, float, float], bool]]:
+        """Margins of the nominal model, that of `model.json`, with each K of the controller's files.
+
+        Returns
+        -------
+        margins : dict
+            For `K_with_delay` and `K_without_delay` the gain margin nearest to 1 (a factor), the phase margin
+            [deg] and the modulus margin; and whether the gain crosses at zero or at the Nyquist frequency,
+            where `control.stability_margins` does not look.
+
+        Notes
+        -----
+        The margins of the certificate are about the ellipses and their centres, from which the nominal model
+        differs a little. Say nothing of a loop that is not stable.
+        """
+        plant = self.plant
+        law = self.controller
+
+        # The grid of the certificate: fine wherever the open or the closed loop has a pole or a zero.
+        closed = closed_loop_poles(law, plant)
+        every_mode = (*plant.modes, *modes_of(closed, plant.dt_s), *modes_of(law.poles, plant.dt_s))
+        light = [
+            Mode(mode.omega_rad_s, max(abs(mode.zeta), 1e-4))
+            for mode in every_mode
+            if abs(mode.zeta) < LIGHT and mode.omega_rad_s < plant.nyquist_rad_s
+        ]
+        roots = np.concatenate([plant.poles, plant.zeros, law.poles, closed])
+        omega = checked_grid(plant, light, 1000, 120, roots=roots)
+
+        def loop_gain(omega: Real, with_delay: bool) -> Complex:
+            return law.response(omega, with_delay=with_delay) * frequency_response(plant.nominal, omega)
+
+        integrators, _ = loop_integrators(law, plant)
+        at_zero = None if integrators else float(loop_gain(np.zeros(1), False)[0].real)
+
+        margins = {}
+        for name, with_delay in (("K_with_delay", True), ("K_without_delay", False)):
+            found = nominal_margins(partial(loop_gain, with_delay=with_delay), omega, at_zero=at_zero)
+            gain = found.gain_up
+            if found.gain_down > 0 and -np.log(found.gain_down) < np.log(found.gain_up):
+                gain = found.gain_down
+            ends = loop_gain(omega[-1:], with_delay).real
+            if at_zero is not None:
+                ends = np.append(ends, at_zero)
+            at_end = bool(np.any(np.isclose(gain * ends, -1.0, rtol=1e-6)))
+            margins[name] = (gain, float(np.degrees(found.phase_rad)), found.modulus), at_end
+        return margins
 
     @staticmethod
     def forms(law: Law) -> dict[str, Any]:
