@@ -337,6 +337,7 @@ def friction_check(sensitivity: kept.SensitivityCheck) -> kept.FrictionCheck:
         certified_peak=sensitivity.certified_peak, tolerance_percent=5.0, certified_from=0.002,
         linear_from=0.01, sticking_step=0.0013, sticking_interval=(0.0012, 0.0014), error_at_rest=0.006,
         error_interval=(0.0058, 0.0062), step=StepMetrics(0.2, 0.1, 10.0, 0.0, 1.5, 0.001, 3.0, 0.0),
+        settling=kept.SettlingRange((0.1, 0.2, 0.4), (1.6, 1.5, 3.0), 20.0),
         watched_s=20.0, left=0.002, output=step, recorded_output=0.1 + 0.5 * step,
         tracking=kept.SlowSine(0.05, 0.1, 0.001, error, 0.2 * error, moves_from=0.02),
     )  # fmt: skip

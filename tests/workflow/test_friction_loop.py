@@ -26,7 +26,7 @@ from workflow.tasks.friction_loop import (
     interval_of,
     soonest,
 )
-from workflow.tasks.results import SlowSine
+from workflow.tasks.results import SettlingRange, SlowSine
 from workflow.text.templates import said
 
 DT_S = 0.005
@@ -190,10 +190,11 @@ def test_the_recorded_loop_stands_beside_the_new_one():
         step_metrics(made.answer(step)).settling_time_s, rel=0.02
     )
     unknown = replace(record, reference=None, reference_names=())
+    assert seen["recorded_settling"] == made.settling(step)
     assert beside_recorded(stage_of(found, [unknown]), slower, step) == {}
 
 
-@pytest.mark.parametrize(("first", "chosen"), [(0.001, 3), (0.05, 5)])
+@pytest.mark.parametrize(("first", "chosen"), [(0.001, 3), (0.03, 5)])
 def test_fewer_states_are_taken_where_friction_lets_them_settle_sooner(monkeypatch, first, chosen):
     """Little integral action waits until friction lets go; no design is tried where it does not."""
     monkeypatch.setattr("workflow.tasks.friction_loop.closed_loop_poles", lambda *_: np.array([0.98]))
@@ -297,6 +298,64 @@ def test_friction_at_the_load_acts_in_the_loop(belt, jump):
     drawn_levels = [one.beyond for one in drawn(law, found, np.random.default_rng(1), 200)]
     assert np.std(drawn_levels) == pytest.approx(0.001, rel=0.2)
     assert replace(loop, controller=controller()).error_at_rest == pytest.approx(0.04 / 5, rel=1e-4)
+
+
+def hunting(integral: float) -> tuple[Controller, Law]:
+    """A law with integral action whose step on the belt sticks in and out of its band: for flexlink, and for
+    the simulator of the machine."""
+    keep = np.exp(-DT_S / 0.008)
+    steep = 0.05 * (1 - keep) / DT_S
+    law = Controller(
+        np.diag([keep, 1.0]), np.array([[1 - keep], [DT_S]]), np.array([[-steep, integral]]), [[1 + steep]],
+        DT_S, computational_delay_samples=0,
+    )  # fmt: skip
+    return law, Law(law.A, np.hstack([law.B, -law.B]), law.C[0], np.append(law.D, -law.D), np.zeros(2))
+
+
+@pytest.mark.parametrize("integral", [0.5, 1.0])
+def test_the_range_over_sizes_holds_the_time_of_another_integration(belt, integral):
+    """One step's settling time jumps from 0.15 s to many with its size, and differs by seconds from that of a
+    simulator with other steps; the range covers both."""
+    machine, found = belt
+    law, both = hunting(integral)
+    loop = FrictionLoop.of(law, found)
+    step = np.append(0.0, np.full(600, 0.12))
+    settling = loop.settling(step)
+    assert settling.worst_s > 20 * settling.settled_s[0]
+    for share in (0.7, 0.85, 1.2):
+        run = loop.answer(share * step)
+        true = machine.run(both, run.reference, 0.0, np.zeros(run.reference.size))["true"]
+        for output in (run.output, true[:, None]):
+            time_s = step_metrics(replace(run, output=output)).settling_time_s
+            assert 0.98 * settling.settled_s[0] <= time_s <= 1.02 * settling.worst_s
+    # Chance decides how long the step itself takes; the middle of all sizes hardly moves with the step.
+    near = loop.settling(1.03 * step)
+    assert near.median_s == pytest.approx(settling.median_s, rel=0.15)
+
+
+def test_without_friction_every_size_takes_the_same_time():
+    loop = FrictionLoop.of(lead(), replace(fit(), noise_std=0.0))
+    step = np.append(0.0, np.full(400, 0.02))
+    settling = replace(loop, friction=FrictionLaw(0.0)).settling(step)
+    assert len(set(settling.times_s)) == 1
+    assert settling.sizes[0] == pytest.approx(0.01)
+    assert settling.sizes[-1] == pytest.approx(0.04)
+
+
+def test_range_and_median_over_sizes():
+    """Sizes that lie close together count as one; a step that does not settle is later than all."""
+    crowded = SettlingRange((0.5, 1.0, 1.01, 1.02, 2.0), (2.0, 1.0, 9.0, 9.0, 3.0), 30.0)
+    assert (crowded.settled_s, crowded.worst_s, crowded.median_s) == ((1.0, 2.0, 3.0, 9.0, 9.0), 9.0, 2.0)
+    some = SettlingRange((0.5, 1.0, 2.0), (2.0, None, 0.2), 30.0)
+    assert (some.worst_s, some.median_s) == (None, 2.0)
+    none = SettlingRange((0.5, 1.0, 2.0), (None, None, 1.0), 30.0)
+    assert none.median_s == np.inf
+    told = [
+        said("settling_range", each)
+        for each in (crowded, some, SettlingRange((1.0, 2.0), (2.71, 2.71), 30.0))
+    ]
+    assert told == ["1 to 9 s", "0.2 to over 30 s", "2.7 to 2.8 s"]
+    assert said("settling_range", SettlingRange((1.0, 2.0), (None, None), 30.0)) == "over 30 s"
 
 
 def test_predicted_response_is_that_of_the_nonlinear_arm():

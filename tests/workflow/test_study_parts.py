@@ -162,8 +162,13 @@ def test_numbers_beyond_the_margins():
     peaks = SimpleNamespace(
         nominal_peak=1.4, measured=(SimpleNamespace(peak=1.42), SimpleNamespace(peak=1.1))
     )
+    slow = SimpleNamespace(settling=kept.SettlingRange((0.1, 0.2), (4.0, 2.0), 30.0))
     check = SimpleNamespace(
-        settled_draws=1, draws=1, sensitivity=peaks, spread_of=lambda name: (0.0, 0.0, _METRICS[name])
+        settled_draws=1,
+        draws=1,
+        sensitivity=peaks,
+        friction=slow,
+        spread_of=lambda name: (0.0, 0.0, _METRICS[name]),
     )
     results = SimpleNamespace(
         design=design_of(0.88),
@@ -177,6 +182,7 @@ def test_numbers_beyond_the_margins():
     assert found["above_any_order_percent"] == pytest.approx(10.0)
     assert (found["whole_held_percent"], found["whole_stable_percent"]) == (99.0, 100.0)
     assert (found["matching_error"], found["matching_error_unfiltered"]) == (0.2, 0.95)
+    assert (found["settling_time_s"], found["settling_time_with_friction_s"]) == (1.0, 4.0)
     assert (found["predicted_peak_sensitivity"], found["measured_peak_sensitivity"]) == (1.4, 1.42)
 
 

@@ -33,7 +33,7 @@ from workflow.engine import codec, documents, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.store import Store
 
-LAYOUT_VERSION = 8  # 8: no design beside it that holds over amplitudes
+LAYOUT_VERSION = 9  # 9: settling with friction over sizes of the step
 T = TypeVar("T")
 _INPUT_HASH, _DIGEST = "_input_hash", "_sha256"
 _RESULT = "result"

@@ -44,6 +44,7 @@ _ALL = (
     StudyColumn("mode_damping", "mode damping", "", "larger"),
     StudyColumn("mode_omega_rad_s", "of the mode at", "rad/s"),
     StudyColumn("settling_time_s", "settling time", "s", "smaller"),
+    StudyColumn("settling_time_with_friction_s", "settling time with friction, longest", "s", "smaller"),
     StudyColumn("rise_time_s", "rise time", "s", "smaller"),
     StudyColumn("overshoot_percent", "overshoot", "%", "smaller"),
     StudyColumn("peak_command", "peak command", "", "smaller"),
@@ -114,6 +115,8 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> dict[str, Number]:
         worst = "settling_time_s", "rise_time_s", "overshoot_percent", "peak_command", "disturbance_peak"
         found |= {name: check.spread_of(name)[-1] for name in worst}
         found["settled_draws"], found["draws"] = check.settled_draws, check.draws
+        if check.friction is not None:
+            found["settling_time_with_friction_s"] = check.friction.settling.worst_s
         if (loop := check.sensitivity) is not None:
             peaks = loop.nominal_peak, loop.measured[0].peak
             found["predicted_peak_sensitivity"], found["measured_peak_sensitivity"] = peaks

@@ -511,6 +511,50 @@ class SlowSine:
         return float(np.sqrt(np.mean(self.without**2))), float(np.sqrt(np.mean(self.given**2)))
 
 
+@dataclass(frozen=True)
+class SettlingRange:
+    """Settling times of steps of several sizes on an arm with dry friction.
+
+    When friction lets an arm go hangs on the last digits of what came before: the settling time of one step
+    is chance, and another one for half the integration step. The range over sizes is not.
+
+    Attributes
+    ----------
+    sizes : tuple of N floats
+        Of the steps, rising, in units of the output; closer where the time jumps.
+    times_s : tuple of N floats or None
+        Time until the output stays within 2 % of each step; None: not within `watched_s`.
+    watched_s : float
+        How long every step was watched.
+    """
+
+    sizes: tuple[float, ...]
+    times_s: tuple[float | None, ...]
+    watched_s: float
+
+    @property
+    def settled_s(self) -> tuple[float, ...]:
+        """Times of the steps that settle, ascending."""
+        return tuple(sorted(time for time in self.times_s if time is not None))
+
+    @property
+    def worst_s(self) -> float | None:
+        """The longest time; None where a step does not settle."""
+        return None if None in self.times_s else max(self.settled_s)
+
+    @property
+    def median_s(self) -> float:
+        """The time within which half of the steps settle, even over the logarithm of the size; infinite where
+        fewer do. Choices are made by it, as the ends of the range are chance themselves."""
+        places = np.log(np.abs(self.sizes))
+        edges = np.concatenate([places[:1], (places[1:] + places[:-1]) / 2, places[-1:]])
+        shares = np.diff(edges) / (places[-1] - places[0])
+        times_s = np.array([np.inf if time is None else time for time in self.times_s])
+        order = np.argsort(times_s, kind="stable")
+        half = int(np.searchsorted(np.cumsum(shares[order]), 0.5))
+        return float(times_s[order[half]])
+
+
 @dataclass(frozen=True, eq=False)
 class FrictionCheck:
     """The loop on the identified arm with its dry friction.
@@ -523,8 +567,10 @@ class FrictionCheck:
     linear prediction; None where not even at the largest. sticking_step: largest step after which the arm
     does not leave its pre-sliding; error_at_rest: largest error with which it may rest, 0 with integral
     action. step: of the reference step on the arm as it was fitted, without noise, watched for `watched_s`
-    after the step; left: the largest error in the last half of that time; output (T,): as long as the trial's
-    step. recorded, recorded_output: the same of the loop that made the logs, None where they do not tell it.
+    after the step (its settling time is chance: `settling` holds those of half to twice its size); left: the
+    largest error in the last half of that time; output (T,): as long as the trial's step. recorded,
+    recorded_settling, recorded_output: the same of the loop that made the logs, None where they do not tell
+    it.
     """
 
     level: float
@@ -544,19 +590,24 @@ class FrictionCheck:
     error_at_rest: float
     error_interval: Interval
     step: StepMetrics
+    settling: SettlingRange
     watched_s: float
     left: float
     output: RealArray
     tracking: SlowSine
     recorded: StepMetrics | None = field(default=None, metadata={"since": 9})
+    recorded_settling: SettlingRange | None = None
     recorded_output: RealArray | None = field(default=None, metadata={"since": 9})
     errors: tuple[float, ...] = field(default=(), metadata={"since": 9})
 
     @property
     def times_slower(self) -> float:
-        """Settling of the step beside the recorded loop's, infinite where only that one settles."""
-        before = None if self.recorded is None else self.recorded.settling_time_s
-        return 0.0 if before is None else (self.step.settling_time_s or np.inf) / before
+        """Median settling time over the sizes beside the recorded loop's, infinite where only that one
+        settles."""
+        if self.recorded_settling is None or self.recorded_settling.median_s == np.inf:
+            return 0.0
+        # A step within its band from the start has settled in no time: one sample would do, too.
+        return self.settling.median_s / max(self.recorded_settling.median_s, 1e-9)
 
     @property
     def inside(self) -> int:
@@ -624,10 +675,11 @@ class LoopCheck:
 
     @property
     def waits_for_friction(self) -> bool:
-        """Whether friction lets the step settle `STALLS` times as late as without it."""
-        free, found = self.predicted.settling_time_s, self.friction
-        slow = np.inf if found is None else found.step.settling_time_s or np.inf
-        return free is not None and found is not None and slow > STALLS * free
+        """Whether friction lets half of the steps settle `STALLS` times as late as without it, or later."""
+        without = self.predicted.settling_time_s
+        if self.friction is None or without is None:
+            return False
+        return self.friction.settling.median_s > STALLS * without
 
     @property
     def draws(self) -> int:
