@@ -181,13 +181,21 @@ def _parts(result: Any, controller: Any) -> tuple[Any, Any]:
 
 
 def _loop_of(result: Any, controller: Any, omega_rad_s: Any) -> FrequencyUncertainty:
-    from workflow.figures.bands import times
+    from workflow.figures.bands import smooth_grid, times
 
     plant, controller = _parts(result, controller)
     found = as_response(plant, omega_rad_s)
     if controller is None:
         return found
-    return times(found, frequency_response(_law(controller), found.omega_rad_s))
+    law = _law(controller)
+    if omega_rad_s is None and as_response(plant, found.omega_rad_s[:1]).omega_rad_s.size == 1:
+        # Known at every frequency, and none was asked for: those that show the loop.
+        grid = smooth_grid(
+            found.omega_rad_s[found.omega_rad_s > 0],
+            lambda omega: as_response(plant, omega).centre * frequency_response(law, omega),
+        )
+        found = as_response(plant, grid)
+    return times(found, frequency_response(law, found.omega_rad_s))
 
 
 def _law(controller: Any) -> control.StateSpace:

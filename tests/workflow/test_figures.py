@@ -23,7 +23,14 @@ from ident.uncertainty import FrequencyUncertainty
 from plant import paper_link
 from tests.workflow import report_examples as example
 from workflow.figures import style
-from workflow.figures.bands import degrees_near, envelope, outline, response_band, unwrapped_degrees
+from workflow.figures.bands import (
+    degrees_near,
+    envelope,
+    outline,
+    response_band,
+    smooth_grid,
+    unwrapped_degrees,
+)
 from workflow.figures.bode import draw_bode, draw_distortion
 from workflow.figures.closed_loop import draw_closed_loop
 from workflow.figures.gap_answer import draw_waterfall
@@ -260,7 +267,7 @@ def test_phase_starts_where_engineers_expect_it():
     assert phase[-1] == pytest.approx(-270, abs=5)
 
 
-@pytest.mark.parametrize("samples", [5, 600, 1777, 2100, 2101, 12345])
+@pytest.mark.parametrize("samples", [1, 2, 5, 600, 1777, 2100, 2101, 12345])
 def test_outline_and_envelope_keep_extremes_and_ends(samples):
     time, signals = np.arange(samples) * 0.1, np.random.default_rng(samples).standard_normal((4, samples))
     for (t, *ends), every in ((outline(time, signals[0]), signals[0]), (envelope(time, signals), signals)):
@@ -268,6 +275,112 @@ def test_outline_and_envelope_keep_extremes_and_ends(samples):
         assert (ends[0].min(), ends[-1].max()) == (every.min(), every.max())
         assert np.all(np.diff(t) > 0)
         assert t.size <= 3 * 700
+    t, low, high = envelope(time, signals)
+    assert np.all(np.interp(time, t, low) <= signals + 1e-12)
+    assert np.all(np.interp(time, t, high) >= signals - 1e-12)
+
+
+WIDTH_PT, HEIGHT_PT, LINE_PT = 300.0, 110.0, 1.4  # of a panel with two columns and its lines
+
+
+def farthest_pt(x, y, line_x, line_y, scale=None):
+    """Largest distance [pt] of points (N,) from a drawn line (M,), both scaled to a panel."""
+    if scale is None:
+        scale = np.array([WIDTH_PT / np.ptp(x), HEIGHT_PT / np.ptp(y)])
+    points, ends = np.column_stack([x, y]) * scale, np.column_stack([line_x, line_y]) * scale
+    way = np.diff(ends, axis=0)
+    worst = 0.0
+    for part in np.array_split(points, max(points.shape[0] // 200, 1)):
+        off = part[:, None] - ends[:-1]
+        along = np.clip(np.sum(off * way, axis=2) / np.maximum(np.sum(way**2, axis=1), 1e-300), 0, 1)
+        worst = max(worst, np.linalg.norm(off - along[..., None] * way, axis=2).min(axis=1).max())
+    return worst
+
+
+def light_mode(samples, period):
+    """A step that a light mode of this period, in samples, rides on."""
+    k = np.arange(samples)
+    return 1 - np.exp(-k / (samples / 6)) * (0.8 + 0.2 * np.cos(2 * np.pi * k / period))
+
+
+@pytest.mark.parametrize(
+    "signal",
+    [
+        light_mode(700, 13.7),
+        light_mode(1110, 8.3),
+        light_mode(4100, 41.0),
+        light_mode(5000, 5.1),
+        np.repeat(np.random.default_rng(1).choice([-1.0, 1.0], 300), 9),
+        np.cumsum(np.random.default_rng(2).standard_normal(3000)),
+    ],
+    ids=["fast", "faster", "slow", "aliased", "binary", "walk"],
+)
+def test_a_thinned_curve_is_drawn_where_the_full_one_is(signal):
+    time = 0.01 * np.arange(signal.size)
+    assert farthest_pt(time, signal, *outline(time, signal)) < LINE_PT / 2
+    # Between any two samples of the drawn line the full one is near, too.
+    t, y = outline(time, signal)
+    middle = (t[:-1] + t[1:]) / 2, (y[:-1] + y[1:]) / 2
+    assert farthest_pt(*middle, time, signal) < LINE_PT
+
+
+def test_a_thinned_command_is_held_as_the_full_one():
+    k = np.arange(1500)
+    command = np.where(k < 100, 0.0, 9.0 * np.exp(-k / 90) * np.cos(k / 7) + 0.3)
+    t, u = outline(0.01 * k, command, hold=True)
+    held = u[np.searchsorted(t, 0.01 * k, side="right") - 1]
+    assert np.max(np.abs(held - command)) < 1e-3 * np.ptp(command)
+    assert t.size < k.size
+
+
+@pytest.mark.parametrize("zeta", [0.05, 3e-3, 2e-4])
+def test_a_locus_is_smooth_at_a_resonance(zeta):
+    """An integrator with a mode, its circle of any size: no corner, and no chord that is seen."""
+
+    def locus(omega):
+        s = 1j * omega
+        return 3.0 / s + 4.0 * zeta * s * 40.0 / (s**2 + 2 * zeta * 40.0 * s + 40.0**2)
+
+    grid = np.unique(np.concatenate([np.geomspace(0.1, 600, 300), 40 * (1 + zeta * np.linspace(-8, 8, 15))]))
+    fine = smooth_grid(grid, locus)
+    assert np.all(np.isin(grid, fine))
+    drawn = locus(fine)
+    scale_pt = 400 / 4.0  # of a panel that is four units wide
+    full = locus(40 * (1 + zeta * np.linspace(-15, 15, 2000)))
+    full = full[np.abs(full) < 3]
+    line = drawn[np.abs(drawn) < 4]
+    scale = np.full(2, scale_pt)
+    assert farthest_pt(full.real, full.imag, line.real, line.imag, scale) < LINE_PT / 2
+    rough = locus(grid)
+    if zeta < 0.01:
+        assert farthest_pt(full.real, full.imag, rough.real, rough.imag, scale) > LINE_PT
+    before, after = np.diff(drawn)[:-1], np.diff(drawn)[1:]
+    large = (np.abs(before) + np.abs(after)) * scale_pt > 6
+    large &= np.abs(drawn[1:-1]) < 3
+    assert np.max(np.abs(np.angle(after / before))[large], initial=0.0) < 0.12
+    assert fine.size < 1500
+
+
+def test_the_step_is_shown_until_it_has_settled():
+    """The linear runs stop at the disturbance; a line with friction goes on until it has settled."""
+    check = example.loop_check(example.config(machine="identified"), 3)
+    late = np.append(check.reference[:400], np.full(700, 0.5))
+    labels = {"output": ("y", "rad"), "command": ("u", "V")}
+    shown = {"others": check.achieved_runs, "disturbance": check.disturbance}
+    ends = []
+    for settled_s, friction in ((0.0, ()), (2.5, ()), (3.4, ()), (8.0, (late,))):
+        figure = draw_closed_loop(
+            check.time_s, check.reference, check.predicted_runs, labels, **shown,
+            settled_s=settled_s, with_friction=friction,
+        )  # fmt: skip
+        ends.append(figure.axes[0].get_xlim()[1])
+        first = max(line.get_xdata()[-1] for line in figure.axes[0].lines if "nominal" in line.get_label())
+        assert first < 4.0  # where the disturbance begins
+    assert ends[0] < 4.0
+    step_s = 0.4
+    assert ends[1] > step_s + 2.5
+    assert ends[2] == pytest.approx(4.0)
+    assert ends[3] == pytest.approx(step_s + 1.15 * 8.0)
 
 
 def test_margins_in_the_picture_are_those_of_the_loop():

@@ -428,7 +428,14 @@ def test_numbers_beside_the_sliders_are_those_of_the_run(fast_run, monkeypatch, 
     margins = {"modulus": worst.modulus, "gain": worst.gain_up, "phase": phase, "delay": delay}
     for name, value in margins.items():  # the certificate's grid is denser
         assert float(shown[f"{name} margin"].split()[0]) == pytest.approx(value, rel=0.01)
-    assert len(found["plants"][0]["step"]["samples"]) == 15
+    drawn = found["plants"][0]["step"]
+    assert len(drawn["samples"]) == 15
+    # The thinned step is drawn where the whole one is, and until it has settled.
+    run = session._steps(session._last, session._plants[0])[0]
+    seen = run.time_s <= drawn["end"]
+    line = np.interp(run.time_s[seen], drawn["nominal"]["x"], drawn["nominal"]["y"])
+    assert np.max(np.abs(line - run.measured[seen])) < 2e-3 * np.ptp(run.measured)
+    assert drawn["end"] > step.settling_time_s
 
 
 def test_a_run_is_tuned_from_its_own_design_at_the_bandwidth_it_found(fast_run, tmp_path):

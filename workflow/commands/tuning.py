@@ -35,6 +35,7 @@ from workflow.config.settings import check
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.randomness import stage_rng
+from workflow.figures.bands import outline, smooth_grid
 from workflow.figures.sensitivity import sensitivity_curves
 from workflow.figures.subjects import unit_of
 from workflow.tasks.design import bracket_numbers, find_bracket, find_design
@@ -264,19 +265,18 @@ class TuningSession:
         curves = []
         for plant, (nominal, *drawn) in zip(plants, runs, strict=True):
             y = nominal.measured
-            # The step until it hardly moves.
+            # The step until it hardly moves: beyond its settling to 2 %.
             away = np.flatnonzero(np.abs(y - y[-1]) > 0.01 * self._step_size)
             shown = min(y.size, max(40, int(1.5 * (away[-1] + 1)) if away.size else 40))
-            at = np.unique(np.linspace(0, shown - 1, 300).astype(int))
             curves.append(
                 {
                     "name": plant.name,
                     "gains": _gains(law, plant, specification),
                     "nyquist": _nyquist(law, plant),
                     "step": {
-                        "x": _short(nominal.time_s[at]),
-                        "nominal": _short(y[at]),
-                        "samples": [_short(run.measured[at]) for run in drawn],
+                        "end": float(nominal.time_s[shown - 1]),
+                        "nominal": _line(nominal, shown),
+                        "samples": [_line(run, shown) for run in drawn],
                     },
                 }
             )
@@ -331,7 +331,10 @@ def _gains(law: Controller, plant: UncertainPlant, specification: Specification)
 def _nyquist(law: Controller, plant: UncertainPlant) -> dict[str, Any]:
     """Loop K G of the centres and outlines of its ellipses, as far as they are near the origin."""
     grid = _grid(plant, law, 400, 30)
-    ellipses, k = plant.at(grid), law.response(grid)
+    if plant.own_grid is None:
+        grid = smooth_grid(grid, lambda omega: law.response(omega) * plant.at(omega).centre)
+    ellipses = plant.at(grid)
+    k = law.response(grid)
     loop = k * ellipses.centre
     near = np.flatnonzero(np.abs(loop) < _NEAR)
     at = near[np.unique(np.linspace(0, near.size - 1, _ELLIPSES).astype(int))] if near.size else near
@@ -345,6 +348,12 @@ def _nyquist(law: Controller, plant: UncertainPlant) -> dict[str, Any]:
         "im": _short(line.imag),
         "ellipses": [[_short(one.real), _short(one.imag)] for one in outline],
     }
+
+
+def _line(run: ClosedLoopTrajectory, shown: int) -> dict[str, Any]:
+    """The first samples of a run's output, as many of them as draw the same curve."""
+    time_s, output = outline(run.time_s[:shown], run.measured[:shown])
+    return {"x": _short(time_s), "y": _short(output)}
 
 
 def _control(name: str, schema: Mapping[str, Any], value: Any) -> dict[str, Any] | None:

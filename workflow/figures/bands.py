@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,18 @@ from ident.uncertainty import FrequencyUncertainty
 
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
+# Parts of a long signal: the widest panel has some 600 pixels for them, and a line covers more than one.
+_COLUMNS = 500
+# Of a signal's range: a tenth of a pixel of a panel of two inches, where a bend is not seen either.
+_STRAIGHT = 1 / 2000
+# A locus is smooth where it turns by no more than this [rad] from point to point: a hundred points a circle.
+_TURN_RAD = 0.06
+# Steps of a locus that are seen: three pixels of a plane that is four units wide; the same of a Nichols
+# chart, in nepers and rad. What is below -30 dB, or far from the origin, is in neither picture.
+_SEEN_STEP = 0.02
+_SEEN_LOG_STEP = 0.05
+_SEEN_GAINS = (0.03, 10.0)
+_REFINEMENTS = 12  # each halves the steps: of a grid of 81 points for a mode one is enough, as a rule
 _SEEN = 0.1  # half a band's height over the gain: two pixels of two hundred on an axis of six decades
 
 
@@ -81,20 +94,126 @@ def degrees_near(response: Complex, target_deg: Real) -> Real:
     return np.asarray(phase + 360.0 * np.round((target_deg - phase) / 360.0))
 
 
-def outline(time_s: Real, signal: Real, bins: int = 700) -> tuple[Real, Real]:
-    """A long signal as the smallest and largest sample of each of `bins` equal parts, in order of time.
+def outline(time_s: Real, signal: Real, columns: int = _COLUMNS, *, hold: bool = False) -> tuple[Real, Real]:
+    """The samples of a signal (T,) that draw the same curve as all of them.
 
-    Drawn as a line it covers the same pixels as the whole signal. Short signals come back as they are.
+    Parameters
+    ----------
+    time_s, signal : (T,) arrays
+    columns : int
+        Equal parts of the samples, at least as many as the panel has pixels.
+    hold : bool
+        Each value is drawn held until the next (`steps-post`), not joined to it by a straight line.
+
+    Returns
+    -------
+    time_s, signal : (N,) arrays
+        At most four samples of each part, with the first and the last of all.
+
+    Notes
+    -----
+    Of a part that is narrower than a line the first, the smallest, the largest and the last sample cover the
+    same pixels as all of it (M4: Jugel et al., Proc. VLDB 7(10), 2014). Samples that the curve meets without
+    them within `_STRAIGHT` of its range are left out.
     """
-    if signal.size <= 3 * bins:
-        return time_s, signal
-    length = -(-signal.size // bins)
-    first = np.arange(0, signal.size, length)
-    # The last part may be shorter: it is filled up with its last sample, which is no new extreme.
-    parts = np.pad(signal, (0, first.size * length - signal.size), mode="edge").reshape(-1, length)
-    both = np.concatenate([first + parts.argmin(axis=1), first + parts.argmax(axis=1), [0, signal.size - 1]])
-    index = np.unique(np.minimum(both, signal.size - 1))
-    return time_s[index], signal[index]
+    index = np.arange(signal.size)
+    if signal.size > 4 * columns:
+        length = -(-signal.size // columns)
+        first = np.arange(0, signal.size, length)
+        last = np.minimum(first + length, signal.size) - 1
+        # The last part may be shorter: it is filled up with its last sample, which is no new extreme.
+        parts = np.pad(signal, (0, first.size * length - signal.size), mode="edge").reshape(-1, length)
+        extremes = [first + parts.argmin(axis=1), first + parts.argmax(axis=1)]
+        index = np.unique(np.minimum(np.concatenate([first, last, *extremes]), signal.size - 1))
+    kept = (_held if hold else _straight)(time_s[index], signal[index], _STRAIGHT * float(np.ptp(signal)))
+    return time_s[index[kept]], signal[index[kept]]
+
+
+def _straight(x: Real, y: Real, tolerance: float) -> list[int]:
+    """Places of points (N,) whose joining lines pass all points within a vertical tolerance, in one walk: a
+    line from the last kept point goes on as long as its slope suits all points it passes."""
+    kept = [0]
+    steepest = np.inf
+    flattest = -np.inf
+    for place in range(1, x.size):
+        run = x[place] - x[kept[-1]]
+        rise = y[place] - y[kept[-1]]
+        if not flattest <= rise / run <= steepest:
+            kept.append(place - 1)
+            run = x[place] - x[place - 1]
+            rise = y[place] - y[place - 1]
+            steepest = np.inf
+            flattest = -np.inf
+        steepest = min(steepest, (rise + tolerance) / run)
+        flattest = max(flattest, (rise - tolerance) / run)
+    if x.size > 1:
+        kept.append(x.size - 1)
+    return kept
+
+
+def _held(x: Real, y: Real, tolerance: float) -> list[int]:
+    """Places of points (N,) whose held values differ from all values by no more than a tolerance."""
+    kept = [0]
+    for place in range(1, x.size):
+        if abs(y[place] - y[kept[-1]]) > tolerance:
+            kept.append(place)
+    if kept[-1] < x.size - 1:
+        kept.append(x.size - 1)
+    return kept
+
+
+def smooth_grid(omega_rad_s: Real, locus: Callable[[Real], Complex]) -> Real:
+    """A grid on which a locus, joined by straight lines, looks smooth: on the complex plane and on a Nichols
+    chart.
+
+    Parameters
+    ----------
+    omega_rad_s : (F,) array
+        Rising and positive; fine enough that no resonance lies unseen between two of its points.
+    locus : callable
+        The response (N,) at frequencies (N,).
+
+    Returns
+    -------
+    omega_rad_s : (N,) array
+        The grid with the middles of steps, on a logarithmic scale, in which the locus turns by more than
+        `_TURN_RAD`, where a picture shows it.
+    """
+    omega = np.asarray(omega_rad_s, dtype=np.float64)
+    value = locus(omega)
+    fresh = np.ones(omega.size - 1, dtype=np.bool_)  # steps that were not looked into
+    for _ in range(_REFINEMENTS):
+        start = np.flatnonzero(fresh)
+        middle = np.sqrt(omega[start] * omega[start + 1])
+        between = locus(middle)
+        first = value[start]
+        last = value[start + 1]
+
+        size = np.abs(between)
+        seen = (size > _SEEN_GAINS[0]) & (size < _SEEN_GAINS[1])
+        bent = _bent(between - first, last - between, _SEEN_STEP)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            bent |= _bent(np.log(between / first), np.log(last / between), _SEEN_LOG_STEP)
+        split = seen & bent
+        if not split.any():
+            break
+
+        at = start[split] + 1
+        omega = np.insert(omega, at, middle[split])
+        value = np.insert(value, at, between[split])
+        # Both halves of every split step are looked into next.
+        where = at + np.arange(at.size)
+        fresh = np.zeros(omega.size - 1, dtype=np.bool_)
+        fresh[where - 1] = True
+        fresh[where] = True
+    return omega
+
+
+def _bent(before: Complex, after: Complex, seen: float) -> npt.NDArray[np.bool_]:
+    """Where two steps (N,) that follow each other differ in direction, and are long enough to be seen."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turn = np.abs(np.angle(after / before))
+    return (turn > _TURN_RAD) & (np.abs(before) + np.abs(after) > seen)
 
 
 def liveliest(signal: Real, length: int) -> slice:
@@ -104,14 +223,24 @@ def liveliest(signal: Real, length: int) -> slice:
     return slice(start, start + length)
 
 
-def envelope(time_s: Real, signals: Real, bins: int = 250) -> tuple[Real, Real, Real]:
-    """Time, smallest and largest value of signals (R, T); of `bins` equal parts where T is much larger."""
-    low, high = signals.min(axis=0), signals.max(axis=0)
-    length = time_s.size // bins
-    if length < 2:
+def envelope(time_s: Real, signals: Real, columns: int = _COLUMNS) -> tuple[Real, Real, Real]:
+    """Time, lower and upper edge of a band that holds signals (R, T).
+
+    Of many samples the edges stand at the ends of `columns` equal parts, each the extreme of both parts that
+    meet there: no sample lies outside of the straight lines between them, and the band is by no more than a
+    part too wide.
+    """
+    low = signals.min(axis=0)
+    high = signals.max(axis=0)
+    if time_s.size <= 2 * columns:
         return time_s, low, high
-    at = np.arange(0, time_s.size, length)
-    # Each value holds for a part: drawn from its middle, but for the ends: the band spans all of the time.
-    middle = np.minimum(at + length // 2, time_s.size - 1)
-    middle[0], middle[-1] = 0, time_s.size - 1
-    return time_s[middle], np.minimum.reduceat(low, at), np.maximum.reduceat(high, at)
+    length = -(-time_s.size // columns)
+    first = np.arange(0, time_s.size, length)
+    ends = np.append(first, time_s.size - 1)
+    lowest = np.minimum.reduceat(low, first)
+    highest = np.maximum.reduceat(high, first)
+    lower = np.minimum(np.append(lowest[:1], lowest), np.append(lowest, lowest[-1:]))
+    upper = np.maximum(np.append(highest[:1], highest), np.append(highest, highest[-1:]))
+    # A last part of one sample ends where it begins.
+    keep = np.append(True, np.diff(ends) > 0)
+    return time_s[ends[keep]], lower[keep], upper[keep]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -39,6 +39,7 @@ def draw_run(run: RunView) -> Figure:
         command_limit=loop.input_limit,
         model=loop.model_answer,
         with_friction=loop.with_friction,
+        settled_s=loop.longest_settling_s,
     )
 
 
@@ -54,6 +55,7 @@ def draw_signals(
     command_limit: float | None = None,
     model: Real | None = None,
     with_friction: Sequence[Real] = (),
+    settled_s: float | None = None,
     ax: Any = None,
 ) -> Figure:
     """Rows: what `labels` names of output, performance and command. Left: the reference step. Right: the
@@ -61,33 +63,40 @@ def draw_signals(
 
     time_s, reference, disturbance and model (the answer of the model that a reference filter makes the loop
     follow) are (T,). labels: (name, unit) of each row. others: runs on `machine`, in words; without one, of
-    plants drawn from the uncertainty. with_friction: outputs of the lines `FRICTION`, as far as they go. The
-    first run is drawn as a line, all of them as the band between their extremes. ax: axes in place of a new
-    figure, one for each panel.
+    plants drawn from the uncertainty. with_friction: outputs of the lines `FRICTION`, as far as they go, the
+    step's panel as far as the longest. settled_s: the panels are cut where nothing moves any more, not before
+    this time after the step; None: all is shown. The first run is drawn as a line, all of them as the band
+    between their extremes. ax: axes in place of a new figure, one for each panel.
     """
     both = (predicted,) if others is None else (predicted, others)
-    onset, windows = _windows(time_s, disturbance, labels, both)
+    dt_s = float(time_s[1] - time_s[0])
+    friction_s = float(time_s[0]) + dt_s * (max((line.size for line in with_friction), default=1) - 1)
+    onset, windows = _windows(time_s, reference, disturbance, labels, both, settled_s, friction_s)
     figure, grid = style.panels(
         2.1 * len(labels) + 0.9, len(labels), len(windows), ax=ax, squeeze=False, sharex="col", sharey="row"
     )
     for (kind, label), row in zip(labels.items(), grid, strict=True):
         hold = {"drawstyle": "steps-post"} if kind == "command" else {}
         line: Real = getattr(predicted, kind)[0]
-        for axes, (start, stop, _) in zip(row, windows, strict=True):
-            first, last = np.searchsorted(time_s, [start, stop])
-            part = slice(int(first), int(last) + (stop == time_s[-1]))
+        for axes, window in zip(row, windows, strict=True):
+            part = _samples(time_s, window)
             time = time_s[part]
             if others is not None:
                 _draw_runs(axes, time, getattr(others, kind)[:, part], machine, hold)
-            axes.plot(*outline(time, line[part], 180), **_PREDICTED, **hold)
+            axes.plot(*outline(time, line[part], hold=bool(hold)), **_PREDICTED, **hold)
             if kind == "output":
-                axes.plot(time, reference[part], **_REFERENCE)
-                for held, look in zip(with_friction, FRICTION, strict=False) if start == time_s[0] else ():
-                    axes.plot(*outline(time[: held[part].size], held[part], 180), **look)
+                wanted_s, wanted = outline(time, reference[part], hold=True)
+                axes.plot(np.append(wanted_s, window.stop), np.append(wanted, wanted[-1]), **_REFERENCE)
+                if window is windows[0]:
+                    for output, look in zip(with_friction, FRICTION, strict=False):
+                        own_time = time_s[0] + dt_s * np.arange(output.size)
+                        seen = own_time <= window.stop
+                        axes.plot(*outline(own_time[seen], output[seen]), **look)
                 if model is not None:
-                    axes.plot(time, model[part], **style.MODEL_LINE, ls=":", label="model to follow")
-            axes.set_xlim(start, stop)
-            if onset is not None and start <= onset <= stop:
+                    looks = style.MODEL_LINE | {"ls": ":", "label": "model to follow"}
+                    axes.plot(*outline(time, model[part]), **looks)
+            axes.set_xlim(window.start, window.stop)
+            if onset is not None and window.start <= onset <= window.runs_until:
                 axes.axvline(onset, color="#888888", lw=0.8, ls=":")
         row[0].set_ylabel(style.two_lines(*label))
         runs = *(with_friction if kind == "output" else ()), *([getattr(others, kind)] if others else ())
@@ -99,8 +108,8 @@ def draw_signals(
                 for axes in row:
                     axes.axhline(limit, **style.LIMIT_LINE, label="saturation")
         row[0].set_ylim(*style.pad_limits(low, high, 0.08))
-    for axes, (_, _, title) in zip(grid[0], windows, strict=True):
-        axes.set_title(title)
+    for axes, window in zip(grid[0], windows, strict=True):
+        axes.set_title(window.title)
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")
     return figure
@@ -120,28 +129,43 @@ def _draw_runs(axes: Axes, time_s: Real, runs: Real, machine: str, hold: Mapping
             *envelope(time_s, runs), **style.ACHIEVED_BAND, label=f"{machine}: all {count} runs"
         )
     label = f"{machine}: first run" if count > 1 else machine
-    axes.plot(*outline(time_s, runs[0], 180), **style.ACHIEVED_LINE, **hold, label=label)
+    axes.plot(*outline(time_s, runs[0], hold=bool(hold)), **style.ACHIEVED_LINE, **hold, label=label)
+
+
+class _Window(NamedTuple):
+    """What a column of panels shows, in s: the axis, and until when the runs are about its title."""
+
+    start: float
+    stop: float
+    runs_until: float
+    title: str
+
+
+def _samples(time_s: Real, window: _Window) -> slice:
+    """Samples of the runs that a window shows."""
+    stop = min(window.stop, window.runs_until)
+    first, last = np.searchsorted(time_s, [window.start, stop])
+    return slice(int(first), int(last) + int(stop == time_s[-1]))
 
 
 def _windows(
-    time_s: Real, disturbance: Real | None, labels: Mapping[str, tuple[str, str]], both: tuple[LoopRuns, ...]
-) -> tuple[float | None, list[tuple[float, float, str]]]:
-    """When the disturbance begins; start, end and title of each panel: step and disturbance apart, each as
-    long as something moves."""
-    start, stop = float(time_s[0]), float(time_s[-1])
-    if disturbance is None or not disturbance.any():
-        return None, [(start, stop, "Reference step")]
-    moving = np.flatnonzero(disturbance != disturbance[0])
-    onset = float(time_s[moving[0]]) if moving.size else start
-    margin = 0.03 * (stop - start)
-    if not start + 4 * margin < onset < stop - 4 * margin:
-        return onset, [(start, stop, "Reference step and disturbance")]
-    size = si(float(disturbance[np.argmax(np.abs(disturbance))]), style.plain(labels["command"][1], 12))
-    windows = []
-    for first, last, title in (
-        (start, onset, "Reference step"),
-        (onset - margin, stop, f"Disturbance of {size} at the plant's input"),
-    ):
+    time_s: Real,
+    reference: Real,
+    disturbance: Real | None,
+    labels: Mapping[str, tuple[str, str]],
+    both: tuple[LoopRuns, ...],
+    settled_s: float | None,
+    friction_s: float,
+) -> tuple[float | None, list[_Window]]:
+    """When the disturbance begins, and the panels: step and disturbance apart, each as long as something
+    moves, the step at least until `settled_s` after it (None: the step is not cut). Lines with friction go on
+    to `friction_s`, where they settle later than the others, and the step's panel with them."""
+    start = float(time_s[0])
+    stop = float(time_s[-1])
+    stepped = np.flatnonzero(reference != reference[0])
+    step_s = float(time_s[stepped[0]]) if stepped.size else start
+
+    def shown(first: float, last: float, least: float, title: str) -> _Window:
         part = slice(int(np.searchsorted(time_s, first)), int(np.searchsorted(time_s, last)))
         # Predicted runs may leave 2 % of their range, the others (noisy) 15 %.
         quiet = max(
@@ -150,9 +174,27 @@ def _windows(
             for kind in labels
         )
         # Cut only where much is saved; some rest after the motion shows that it is over.
-        end = min(last, first + max(1.5 * (quiet - first), 0.2 * (last - first)))
-        windows.append((first, end if end < first + 0.75 * (last - first) else last - 1e-9, title))
-    return onset, windows
+        end = max(first + max(1.5 * (quiet - first), 0.2 * (last - first)), least)
+        uncut = last if last == stop else last - 1e-9  # the disturbance is not of the step's panel
+        if least > uncut:
+            return _Window(first, max(uncut, min(least, friction_s)), uncut, title)
+        return _Window(first, end if end < first + 0.75 * (last - first) else uncut, uncut, title)
+
+    if disturbance is None or not disturbance.any():
+        if settled_s is None:
+            return None, [_Window(start, stop, stop, "Reference step")]
+        return None, [shown(start, stop, step_s + 1.15 * settled_s, "Reference step")]
+
+    moving = np.flatnonzero(disturbance != disturbance[0])
+    onset = float(time_s[moving[0]]) if moving.size else start
+    margin = 0.03 * (stop - start)
+    if not start + 4 * margin < onset < stop - 4 * margin:
+        return onset, [_Window(start, stop, stop, "Reference step and disturbance")]
+    size = si(float(disturbance[np.argmax(np.abs(disturbance))]), style.plain(labels["command"][1], 12))
+    return onset, [
+        shown(start, onset, step_s + 1.15 * (settled_s or 0.0), "Reference step"),
+        shown(onset - margin, stop, 0.0, f"Disturbance of {size} at the plant's input"),
+    ]
 
 
 def _quiet_from(time_s: Real, runs: Real, tolerance: float) -> float:
@@ -187,7 +229,9 @@ def draw_measured_sensitivity(run: RunView) -> Figure | None:
     if loop is None or loop.sensitivity is None:
         return None
     low, high = loop.sensitivity.band_rad_s
-    curve = curves_of(run, np.geomspace(0.9 * low, min(1.1 * high, run.plant.nyquist_rad_s), 900))[0]
+    high = min(1.1 * high, run.plant.nyquist_rad_s)
+    fine = run.loop_grid[(run.loop_grid > 0.9 * low) & (run.loop_grid < high)]
+    curve = curves_of(run, np.union1d(np.geomspace(0.9 * low, high, 900), fine))[0]
     figure, axes = style.panels(4.4)
     draw_curve(axes, curve, run.level)
     for m, look in zip(loop.sensitivity.measured, _MARKERS, strict=False):
@@ -210,9 +254,9 @@ def draw_conditions(run: RunView) -> Figure | None:
     time_s = loop.time_s[: loop.conditions[0].reference.size]
     figure, panels = style.small_multiples(len(loop.conditions), columns, 1.95, 0.8, sharex=True)
     for axes, found in zip(panels, loop.conditions, strict=True):
-        achieved = outline(time_s, found.achieved, 120)
+        achieved = outline(time_s, found.achieved)
         axes.plot(*achieved, **style.ACHIEVED_LINE, label=MACHINE[loop.machine])
-        axes.plot(*outline(time_s, found.predicted, 120), **_PREDICTED)
+        axes.plot(*outline(time_s, found.predicted), **_PREDICTED)
         axes.plot(time_s, found.reference, **_REFERENCE)
         axes.set_title(found.name)
         low, high = height(np.append(found.reference, found.predicted), [found.achieved], 1.0)
@@ -255,7 +299,7 @@ def draw_friction(run: RunView) -> Figure | None:
         (sine.without, style.ACHIEVED_LINE, "without feed-forward"),
         (sine.given, style.MODEL_LINE, "with friction feed-forward"),
     ):
-        errors.plot(*outline(time_s, error, 400), **look, label=words)
+        errors.plot(*outline(time_s, error), **look, label=words)
     for sign in (-1, 1) if found.error_at_rest > 0 else ():
         errors.axhline(
             sign * found.error_at_rest, **style.LIMIT_LINE, label="largest error at rest (friction)"

@@ -16,7 +16,6 @@ from workflow.figures import gap_style, style
 from workflow.figures.bands import Real, outline
 
 _SEGMENT = 512  # samples: 257 lines, more than a panel shows; short records still hold several
-_TRACE_BINS = 250  # a panel is some 400 pixels wide
 _MODES = 3  # marks of higher ones stand too close
 
 
@@ -37,14 +36,14 @@ def draw_measured_beside_simulated(found: Diagnosis) -> Figure:
         unit = style.plain(unit or case.units.get(output, ""), 16) or "as logged"
         (above, below), measured = grid[:, column], worst.output[:, column]
         # Broad and pale: a model that fits lies on top of it.
-        above.plot(*outline(time, measured, _TRACE_BINS), color=gap_style.PALE, lw=3.0, label="measured")
+        above.plot(*outline(time, measured), color=gap_style.PALE, lw=3.0, label="measured")
         for model in dict.fromkeys(("stated", found.models[-1])):
             look, name = gap_style.MODELS[model], gap_style.WORDS[model]
             residual = found.residuals[model][worst.name][:, column] * case.noise[column]
             if runs:
                 residual = measured - runs[model][worst.name][:, column]
-            above.plot(*outline(time, measured - residual, _TRACE_BINS), **look, label=name)
-            below.plot(*outline(time, residual, _TRACE_BINS), **look)
+            above.plot(*outline(time, measured - residual), **look, label=name)
+            below.plot(*outline(time, residual), **look)
         above.set(title=f"{style.plain(worst.name, 30)}: {words}", ylabel=f"{words} [{unit}]")
         below.set(xlabel="time [s]", ylabel=f"residual [{unit}]")
         above.margins(x=0.01)
@@ -79,7 +78,7 @@ def draw_residual_traces(found: Diagnosis) -> Figure:
                 axes.axhspan(-2, 2, **gap_style.NOISE_BAND)
             for model, e in residuals.items():
                 look = {**gap_style.MODELS[model], "lw": 0.7, "ls": "-"}
-                axes.plot(*outline(time, e[:, column], _TRACE_BINS), **look, label=gap_style.WORDS[model])
+                axes.plot(*outline(time, e[:, column]), **look, label=gap_style.WORDS[model])
             reach = max(4.0, 1.05 * max(float(np.max(np.abs(e[:, column]))) for e in residuals.values()))
             axes.set_ylim(-reach, reach)
             axes.margins(x=0.01)

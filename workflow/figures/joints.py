@@ -42,7 +42,7 @@ def draw_joint_steps(run: AnyRunView) -> Figure | None:
             for number, (one, line) in enumerate(zip(loop.runs, lines, strict=True)):
                 if one.condition == loop.runs[0].condition:
                     look = style.ACHIEVED_LINE | {"label": None if number else "as identified"}
-                    axes.plot(*outline(loop.time_s, line, 150), **look)
+                    axes.plot(*outline(loop.time_s, line), **look)
             axes.set_ylabel(style.two_lines(name, run.results.records.unit(name)))
         steps = outline(loop.time_s, loop.reference[:, k], 150)
         grid[0, k].plot(*steps, **style.REFERENCE_STEPS, label="reference")

@@ -43,6 +43,7 @@ def draw_overview(run: RunView) -> Figure:
         others=achieved,
         machine=MACHINE["simulated"] if loop.machine == "simulated" else "",
         with_friction=loop.with_friction,
+        settled_s=loop.longest_settling_s,
         ax=step,
     )
     step.set_title("Checked in closed loop")

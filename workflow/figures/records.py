@@ -45,7 +45,7 @@ def draw_records(shown: Sequence[RunRecord], inputs: Sequence[str], outputs: Seq
             left.axvspan(start, start + item.duration_s, **shade)
             signal, _ = _signal(item.record, kind, name)
             left.plot(
-                *outline(item.record.time_s + start, signal, 1000 // len(shown)),
+                *outline(item.record.time_s + start, signal, max(600 // len(shown), 40)),
                 **style.MEASURED_LINE | {"lw": 0.6},
             )
         signal, unit = _signal(first, kind, name)

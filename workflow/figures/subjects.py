@@ -31,7 +31,7 @@ from ident.data.repeats import repeats_of
 from ident.friction import FrictionFit
 from workflow.config.run_config import Channel, RunConfig
 from workflow.figures import style
-from workflow.figures.bands import Complex, Real
+from workflow.figures.bands import Complex, Real, smooth_grid
 from workflow.figures.style import ratio_unit
 from workflow.tasks.design import joint_numbers
 from workflow.tasks.exports import Logged
@@ -335,8 +335,8 @@ class RunView(AnyRunView):
 
     @cached_property
     def loop_grid(self) -> Real:
-        """Display frequencies, denser around the modes of controller and closed loop, with the certificate's
-        worst one.
+        """Display frequencies, denser around the modes of controller and closed loop and where the loop's
+        locus turns, with the certificate's worst one.
 
         A controller that notches a mode has features as narrow as the mode's own; the identified poles do
         not show them.
@@ -359,7 +359,8 @@ class RunView(AnyRunView):
             float(omega[-1]), modes, omega_min_rad_s=float(omega[0]), n_log=2, n_mode=81 * len(modes)
         )
         every = np.unique(np.concatenate([omega, dense, worst]))
-        return np.asarray(every[(every > 0) & (every <= omega[-1])])
+        every = every[(every > 0) & (every <= omega[-1])]
+        return smooth_grid(every, lambda w: self.controller.response(w) * self.plant.at(w).centre)
 
 
 _ENDINGS = (("_rad_s", "rad/s"), ("_s", "s"))

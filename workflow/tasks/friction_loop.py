@@ -59,6 +59,8 @@ _SLOW, _LONGEST = 300.0, 20_000
 _SINE_SHARE = 0.2  # of the reference step
 # Friction lets integral action wait: the step is watched so many times as long as the linear loop needs.
 _WATCHED, _MOST_WATCHED = 20, 100_000
+# A picture shows so many times the trial's step: what moves in that is still seen.
+_MOST_SHOWN = 4
 # Sizes over which a step's settling time is given, over the one asked for: an octave either way, which a user
 # who tries another step hardly leaves; a quarter of an octave apart, with the step itself (share 1) in the
 # middle.
@@ -327,12 +329,23 @@ def check_friction(
         settling=fitted.settling(reference, given),
         watched_s=error.size * controller.dt_s,
         left=float(np.max(error[error.size // 2 :])),
-        output=run.measured[: reference.size],
+        output=run.measured[: _shown_samples(run, reference.size)],
         tracking=slow_sine(
             stage, controller, _SINE_SHARE * float(reference[-1]), on_arm=sensitivity is not None
         ),
         **beside_recorded(stage, fitted, reference),
     )
+
+
+def _shown_samples(run: ClosedLoopTrajectory, samples: int) -> int:
+    """As many as the trial's step has, or a little more than its settling needs, as far as a picture can show
+    both."""
+    settling_s = step_metrics(run).settling_time_s
+    if settling_s is None:
+        return samples
+    before = int(np.flatnonzero(run.reference)[0])
+    needed = before + round(1.15 * settling_s / run.dt_s)
+    return max(samples, min(needed, _MOST_SHOWN * samples))
 
 
 def beside_recorded(stage: StageInput, loop: FrictionLoop, step: RealArray) -> dict[str, Any]:

@@ -568,7 +568,8 @@ class FrictionCheck:
     does not leave its pre-sliding; error_at_rest: largest error with which it may rest, 0 with integral
     action. step: of the reference step on the arm as it was fitted, without noise, watched for `watched_s`
     after the step (its settling time is chance: `settling` holds those of half to twice its size); left: the
-    largest error in the last half of that time; output (T,): as long as the trial's step. recorded,
+    largest error in the last half of that time; output (N,): as long as the trial's step, or until this step
+    has settled. recorded,
     recorded_settling, recorded_output: the same of the loop that made the logs, None where they do not tell
     it.
     """
@@ -672,6 +673,16 @@ class LoopCheck:
         the loop, and of the recorded one where the logs tell it."""
         known = () if self.machine == "simulated" or self.friction is None else (self.friction,)
         return tuple(y for each in known for y in (each.output, each.recorded_output) if y is not None)
+
+    @property
+    def longest_settling_s(self) -> float:
+        """The longest stated settling time of a drawn reference step: predicted, in the runs, and with
+        friction where that is drawn (`with_friction`); 0 where none settles."""
+        rows: list[StepMetrics | None] = [self.predicted, *self.achieved]
+        if self.with_friction and self.friction is not None:
+            rows += [self.friction.step, self.friction.recorded]
+        times = [row.settling_time_s for row in rows if row is not None]
+        return max((time for time in times if time is not None), default=0.0)
 
     @property
     def waits_for_friction(self) -> bool:

@@ -266,12 +266,12 @@ const panels = () => {
   draw("path", group, {class: "curve nominal", d: path(plant.nyquist.re, plant.nyquist.im, nx, ny)});
   draw("circle", group, {class: "point", cx: nx(-1), cy: ny(0), r: 3});
   const step = plant.step;
-  if (step.x) {
-    const all = [...step.nominal, ...step.samples.flat(), 0], end = step.x.at(-1);
+  if (step.end) {
+    const all = [...step.nominal.y, ...step.samples.flatMap(one => one.y), 0], end = step.end;
     const [x, y, inside] = panel("Step of the reference, models from the posterior", [0, end, false], [Math.min(...all) - .05, Math.max(...all) * 1.08 + .01, false], "time [s]");
-    for (const one of step.samples) draw("path", inside, {class: "curve thin", d: path(step.x, one, x, y)});
-    if (other?.step.x) draw("path", inside, {class: "curve pinned", d: path(other.step.x, other.step.nominal, x, y)});
-    draw("path", inside, {class: "curve nominal", d: path(step.x, step.nominal, x, y)});
+    for (const one of step.samples) draw("path", inside, {class: "curve thin", d: path(one.x, one.y, x, y)});
+    if (other?.step.end) draw("path", inside, {class: "curve pinned", d: path(other.step.nominal.x, other.step.nominal.y, x, y)});
+    draw("path", inside, {class: "curve nominal", d: path(step.nominal.x, step.nominal.y, x, y)});
   }
   scrollTo(scrollX, top);
 };
