@@ -453,3 +453,50 @@ def test_captions_say_where_the_delay_is(delay, words, tmp_path, undrawn, monkey
     assert words in text
     assert ("K_with_delay = K_without_delay * control.tf([1], [1, 0], 0.01)" in text) == (delay == 1)
     assert ("K = control.zpk(" in text) == (delay == 0)
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_the_first_screen_says_why_a_measurement_lies_above_the_specification(place, tmp_path, undrawn):
+    """|S| is measured beside a certificate for linear plants: payload and friction are not in it."""
+    settings = example.config()
+    effects = ({"name": "tip_payload", "mass_kg": 0.02},)
+    loop = settings.closed_loop.model_copy(update={"effects": effects})
+    settings = settings.model_copy(update={"closed_loop": loop})
+    run = example.build_run(tmp_path / "run", settings)
+    check = RunResults(run).closed_loop.check
+    rows = [
+        *check.sensitivity.measured,
+        replace(check.sensitivity.measured[0], name="arm of the closed-loop check"),
+    ]
+    higher = rows[place].magnitude.copy()
+    line = int(np.argmin(np.abs(rows[place].omega_rad_s - 20.0)))
+    higher[line] = 2.2  # the modulus margin of 0.5 allows 2
+    rows[place] = replace(rows[place], magnitude=higher)
+    changed = replace(check, sensitivity=replace(check.sensitivity, measured=tuple(rows)))
+    run.save_stage("closed_loop", ClosedLoopResult(check=changed), "00")
+
+    text = text_of(run, settings)
+    screen = text[: text.index("Margins and certificate")]
+    why = [
+        "as identified: it has friction, or the model is not right",
+        "as identified at small references, where dry friction weighs more",
+        "with tip_payload (mass_kg = 0.02): the records were made without",
+    ][place]
+    at = rows[place].omega_rad_s[line]
+    assert f"The certificate does not cover the arm {why}. Measured |S| is 2.2 at {at:.3g} rad/s" in screen
+    assert screen.count("The certificate does not cover") == 1
+
+
+def test_what_is_measured_counts_beyond_its_noise():
+    omega = np.array([1.0, 2.0, 4.0, 8.0])
+    peak = example.beyond_the_trial(np.zeros(400), np.zeros(400))[0].measured[0]
+    row = replace(peak, omega_rad_s=omega, magnitude=np.array([0.5, 0.75, 1.3, 1.5]), std=np.full(4, 0.01))
+    assert row.beyond(np.array([1.0, 1.0, 1.0, 1.3])) == 2  # by the largest factor
+    assert row.beyond(np.array([0.48, 1.0, 1.5, 1.6])) is None  # two standard deviations
+    assert row.beyond_bandwidth(1.9) is None
+    assert row.beyond_bandwidth(2.1) == 1
+    rows = SimpleNamespace(sensitivity=SimpleNamespace(measured=(row, row, replace(row, name="other"))))
+    macro = environment().get_template("numbers.j2").module.not_the_arm
+    effects = [{"name": "tip_payload"}]
+    assert macro(None, 5.0, effects).strip() == macro(rows, 1.9, effects).strip() == ""
+    assert macro(rows, 2.1, effects).strip().endswith("and with tip_payload")

@@ -21,6 +21,7 @@ from control_design.controllers.law import Law
 from control_design.plants.frequency_grid import checked_grid, frequency_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, frequency_response, modes_of
 from control_design.specification import Specification
+from control_design.specification.requirement import LoopFunction
 from ident.basis.options import IdentOptions
 from ident.checks.distortion_findings import distortion_findings
 from ident.checks.plausible_modes import LIGHT
@@ -37,7 +38,13 @@ from workflow.tasks.design import joint_numbers
 from workflow.tasks.exports import Logged
 from workflow.tasks.identification import as_fitted
 from workflow.tasks.log_identification import LogIdentification
-from workflow.tasks.results import IdentifiedChannel, ModelMode, RunResults, UncertainChannel
+from workflow.tasks.results import (
+    IdentifiedChannel,
+    MeasuredPeak,
+    ModelMode,
+    RunResults,
+    UncertainChannel,
+)
 
 MACHINE = {"simulated": "simulated arm", "identified": "plants drawn from the identified uncertainty"}
 FRICTION = (
@@ -155,6 +162,25 @@ def log_channel(result: LogIdentification) -> ChannelView:
     return ChannelView(
         result.about, result.spread, result.options, result.fresh_records, result.measured, units
     )
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredBeyond:
+    """A measurement of |S| beyond what is certified.
+
+    cause: what sets its arm apart: "effects" (the arm of the closed-loop check), "size" (the arm as
+    identified with a small reference, where friction weighs more), or "model" (nothing but friction and what
+    else is not linear). limit (F,): the specification at the lines, infinite where nothing is asked for.
+    line: where |S| exceeds it most, bandwidth_line: where it exceeds -3 dB most up to the certified
+    bandwidth; None: nowhere.
+    """
+
+    measured: MeasuredPeak
+    cause: str
+    limit: Real
+    line: int | None
+    bandwidth_line: int | None
+    bandwidth_rad_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,6 +358,28 @@ class RunView(AnyRunView):
     def shares(self) -> Mapping[str, Any]:
         """Shares of sampled responses that hold and are stable, with their 95 % intervals."""
         return joint_numbers(self.results.certify.sampled)
+
+    @property
+    def measured_beyond(self) -> list[MeasuredBeyond]:
+        """Measurements of |S| on an arm that contradict the specification or the certified bandwidth, which
+        are about linear plants in the uncertainty set."""
+        check = self.results.closed_loop.check
+        certificate = self.results.certify.certificate
+        if check is None or check.sensitivity is None or certificate is None:
+            return []
+        bandwidth = min(plant.bandwidth_rad_s for plant in certificate.plants)
+        as_identified, small, *others = check.sensitivity.measured
+        causes = [(as_identified, "model"), (small, "size"), *((row, "effects") for row in others)]
+        contradictions = []
+        for row, cause in causes:
+            weight = self.specification.magnitude(self.plant, row.omega_rad_s, LoopFunction.SENSITIVITY)
+            limit = np.divide(1.0, weight, out=np.full_like(weight, np.inf), where=weight > 0)
+            found = MeasuredBeyond(
+                row, cause, limit, row.beyond(limit), row.beyond_bandwidth(bandwidth), bandwidth
+            )
+            if found.line is not None or found.bandwidth_line is not None:
+                contradictions.append(found)
+        return contradictions
 
     @cached_property
     def loop_grid(self) -> Real:

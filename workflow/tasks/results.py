@@ -472,6 +472,21 @@ class MeasuredPeak:
     magnitude: RealArray
     std: RealArray
 
+    def beyond(self, limit: RealArray) -> int | None:
+        """The line at which |S| exceeds a limit (F,) by the largest factor, by more than `SIGNIFICANT`
+        standard deviations; None where it does nowhere."""
+        factor = np.where(self.magnitude - SIGNIFICANT * self.std > limit, self.magnitude / limit, 0.0)
+        line = int(np.argmax(factor))
+        return line if factor[line] > 0 else None
+
+    def beyond_bandwidth(self, bandwidth_rad_s: float) -> int | None:
+        """The line up to a bandwidth at which |S| exceeds -3 dB by the largest factor, as `beyond`."""
+        return self.beyond(np.where(self.omega_rad_s <= bandwidth_rad_s, np.sqrt(0.5), np.inf))
+
+
+# Standard deviations: of some hundred lines the largest lies two of them too high by chance.
+SIGNIFICANT = 3.0
+
 
 @dataclass(frozen=True, eq=False)
 class SensitivityCheck:
