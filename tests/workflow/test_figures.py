@@ -26,6 +26,7 @@ from workflow.figures import style
 from workflow.figures.bands import (
     degrees_near,
     envelope,
+    extremes,
     outline,
     response_band,
     smooth_grid,
@@ -331,6 +332,16 @@ def test_a_thinned_command_is_held_as_the_full_one():
     held = u[np.searchsorted(t, 0.01 * k, side="right") - 1]
     assert np.max(np.abs(held - command)) < 1e-3 * np.ptp(command)
     assert t.size < k.size
+
+
+def test_dots_of_a_long_record_keep_a_light_mode():
+    """4096 lines, of which three are a resonance: one dot in three hundred would miss it."""
+    omega = np.linspace(0.1, 300.0, 4096)
+    size = np.abs(1 / (40.0**2 - omega**2 + 2j * 3e-4 * 40.0 * omega))
+    index = extremes(omega, size, np.geomspace(0.1, 300.0, 151))
+    assert size[index].max() == size.max()
+    assert index.size <= 302
+    assert {0, omega.size - 1} <= set(extremes(omega, omega, np.array([0.1, 300.0])).tolist())
 
 
 @pytest.mark.parametrize("zeta", [0.05, 3e-3, 2e-4])

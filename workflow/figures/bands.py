@@ -129,6 +129,16 @@ def outline(time_s: Real, signal: Real, columns: int = _COLUMNS, *, hold: bool =
     return time_s[index[kept]], signal[index[kept]]
 
 
+def extremes(x: Real, y: Real, edges: Real) -> npt.NDArray[np.int64]:
+    """Places of the smallest and the largest of values (N,) at x (N,) in every part between edges (E,)."""
+    part = np.digitize(x, edges)
+    order = np.lexsort((y, part))
+    # Sorted by part, then by value: a part begins with its smallest and ends with its largest.
+    begins = np.flatnonzero(np.diff(part[order], prepend=-1))
+    ends = np.append(begins[1:], x.size) - 1
+    return np.unique(order[np.concatenate([begins, ends])])
+
+
 def _straight(x: Real, y: Real, tolerance: float) -> list[int]:
     """Places of points (N,) whose joining lines pass all points within a vertical tolerance, in one walk: a
     line from the last kept point goes on as long as its slope suits all points it passes."""

@@ -21,6 +21,7 @@ from workflow.figures.bands import (
     ResponseBand,
     degrees_near,
     enlargement,
+    extremes,
     response_band,
 )
 from workflow.figures.nyquist import loop_of
@@ -35,6 +36,8 @@ _DOTS: dict[str, Any] = {
     "alpha": 0.55,
     "mew": 0,
 }
+# Ends of parts of the frequency axis whose smallest and largest dot are drawn: a part is two dots wide.
+_PARTS = 151
 _NOMINAL: dict[str, Any] = {"color": style.REFERENCE, "lw": 1.0, "ls": (0, (2, 2))}
 
 
@@ -116,11 +119,14 @@ def draw_bode(
     band = _draw(gain, phase, uncertainty, look, style.BAND | {"label": label}, measured, dB=dB, Hz=Hz)
     omega = band.omega_rad_s
     if empirical is not None:
-        # Evenly spread on the log axis: the thousands of a long record hide each other.
-        first, last = np.searchsorted(empirical.omega_rad_s, [omega[0], np.nextafter(omega[-1], np.inf)])
-        spread = np.searchsorted(empirical.omega_rad_s, np.geomspace(omega[0], omega[-1], 300))
-        index = np.unique(np.clip(spread, first, last - 1))
-        at, response = empirical.omega_rad_s[index], empirical.centre[index]
+        # Evenly spread on the log axis: the thousands of a long record hide each other. Of each part the
+        # smallest and the largest, so that no peak is lost.
+        shown = (empirical.omega_rad_s >= omega[0]) & (empirical.omega_rad_s <= omega[-1])
+        at = empirical.omega_rad_s[shown]
+        response = empirical.centre[shown]
+        index = extremes(at, np.abs(response), np.geomspace(omega[0], omega[-1], _PARTS))
+        at = at[index]
+        response = response[index]
         seen = y(np.maximum(np.abs(response), _gain_floor(band.gain, measured)))
         gain.plot(x(at), seen, **_DOTS, label="straight from the records, no model", zorder=1)
         phase.plot(x(at), degrees_near(response, np.interp(at, omega, band.phase_deg)), **_DOTS, zorder=1)
