@@ -257,7 +257,7 @@ def draw_conditions(run: RunView) -> Figure | None:
         achieved = outline(time_s, found.achieved)
         axes.plot(*achieved, **style.ACHIEVED_LINE, label=MACHINE[loop.machine])
         axes.plot(*outline(time_s, found.predicted), **_PREDICTED)
-        axes.plot(time_s, found.reference, **_REFERENCE)
+        axes.plot(*outline(time_s, found.reference, hold=True), **_REFERENCE)
         axes.set_title(found.name)
         low, high = height(np.append(found.reference, found.predicted), [found.achieved], 1.0)
         axes.set_ylim(*style.pad_limits(low, high, 0.08))

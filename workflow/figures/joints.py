@@ -44,7 +44,7 @@ def draw_joint_steps(run: AnyRunView) -> Figure | None:
                     look = style.ACHIEVED_LINE | {"label": None if number else "as identified"}
                     axes.plot(*outline(loop.time_s, line), **look)
             axes.set_ylabel(style.two_lines(name, run.results.records.unit(name)))
-        steps = outline(loop.time_s, loop.reference[:, k], 150)
+        steps = outline(loop.time_s, loop.reference[:, k], hold=True)
         grid[0, k].plot(*steps, **style.REFERENCE_STEPS, label="reference")
         limit = joint.input_limit
         if limit is not None and np.max(np.abs(lines)) > 0.5 * limit:
