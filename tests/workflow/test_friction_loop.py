@@ -356,6 +356,9 @@ def test_range_and_median_over_sizes():
     ]
     assert told == ["1 to 9 s", "0.2 to over 30 s", "2.7 to 2.8 s"]
     assert said("settling_range", SettlingRange((1.0, 2.0), (None, None), 30.0)) == "over 30 s"
+    assert said("settle", none) == "settle to 2 % in 1 to over 30 s"
+    never = SettlingRange((1.0, 2.0), (None, None), 30.0)
+    assert said("settle", never) == "do not settle to 2 % in 30 s"
 
 
 def test_predicted_response_is_that_of_the_nonlinear_arm():
