@@ -42,7 +42,7 @@ VALUES = {
     "like": "degrees and radians", "of": "deg", "options": "--scale y=57.3",
     "nyquist_rad_s": 1571.0, "largest_below": 1.2, "gain_at_high": 0.0063, "gain_at_nyquist": 0.0007,
     "largest_above": 0.0063, "largest_above_rad_s": 400.0, "direct_term": 0.000366,
-    "outside_percent": 51.0, "at_rad_s": 12.0, "same": False,
+    "outside_percent": 51.0, "at_rad_s": 12.0, "same": False, "step_s": 0.002, "repeats": False,
 }  # fmt: skip
 # Other values that lead to other words.
 OTHERWISE = {
@@ -52,6 +52,7 @@ OTHERWISE = {
     "UNIT_OF_REFERENCE": [{"same": True, "options": "--reference y --unit y=deg"}],
     "REPAIRED": [{"missing": 0}],
     "SKIPPED_ROWS": [{"rows": 1}],
+    "CONTROLLER_PERIOD": [{"reference": ""}, {"repeats": True}],
     "WRAPS": [{"name": "hub angle", "period": 2 * 3.141592653589793}],
     "NUISANCE": [{"needed": False}],
     "INTEGRATORS": [{"accepted": 0}, {"refused": False}],
