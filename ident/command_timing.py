@@ -186,8 +186,8 @@ def timing_of(
     if law is None or not law.repeats_command:
         # It may have changed all the time, and the log may hold its mean over a step, or the output may have
         # been read later in the step than the command: delays of up to a step, which a hold does not have.
-        possible = (HELD, Hold(0.0), Hold(0.0, averaged=True))
-        return CommandTiming(TimingSource.UNKNOWN, step_s, None, possible=possible, middle=Hold(0.0))
+        delays = (HELD, Hold(0.0), Hold(0.0, averaged=True))
+        return CommandTiming(TimingSource.UNKNOWN, step_s, None, possible=delays, middle=Hold(0.0))
     if law.tells_period:
         return CommandTiming(TimingSource.LAW, step_s, step_s, law=law)
     possible = (HELD, Hold(0.0))

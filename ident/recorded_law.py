@@ -192,12 +192,13 @@ class _Columns:
         None where there are too few rows.
         """
         limit = LIMIT_SHARE * self.largest
-        parts = [
-            _regression(*(signal[start::thinned] for signal in signals), structure, limit)
-            for signals in self.signals
-            for start in range(thinned)
-            if signals[0].size > thinned * (structure.n_states + 2)
-        ]
+        parts = []
+        for command, reference, output in self.signals:
+            if command.size <= thinned * (structure.n_states + 2):
+                continue
+            for start in range(thinned):
+                every = slice(start, None, thinned)
+                parts.append(_regression(command[every], reference[every], output[every], structure, limit))
         if not parts:
             return None
         rows = np.concatenate([part[0] for part in parts])

@@ -127,7 +127,7 @@ def test_hints_of_a_command_name_its_own_options(command):
 
 
 def test_hints_of_a_configuration_name_its_keys():
-    told = KEYS | {"time_unit", "resample_s", "flexlink"}
+    told = KEYS | {"time_unit", "resample_s", "controller_period_s", "flexlink"}
     for sentence in every_sentence():
         if "in a configuration)" in sentence or "--unit" in sentence:
             continue  # doubts about columns name both ways themselves
