@@ -21,7 +21,7 @@ from ident.basis.mimo_model import MimoModel
 from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.poles import Poles
-from ident.checks.input_checks import refuse_few_lines
+from ident.checks.early_checks import refuse_few_lines
 from ident.checks.validation import fit_on_fresh_data
 from ident.data.arrays import RealArray
 from ident.data.finding import Finding, FindingKind, finding

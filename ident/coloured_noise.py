@@ -15,7 +15,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ident.basis.options import IdentOptions
-from ident.checks.input_checks import clipped
+from ident.checks.early_checks import clipped
 from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.checks.residual_tests import whiteness_test
 from ident.checks.validation import fit_on_fresh_data

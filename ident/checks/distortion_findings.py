@@ -8,7 +8,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from ident.checks.input_checks import clipped
+from ident.checks.early_checks import clipped
 from ident.data.distortion import BandLevel, Distortion
 from ident.data.finding import Finding, FindingKind, Value, finding
 from ident.data.nonparametric import coherence

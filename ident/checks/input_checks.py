@@ -11,7 +11,8 @@ from scipy.special import chdtri
 
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
-from ident.data.arrays import ComplexArray, RealArray, clipped_share
+from ident.checks.early_checks import FEWEST_LINES, STILL_INPUT, STILL_OUTPUT, clipped, refuse_hopeless
+from ident.data.arrays import ComplexArray, RealArray
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.fit.least_squares import Regression
@@ -37,40 +38,12 @@ _AS_WELL = 1.05
 _SAME_INPUT = 1e-12
 # Inputs are alike in a band where a combination of them, each of unit power there, has less of it ...
 _ALIKE_INPUT = 1e-2
-# ... by lines whose power is worth so many an input (a Hann window makes 1.5 of one, 2 of a sine; an
-# integrator that hunts in stiction has 3.3, logs of 45 machines 8 up; independent inputs then have ten times
-# as much in a combination), within an octave. Poles bridge a band of less than a third of an octave. An input
-# rests at lines with less than _LEAKAGE of its mean density.
-_LINES_AN_INPUT, _CELLS, _LEAST_CELLS = 6.0, 12, 4
+# ... by lines whose power is worth `FEWEST_LINES` an input (independent inputs then have ten times as much in
+# a combination), within an octave. An input rests at lines with less than _LEAKAGE of its mean density.
+_CELLS = 12  # of a twelfth of an octave
+_LEAST_CELLS = 4  # poles bridge a band of less than a third of an octave
 # Deviations from an operating point this many times larger are lost beside it.
 _LARGE_OFFSET = 10.0
-
-
-def refuse_few_lines(records: Sequence[Record]) -> None:
-    """Raises ValueError, one line, where the commands of a loop (one input) are concentrated at a few
-    frequencies, as of a sine or a limit cycle, or where every recorded reference stands still: an arm cannot
-    be told from its loop then. The number is the participation ratio (sum P)^2 / sum P^2 of their spectra."""
-    dt_s, shortest = records[0].dt_s, min(record.n_samples for record in records)
-    power = np.zeros(shortest // 2)
-    for record in records:
-        moved = detrend(record.input[:shortest, 0]) * np.hanning(shortest)
-        own = np.abs(np.fft.rfft(moved)[1 : power.size + 1]) ** 2
-        power += own / max(float(own.sum()), np.finfo(np.float64).tiny)
-    count, largest_Hz = power.sum() ** 2 / (power @ power), (1 + power.argmax()) / (shortest * dt_s)
-    references = [record.reference for record in records if record.reference is not None]
-    still = bool(references) and not any(np.any(np.ptp(one, axis=0)) for one in references)
-    if count >= _LINES_AN_INPUT and not still:
-        return
-    why = (
-        f"the reference '{records[0].reference_names[0]}' of these logs stands still"
-        if still
-        else f"the command '{records[0].input_names[0]}' is concentrated near {largest_Hz:.3g} Hz, as of a "
-        "sine or a limit cycle"
-    )
-    raise ValueError(
-        f"{why}: too little to tell a machine from its loop; record logs that excite a band: flexlink excite "
-        "--closed-loop LOG..."
-    )
 
 
 def refuse_unusable(records: Sequence[Record], data: Regression, order: int) -> None:
@@ -80,16 +53,9 @@ def refuse_unusable(records: Sequence[Record], data: Regression, order: int) -> 
     A single input varies in every record, each of several in one of them at least.
     """
     names = records[0].input_names
-    for record in records:
-        signals = [("output", record.output[:, 0], record.output_names[0])]
-        if len(names) == 1:
-            signals.insert(0, ("input", record.input[:, 0], record.input_names[0]))
-        for kind, signal, name in signals:
-            if np.ptp(signal) == 0:
-                raise ValueError(
-                    f"{record.label}: {kind} column '{name}' is constant ({signal[0]:.6g}); "
-                    "expected a signal that varies"
-                )
+    if len(names) == 1:
+        refuse_hopeless(records, [STILL_INPUT])
+    refuse_hopeless(records, [STILL_OUTPUT])
     for i, name in enumerate(names):
         if all(np.ptp(record.input[:, i]) == 0 for record in records):
             raise ValueError(
@@ -138,7 +104,7 @@ def alike_inputs(records: Sequence[Record]) -> list[Finding]:
     for stop in range(1, n_cells + 1):
         start = max(start, stop - _CELLS)
         here = slice(start, stop)
-        if first[here].sum() ** 2 < _LINES_AN_INPUT * len(names) * second[here].sum():
+        if first[here].sum() ** 2 < FEWEST_LINES * len(names) * second[here].sum():
             continue
         found = _dependent(sums[here].sum(axis=0) / count[here].sum())
         band = (band[0] if found == group and band[1] == start else start, stop)
@@ -254,23 +220,6 @@ def _is_known(residual: RealArray, data: Regression, omega_rad_s: float, deviati
     omega = np.linspace(0, np.pi / data.dt_s, density.size)
     there = float(np.interp(omega_rad_s, omega, _smooth(density, 3)))
     return bool(deviation * np.sqrt(there / max(float(density.mean()), 1e-300)) <= allowed)
-
-
-def clipped(records: Sequence[Record]) -> list[Finding]:
-    found = []
-    for record in records:
-        for kind, signal, names in (
-            ("input", record.input, record.input_names),
-            ("output", record.output, record.output_names),
-        ):
-            share = clipped_share(signal[:, 0])
-            # An input at the amplifier's known limit is no doubt, nor are means of a binary one.
-            known = record.cut or (record.repair is not None and record.repair.own_s)
-            if share > 0 and not (kind == "input" and known):
-                found.append(
-                    finding(FindingKind.CLIPPED, record=record.label, signal=kind, name=names[0], share=share)
-                )
-    return found
 
 
 def _drifting(

@@ -14,10 +14,9 @@ from scipy.stats import chi2, norm
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.validation import fit_on_fresh_data
 from ident.data.arrays import RealArray, lock
-from ident.data.finding import TEST_LEVEL, Finding, FindingKind, finding
+from ident.data.finding import TEST_LEVEL, WHITE_LAGS, Finding, FindingKind, finding
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
-from ident.fit.problem import WHITE_LAGS
 
 # Frequencies at which feedback is looked for, and bands over which it is averaged.
 _RESOLVED, _BANDS = 60, 6

@@ -15,6 +15,10 @@ Value = float | bool | int | str  # what a sentence is made with
 # Level of the tests of what is stated as known.
 TEST_LEVEL = 0.99
 
+# Lags at which residuals are tested for whiteness: 25 samples, a few periods of what a sampled model can
+# follow. A test over so many lags takes more than twice as many samples.
+WHITE_LAGS = 25
+
 
 class FindingKind(Enum):
     """Which question a finding answers, or what it warns of."""
@@ -58,6 +62,8 @@ class FindingKind(Enum):
     WEAK_INPUT = auto()
     ALIKE_INPUTS = auto()
     CLIPPED = auto()
+    SATURATED = auto()
+    FEW_READINGS = auto()
     SLOW_POLE_IS_DRIFT = auto()
     DRIFT = auto()
     FAR_FROM_ZERO = auto()

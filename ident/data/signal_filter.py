@@ -7,7 +7,6 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-import scipy.signal
 
 from ident.data.arrays import RealArray
 from ident.data.record import Record
@@ -28,15 +27,10 @@ def band_limited(
     the fit. Raises ValueError if the band is empty or leaves (0, pi/dt), both sides are None, or nothing is
     left after `skip_s`.
     """
-    nyquist = np.pi / record.dt_s
+    import scipy.signal  # half a second that logs which are refused do not need
+
     low, high = low_rad_s, high_rad_s
-    if low is None and high is None:
-        raise ValueError("a band needs a lower or an upper frequency")
-    edges = [edge for edge in (low, high) if edge is not None]
-    if not all(a < b for a, b in pairwise([0.0, *edges, nyquist])):
-        raise ValueError(
-            f"the band must lie in (0, {nyquist:.6g}) rad/s, lower below upper; got {low} to {high}"
-        )
+    edges = band_edges(record.dt_s, low, high)
     skip = round(skip_s / record.dt_s)
     if not 0 <= skip < record.n_samples:
         raise ValueError(f"{record.label}: skip_s = {skip_s} leaves nothing of {record.n_samples} samples")
@@ -55,9 +49,26 @@ def band_limited(
     return record.each(filtered)
 
 
+def band_edges(dt_s: float, low_rad_s: float | None, high_rad_s: float | None) -> list[float]:
+    """The one or two edges [rad/s] that a band has. Raises ValueError if both are None, or the band is empty
+    or leaves (0, pi/dt_s)."""
+    if low_rad_s is None and high_rad_s is None:
+        raise ValueError("a band needs a lower or an upper frequency")
+    nyquist = np.pi / dt_s
+    edges = [edge for edge in (low_rad_s, high_rad_s) if edge is not None]
+    if not all(a < b for a, b in pairwise([0.0, *edges, nyquist])):
+        raise ValueError(
+            f"the band must lie in (0, {nyquist:.6g}) rad/s, lower below upper; got {low_rad_s} to "
+            f"{high_rad_s}"
+        )
+    return edges
+
+
 def settling_time_s(dt_s: float, low_rad_s: float, high_rad_s: float) -> float:
     """Time after which the start of `band_limited` (order 2) has died down to e^-5: before, it looks like
     a mode at the edge."""
+    import scipy.signal
+
     _, poles, _ = scipy.signal.butter(
         2, [low_rad_s, high_rad_s], "bandpass", output="zpk", fs=2 * np.pi / dt_s
     )

@@ -16,11 +16,10 @@ from scipy.special import chdtri
 from ident.basis.coordinates import SearchSpace
 from ident.basis.poles import Poles
 from ident.data.arrays import ComplexArray, IntArray, RealArray, kernel_array
-from ident.data.finding import TEST_LEVEL
+from ident.data.finding import TEST_LEVEL, WHITE_LAGS
 
 # Below this share of |y|^2 products of columns know nothing; a refinement sees the true residual.
 _FLOOR = 1e-13
-WHITE_LAGS = 25  # at which a residual is tested for whiteness
 
 
 class Linearisation(NamedTuple):

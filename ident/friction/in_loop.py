@@ -29,7 +29,7 @@ from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
 from ident.basis.structure import answered, driving_input, stabilised
-from ident.checks.input_checks import refuse_few_lines
+from ident.checks.early_checks import refuse_few_lines
 from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.checks.validation import fit_in_windows
 from ident.coloured_noise import long_arx_filter, prewhitened

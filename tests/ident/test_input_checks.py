@@ -5,7 +5,8 @@ import pytest
 import scipy.signal
 
 from ident import IdentOptions, Record, identify
-from ident.checks.input_checks import clipped_share, excitation_limit_rad_s
+from ident.checks.input_checks import excitation_limit_rad_s
+from ident.data.arrays import clipped_share
 from ident.data.finding import FindingKind
 from tests.ident.benchmark_plants import DT_S, as_record, p1, p2
 from tests.ident.findings import kinds, only

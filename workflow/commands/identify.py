@@ -5,22 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from ident.basis.model_files import ModelFile
 from ident.basis.options import IdentOptions
-from ident.command_timing import timing_of, with_equivalent_command
 from workflow.commands.logs import Logs
+from workflow.config.command_files import refuse_model_ending
 from workflow.config.run_config import ClosedLoopData
 from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.engine import codec, interrupts, storage
-from workflow.engine.errors import InputError, naming
+from workflow.engine.errors import naming
 from workflow.engine.progress import Progress
-from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
-from workflow.tasks.identification import made_in_loop
-from workflow.tasks.log_identification import identify_records
-from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
-from workflow.tasks.results import IdentifiedPlant
-from workflow.tasks.simulated_rig import beside, truth_beside
-from workflow.tasks.summary import model_numbers, uncertainty_numbers
+from workflow.tasks.early_refusals import (
+    fit_options,
+    refuse_constant_input,
+    refuse_hopeless_channel,
+    single_channel,
+)
 from workflow.text.formats import count
 from workflow.text.options import speaking
 from workflow.text.templates import RunSummary, rows_of, words
@@ -45,13 +43,28 @@ def identify_logs(
     `identify_records`; where friction is identified the output is the position of the shaft it acts on.
     loop: how to use logs made in closed loop. Raises InputError.
     """
-    progress, described = progress or Progress(), described or UncertaintyOptions()
-    if export is not None and export.suffix.lower() not in MODEL_SUFFIXES:
-        raise InputError(f"--export {export}: the ending must be {' or '.join(MODEL_SUFFIXES)}")
-    progress.plan((("identify", 2.0), ("uncertainty", 1.0), *((("report", 4.0),) if report else ())))
-    true_modes = truth_beside(logs.files, logs.measured[0].output_names[0])
+    progress = progress or Progress()
+    described = described or UncertaintyOptions()
+    refuse_model_ending(export)
     for record in logs.measured:
         refuse_constant_input(record)
+    with naming("identify"):
+        channel = single_channel(logs.measured[0], fit_options(options), described, band_rad_s)
+    refuse_hopeless_channel(channel, logs.measured, loop or ClosedLoopData(), progress)
+
+    # What is refused does not wait for what identifies: that takes seconds to load.
+    from ident.basis.model_files import ModelFile
+    from ident.command_timing import timing_of, with_equivalent_command
+    from workflow.tasks.exports import model_bytes
+    from workflow.tasks.identification import made_in_loop
+    from workflow.tasks.log_identification import identify_records
+    from workflow.tasks.records import with_common_sampling_time
+    from workflow.tasks.results import IdentifiedPlant
+    from workflow.tasks.simulated_rig import beside, truth_beside
+    from workflow.tasks.summary import model_numbers, uncertainty_numbers
+
+    progress.plan((("identify", 2.0), ("uncertainty", 1.0), *((("report", 4.0),) if report else ())))
+    true_modes = truth_beside(logs.files, logs.measured[0].output_names[0])
     common = with_common_sampling_time([*logs.measured, *logs.fresh])
     in_loop = loop is not None and loop.stated
     with speaking("identify"), naming("identify"):

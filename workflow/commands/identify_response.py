@@ -13,10 +13,11 @@ from ident.data.frequency_uncertainty import FREQUENCIES
 from ident.data.frf_records import FrfRepeats, measured_response
 from ident.frequency_fit import identify_frf
 from ident.uncertainty.nominal import nominal_near
+from workflow.config.command_files import refuse_model_ending
 from workflow.engine import codec, interrupts, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
-from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
+from workflow.tasks.exports import model_bytes
 from workflow.tasks.results import IdentifiedPlant
 from workflow.text.formats import count
 from workflow.text.templates import RunSummary, rows_of, words
@@ -47,8 +48,7 @@ def identify_response(
             f"{paths[0]}: a frequency response does not say at which period the model runs: "
             "give it, --dt-s SECONDS"
         )
-    if export is not None and export.suffix.lower() not in MODEL_SUFFIXES:
-        raise InputError(f"--export {export}: the ending must be {' or '.join(MODEL_SUFFIXES)}")
+    refuse_model_ending(export)
     progress = progress or Progress()
     progress.plan((("identify", 1.0),))
     with progress.stage("identify"), naming(str(paths[0])):

@@ -30,7 +30,8 @@ from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.records import refuse_constant_input, with_common_sampling_time
+from workflow.tasks.early_refusals import refuse_constant_input, refuse_hopeless_logs
+from workflow.tasks.records import with_common_sampling_time
 from workflow.text.templates import RunSummary, environment, rows_of
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ def decided(
     """The configuration of logs, to stand in a file, with a specification that follows from the model they
     were identified by; its text, the files of the stages up to that model, and what was seen. Raises
     InputError."""
-    config, text, found = drafted(command, logs, file, stated)
+    config, text, found = drafted(command, logs, file, stated, progress)
     from workflow.tasks.draft import informed
     from workflow.tasks.first_look import TOLD
     from workflow.tasks.pipeline import identify_only
@@ -130,12 +131,16 @@ def decided(
 
 
 def drafted(
-    command: str, logs: Sequence[Path], out: Path, stated: Reading | None
+    command: str,
+    logs: Sequence[Path],
+    out: Path,
+    stated: Reading | None,
+    progress: Progress | None = None,
 ) -> tuple[RunConfig, str, Found]:
     """The configuration of one channel of these logs, to stand at `out`, its text, and what was seen; nothing
     is written. command: what a complaint says to type again. Raises InputError, one line."""
     stated = stated or Reading()
-    read = read_channel(command, logs, stated)
+    read = read_channel(command, logs, stated, progress, drafted=True)
     # A log that is refused does not wait for what looks at it: that takes seconds to load.
     from workflow.tasks.draft import draft_of
 
@@ -183,9 +188,17 @@ class ReadChannel:
     tables: list[Table]
 
 
-def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> ReadChannel:
+def read_channel(
+    command: str,
+    logs: Sequence[Path],
+    stated: Reading,
+    progress: Progress | None = None,
+    *,
+    drafted: bool = False,
+) -> ReadChannel:
     """Columns as names and units tell them, a reference among them, repaired and unwrapped where they need
-    it. command: what a complaint says to type again. Raises InputError."""
+    it. command: what a complaint says to type again; drafted: a model is drafted from the logs, so that
+    hopeless ones are refused before that is loaded. Raises InputError."""
     tables = list[Table]()
     for path in logs:
         with naming(str(path)):
@@ -228,6 +241,10 @@ def read_channel(command: str, logs: Sequence[Path], stated: Reading) -> ReadCha
     if repeats > 1 and not steps:
         how = how.model_copy(update={"resample_s": float(f"{repeats * records[0].dt_s:.9g}")})
         records = how.records(tables)
+    if drafted:
+        fitted = records[:-1] or records
+        in_loop = all(record.reference is not None for record in fitted)
+        refuse_hopeless_logs(fitted, progress, loop=in_loop)
     for record in records:
         refuse_constant_input(record)
     unit_of = {

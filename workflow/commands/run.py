@@ -17,6 +17,7 @@ from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory, default_directory
+from workflow.tasks.early_refusals import refuse_hopeless_source
 from workflow.tasks.records import read_records
 
 if TYPE_CHECKING:
@@ -70,6 +71,7 @@ def run_from_files(
     if isinstance(config.source, FileSource) and not known and not (resume and place.exists()):
         RunDirectory(place).refuse_unless_free(resume=resume, replace=replace)
         read = read_records(config.source, config.columns)
+        refuse_hopeless_source(config, read, progress)
     from workflow.report.pages import page_of
     from workflow.tasks.pipeline import run_pipeline
 

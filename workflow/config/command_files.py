@@ -7,6 +7,9 @@ from pathlib import Path
 from pydantic import Field
 
 from workflow.config.settings import Section
+from workflow.engine.errors import InputError
+
+MODEL_SUFFIXES = (".json", ".mat")
 
 
 class CommandFiles(Section):
@@ -34,3 +37,9 @@ class CommandFiles(Section):
     write_baseline: Path | None = Field(
         None, description="write the baseline, where all is certified; tolerances that are there are kept"
     )
+
+
+def refuse_model_ending(export: Path | None) -> None:
+    """Raises InputError for a file of a model whose ending says no format (`MODEL_SUFFIXES`)."""
+    if export is not None and export.suffix.lower() not in MODEL_SUFFIXES:
+        raise InputError(f"--export {export}: the ending must be {' or '.join(MODEL_SUFFIXES)}")

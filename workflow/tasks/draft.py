@@ -10,7 +10,7 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from diagnosis.machine.quantisation_grid import grid_step
-from ident.checks.input_checks import refuse_few_lines
+from ident.checks.early_checks import refuse_few_lines
 from ident.checks.plausible_modes import LIGHT
 from ident.command_timing import CommandTiming, timing_of
 from ident.data.arrays import clipped_share

@@ -103,11 +103,8 @@ def write_controller(
     return list(content)
 
 
-MODEL_SUFFIXES = (".json", ".mat")
-
-
 def model_bytes(path: Path, file: ModelFile) -> bytes:
-    """JSON or MAT by the ending (`MODEL_SUFFIXES`)."""
+    """JSON or MAT by the ending (`workflow.config.command_files.MODEL_SUFFIXES`)."""
     return file.to_mat() if path.suffix.lower() == ".mat" else file.to_json().encode("utf-8")
 
 

@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pydantic import ValidationError
-
 from ident.basis.options import IdentOptions
 from ident.command_timing import CommandTiming
 from ident.data.finding import Finding
 from ident.data.record import Record
 from ident.friction import EquivalentFriction, FrictionFit
-from workflow.config.run_config import Channel, ClosedLoopData, RunSection
-from workflow.config.uncertainty_options import FitOptions, UncertaintyOptions
+from workflow.config.run_config import ClosedLoopData, RunSection
+from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.engine.errors import naming
 from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
+from workflow.tasks.early_refusals import fit_options, single_channel
 from workflow.tasks.identification import identify_channel, made_in_loop, shaft_friction
 from workflow.tasks.results import IdentifiedChannel, UncertainChannel
 from workflow.tasks.simulated_rig import TrueMode
@@ -69,19 +68,10 @@ def identify_records(
     """
     progress, described = progress or Progress(), described or UncertaintyOptions()
     loop = loop or ClosedLoopData()
-    stated = {} if options is None else options.model_dump(exclude_unset=True)
-    fit, friction = FitOptions.model_validate(stated), None
+    fit = fit_options(options)
+    friction = None
     with naming("identify"), progress.stage("identify") as update:
-        try:
-            channel = Channel(
-                input=measured[0].input_names[0],
-                output=measured[0].output_names[0],
-                identification=fit,
-                uncertainty=described,
-                band_rad_s=band_rad_s,
-            )
-        except ValidationError as error:
-            raise ValueError(str(error.errors()[0]["ctx"]["error"])) from error
+        channel = single_channel(measured[0], fit, described, band_rad_s)
         if described.friction_identified:
             friction = shaft_friction(measured, channel, update)
         about = identify_channel(

@@ -20,6 +20,7 @@ from workflow.config.run_config import (
     record_name,
 )
 from workflow.engine.errors import InputError, naming
+from workflow.tasks.early_refusals import refuse_constant_input
 
 if TYPE_CHECKING:
     from ident.command_timing import CommandTiming
@@ -133,16 +134,6 @@ def command_timing(config: AnyConfig, records: Sequence[Record]) -> CommandTimin
         stated_s = records[0].dt_s
     with naming(""):
         return timing_of(records, in_loop=in_loop, stated_period_s=stated_s, averaged=source.command_averaged)
-
-
-def refuse_constant_input(record: Record) -> None:
-    """A record to identify from must have an input that moves. Raises InputError."""
-    for index, column in enumerate(record.input_names):
-        if not np.ptp(record.input[:, index]) > 0:
-            raise InputError(
-                f"{record.label}: input column '{column}' is constant ({record.input[0, index]:.6g}); "
-                "expected a signal that moves"
-            )
 
 
 def with_common_sampling_time(records: Sequence[Record]) -> list[Record]:

@@ -1,0 +1,519 @@
+"""What makes logs hopeless or doubtful, told by their columns alone in a fraction of a second.
+
+`early_checks` lists them in the order in which they speak. They need numpy and nothing else, so that a
+command refuses hopeless logs before it loads what identifies: that takes seconds. A refusal is certain. What
+may be meant is a doubt (`early_doubts`), and the identification goes on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from ident.data.arrays import RealArray, clipped_share
+from ident.data.finding import WHITE_LAGS, Finding, FindingKind, finding
+from ident.data.record import Record
+from ident.data.wrapping import spikes_in, wraps_at
+
+# Samples of which the longest record needs more. Every model's residuals are tested over WHITE_LAGS lags, and
+# such a test needs more than two samples a lag: with fewer no identification ends, whatever the order of its
+# model.
+FEWEST_SAMPLES = 2 * WHITE_LAGS
+
+# Relative to its motion: a column that differs by no more from a multiple of another one is its copy. Text
+# logs have six digits or more; the best servo follows its reference a hundred times worse.
+_COPY_ERROR = 1e-6
+
+# Readings of an output that takes fewer different values are doubted: so few steps of a sensor hide what a
+# light mode does. As in `clipped_share`, which takes a signal of fewer levels for one of few levels by
+# design.
+_FEW_READINGS = 10
+
+# Share of samples: a command of a loop that stands at its ends more often than not follows no linear law
+# there.
+_MOSTLY = 0.5
+
+# Frequencies, as the participation ratio of the command's spectrum, that tell a machine from its loop. A Hann
+# window makes 1.5 of one line, 2 of a sine; an integrator that hunts in stiction has 3.3, logs of 45 machines
+# 8 and more.
+FEWEST_LINES = 6.0
+
+# Probability that two signals which have nothing in common pass for a cause and its answer, in each of the
+# tests that `_answers` makes. Errors on that side cost time only: the identification finds that nothing is
+# explained.
+_BY_CHANCE = 1e-3
+# Its standard normal deviate, for the chi-square limit.
+_BY_CHANCE_DEVIATE = 3.09
+
+# Parts into which the coherence test cuts a record: few for slow answers, many for weak ones.
+_PARTS = (8, 32, 128)
+# Samples: shorter parts have too few lines. A record that has no room for the fewest parts is not tested.
+_SHORTEST_PART = 32
+# Of the largest power of the cause: lines with less hold rounding only.
+_NO_POWER = 1e-9
+
+# Samples over which the prediction test averages: from one up to a sixty-fourth of the sampling rate, for
+# machines that are far slower than their log.
+_AVERAGED = (1, 4, 16, 64)
+# Earlier values of the output in a prediction: ten pairs of poles for what it does by itself.
+_OWN_PAST = 20
+# Values of the cause in a prediction: as many as show its action over a few samples; later ones are seen at
+# coarser averages.
+_PAST_OF_CAUSE = 10
+# Samples of each average that the prediction test uses at most: 20 000 rows of 31 columns cost 20 ms.
+_MOST_AVERAGES = 20_000
+# Of an output's samples, the share by which an answer may come late: less overlap tells nothing.
+_LATEST = 0.75
+# Samples that the correlation test uses at most.
+_MOST_CORRELATED = 200_000
+# Of the output's power: what is predicted better is rounding, of which no test holds.
+_EXACT = 1e-18
+
+
+@dataclass(frozen=True)
+class EarlyCheck:
+    """A named check; complaint: one line on the records of one channel, empty where there is nothing to
+    say."""
+
+    name: str
+    complaint: Callable[[Sequence[Record]], str]
+
+
+def refuse_hopeless(records: Sequence[Record], checks: Sequence[EarlyCheck]) -> None:
+    """Nothing, where no check has a complaint.
+
+    Parameters
+    ----------
+    records
+        Of one channel, to identify from: one input and one output each.
+    checks
+        In the order in which they speak: `early_checks`.
+
+    Raises
+    ------
+    ValueError
+        The first complaint, one line: file, column, what is expected, what mends it.
+    """
+    for check in checks:
+        complaint = check.complaint(records)
+        if complaint:
+            raise ValueError(complaint)
+
+
+def early_doubts(records: Sequence[Record]) -> list[Finding]:
+    """Findings on records (one input, one output each) that can be used but hardly are what was meant.
+
+    An input at its ends in a loop, few readings of the output, signals that stand at an end of their range.
+    """
+    return [*saturated(records), *few_readings(records), *clipped(records)]
+
+
+def too_few_samples(records: Sequence[Record], order: int = 0) -> str:
+    """The complaint that no record has more than `FEWEST_SAMPLES`; order: of the model, where it is
+    stated."""
+    longest = max(records, key=lambda record: record.n_samples)
+    if longest.n_samples > FEWEST_SAMPLES:
+        return ""
+    asked = ""
+    if order:
+        asked = f" for order {order}"
+    return (
+        f"{longest.label}: {longest.n_samples} samples are too few{asked}; expected more than "
+        f"{FEWEST_SAMPLES} in one log, better some thousand: record longer, or log faster"
+    )
+
+
+def still_input(records: Sequence[Record]) -> str:
+    """The complaint about a record none of whose inputs moves."""
+    for record in records:
+        if not np.ptp(record.input, axis=0).any():
+            return _constant(record, "input", record.input_names[0], float(record.input[0, 0]))
+    return ""
+
+
+def still_output(records: Sequence[Record]) -> str:
+    """The complaint about a record one of whose outputs is constant."""
+    for record in records:
+        for index, name in enumerate(record.output_names):
+            if not np.ptp(record.output[:, index]) > 0:
+                return _constant(record, "output", name, float(record.output[0, index]))
+    return ""
+
+
+def _constant(record: Record, role: str, name: str, value: float) -> str:
+    return (
+        f"{record.label}: {role} column '{name}' is constant ({value:.6g}); expected a signal that moves: "
+        f"leave this log out, or name another column with --{role} NAME ({role})"
+    )
+
+
+def late_command(records: Sequence[Record]) -> str:
+    """The complaint that in every record the input first moves when hardly a sample is left."""
+    left = []
+    for record in records:
+        first = int(np.argmax(record.input[:, 0] != record.input[0, 0]))
+        left.append(record.n_samples - first)
+    most = int(np.argmax(left))
+    if left[most] > FEWEST_SAMPLES:
+        return ""
+    record = records[most]
+    return (
+        f"{record.label}: input column '{record.input_names[0]}' first moves {left[most]} samples before the "
+        f"end, too late to show an answer; expected more than {FEWEST_SAMPLES} samples from there: record "
+        "longer"
+    )
+
+
+def two_readings(records: Sequence[Record]) -> str:
+    """The complaint that the output takes two values in all records together."""
+    values = np.unique(np.concatenate([np.unique(record.output[:, 0]) for record in records]))
+    if values.size > 2:
+        return ""
+    name = records[0].output_names[0]
+    return (
+        f"{records[0].label}: output column '{name}' takes two values only, {values[0]:.9g} and "
+        f"{values[-1]:.9g}; expected a measured motion: move by more than a step of the sensor, log more "
+        "digits, or name another column with --output NAME (output)"
+    )
+
+
+def resting_output(records: Sequence[Record]) -> str:
+    """The complaint that in every record the output leaves one reading for hardly a sample: a sensor at its
+    end, or a machine that sticks."""
+    for record in records:
+        output = record.output[:, 0]
+        values, counts = np.unique(output, return_counts=True)
+        away = record.n_samples - int(counts.max())
+        if away > FEWEST_SAMPLES:
+            return ""
+    name = record.output_names[0]
+    return (
+        f"{record.label}: output column '{name}' stands at {values[np.argmax(counts)]:.6g} in all but {away} "
+        f"of {record.n_samples} samples, as a sensor at its end or a machine that sticks; expected more than "
+        f"{FEWEST_SAMPLES} others: drive it harder, within the sensor's range, or name another column with "
+        "--output NAME (output)"
+    )
+
+
+def copied_column(records: Sequence[Record]) -> str:
+    """The complaint that the output is the input or the reference again, times a number, sample by sample."""
+    for record in records:
+        output = record.output[:, 0]
+        others = [("input", record.input[:, 0], record.input_names[0])]
+        if record.reference is not None:
+            others += [
+                ("reference", signal, name)
+                for signal, name in zip(record.reference.T, record.reference_names, strict=True)
+            ]
+        for role, signal, name in others:
+            if _is_copy(output, signal):
+                return (
+                    f"{record.label}: output column '{record.output_names[0]}' is the {role} column '{name}' "
+                    "again, sample by sample, so no machine shows in it; name the measured column with "
+                    "--output NAME (output)"
+                )
+    return ""
+
+
+def _is_copy(signal: RealArray, other: RealArray) -> bool:
+    """Whether a signal (T,) is another one (T,) times a number, beside a constant."""
+    moved = signal - signal.mean()
+    moved_other = other - other.mean()
+    power = float(moved_other @ moved_other)
+    if not 0 < power < np.inf:
+        return False
+    difference = moved - (moved @ moved_other) / power * moved_other
+    return float(np.linalg.norm(difference)) <= _COPY_ERROR * float(np.linalg.norm(moved))
+
+
+def few_lines(records: Sequence[Record]) -> str:
+    """The complaint about the records of a loop whose input is concentrated at few frequencies, as of a sine
+    or a limit cycle, or whose references all stand still: an arm cannot be told from its loop then.
+
+    Notes
+    -----
+    The number of lines is the participation ratio (sum P)^2 / sum P^2 of the input's spectra, each scaled to
+    unit power.
+    """
+    dt_s = records[0].dt_s
+    shortest = min(record.n_samples for record in records)
+    power = np.zeros(shortest // 2)
+    for record in records:
+        moved = _without_line(record.input[:shortest, 0]) * np.hanning(shortest)
+        own = np.abs(np.fft.rfft(moved)[1 : power.size + 1]) ** 2
+        power += own / max(float(own.sum()), np.finfo(np.float64).tiny)
+    count = power.sum() ** 2 / (power @ power)
+    references = [record.reference for record in records if record.reference is not None]
+    if references and not any(np.any(np.ptp(reference, axis=0)) for reference in references):
+        why = f"the reference '{records[0].reference_names[0]}' of these logs stands still"
+    elif count < FEWEST_LINES:
+        largest_Hz = (1 + power.argmax()) / (shortest * dt_s)
+        why = (
+            f"the command '{records[0].input_names[0]}' is concentrated near {largest_Hz:.3g} Hz, as of a "
+            "sine or a limit cycle"
+        )
+    else:
+        return ""
+    return (
+        f"{records[0].label}: {why}: too little to tell a machine from its loop; record logs that excite "
+        "a band: flexlink excite --closed-loop LOG..."
+    )
+
+
+def _without_line(signal: RealArray) -> RealArray:
+    """A signal (T,) without its straight line of least squares."""
+    line = np.linspace(-1.0, 1.0, signal.size)
+    centred = signal - signal.mean()
+    return np.asarray(centred - (line @ centred) / max(float(line @ line), np.finfo(np.float64).tiny) * line)
+
+
+def refuse_few_lines(records: Sequence[Record]) -> None:
+    """Raises ValueError with what `few_lines` complains of in the records of a loop."""
+    refuse_hopeless(records, [FEW_LINES])
+
+
+def no_answer(records: Sequence[Record]) -> str:
+    """The complaint that in no record the output has anything to do with what moves the machine.
+
+    Notes
+    -----
+    In open loop that is the input. In a loop noise of a sensor comes back in the input, so that only the
+    reference and earlier inputs count. Nothing is said where a reference stands still, where a record is
+    short, or where readings wrap or jump as those of a sensor without a value: those have words of their own.
+    """
+    for record in records:
+        command = record.input[:, 0]
+        output = record.output[:, 0]
+        if output.size < min(_PARTS) * _SHORTEST_PART:
+            return ""
+        if spikes_in(command).size or spikes_in(output).size or wraps_at(output):
+            return ""
+        if record.reference is None:
+            if _answers(output, command):
+                return ""
+            continue
+        references = record.reference.T
+        if any(np.ptp(reference) == 0 for reference in references):
+            return ""
+        if any(_answers(output, reference) for reference in references):
+            return ""
+        if _predicts(output, command, from_lag=1):
+            return ""
+    record = records[0]
+    return (
+        f"{record.label}: output column '{record.output_names[0]}' does not answer to the input column "
+        f"'{record.input_names[0]}'; expected the motion that it causes: check wiring and machine, or "
+        "name other columns with --input NAME --output NAME (input, output)"
+    )
+
+
+def _answers(output: RealArray, cause: RealArray) -> bool:
+    """Whether an output (T,) shows more of a cause (T,) than chance would.
+
+    The coherence sees what lasts, as a few sines; the prediction what happens once, as a step; the
+    correlation what comes late.
+    """
+    if _is_coherent(output, cause):
+        return True
+    if _predicts(output, cause, from_lag=0):
+        return True
+    return _correlates(output, cause)
+
+
+def _correlates(output: RealArray, cause: RealArray) -> bool:
+    """Whether what is new in an output (T,) is correlated with what was new in a cause (T,), at any lag.
+
+    Notes
+    -----
+    Both are whitened by autoregressions of their own (Haugh, J. Am. Stat. Assoc. 71(354), 1976). Their
+    product at a lag has mean zero where they are unrelated, and the sum of its squares is the variance of its
+    sum (White, Econometrica 48(4), 1980), also where both move only now and then, as commands that are held.
+    """
+    n = min(output.size, _MOST_CORRELATED)
+    answer = _innovations(output[:n])
+    driven = _innovations(cause[:n])
+    lags = np.arange(int(_LATEST * answer.size))
+    products = _sums_of_products(answer, driven)[lags]
+    squares = _sums_of_products(answer**2, driven**2)[lags]
+    # Without a square of any size there is nothing but rounding.
+    there = squares > _NO_POWER * squares.max()
+    if not there.any():
+        return False
+    deviates = np.abs(products[there]) / np.sqrt(squares[there])
+    by_chance = lags.size * math.erfc(float(deviates.max()) / math.sqrt(2))
+    return by_chance < _BY_CHANCE
+
+
+def _sums_of_products(later: RealArray, earlier: RealArray) -> RealArray:
+    """Sum of later[k + lag] earlier[k] of two signals (T,) at lags 0 to T - 1, (T,)."""
+    n = later.size
+    spectrum = np.fft.rfft(later, 2 * n) * np.fft.rfft(earlier, 2 * n).conj()
+    return np.asarray(np.fft.irfft(spectrum, 2 * n)[:n])
+
+
+def _innovations(signal: RealArray) -> RealArray:
+    """What an autoregression does not predict of a signal (T,), (T - _OWN_PAST,)."""
+    centred = _averages(signal, 1, signal.size)
+    fitted = centred[: _MOST_AVERAGES + _OWN_PAST]
+    own = [fitted[_OWN_PAST - lag : fitted.size - lag] for lag in range(1, _OWN_PAST + 1)]
+    coefficients = np.linalg.lstsq(np.column_stack(own), fitted[_OWN_PAST:], rcond=None)[0]
+    return np.asarray(np.convolve(centred, np.append(1.0, -coefficients), "valid"))
+
+
+def _is_coherent(output: RealArray, cause: RealArray) -> bool:
+    """Whether two signals (T,) are more coherent at some frequency than noise would be, over parts of some
+    lengths.
+
+    Notes
+    -----
+    For K independent parts of independent signals, P(coherence > x) = (1 - x)^(K - 1) at one line (Carter,
+    Proc. IEEE 75(2), 1987). Hann windows that overlap by half are worth K = 18 k^2 / (19 k - 1) parts of k.
+    """
+    for parts in _PARTS:
+        size = output.size // parts
+        if size < _SHORTEST_PART:
+            return False
+        window = np.hanning(size)
+        spectra = []
+        for signal in (output, cause):
+            pieces = np.lib.stride_tricks.sliding_window_view(signal, size)[:: size // 2]
+            centred = pieces - pieces.mean(axis=1, keepdims=True)
+            spectra.append(np.fft.rfft(centred * window)[:, 1:])
+        answer, driven = spectra
+        power_answer = np.sum(np.abs(answer) ** 2, axis=0)
+        power_driven = np.sum(np.abs(driven) ** 2, axis=0)
+        common = np.abs(np.sum(answer * driven.conj(), axis=0)) ** 2
+        there = (power_driven > _NO_POWER * power_driven.max()) & (power_answer > 0)
+        if not there.any():
+            continue
+        coherence = common[there] / (power_answer[there] * power_driven[there])
+        n_pieces = answer.shape[0]
+        worth = 18 * n_pieces**2 / (19 * n_pieces - 1)
+        by_chance = coherence.size * (1 - min(float(coherence.max()), 1.0)) ** (worth - 1)
+        if by_chance < _BY_CHANCE:
+            return True
+    return False
+
+
+def _predicts(output: RealArray, cause: RealArray, from_lag: int) -> bool:
+    """Whether an output (T,) is predicted better from its own past with a cause (T,) than without.
+
+    Notes
+    -----
+    Granger, Econometrica 37(3), 1969, as a likelihood ratio of two autoregressions, at several rates.
+    from_lag: 0 where the cause may act within the sample. The chi-square limit is that of Wilson and
+    Hilferty.
+    """
+    limit = (
+        _PAST_OF_CAUSE
+        * (1 - 2 / (9 * _PAST_OF_CAUSE) + _BY_CHANCE_DEVIATE * np.sqrt(2 / (9 * _PAST_OF_CAUSE))) ** 3
+    )
+    for averaged in _AVERAGED:
+        n = min(output.size // averaged, _MOST_AVERAGES)
+        n_equations = n - _OWN_PAST
+        if n_equations < 2 * (_OWN_PAST + _PAST_OF_CAUSE):
+            return False
+        y = _averages(output, averaged, n)
+        c = _averages(cause, averaged, n)
+        own = [y[_OWN_PAST - lag : n - lag] for lag in range(1, _OWN_PAST + 1)]
+        more = [c[_OWN_PAST - lag : n - lag] for lag in range(from_lag, from_lag + _PAST_OF_CAUSE)]
+        target = y[_OWN_PAST:]
+        alone = _residual_power([np.ones(n_equations), *own], target)
+        together = _residual_power([np.ones(n_equations), *own, *more], target)
+        if not together > _EXACT * float(y @ y) or n_equations * np.log(alone / together) > limit:
+            return True
+    return False
+
+
+def _averages(signal: RealArray, averaged: int, n: int) -> RealArray:
+    """The first n averages of a signal (T,) over so many samples, (n,), around zero and of unit size."""
+    means = signal[: n * averaged].reshape(n, averaged).mean(axis=1)
+    means = means - means.mean()
+    return np.asarray(means / max(float(np.abs(means).max()), np.finfo(np.float64).tiny))
+
+
+def _residual_power(columns: Sequence[RealArray], target: RealArray) -> float:
+    """Sum of squares that a least-squares fit of columns (n,) leaves of a target (n,)."""
+    matrix = np.column_stack(columns)
+    solution = np.linalg.lstsq(matrix, target, rcond=None)[0]
+    residual = target - matrix @ solution
+    return float(residual @ residual)
+
+
+def saturated(records: Sequence[Record]) -> list[Finding]:
+    """A finding on every record of a loop whose input mostly stands at its two ends."""
+    found = []
+    for record in records:
+        command = record.input[:, 0]
+        if record.reference is None or np.ptp(command) == 0:
+            continue  # in open loop a command of two levels is a good one
+        low = float(command.min())
+        high = float(command.max())
+        share = float(np.mean((command == low) | (command == high)))
+        if share > _MOSTLY:
+            found.append(
+                finding(
+                    FindingKind.SATURATED, record=record.label, name=record.input_names[0], share=share,
+                    low=low, high=high,
+                )
+            )  # fmt: skip
+    return found
+
+
+def few_readings(records: Sequence[Record]) -> list[Finding]:
+    """A finding on every record whose output takes fewer than ten values."""
+    found = []
+    for record in records:
+        count = np.unique(record.output[:, 0]).size
+        if count < _FEW_READINGS:
+            found.append(
+                finding(
+                    FindingKind.FEW_READINGS, record=record.label, name=record.output_names[0], count=count
+                )
+            )
+    return found
+
+
+def clipped(records: Sequence[Record]) -> list[Finding]:
+    """A finding on every input or output that stands suspiciously often at an end of its range."""
+    found = []
+    for record in records:
+        for kind, signal, names in (
+            ("input", record.input, record.input_names),
+            ("output", record.output, record.output_names),
+        ):
+            share = clipped_share(signal[:, 0])
+            # An input at the amplifier's known limit is no doubt, nor are means of a binary one.
+            known = record.cut or (record.repair is not None and record.repair.own_s)
+            if share > 0 and not (kind == "input" and known):
+                found.append(
+                    finding(FindingKind.CLIPPED, record=record.label, signal=kind, name=names[0], share=share)
+                )
+    return found
+
+
+STILL_INPUT = EarlyCheck("the input moves", still_input)
+STILL_OUTPUT = EarlyCheck("the output moves", still_output)
+FEW_LINES = EarlyCheck("the command of a loop excites a band", few_lines)
+
+
+def early_checks(order: int = 0, *, loop: bool = False) -> list[EarlyCheck]:
+    """The checks of one channel, in the order in which they speak; order: of the model, where it is stated;
+    loop: the logs were made in one that is to be opened."""
+    checks = [
+        EarlyCheck("more samples than a residual test needs", partial(too_few_samples, order=order)),
+        STILL_INPUT,
+        STILL_OUTPUT,
+        EarlyCheck("the command moves before the end", late_command),
+        EarlyCheck("more than one step of the sensor", two_readings),
+        EarlyCheck("the output leaves its place", resting_output),
+        EarlyCheck("the output is no other column again", copied_column),
+        EarlyCheck("the output answers", no_answer),
+    ]
+    if loop:
+        checks.append(FEW_LINES)
+    return checks
