@@ -15,13 +15,11 @@ from typing import Any
 import numpy as np
 
 from ident.basis.model import GobfModel
+from ident.basis.model_format import FORMAT, FORMAT_VERSION
 from ident.basis.poles import NO_POLES, Poles
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.json_text import json_value
 from ident.data.mat_files import mat_bytes, mat_variables
-
-FORMAT = "flexlink GOBF model"
-FORMAT_VERSION = 1  # the first; files of another one are refused
 
 # The state matrices are computed anew on reading; another machine may round differently.
 _STATE_TOLERANCE = 1e-9

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tomlkit
 
-from control_design.analysis.certificate import Certificate
 from control_design.specification import Specification
 from ident.data.settings import meant
-from workflow.commands.design import at_one_bandwidth, load_asked, of_run
 from workflow.config.command_files import CommandFiles
 from workflow.config.design_file import DesignFile
 from workflow.engine import codec, storage
@@ -21,9 +19,11 @@ from workflow.engine.documents import read_toml
 from workflow.engine.errors import InputError, naming, need
 from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
-from workflow.tasks.design import certify_asked
-from workflow.tasks.system_files import read_law
+from workflow.tasks.system_documents import refuse_broken_files
 from workflow.text.templates import RunSummary, rows_of, said, words
+
+if TYPE_CHECKING:
+    from control_design.analysis.certificate import Certificate
 
 # Relative. On one machine a certificate repeats to the last digit, others round differently: two to ten times
 # what other sets of starts were seen to do to designs (tests/golden/margins.toml).
@@ -102,12 +102,21 @@ def certify_controller(
     """Certify a controller for one or several plants (files: `workflow.tasks.design_source`), and hold its
     worst cases against a baseline; `certified` only where none is worse. file: None takes the specification
     of a run directory. Raises InputError."""
-    controller, baseline, written = files.controller, files.baseline, files.write_baseline
+    controller = files.controller
+    baseline = files.baseline
+    written = files.write_baseline
     if controller is None and not paths[0].is_dir():
         raise InputError(f"{paths[0]}: no run directory, which has a controller: give --controller FILE")
     controller = controller or paths[0] / "controller.json"
     need(controller, baseline)
     storage.refuse_in_the_way([*paths, controller], [("--write-baseline", written)] if written else [])
+    refuse_broken_files(paths, controller)
+
+    # What is refused does not wait for what certifies: that takes seconds to load.
+    from workflow.commands.design import at_one_bandwidth, load_asked, of_run
+    from workflow.tasks.design import certify_asked
+    from workflow.tasks.system_files import read_law
+
     progress = progress or Progress()
     progress.plan([("plants", 5.0), ("certify", 5.0)])
     with progress.stage("plants"):

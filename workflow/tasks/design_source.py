@@ -35,7 +35,8 @@ from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.exports import Logged, read_model
 from workflow.tasks.pipeline import certified_for, config_of
 from workflow.tasks.results import IdentifiedPlant, RunResults
-from workflow.tasks.system_files import DOCUMENTS, read_document, read_state_space
+from workflow.tasks.system_documents import DOCUMENTS, read_document
+from workflow.tasks.system_files import read_state_space
 from workflow.text.templates import said, words
 
 
