@@ -64,6 +64,10 @@ _OWN_PAST = 20
 # Values of the cause in a prediction: as many as show its action over a few samples; later ones are seen at
 # coarser averages.
 _PAST_OF_CAUSE = 10
+# Moves of a cause (participation ratio): of fewer, ten lags have no variance that their own squares tell.
+_FEWEST_EVENTS = 20.0
+# Relative: lags of a slow cause with less variance of their own are one and the same.
+_SAME_LAGS = 1e-8
 # Samples of each average that the prediction test uses at most: 20 000 rows of 31 columns cost 20 ms.
 _MOST_AVERAGES = 20_000
 # Of an output's samples, the share by which an answer may come late: less overlap tells nothing.
@@ -404,14 +408,13 @@ def _predicts(output: RealArray, cause: RealArray, from_lag: int) -> bool:
 
     Notes
     -----
-    Granger, Econometrica 37(3), 1969, as a likelihood ratio of two autoregressions, at several rates.
-    from_lag: 0 where the cause may act within the sample. The chi-square limit is that of Wilson and
-    Hilferty.
+    Granger, Econometrica 37(3), 1969, at several rates. from_lag: 0 where the cause may act within the
+    sample. What the cause adds to the output's autoregression is tested by its scores, with the variance that
+    their own squares have (White, Econometrica 48(4), 1980): two signals that are held over the same samples
+    are not related for that. Of a cause that moves a few times only, as a step, no such variance is known:
+    there it is the likelihood ratio.
     """
-    limit = (
-        _PAST_OF_CAUSE
-        * (1 - 2 / (9 * _PAST_OF_CAUSE) + _BY_CHANCE_DEVIATE * np.sqrt(2 / (9 * _PAST_OF_CAUSE))) ** 3
-    )
+    limit = _chi_square_limit(_PAST_OF_CAUSE)
     for averaged in _AVERAGED:
         n = min(output.size // averaged, _MOST_AVERAGES)
         n_equations = n - _OWN_PAST
@@ -419,14 +422,42 @@ def _predicts(output: RealArray, cause: RealArray, from_lag: int) -> bool:
             return False
         y = _averages(output, averaged, n)
         c = _averages(cause, averaged, n)
-        own = [y[_OWN_PAST - lag : n - lag] for lag in range(1, _OWN_PAST + 1)]
-        more = [c[_OWN_PAST - lag : n - lag] for lag in range(from_lag, from_lag + _PAST_OF_CAUSE)]
-        target = y[_OWN_PAST:]
-        alone = _residual_power([np.ones(n_equations), *own], target)
-        together = _residual_power([np.ones(n_equations), *own, *more], target)
-        if not together > _EXACT * float(y @ y) or n_equations * np.log(alone / together) > limit:
+        own_past = [y[_OWN_PAST - lag : n - lag] for lag in range(1, _OWN_PAST + 1)]
+        own = np.linalg.qr(np.column_stack([np.ones(n_equations), *own_past]))[0]
+        lags = range(from_lag, from_lag + _PAST_OF_CAUSE)
+        added = np.column_stack([c[_OWN_PAST - lag : n - lag] for lag in lags])
+
+        # What the output's own past leaves of both.
+        residual = y[_OWN_PAST:] - own @ (own.T @ y[_OWN_PAST:])
+        added = added - own @ (own.T @ added)
+        if not residual @ residual > _EXACT * float(y @ y):
+            return True
+        if _events(c) < _FEWEST_EVENTS:
+            solution = np.linalg.lstsq(added, residual, rcond=None)[0]
+            left = residual - added @ solution
+            statistic = n_equations * np.log(float(residual @ residual) / max(float(left @ left), _EXACT))
+        else:
+            products = added * residual[:, None]
+            size = np.maximum(np.linalg.norm(products, axis=0), np.finfo(np.float64).tiny)
+            score = products.sum(axis=0) / size
+            variance = (products / size).T @ (products / size)
+            statistic = float(score @ np.linalg.pinv(variance, rcond=_SAME_LAGS, hermitian=True) @ score)
+        if statistic > limit:
             return True
     return False
+
+
+def _chi_square_limit(degrees_of_freedom: int) -> float:
+    """The value that a chi-square exceeds with probability `_BY_CHANCE` (Wilson and Hilferty, PNAS 17,
+    1931)."""
+    part = 2 / (9 * degrees_of_freedom)
+    return float(degrees_of_freedom * (1 - part + _BY_CHANCE_DEVIATE * np.sqrt(part)) ** 3)
+
+
+def _events(cause: RealArray) -> float:
+    """How often a signal (T,) moves anew: the participation ratio of what its past does not predict."""
+    power = _innovations(cause) ** 2
+    return float(power.sum() ** 2 / max(float(power @ power), np.finfo(np.float64).tiny))
 
 
 def _averages(signal: RealArray, averaged: int, n: int) -> RealArray:
@@ -434,14 +465,6 @@ def _averages(signal: RealArray, averaged: int, n: int) -> RealArray:
     means = signal[: n * averaged].reshape(n, averaged).mean(axis=1)
     means = means - means.mean()
     return np.asarray(means / max(float(np.abs(means).max()), np.finfo(np.float64).tiny))
-
-
-def _residual_power(columns: Sequence[RealArray], target: RealArray) -> float:
-    """Sum of squares that a least-squares fit of columns (n,) leaves of a target (n,)."""
-    matrix = np.column_stack(columns)
-    solution = np.linalg.lstsq(matrix, target, rcond=None)[0]
-    residual = target - matrix @ solution
-    return float(residual @ residual)
 
 
 def saturated(records: Sequence[Record]) -> list[Finding]:

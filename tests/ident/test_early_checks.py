@@ -1,0 +1,176 @@
+"""Logs that their columns alone show to be hopeless or doubtful; nothing is said of good ones."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from ident import Record
+from ident.checks import early_checks
+from ident.checks.early_checks import early_doubts, refuse_hopeless
+from ident.data.finding import FindingKind
+
+N = 3000
+DT_S = 0.005
+ARM = ([0, 0.02, 0.01], np.polymul([1, -1.9, 0.93], [1, -0.8]))
+
+
+def held(rng, samples=6, n=N):
+    return np.repeat(rng.standard_normal(n // samples + 1), samples)[:n]
+
+
+def opened(seed=0, noise=1e-3):
+    rng = np.random.default_rng(seed)
+    command = held(rng)
+    return {"u": command, "y": lfilter(*ARM, command) + noise * rng.standard_normal(N)}
+
+
+def looped(seed=0, noise=1e-3, limit=np.inf, gain=0.5):
+    """An integrating arm under a P loop: y' = u + disturbance, the sensor with noise."""
+    rng = np.random.default_rng(seed)
+    reference = held(rng, 30)
+    signals = {"r": reference, "u": np.zeros(N), "y": np.zeros(N)}
+    position = speed = 0.0
+    for k in range(N):
+        signals["y"][k] = position + noise * rng.standard_normal()
+        signals["u"][k] = np.clip(gain * (reference[k] - signals["y"][k]), -limit, limit)
+        speed += 0.1 * (signals["u"][k] - speed)
+        position += 0.2 * speed
+    return signals
+
+
+def record(signals, **changed):
+    signals = signals | changed
+    of_loop = {"reference": signals["r"][:, None], "reference_names": ("r",)} if "r" in signals else {}
+    return Record("log", signals["u"][:, None], signals["y"][:, None], DT_S, ("u",), ("y",), **of_loop)
+
+
+def complaint(*records, loop=False, order=0):
+    try:
+        refuse_hopeless(records, early_checks.early_checks(order, loop=loop))
+    except ValueError as error:
+        line = str(error)
+        assert "\n" not in line
+        assert line.startswith("record 'log': ")
+        return line
+    return ""
+
+
+def late(signals):
+    return np.where(np.arange(N) < N - 30, 0.0, signals["u"])
+
+
+def at_end(signals):
+    return np.where(np.arange(N) % 100 == 50, 0.1 * signals["y"], 1.57)
+
+
+HOPELESS = {
+    "still output": (opened, lambda s: {"y": 0 * s["y"] + 0.3}, r"output column 'y' is constant (0.3)"),
+    "still input": (opened, lambda s: {"u": 0 * s["u"]}, "input column 'u' is constant (0)"),
+    "all zeros": (looped, lambda s: {"u": 0 * s["u"], "y": 0 * s["y"]}, "'u' is constant (0)"),
+    "50 samples": (opened, lambda s: {k: v[:50] for k, v in s.items()}, "50 samples are too few"),
+    "late step": (opened, lambda s: {"u": late(s)}, "first moves 30 samples before the end"),
+    "two readings": (opened, lambda s: {"y": 0.5 * (s["y"] > 0)}, "two values only, 0 and 0.5"),
+    "lost digits": (opened, lambda s: {"y": 1e9 + 1e-10 * s["y"]}, "'y' is constant"),
+    "sensor at its end": (opened, lambda s: {"y": at_end(s)}, "stands at 1.57 in all but 30 of 3000"),
+    "output is the command": (opened, lambda s: {"y": 3 - 2 * s["u"]}, "is the input column 'u' again"),
+    "output is the reference": (looped, lambda s: {"y": 1.0 * s["r"]}, "is the reference column 'r' again"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", HOPELESS)
+def test_hopeless_logs_are_named(kind):
+    make, change, words = HOPELESS[kind]
+    signals = make()
+    assert words in complaint(record(signals, **change(signals)))
+    assert complaint(record(signals)) == ""
+
+
+@pytest.mark.parametrize("make", [opened, looped])
+def test_the_output_of_another_machine_is_named(make):
+    """Held commands of two machines that move at the same samples. Chance passes for an answer now and then:
+    ten tests, each of many lines or lags, at a thousandth."""
+    named = 0
+    for seed in range(6):
+        said = complaint(record(make(seed), y=make(seed + 50)["y"]))
+        named += "output column 'y' does not answer to the input column 'u'" in said
+    assert named >= 5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_sensor_that_shows_noise_in_a_loop_does_not_answer(seed):
+    """The command follows the noise, and so do earlier commands: only the reference tells."""
+    rng = np.random.default_rng(seed)
+    noise = lfilter([1], [1, -0.7], rng.standard_normal(N))
+    reference = held(rng, 30)
+    assert "does not answer" in complaint(record({"r": reference, "u": reference - noise, "y": noise}))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_good_logs_are_not_refused_nor_doubted(seed):
+    rng = np.random.default_rng(seed)
+    step = (np.arange(N) > 200).astype(float)
+    sines = np.sin(0.05 * np.arange(N)) + np.sin(0.21 * np.arange(N) + 1)
+    ramp = np.cumsum(lfilter([0, 0.1], [1, -0.9], step)) + 0.01 * rng.standard_normal(N)
+    binary = np.sign(held(rng))
+    good = [
+        opened(seed),
+        opened(seed, noise=0.3),
+        looped(seed),
+        looped(seed, noise=0.05),
+        {"u": binary, "y": lfilter(*ARM, binary)},
+        {"u": step, "y": ramp},
+        {"u": sines, "y": lfilter(*ARM, sines)},
+        {"u": held(rng), "y": np.zeros(N)},
+    ]
+    delayed = good[-1]
+    delayed["y"][900:] = lfilter(*ARM, delayed["u"])[:-900]
+    delayed["y"] += 0.05 * rng.standard_normal(N)
+    for signals in good:
+        assert complaint(record(signals)) == ""
+        assert early_doubts([record(signals)]) == []
+
+
+def test_one_good_log_among_hopeless_ones_is_enough():
+    signals = opened()
+    short = {name: column[:40] for name, column in signals.items()}
+    other = signals | {"y": opened(7)["y"]}
+    assert complaint(record(short), record(signals)) == ""
+    assert complaint(record(other), record(signals)) == ""
+    assert complaint(record(other), record(other)) != ""
+
+
+def test_a_loop_of_few_frequencies_is_refused_where_it_is_to_be_opened():
+    time = np.arange(N) * DT_S
+    signals = {"r": np.sin(9 * time), "u": np.sin(9 * time + 1), "y": np.sin(9 * time - 1)}
+    assert "as of a sine or a limit cycle" in complaint(record(signals), loop=True)
+    assert complaint(record(signals)) == ""
+    still = looped() | {"r": np.ones(N)}
+    assert "the reference 'r' of these logs stands still" in complaint(record(still), loop=True)
+    assert complaint(record(looped()), loop=True) == ""
+
+
+def test_a_stated_order_is_named():
+    signals = {name: column[:12] for name, column in opened().items()}
+    assert "12 samples are too few for order 8" in complaint(record(signals), order=8)
+
+
+def test_readings_that_jump_or_wrap_are_left_to_their_own_words():
+    signals = opened()
+    jumps = np.where(np.arange(N) == 1234, -9999.0, signals["u"])
+    assert complaint(record(signals, u=jumps)) == ""
+    turned = np.mod(np.floor(200 * np.cumsum(signals["u"] + 3)), 4096.0)
+    assert complaint(record(signals, y=turned)) == ""
+
+
+def test_what_may_be_meant_is_doubted():
+    banging = record(looped(limit=1e-3, gain=1e6))
+    (doubt,) = early_doubts([banging])
+    assert doubt.kind is FindingKind.SATURATED
+    assert (doubt.values["low"], doubt.values["high"]) == (-1e-3, 1e-3)
+    assert complaint(banging) == ""
+    signals = opened()
+    few = record(signals, y=np.round(np.clip(signals["y"] / signals["y"].std(), -2, 2)))
+    assert [doubt.kind for doubt in early_doubts([few])] == [FindingKind.FEW_READINGS]
+    assert early_doubts([few])[0].values["count"] == 5
+    clipped = record(signals, y=np.clip(signals["y"], -signals["y"].std(), np.inf))
+    assert [doubt.kind for doubt in early_doubts([clipped])] == [FindingKind.CLIPPED]
