@@ -36,8 +36,9 @@ def html_text(result: Shown) -> str:
 
 
 def save(model: GobfModel, path: Path) -> None:
+    from workflow.config.command_files import MODEL_SUFFIXES
     from workflow.engine.storage import write_bytes
-    from workflow.tasks.exports import MODEL_SUFFIXES, model_bytes
+    from workflow.tasks.exports import model_bytes
 
     if path.suffix.lower() not in MODEL_SUFFIXES:
         raise ValueError(f"{path}: expected a file name that ends in {' or '.join(MODEL_SUFFIXES)}")

@@ -19,7 +19,7 @@ import numpy as np
 from control_design.analysis.joint_coverage import ResponseDraws, at_level
 from control_design.plants.plant_set import UncertainPlant, count_integrators, frequency_response
 from control_design.plants.stated_uncertainty import StatedDiscs
-from ident.basis.model_files import FORMAT
+from ident.basis.model_format import FORMAT
 from ident.data.ellipses import chi2_radius
 from ident.data.finding import FindingKind
 from ident.data.frf_records import is_response, measured_response
