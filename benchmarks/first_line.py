@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import resource
 import subprocess
 import sys
 import tempfile
@@ -28,7 +29,8 @@ from benchmarks.harness import Print, main
 
 DT_S = 0.002
 N = 4000  # samples of a log: 8 s
-LONGEST_S = 120  # wall clock: then a case is ended and lost
+LONGEST_S = 120  # wall clock and CPU: then a case is ended and lost
+SEARCHED_S = 4  # CPU: whoever is not refused by then has gone on to search
 
 Columns = dict[str, np.ndarray]
 
@@ -179,13 +181,16 @@ def arguments_by_command(folder: Path, columns: Mapping[str, np.ndarray]) -> dic
     }
 
 
-def told_by(arguments: list[str], words: str = "", *, doubted: bool = False) -> Told:
+def told_by(
+    arguments: list[str], words: str = "", *, doubted: bool = False, longest_cpu_s: int = LONGEST_S
+) -> Told:
     """The line with which a process ends; doubted: the line with these words, after which it is ended."""
     process = subprocess.Popen(
         [sys.executable, "-m", "flexlink", *arguments],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (longest_cpu_s, longest_cpu_s)),
     )
     timer = threading.Timer(LONGEST_S, process.kill)
     timer.start()
@@ -310,8 +315,7 @@ def run(out: Print, *, seed: int = 0, most_s: float = 2.0, good: int = 3) -> Non
                 folder.mkdir()
                 columns = simulated(seed + 10 + number, closed=closed)
                 for command, arguments in arguments_by_command(folder, columns).items():
-                    # Whoever goes on to search says so after a while.
-                    told = told_by(arguments, r"\d+ s: (identify|records|uncertainty)", doubted=True)
+                    told = told_by(arguments, longest_cpu_s=SEARCHED_S)
                     refused += told.code == 2
                     if told.code == 2:
                         out(f"!! good log {number}, closed = {closed}, {command}: {told.line}")
