@@ -109,11 +109,9 @@ def refuse_hopeless(records: Sequence[Record], checks: Sequence[EarlyCheck]) -> 
 
 
 def early_doubts(records: Sequence[Record]) -> list[Finding]:
-    """Findings on records (one input, one output each) that can be used but hardly are what was meant.
-
-    An input at its ends in a loop, few readings of the output, signals that stand at an end of their range.
-    """
-    return [*saturated(records), *few_readings(records), *clipped(records)]
+    """Findings on records (one input, one output each) that can be used but hardly are what was meant: a
+    command of a loop that mostly stands at its ends, an output of few readings."""
+    return [*saturated(records), *few_readings(records)]
 
 
 def too_few_samples(records: Sequence[Record], order: int = 0) -> str:
