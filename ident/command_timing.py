@@ -22,11 +22,12 @@ from enum import Enum
 import numpy as np
 
 from ident.basis.posterior import ResponsePosterior
-from ident.data.arrays import ComplexArray, RealArray, real_rows
+from ident.data.arrays import ComplexArray, RealArray
 from ident.data.ellipses import LEVEL, chi2_radius
 from ident.data.finding import FindingKind, finding
 from ident.data.record import Record
 from ident.recorded_law import RecordedLaw, law_of
+from ident.response_coefficients import coefficients_of
 
 # Rows before and after one that its equivalent command is made of. With four on each side the filter is
 # within .1 % of 1 / S up to 1 rad of w T, and within .5 % up to half the Nyquist frequency.
@@ -284,10 +285,8 @@ def filtered(command: RealArray, hold: Hold) -> RealArray:
     angle = np.linspace(0.0, FITTED_UP_TO_RAD, 400)[1:]
     lags = np.arange(-ROWS_BESIDE, ROWS_BESIDE + 1)
     # Where the motion is large, at low frequency, the filter has to be exact; a constant stays one.
-    weight = 1 / angle[:, None]
     rows = np.exp(1j * np.outer(angle, lags)) - 1
-    wanted = hold.response(angle) - 1
-    taps = np.linalg.lstsq(real_rows(rows * weight), real_rows(wanted[:, None] * weight), rcond=None)[0][:, 0]
+    taps = coefficients_of(rows, (hold.response(angle) - 1)[:, None], 1 / angle)[:, 0]
     taps[ROWS_BESIDE] = 1 - (taps.sum() - taps[ROWS_BESIDE])
     padded = np.pad(command, ((ROWS_BESIDE, ROWS_BESIDE), (0, 0)), mode="edge")
     columns = [np.convolve(column, taps[::-1], mode="valid") for column in padded.T]
@@ -341,19 +340,14 @@ def with_unknown_timing(posterior: ResponsePosterior, timing: CommandTiming) -> 
     rows = wider.frequency_rows(omega)[:, : n_stable + more]
     centre = posterior.centre(omega)
 
-    def fitted(wanted: ComplexArray, scale: RealArray) -> RealArray:
-        """Coefficients (P, N) of responses (F, N), errors as a share of a scale (F,), less above the data."""
-        weight = 1 / (scale * (1 + (angle / FITTED_UP_TO_RAD) ** 4))[:, None]
-        length = np.maximum(np.linalg.norm(rows * weight, axis=0), np.finfo(np.float64).tiny)
-        left = real_rows(rows * weight / length)
-        return np.asarray(np.linalg.lstsq(left, real_rows(wanted * weight), rcond=1e-12)[0] / length[:, None])
-
+    # Errors count as a share of what they are held against, and less above the data.
+    above = 1 / (1 + (angle / FITTED_UP_TO_RAD) ** 4)
     late = middle[:, None] * rows
-    mean = fitted(late @ wider.mean[: n_stable + more, None], np.abs(phase * centre))
-    factor = fitted(late @ wider.covariance_factor[: n_stable + more], np.abs(centre))
+    mean = coefficients_of(rows, late @ wider.mean[: n_stable + more, None], above / np.abs(phase * centre))
+    factor = coefficients_of(rows, late @ wider.covariance_factor[: n_stable + more], above / np.abs(centre))
     ends = BEYOND_ENDS / chi2_radius(LEVEL) * middle * centre
-    along_phase = fitted((1j * phase * ends)[:, None], np.abs(phase * centre))
-    along_gain = fitted((gain * ends)[:, None], np.abs(gain * centre))
+    along_phase = coefficients_of(rows, (1j * phase * ends)[:, None], above / np.abs(phase * centre))
+    along_gain = coefficients_of(rows, (gain * ends)[:, None], above / np.abs(gain * centre))
     nothing = np.zeros((posterior.unstable.order, 2))
     return replace(
         wider,

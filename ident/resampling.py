@@ -19,9 +19,10 @@ import numpy as np
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.command_timing import Hold
-from ident.data.arrays import ComplexArray, RealArray, real_rows
+from ident.data.arrays import ComplexArray, RealArray
 from ident.data.ellipses import LEVEL, chi2_radius
 from ident.friction import FrictionFit
+from ident.response_coefficients import coefficients_of
 
 # Whole multiples and parts of a step agree within this share of it.
 SAME_RATIO = 1e-3
@@ -144,18 +145,15 @@ def resampled(posterior: ResponsePosterior, controller_dt_s: float) -> ResponseP
         shorter = Hold(1 / up).response(omega * posterior.dt_s)
         wanted = (posterior.frequency_rows(omega) @ known) * shorter[:, None]
         omega, wanted = _falling_above(omega, wanted, posterior.dt_s, up)
-    weight = 1 / np.abs(wanted[:, :1])
+    weight = 1 / np.abs(wanted[:, 0])
     if up > 1:
         # Exact where nothing was folded back; elsewhere as exact as what was.
-        weight /= np.maximum((omega * posterior.dt_s / (2 * np.pi))[:, None] ** 2, LEAST_FOLDED)
+        weight /= np.maximum((omega * posterior.dt_s / (2 * np.pi)) ** 2, LEAST_FOLDED)
         above = omega > np.pi / posterior.dt_s
         weight[above] *= FALLS_WEIGHT
         wanted[above] = 0.0
-    rows = empty.frequency_rows(omega)[:, : size - n_left] * weight
-    # Of nearly equal columns none gets a large coefficient.
-    length = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(np.float64).tiny)
-    solved = np.linalg.lstsq(real_rows(rows / length), real_rows(wanted * weight), rcond=1e-11)[0]
-    solved = np.pad(solved / length[:, None], ((0, n_left), (0, 0)))
+    solved = coefficients_of(empty.frequency_rows(omega)[:, : size - n_left], wanted, weight)
+    solved = np.pad(solved, ((0, n_left), (0, 0)))
     found = replace(empty, mean=solved[:, 0], covariance_factor=solved[:, 1:])
     if up == 1:
         return found
@@ -211,10 +209,8 @@ def _unknown_above(posterior: ResponsePosterior, log_dt_s: float, up: int) -> Re
     opening = ((1 - later) / (2 * np.sin(np.pi / (2 * up)))) ** OPENING_POWER
     folded = FOLDED_BACK * (up / np.pi) ** 2 * (1 - later) ** 2
     wanted = np.column_stack([opening, opening * later, folded, folded * later**up]) / chi2_radius(LEVEL)
-    rows = posterior.frequency_rows(omega) / posterior.centre(omega)[:, None]
-    length = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(np.float64).tiny)
-    solved = np.linalg.lstsq(real_rows(rows / length), real_rows(wanted), rcond=1e-11)[0]
-    return np.asarray(solved / length[:, None])
+    centre = posterior.centre(omega)
+    return coefficients_of(posterior.frequency_rows(omega), wanted * centre[:, None], 1 / np.abs(centre))
 
 
 def resampled_friction(found: FrictionFit, controller_dt_s: float) -> FrictionFit:

@@ -19,10 +19,11 @@ _COLUMNS = 500
 _STRAIGHT = 1 / 2000
 # A locus is smooth where it turns by no more than this [rad] from point to point: a hundred points a circle.
 _TURN_RAD = 0.06
-# Steps of a locus that are seen: three pixels of a plane that is four units wide; the same of a Nichols
-# chart, in nepers and rad. What is below -30 dB, or far from the origin, is in neither picture.
+# Steps of a locus that are seen: three pixels of a plane that is four units wide.
 _SEEN_STEP = 0.02
+# Steps of a locus in a Nichols chart that are seen, in nepers and rad: three pixels, too.
 _SEEN_LOG_STEP = 0.05
+# Gains that are in a picture: what is below -30 dB, or far from the origin, is in neither.
 _SEEN_GAINS = (0.03, 10.0)
 _REFINEMENTS = 12  # each halves the steps: of a grid of 81 points for a mode one is enough, as a rule
 _SEEN = 0.1  # half a band's height over the gain: two pixels of two hundred on an axis of six decades
