@@ -54,10 +54,11 @@ def altered(config: RunConfig, *, seed: int | None = None, **effects: dict[str, 
     """The configuration with another seed, or with effects of the source added or exchanged by name."""
     document = config.to_document()
     for channel in document["channels"]:
-        channel["identification"] |= BOUNDS
+        channel["identification"] = {**channel.get("identification", {}), **BOUNDS}
     if seed is not None:
-        document["run"]["seed"] = seed
-    kept = [effect for effect in document["source"]["effects"] if effect["name"] not in effects]
+        document["run"] = {**document.get("run", {}), "seed": seed}
+    stated = document["source"].get("effects", [])
+    kept = [effect for effect in stated if effect["name"] not in effects]
     document["source"]["effects"] = [*kept, *({"name": name, **values} for name, values in effects.items())]
     return RunConfig.from_document(document, source="default arm")
 

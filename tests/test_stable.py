@@ -29,8 +29,8 @@ def test_formats_are_those_of_the_files():
     assert f"| `controller.json` | `{Controller.format_name()}` |" in PAGE
     assert f"| answer of `diagnose` | `{document.FORMAT}` |" in PAGE
     assert f"| run directory | `layout` {run_directory.LAYOUT_VERSION} in" in PAGE
-    assert study_directory.LAYOUT_VERSION == diagnosis_directory.LAYOUT_VERSION
-    assert f"| study directory; diagnosis directory | `layout` {study_directory.LAYOUT_VERSION} in" in PAGE
+    assert f"| study directory | `layout` {study_directory.LAYOUT_VERSION} in" in PAGE
+    assert f"| diagnosis directory | `layout` {diagnosis_directory.LAYOUT_VERSION} in" in PAGE
 
 
 def test_exit_codes_are_those_of_the_commands():

@@ -25,6 +25,11 @@ Algorithm = Literal[
 ]
 
 
+# Settings about which the data decide where nobody stated them, not even at their default. A stored
+# configuration tells which of them were stated (`workflow.tasks.stage.Stage.settings`).
+LEFT_OPEN = ("input_delay_samples", "integrators", "unstable_poles")
+
+
 class IdentOptions(Settings):
     """Settings of the fit and of the pole search.
 
@@ -193,10 +198,20 @@ class IdentOptions(Settings):
         outside = tuple((float((1 / p).real), -float((1 / p).imag)) for p in poles)
         return self.model_copy(update={"unstable_poles": outside})
 
+    def states(self, *names: str) -> bool:
+        """Whether at least one of these settings was stated, be it at its default.
+
+        Raises ValueError for a name that is not one of `LEFT_OPEN`: of others only the value counts.
+        """
+        strange = set(names) - set(LEFT_OPEN)
+        if strange:
+            raise ValueError(f"{min(strange)}: not one of {', '.join(LEFT_OPEN)}")
+        return not self.model_fields_set.isdisjoint(names)
+
     @property
     def delay_left_to_data(self) -> bool:
         """Nobody stated a delay, not even that there is none."""
-        return "input_delay_samples" not in self.model_fields_set
+        return not self.states("input_delay_samples")
 
     def with_delay_stated(self) -> IdentOptions:
         """The same, the delay no longer sought: what is no record of one input and one output has none."""

@@ -333,7 +333,7 @@ def _kept_if_better(
 def _of_structure(logs: _Logs, options: IdentOptions) -> list[tuple[IdentOptions, FrictionFit]]:
     """The options with each structure that is possible, and the fit with the fewest poles: where the
     integrators are not stated, one of them, or a weight that throws the arm over."""
-    stated = bool(options.model_fields_set & {"integrators", "unstable_poles"})
+    stated = options.states("integrators", "unstable_poles")
     tried = list[tuple[IdentOptions, FrictionFit]]()
     for integrators in (1, 0):
         with suppress(LostError):

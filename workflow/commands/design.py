@@ -98,8 +98,8 @@ def of_run(paths: Sequence[Path]) -> RunResults | None:
 def at_one_bandwidth(specification: Specification, found: RunResults | None) -> Specification:
     """Of one that leaves the bandwidth open: that which its run has found, or the one to try first. A search
     for it takes a dozen designs."""
-    known = specification.model_dump(include=set(Specification.model_fields))
-    if known.pop("lowest_bandwidth_rad_s") is not None and found is not None:
+    known = specification.model_dump(include=set(Specification.model_fields), exclude_unset=True)
+    if known.pop("lowest_bandwidth_rad_s", None) is not None and found is not None:
         known["bandwidth_rad_s"] = (found.design.specification or specification).bandwidth_rad_s
     return Specification.model_validate(known)
 

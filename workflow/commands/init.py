@@ -80,7 +80,7 @@ def init(
         title=str(out),
         sections=rows_of("summary/init.j2", found=found, config=config),
         numbers={
-            "configuration": config.to_document(),
+            "configuration": config.with_defaults(),
             "seen": {
                 "roles": codec.plain(found.read.roles),
                 "told_rad_s": codec.plain(look.told_rad_s),

@@ -108,7 +108,7 @@ class TuningSession:
         level = stated.pop(CONFIDENCE, None) if self.drawable else None
         if level is not None:
             level = check(PlantSection, {"level": level}, source=CONFIDENCE).level
-        document = self.specification.model_dump(mode="json") | stated
+        document = self.specification.model_dump(mode="json", exclude_unset=True) | stated
         specification = check(Specification, document, source="settings")
         plants = self._plants if level is None else [at_level(plant, level) for plant in self._plants]
         return specification, plants, level
@@ -381,8 +381,10 @@ def toml_of(file: DesignFile) -> str:
     for name in DesignFile.model_fields:
         section = getattr(file, name)
         if section is not None:
-            # A section that is left out would be the run's own: it stands here even where all is default.
-            document[name] = section.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
+            # A section that is left out would be the run's own: it stands here even where all is default. In
+            # it, what is stated and nothing else: a level or a delay that is stated at its default is kept,
+            # one that is not stated is that of the plant's file or sought in the data.
+            document[name] = section.model_dump(mode="json", exclude_unset=True, exclude_none=True)
     return tomlkit.dumps(document)
 
 

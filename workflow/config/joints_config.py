@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field, NonNegativeInt, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, NonNegativeInt, model_validator
 
 from control_design.specification import Specification
 from control_design.specification.multivariable import MultivariableSpecification
@@ -74,10 +74,13 @@ class Joint(Specification):
     input: str = Field(min_length=1, description="column of the command")
     output: str = Field(min_length=1, description="column of the measured angle")
 
-    @model_serializer(mode="wrap")
-    def _as_given(self, every: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Without keys that were not given: some are refused where they are stated."""
-        return {key: value for key, value in every(self).items() if key in self.model_fields_set}
+    def specification(self) -> Specification:
+        """What is asked of the joint, without its columns.
+
+        Only the keys that were stated: some are refused where they are stated
+        (`MultivariableSpecification`), even at their defaults.
+        """
+        return Specification(**self.model_dump(exclude={"input", "output"}, exclude_unset=True))
 
 
 class JointsIdentification(Section):
@@ -99,12 +102,21 @@ class JointsIdentification(Section):
     )
 
 
+class JointsSearch(MultivariableOptions):
+    """Effort of the search in a run for several joints."""
+
+    # A worst case just below 1 is certified; the last percents below it cost most of the time.
+    sufficient_gamma: float = Field(
+        0.97, ge=0, description=MultivariableOptions.model_fields["sufficient_gamma"].description
+    )
+
+
 class JointsDesign(Section):
     controller_order: int = Field(6, ge=0, le=40, description="number of controller states")
     structure: Literal["full", "decentralised"] = Field("full", description="decentralised: K is diagonal")
     controller_damping: float = Field(0.02, gt=0, le=1, description="smallest of the controller's pole pairs")
-    search: MultivariableOptions = Field(
-        default_factory=lambda: MultivariableOptions(sufficient_gamma=0.97),
+    search: JointsSearch = Field(
+        default_factory=JointsSearch,
         description="effort of the search, which ends at a worst case of 0.97",
     )
 
@@ -186,9 +198,7 @@ class JointsConfig(AnyRun):
     def specification(self) -> MultivariableSpecification:
         """What is asked of the whole."""
         return MultivariableSpecification(
-            joints=tuple(
-                Specification(**joint.model_dump(exclude={"input", "output"})) for joint in self.joints
-            ),
+            joints=tuple(joint.specification() for joint in self.joints),
             structure=self.design.structure,
             controller_order=self.design.controller_order,
             controller_damping=self.design.controller_damping,

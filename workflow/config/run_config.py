@@ -93,6 +93,9 @@ class SimulatedSource(Section):
             )
             object.__setattr__(self, "records", (*planned, *self.records))
             object.__setattr__(self, "plan", None)
+            # Whoever states a plan states its records, which are stored in its place.
+            self.model_fields_set.discard("plan")
+            self.model_fields_set.add("records")
         if not self.records:
             raise ValueError("there is nothing to simulate: give [source.plan] or [[source.records]]")
         return self
@@ -361,16 +364,30 @@ class AnyRun(Section):
         return sorted({record.path for record in source.records}) if isinstance(source, FileSource) else []
 
     def to_document(self) -> dict[str, Any]:
-        """JSON-able, every default filled in; `from_document` gives back an equal configuration."""
+        """What the configuration states, JSON-able; `from_document` gives back an equal configuration.
+
+        Notes
+        -----
+        Defaults are left out, because a default and the same value stated are different settings: a delay of
+        0 that is stated is tested and kept, one that is not stated is sought in the data.
+        """
+        return self.model_dump(mode="json", exclude_unset=True)
+
+    def with_defaults(self) -> dict[str, Any]:
+        """Every key with its value, JSON-able, for whoever reads values; it no longer tells what was
+        stated."""
         return self.model_dump(mode="json")
 
     def to_toml(self) -> str:
-        """As a user would write it; what has no value is left out."""
-        return tomlkit.dumps(self.model_dump(mode="json", exclude_none=True))
+        """What the configuration states, as a user would write it; keys without a value are left out."""
+        return tomlkit.dumps(self.model_dump(mode="json", exclude_unset=True, exclude_none=True))
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any], *, source: str) -> Self:
-        """Inverse of `to_document`; input files may have moved away since (a report needs them no more)."""
+        """The configuration that `to_document` wrote, with the same keys stated.
+
+        Input files may have moved away since: a report does not need them.
+        """
         return check(cls, document, source=source, context={"may_be_gone": True})
 
 

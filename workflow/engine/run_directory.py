@@ -1,7 +1,7 @@
 """One run = one directory, written stage by stage, resumable after a kill at any point.
 
     config.toml      the user's file, byte for byte
-    config.json      the same with every default filled in; this is what a resumed run is compared with
+    config.json      what it states, checked, with absolute paths; a resumed run is compared with this
     manifest.json    versions, seed, SHA-256 of config and of every input file, timings, status
     stages/<name>.npz | .json
     figures/
@@ -33,7 +33,10 @@ from workflow.engine import codec, documents, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.store import Store
 
-LAYOUT_VERSION = 9  # 9: settling with friction over sizes of the step
+# 9: settling with friction over sizes of the step.
+# 10: config.json holds what was stated. Those of earlier layouts hold defaults, too, and no longer tell which of
+# them were stated: resumed, such a run would give another answer.
+LAYOUT_VERSION = 10
 T = TypeVar("T")
 _INPUT_HASH, _DIGEST = "_input_hash", "_sha256"
 _RESULT = "result"
@@ -106,7 +109,7 @@ class RunDirectory(Store):
         resume: bool = False,
         replace: bool = False,
     ) -> Self:
-        """As `begin`. config: the resolved configuration, JSON-able; inputs: every input file as the user
+        """As `begin`. config: what the configuration states, JSON-able; inputs: every input file as the user
         named it, with its SHA-256."""
         manifest = {
             "layout": LAYOUT_VERSION,
@@ -202,7 +205,8 @@ class RunDirectory(Store):
         return document
 
     def config_document(self) -> dict[str, Any]:
-        """The resolved configuration the run was begun with. Raises InputError where it was changed since."""
+        """What the configuration stated that the run was begun with. Raises InputError where it was changed
+        since."""
         path = self.path / "config.json"
         document = storage.read_json(path)
         try:

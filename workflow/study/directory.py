@@ -1,7 +1,7 @@
 """A study's files.
 
     study.toml           the user's file, byte for byte
-    study.json           base with every default filled in, its input files; a resumed study is held to them
+    study.json           what the base states, its input files; a resumed study is held to them
     plants/<key>/        run directories with records, model and ellipses, shared by points
     points/<name>/       one run directory per point, without a page (`flexlink report` writes it)
     points/<number>      a link to it, by its number in the table
@@ -31,7 +31,9 @@ from workflow.tasks.stage import Stage
 from workflow.tasks.stages import PLANT
 from workflow.tasks.summary import summarise
 
-LAYOUT_VERSION = 1  # the first; a study of another one is not resumed
+# 2: the base is what was stated, without defaults, as in run directories of layout 10. A study of another
+# layout is not resumed.
+LAYOUT_VERSION = 2
 
 
 @dataclass(frozen=True)

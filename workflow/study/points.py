@@ -49,13 +49,19 @@ class Base:
     def changed(self, values: Mapping[str, Any], source: str) -> AnyConfig:
         """The configuration with dotted keys set. Raises InputError naming `source` where they do not fit."""
         try:
-            document = with_values(self.document, values)
+            document = self.with_values(values)
         except ValueError as error:
             raise InputError(f"{source}: {error}") from error
         return check(type(self.config), document, source=source, context=self.context)
 
+    def with_values(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """What the configuration states with dotted keys set, not checked. Raises ValueError for a key that
+        leads nowhere."""
+        return with_values(self.document, values, self.config.with_defaults())
+
     @cached_property
     def document(self) -> dict[str, Any]:
+        """What the configuration states."""
         return self.config.to_document()
 
     @property
@@ -215,7 +221,7 @@ class PointMaker:
             ends = {f"values[{place}]": value for place, value in enumerate(axis.values)}
         for where, value in ends.items():
             try:
-                document = with_values(self._base.document, {axis.key: value})
+                document = self._base.with_values({axis.key: value})
                 type(self._base.config).model_validate(document, context=self._base.context)
             except ValidationError as error:
                 # Only what sections say about values that are each right by themselves.

@@ -217,28 +217,54 @@ def last_name(key: str) -> str:
     return next(part for part in reversed(parse_key(key)) if isinstance(part, str))
 
 
-def with_values(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of the document with the dotted keys set.
+def with_values(
+    document: Mapping[str, Any], values: Mapping[str, Any], defaults: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """A copy of a document with dotted keys set.
 
-    A table that is absent is made; whether its keys are known is for the configuration's own check to say.
-    Raises ValueError where a key goes through something that is no table, or an index is beyond the list.
+    Parameters
+    ----------
+    document
+        What a configuration states, nested.
+    values
+        New values by dotted key.
+    defaults
+        The same configuration with every default filled in. A list that the document does not state begins
+        as it is there, so that one of its entries can be set.
+
+    Returns
+    -------
+    dict
+        The changed copy. A table that is absent is made, with nothing in it but the keys that are set;
+        whether these are known is for the configuration's own check to say.
+
+    Raises
+    ------
+    ValueError
+        A key goes through something that is no table, or an index is beyond the list.
     """
     changed = copy.deepcopy(dict(document))
     for key, value in values.items():
-        path, where = parse_key(key), ""
+        path = parse_key(key)
         here: Any = changed
-        for part, last in zip(path, [*[False] * (len(path) - 1), True], strict=True):
+        default: Any = defaults
+        where = ""
+        for position, part in enumerate(path):
             if isinstance(part, int):
                 if not isinstance(here, list):
                     raise ValueError(f"{key}: {where} is no list")
                 if part >= len(here):
                     raise ValueError(f"{key}: {where} has {len(here)} entries, counted from 0")
-            elif not isinstance(here, dict):
-                raise ValueError(f"{key}: {where} is no table")
-            elif here.get(part) is None:
-                here[part] = {}
-            if last:
+                default = None  # of a list that is stated, or was copied whole
+                where = f"{where}[{part}]"
+            else:
+                if not isinstance(here, dict):
+                    raise ValueError(f"{key}: {where} is no table")
+                default = default.get(part) if isinstance(default, Mapping) else None
+                if here.get(part) is None:
+                    here[part] = copy.deepcopy(default) if isinstance(default, list) else {}
+                where = f"{where}.{part}".removeprefix(".")
+            if position == len(path) - 1:
                 here[part] = copy.deepcopy(value)
             here = here[part]
-            where = f"{where}[{part}]" if isinstance(part, int) else f"{where}.{part}".removeprefix(".")
     return changed

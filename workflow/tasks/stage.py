@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
+from ident.basis.options import LEFT_OPEN
 from ident.data.record import Record
 from workflow.config.joints_config import AnyConfig
 from workflow.config.run_config import RunConfig
@@ -67,8 +68,28 @@ class Stage:
     several: tuple[Callable[[StageInput], Any], float] | None = None
 
     def settings(self, config: AnyConfig) -> dict[str, Any]:
-        """Its share of the configuration, JSON-able."""
-        return config.model_dump(mode="json", include=self.uses, exclude=self.except_for)
+        """Its share of the configuration, JSON-able: every value, and which of `LEFT_OPEN` were stated.
+
+        Two configurations with the same settings of a stage give it the same result: a key stated at its
+        default is the same as one left out, but for those where the data decide unless it is stated.
+        """
+        part: dict[str, Any] = {"mode": "json", "include": self.uses, "exclude": self.except_for}
+        values: dict[str, Any] = config.model_dump(**part)
+        stated = sorted(_stated_of_left_open(config.model_dump(**part, exclude_unset=True)))
+        return {**values, "stated": stated}
+
+
+def _stated_of_left_open(document: Any, where: str = "") -> Iterator[str]:
+    """Dotted keys in a nested document whose last name is one of `LEFT_OPEN`."""
+    if isinstance(document, Mapping):
+        for name, value in document.items():
+            key = f"{where}.{name}".removeprefix(".")
+            if name in LEFT_OPEN:
+                yield key
+            yield from _stated_of_left_open(value, key)
+    elif isinstance(document, list):
+        for index, value in enumerate(document):
+            yield from _stated_of_left_open(value, f"{where}[{index}]")
 
 
 def stages_for(config: AnyConfig, stages: Sequence[Stage]) -> tuple[Stage, ...]:
