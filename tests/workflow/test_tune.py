@@ -26,6 +26,7 @@ from workflow.commands.tuning import SupersededError, TuningSession, toml_of
 from workflow.config.design_file import DesignFile, read_design_file
 from workflow.engine import codec
 from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.design_source import load_sources
 from workflow.tasks.results import IdentifiedPlant, RunResults
 from workflow.text.formats import percent, si
 
@@ -175,6 +176,10 @@ def test_confidence_is_kept_with_the_design(posterior_session):
     narrow, wide = (session.design({"confidence": level}) for level in (0.6, 0.999))
     assert wide["gamma"] > narrow["gamma"]
     assert len(narrow["plants"][0]["step"]["samples"]) == 15
+    usual = session.out / "usual.toml"
+    usual.write_text(toml_of(session.completed({"confidence": 0.95})))
+    # Stated at the default of [plant]: not the 0.9 of the plant's file.
+    assert load_sources(session.paths, read_design_file(usual))[0].plant.level == 0.95
     saved = session.save({"confidence": 0.999}, "sure")
     file = read_design_file(Path(saved["directory"]) / "design.toml")
     assert file.plant.level == 0.999
