@@ -5,6 +5,8 @@ import json
 import re
 import shutil
 import signal
+import socket
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -168,7 +170,7 @@ def test_the_scaled_design_is_the_last_one_times_a_gain(session):
     assert found["gain"] < session.scaled({"effort_limit": 50.0})["gain"]
 
 
-def test_confidence_is_kept_with_the_design(posterior_session):
+def test_confidence_is_kept_with_the_design(posterior_session, tmp_path):
     session = posterior_session
     names = {one["name"] for one in session.settings()}
     assert "confidence" in names
@@ -176,7 +178,7 @@ def test_confidence_is_kept_with_the_design(posterior_session):
     narrow, wide = (session.design({"confidence": level}) for level in (0.6, 0.999))
     assert wide["gamma"] > narrow["gamma"]
     assert len(narrow["plants"][0]["step"]["samples"]) == 15
-    usual = session.out / "usual.toml"
+    usual = tmp_path / "usual.toml"
     usual.write_text(toml_of(session.completed({"confidence": 0.95})))
     # Stated at the default of [plant]: not the 0.9 of the plant's file.
     assert load_sources(session.paths, read_design_file(usual))[0].plant.level == 0.95
@@ -275,13 +277,87 @@ def test_others_are_refused(server):
         ("/save", {"settings": {}, "name": 7}, 400, "expected letters"),
         ("/nothing", {"settings": {}}, 404, "no such"),
         ("/scaled", b" " * (1 << 17), 413, "bytes"),
+        ("/scaled", b"[" * 60_000, 400, "nested deeper"),
+        ("/scaled", b'{"settings": {"a": ' + b'{"a": ' * 9_000 + b"1" + b"}" * 9_002, 400, "nested deeper"),
+        ("/scaled", b'{"settings": {"a": ' + b"[" * 50 + b"]" * 50 + b"}}", 400, "nested deeper"),
+        ("/scaled", b'{"settings": {"effort_limit": ' + b"1" * 5_000 + b"}}", 400, "4300 digits"),
+        ("/scaled", b'{"settings": {"effort_limit": ' + b"1" * 4_000 + b"}}", 400, "beyond 64 bits"),
+        ("/scaled", b'{"settings": {"effort_limit": 1e999}}', 400, "finite"),
+        ("/scaled", b'{"settings": {"effort_limit": -Infinity}}', 400, "finite"),
+        ("/scaled", b'{"settings": {"effort_limit": NaN}}', 400, "finite"),
+        ("/scaled", b'{"settings": {"effort_limit": 1, "effort_limit": 2}}', 400, "twice"),
+        ("/scaled", b'{"settings": {"\\ud800": 1}}', 400, "UTF-16"),
+        ("/save", b'{"settings": {}, "name": "\\udfff"}', 400, "UTF-16"),
+        ("/save", b'{"settings": {}, "name": "a\\u0000b"}', 400, "NUL"),
+        ("/scaled", {"settings": {"effort_limit": {"a": [1]}}}, 400, "effort_limit"),
+        ("/scaled", {"settings": {"effort_limit": True}}, 400, "effort_limit"),
+        ("/scaled", {"settings": {"confidence": "0.9"}}, 400, "confidence"),
+        ("/scaled", {"settings": None}, 400, "settings"),
+        ("/scaled", b"", 400, "Expecting"),
     ],
 )
-def test_what_is_wrong_is_one_line(server, path, content, status, words):
+def test_what_is_wrong_is_one_line(server, path, content, status, words, capfd):
     found, said, _ = ask(server, path, content, **{"X-Flexlink-Token": server.token})
     assert found == status
     assert words in said["error"]
     assert "\n" not in said["error"]
+    assert capfd.readouterr() == ("", "")
+
+
+def answered(server: TuneServer, request: bytes) -> int:
+    """Status of the answer to bytes as they are, after which the server hangs up."""
+    with socket.create_connection(server.server_address, timeout=20) as link:
+        link.sendall(request)
+        answer = b""
+        while part := link.recv(1 << 16):
+            answer += part
+    return int(answer.split()[1])
+
+
+@pytest.mark.parametrize(
+    ("lines", "content", "status"),
+    [
+        ("Content-Length: many", b"{}", 400),
+        ("Content-Length: \u00b2", b"{}", 400),  # a digit to str.isdigit, no number to int
+        ("Content-Length: -2", b"{}", 400),
+        ("Content-Length: +2", b"{}", 400),
+        ("Content-Length: 0x2", b"{}", 400),
+        ("Content-Length: 2.0", b"{}", 400),
+        ("Content-Length:", b"{}", 400),
+        ("Content-Length: " + "9" * 5_000, b"{}", 400),
+        ("Content-Length: 99999999999", b"{}", 413),
+        ("Content-Length: 2\r\nContent-Length: 30", b"{}", 400),
+        ("Content-Length: 2\r\nTransfer-Encoding: chunked", b"2\r\n{}\r\n0\r\n\r\n", 400),
+        ("Transfer-Encoding: chunked", b"2\r\n{}\r\n0\r\n\r\n", 411),
+        ("Accept: */*", b"", 411),
+    ],
+)
+def test_a_length_that_is_none_is_refused(server, lines, content, status, capfd):
+    head = f"POST /scaled HTTP/1.1\r\nHost: 127.0.0.1:{server.server_port}\r\n{lines}\r\n"
+    head += f"X-Flexlink-Token: {server.token}\r\n\r\n"
+    assert answered(server, head.encode("latin-1") + content) == status
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("request_line", "status"),
+    [("GET http://[ HTTP/1.1", 400), ("GET /?token=%ff%00 HTTP/1.1", 403), ("PUT / HTTP/1.1", 501)],
+)
+def test_an_address_that_is_none_is_refused(server, request_line, status, capfd):
+    host = f"Host: 127.0.0.1:{server.server_port}"
+    assert answered(server, f"{request_line}\r\n{host}\r\n\r\n".encode()) == status
+    assert answered(server, f"{request_line}\r\n\r\n".encode()) in (400, 403, 501)  # no Host at all
+    assert capfd.readouterr() == ("", "")
+
+
+def test_whoever_leaves_in_the_middle_leaves_no_traceback(server, capfd):
+    for _ in range(3):
+        with socket.create_connection(server.server_address) as link:
+            # Closed with a reset, as by a browser that is killed.
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            link.sendall(b"POST /scaled HTTP/1.1\r\nContent-Length: 100\r\n")
+    assert ask(server, f"/?token={server.token}")[0] == 200
+    assert capfd.readouterr() == ("", "")
 
 
 def test_actions_of_the_page(server):

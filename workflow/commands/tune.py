@@ -8,7 +8,9 @@ this server as its host (a name that somebody points to 127.0.0.1 is another).
 from __future__ import annotations
 
 import json
+import re
 import secrets
+import sys
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,13 +24,19 @@ from urllib.parse import parse_qs, urlsplit
 from workflow.commands.tuning import Handler, SupersededError, TuningSession
 from workflow.config.design_file import DesignFile
 from workflow.config.run_config import built_in_config
+from workflow.engine.documents import json_object
 from workflow.engine.errors import InputError, one_line
 from workflow.engine.progress import Progress
 from workflow.tasks.pipeline import identify_only
 from workflow.text.templates import environment
 
 HOST = "127.0.0.1"
-_MOST_BYTES = 1 << 16  # of a request
+# Of a request, bytes: its settings are a page of text. Large enough for all of them, small enough to be read
+# into memory by anybody who knows the token.
+_MOST_BYTES = 1 << 16
+# Of a Content-Length: Python reads no integer of more than 4300 digits, and `str.isdigit` is true of digits
+# that `int` does not read, like a superscript two.
+_LENGTH = re.compile(r"[0-9]{1,20}")
 
 
 class TuneServer(ThreadingHTTPServer):
@@ -54,6 +62,12 @@ class TuneServer(ThreadingHTTPServer):
     @property
     def url(self) -> str:
         return f"http://{HOST}:{self.server_port}/?token={self.token}"
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """One line on the terminal, never a traceback; nothing where whoever asked has left."""
+        error = sys.exc_info()[1]
+        if error is not None and not isinstance(error, OSError):
+            sys.stderr.write(f"flexlink tune: {type(error).__name__}: {one_line(error)}\n")
 
     def page(self, nonce: str) -> str:
         session = self.session
@@ -85,7 +99,11 @@ class _Request(BaseHTTPRequestHandler):
     server_version, sys_version = "flexlink", ""
 
     def do_GET(self) -> None:
-        asked = urlsplit(self.path)
+        try:
+            asked = urlsplit(self.path)
+        except ValueError as error:  # http://[ is the beginning of no address
+            self._refuse(HTTPStatus.BAD_REQUEST, one_line(error))
+            return
         token = (parse_qs(asked.query).get("token") or [""])[0]
         if asked.path != "/":
             self._refuse(HTTPStatus.NOT_FOUND, "no such page")
@@ -97,29 +115,37 @@ class _Request(BaseHTTPRequestHandler):
         if not self._allowed(self.headers.get("X-Flexlink-Token", "")):
             return
         action = self.server.actions.get(self.path)
-        length = self.headers.get("Content-Length", "")
         if action is None:
             self._refuse(HTTPStatus.NOT_FOUND, "no such action")
-        elif not length.isdigit() or int(length) > _MOST_BYTES:
+            return
+        # How long the content is has to be known before it is read, and said once: of two lengths, or a
+        # length and pieces, the rest of the content would be taken for the next request.
+        lengths = self.headers.get_all("Content-Length", [])
+        if not lengths:
+            self._refuse(HTTPStatus.LENGTH_REQUIRED, "expected a Content-Length")
+            return
+        in_pieces = "Transfer-Encoding" in self.headers
+        if len(lengths) > 1 or in_pieces or not _LENGTH.fullmatch(lengths[0]):
+            self._refuse(HTTPStatus.BAD_REQUEST, "expected one Content-Length, a whole number of bytes")
+            return
+        length = int(lengths[0])
+        if length > _MOST_BYTES:
             self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"expected at most {_MOST_BYTES} bytes")
-        else:
-            self._act(action, self.rfile.read(int(length)))
+            return
+        self._act(action, self.rfile.read(length))
 
     def _act(self, action: Handler, content: bytes) -> None:
         try:
-            asked = json.loads(content)
-            if not isinstance(asked, dict) or not isinstance(asked.get("settings"), dict):
-                raise InputError("expected a JSON object with settings")
-            answer = action({"name": "", **asked})
+            answer = json.dumps(action({"name": "", **_request(content)}), allow_nan=False)
         except SupersededError:
             self._refuse(HTTPStatus.CONFLICT, "superseded")
-        except (InputError, UnicodeError, json.JSONDecodeError) as error:
+        except InputError as error:
             self._refuse(HTTPStatus.BAD_REQUEST, one_line(error))
         except Exception as error:  # the page goes on, whatever a library raises
             said = f"internal error: {type(error).__name__}: {one_line(error)}"
             self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, said)
         else:
-            self._answer(HTTPStatus.OK, json.dumps(answer, allow_nan=False), "application/json")
+            self._answer(HTTPStatus.OK, answer, "application/json")
 
     def _allowed(self, token: str) -> bool:
         """Whether the request comes from our own page; refused where not."""
@@ -150,14 +176,34 @@ class _Request(BaseHTTPRequestHandler):
             **({"Connection": "close"} if self.close_connection else {}),
         }.items():
             self.send_header(name, value)
-        self.end_headers()
         try:
+            self.end_headers()
             self.wfile.write(content)
         except (BrokenPipeError, ConnectionResetError):
             self.close_connection = True  # whoever asked has left
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
         """Nothing: the terminal has the address and errors only."""
+
+
+def _request(content: bytes) -> dict[str, Any]:
+    """What is asked for: an object with `settings`, all of its numbers finite.
+
+    Raises InputError, one line, for anything else.
+    """
+    source = "the request"
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{source}: {one_line(error)}") from error
+    asked = json_object(text, source)
+    if not isinstance(asked.get("settings"), dict):
+        raise InputError(f"{source}: expected a JSON object with settings")
+    try:
+        json.dumps(asked, allow_nan=False)
+    except ValueError as error:  # NaN, Infinity, or 1e999, which Python's reader takes
+        raise InputError(f"{source}: expected finite numbers") from error
+    return asked
 
 
 @contextmanager

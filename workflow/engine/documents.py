@@ -55,42 +55,61 @@ def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
     text = read_text(path, MOST_TOML_BYTES)
     if (longest := max(map(len, text.splitlines()), default=0)) > _LONGEST_TOML_LINE:
         raise InputError(f"{path}: a line of {longest} characters, at most {_LONGEST_TOML_LINE} are read")
-    return text, _parsed(tomllib.loads, text, path, "TOML")
+    return text, _parsed(tomllib.loads, text, str(path), "TOML")
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """The object in a JSON file. Raises InputError naming the file."""
-    document = _parsed(json_value, read_text(path), path, "JSON")
+    return json_object(read_text(path), str(path))
+
+
+def json_object(text: str, source: str) -> dict[str, Any]:
+    """The object in a JSON text, with nothing in it that whoever looks at its values would fail on.
+
+    Raises InputError, one line that begins with `source`: syntax, a name twice, no object, nested deeper than
+    `MOST_LEVELS`, an integer beyond 64 bits, text that is no Unicode.
+    """
+    document = _parsed(json_value, text, source, "JSON")
     if not isinstance(document, dict):
-        raise InputError(f"{path}: expected a JSON object, found {type(document).__name__}")
+        raise InputError(f"{source}: expected a JSON object, found {type(document).__name__}")
     return document
 
 
-def _parsed(parse: Callable[[str], Any], text: str, path: Path, what: str) -> Any:
+def _parsed(parse: Callable[[str], Any], text: str, source: str, what: str) -> Any:
     try:
         document = parse(text)
     except RecursionError:
-        raise InputError(f"{path}: nested deeper than {MOST_LEVELS} levels") from None
+        raise InputError(f"{source}: nested deeper than {MOST_LEVELS} levels") from None
     except ValueError as error:  # syntax, or an integer of more digits than Python reads
-        raise InputError(f"{path}: not valid {what}: {error}") from error
-    _refuse_extremes(document, path)
+        raise InputError(f"{source}: not valid {what}: {error}") from error
+    _refuse_extremes(document, source)
     return document
 
 
-def _refuse_extremes(document: Any, path: Path) -> None:
+def _refuse_extremes(document: Any, source: str) -> None:
     """Level by level, so that no depth is too much for the check itself."""
     level: list[tuple[str, Any]] = [("", document)]
     for _ in range(MOST_LEVELS + 1):
         below: list[tuple[str, Any]] = []
         for key, value in level:
+            _refuse_strange_text(key, key, source)
             if isinstance(value, dict):
                 below += [(str(name), item) for name, item in value.items()]
             elif isinstance(value, list):
                 below += [(key, item) for item in value]
             elif isinstance(value, int) and abs(value) > LARGEST_INTEGER:
-                raise InputError(f"{path}: {shortened(key)}: an integer beyond 64 bits, {shortened(value)}")
-            elif isinstance(value, str) and "\0" in value:
-                raise InputError(f"{path}: {shortened(key)}: a NUL character in {shortened(value)}")
+                raise InputError(f"{source}: {shortened(key)}: an integer beyond 64 bits, {shortened(value)}")
+            elif isinstance(value, str):
+                _refuse_strange_text(value, key, source)
         level = below
     if level:
-        raise InputError(f"{path}: nested deeper than {MOST_LEVELS} levels")
+        raise InputError(f"{source}: nested deeper than {MOST_LEVELS} levels")
+
+
+def _refuse_strange_text(text: str, key: str, source: str) -> None:
+    """Refuse what no file name and no other document can hold: NUL, and half of a pair of UTF-16 (JSON can
+    write it as an escape)."""
+    if "\0" in text:
+        raise InputError(f"{source}: {shortened(key)}: a NUL character in {shortened(text)}")
+    if any("\ud800" <= character <= "\udfff" for character in text):
+        raise InputError(f"{source}: {shortened(key)}: half a character of UTF-16 in {shortened(text)}")
