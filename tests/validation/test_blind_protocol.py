@@ -1,6 +1,7 @@
 """Cases, seal, opening: what a blind run promises; a quick stand-in diagnoses where it may."""
 
 import json
+import os
 import shutil
 import stat
 import subprocess
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from plant import Rig, parse_effects, simulate
+from tests.workflow.command import ROOT
 from validation.blind.cases import NOT_TOGETHER, SHARES, schedule
 from validation.blind.generate import answer_toml, folder_hash, generate
 from validation.blind.protocol import run_blind
@@ -243,31 +245,87 @@ def test_bad_requests_are_one_line(tmp_path):
     assert not (tmp_path / "a").exists()
 
 
+_ATTEMPTS = {
+    "open": "open(place / 'seal' / 'labels.json')",
+    "os.open": "os.open(place / 'seal' / 'labels.json', os.O_RDONLY)",
+    "bytes": "open(os.fsencode(place / 'seal' / 'labels.json'))",
+    "list": "os.listdir(place / 'seal')",
+    "rename": "os.rename(place / 'seal', away)",
+    "chdir": "os.chdir(place)",
+    "read_text": "(place / 'commitment.json').read_text()",
+    "mkdir": "os.mkdir(place / 'own')",
+    "utime": "os.utime(place / 'seal')",
+    "rmdir": "os.rmdir(place / 'seal')",
+    "copytree": "shutil.copytree(place, away)",
+    "sqlite": "sqlite3.connect(place / 'seal' / 'labels.json')",
+    "getxattr": "os.getxattr(place / 'seal' / 'labels.json', 'user.any')",
+    "old symbolic link": "open(place.parent / 'symbolic')",
+    "new symbolic link": "os.symlink(place / 'seal' / 'labels.json', away)",
+    "old hard link": "open(place.parent / 'hard')",
+    "new hard link": "os.link(place / 'seal' / 'labels.json', away)",
+    "dir_fd": "os.open('labels.json', os.O_RDONLY, dir_fd=os.open(place / 'seal', os.O_RDONLY))",
+    "dir_fd of a parent": "os.open(f'{place.name}/seal/labels.json', 0, dir_fd=os.open(place.parent, 0))",
+    "dir_fd of the root": "os.open(str(place)[1:], 0, dir_fd=os.open('/proc/self/root', 0))",
+    "dir_fd beside": "os.open(f'../{place.name}/seal/labels.json', 0, dir_fd=os.open(beside, 0))",
+    "system": "os.system('true')",
+    "subprocess": "subprocess.run(['true'])",
+    "fork": "os.fork()",
+    "exec": "os.execv('/bin/true', ['true'])",
+    "posix_spawn": "os.posix_spawn('/bin/true', ['true'], {})",
+    "spawn": "multiprocessing.get_context('spawn').Process(target=print).start()",
+    "fork server": "multiprocessing.get_context('forkserver').Process(target=print).start()",
+    "forked": "multiprocessing.get_context('fork').Process(target=print).start()",
+    "pool": "concurrent.futures.ProcessPoolExecutor(1).submit(print).result()",
+    "socket": "socket.socket(socket.AF_UNIX).connect(str(place.parent / 'server'))",
+    "loopback": "socket.create_connection(('127.0.0.1', 9))",
+    "memory of the parent": "open(f'/proc/{os.getppid()}/mem', 'rb')",
+    "interpreter": "interpreters.create()",
+}
+_TRIED = """
+import concurrent.futures, multiprocessing, os, pathlib, shutil, socket, sqlite3, subprocess, sys
+try:
+    import _xxsubinterpreters as interpreters
+except ImportError:
+    import _interpreters as interpreters
+from validation.blind.worker import keep_out
+
+place, away, beside = map(pathlib.Path, sys.argv[1:4])
+if __name__ == "__main__":
+    keep_out(place)
+    for attempt in sys.argv[4:]:
+        try:
+            done = eval(attempt)
+        except (PermissionError, RuntimeError) as error:  # the latter of an interpreter that is not made
+            print("refused", error)
+        else:
+            print("DONE", attempt, done)
+    beside.joinpath("own.txt").write_text("what is not below the directory stays open")
+    assert os.listdir(beside) == ["own.txt"]
+"""
+
+
 def test_the_diagnosing_process_cannot_reach_the_labels(tmp_path):
-    close_seal(tmp_path, LABELS)
-    program = (
-        "import sys, pathlib, os, shutil, sqlite3\n"
-        "from validation.blind.worker import keep_out\n"
-        "place = pathlib.Path(sys.argv[1])\n"
-        "keep_out(place)\n"
-        "attempts = [lambda: open(place / 'seal' / 'labels.json'), lambda: os.listdir(place / 'seal'),\n"
-        "    lambda: os.open(place / 'seal' / 'labels.json', os.O_RDONLY),\n"
-        "    lambda: os.rename(place / 'seal', '/tmp/never'), lambda: os.system('true'),\n"
-        "    lambda: os.chdir(place), lambda: (place / 'commitment.json').read_text(),\n"
-        "    lambda: os.mkdir(place / 'own'), lambda: os.utime(place / 'seal'),\n"
-        "    lambda: os.rmdir(place / 'seal'), lambda: shutil.copytree(place, '/tmp/never'),\n"
-        "    lambda: sqlite3.connect(place / 'seal' / 'labels.json'),\n"
-        "    lambda: os.getxattr(place / 'seal' / 'labels.json', 'user.any')]\n"
-        "for attempt in attempts:\n"
-        "    try:\n"
-        "        attempt()\n"
-        "    except PermissionError as error:\n"
-        "        print('refused', error)\n"
-    )
+    """Nor start anything that could; each attempt is one that the head of the worker's module names."""
+    place = tmp_path / "run"
+    place.mkdir()
+    close_seal(place, LABELS)
+    (tmp_path / "symbolic").symlink_to(place / "seal" / "labels.json")
+    (tmp_path / "hard").hardlink_to(place / "seal" / "labels.json")
+    (tmp_path / "beside").mkdir()
+    program = tmp_path / "tried.py"
+    program.write_text(_TRIED)
+    places = [place, tmp_path / "away", tmp_path / "beside"]
     done = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True, check=True
+        [sys.executable, program, *places, *_ATTEMPTS.values()],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
-    assert done.stdout.count("refused") == 13, done.stdout
+    refused = [line.startswith("refused") for line in done.stdout.splitlines()]
+    assert dict(zip(_ATTEMPTS, refused, strict=True)) == dict.fromkeys(_ATTEMPTS, True), done.stdout
+    assert not (tmp_path / "away").exists()
 
 
 def test_a_diagnosis_that_fails_counts_as_a_wrong_answer(tmp_path):
