@@ -242,5 +242,9 @@ def one_line(error: ValidationError, known: Collection[str] = ()) -> str:
         text = f"{key}: {message}" if key else message
     else:
         expected = message.removeprefix("Input should be ")
-        text = f"{key}: expected {expected}, got {first['input']!r:.80}"
+        try:
+            given = f"{first['input']!r:.80}"
+        except ValueError:  # hexadecimal digits give integers that Python does not write in decimal ones
+            given = "a number of too many digits"
+        text = f"{key}: expected {expected}, got {given}"
     return text

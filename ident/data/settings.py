@@ -85,7 +85,11 @@ def _complaint(model: type[BaseModel], detail: ErrorDetails) -> str:
     if kind == "value_error":
         return where + message
     message = message[:1].lower() + message[1:]
-    return f"{where}{message}, got {detail['input']!r:.80}"
+    try:
+        given = f"{detail['input']!r:.80}"
+    except ValueError:  # Python writes no integer of more than 4300 digits
+        given = "a number of too many digits"
+    return f"{where}{message}, got {given}"
 
 
 def _bare(text: object) -> str:

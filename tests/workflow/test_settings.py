@@ -5,8 +5,11 @@ from typing import Annotated, Literal
 import pytest
 from pydantic import BaseModel, ConfigDict, Field
 
+from ident.basis.options import IdentOptions
+from plant import paper_link
+from plant.rig import Rig
 from workflow.config.settings import InputPath, check, expand
-from workflow.engine.documents import read_toml
+from workflow.engine.documents import read_json, read_toml
 from workflow.engine.errors import InputError
 
 
@@ -107,6 +110,52 @@ def test_toml_syntax_error_names_line_and_column(tmp_path):
     path.write_text("[run]\nname = \n")
     with pytest.raises(InputError, match=r"arm\.toml: not valid TOML: .*line 2, column 8"):
         read_toml(path)
+
+
+_DEEP = 60_000
+_LONG = "1" * 5_000
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.json", "[" * _DEEP, "nested deeper than 40 levels"),
+        ("a.json", '{"a": ' * _DEEP + "1" + "}" * _DEEP, "nested deeper than 40 levels"),
+        ("a.json", f'{{"A": [[{_LONG}]]}}', "4300 digits"),
+        ("a.json", f'{{"A": [[{_LONG[:4000]}]]}}', "'A': an integer beyond 64 bits"),
+        ("a.json", '{"A": "\\ud800"}', "'A': half a character of UTF-16"),
+        ("a.json", '{"\\udfff": 1}', "half a character of UTF-16"),
+        ("a.json", '{"a\\u0000": 1}', "a NUL character"),
+        ("a.json", '{"a": 1, "a": 2}', "'a' is there twice"),
+        ("a.json", "7", "expected a JSON object, found int"),
+        ("a.toml", "a = " + "[" * 10_000, "nested deeper than 40 levels"),
+        ("a.toml", f"a = {_LONG}", "4300 digits"),
+        ("a.toml", "a = 0x" + "f" * 5_000, "'a': an integer beyond 64 bits, <int with too many digits>"),
+        ("a.toml", "a = [0b" + "1" * 19_000 + "]", "'a': an integer beyond 64 bits"),
+        ("a.toml", "a" + ".a" * 9_000 + " = 1", "nested deeper than 40 levels"),
+    ],
+)
+def test_a_document_that_no_person_wrote_is_refused_in_one_line(tmp_path, refused, name, text, words):
+    path = tmp_path / name
+    path.write_text(text)
+    read = read_json if name == "a.json" else read_toml
+    with pytest.raises(InputError) as error:
+        read(path)
+    assert words in str(error.value)
+    # The same of a command that is given it as a plant, or as a configuration.
+    command = ["run", "--config", path, "--out", tmp_path / "out"]
+    if name == "a.json":
+        command = ["design", path]
+    assert words in refused(*command)
+
+
+def test_a_number_of_too_many_digits_is_refused_in_one_line(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(paper_link().to_toml().replace("length_m = 1.0", "length_m = 0x" + "f" * 5_000))
+    with pytest.raises(ValueError, match=r"rig\.toml: .*got a number of too many digits"):
+        Rig.from_toml(path)
+    with pytest.raises(ValueError, match=r"n_real: .*, got a number of too many digits"):
+        IdentOptions(n_real=16**5_000)
 
 
 def test_a_byte_order_mark_is_no_syntax_error(tmp_path):

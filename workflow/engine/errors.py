@@ -29,7 +29,11 @@ def printable(text: str) -> str:
 
 def shortened(value: object, most: int = 80) -> str:
     """How a value is written, cut where it is long."""
-    return cut(repr(value), most)
+    try:
+        text = repr(value)
+    except ValueError:  # hexadecimal digits in TOML give integers that Python does not write in decimal ones
+        text = f"<{type(value).__name__} with too many digits>"
+    return cut(text, most)
 
 
 def cut(text: str, most: int) -> str:
