@@ -41,6 +41,10 @@ records = [{ path = "log.csv" }]
 input = "u_V"
 output = "y_rad"
 
+[channels.identification]
+max_real = 2
+max_pairs = 1
+
 [specification]
 bandwidth_rad_s = 1.0
 modulus_margin = 0.4
@@ -119,10 +123,10 @@ def test_a_stored_configuration_has_the_keys_of_its_file(path, monkeypatch, requ
 @pytest.mark.parametrize("key", LEFT_OPEN)
 def test_a_default_that_is_stated_is_another_question_to_the_data(key, tmp_path):
     default = IdentOptions.model_fields[key].get_default()
-    stated = f"[channels.identification]\n{key} = {list(default) if default == () else default}\n"
+    stated = f"{key} = {list(default) if default == () else default}\n"
     open_, _ = load_config(with_log(tmp_path / "open"))
     (tmp_path / "open" / "stated.toml").write_text(
-        CONFIGURATION.replace("[specification]", f"{stated}\n[specification]")
+        CONFIGURATION.replace("max_pairs = 1\n", f"max_pairs = 1\n{stated}")
     )
     closed, _ = load_config(tmp_path / "open" / "stated.toml")
     for config, there in ((open_, False), (closed, True)):
