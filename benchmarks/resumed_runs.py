@@ -278,7 +278,8 @@ def run(out: Print, *, only: str = "") -> None:
         out(f"{kind.name}: {time.process_time() - started_s:.0f} s of CPU")
         out()
     out(f"runs of one loop, cut and resumed, that differ: {differ} of {cuts}")
-    out(f"studies on a run's directory that differ from those on its file: {studies_differ} of {studies}")
+    differing = f"{studies_differ} of {studies}"
+    out(f"studies on a run's directory that differ from one on its configuration: {differing}")
 
 
 if __name__ == "__main__":

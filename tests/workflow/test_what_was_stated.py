@@ -153,12 +153,13 @@ def test_the_data_decide_about_the_dead_time_in_a_run_that_is_continued(tmp_path
     config, text = load_config(with_log(tmp_path))
     identify_only(config, tmp_path / "run", config_text=text)
     kept = config_of(RunDirectory.open(tmp_path / "run"))
-    base = load_base(
-        StudyConfig.model_validate({"axes": [{"key": "closed_loop.draws", "values": [1]}]}),
-        tmp_path / "study.toml",
-        tmp_path / "run",
-    )
-    assert base.config.to_document() == kept.to_document() == config.to_document()
+    study = StudyConfig.model_validate({"axes": [{"key": "closed_loop.draws", "values": [1]}]})
+    bases = [
+        load_base(study, tmp_path / "study.toml", base).config
+        for base in (tmp_path / "run", tmp_path / "arm.toml")
+    ]
+    for other in (kept, *bases):
+        assert other.to_document() == config.to_document()
     identify_only(kept, tmp_path / "again")
     assert stage_bytes(tmp_path / "again") == stage_bytes(tmp_path / "run")
     model = RunResults(RunDirectory(tmp_path / "again")).identify.channels[0].model
