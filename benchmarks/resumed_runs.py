@@ -24,10 +24,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.harness import Print, main
+from workflow.commands.logs import Reading
 from workflow.commands.run import run_from_files, simulate_to_csv
 from workflow.config.joints_config import load_any
 from workflow.engine import storage
-from workflow.engine.errors import InputError
 from workflow.engine.run_directory import KEPT_FILES, RunDirectory
 from workflow.study.settings import load_study
 from workflow.study.work import run_study
@@ -175,7 +175,8 @@ class Kind:
     def run(self, config: Path, out: Path) -> None:
         """A run that is left alone."""
         if self.drafted:
-            run_from_files(None, out, [config.parent / "logs" / "01_first.csv"])
+            columns = Reading(time="time_s", input_name="voltage_V", output_name="hub_angle_rad")
+            run_from_files(None, out, [config.parent / "logs" / "01_first.csv"], columns)
         else:
             run_from_files(config, out)
 
@@ -252,11 +253,7 @@ def run(out: Print, *, only: str = "") -> None:
             folder = Path(name)
             config = kind.write(folder)
             whole = folder / "alone" / "run"
-            try:
-                kind.run(config, whole)
-            except InputError as refused:
-                out(f"{kind.name}: refused, {refused}")
-                continue
+            kind.run(config, whole)
             if kind.drafted:
                 config = whole / "config.toml"
             settings, _ = load_any(config)
