@@ -34,7 +34,7 @@ from workflow.engine.errors import InputError, naming
 from workflow.engine.store import Store
 
 # 9: settling with friction over sizes of the step.
-# 10: config.json holds what was stated. Those of earlier layouts hold defaults, too, and no longer tell which of
+# 10: config.json holds what was stated. Those of earlier layouts hold defaults, too, and do not tell which of
 # them were stated: resumed, such a run would give another answer.
 LAYOUT_VERSION = 10
 T = TypeVar("T")
