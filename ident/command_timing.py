@@ -34,6 +34,8 @@ from ident.response_coefficients import coefficients_of
 ROWS_BESIDE = 4
 # Highest frequency times step up to which the filter is fitted, rad: above it most logs hold noise alone.
 FITTED_UP_TO_RAD = 2.0
+# Highest frequency times step at which an ellipse is fitted, rad: the Nyquist frequency but for rounding.
+HIGHEST_ANGLE_RAD = 3.14
 # Taps by which an ellipse follows a phase that grows with frequency.
 TAPS = 8
 # Ellipses of noise and timing add as variances, but an interval of the timing has ends that are as likely as
@@ -319,7 +321,11 @@ def with_unknown_timing(posterior: ResponsePosterior, timing: CommandTiming) -> 
     """
     if timing.known:
         return posterior
-    angle = np.geomspace(1e-4, 0.98 * np.pi, 600)
+    # Slow motions, and points between which no tap of the kernel turns round.
+    n_linear = 4 * (posterior.fir_length + TAPS) + 200
+    angle = np.union1d(
+        np.geomspace(1e-5, HIGHEST_ANGLE_RAD, 500), np.linspace(0.0, HIGHEST_ANGLE_RAD, n_linear)[1:]
+    )
     omega = angle / posterior.dt_s
     middle = 1 / timing.middle.response(angle)
     ratios = [1 / hold.response(angle) / middle for hold in timing.possible]

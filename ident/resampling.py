@@ -134,9 +134,12 @@ def resampled(posterior: ResponsePosterior, controller_dt_s: float) -> ResponseP
     )
     known = np.column_stack([posterior.mean, posterior.covariance_factor])
     slower_dt_s = max(posterior.dt_s, controller_dt_s)
-    omega = np.union1d(
-        np.geomspace(LOWEST_ANGLE_RAD, 0.98 * np.pi, 900) / slower_dt_s, _around_modes(posterior)
-    )
+    # Between the points of the even part no tap turns round.
+    even = np.linspace(0.0, 0.99 * np.pi / slower_dt_s, 4 * n_taps + 200)[1:]
+    slow = np.geomspace(LOWEST_ANGLE_RAD, 0.98 * np.pi, 600) / slower_dt_s
+    # Between two of these no tap turns round.
+    even = np.linspace(0.0, 0.99 * np.pi, 4 * n_taps + 200)[1:] / slower_dt_s
+    omega = np.union1d(np.union1d(slow, even), _around_modes(posterior))
     omega = omega[omega < 0.99 * np.pi / slower_dt_s]
     if up == 1:
         wanted = _held(posterior, omega, down) @ known
@@ -166,7 +169,7 @@ def _falling_above(
 ) -> tuple[RealArray, ComplexArray]:
     """Frequencies (F,) and responses (F, N) with more above the log's Nyquist frequency, of the size that an
     inertia has there: it falls with 1/w^2."""
-    above = np.linspace(1.0, 0.98 * up, 60 * up)[1:] * np.pi / log_dt_s
+    above = np.linspace(1.0, 0.99 * up, 400 * up)[1:] * np.pi / log_dt_s
     last = np.abs(wanted[-1:, :1])
     falling = np.zeros((above.size, wanted.shape[1]), dtype=np.complex128)
     falling[:, :1] = last * ((omega[-1] / above) ** 2)[:, None]
@@ -203,7 +206,8 @@ def _unknown_above(posterior: ResponsePosterior, log_dt_s: float, up: int) -> Re
     (w T / 2 pi)^2 of the response where it falls with 1/w or faster. The response times a few taps lies in
     the span of poles and taps; the same a sample later is the other direction of an ellipse.
     """
-    angle = np.union1d(np.geomspace(LOWEST_ANGLE_RAD, 0.99 * np.pi, 600), np.linspace(0.0, 3.1, 600)[1:])
+    even = np.linspace(0.0, 0.99 * np.pi, 4 * posterior.fir_length + 200)[1:]
+    angle = np.union1d(np.geomspace(LOWEST_ANGLE_RAD, 0.99 * np.pi, 600), even)
     omega = angle / posterior.dt_s
     later = np.exp(-1j * omega * posterior.dt_s)
     opening = ((1 - later) / (2 * np.sin(np.pi / (2 * up)))) ** OPENING_POWER
