@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from control_design.specification import Specification
+from ident.command_timing import CommandTiming
 from ident.data.finding import Finding
 from ident.uncertainty import FrequencyUncertainty
 from workflow.config.joints_config import AnyConfig
@@ -54,6 +55,7 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> tuple[dict[str, Any]
     conditions = results.uncertainty.conditions(config)
     return (
         {
+            "command_timing": timing_numbers(results.records.timing),
             "channels": [channel_numbers(found, spread) for found, spread in pairs],
             "design": {
                 "met": design.met,
@@ -62,6 +64,7 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> tuple[dict[str, Any]
                 "outcome": "IMPOSSIBLE" if design.synthesis is None else design.synthesis.outcome.name,
                 "blocking": [] if design.synthesis is None else codec.plain(design.synthesis.blocking),
                 "bandwidth_rad_s": bandwidth_numbers(design, certify, config.specification),
+                "controller_dt_s": None if design.controller is None else design.controller.dt_s,
             },
             "signals": Logged.of(config, results.records).signals,
             "certificate": codec.plain(certify.certificate),
@@ -126,6 +129,19 @@ def verdict_of(
         advice = said("order_advice", achievable, design.gamma, order)
     told = ". Also, ".join(words(doubt) for doubt in conditions)
     return said("run_verdict", design, certify, loop, untold or advice, untold, told, asked)
+
+
+def timing_numbers(timing: CommandTiming | None) -> dict[str, Any] | None:
+    """How the period of the controller that made the logs is known; None of simulated records."""
+    if timing is None:
+        return None
+    return {
+        "source": timing.source.value,
+        "row_step_s": timing.row_step_s,
+        "controller_period_s": timing.period_s,
+        "rows_per_command": timing.rows_per_command,
+        "known": timing.known,
+    }
 
 
 def bandwidth_numbers(
