@@ -232,7 +232,7 @@ def _every(record: Record, start: int, rows: int) -> Record:
 def _refuse_contradiction(record: Record, period_s: float, rows_per_command: int) -> None:
     """Raise ValueError where the log shows that the stated period is not that of its controller."""
     step_s = record.dt_s
-    option = "controller_period_s, --controller-period-s"
+    option = "controller_period_s, --controller-period"
     share = step_s / period_s
     if share > 2 and abs(share - round(share)) > SAME_PERIOD * share:
         raise ValueError(

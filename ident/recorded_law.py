@@ -35,8 +35,12 @@ LEAST_EXCESS = 1.0
 SHOWN_SHARE = 0.5
 # Rows of all records together that are used: the residual is known to 1 % then.
 MOST_ROWS = 16_000
-# Decimal places that are looked for in a column; doubles hold no more.
-MOST_DECIMALS = 12
+# Decimal places that are looked for in a column: what logs have; more are those of numbers of 64 bits.
+MOST_DECIMALS = 9
+# Multiples of a step up to which a column may have been scaled: of 24 bits, the most of any converter.
+MOST_COUNTS = 2**24
+# Significant digits that are looked for: "%.4g" to "%.10g".
+SIGNIFICANT_DIGITS = range(4, 11)
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,22 +266,46 @@ def _rounding_step(signals: Sequence[RealArray]) -> float:
     decimals of a millimetre) were not rounded by the log. A value that stands has one rounding error, which
     a law with integral action does not see.
     """
-    steps = [_decimal_step(signal) for signal in signals]
-    finest = min(steps)
+    finest = min(_decimal_step(signal) for signal in signals)
     if finest == 0.0:
         return 0.0
-    counts = np.unique(np.concatenate([np.round(signal / finest).astype(np.int64) for signal in signals]))
-    if np.gcd.reduce(counts - counts[0]) > 1:
-        return 0.0
+    multiples = np.unique(np.concatenate([np.asarray(signal / finest) for signal in signals]))
+    counts = np.round(multiples)
+    # What is no multiple has a step that differs from value to value (significant digits).
+    if np.all(np.abs(multiples - counts) < 1e-3):
+        steps = counts.astype(np.int64)
+        if np.gcd.reduce(steps - steps[0]) > 1:
+            return 0.0
     moving = np.concatenate([np.diff(signal) != 0 for signal in signals])
     return finest * float(np.sqrt(np.mean(moving)))
 
 
 def _decimal_step(signal: RealArray) -> float:
-    """Power of ten of which all values are multiples; 0 where there is none, as of scaled values."""
+    """Step to which a column was rounded, in the mean over its values; 0 where there is none.
+
+    A power of ten; or the smallest difference, where all values are multiples of it, as of decimals that were
+    scaled to another unit; or that of so many significant digits, or of a number of 32 bits, at each value.
+    """
     values = np.unique(signal)
+    eps = np.finfo(np.float64).eps
     for decimals in range(MOST_DECIMALS + 1):
         scaled = values * 10.0**decimals
-        if np.all(np.abs(scaled - np.round(scaled)) <= 1e-6 + 4 * np.finfo(np.float64).eps * np.abs(scaled)):
+        if np.all(np.abs(scaled - np.round(scaled)) <= 1e-6 + 4 * eps * np.abs(scaled)):
             return float(10.0**-decimals)
+
+    if values.size > 1:
+        least = float(np.min(np.diff(values)))
+        counts = values / least
+        # Counts beyond this are not told from neighbours by doubles that were multiplied once.
+        if np.max(np.abs(counts)) < MOST_COUNTS and np.all(np.abs(counts - np.round(counts)) < 1e-3):
+            return least
+
+    size = np.abs(values[values != 0])
+    exponent = np.floor(np.log10(size))
+    for digits in SIGNIFICANT_DIGITS:
+        step = 10.0 ** (exponent + 1 - digits)
+        if np.all(np.abs(size / step - np.round(size / step)) <= 1e-6 + 4 * eps * size / step):
+            return float(np.sqrt(np.mean(step**2)))
+    if np.array_equal(values, values.astype(np.float32)):
+        return float(np.sqrt(np.mean(np.spacing(size.astype(np.float32)).astype(np.float64) ** 2)))
     return 0.0

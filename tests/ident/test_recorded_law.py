@@ -29,11 +29,11 @@ def loop_log(numerator, denominator, *, rows=1, limit=50.0, decimals=4, n=4000, 
     return Record(
         "log",
         np.round(u[every, None], decimals),
-        np.round(y[every, None], 6),
+        np.round(y[every, None], decimals + 2),
         DT * rows,
         ("u",),
         ("y",),
-        reference=np.round(r[every, None], 6),
+        reference=np.round(r[every, None], decimals + 2),
         reference_names=("r",),
     )
 
@@ -96,3 +96,27 @@ def test_no_reference_and_a_relay_tell_no_law():
     assert law_of([replace(record, reference=None, reference_names=())]) is None
     relay = law_of([replace(record, input=np.sign(record.reference - record.output))])
     assert relay is None or not relay.repeats_command
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        lambda x: np.round(x, 6),
+        lambda x: np.round(x * 180 / np.pi, 5) * np.pi / 180,
+        lambda x: np.array([float(f"{value:.7g}") for value in x]),
+        lambda x: x.astype(np.float32).astype(np.float64),
+    ],
+    ids=["decimals", "scaled", "significant digits", "32 bits"],
+)
+def test_the_rounding_of_a_log_is_seen_however_it_was_written(written):
+    """A law is told from one that ran at half the period by what rounding leaves of each."""
+    for rows, told in ((1, True), (2, False)):
+        record = loop_log(*pid(), rows=rows, decimals=12)
+        columns = {
+            "input": written(record.input[:, 0])[:, None],
+            "output": written(record.output[:, 0])[:, None],
+            "reference": written(record.reference[:, 0])[:, None],
+        }
+        law = law_of([replace(record, **columns)])
+        assert law.repeats_command == told
+        assert law.tells_period == told

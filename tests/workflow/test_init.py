@@ -369,3 +369,32 @@ def test_what_to_type_is_whole_however_long_the_path(refused, flexlink, tmp_path
     assert words[1] in (str(log), "LOG...")
     assert words.count("--input") == words.count("--output") == 1
     assert not any(word.endswith("...") for word in words[2:])
+
+
+@pytest.mark.usefixtures("unidentified")
+def test_the_period_of_the_controller_is_read_off_stated_or_asked_for(flexlink, tmp_path, signals):
+    """Every row of a loop tells its period, and that a command is made of its own row's position; every
+    second row does not; a stated period is taken, and refused where the log contradicts it."""
+    names = ("t_s", "ref_rad", "i_cmd_A", "enc_rad")
+    folders = [tmp_path / name for name in ("every", "second", "stated")]
+    for folder in folders:
+        folder.mkdir()
+    _, text, config = drafted(flexlink, write(folders[0], signals, names))
+    assert config.source.controller_period_s == pytest.approx(DT_S)
+    assert config.specification.computational_delay_samples == 0
+    assert "repeats every command from the rows" in text
+    assert "made of the output of its own row" in text
+
+    thinned = [tuple(column[::2] for column in log) for log in signals]
+    logs = write(folders[1], thinned, names)
+    _, text, config = drafted(flexlink, logs)
+    assert config.source.controller_period_s is None
+    assert config.specification.computational_delay_samples == 1
+    assert "they do not tell it" in text
+
+    _, text, config = drafted(flexlink, logs, "--replace", "--controller-period", DT_S)
+    assert config.source.controller_period_s == DT_S
+    assert "as stated" in text
+    wrong = flexlink("init", *logs, "--out", tmp_path / "wrong.toml", "--controller-period", 3 * DT_S)
+    assert wrong.code == 2
+    assert "more often than a controller" in wrong.err
