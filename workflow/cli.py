@@ -55,6 +55,7 @@ _READING = (
     *("input_name", "output_name", "reference", "time", "time_unit", "dt_s"),
     *("scale", "units", "unwrap", "decimal", "input_limit", "controller_period_s", "command_averaged"),
 )
+_OF_LOOP = ("input_name", "output_name", "reference", "time", "time_unit", "decimal", "dt_s")
 _SIMULATOR = ("mjcf", "fmu", "python", "motion", "log", "dt_s", "repair", "resample_s")
 _MANIFESTS = ("manifest.json", "study.json", "diagnose.json", "blind.json")  # of what can be continued
 
@@ -260,7 +261,7 @@ def simulate(
         "noise_std_rad",
         "lead_in_s",
     ),
-    reading=("input_name", "output_name", "reference"),
+    reading=("input_name", "output_name", "reference", "time", "time_unit", "decimal"),
     plan=("realisations", "periods"),
 )
 def excite(
@@ -287,7 +288,7 @@ def excite(
         summary = write_reference(
             log,
             out,
-            _reading({name: of_fields[name] for name in ("input_name", "output_name", "reference")}),
+            _reading({name: of_fields[name] for name in _OF_LOOP}),
             largest_command=stated.get("peak_V"),
             largest_motion=stated.get("motion"),
             rms=next(iter(stated.get("rms_V", ())), None),

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 from rich.table import Column, Table
+from rich.text import Text
 
 from workflow.engine import interrupts, progress
 from workflow.engine.errors import printable
@@ -158,19 +159,23 @@ class TerminalProgress(progress.Progress):
 def print_summary(summary: RunSummary, *, verbose: bool = False) -> None:
     """The table of numbers on standard output, and the verdict where it is no complaint on standard error.
     verbose: every row."""
+    from workflow.text.formats import BARS  # numpy, which a command that only says its version can do without
+
     # A pipe has no width; 120 columns keep the rows on one line there, where COLUMNS does not say less.
     told = sys.stdout.isatty() or "COLUMNS" in os.environ
     console = Console(file=sys.stdout, width=None if told else 120)
     table = Table(title=_text(summary.title), title_justify="left", show_header=False, pad_edge=False)
     table.add_column("section", style="bold")
-    table.add_column("quantity")
-    table.add_column("value")
+    # Names of columns are folded, not cut: what tells two of them apart may stand at the end.
+    table.add_column("quantity", overflow="fold")
+    table.add_column("value", overflow="fold")
     for section in (not verbose and summary.brief) or summary.sections:
         for index, row in enumerate(section.rows):
             label = _text(section.title) if index == 0 else ""
-            table.add_row(
-                label, _text(row.label), _text(row.value), end_section=index == len(section.rows) - 1
-            )
+            value: str | Text = _text(row.value)
+            if row.value and not set(row.value) - set(BARS):
+                value = Text(row.value, overflow="ellipsis", no_wrap=True)  # a curve is no use in two lines
+            table.add_row(label, _text(row.label), value, end_section=index == len(section.rows) - 1)
     console.print(table)
     if summary.certified is not False:
         console.print(_text(summary.verdict), highlight=False, soft_wrap=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -41,6 +42,37 @@ def shown(value: object, longest: int = 80) -> str:
     text = " ".join(text[: 4 * longest].split())
     text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return text if len(text) <= longest else text[: longest - 3] + "..."
+
+
+def as_typed(value: object) -> str:
+    """A name or a path as a shell takes it, whole and on one line: quoted where it has to be.
+
+    What a message cannot show as it is (control characters, runs of blanks, blanks that do not break) is
+    written in the quotes of bash and zsh that take escapes: $'a\\tb'.
+    """
+    text = str(value)
+    if text.isprintable() and text == " ".join(text.split()):
+        return shlex.quote(text)
+    escaped = "".join(
+        character if character.isprintable() and character not in " \\'" else _escape(character)
+        for character in text
+    )
+    return f"$'{escaped}'"
+
+
+def _escape(character: str) -> str:
+    """A character by its number, as in $'\\x20' and $'\\u00a0'."""
+    code = ord(character)
+    if 0xDC80 <= code <= 0xDCFF:  # a byte of a path that is no UTF-8, as Python keeps it
+        code -= 0xDC00
+        return f"\\x{code:02x}"
+    return f"\\x{code:02x}" if code < 0x80 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+
+
+def path_as_typed(path: object) -> str:
+    """A path as a shell takes it, and a program that takes what begins with a dash for an option."""
+    text = str(path)
+    return as_typed(f"./{text}" if text.startswith("-") else text)
 
 
 def content_of(file: Path) -> bytes:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ident.data.arrays import RealArray, readonly
 from ident.data.finding import Finding, FindingKind, Value, finding
-from ident.data.foreign_files import shown
+from ident.data.foreign_files import as_typed, shown
 from ident.data.record_files import read_table
 from ident.data.shown import Shown
 from ident.data.table import LARGEST, Table
@@ -372,7 +372,7 @@ def in_one_unit(records: Sequence[Record]) -> list[Record]:
                 raise ValueError(
                     f"{record.label}: '{shown(name, 40)}' is in {shown(unit, 30)}, in {whose} in "
                     f"{shown(wanted, 30)}; expected one unit in all logs that are read together: convert "
-                    f"one, or state --unit {shown(name, 40)}=UNIT if a header is wrong"
+                    f"one, or state --unit {as_typed(f'{name}=UNIT')} if a header is wrong"
                 )
             if factor != 1.0:
                 factors[name], units[name] = factor, wanted

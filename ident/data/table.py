@@ -16,9 +16,10 @@ import numpy as np
 from ident.data.arrays import RealArray
 from ident.data.foreign_files import MOST_COLUMNS, as_numbers, shown
 from ident.data.json_columns import columns_in
-from ident.data.text_tables import Layout, doubtful_groups, is_number, number
+from ident.data.text_numbers import doubtful_groups, is_number, number
+from ident.data.text_tables import Layout
 from ident.data.time_stamps import StampError, is_stamp, may_be_minutes, seconds_since_first
-from ident.data.units import SIGNAL_WORDS, TimeColumn, size_of, written_unit
+from ident.data.units import COUNTED, SIGNAL_WORDS, TimeColumn, kind_of, size_of, written_unit
 
 # Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
 LARGEST = 1e100
@@ -207,9 +208,13 @@ class Table:
         return np.array([number(cell, decimal) if is_number(cell, decimal) else np.nan for cell in cells])
 
     def _refuse_doubtful_groups(self, name: str, cells: tuple[str, ...]) -> None:
+        """Raise ValueError where '1.500' in a column may be one and a half, or fifteen hundred."""
         if self.layout is None or self.layout.stated:
             return
-        row = doubtful_groups(cells, self.layout)
+        # Between commas a point is a decimal sign, but in a column of counts, which are whole.
+        counted = kind_of(self.unit(name)) in COUNTED - {"%"}
+        proven = self.layout.plain or (self.layout.separator == "," and not counted)
+        row = doubtful_groups(cells, self.layout.decimal, proven=proven)
         if row is not None:
             sign = "," if "," in cells[row] else "."
             raise ValueError(

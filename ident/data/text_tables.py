@@ -13,6 +13,14 @@ from dataclasses import dataclass, replace
 
 from ident.data.child_reader import LARGEST_TEXT_BYTES
 from ident.data.foreign_files import MOST_COLUMNS, distinct
+from ident.data.text_numbers import (
+    is_number,
+    number,
+    quantity,
+    shows_decimals,
+    with_plain_minus,
+    without_units,
+)
 from ident.data.time_stamps import is_stamp
 from ident.data.units import is_unit, says_time
 
@@ -23,16 +31,7 @@ _KINDS = (
     *((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), (" ", "."), (" ", ","), ("|", ".")),
     *(("|", ","), (",", ",")),
 )
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
 _COMMENT = re.compile(r"^\s*(?:#+|%+|//+|!+|--+(?=\D)|\*+|rem\s)\s*", re.IGNORECASE)
-# Digits in groups of three, by a comma or a point as others write decimals, or by what is neither.
-_GROUPS = {
-    sign: re.compile(
-        rf"[+-]?[1-9]\d{{0,2}}([{other}'’\u00a0\u202f\u2009])\d{{3}}(\1\d{{3}})*({re.escape(sign)}\d*)?"
-    )
-    for sign, other in ((".", ","), (",", "."))
-}
-_GROUP = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
 # A statement of the sampling above the rows: Rigol's tInc = 1e-06 and t0 = -0.005 between the names.
 _START = re.compile(r"(?:t0|x0|start|x ?org|x ?origin)\b", re.IGNORECASE)
 _INCREMENT = re.compile(
@@ -45,9 +44,12 @@ _UNITS_OF_X = re.compile(r"(?:horizontal|x)[_ ]units?\b|x_dimension\b", re.IGNOR
 _UNITS_OF_Y = re.compile(r"(?:vertical|y)[_ ]unit", re.IGNORECASE)
 # What a serial monitor puts before each line: '10:15:30.000 -> ', '[2024-03-01 10:15:30.000] '.
 _ARRIVED = re.compile(r"\s*(?:\[([^]]{4,40})\]|(\S[^>]{3,40}?)\s*->)(?:\s+|$)")
-# A number with its name, as plotters of serial ports take it: 'angle:0.01', 'volt = -3.00'.
-_LABELLED = re.compile(r"([^\W\d][^:=,;\t|]*?)\s*[:=]\s*([+-]?(?:\.?\d|nan|inf)[^:=,;\t| ]*) *([,;\t|]?)\s*")
+_LONGEST_ARRIVAL = 120  # characters of a line in which that is looked for
+# A number with its name, as plotters of serial ports take it: 'angle:0.01', 'volt = -3.00'. No part matches
+# what the next one begins with, so that time is linear in the length of a line.
+_LABELLED = re.compile(r"([^\W\d_][^:=,;\t|]*)[:=]\s*([+-]?(?:\.?\d|nan|inf)[^:=,;\t| ]*) *([,;\t|]?)\s*")
 _SIGNS = frozenset("#%/!-*rR")
+_MOST_FOOTER_LINES = 3  # words under a table: units, a count of rows, the name of the recorder
 _NO_TEXT = re.compile(r"[\x00-\x08\x0e-\x1f]")
 
 
@@ -59,8 +61,9 @@ class Layout:
     numbered where there is no header line. units: by name, of a line of units. header, first: line (from 1)
     of the names, 0 for none, and of the first row. skipped: lines from there on that are no rows; commented:
     how many of them are commented out. increment: (start, step) of the rows [s], where lines above say so.
-    plain: the decimal sign separates no groups of digits for certain; stated: by the user. cut: the last line
-    that was left out because the file ends inside of it, 0 for none.
+    plain: a cell leaves no doubt of the decimal sign; stated: by the user. cut: the last line that was left
+    out because the file ends inside of it, footer: the first of those under the table that hold words alone,
+    0 for none.
     """
 
     separator: str
@@ -75,6 +78,7 @@ class Layout:
     plain: bool = True
     stated: bool = False
     cut: int = 0
+    footer: int = 0
 
     def line(self, row: int) -> int:
         """The line of a row, which is counted from 0."""
@@ -112,7 +116,7 @@ def text_of(content: bytes) -> str:
 def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
     """The layout of a table, and its columns as text, equally long. Raises ValueError, with the line first
     where there is one."""
-    lines = text.split("\n")
+    lines = with_plain_minus(text).split("\n")
     while lines and not lines[-1].strip(" \t,;|"):
         lines.pop()  # blank lines at the very end are no samples
     if not lines:
@@ -123,20 +127,32 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
         names = distinct([*named, *layout.names[len(named) if layout.header else 0 :]])[: len(layout.names)]
         header = layout.header or (layout.first if len(named) > 1 else 0)
         layout = replace(layout, names=tuple(names), header=header)
+
+    # Lines that are no rows: comments, and blank ones behind every row; a single one may be a missing sample.
     first = layout.first - 1
     commented = [k for k in range(first, len(lines)) if _is_comment(lines[k])]
     blank = [k for k in range(first, len(lines)) if not lines[k].strip()]
-    # Behind every row they are a line end too many; one alone may be a sample that is missing.
     double = 2 * len(blank) >= len(lines) - first - len(commented) - 2
     skipped = {*commented, *(blank if double else ())}
     body = [line for k, line in enumerate(lines[first:], first) if k not in skipped]
     if not body:
         raise ValueError(": no rows under the header line; expected numbers")
     layout = replace(layout, skipped=tuple(k + 1 for k in sorted(skipped)), commented=len(commented))
-    rows, width = _rows(body, layout.separator), len(layout.names)
-    if not text.endswith("\n") and len(lines) not in skipped and _is_cut(rows, layout.decimal):
+    rows = _rows(body, layout.separator)
+
+    # Words under the last row are no reading, and a row in which the file ends is no whole one.
+    footer = _footer(rows, layout.decimal)
+    if footer:
+        layout = replace(layout, footer=layout.line(len(rows) - len(footer)))
+        del rows[-len(footer) :]
+        if not layout.units:
+            layout = replace(layout, units=_units_of(footer[0], layout.names))
+    elif not text.endswith("\n") and len(lines) not in skipped and _is_cut(rows, layout.decimal):
         del rows[-1]
         layout = replace(layout, cut=len(lines))
+
+    # Every row has to have a cell for each name.
+    width = len(layout.names)
     lengths = set(map(len, rows))
     if max(lengths) > width:
         for k, row in enumerate(rows):
@@ -146,41 +162,83 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
     if min(lengths) < width:
         for row in rows:
             row.extend([""] * (width - len(row)))
-    sure = (layout.separator, layout.decimal) == (",", ".") or any(
-        layout.decimal in cell and is_number(cell, layout.decimal) and not _GROUP.fullmatch(cell)
-        for row in rows
-        for cell in row
-    )
-    layout = replace(layout, plain=sure)
-    return layout, dict(zip(layout.names, zip(*rows, strict=True), strict=True))
+    proven = any(shows_decimals(cell, layout.decimal) for row in rows for cell in row)
+    columns = dict(zip(layout.names, zip(*rows, strict=True), strict=True))
+
+    # '0.005 sec' in every row is a column of numbers in seconds.
+    units = dict(layout.units)
+    for name, cells in columns.items():
+        if bare := without_units(cells, layout.decimal):
+            columns[name], units[name] = bare
+    return replace(layout, plain=proven, units=units), columns
+
+
+def _footer(rows: Sequence[Sequence[str]], decimal: str) -> list[Sequence[str]]:
+    """The last rows, three at most, that hold words and not one number, where four rows stand above."""
+    begin = len(rows)
+    while (
+        begin > 4 and any(rows[begin - 1]) and not any(_is_value(cell, decimal) for cell in rows[begin - 1])
+    ):
+        begin -= 1
+    if len(rows) - begin > _MOST_FOOTER_LINES:
+        return []
+    return list(rows[begin:])
+
+
+def _units_of(cells: Sequence[str], names: Sequence[str]) -> dict[str, str]:
+    """Units by name, where a line gives one for each column."""
+    words = [cell.strip("[](){} ") for cell in cells]
+    if len(words) != len(names) or not all(map(is_unit, words)):
+        return {}
+    return dict(zip(names, words, strict=True))
 
 
 def _bare(lines: list[str]) -> tuple[list[str], list[str]]:
-    """Lines of a serial port as a table has them, and names of the first columns: without 'angle:' before
-    each number, and with the stamp that a monitor puts before each line as a cell of its own."""
-    heads = [_ARRIVED.match(line) for line in lines]
+    """Lines of a serial port as a table has them, and the names of their first columns.
+
+    Without 'angle:' before each number; the stamp that a monitor puts before each line is a cell of its own.
+    """
+    heads = [_ARRIVED.match(line[:_LONGEST_ARRIVAL]) for line in lines]
     stamps = [(head[1] or head[2]) if head else "" for head in heads]
     arrived = 2 * sum(map(is_stamp, stamps)) > len(lines)
     if arrived:
         lines = [line[head.end() if head else 0 :] for line, head in zip(lines, heads, strict=True)]
-    ((labels, times),) = Counter(map(_labels, lines[:_SAMPLE])).most_common(1)
-    named = list(labels) if 2 * times > len(lines[:_SAMPLE]) else []
-    if named:
-        between = " " if len(named) > 1 else ";"
-        # Another line stays as it is: whoever takes the column is told.
-        values = [_LABELLED.sub(lambda found: found[2] + (found[3] or between), line) for line in lines]
-        lines = [bare if _labels(line) == labels else line for line, bare in zip(lines, values, strict=True)]
+
+    # Most lines of the sample have to be numbers with the same names.
+    samples = [tuple(name for name, _, _ in _labelled(line)) for line in lines[:_SAMPLE]]
+    ((labels, times),) = Counter(samples).most_common(1)
+    names = list(labels) if 2 * times > len(samples) else []
+    if names:
+        usual_separator = " " if len(names) > 1 else ";"
+        bare = list[str]()
+        for line in lines:
+            numbers = _labelled(line)
+            if tuple(name for name, _, _ in numbers) == labels:
+                line = "".join(value + (separator or usual_separator) for _, value, separator in numbers)
+            # Another line stays as it is: whoever takes the column is told.
+            bare.append(line)
+        lines = bare
+
     if arrived:
         sign = next((sign for sign in ";\t,|" if sign in lines[len(lines) // 2].strip()), " ")
         lines = [
             f'"{stamp}"{sign}{line}' if stamp else line for stamp, line in zip(stamps, lines, strict=True)
         ]
-    return lines, ["time"] * arrived + named
+        names = ["time", *names]
+    return lines, names
 
 
-def _labels(line: str) -> tuple[str, ...]:
-    """The names of the numbers of a line that is nothing else."""
-    return () if _LABELLED.sub("", line).strip() else tuple(found[0] for found in _LABELLED.findall(line))
+def _labelled(line: str) -> list[tuple[str, str, str]]:
+    """Name, number and separator of each number in a line that holds nothing else; empty for another line."""
+    numbers = list[tuple[str, str, str]]()
+    at = len(line) - len(line.lstrip())
+    while at < len(line):
+        found = _LABELLED.match(line, at)
+        if found is None:
+            return []
+        numbers.append((found[1].rstrip(), found[2], found[3]))
+        at = found.end()
+    return numbers
 
 
 def _is_cut(rows: Sequence[Sequence[str]], decimal: str) -> bool:
@@ -197,8 +255,10 @@ def _is_cut(rows: Sequence[Sequence[str]], decimal: str) -> bool:
 
 
 def _layout(lines: Sequence[str], n_lines: int) -> Layout:
-    found = [_Fit.of(lines, separator, decimal) for separator, decimal in _KINDS]
-    best = max(found, key=lambda fit: fit.score)  # the first of equals
+    """The layout of the separator and the decimal sign that fit best; the first of equals."""
+    rows = {separator: _rows(lines, separator) for separator in dict.fromkeys(kind[0] for kind in _KINDS)}
+    fits = [_Fit.of(lines, rows[separator], separator, decimal) for separator, decimal in _KINDS]
+    best = max(fits, key=lambda fit: fit.score)
     if not best.share:
         if n_lines == 1:
             raise ValueError(": no rows under the header line; expected numbers")
@@ -225,49 +285,58 @@ class _Fit:
     start: int = 0
 
     @classmethod
-    def of(cls, lines: Sequence[str], separator: str, decimal: str) -> _Fit:
-        rows = _rows(lines, separator)
+    def of(cls, lines: Sequence[str], rows: list[list[str]], separator: str, decimal: str) -> _Fit:
+        none = cls(separator, decimal, lines, rows)
         live = [k for k, row in enumerate(rows) if any(row) and not _is_comment(lines[k])]
         widest = max(live, key=lambda k: len(rows[k]), default=0)
         if len(rows[widest]) > MOST_COLUMNS:
             what = f"{len(rows[widest])} cells; expected at most {MOST_COLUMNS} columns, a row per sample"
             raise ValueError(f", line {widest + 1}: {what}")
-        filled = [rows[k] for k in live[-100:] if any(_is_value(cell, decimal) for cell in rows[k])]
+        # Which cells of a line are values; each cell is looked at once.
+        values = {k: [bool(cell) and _is_value(cell, decimal) for cell in rows[k]] for k in live}
+
+        # The usual width of a row is that of the last lines that hold values.
+        filled = [k for k in live[-100:] if any(values[k])]
         if not filled:
-            return cls(separator, decimal, lines, rows)
-        most = Counter(map(len, filled)).most_common(1)[0][0]
-        usual = [row for row in filled if len(row) == most]
+            return none
+        most = Counter(len(rows[k]) for k in filled).most_common(1)[0][0]
+        usual = [k for k in filled if len(rows[k]) == most]
         # A separator at the end of each line makes an empty cell of no column.
-        least = max(len(row) - _empty_at_end(row) for row in usual)
-        numbers = [sum(_is_value(cell, decimal) for cell in row) for row in usual]
+        least = max(len(rows[k]) - _empty_at_end(rows[k]) for k in usual)
+        numbers = [sum(values[k]) for k in usual]
         typical = sorted(numbers)[len(numbers) // 2]
-        cells = sum(1 for row in usual for cell in row if cell)
+        cells = sum(1 for k in usual for cell in rows[k] if cell)
         if not typical or (most == 1 and separator != ";"):
-            return cls(separator, decimal, lines, rows)
+            return none
         if separator == " " and all("\t" in lines[k].strip() for k in live[-100:]):
-            return cls(separator, decimal, lines, rows)  # blanks are then inside of cells
+            return none  # blanks are then inside of cells
 
-        def looks(row: list[str]) -> bool:
-            return len(row) == most and 2 * sum(_is_value(cell, decimal) for cell in row) >= typical
+        # A row is as wide as the usual one, and holds half as many values at least.
+        looks = {k for k in live if len(rows[k]) == most and 2 * sum(values[k]) >= typical}
+        first = next(k for k in live if k in looks)
+        present = [sum(1 for k in usual if rows[k][column]) for column in range(most)]
+        valued = [sum(values[k][column] for k in usual) for column in range(most)]
+        numeric = [column for column in range(most) if 2 * valued[column] > present[column]]
 
-        first = next(k for k in live if looks(rows[k]))
-        columns = [[row[k] for row in usual if row[k]] for k in range(most)]
-        numeric = [2 * sum(_is_value(cell, decimal) for cell in column) > len(column) for column in columns]
+        def fits(k: int) -> bool:
+            return k in looks and all(values[k][column] or not rows[k][column] for column in numeric)
 
-        def fits(row: list[str]) -> bool:
-            known = zip(row, numeric, strict=False)
-            return looks(row) and all(_is_value(x, decimal) for x, is_numeric in known if is_numeric and x)
-
-        pairs = zip(live, [*live[1:], live[-1]], strict=True)
-        start = next((k for k, after in pairs if fits(rows[k]) and fits(rows[after])), first)
+        start = first
+        for k, after in zip(live, [*live[1:], live[-1]], strict=True):
+            if fits(k) and fits(after):
+                start = k
+                break
         return cls(separator, decimal, lines, rows, least, most, sum(numbers) / cells, first, start)
 
     @property
     def score(self) -> tuple[bool, float, int]:
         above = self._above(self.start)
         header = self._header()
-        # Of a preamble of 'XInc:,5e-3' alone there are no names.
-        matches = header is not None or all(self.rows[k][0].endswith(":") for k in above)
+        # A line above the rows that is neither names nor 'XInc:,5e-3' belongs to another separator. Comments
+        # are sentences: they need not fit.
+        matches = header is not None or all(
+            self.rows[k][0].endswith(":") or _is_comment(self.lines[k]) for k in above
+        )
         if header is not None and _is_comment(self.lines[header]):
             # Words of a comment are no names where a line of the table stands below them.
             matches = all(k <= header or _is_comment(self.lines[k]) for k in above)
@@ -290,10 +359,17 @@ class _Fit:
         return any(_is_value(cell, self.decimal) for cell in self.rows[row])
 
     def _names_at(self, row: int, numbered: bool = False) -> list[str] | None:
-        """The cells of a line, if they can be the names of the columns; numbered: channels 1, 2, ... too."""
+        """The cells of a line, if they can be the names of the columns; numbered: channels 1, 2, ... too.
+
+        There has to be a cell for each column of numbers: of a comment, too, which may separate its names
+        otherwise than the rows their numbers, as numpy.savetxt(header="t [s], u [V]") does.
+        """
         cells = self.rows[row]
         if self.separator == " " and len(cells) > self.most:  # names of several words
-            cells = re.split(r"\s{2,}|\t", _COMMENT.sub("", self.lines[row]).strip())
+            cells = re.split(r"\s{2,}|\t", self._without_sign(row))
+        if _is_comment(self.lines[row]) and not self.least <= len(cells) <= self.most:
+            ways = ([cell.strip() for cell in self._without_sign(row).split(sign)] for sign in ",;\t|")
+            cells = next((way for way in ways if len(way) == self.least), cells)
         cells = cells[: len(cells) - _empty_at_end(cells)]
         if all(_BEYOND.fullmatch(cell) for cell in cells[self.most :]):
             cells = cells[: self.most]
@@ -304,6 +380,10 @@ class _Fit:
         if numbered and cells and all(re.fullmatch(r"\d{1,3}", cell) for cell in cells[1:]):
             words = len(cells)
         return cells if self.least <= len(cells) <= self.most and 2 * words > len(cells) else None
+
+    def _without_sign(self, row: int) -> str:
+        """A line without the sign of a comment."""
+        return _COMMENT.sub("", self.lines[row]).strip()
 
     def _header(self) -> int | None:
         """The line of the names: the nearest; a comment only where it says time, or no other line will do."""
@@ -319,8 +399,9 @@ class _Fit:
     def layout(self) -> Layout:
         above, header = self._above(self.start), self._header()
         if header is None:
-            lines = (k for k in above if len(self.rows[k]) > 1 and not _is_key(self.rows[k]))
-            named = next((k for k in lines if not self._has_value(k)), None)
+            # Words above the rows that are too few or too many; a comment may be any sentence.
+            candidates = (k for k in above if len(self.rows[k]) > 1 and not _is_comment(self.lines[k]))
+            named = next((k for k in candidates if not (_is_key(self.rows[k]) or self._has_value(k))), None)
             if named is not None and named + 1 < len(self.rows):
                 there, cells = (len(self.rows[k]) - _empty_at_end(self.rows[k]) for k in (named, named + 1))
                 raise ValueError(_ragged(named + 2, cells, named + 1, there, self.separator))
@@ -448,45 +529,9 @@ def _empty_at_end(row: Sequence[str]) -> int:
     return next((k for k, cell in enumerate(reversed(row)) if cell), len(row))
 
 
-def is_number(cell: str, decimal: str) -> bool:
-    """Whether the cell is a number with this decimal sign; blanks around it do no harm."""
-    text = cell.strip()
-    if _GROUPS[decimal].fullmatch(text):
-        return True
-    if decimal == ",":
-        if "." in text:
-            return False
-        text = text.replace(",", ".")
-    return _NUMBER.fullmatch(text) is not None
-
-
-def number(cell: str, decimal: str) -> float:
-    """The number in a cell for which `is_number` holds; digits in groups of three are one number."""
-    text = cell.strip()
-    grouped = _GROUPS[decimal].fullmatch(text)
-    return float((text.replace(grouped[1], "") if grouped else text).replace(",", "."))
-
-
-def doubtful_groups(cells: Sequence[str], layout: Layout) -> int | None:
-    """The first row of a column whose commas, or points, may be decimal or separate groups of three digits:
-    '1,020' beside '898'. None where the column says which ('1,020.5', '1,020,300', '0,125')."""
-    decimal = layout.decimal
-    other = "," if decimal == "." else "."
-    rows = [k for k, cell in enumerate(cells) if other in cell]
-    if rows:
-        return rows[0] if all(_GROUP.fullmatch(cells[k]) for k in rows) else None
-    if layout.plain:
-        return None
-    rows = [k for k, cell in enumerate(cells) if decimal in cell]
-    if rows and all(_GROUP.fullmatch(cells[k]) for k in rows):
-        whole = [cell for cell in cells if cell and decimal not in cell]
-        if whole and all(re.fullmatch(r"[+-]?\d{1,3}", cell) for cell in whole):
-            return rows[0]
-    return None
-
-
 def _is_value(cell: str, decimal: str) -> bool:
-    return is_number(cell, decimal) or is_stamp(cell)
+    """Whether a cell holds a number, a number with its unit, a date or a clock time."""
+    return is_number(cell, decimal) or is_stamp(cell) or quantity(cell, decimal) is not None
 
 
 def _ragged(line: int, cells: int, header: int, names: int, separator: str) -> str:

@@ -6,16 +6,16 @@ Time is converted to seconds; every other signal keeps its unit, which is carrie
 from __future__ import annotations
 
 import re
-import shlex
 import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from ident.data.arrays import RealArray
 from ident.data.finding import Finding, FindingKind, finding
-from ident.data.foreign_files import shown
+from ident.data.foreign_files import as_typed, shown
 
 # Integers, so that 2 [ms] becomes the very double that 0.002 is: an exact division is rounded once.
 _PER_SECOND = {"s": 1, "ms": 1000, "us": 10**6, "ns": 10**9}
@@ -71,9 +71,14 @@ _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
 _WORD = re.compile(r"[^\W\d_]+")
 # A number just before a word, or behind it: 0.1 ms, 100us, sec/1000; not that of a word, as in t0 ms.
 _FACTOR = re.compile(
-    r"(?<![^\W_])(?<![.,])\d[\d.,]*(?:e[+-]?\d+)?\s*[x*·]?\s*([^\W\d_]+)|([^\W\d_]+)\s*[/x*·^]\s*\d",
+    r"(?<![^\W_])(?<![.,])\d[\d.,]*(?:e[+-]?\d+)?\s*[x*·]?\s*([^\W\d_]+)|"
+    r"(?<![^\W\d_])([^\W\d_]+)\s*[/x*·^]\s*\d",
     re.IGNORECASE,
 )
+# Characters: a name says its unit and its role at its ends, and a unit is short ('microseconds per second').
+# What is longer is a sentence, a path or a trap; the expressions here take a square of the length.
+_LONGEST_NAME, _LONGEST_UNIT = 200, 40
+_NAMES_KEPT = 2 * 4096  # as many as two tables have columns
 _TIME_WORD = re.compile(
     r"t|ts|time|zeit|uhrzeit|timestamps?|zeitstempel|zeitpunkt|elapsed|clock|stamp|temps|tiempo|tempo|date|datum|"
     r"datetime|время|时间|時間"
@@ -94,7 +99,8 @@ _CHANGED = re.compile(r"[\])}>]\s*[/x*·^]\s*\d|^[\d.,e+-]+\s*[x*·]")
 # These, and what stands beside them and says nothing of the unit.
 _NO_UNIT = re.compile(
     rf"{_TIME_WORD.pattern}|in|of|to|by|at|on|up|no|nr|id|ch|io|pc|ab|is|since|start|begin|epoch|unix|posix|utc|gmt|ce?s?t|local|rel|abs|"
-    r"relative|absolute|from|seit|beginn|log|host|sys|system|boot|trigger|raw|the|a|and|hh|mm|ss|hhmmss|day"
+    r"relative|absolute|from|seit|beginn|log|host|sys|system|boot|trigger|raw|the|a|and|hh|mm|ss|hhmmss|day|today|midnight|"
+    r"uptime|now|run|running|total|passed|power|session|test"
 )
 # Counts of something whose length nobody has said, and units of time that are not known.
 _COUNTS = re.compile(
@@ -125,7 +131,7 @@ def unit_of_time(name: str, beside: str = "") -> tuple[str, str]:
     """What a file says of the unit of a time column: the one known unit, or empty; why it has to be asked for
     (units that contradict each other, an unknown word), or empty. beside: what the file gives outside of the
     name, as in a line of units."""
-    name, beside = (unicodedata.normalize("NFKC", text).strip() for text in (name, beside))
+    name, beside = (in_short(unicodedata.normalize("NFKC", text).strip()) for text in (name, beside))
     texts = [beside.strip("[](){}<> "), *_BRACKETS.findall(name)]
     said, strange = dict[str, str](), ""
     for text in (text for text in texts if _WORD.search(text)):
@@ -158,6 +164,12 @@ def unit_of_time(name: str, beside: str = "") -> tuple[str, str]:
     return next(iter(said), ""), ""
 
 
+def in_short(name: str) -> str:
+    """What is read of a name: all but its middle, where it is longer than any name that people read."""
+    half = _LONGEST_NAME // 2
+    return name if len(name) <= _LONGEST_NAME else f"{name[:half]} {name[-half:]}"
+
+
 def _words(text: str) -> list[str]:
     """The words of a name in lower case, without digits; a unit that is glued to the word for time is one of
     its own."""
@@ -171,9 +183,10 @@ def _words(text: str) -> list[str]:
     return found
 
 
+@lru_cache(_NAMES_KEPT)
 def says_time(name: str) -> bool:
     """Whether a name is one of time: 'Zeit', 'timeMs', 'millis', 'us since start'; not 'counts_s'."""
-    words = _words(unicodedata.normalize("NFKC", name))
+    words = _words(in_short(unicodedata.normalize("NFKC", name)))
     return bool(words) and (
         _TIME_WORD.fullmatch(words[0]) is not None
         or (
@@ -186,8 +199,14 @@ def says_time(name: str) -> bool:
 
 def ends_with_time(name: str) -> bool:
     """Whether a name may be one of time: 'host_time', 'uptimems', 'bagTimestamp', but also 'cycle_time'."""
-    words = [word for word in _words(name) if word not in TIME_UNITS]
+    words = [word for word in _words(in_short(name)) if word not in TIME_UNITS]
     return bool(words) and re.fullmatch(r"\w*(time|timestamp|stamp|zeit|clock)", words[-1]) is not None
+
+
+def begins_with_time_unit(name: str) -> bool:
+    """Whether a name begins with a unit of time, 'ms_since_power_on', and says no other unit at its end."""
+    words = _words(in_short(name))
+    return len(words) > 1 and TIME_UNITS.get(words[0], "") in _PER_SECOND and not written_unit(name)
 
 
 def stated_time_unit(stated: str) -> str:
@@ -306,9 +325,12 @@ def refuse_step(label: str, dt_s: float, output: RealArray, column: TimeColumn |
     )
 
 
+@lru_cache(_NAMES_KEPT)
 def size_of(unit: str) -> tuple[str, float] | None:
     """Of what a unit is, 'rad' or 'rad/s', and how many of that one is: ('rad/s', 0.1047) of rpm. None where
     it is not known."""
+    if len(unit) > _LONGEST_UNIT:
+        return None
     text = "".join(unicodedata.normalize("NFKC", unit).split())
     text = _OWN_NAMES.get(text.lower(), text)
     if text.lower() in TIME_UNITS:
@@ -378,10 +400,10 @@ def contradicted_by_loop(
         return (
             finding(
                 FindingKind.EXCHANGED, reference=names[0], output=names[1], name=names[2],
-                options=shlex.join([
+                options=" ".join(map(as_typed, [
                     "--input", names[1], "--output", names[2], "--reference", names[0],
                     "--unit", f"{names[1]}={units[2]}", "--unit", f"{names[2]}={units[1]}",
-                ]),
+                ])),
             ),
         )  # fmt: skip
     larger = followed > 1  # the output
@@ -404,13 +426,14 @@ def contradicted_by_loop(
 def scaled_by(name: str, factor: float, unit: str = "") -> str:
     """The options that take a column times a factor, in a unit."""
     said = {"--scale": f"{factor:.10g}", "--unit": unit}
-    return " ".join(f"{option} {shlex.quote(f'{name}={value}')}" for option, value in said.items() if value)
+    return " ".join(f"{option} {as_typed(f'{name}={value}')}" for option, value in said.items() if value)
 
 
+@lru_cache(_NAMES_KEPT)
 def written_unit(name: str) -> str:
     """The unit in a column's name, as written, or empty. Brackets at the end hold a unit whatever they say
     but a number; after 'in', '/' and an underscore only known units count."""
-    name = unicodedata.normalize("NFKC", name)
+    name = unicodedata.normalize("NFKC", name)[-_LONGEST_NAME:]
     found = _BRACKETED.search(name)
     if found:
         text = (found[1] if found[1] is not None else found[2]).strip()
@@ -424,7 +447,10 @@ def written_unit(name: str) -> str:
     return unit if is_unit(unit) else ""
 
 
+@lru_cache(_NAMES_KEPT)
 def is_unit(text: str) -> bool:
     """Whether the word is a unit that headers use: of time, or of a signal."""
+    if len(text) > _LONGEST_UNIT:
+        return False
     known = text.lower() in TIME_UNITS or text.lower() in SIGNAL_WORDS or _BARE.fullmatch(text) is not None
     return known or "/s" in kind_of(text)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import tempfile
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ import tomlkit
 from markupsafe import Markup
 
 from ident.data.finding import Finding, distinct
-from ident.data.foreign_files import shown
+from ident.data.foreign_files import as_typed, path_as_typed
 from ident.data.record import Record
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response
@@ -92,7 +91,7 @@ def init(
                 "unstable_per_s": draft.unstable_per_s,
             },
         },
-        verdict=f"flexlink run --config {shlex.quote(str(out))}",
+        verdict=f"flexlink run --config {path_as_typed(out)}",
     )
 
 
@@ -159,7 +158,7 @@ def drafted(
         scale[name] = -scale.get(name, 1.0)
         units |= {name: unit_of[name]} if unit_of[name] else {}
     doubts = distinct([doubt for record in read.records for doubt in record.doubts])
-    found = Found(command, tuple(logs), shlex.quote(out.name), stated, read, scale, units, draft, doubts)
+    found = Found(command, tuple(logs), path_as_typed(out.name), stated, read, scale, units, draft, doubts)
     return (*written(found, out), found)
 
 
@@ -206,15 +205,16 @@ def read_channel(
             if has_response(tables[-1]):
                 raise ValueError("a frequency response, no log: flexlink design takes it")
     with naming(str(logs[0])):
-        roles = stated.roles(tables[0], to_type(logs), command)
+        roles = stated.roles(tables[0], logs, command)
         if stated.dt_s is not None and stated.time is None:
             roles = replace(roles, time=None)
         tables = [run for table in tables for run in table.runs(roles.time)]
         if roles.time is None and stated.dt_s is None:
-            ways = ", or --time ".join(
-                ["--dt-s SECONDS", *(shlex.quote(shown(n, 30)) for n in rising(tables[0]))]
-            )
-            raise ValueError(f"no column looks like time: type flexlink {command} {to_type(logs)} {ways}")
+            typed = f"flexlink {command} {to_type(logs)} {stated.typed(command)}".rstrip()
+            named = {"input": stated.input_name, "output": stated.output_name, "reference": stated.reference}
+            typed += "".join(f" --{role} {as_typed(name)}" for role, name in named.items() if name)
+            ways = [f"--time {as_typed(name)}" for name in rising(tables[0])] or ["--dt-s SECONDS"]
+            raise ValueError(f"no column looks like time; type: {typed} {ways[0]}")
     with naming(""):
         options = [
             option_for(table.stamps(roles.time, roles.output if table.sparse else None, stated.time_unit)[0])

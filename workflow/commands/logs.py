@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,12 +9,16 @@ from typing import Any
 
 from pydantic import Field
 
+from ident.data.foreign_files import as_typed, path_as_typed
 from ident.data.record import Record, in_one_unit
 from ident.data.record_files import read_table
 from ident.data.roles import Roles, roles_of
 from ident.data.table import Table
 from workflow.config.log_reading import LogReading
 from workflow.engine.errors import naming
+
+# What a command cannot do without, beside logs.
+_NEEDED = {"init": ("--out my.toml",), "excite --closed-loop": ("--out experiment",)}
 
 
 class Reading(LogReading):
@@ -35,17 +38,48 @@ class Reading(LogReading):
     )
     doubts: tuple[Any, ...] = ()
 
-    def roles(self, table: Table, logs: str, command: str) -> Roles:
-        """What is stated, and what names and units of the table tell. Raises ValueError."""
+    def roles(self, table: Table, logs: Sequence[Path], command: str) -> Roles:
+        """What is stated, and what names and units of the table tell.
+
+        logs, command: what a complaint offers to type again. Raises ValueError.
+        """
         return roles_of(
             table,
-            logs,
+            f"{to_type(logs)} {self.typed(command)}".rstrip(),
             command,
             input=self.input_name,
             output=self.output_name,
             time=self.time,
             reference=self.reference,
         )
+
+    def typed(self, command: str) -> str:
+        """The options that say how the logs are read, as they were given, but for the columns' roles; and the
+        file or directory without which the command would ask for one."""
+        words = list[str]()
+        for option, value in (("--time-unit", self.time_unit), ("--decimal", self.decimal)):
+            if value:
+                words.append(f"{option} {value}")
+        by_column = {
+            "--scale": self.scale,
+            "--offset": self.offset,
+            "--unwrap": self.unwrap,
+            "--unit": self.units,
+        }
+        for option, values in by_column.items():
+            for name, value in values.items():
+                number = value if isinstance(value, str) else f"{value:.17g}"
+                words.append(f"{option} {as_typed(f'{name}={number}')}")
+        for option, number in (
+            ("--resample-s", self.resample_s),
+            ("--input-limit", self.input_limit),
+            ("--dt-s", self.dt_s),
+        ):
+            if number is not None:
+                words.append(f"{option} {number:.17g}")
+        if self.repair:
+            words.append("--repair")
+        return " ".join([*words, *_NEEDED.get(command, ())])
 
     def records(self, tables: Sequence[Table]) -> list[Record]:
         """Of tables that are used together, where input and output are named; each column in one unit. Raises
@@ -89,8 +123,8 @@ class Logs:
 
 
 def to_type(logs: Sequence[Path]) -> str:
-    """Logs in a command that a complaint offers: its options have to be seen of a line that may be cut."""
-    return named if len(named := shlex.join(map(str, logs))) < 160 else "LOG..."
+    """Logs in a command that a complaint offers."""
+    return " ".join(map(path_as_typed, logs))
 
 
 def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: Sequence[Path] = ()) -> Logs:
@@ -102,7 +136,7 @@ def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: S
             tables.append(read_table(path).with_decimal(how.decimal))
     if how.input_name is None or how.output_name is None or (how.time is None and how.dt_s is None):
         with naming(str(logs[0])):
-            roles = how.roles(tables[0], to_type(logs), "identify")
+            roles = how.roles(tables[0], logs, "identify")
         given: dict[str, Any] = {
             "input_name": roles.input,
             "output_name": roles.output,

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
 from ident.data.finding import FindingKind
+from ident.data.foreign_files import as_typed, path_as_typed
 from workflow.engine import codec, storage
-from workflow.tasks.log_look import LogLook, look_at
+from workflow.tasks.log_look import LogLook, look_at, options_typed
 from workflow.text.templates import RunSummary, rows_of, said
 
 
@@ -25,12 +26,13 @@ def look(
     """
     storage.refuse_in_the_way([log], [] if out is None else [("--out", out)])
     found = look_at(log, time, time_unit, decimal)
+    command = _next(found, options_typed(time_unit, decimal))
     if out is not None:
         from workflow.report.rendering import render_page  # loads matplotlib: a second
 
         storage.write_text(
             out,
-            render_page("look.html.j2", title=f"Log {log.name}", found=found, next=_next(found)).html,
+            render_page("look.html.j2", title=f"Log {log.name}", found=found, next=command).html,
         )
     columns = {
         column.name: {
@@ -48,18 +50,22 @@ def look(
         title=str(log),
         sections=rows_of("summary/look.j2", found=found),
         numbers=parts | {"columns": columns},
-        verdict=_next(found),
+        verdict=command,
         report_path=None if out is None else str(out),
     )
 
 
-def _next(found: LogLook) -> str:
-    """The command that goes on from here."""
+def _next(found: LogLook, options: Sequence[str]) -> str:
+    """The command that goes on from here, or what has to be done before.
+
+    options: of `look`, to be given again.
+    """
+    log = " ".join([path_as_typed(found.path), *options])
     if found.response is not None:
-        return said("response_next", found.response, shlex.quote(str(found.path)))
+        return said("response_next", found.response, path_as_typed(found.path))
     if found.roles is None:
         return found.unclear
-    roles, log = found.roles, shlex.quote(str(found.path))
+    roles = found.roles
     used = found.taken_as.values()
     why = [column.why for column in found.columns if column.name in used and column.values is None]
     if found.time and found.time.why:
@@ -72,12 +78,13 @@ def _next(found: LogLook) -> str:
     if roles.reference or roles.doubts:  # made in closed loop
         return " ".join(["flexlink run", log, *doubted, "--out runs/arm"])
     named = {"--input": roles.input, "--output": roles.output, "--time": roles.time}
-    options = [f"{option} {shlex.quote(name)}" for option, name in named.items() if name]
-    mend = found.time.option if found.time and found.time.option.startswith("--") else ""
-    options += [one for one in ("" if roles.time else "--dt-s SECONDS", mend) if one]
-    options += [
-        f"--unwrap {shlex.quote(roles.output)}={doubt.values['period']:.17g}"
-        for doubt in found.doubts
-        if doubt.kind is FindingKind.WRAPS and doubt.values["name"] == roles.output
-    ]
-    return " ".join(["flexlink identify", log, *options, *doubted])
+    typed = [f"{option} {as_typed(name)}" for option, name in named.items() if name]
+    if not roles.time:
+        typed.append("--dt-s SECONDS")
+    if found.time and found.time.option.startswith("--"):
+        typed.append(found.time.option)
+    for doubt in found.doubts:
+        if doubt.kind is FindingKind.WRAPS and doubt.values["name"] == roles.output:
+            period = f"{doubt.values['period']:.17g}"
+            typed.append(f"--unwrap {as_typed(f'{roles.output}={period}')}")
+    return " ".join(["flexlink identify", log, *typed, *doubted])

@@ -4,7 +4,6 @@ anything looks at what is said."""
 from __future__ import annotations
 
 import os
-import shlex
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -50,7 +49,9 @@ def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
         from ident.data.record_files import READERS  # numpy, which a configuration can do without
 
         if ending in READERS:
-            command = f"flexlink init {shlex.quote(str(path))} --out my.toml"
+            from ident.data.foreign_files import path_as_typed
+
+            command = f"flexlink init {path_as_typed(path)} --out my.toml"
             raise InputError(f"{path}: a log, not a TOML file; write one: {command}")
     text = read_text(path, MOST_TOML_BYTES)
     if (longest := max(map(len, text.splitlines()), default=0)) > _LONGEST_TOML_LINE:

@@ -15,6 +15,8 @@ EXIT_NOT_CERTIFIED = 3  # the first that means nothing elsewhere
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 
 LONGEST_LINE = 300  # two to four lines of a terminal
+_LEAST_BEFORE_COMMAND = 120  # characters of a complaint that say what is wrong and where
+_WORDS_BEFORE_COMMAND = 30  # characters between a comma and the command, as in '; type: flexlink ...'
 
 
 def one_line(text: object) -> str:
@@ -42,10 +44,20 @@ def cut(text: str, most: int) -> str:
 
 
 def cut_inside(text: str, most: int = LONGEST_LINE) -> str:
-    """The text, cut where it is longer: at its end, but for the command to type there."""
-    at = text.find("type: flexlink ")
-    tail = text[at:] if at >= 0 and len(text) - at < most - 5 else ""
-    return cut(text, most) if len(text) <= most or not tail else f"{text[: most - 5 - len(tail)]} ... {tail}"
+    """The text, cut where it is longer: at its end, or before the command to type that it ends with.
+
+    A command is never cut, for it would not work: a line with long names and paths gets longer than `most`.
+    """
+    if len(text) <= most:
+        return text
+    at = text.rfind(": flexlink ")
+    if at < 0:
+        return cut(text, most)
+    # Words before the command that tell the reader what it is: 'type', 'name it'.
+    words = max(text.rfind(sign, 0, at) for sign in ";,.?(:")
+    tail = text[words + 1 if at - words < _WORDS_BEFORE_COMMAND else at + 1 :].lstrip()
+    room = max(most - 5 - len(tail), _LEAST_BEFORE_COMMAND)
+    return f"{text[:room]} ... {tail}" if len(text) > room + 5 + len(tail) else text
 
 
 class InputError(ValueError):

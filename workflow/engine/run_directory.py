@@ -29,6 +29,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
+from ident.data.foreign_files import path_as_typed
 from workflow.engine import codec, documents, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.store import Store
@@ -152,7 +153,7 @@ class RunDirectory(Store):
 
     def _finished(self, name: str) -> Path:
         if (path := self.stage_file(name)) is None:
-            raise InputError(f"{self.path}: stage {name} is not there; run flexlink run --resume first")
+            raise InputError(f"{self.path}: stage {name} is not there; type: {_resumed(self.path)}")
         return path
 
     def stage_files(self, names: Iterable[str]) -> dict[str, bytes]:
@@ -246,12 +247,19 @@ def stage_bytes(result: Any, input_hash: str) -> tuple[bytes, str]:
     return (text + "\n").encode("utf-8"), ".json"
 
 
+def _resumed(path: Path) -> str:
+    """The command that resumes the run in a directory."""
+    return f"flexlink run --out {path_as_typed(path)} --resume"
+
+
 def _stage_content(path: Path) -> tuple[str, dict[str, Any]]:
     """Input hash and content of a stage's file. Raises InputError where it is not as it was written."""
     content = storage.read_npz(path) if path.suffix == ".npz" else documents.read_json(path)
     recorded = str(content.pop(_DIGEST, None))
     if _INPUT_HASH not in content or recorded != _digest(content):
-        raise InputError(f"{path}: changed since it was written; flexlink run --resume computes it again")
+        raise InputError(
+            f"{path}: changed since it was written; to compute it again, type: {_resumed(path.parents[1])}"
+        )
     return str(content[_INPUT_HASH]), content
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 from diagnosis.machine.quantisation_grid import grid_step
 from ident.data.arrays import RealArray, clipped_share
 from ident.data.finding import Finding, distinct
+from ident.data.foreign_files import path_as_typed
 from ident.data.record import reading_notes
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response, read_response
@@ -98,6 +100,12 @@ class LogLook:
         return {role: of[role] for role in ("command", "output", "reference", "time") if of[role]}
 
 
+def options_typed(time_unit: str | None, decimal: str | None) -> list[str]:
+    """The options, as they were given, without which the next command would read the log otherwise."""
+    given = {"--time-unit": time_unit, "--decimal": decimal}
+    return [f"{option} {value}" for option, value in given.items() if value]
+
+
 def look_at(
     path: Path, time: str | None = None, time_unit: str | None = None, decimal: str | None = None
 ) -> LogLook:
@@ -111,7 +119,8 @@ def look_at(
     time = time or (times[0] if times else None)
     roles, unclear = None, ""
     try:
-        roles = roles_of(table, str(path), "identify", time=time) if response is None else None
+        log = " ".join([path_as_typed(path), *options_typed(time_unit, decimal)])
+        roles = roles_of(table, log, "identify", time=time) if response is None else None
     except ValueError as error:
         unclear = str(error)
     columns = tuple(_column(table, name) for name in table.names if name != time)
@@ -170,9 +179,11 @@ def _time(
         stamps, column = table.stamps(name, rows_of, unit)
         steps = np.diff(stamps)
         period = float(np.median(steps))
-        if moved:
-            own = table.columns([name, moved], rows_of)[moved]
-            refuse_step(str(table.path), period, own[:, None], column)
+        output = None
+        with suppress(ValueError):  # cells that hold no number are said of their own column
+            output = table.columns([name, moved], rows_of)[moved] if moved else None
+        if output is not None:
+            refuse_step(str(table.path), period, output[:, None], column)
     except ValueError as error:
         return TimeLook(name, why=str(error).removeprefix(str(table.path)).lstrip(":, ")), []
     counts = np.maximum(np.rint(steps / period), 1)

@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from control_design.controllers.c_code import Dialect
 from ident.basis.model_files import ModelFile
+from ident.data.foreign_files import path_as_typed
 from ident.data.record import Record
 from workflow.config.joints_config import AnyConfig, JointsConfig
 from workflow.config.run_config import RunConfig
@@ -159,9 +160,10 @@ def config_of(run: RunDirectory) -> RunConfig:
     """The configuration a run of one loop was begun with. Raises InputError for one of several joints."""
     config = any_config_of(run)
     if isinstance(config, JointsConfig):
+        kept = path_as_typed(run.path / "config.toml")
         raise InputError(
-            f"{run.path}: a run for several joints, and this command takes one loop; other settings: edit "
-            f"{run.path / 'config.toml'} and flexlink run, or vary them with flexlink study"
+            f"{run.path}: a run for several joints, and this command takes one loop; for other settings edit "
+            f"its config.toml and type: flexlink run --config {kept} --out OTHER"
         )
     return config
 

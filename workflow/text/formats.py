@@ -6,7 +6,6 @@ Each takes plain values (None and non-finite ones too) and returns text; sentenc
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from typing import Any
@@ -14,8 +13,10 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from ident.data.foreign_files import as_typed
+
 MISSING = "–"
-_BARS = "▁▂▃▄▅▆▇█"
+BARS = "▁▂▃▄▅▆▇█"
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -153,7 +154,7 @@ def sparkline(values: Sequence[float], width: int = 60) -> str:
     signal = np.asarray(values, dtype=np.float64)
     means = np.array([part.mean() for part in np.array_split(signal, min(width, signal.size))])
     span = float(np.ptp(means))
-    return "".join(_BARS[round(7 * (mean - means.min()) / span)] for mean in means) if span > 0 else ""
+    return "".join(BARS[round(7 * (mean - means.min()) / span)] for mean in means) if span > 0 else ""
 
 
 def count(n: int, one: str, many: str | None = None) -> str:
@@ -201,7 +202,7 @@ _NAMED: tuple[Callable[..., Any], ...] = (
     hertz, decibels, in_decibels, unit, listing, sparkline, count, sentence, yes_no, setting,
 )  # fmt: skip
 FILTERS: Mapping[str, Callable[..., Any]] = {
-    "quoted": shlex.quote,
+    "quoted": as_typed,
     **{function.__name__: function for function in _NAMED},
     "fmt": format,
     "ln": math.log,
