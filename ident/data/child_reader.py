@@ -10,12 +10,14 @@ wrong; 3: the library it names is not there.
 
 import io
 import json
+import re
 import resource
 import sys
 import tempfile
 import warnings
 import zipfile
 from collections.abc import Iterator
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -259,17 +261,34 @@ def sheet_texts(content: bytes) -> dict[str, str]:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > LARGEST_TEXT_BYTES:
             raise RefusedError(f"unpacks to more than {LARGEST_TEXT_BYTES >> 20} MiB: save it as CSV")
+        sheets = [entry for entry in archive.namelist() if entry.startswith("xl/worksheets/")]
+        formulas = any(re.search(rb"<f[\s>/]", archive.read(entry)) for entry in sheets)
     reader = Reader(io.BytesIO(content), read_only=True, data_only=True)
     reader.read()
+    # A program that is no spreadsheet writes formulas without their values: these are told by their text.
+    with_formulas = Reader(io.BytesIO(content), read_only=True, data_only=False) if formulas else None
+    if with_formulas is not None:
+        with_formulas.read()
     found: dict[str, str] = {}
     cells = 0
-    for sheet in reader.wb.worksheets:
+    for number, sheet in enumerate(reader.wb.worksheets):
         if sheet.sheet_state != "visible":  # its author does not show it either
             continue
         sheet.reset_dimensions()  # which the file states, and need not be true
         lines, last, empty = [], 0, 0
-        for row in sheet.iter_rows(values_only=True):
-            line = "\t".join(_cell(value) for value in row)
+        factors: dict[int, tuple[int, int]] = {}
+        formula_rows: Iterator[Any] = iter(())
+        if with_formulas is not None:
+            twin = with_formulas.wb.worksheets[number]
+            twin.reset_dimensions()
+            formula_rows = twin.iter_rows(values_only=True)
+        for row in sheet.iter_rows():
+            texts = [_shown_cell(cell, factors) for cell in row]
+            for column, formula in enumerate(next(formula_rows, ())):
+                # Text that begins like that is one, and so is an array formula, an object.
+                if formula is not None and column < len(texts) and not texts[column]:
+                    texts[column] = _cell(formula) if isinstance(formula, str) else "=..."
+            line = "\t".join(texts)
             lines.append(line)
             last, empty = (len(lines), 0) if line.strip() else (last, empty + max(len(row), 1))
             if empty > _EMPTY_CELLS:
@@ -285,6 +304,31 @@ def sheet_texts(content: bytes) -> dict[str, str]:
     if not found:
         raise RefusedError("no visible sheet has a table; expected a row of names and rows of numbers")
     return found
+
+
+def _shown_cell(cell: Any, factors: dict[int, tuple[int, int]]) -> str:
+    """The text of a cell as the spreadsheet shows its size: 30% of 0.3 in the format 0.0 %, 12.5 of 12500 in
+    the format 0.0, (by thousands). factors: percent signs and thousands by style, as they get known."""
+    value = cell.value
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return _cell(value)
+    style = getattr(cell, "_style_id", -1)
+    if style not in factors:
+        factors[style] = _scale_of_format(cell.number_format or "")
+    percents, thousands = factors[style]
+    if not (percents or thousands):
+        return _cell(value)
+    # In decimals, so that 0.07 is 7 % and no 7.000000000000001 %.
+    scaled = Decimal(repr(value)).scaleb(2 * percents - 3 * thousands)
+    return f"{scaled.normalize():f}{'%' if percents == 1 else ''}"
+
+
+def _scale_of_format(code: str) -> tuple[int, int]:
+    """Percent signs in a number format, each of which shows a hundred times the number, and commas behind its
+    last digit, each of which shows a thousandth (ECMA-376, 18.8.31)."""
+    positive = re.sub(r'"[^"]*"|\\.|_.|\*.|\[[^]]*\]', "", code).partition(";")[0]
+    trailing = re.search(r"[0#?](,+)(?=[^0#?,]*$|\.)", positive)
+    return positive.count("%"), len(trailing[1]) if trailing else 0
 
 
 def _cell(value: Any) -> str:

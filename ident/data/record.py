@@ -15,9 +15,10 @@ from ident.data.foreign_files import as_typed, shown
 from ident.data.record_files import read_table
 from ident.data.shown import Shown
 from ident.data.table import LARGEST, Table
+from ident.data.text_numbers import is_bookkept, number
 from ident.data.time_grid import CoarseGrid, Repair, TimeGrid, clock_doubts, sampling_time
 from ident.data.units import TimeColumn, contradicted_by_loop, per, refuse_step
-from ident.data.wrapping import spikes_in, unwrapped, wraps_at
+from ident.data.wrapping import no_reading, spikes_in, unwrapped, wraps_at
 
 T = TypeVar("T")
 
@@ -265,7 +266,9 @@ class Record(Shown):
                 doubtful.append(
                     finding(FindingKind.LONG_STEPS, record=str(table.path), name=item, share=longest)
                 )
-        notes = (*doubtful, *reading_notes(table, columns, inputs, outputs))
+        if time_column is not None and time_column.wraps:
+            doubtful.append(time_column.timer(str(table.path)))
+        notes = (*doubtful, *reading_notes(table, columns, inputs, outputs, references))
         step = dt_s if stamps is None else float(np.median(np.diff(stamps))) if stamps.size > 1 else None
         if step is not None and 0 < step < np.inf:
             moved = np.column_stack([columns[item] for item in outputs])
@@ -327,9 +330,13 @@ class Record(Shown):
 
 
 def reading_notes(
-    table: Table, columns: Mapping[str, RealArray], inputs: Sequence[str], outputs: Sequence[str]
+    table: Table,
+    columns: Mapping[str, RealArray],
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    references: Sequence[str] = (),
 ) -> tuple[Finding, ...]:
-    """What is said of the way a file was read; columns: inputs and outputs as they are used."""
+    """What is said of the way a file was read; columns: inputs, outputs and references as they are used."""
     found, record = list[Finding](), str(table.path)
     if table.layout is not None and table.layout.commented:
         first = table.layout.skipped[0]
@@ -338,22 +345,54 @@ def reading_notes(
         )
     if table.layout is not None and table.layout.cut:
         found.append(finding(FindingKind.CUT_ROW, record=record, line=table.layout.cut))
+    if table.layout is not None and table.layout.footer:
+        found.append(finding(FindingKind.FOOTER, record=record, line=table.layout.footer))
     if table.sparse:
         others = [name for name in inputs if not np.array_equal(table.clocks[name], table.clocks[outputs[0]])]
         found += [finding(FindingKind.HELD, record=record, name=name, output=outputs[0]) for name in others]
     for name in (*inputs, *outputs):
         if units := table.contradiction(name):
             found.append(finding(FindingKind.UNIT_CONTRADICTED, record=record, name=name, units=units))
-    for name in outputs:
-        if period := wraps_at(columns[name]):
-            found.append(finding(FindingKind.WRAPS, record=record, name=name, period=period))
-        elif (spikes := spikes_in(columns[name])).size:
-            value, place = float(columns[name][spikes[0]]), table.place(int(spikes[0]), name)
-            rows = spikes.size
+    for name in (*inputs, *outputs):
+        if told := _bookkept(table, name):
+            found.append(told)
+    for name in (*inputs, *references, *outputs):
+        values = columns[name]
+        rows = no_reading(values, command=name not in outputs)
+        kind = FindingKind.NO_READING
+        if not rows.size and name in outputs:
+            if period := wraps_at(values):
+                found.append(finding(FindingKind.WRAPS, record=record, name=name, period=period))
+                continue
+            rows = spikes_in(values)
+            kind = FindingKind.SPIKES
+        if rows.size:
+            first = int(rows[0])
+            place = table.place(first, name)
             found.append(
-                finding(FindingKind.SPIKES, record=record, name=name, value=value, place=place, rows=rows)
+                finding(kind, record=record, name=name, value=values[first], place=place, rows=rows.size)
             )
     return tuple(found)
+
+
+def _bookkept(table: Table, name: str) -> Finding | None:
+    """The finding on a column of text with numbers like '(3.25)' and '3.25-'."""
+    cells = table.raw[name]
+    if table.layout is None or not isinstance(cells, tuple):
+        return None
+    decimal = table.layout.decimal
+    rows = [k for k, cell in enumerate(cells) if is_bookkept(cell, decimal)]
+    if not rows:
+        return None
+    return finding(
+        FindingKind.BOOKKEPT,
+        record=str(table.path),
+        name=name,
+        place=table.place(rows[0], name),
+        cell=cells[rows[0]],
+        value=number(cells[rows[0]], decimal),
+        rows=len(rows),
+    )
 
 
 def in_one_unit(records: Sequence[Record]) -> list[Record]:

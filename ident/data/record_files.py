@@ -153,6 +153,10 @@ def _read_xlsx(file: Path, content: bytes) -> Table:
             found[title] = read_text(text)
         except ValueError as error:
             refused = refused if refused.args else error
+    if not found and any("\t=" in text or text.startswith("=") for text in texts.values()):
+        raise ValueError(
+            ": formulas without their values; open the file in Excel or LibreOffice and save it again"
+        )
     if not found:
         raise refused
     rows = {title: len(next(iter(columns.values()))) for title, (_, columns) in found.items()}

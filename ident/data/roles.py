@@ -203,6 +203,7 @@ def _loop_of_twins(
     it follows. Two positions that a command moves are two measured ones. role: by name, as by
     `_role_by_name`; beside: columns that are neither. None where there is no such loop, or several."""
     signals = [name for name in free if name not in beside and not _is_text(table.raw[name])]
+    signals = [name for name in signals if not _increases(table, name)]  # rather time, or a row's number
     named_inputs = [name for name in signals if role[name] == "input"]
     motions = [name for name in (*signals, stated.get("output")) if name and role.get(name) != "input"]
     if len(motions) > _MOST_TWINS:
@@ -233,7 +234,10 @@ def _are_twins(table: Table, first: str, second: str) -> bool:
         if one != other:
             break
         shared += 1
-    return shared > 0 and max(map(len, stems)) - shared <= _TWIN_LETTERS
+    rests = [stem[shared:] for stem in stems]
+    # x1 and x2, channel 1 and channel 2 are numbered, not paired.
+    numbered = all(rest.isdigit() for rest in rests)
+    return shared > 0 and not numbered and max(map(len, rests)) <= _TWIN_LETTERS
 
 
 def _is_loop(table: Table, reference: str, output: str, command: str) -> bool:

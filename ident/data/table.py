@@ -19,7 +19,8 @@ from ident.data.json_columns import columns_in
 from ident.data.text_numbers import doubtful_groups, is_number, number
 from ident.data.text_tables import Layout
 from ident.data.time_stamps import StampError, is_stamp, may_be_minutes, seconds_since_first
-from ident.data.units import COUNTED, SIGNAL_WORDS, TimeColumn, kind_of, size_of, written_unit
+from ident.data.units import COUNTED, SIGNAL_WORDS, TimeColumn, kind_of, says_counts, size_of, written_unit
+from ident.data.wrapping import timer_period
 
 # Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
 LARGEST = 1e100
@@ -212,7 +213,7 @@ class Table:
         if self.layout is None or self.layout.stated:
             return
         # Between commas a point is a decimal sign, but in a column of counts, which are whole.
-        counted = kind_of(self.unit(name)) in COUNTED - {"%"}
+        counted = says_counts(name) or kind_of(self.unit(name)) in COUNTED - {"%"}
         proven = self.layout.plain or (self.layout.separator == "," and not counted)
         row = doubtful_groups(cells, self.layout.decimal, proven=proven)
         if row is not None:
@@ -239,6 +240,11 @@ class Table:
                 )
         sign = " with a decimal comma" if self.layout and self.layout.decimal == "," else ""
         remedy = ""
+        if isinstance(cells, tuple) and str(cells[row]).startswith("="):
+            raise ValueError(
+                f"{self.path}, {self.place(row, name)}: column '{shown(name)}' is {found}, a formula without "
+                "its value; open the file in Excel or LibreOffice and save it again, or write values"
+            )
         if 2 * bad.size < numbers.size and not np.isfinite(numbers[row]):  # else it is no column of numbers
             remedy = (
                 f"; delete such rows ({bad.size} here): with a time column, flexlink init fills the gap that "
@@ -254,13 +260,19 @@ class Table:
         """Time stamps in seconds, and what was taken for which. Raises ValueError for an unknown unit."""
         if self.is_clock(name):
             return self._clock_seconds(name, stamps, unit)
+        # A timer that starts again goes on, so that a long log is one.
+        period = timer_period(stamps)
+        wraps = int(np.sum(np.diff(stamps) < 0)) if period else 0
+        if period:
+            stamps = stamps + period * np.concatenate([[0], np.cumsum(np.diff(stamps) < 0)])
         try:
             column = TimeColumn.of(name, unit, self.units.get(name, ""))
             column.refuse_stamps(stamps)
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from None
         doubtful = column.doubtful_for(stamps)
-        return column.seconds(self._since_first(name, stamps)), replace(column, doubtful=doubtful)
+        passed = stamps - stamps[0] if period else self._since_first(name, stamps)
+        return column.seconds(passed), replace(column, doubtful=doubtful, wraps_at=period, wraps=wraps)
 
     def _clock_seconds(self, name: str, stamps: RealArray, unit: str | None) -> tuple[RealArray, TimeColumn]:
         cells = self.raw[name]
@@ -311,7 +323,12 @@ class Table:
         if backwards.size:
             row = int(backwards[0]) + 1
             what = "split the file there, or number its runs in a column"
-            what = "take the repeated row out" if stamps[row] == stamps[row - 1] else what
+            if stamps[row] == stamps[row - 1]:
+                what = "take the repeated row out"
+            elif backwards.size == 1 and 1 < row < stamps.size - 1 and stamps[row - 2] < stamps[row]:
+                what = "delete the row before, which has no time, and give --repair"
+            elif backwards.size == 1 and row < stamps.size - 1 and stamps[row - 1] < stamps[row + 1]:
+                what = "delete this row, which has no time, and give --repair"
             raise ValueError(
                 f"{self.path}, {self.place(row)}: time '{name}' goes from {stamps[row - 1]:.9g} to "
                 f"{stamps[row]:.9g} s; expected increasing time ({what})"

@@ -186,11 +186,12 @@ def _footer(rows: Sequence[Sequence[str]], decimal: str) -> list[Sequence[str]]:
 
 
 def _units_of(cells: Sequence[str], names: Sequence[str]) -> dict[str, str]:
-    """Units by name, where a line gives one for each column."""
+    """Units by name, of a line that holds units alone: empty cells, and columns that it does not reach, have
+    none."""
     words = [cell.strip("[](){} ") for cell in cells]
-    if len(words) != len(names) or not all(map(is_unit, words)):
+    if len(words) > len(names) or not all(is_unit(word) for word in words if word):
         return {}
-    return dict(zip(names, words, strict=True))
+    return {name: word for name, word in zip(names, words, strict=False) if word}
 
 
 def _bare(lines: list[str]) -> tuple[list[str], list[str]]:

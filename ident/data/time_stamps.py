@@ -2,7 +2,9 @@
 
 ISO 8601 ('2024-03-01T12:00:00.25Z', with a blank for the T and slashes for the dashes as well), '01.03.2024
 12:00:00,250', '3/1/2024 1:02:03.5 PM', and '12:00:00.250' without a day, which may pass midnight; '01:02.5'
-is minutes and seconds, and of '12:30' alone nobody knows (`may_be_minutes`).
+is minutes and seconds, and of '12:30' alone nobody knows (`may_be_minutes`). Dates with a named month
+('01-Mar-2024 10:00:00', 'Fri Mar 1 10:00:00 2024'), '20240301T100000', and what has passed in days ('0 days
+00:00:00.005' of pandas, 'PT0.005S') are put into these forms first (`_in_usual_form`).
 """
 
 from __future__ import annotations
@@ -18,16 +20,62 @@ from ident.data.arrays import RealArray
 from ident.data.foreign_files import shown
 
 _DAY = r"(?:(\d{4})([-/])(\d\d?)\2(\d\d?)|(\d\d?)([./])(\d\d?)\6(\d{4}))"
-_CLOCK = r"(\d{1,4}):(\d\d)(?::(\d\d))?(?:[.,](\d{1,9}))?\s*([AaPp][Mm])?"
-_ZONE = r"(?:Z|([+-])(\d\d):?(\d\d))"
-_STAMP = re.compile(rf"(?:{_DAY}(?:T|\s+|$))?(?:{_CLOCK})?\s*{_ZONE}?")
+_CLOCK = r"(\d{1,7}):(\d\d)(?::(\d\d))?(?:[.,](\d{1,9}))?\s*([AaPp][Mm])?"
+_ZONE = r"(?:Z|UTC|GMT|([+-])(\d\d):?(\d\d))"
+_STAMP = re.compile(rf"(?:{_DAY}(?:T|,?\s+|_|-|$))?(?:{_CLOCK})?\s*{_ZONE}?")
+_LONGEST_STAMP = 60  # characters
+# English and German months by their first letters.
+_MONTHS = {
+    "jan": 1,
+    "feb": 2,
+    "mar": 3,
+    "mär": 3,
+    "mrz": 3,
+    "apr": 4,
+    "may": 5,
+    "mai": 5,
+    "jun": 6,
+    "jul": 7,
+    "aug": 8,
+    "sep": 9,
+    "oct": 10,
+    "okt": 10,
+    "nov": 11,
+    "dec": 12,
+    "dez": 12,
+}
+_MONTH = r"(?P<month>[A-Za-zä]{3})[a-zä]*\.?"
+_WEEKDAY = r"(?:(?:Mon|Tue|Wed|Thu|Fri|Sat|Sun|Mo|Di|Mi|Do|Fr|Sa|So)[a-z]*\.?,?\s+)?"
+_NAMED_MONTH = (
+    # 01-Mar-2024 10:00:00; Mar 1, 2024 10:00:00; Fri Mar 1 10:00:00 2024.
+    re.compile(
+        rf"{_WEEKDAY}(?P<day>\d\d?)(?:\.|st|nd|rd|th)?[-/ ]\s*{_MONTH}[-/, ]+(?P<year>\d{{4}})(?P<clock>.*)"
+    ),
+    re.compile(rf"{_WEEKDAY}{_MONTH}\s+(?P<day>\d\d?)(?:st|nd|rd|th)?,?\s+(?P<year>\d{{4}})(?P<clock>\D.*|)"),
+    re.compile(rf"{_WEEKDAY}{_MONTH}\s+(?P<day>\d\d?)\s+(?P<clock>\d\d?:\S+)\s+(?P<year>\d{{4}})"),
+)
+_BASIC = re.compile(r"(\d{4})(\d\d)(\d\d)[T _-](\d\d)(\d\d)(\d\d)(.*)")
+_DAYS_AND_CLOCK = re.compile(
+    r"(?P<days>\d{1,5})\s*(?:days?|d|tage?),?\s*(?:\+?(?P<hours>\d{1,2}):(?P<rest>\d\d:\d\d.*))?",
+    re.IGNORECASE,
+)
+_ISO_DURATION = re.compile(
+    r"P(?:(?P<days>\d{1,5})D)?T(?:(?P<hours>\d{1,4})H)?(?:(?P<minutes>\d\d?)M)?(?P<seconds>\d\d?)"
+    r"(?P<fraction>[.,]\d+)?S"
+)
+_YEAR_OF_TWO_DIGITS = re.compile(r"(\d\d?\.\d\d?\.)(\d\d)(?=[\s,]|$)")
+_FRACTION_BEHIND_COLON = re.compile(r"(:\d\d:\d\d):(\d{3,9})")
 _DAY_NS = 86_400 * 10**9  # a clock time begins again
 _MINUTES_NS = 3600 * 10**9  # minutes and seconds begin again
 
 
 def is_stamp(cell: str) -> bool:
     """Whether the text has the form of a date, a clock time, or both."""
-    return (":" in cell or "-" in cell[1:] or "." in cell or "/" in cell) and _matched(cell) is not None
+    if len(cell) > 2 * _LONGEST_STAMP or not any(map(str.isdigit, cell)):
+        return False
+    begins = cell.lstrip()
+    marked = any(sign in cell for sign in ":./") or "-" in cell[1:]
+    return (marked or begins[:1] == "P" or begins[8:9] in ("T", " ", "_")) and _matched(cell) is not None
 
 
 def seconds_since_first(cells: Sequence[str]) -> RealArray:
@@ -81,9 +129,34 @@ class StampError(ValueError):
 
 
 def _matched(cell: str) -> re.Match[str] | None:
+    """The parts of a date, a clock time or both, in the groups of `_STAMP`; None where it is none."""
     text = cell.strip()
-    found = _STAMP.fullmatch(text) if 3 < len(text) < 60 else None
+    if not 3 < len(text) < _LONGEST_STAMP:
+        return None
+    found = _STAMP.fullmatch(text) or _STAMP.fullmatch(_in_usual_form(text))
     return found if found is not None and (found[1] or found[5] or found[9]) else None
+
+
+def _in_usual_form(text: str) -> str:
+    """A stamp with a named month, in basic ISO 8601 or in days, as ISO 8601 or a clock time has it; another
+    text as it is."""
+    for form in _NAMED_MONTH:
+        named = form.fullmatch(text)
+        month = _MONTHS.get(named["month"].lower(), 0) if named else 0
+        if named and month:
+            return (
+                f"{named['year']}-{month:02d}-{named['day'].zfill(2)} {named['clock'].strip(' ,_T-')}".strip()
+            )
+    if basic := _BASIC.fullmatch(text):
+        return f"{basic[1]}-{basic[2]}-{basic[3]} {basic[4]}:{basic[5]}:{basic[6]}{basic[7]}"
+    if passed := _DAYS_AND_CLOCK.fullmatch(text):
+        hours = 24 * int(passed["days"]) + int(passed["hours"] or 0)
+        return f"{hours}:{passed['rest'] or '00:00'}"
+    if passed := _ISO_DURATION.fullmatch(text):
+        hours = 24 * int(passed["days"] or 0) + int(passed["hours"] or 0)
+        minutes = (passed["minutes"] or "0").zfill(2)
+        return f"{hours}:{minutes}:{passed['seconds'].zfill(2)}{passed['fraction'] or ''}"
+    return _FRACTION_BEHIND_COLON.sub(r"\1.\2", _YEAR_OF_TWO_DIGITS.sub(r"\g<1>20\2", text))
 
 
 def _month_first(matches: Sequence[re.Match[str]]) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -203,6 +203,12 @@ def ends_with_time(name: str) -> bool:
     return bool(words) and re.fullmatch(r"\w*(time|timestamp|stamp|zeit|clock)", words[-1]) is not None
 
 
+def says_counts(name: str) -> bool:
+    """Whether a name speaks of counts, which are whole numbers: 'encoder_counts', 'inc', 'ticks left'."""
+    kinds = (_SIZES.get(word, ("", 0.0))[0] for word in _words(in_short(name)))
+    return any(kind in COUNTED - {"%"} for kind in kinds)
+
+
 def begins_with_time_unit(name: str) -> bool:
     """Whether a name begins with a unit of time, 'ms_since_power_on', and says no other unit at its end."""
     words = _words(in_short(name))
@@ -221,13 +227,22 @@ def stated_time_unit(stated: str) -> str:
 class TimeColumn:
     """What the time stamps of a log were taken for: unit, one of `KNOWN_TIME_UNITS`; in_header: that in the
     column's name, or empty; stated: by the user, which counts more. doubtful: called seconds, and look like
-    integer milliseconds, or called by a smaller unit and look like seconds."""
+    integer milliseconds, or called by a smaller unit and look like seconds. wraps_at, wraps: the period of a
+    timer that starts again, in its unit, and how often it does; 0 for none."""
 
     name: str
     unit: str
     in_header: str
     stated: bool = False
     doubtful: bool = False
+    wraps_at: float = field(default=0.0, metadata={"since": 2})
+    wraps: int = field(default=0, metadata={"since": 2})
+
+    def timer(self, record: str) -> Finding:
+        """What there is to say of stamps that start again and were read as going on."""
+        return finding(
+            FindingKind.TIMER_WRAPS, record=record, name=self.name, period=self.wraps_at, count=self.wraps
+        )
 
     def doubt(self, dt_s: float) -> Finding:
         """What there is to say of a doubtful column with steps of dt_s."""

@@ -34,6 +34,27 @@ _SMOOTHER = 0.5
 _NEARLY_HALF = 0.4
 # A speed that changes by less than this share of a period per sample leaves no doubt: half would.
 _SAME_SPEED = 0.25
+# Timers start again after 16 to 32 bits of seconds, milliseconds or microseconds, or at midnight.
+_TIMERS = tuple(
+    sorted(
+        {2.0**bits * unit for bits in (16, 24, 31, 32) for unit in (1.0, 1e-3, 1e-6)}
+        | {86_400.0 * unit for unit in (1.0, 1e3, 1e6)}
+    )
+)
+# Across a restart of a timer passes a usual step, or as many as may be missing at a place elsewhere.
+_LONGEST_SEAM = 6.0
+# Numbers that stand for no reading: the ends of 16, 32 and 64 bits, and what meters take for infinite.
+_ENDS_OF_INTEGERS = frozenset(
+    sign * value
+    for bits in (15, 16, 31, 32, 63)
+    for sign in (-1.0, 1.0)
+    for value in (2.0**bits, 2.0**bits - 1)
+)
+_INFINITE = 1e30
+# Such a number counts where it is so many times larger than all others.
+_FAR = 10.0
+# A command may be a single pulse; one so many times the range of the others is none.
+_FAR_OF_COMMAND = 100.0
 # Spikes: this share of the samples at most, and steps so many times longer than any other.
 _FEW, _JUMPS = 0.05, 10.0
 
@@ -68,6 +89,56 @@ def wraps_at(values: RealArray) -> float:
         ):
             return 0.0
     return period if np.std(np.diff(going_on, 2)) <= _SMOOTHER * np.std(np.diff(values, 2)) else 0.0
+
+
+def timer_period(stamps: RealArray) -> float:
+    """The period at which a timer with these stamps (T,) starts again, in their unit, else 0.
+
+    Every step back has to be a usual step once the period is added.
+    """
+    steps = np.diff(stamps)
+    back = steps < 0
+    if not back.any() or back.all() or not np.all(np.isfinite(stamps)):
+        return 0.0
+    usual = float(np.median(steps[~back]))
+    longest = max(1.5 * usual, float(np.max(steps[~back])))
+    span = float(np.ptp(stamps))
+    for period in _TIMERS:
+        seams = steps[back] + period
+        if span < period and np.all(seams > 0) and np.all(seams <= min(longest, _LONGEST_SEAM * usual)):
+            return period
+    return 0.0
+
+
+def no_reading(values: RealArray, *, command: bool = False) -> IntArray:
+    """The samples (of T) that hold a number for no reading: -9999, 65535, 9.91e37, far from all others.
+
+    command: of a command also single values that are a hundred times beyond the range of all others; a
+    smaller pulse may be meant.
+    """
+    nothing = np.zeros(0, dtype=np.int64)
+    for code in (float(np.min(values, initial=0.0)), float(np.max(values, initial=0.0))):
+        rows = np.flatnonzero(values == code)
+        others = values[values != code]
+        if 2 * rows.size > values.size or not others.size:
+            continue
+        if _stands_for_nothing(code) and abs(code) > _FAR * float(np.max(np.abs(others))):
+            return rows
+    spikes = spikes_in(values) if command else nothing
+    if spikes.size:
+        others = np.delete(values, spikes)
+        distance = float(np.min(np.abs(values[spikes] - np.median(others))))
+        if distance > _FAR_OF_COMMAND * float(np.ptp(others)):
+            return spikes
+    return nothing
+
+
+def _stands_for_nothing(value: float) -> bool:
+    """Whether programs write this number where there is no reading: three nines and more, another digit four
+    times and more, the largest of an integer, more than any meter shows."""
+    digits = f"{abs(value):.10g}".replace(".", "").rstrip("0")
+    repeated = len(set(digits)) == 1 and len(digits) >= (3 if digits[:1] == "9" else 4)
+    return repeated or value in _ENDS_OF_INTEGERS or abs(value) >= _INFINITE
 
 
 def counts_rows(values: RealArray) -> bool:

@@ -202,6 +202,8 @@ def _time(
         option_for(stamps),
     )
     doubts = [column.doubt(period)] if column.doubtful else []
+    if column.wraps:
+        doubts.append(column.timer(str(table.path)))
     # Of uneven stamps the look says what they are itself.
     return found, [*doubts, *(clock_doubts(stamps, str(table.path)) if not found.option else ())]
 
