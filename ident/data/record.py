@@ -356,16 +356,19 @@ def reading_notes(
     for name in (*inputs, *outputs):
         if told := _bookkept(table, name):
             found.append(told)
+    for name in outputs:
+        if period := wraps_at(columns[name]):
+            found.append(finding(FindingKind.WRAPS, record=record, name=name, period=period))
+    wrapping = {item.values["name"] for item in found if item.kind is FindingKind.WRAPS}
     for name in (*inputs, *references, *outputs):
+        if name in wrapping:
+            continue
         values = columns[name]
-        rows = no_reading(values, command=name not in outputs)
-        kind = FindingKind.NO_READING
-        if not rows.size and name in outputs:
-            if period := wraps_at(values):
-                found.append(finding(FindingKind.WRAPS, record=record, name=name, period=period))
-                continue
-            rows = spikes_in(values)
-            kind = FindingKind.SPIKES
+        kind = FindingKind.SPIKES
+        rows = spikes_in(values) if name in outputs else np.zeros(0, dtype=np.int64)
+        if not rows.size:
+            kind = FindingKind.NO_READING
+            rows = no_reading(values, command=name not in outputs)
         if rows.size:
             first = int(rows[0])
             place = table.place(first, name)

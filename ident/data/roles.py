@@ -11,7 +11,7 @@ from typing import NoReturn
 import numpy as np
 
 from ident.data.arrays import RealArray
-from ident.data.causality import follows, is_moved_by, leads
+from ident.data.causality import is_loop, is_moved_by, leads
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.foreign_files import Unread, as_typed, shown
 from ident.data.table import Table
@@ -228,7 +228,8 @@ def _are_twins(table: Table, first: str, second: str) -> bool:
     if table.unit(first) != table.unit(second):
         return False
     unit = table.unit(first).replace("/", "_")
-    stems = [re.sub(r"[\W_]+", "", name.removesuffix(unit)).lower() for name in (first, second)]
+    bare = [in_short(name).removesuffix(unit) for name in (first, second)]
+    stems = [re.sub(r"[\W_]+", "", name).lower() for name in bare]
     shared = 0
     for one, other in zip(*stems, strict=False):
         if one != other:
@@ -241,10 +242,9 @@ def _are_twins(table: Table, first: str, second: str) -> bool:
 
 
 def _is_loop(table: Table, reference: str, output: str, command: str) -> bool:
-    """Whether an output follows a reference as it stands, and the command moves the output alone."""
+    """Whether the numbers of three columns are those of a closed loop."""
     with suppress(ValueError):  # cells that hold no number are somebody else's to say
-        r, y, u = table.columns([reference, output, command]).values()
-        return follows(r, y) and is_moved_by(y, u) and not is_moved_by(r, u)
+        return is_loop(*table.columns([reference, output, command]).values())
     return False
 
 
@@ -421,10 +421,11 @@ def _quantity(table: Table, name: str) -> tuple[str, bool]:
 
 
 def _is_wished(table: Table, name: str) -> bool:
-    bare = name.removesuffix(table.unit(name).replace("/", "_"))
+    short = in_short(name)
+    bare = short.removesuffix(table.unit(name).replace("/", "_"))
     while bare and not bare[-1].isalnum():
         bare = bare[:-1]
-    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", in_short(name))  # posRef, SetAngle
+    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", short)  # posRef, SetAngle
     return _WISHED.search(apart) is not None or bare.lower() == "r"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
@@ -36,7 +37,7 @@ class Table:
     raw: by name, an array, or text cells (a tuple of str) as `layout` says. A matrix (T, C) is offered as C
     columns name[0], name[1], ... first_line: file line of row 0, None where rows have no lines (npz, mat).
     units: by name, where the file states them apart from the names. begin, run: row of the file at which a
-    run of it begins, and what it is called.
+    run of it begins, and what it is called. parsed: columns of text that were read as numbers, by name.
     """
 
     path: Path
@@ -47,6 +48,7 @@ class Table:
     clocks: Mapping[str, RealArray] = field(default_factory=dict)
     begin: int = 0
     run: str = ""
+    parsed: dict[str, RealArray] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         columns: dict[str, Any] = {}
@@ -191,6 +193,8 @@ class Table:
 
     def _parsed(self, name: str, cells: tuple[str, ...]) -> RealArray:
         """Text as numbers; NaN for what is none."""
+        if name in self.parsed:
+            return self.parsed[name].copy()
         decimal = self.layout.decimal if self.layout else "."
         try:
             if self.is_clock(name):
@@ -198,15 +202,22 @@ class Table:
         except StampError as error:
             what = f"{self.path}, {self.place(error.row, name)}: column '{shown(name)}' {error}"
             raise ValueError(what) from None
-        plain = [cell.replace(",", ".") for cell in cells] if decimal == "," else cells
         self._refuse_doubtful_groups(name, cells)
-        try:
-            # Python takes _ for a separator of digits; with a decimal comma a point is no decimal sign.
-            if not any("_" in cell or (decimal == "," and "." in cell) for cell in cells):
-                return np.array(list(map(float, plain)))
-        except ValueError:
-            pass
-        return np.array([number(cell, decimal) if is_number(cell, decimal) else np.nan for cell in cells])
+
+        # Python reads most columns as they stand, and faster. It takes _ for a separator of digits; with a
+        # decimal comma a point is no decimal sign.
+        text = "\n".join(cells)
+        numbers = None
+        if "_" not in text and not (decimal == "," and "." in text):
+            with suppress(ValueError):
+                plain = text.replace(",", ".").split("\n") if decimal == "," else cells
+                numbers = np.array(list(map(float, plain)))
+        if numbers is None:
+            numbers = np.array(
+                [number(cell, decimal) if is_number(cell, decimal) else np.nan for cell in cells]
+            )
+        self.parsed[name] = numbers
+        return numbers.copy()
 
     def _refuse_doubtful_groups(self, name: str, cells: tuple[str, ...]) -> None:
         """Raise ValueError where '1.500' in a column may be one and a half, or fifteen hundred."""

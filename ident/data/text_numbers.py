@@ -56,14 +56,16 @@ def is_bookkept(cell: str, decimal: str) -> bool:
 
 def is_number(cell: str, decimal: str) -> bool:
     """Whether the cell is a number with this decimal sign; blanks around it do no harm."""
-    text = _with_leading_sign(cell.strip())
-    if _GROUPED_NUMBER[decimal].fullmatch(text):
+    text = cell.strip()
+    if decimal == ".":
+        if _NUMBER.fullmatch(text):  # nearly all cells
+            return True
+    elif "." not in text and _NUMBER.fullmatch(text.replace(",", ".")):
         return True
-    if decimal == ",":
-        if "." in text:
-            return False
-        text = text.replace(",", ".")
-    return _NUMBER.fullmatch(text) is not None
+    with_sign = _with_leading_sign(text)
+    if with_sign != text:
+        return is_number(with_sign, decimal)
+    return _GROUPED_NUMBER[decimal].fullmatch(text) is not None
 
 
 def number(cell: str, decimal: str) -> float:

@@ -162,7 +162,8 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
     if min(lengths) < width:
         for row in rows:
             row.extend([""] * (width - len(row)))
-    proven = any(shows_decimals(cell, layout.decimal) for row in rows for cell in row)
+    sign = layout.decimal
+    proven = any(sign in cell and shows_decimals(cell, sign) for row in rows for cell in row)
     columns = dict(zip(layout.names, zip(*rows, strict=True), strict=True))
 
     # '0.005 sec' in every row is a column of numbers in seconds.
@@ -199,11 +200,13 @@ def _bare(lines: list[str]) -> tuple[list[str], list[str]]:
 
     Without 'angle:' before each number; the stamp that a monitor puts before each line is a cell of its own.
     """
-    heads = [_ARRIVED.match(line[:_LONGEST_ARRIVAL]) for line in lines]
-    stamps = [(head[1] or head[2]) if head else "" for head in heads]
-    arrived = 2 * sum(map(is_stamp, stamps)) > len(lines)
+    sample = [_arrival(line) for line in lines[:_SAMPLE]]
+    arrived = 2 * sum(is_stamp(stamp) for stamp, _ in sample) > len(sample)
+    stamps = list[str]()
     if arrived:
-        lines = [line[head.end() if head else 0 :] for line, head in zip(lines, heads, strict=True)]
+        parts = [_arrival(line) for line in lines]
+        stamps = [stamp for stamp, _ in parts]
+        lines = [line for _, line in parts]
 
     # Most lines of the sample have to be numbers with the same names.
     samples = [tuple(name for name, _, _ in _labelled(line)) for line in lines[:_SAMPLE]]
@@ -227,6 +230,12 @@ def _bare(lines: list[str]) -> tuple[list[str], list[str]]:
         ]
         names = ["time", *names]
     return lines, names
+
+
+def _arrival(line: str) -> tuple[str, str]:
+    """The stamp that a serial monitor puts before a line, or empty, and the line without it."""
+    head = _ARRIVED.match(line[:_LONGEST_ARRIVAL])
+    return (head[1] or head[2], line[head.end() :]) if head else ("", line)
 
 
 def _labelled(line: str) -> list[tuple[str, str, str]]:
@@ -258,7 +267,13 @@ def _is_cut(rows: Sequence[Sequence[str]], decimal: str) -> bool:
 def _layout(lines: Sequence[str], n_lines: int) -> Layout:
     """The layout of the separator and the decimal sign that fit best; the first of equals."""
     rows = {separator: _rows(lines, separator) for separator in dict.fromkeys(kind[0] for kind in _KINDS)}
-    fits = [_Fit.of(lines, rows[separator], separator, decimal) for separator, decimal in _KINDS]
+    known: dict[str, dict[str, bool]] = {
+        ".": {},
+        ",": {},
+    }  # of cells, by decimal sign: whether they are values
+    fits = [
+        _Fit.of(lines, rows[separator], separator, decimal, known[decimal]) for separator, decimal in _KINDS
+    ]
     best = max(fits, key=lambda fit: fit.score)
     if not best.share:
         if n_lines == 1:
@@ -286,15 +301,25 @@ class _Fit:
     start: int = 0
 
     @classmethod
-    def of(cls, lines: Sequence[str], rows: list[list[str]], separator: str, decimal: str) -> _Fit:
+    def of(
+        cls,
+        lines: Sequence[str],
+        rows: list[list[str]],
+        separator: str,
+        decimal: str,
+        known: dict[str, bool],
+    ) -> _Fit:
+        """The fit of lines whose cells are `rows`; known: whether a cell is a value, as far as looked at."""
         none = cls(separator, decimal, lines, rows)
         live = [k for k, row in enumerate(rows) if any(row) and not _is_comment(lines[k])]
         widest = max(live, key=lambda k: len(rows[k]), default=0)
         if len(rows[widest]) > MOST_COLUMNS:
             what = f"{len(rows[widest])} cells; expected at most {MOST_COLUMNS} columns, a row per sample"
             raise ValueError(f", line {widest + 1}: {what}")
-        # Which cells of a line are values; each cell is looked at once.
-        values = {k: [bool(cell) and _is_value(cell, decimal) for cell in rows[k]] for k in live}
+        # Which cells of a line are values; each text is looked at once.
+        for cell in {cell for k in live for cell in rows[k]} - known.keys():
+            known[cell] = bool(cell) and _is_value(cell, decimal)
+        values = {k: [known[cell] for cell in rows[k]] for k in live}
 
         # The usual width of a row is that of the last lines that hold values.
         filled = [k for k in live[-100:] if any(values[k])]
@@ -306,7 +331,8 @@ class _Fit:
         least = max(len(rows[k]) - _empty_at_end(rows[k]) for k in usual)
         numbers = [sum(values[k]) for k in usual]
         typical = sorted(numbers)[len(numbers) // 2]
-        cells = sum(1 for k in usual for cell in rows[k] if cell)
+        present = [sum(map(bool, column)) for column in zip(*(rows[k] for k in usual), strict=True)]
+        valued = [sum(column) for column in zip(*(values[k] for k in usual), strict=True)]
         if not typical or (most == 1 and separator != ";"):
             return none
         if separator == " " and all("\t" in lines[k].strip() for k in live[-100:]):
@@ -315,8 +341,6 @@ class _Fit:
         # A row is as wide as the usual one, and holds half as many values at least.
         looks = {k for k in live if len(rows[k]) == most and 2 * sum(values[k]) >= typical}
         first = next(k for k in live if k in looks)
-        present = [sum(1 for k in usual if rows[k][column]) for column in range(most)]
-        valued = [sum(values[k][column] for k in usual) for column in range(most)]
         numeric = [column for column in range(most) if 2 * valued[column] > present[column]]
 
         def fits(k: int) -> bool:
@@ -327,7 +351,7 @@ class _Fit:
             if fits(k) and fits(after):
                 start = k
                 break
-        return cls(separator, decimal, lines, rows, least, most, sum(numbers) / cells, first, start)
+        return cls(separator, decimal, lines, rows, least, most, sum(numbers) / sum(present), first, start)
 
     @property
     def score(self) -> tuple[bool, float, int]:

@@ -23,6 +23,7 @@ _DAY = r"(?:(\d{4})([-/])(\d\d?)\2(\d\d?)|(\d\d?)([./])(\d\d?)\6(\d{4}))"
 _CLOCK = r"(\d{1,7}):(\d\d)(?::(\d\d))?(?:[.,](\d{1,9}))?\s*([AaPp][Mm])?"
 _ZONE = r"(?:Z|UTC|GMT|([+-])(\d\d):?(\d\d))"
 _STAMP = re.compile(rf"(?:{_DAY}(?:T|,?\s+|_|-|$))?(?:{_CLOCK})?\s*{_ZONE}?")
+_MAY_BE_OTHERWISE = re.compile(r"\d.*[A-Za-z]|[A-Za-z].*\d|:\d\d:\d\d:|\.\d\d?\.|\d{8}[ _-]\d{6}")
 _LONGEST_STAMP = 60  # characters
 # English and German months by their first letters.
 _MONTHS = {
@@ -71,7 +72,7 @@ _MINUTES_NS = 3600 * 10**9  # minutes and seconds begin again
 
 def is_stamp(cell: str) -> bool:
     """Whether the text has the form of a date, a clock time, or both."""
-    if len(cell) > 2 * _LONGEST_STAMP or not any(map(str.isdigit, cell)):
+    if len(cell) > 2 * _LONGEST_STAMP:
         return False
     begins = cell.lstrip()
     marked = any(sign in cell for sign in ":./") or "-" in cell[1:]
@@ -133,7 +134,9 @@ def _matched(cell: str) -> re.Match[str] | None:
     text = cell.strip()
     if not 3 < len(text) < _LONGEST_STAMP:
         return None
-    found = _STAMP.fullmatch(text) or _STAMP.fullmatch(_in_usual_form(text))
+    found = _STAMP.fullmatch(text)
+    if found is None and _MAY_BE_OTHERWISE.search(text):
+        found = _STAMP.fullmatch(_in_usual_form(text))
     return found if found is not None and (found[1] or found[5] or found[9]) else None
 
 
