@@ -94,6 +94,8 @@ def difference(record: Record, log: Log) -> str:
             return f"{len(found)} samples, true {len(true)}"
         if len(true) and np.any(np.abs(found[:, 0] - true) > 1e-6 * (1 + np.abs(true))):
             return f"{what} {found[:3, 0]}, true {true[:3]}"
+    if log.reference and record.reference_names != (log.reference,):
+        return f"reference {record.reference_names}, true {log.reference}"
     for unit, true_unit in zip((*record.input_units, *record.output_units), log.units, strict=False):
         if unit not in ("", true_unit):
             return f"in {unit}, true {true_unit}"

@@ -444,8 +444,9 @@ class _Fit:
         longer = self._names_at(over[0], numbered=True) if over else None
         if longer is not None and self._are_units(names):
             units, names, header = names, longer, over[0]
-        elif longer is not None and self._are_units(longer):
-            units = longer  # of some loggers they stand above the names
+        elif over and len(self.rows[over[0]]) >= len(names) and self._are_units(self.rows[over[0]]):
+            # Of some loggers they stand above the names; columns without a unit have an empty cell.
+            units = self.rows[over[0]]
         elif below < self.first and any(self.rows[below]) and self._are_units(self.rows[below]):
             # Cells at its end are empty: those columns have no unit.
             units, below = self.rows[below], below + 1

@@ -29,7 +29,10 @@ TIMES = {
 SIGNALS = (
     "u_V y_rad V rad|voltage_V angle_deg V deg|Spannung~[V] Winkel~[°] V °|torque~(Nm) position~(mm) Nm mm|"
 )
-SIGNALS += "Strom~in~A Weg~in~mm A mm|cmd~[mV] ω~[rad/s] mV rad/s|u y  "
+SIGNALS += "Strom~in~A Weg~in~mm A mm|cmd~[mV] ω~[rad/s] mV rad/s|u y  |"
+# The last word of a name decides, not a letter at its front; long names are typed whole.
+SIGNALS += "q_current y_position  |y_axis_torque y_axis_speed  |pwm v_wheel  |u_voltage x_angle  |"
+SIGNALS += "Plant/Drive_Subsystem/Motor_Command_Left_V Plant/Sensor_Subsystem/Encoder_Angle_Left_rad V rad"
 START = np.datetime64("2024-02-29T23:59:58.500", "ns")  # passes midnight, in a leap year
 ANSWERS = ("read", "ask", "refuse")
 MATLAB_MARK = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"  # before HDF5
@@ -55,6 +58,7 @@ class Log:
     answer: str = "read"
     told: str = ""
     clock: str = ""
+    reference: str = ""
     kind: str = ""
     file: str = ""
     content: bytes = b""
@@ -66,6 +70,7 @@ class Log:
     above: list[str] = field(default_factory=list)
     between: dict[int, str] = field(default_factory=dict)
     below: list[str] = field(default_factory=list)
+    under: list[str] = field(default_factory=list)
     last: str = ""
     end: str = "\n"
 
@@ -103,10 +108,10 @@ class Log:
         return self.separator.join(quoted) + self.last
 
     def text(self) -> str:
-        lines = [*self.above, self.line(self.header), *self.below]
+        lines = [*self.above, *([self.line(self.header)] if self.header else []), *self.below]
         for k, row in enumerate(self.rows):
             lines += [*([self.between[k]] if k in self.between else []), self.line(row)]
-        return self.end.join(lines) + self.end
+        return self.end.join([*lines, *self.under]) + self.end
 
 
 # Times of text tables.
@@ -130,6 +135,34 @@ def epoch(log: Log, unit: str, names: str) -> list[str]:
     return [str(k // (10**9 // int(PER_SECOND[unit]))) for k in ns]
 
 
+def with_unit(log: Log) -> list[str]:
+    """The unit behind each number, as MATLAB writes a timetable."""
+    words = {"s": "sec|s|seconds", "ms": "ms|msec", "us": "us|µs", "ns": "ns", "min": "min"}
+    log.names[0] = str(log.rng.choice(["Time", "t", "elapsed"]))
+    blank = "" if log.separator == " " else " "
+    word = str(log.rng.choice(words[log.unit].split("|")))
+    return [f"{x:.12g}{blank}{word}" for x in log.stamps]
+
+
+def passed(log: Log) -> list[str]:
+    """Timedeltas of pandas, or ISO 8601 durations."""
+    log.names[0], log.unit, log.clock = "time", "s", "h"
+    seconds = [(k // 10**9 % 60, k // 1000 % 10**6, k // (60 * 10**9)) for k in log.ns.tolist()]
+    if log.rng.random() < 0.3:
+        return [f"P0DT0H{m}M{s}.{us:06d}S" for s, us, m in seconds]
+    return [f"0 days 00:{m:02d}:{s:02d}.{us:06d}" for s, us, m in seconds]
+
+
+def timer(log: Log) -> list[str]:
+    """A timer of 16 or 32 bits that starts again in the middle of the log."""
+    bits, unit = (16, "ms") if log.rng.random() < 0.5 else (32, "us")
+    log.unit, log.names[0] = unit, {"ms": "t_ms", "us": "micros"}[unit]
+    log.dt_s = max(log.dt_s, 1 / PER_SECOND[unit])
+    counts = np.round(log.t * PER_SECOND[unit]).astype(np.int64)
+    log.told = "starts again"
+    return [str(k) for k in (counts - counts[len(counts) // 2] + 2**bits) % 2**bits]
+
+
 def unknown(log: Log) -> list[str]:
     """Milliseconds that nothing says are some."""
     log.unit, log.names[0] = "ms", str(log.rng.choice(["t", "time", "timestamp", "Zeit", "elapsed", "tick"]))
@@ -149,6 +182,10 @@ STAMPS: dict[str, Callable[[Log], list[str]]] = {
     "epoch s": lambda log: epoch(log, "s", "time|timestamp|__time|t_s"),
     "epoch ms": lambda log: epoch(log, "ms", "time_ms|timestamp|Time [ms]|time"),
     "epoch us": lambda log: epoch(log, "us", "timestamp_us|timestamp|time (us)"),
+    "datetime of MATLAB": lambda log: clock(log, "%d-%b-%Y %H:%M:%S.%f"),
+    "ctime": lambda log: clock(log, "%a %b %d %H:%M:%S.%f %Y"),
+    "JavaScript": lambda log: clock(log, "%d/%m/%Y, %H:%M:%S.%f"),
+    **{way.__name__: way for way in (with_unit, passed, timer)},
     "epoch ns": lambda log: epoch(log, "ns", "timestamp_ns|timestamp|time|Time [ns]"),
 }
 
@@ -277,6 +314,117 @@ def outputs_only(log: Log) -> None:
     log.needs("refuse")
 
 
+def whole(log: Log) -> None:
+    """Rows have to be those of the truth, and nothing to be said of them but of their timer."""
+    if len(log.rows) != len(log.y) or np.any(np.isnan(log.y)) or log.told not in ("", "starts again"):
+        raise UnfitError
+
+
+def typeset_minus(log: Log) -> None:
+    for row in log.rows:
+        row[1:3] = [cell.replace("-", "\u2212") for cell in row[1:3]]
+
+
+def bookkept(log: Log) -> None:
+    """Negative numbers in brackets, or with the sign behind."""
+    whole(log)
+    form = str(log.rng.choice(["({})", "{}-"]))
+    for row in log.rows:
+        row[1:3] = [form.format(cell[1:]) if cell.startswith("-") else cell for cell in row[1:3]]
+    log.told = "bookkeeping" if np.min(log.u) < 0 or np.min(log.y) < 0 else log.told
+
+
+def fortran(log: Log) -> None:
+    whole(log)
+    for row, value in zip(log.rows, log.y, strict=True):
+        row[2] = f"{value:.9e}".replace("e", "D").replace(".", log.decimal)
+
+
+def units_in_cells(log: Log) -> None:
+    if log.separator == " " or not log.units[0] or "/" in log.units[1]:
+        raise UnfitError
+    log.names[1:] = log.header[1:3] = ["drive", "hub"]
+    for row in log.rows:
+        row[1:3] = [f"{cell} {unit}" for cell, unit in zip(row[1:3], log.units, strict=True)]
+
+
+def per_cent(log: Log) -> None:
+    log.names[1] = log.header[1] = "drive [%]"
+    log.units[0] = "%"
+    blank = str(log.rng.choice(["", " "])) if log.separator != " " else ""
+    for row in log.rows:
+        row[1] = f"{row[1]}{blank}%"
+
+
+def none_there(log: Log) -> None:
+    """A number for no reading, in the command or in the output."""
+    whole(log)
+    code = float(log.rng.choice([-9999.0, 65535.0, 9999.0, 9.9e37]))
+    column = int(log.rng.integers(1, 3))
+    values = [log.u, log.y][column - 1]
+    for k in log.rng.choice(np.arange(2, len(log.rows) - 2), 2, replace=False):
+        values[k] = code
+        log.rows[k][column] = f"{code:.12g}"
+    log.told = "reading?"
+
+
+def grouped_counts(log: Log) -> None:
+    """Whole numbers of four digits in groups, beside whole numbers: 1.500 may be one and a half."""
+    if len(log.header) > 3 or any(re.search(r"[.,]", row[0]) for row in log.rows):
+        raise UnfitError
+    whole(log)
+    log.u = np.round(2 * log.u)
+    log.y = np.round(5000 + 100 * log.y).clip(1100, 9900)
+    log.names[1:] = log.header[1:3] = ["drive", "encoder_counts"]
+    log.units, log.decimal = ["", "counts"], ","
+    for row, u, y in zip(log.rows, log.u, log.y, strict=True):
+        row[1:3] = [f"{u:.0f}", f"{y:,.0f}".replace(",", ".")]
+    log.needs("ask")
+
+
+def words_under(log: Log) -> None:
+    log.under = [str(log.rng.choice(["End of file", "stopped by operator", "ok"]))]
+
+
+def units_under(log: Log) -> None:
+    units_below(log)
+    log.under, log.below = log.below, []
+    log.told = log.told or "under the rows"
+
+
+def loop(log: Log) -> None:
+    """A closed loop with names that say nothing of which is the reference."""
+    whole(log)
+    if len(log.rows) < 150 or len(log.header) > 3:
+        raise UnfitError
+    n = len(log.rows)
+    reference = np.round(log.rng.uniform(-5, 5, n // 25 + 1).repeat(25)[:n], 3)
+    position = speed = 0.0
+    for k in range(n):
+        log.y[k] = round(position + 1e-4 * log.rng.normal(), 6)
+        log.u[k] = round(0.4 * (reference[k] - log.y[k]) - 0.2 * speed, 6)
+        speed += 0.3 * log.u[k] - 0.05 * speed
+        position += speed
+    names = str(log.rng.choice(["u y yr", "vir qm qg", "u_V x1_mm xr_mm", "torque theta theta_r"])).split(" ")
+    *log.names[1:], log.reference = names
+    log.header = [log.header[0], *names]
+    log.units = ["V", "mm"] if names[0] == "u_V" else ["", ""]
+    for row, *values in zip(log.rows, log.u, log.y, reference, strict=True):
+        row[1:] = [f"{value:.9g}".replace(".", log.decimal) for value in values]
+
+
+def sentence(log: Log) -> None:
+    """A commented sentence above the rows and no names."""
+    said = ["open loop, wheels free, battery full again", "Rig (12)", "pendulum rig, third run by hand"]
+    words = str(log.rng.choice(said))
+    sizes = {len(words.split(sign)) for sign in (" ", ",", ";", "\t", "|")}
+    if len(log.header) in sizes or log.below or log.above or log.under or log.answer == "refuse":
+        raise UnfitError
+    log.above, log.header = comment(log, words), []
+    log.names, log.units, log.reference = ["column 1", "column 2", "column 3"], ["", ""], ""
+    log.needs("ask")
+
+
 BLEMISHES: dict[str, Callable[[Log], object]] = {
     **{f.__name__: f for f in (preamble, comment_above, thousands, wrapped)},
     "words beside": lambda log: column(log, "note", lambda k: "ok"),
@@ -286,6 +434,8 @@ BLEMISHES: dict[str, Callable[[Log], object]] = {
     "twice": lambda log: column(log, log.header[2], lambda k: str(k % 3), "refuse"),
     **{f.__name__: f for f in (hole, lost_row, comment_names, jitter, comment_between, rows_out, sparse)},
     "outputs_only": outputs_only,
+    **{f.__name__: f for f in (typeset_minus, fortran, units_in_cells, per_cent, none_there)},
+    **{f.__name__: f for f in (bookkept, grouped_counts, words_under, units_under, loop, sentence)},
     "separators at the ends": lambda log: setattr(log, "last", log.separator.strip(" ")),
     "lines of Windows": lambda log: setattr(log, "end", "\r\n"),
 }
@@ -440,7 +590,17 @@ def xlsx(log: Log, columns: Columns) -> bytes:
     found = columns(log)
     rows = [list(found), *zip(*(values.tolist() for values in found.values()), strict=True)]
     other = [rows[0], *([3 * x + 1 for x in row] for row in rows[1:])]
-    book, more = openpyxl.Workbook(), int(log.rng.integers(5))
+    book, more = openpyxl.Workbook(), int(log.rng.integers(8))
+    form = {5: "0.0 %", 7: "0.000,"}.get(more, "General")
+    if more == 5:
+        rows[0][1], log.names[1], log.units[0] = "drive [%]", "drive [%]", "%"
+        log.u = np.array([float(f"{100 * x:.9g}") for x in log.u])
+    if more == 6:  # by a program that computes nothing
+        rows[1:] = [[t, f"=3*A{k}", y] for k, (t, _, y) in enumerate(rows[1:], 2)]
+        log.needs("refuse")
+    if more == 7:
+        rows[0][1], log.names[1], log.units[0] = "force [kN]", "force [kN]", "kN"
+        log.u = log.u / 1000.0
     if more == 1:
         book.active.sheet_state = "hidden"
     if more == 2:
@@ -452,6 +612,8 @@ def xlsx(log: Log, columns: Columns) -> bytes:
     sheet = book.create_sheet("Data")
     for row in [*([["Logger", 3000], ["operator", "M. Huber"], []] if more == 4 else []), *rows]:
         sheet.append(row)
+    for (cell,) in sheet.iter_rows(min_row=2, min_col=2, max_col=2):
+        cell.number_format = form
     return written(book.save)
 
 
