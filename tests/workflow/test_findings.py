@@ -34,7 +34,7 @@ VALUES = {
     "worst_distance": 3.21, "least_percent": 90.0, "most_percent": 95.0, "explained_percent": 12.3,
     "relative_std": 0.0342, "rms": 4.0012, "unit": "V", "percent": 2.345, "samples": 4000, "rows": 12,
     "line": 7, "value": -9999.0, "place": "line 7", "period": 4096.0, "units": "deg and rad", "missing": 12,
-    "jitter": 0.0421,
+    "jitter": 0.0421, "cell": "(3.25)",
     "too_narrow": 0.0015, "faithful_rad_s": 93.62, "from_Hz": 0.2, "to_Hz": 31.62, "parity": "odd",
     "trend": "falls", "lines": 61, "n_records": 2, "n_amplitudes": 2, "times": 1.5, "most_from_Hz": 16.2,
     "most_to_Hz": 22.0, "chance_percent": 0.81, "shift_percent": -0.65, "shift_from_Hz": 16.2,

@@ -15,6 +15,7 @@ from workflow.engine.errors import naming
 from workflow.engine.progress import Progress
 from workflow.tasks.early_refusals import (
     fit_options,
+    naming_readings,
     refuse_constant_input,
     refuse_hopeless_channel,
     single_channel,
@@ -50,7 +51,9 @@ def identify_logs(
         refuse_constant_input(record)
     with naming("identify"):
         channel = single_channel(logs.measured[0], fit_options(options), described, band_rad_s)
-    refuse_hopeless_channel(channel, logs.measured, loop or ClosedLoopData(), progress)
+    records = [*logs.measured, *logs.fresh]
+    with naming_readings(records):
+        refuse_hopeless_channel(channel, logs.measured, loop or ClosedLoopData(), progress)
 
     # What is refused does not wait for what identifies: that takes seconds to load.
     from ident.basis.model_files import ModelFile
@@ -75,7 +78,7 @@ def identify_logs(
             averaged=logs.command_averaged,
         )
         common = with_equivalent_command(common, timing)
-    with speaking("identify"):
+    with speaking("identify"), naming_readings(records):
         result = identify_records(
             common[: len(logs.measured)],
             common[len(logs.measured) :],

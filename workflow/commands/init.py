@@ -29,7 +29,11 @@ from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.early_refusals import refuse_constant_input, refuse_hopeless_logs
+from workflow.tasks.early_refusals import (
+    naming_readings,
+    refuse_constant_input,
+    refuse_hopeless_logs,
+)
 from workflow.tasks.records import with_common_sampling_time
 from workflow.text.templates import RunSummary, environment, rows_of
 
@@ -107,7 +111,7 @@ def decided(
     from workflow.tasks.pipeline import identify_only
     from workflow.tasks.results import RunResults
 
-    with tempfile.TemporaryDirectory(prefix="flexlink-") as folder:
+    with naming_readings(found.read.records), tempfile.TemporaryDirectory(prefix="flexlink-") as folder:
         run = RunDirectory(Path(folder))
         try:
             identify_only(config, run.path, config_text=text, progress=progress)
@@ -144,7 +148,7 @@ def drafted(
     from workflow.tasks.draft import draft_of
 
     output, unit_of = read.roles.output, read.unit_of
-    with naming(command):
+    with naming_readings(read.records), naming(command):
         draft = draft_of(
             read.records,
             position=is_position(output, unit_of[output]),
@@ -244,7 +248,8 @@ def read_channel(
     if drafted:
         fitted = records[:-1] or records
         in_loop = all(record.reference is not None for record in fitted)
-        refuse_hopeless_logs(fitted, progress, loop=in_loop)
+        with naming_readings(fitted):
+            refuse_hopeless_logs(fitted, progress, loop=in_loop)
     for record in records:
         refuse_constant_input(record)
     unit_of = {

@@ -3,7 +3,8 @@ once."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 from pydantic import ValidationError
@@ -16,7 +17,7 @@ from ident.data.signal_filter import band_edges
 from workflow.config.joints_config import AnyConfig
 from workflow.config.run_config import Channel, ClosedLoopData, FileSource, RunConfig
 from workflow.config.uncertainty_options import FitOptions, UncertaintyOptions
-from workflow.engine.errors import naming
+from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
 
 # Of the ways in which a log was read, what may spoil the whole answer: said before anything is searched. The
@@ -30,6 +31,24 @@ _SAID_AT_ONCE = frozenset(
         FindingKind.UNIT_CONTRADICTED,
     }
 )
+
+# Findings on readings that are none: what is identified from them is of no machine.
+_NO_READINGS = frozenset({FindingKind.SPIKES, FindingKind.NO_READING})
+
+
+@contextmanager
+def naming_readings(records: Sequence[Record]) -> Iterator[None]:
+    """A refusal inside begins with the first reading that is none, its likely cause. Raises InputError."""
+    try:
+        yield
+    except InputError as refused:
+        notes = (note for record in records for note in record.notes)
+        likely = next((note for note in notes if note.kind in _NO_READINGS), None)
+        if likely is None:
+            raise
+        from workflow.text.templates import words  # templates take a moment to load, and few logs need them
+
+        raise InputError(f"{words(likely).partition(' Delete such rows')[0]} Then: {refused}") from refused
 
 
 def refuse_hopeless_logs(
