@@ -49,7 +49,8 @@ def test_a_set_point_is_told_from_the_output_that_follows_it(kind, noise):
     command, output = closed_loop(reference, noise)
     assert is_loop(reference, output, command)
     assert not is_loop(output, reference, command)
-    assert is_moved_by(output, command) and not is_moved_by(reference, command)
+    assert is_moved_by(output, command)
+    assert not is_moved_by(reference, command)
 
 
 @pytest.mark.parametrize("noise", [1e-3, 0.05, 0.5])

@@ -1,6 +1,7 @@
 """Units in headers, columns found by them, logs in different ones: recognised, refused, kept to the bit."""
 
 import re
+import subprocess
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,10 +11,12 @@ from hypothesis import given, strategies as st
 
 import flexlink
 from ident.data.finding import FindingKind
+from ident.data.foreign_files import path_as_typed
 from ident.data.record import Record, in_one_unit
 from ident.data.roles import Roles, is_position, roles_of, time_of
 from ident.data.table import Table
 from ident.data.units import TimeColumn, contradicted_by_loop, kind_of, per, says_time, size_of, written_unit
+from workflow.engine.errors import cut_inside, one_line
 
 PER_SECOND = {"s": 1, "ms": 1000, "us": 10**6, "ns": 10**9, "min": Fraction(1, 60), "h": Fraction(1, 3600)}
 
@@ -177,6 +180,71 @@ def test_of_two_columns_without_a_known_name_the_follower_is_the_output():
         roles_of(log, "a.csv", "init")
 
 
+def servo(*names):
+    """Reference, measured position and command of a motor under proportional control, by name."""
+    rng = np.random.default_rng(5)
+    reference = rng.uniform(-5, 5, 12).repeat(50)
+    position = speed = 0.0
+    rows = []
+    for wished in reference:
+        reading = position + 1e-4 * rng.standard_normal()
+        command = 0.4 * (wished - reading) - 0.2 * speed
+        rows.append((wished, reading, command))
+        speed += 0.3 * command - 0.05 * speed
+        position += speed
+    columns = dict(zip(names, np.array(rows).T, strict=True))
+    return Table("a.csv", {"t": 0.01 * np.arange(len(rows)), **columns})
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("names", ["xr_mm x1_mm u_V", "yr y u", "qg qm vir", "theta_r theta torque"])
+def test_of_twins_in_a_loop_the_reference_is_what_the_command_does_not_move(names, turned):
+    log = servo(*names.split())
+    if turned:
+        log = Table("a.csv", dict(reversed(log.raw.items())))
+    reference, output, command = names.split()
+    assert roles_of(log, "a.csv") == Roles("t", command, output, reference)
+
+
+def test_two_measured_positions_in_open_loop_have_no_reference():
+    rng = np.random.default_rng(6)
+    command = rng.choice([-3.0, 3.0], 60).repeat(10)
+    motor = np.concatenate([[0.0], np.cumsum(np.convolve(command, 0.9 ** np.arange(40))[:599])])
+    load = np.convolve(motor, [0, 0, 0.1, 0.2, 0.3, 0.4])[:600] + rng.standard_normal(600)
+    for first, second in (("motor_rad", "load_rad"), ("x1_mm", "xr_mm"), ("x1_mm", "x2_mm")):
+        log = Table("a.csv", {"t_s": 0.01 * np.arange(600), "u_V": command, first: motor, second: load})
+        with pytest.raises(ValueError, match=rf"--input u_V --output {first} --time t_s$"):
+            roles_of(log, "a.csv")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "arm controller/joint state.positions[0] (measured)",
+        "a  b",
+        "drive's",
+        "tab\there",
+        "Winkel\u00a0x",
+        "-x",
+    ],
+)
+def test_a_command_to_type_has_names_in_full(name):
+    """As a shell reads it back, in whatever way it is quoted."""
+    log = table("t_s", "i_meas_A", "i_cmd_A", name + "_rad")
+    with pytest.raises(ValueError) as caught:
+        roles_of(log, path_as_typed("my log.csv"))
+    command = cut_inside(one_line(str(caught.value))).partition("type: ")[2]
+    shell = subprocess.run(
+        ["bash", "-c", f"printf '%s\\0' {command}"],
+        capture_output=True,
+        check=True,
+        env={"LC_ALL": "C.UTF-8"},
+    )
+    words = shell.stdout.decode().split("\0")[:-1]
+    assert words[:3] == ["flexlink", "identify", "my log.csv"]
+    assert words[words.index("--output") + 1] == name + "_rad"
+
+
 def test_a_first_column_that_rises_may_be_time_but_a_rows_number_is_none():
     for dt, typed in ((0.002, "--time a$"), (1.0, "--dt-s SECONDS$")):
         log = Table(
@@ -208,6 +276,9 @@ t,/cmd/voltage,/joint_states/motor/position,,bus.count|t,PLC_PRG.rVoltage,PLC_PR
 t,MAIN.fTorque,MAIN.lrPosition,|t_ms,torque_cmd_%,x_mm,x_ref_mm|t_us,dac_cnt,enc_cnt,ref_cnt|t_s,foo,pv_deg,sp,note
 t_us,out_cnt,pv_cnt,sp_cnt|t_s,output_%,position_mm,setpoint_mm
 t_s,u,current_position,target,v_est|t_s,cmd,pos,ref,vel_est|t_s,pid_out,y_deg,r_deg
+t_s,y_axis_torque,y_axis_rpm,|ms_today,q_axis_current,erpm,|t_s,pwm,v_wheel,|t_s,voltage,v_wheel_speed,|t_s,q_current,speed,
+t_ms,current_A,pos_cnt,pos_ref_cnt,vel_ref_cnt_s|t_ms,pwm,vel_cnt_s,vel_ref_cnt_s,pos_ref_cnt|t_s,pwm,pos,pos_ref,vel_ref
+t_s,y_motor_current,y_position,|t_s,q_voltage,u_angle,|t_s,v,y,
 t_s,u_V,meas,ref_deg,temp|t_s,i_A,alpha,alpha_cmd,alpha_err,index
 Zeit [ms],Spannung [V],Winkel [°],|,voltage,angle,,temperature"""
 ASKED = """

@@ -1,0 +1,104 @@
+"""Tables of text are read in a time that grows as their length: a megabyte a second at least."""
+
+import statistics
+import time
+from pathlib import Path
+
+import pytest
+
+from ident.data.record_files import _text_table
+from ident.data.roles import roles_of
+from ident.data.text_tables import read_text, text_of
+
+# Characters of the shorter of two texts: enough that a square of the length would show.
+SIZE = 100_000
+# Twice the text takes twice the time; a square takes four times it.
+MOST_TIMES = 2.6
+LEAST_BYTES_PER_S = 1e6
+ROWS = 30
+
+
+def rows(cell, head="t_s,u_V,y_rad,note", count=ROWS):
+    return head + "\n" + "".join(f"{k / 1000},{k % 5},{k * k % 97 / 10},{cell}\n" for k in range(count))
+
+
+def named(name):
+    return rows("", f"t_s,u_V,{name},note", 300)
+
+
+def wide(names, size, count=200):
+    columns = size // (2 * count)
+    lines = [",".join(names(j) for j in range(columns))]
+    lines += [",".join(str(j * k % 7) for j in range(columns)) for k in range(count)]
+    return "\n".join(lines) + "\n"
+
+
+# By length: cells, lines, names, columns, rows, header lines, quotes, comments, units.
+TEXTS = {
+    "a cell of hex digits": lambda n: rows("9f3a1e07" * (n // (8 * ROWS))),
+    "a cell of letters": lambda n: rows("ab" * (n // (2 * ROWS))),
+    "a cell of digits and a letter": lambda n: rows("1" * (n // ROWS) + "x"),
+    "a cell of blanks": lambda n: rows("a" + " " * (n // ROWS) + "b"),
+    "a cell of names and signs": lambda n: rows("ab = " * (n // (5 * ROWS))),
+    "a cell of grouped digits": lambda n: rows("1" + "'000" * (n // (4 * ROWS)) + "x"),
+    "quotes": lambda n: rows('"' + '""' * (n // (2 * ROWS)) + '"'),
+    "a line of 1e1e1": lambda n: "1e1" * (n // 3) + "\n",
+    "a line of words": lambda n: "ab " * (n // 3) + "\n1 2\n3 4\n",
+    "labelled numbers": lambda n: "\n".join(f"volt:{k % 7} angle:{k % 97 / 10}" for k in range(n // 16)),
+    "a monitor's arrows": lambda n: "\n".join(["a" + " " * (n // ROWS) + "-> 1,2"] * ROWS),
+    "comments": lambda n: "# some words of it\n" * (n // 19) + rows(""),
+    "comment signs": lambda n: "!  " * (n // 3) + "\n" + rows(""),
+    "lines above the names": lambda n: "key: value\n" * (n // 11) + rows(""),
+    "blank lines": lambda n: rows("", count=300) + "\n" * n + "9.9,1,1,\n",
+    "a name of letters": lambda n: named("ab" * (n // 2)),
+    "a name of underscores": lambda n: named("a_" * (n // 2)),
+    "a name of capitals": lambda n: named("aB" * (n // 2)),
+    "a name of brackets": lambda n: named("(" * n),
+    "a name of blanks": lambda n: named("y" + " " * n + "x"),
+    "a name of rates": lambda n: named("per/" * (n // 4)),
+    "a name of times": lambda n: named("time in " * (n // 8)),
+    "a unit": lambda n: "time,u,y,z\ns,V," + "m" * n + ",\n" + rows("", count=300).partition("\n")[2],
+    "columns": lambda n: wide(lambda j: f"c{j}", n),
+    "columns of one name": lambda n: wide(lambda j: "c", n),
+    "columns of inputs": lambda n: wide(lambda j: f"u{j}", n),
+    "rows": lambda n: rows("", count=n // 15),
+    "rows with decimal commas": lambda n: rows("", count=n // 15).replace(",", ";").replace(".", ","),
+    "rows with dates": lambda n: (
+        "t,u_V,y_rad\n"
+        + "".join(
+            f"2024-03-01 12:00:{k // 1000:02d}.{k % 1000:03d},{k % 5},{k % 97}\n" for k in range(n // 30)
+        )
+    ),
+    "rows with units": lambda n: rows("", count=n // 20).replace(",\n", " V,\n"),
+    "rows with lists": lambda n: (
+        "t_s;u_V;y\n" + "".join(f"{k};{k % 5};[0.1, {k % 10}.5]\n" for k in range(n // 20))
+    ),
+    "long lists": lambda n: (
+        "t_s;u_V;y\n" + "".join(f"{k};{k % 5};[{', '.join(['0.1'] * (n // 1500))}]\n" for k in range(300))
+    ),
+}
+
+
+def cpu_s(text):
+    """CPU time of all that reading a table does, whether it is one or not."""
+    begin = time.process_time()
+    try:
+        layout, columns = read_text(text_of(text.encode()))
+        table = _text_table(Path("a.csv"), layout, columns)
+        for name in table.names:
+            table.unit(name)
+        roles_of(table, "a.csv")
+    except ValueError:
+        pass
+    return time.process_time() - begin
+
+
+@pytest.mark.parametrize("kind", TEXTS)
+def test_time_is_linear_in_the_length(kind):
+    """Medians of CPU time; what takes less than a tenth of a second has no square in it that matters."""
+    shorter, longer = TEXTS[kind](SIZE), TEXTS[kind](2 * SIZE)
+    assert len(longer) > 1.8 * len(shorter)
+    takes_s = statistics.median(cpu_s(longer) for _ in range(3))
+    assert len(longer) > LEAST_BYTES_PER_S * takes_s
+    if takes_s > 0.1:
+        assert takes_s < MOST_TIMES * statistics.median(cpu_s(shorter) for _ in range(3))
