@@ -48,7 +48,7 @@ def test_more_samples_than_memory_are_refused(logs, refused, monkeypatch):
 
 
 def test_unclear_columns_offer_a_command_with_every_log(tmp_path, monkeypatch, refused):
-    monkeypatch.chdir(tmp_path)  # many long names are "LOG..."
+    monkeypatch.chdir(tmp_path)
     u, y = np.random.default_rng(0).standard_normal((2, 40))
     paths = [write_log(Path(f"{k} a.csv"), u, y, tip_2_m=-y) for k in range(2)]
     line = refused("identify", *paths)

@@ -1,6 +1,7 @@
 """`flexlink look` against logs whose sampling, steps, limits and gaps are known."""
 
 import re
+import shlex
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from tests.ident.test_forty_logs import LOGS
 from tests.workflow.command import Answer
 from workflow.commands.logs import read_logs
 from workflow.config.run_config import load_config
+from workflow.engine.errors import cut_inside
 from workflow.tasks.log_look import look_at
 from workflow.tasks.records import read_record
 from workflow.text.formats import sparkline
@@ -194,3 +196,39 @@ def test_a_bode_table_is_said_to_be_one_and_goes_on(sweeps, flexlink, refused, t
     spec.write_text(wish.partition("[plant]")[0] + quick)
     for model in ("m.json", "m.npz"):
         assert flexlink("design", tmp_path / model, "--spec", spec).code == 0
+
+
+def test_the_next_command_reads_the_log_as_it_was_looked_at(flexlink, tmp_path):
+    """With the options that were given, and names in full, however long they are."""
+    name = "Plant Model/Sensor Subsystem/Encoder of the left hub (filtered, at the load side) [rad]"
+    rows = [f"{5 * k}|{1 + k % 3},250|{k % 7},125" for k in range(80)]
+    path = tmp_path / "my log.csv"
+    path.write_text("\n".join([f"tick|u_V|{name}", *rows]) + "\n")
+    stated = ["--time", "tick", "--time-unit", "ms", "--decimal", "comma"]
+    answer: Answer = flexlink("look", path, *stated)
+    assert answer.code == 0, answer.err
+    words = shlex.split(answer.out.strip().splitlines()[-1])
+    assert words[:3] == ["flexlink", "identify", str(path)]
+    assert words[words.index("--output") + 1] == name
+    for option in (["--time", "tick"], ["--time-unit", "ms"], ["--decimal", "comma"]):
+        assert words[words.index(option[0]) + 1] == option[1]
+    # The table folds a long name: every part of it is there.
+    shown = "".join(
+        re.findall(r"[^\W_]+", "".join(line.split("│")[2] for line in answer.out.splitlines() if "│" in line))
+    )
+    assert "".join(re.findall(r"[^\W_]+", name)) in shown
+
+
+@pytest.mark.parametrize(
+    "text", ["x" * 400, "a: " + "x" * 400 + "; type: flexlink identify 'a b.csv' --input u"]
+)
+def test_a_line_is_cut_but_never_its_command(text):
+    line = cut_inside(text)
+    assert len(line) <= 300
+    assert (
+        line.endswith("...")
+        if "flexlink" not in text
+        else line.endswith("type: flexlink identify 'a b.csv' --input u")
+    )
+    command = "type: flexlink identify " + "y" * 500
+    assert cut_inside(f"{'x' * 200}; {command}").endswith(f"... {command}")

@@ -57,26 +57,23 @@ class Reading(LogReading):
         """The options that say how the logs are read, as they were given, but for the columns' roles; and the
         file or directory without which the command would ask for one."""
         words = list[str]()
-        for option, value in (("--time-unit", self.time_unit), ("--decimal", self.decimal)):
-            if value:
-                words.append(f"{option} {value}")
-        by_column = {
-            "--scale": self.scale,
-            "--offset": self.offset,
-            "--unwrap": self.unwrap,
-            "--unit": self.units,
-        }
-        for option, values in by_column.items():
-            for name, value in values.items():
-                number = value if isinstance(value, str) else f"{value:.17g}"
-                words.append(f"{option} {as_typed(f'{name}={number}')}")
+        for option, word in (("--time-unit", self.time_unit), ("--decimal", self.decimal)):
+            if word:
+                words.append(f"{option} {word}")
+        for option, numbers in (
+            ("--scale", self.scale),
+            ("--offset", self.offset),
+            ("--unwrap", self.unwrap),
+        ):
+            words += [f"{option} {as_typed(f'{name}={value!r}')}" for name, value in numbers.items()]
+        words += [f"--unit {as_typed(f'{name}={unit}')}" for name, unit in self.units.items()]
         for option, number in (
             ("--resample-s", self.resample_s),
             ("--input-limit", self.input_limit),
             ("--dt-s", self.dt_s),
         ):
             if number is not None:
-                words.append(f"{option} {number:.17g}")
+                words.append(f"{option} {number!r}")
         if self.repair:
             words.append("--repair")
         return " ".join([*words, *_NEEDED.get(command, ())])
