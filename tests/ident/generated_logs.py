@@ -280,6 +280,8 @@ def lost_row(log: Log) -> None:
 
 
 def later(log: Log, cell: str, share: float) -> str:
+    if not cell[-1].isdigit():  # a unit
+        raise UnfitError
     passed = share * log.dt_s * PER_SECOND[log.unit] + float(cell.replace(log.decimal, "."))
     return f"{passed:.9f}".replace(".", log.decimal)
 
@@ -316,7 +318,12 @@ def outputs_only(log: Log) -> None:
 
 def whole(log: Log) -> None:
     """Rows have to be those of the truth, and nothing to be said of them but of their timer."""
-    if len(log.rows) != len(log.y) or np.any(np.isnan(log.y)) or log.told not in ("", "starts again"):
+    if (
+        len(log.header) < 3
+        or len(log.rows) != len(log.y)
+        or np.any(np.isnan(log.y))
+        or log.told not in ("", "starts again")
+    ):
         raise UnfitError
 
 
@@ -341,6 +348,7 @@ def fortran(log: Log) -> None:
 
 
 def units_in_cells(log: Log) -> None:
+    whole(log)
     if log.separator == " " or not log.units[0] or "/" in log.units[1]:
         raise UnfitError
     log.names[1:] = log.header[1:3] = ["drive", "hub"]
@@ -349,6 +357,7 @@ def units_in_cells(log: Log) -> None:
 
 
 def per_cent(log: Log) -> None:
+    whole(log)
     log.names[1] = log.header[1] = "drive [%]"
     log.units[0] = "%"
     blank = str(log.rng.choice(["", " "])) if log.separator != " " else ""
