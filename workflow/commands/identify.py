@@ -68,9 +68,9 @@ def identify_logs(
 
     progress.plan((("identify", 2.0), ("uncertainty", 1.0), *((("report", 4.0),) if report else ())))
     true_modes = truth_beside(logs.files, logs.measured[0].output_names[0])
-    common = with_common_sampling_time([*logs.measured, *logs.fresh])
     in_loop = loop is not None and loop.stated
-    with speaking("identify"), naming("identify"):
+    common = with_common_sampling_time(records)
+    with speaking("identify"), naming_readings(records), naming("identify"):
         timing = timing_of(
             common,
             in_loop=in_loop or made_in_loop(common[: len(logs.measured)]),

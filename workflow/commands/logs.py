@@ -71,11 +71,13 @@ class Reading(LogReading):
             ("--resample-s", self.resample_s),
             ("--input-limit", self.input_limit),
             ("--dt-s", self.dt_s),
+            ("--controller-period", self.controller_period_s),
         ):
             if number is not None:
                 words.append(f"{option} {number!r}")
-        if self.repair:
-            words.append("--repair")
+        for option, stated in (("--repair", self.repair), ("--command-averaged", self.command_averaged)):
+            if stated:
+                words.append(option)
         return " ".join([*words, *_NEEDED.get(command, ())])
 
     def records(self, tables: Sequence[Table]) -> list[Record]:
