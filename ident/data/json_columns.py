@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ident.data.foreign_files import Unread
+from ident.data.foreign_files import MOST_COLUMNS, Unread
 from ident.data.json_text import json_value
 
 _KINDS = {bool: "true or false", int: "numbers", float: "numbers", str: "text", list: "lists"}
@@ -35,6 +35,9 @@ def columns_in(name: str, cells: Sequence[Any]) -> dict[str, Any]:
     parts: dict[str, list[Any]]
     if there and all(isinstance(cell, dict) for cell in there):
         keys = dict.fromkeys(key for cell in there for key in cell)
+        # Rows times keys are cells, also where each row has a key of its own.
+        if len(keys) > MOST_COLUMNS:
+            raise ValueError(f": {len(keys)} names in objects; expected at most {MOST_COLUMNS} columns")
         parts = {f"{name}.{key}" if name else key: [(cell or {}).get(key) for cell in cells] for key in keys}
     elif there and all(isinstance(cell, list) for cell in there):
         lengths = [len(cell) for cell in there]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from ident.data.json_columns import json_columns
 from ident.data.record_files import _text_table
 from ident.data.roles import roles_of
 from ident.data.text_tables import read_text, text_of
@@ -105,3 +106,11 @@ def test_time_is_linear_in_the_length(kind):
     assert len(longer) > LEAST_BYTES_PER_S * min(seconds for _, seconds in taken)
     if longer_s > 0.1:
         assert longer_s < MOST_TIMES * shorter_s
+
+
+def test_rows_of_json_with_a_name_each_are_refused_before_they_are_cells():
+    rows_of_names = "\n".join(f'{{"k{number}": {number}}}' for number in range(20_000))
+    begin = time.process_time()
+    with pytest.raises(ValueError, match="20000 names in objects; expected at most 4096 columns"):
+        json_columns(rows_of_names, in_lines=True)
+    assert time.process_time() - begin < 1.0
