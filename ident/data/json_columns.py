@@ -12,6 +12,8 @@ import numpy as np
 from ident.data.foreign_files import MOST_COLUMNS, Unread
 from ident.data.json_text import json_value
 
+# Names may be missing in rows: so many empty cells for a value, beside some, are looked at, not more.
+_MOST_CELLS_A_VALUE, _FEW_CELLS = 50, 1_000_000
 _KINDS = {bool: "true or false", int: "numbers", float: "numbers", str: "text", list: "lists"}
 
 
@@ -35,9 +37,13 @@ def columns_in(name: str, cells: Sequence[Any]) -> dict[str, Any]:
     parts: dict[str, list[Any]]
     if there and all(isinstance(cell, dict) for cell in there):
         keys = dict.fromkeys(key for cell in there for key in cell)
-        # Rows times keys are cells, also where each row has a key of its own.
-        if len(keys) > MOST_COLUMNS:
-            raise ValueError(f": {len(keys)} names in objects; expected at most {MOST_COLUMNS} columns")
+        # Rows times names are cells, also where each row has a name of its own: that is no table.
+        filled = sum(map(len, there))
+        if len(keys) > MOST_COLUMNS or len(keys) * len(cells) > _MOST_CELLS_A_VALUE * filled + _FEW_CELLS:
+            raise ValueError(
+                f": {len(keys)} names in {len(cells)} objects of {filled} values; expected at most "
+                f"{MOST_COLUMNS} columns, and the same names in each row"
+            )
         parts = {f"{name}.{key}" if name else key: [(cell or {}).get(key) for cell in cells] for key in keys}
     elif there and all(isinstance(cell, list) for cell in there):
         lengths = [len(cell) for cell in there]

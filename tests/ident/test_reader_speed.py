@@ -108,9 +108,10 @@ def test_time_is_linear_in_the_length(kind):
         assert longer_s < MOST_TIMES * shorter_s
 
 
-def test_rows_of_json_with_a_name_each_are_refused_before_they_are_cells():
-    rows_of_names = "\n".join(f'{{"k{number}": {number}}}' for number in range(20_000))
+@pytest.mark.parametrize("count", [4000, 20_000])
+def test_rows_of_json_with_a_name_each_are_refused_before_they_are_cells(count):
+    rows_of_names = "\n".join(f'{{"k{number}": {number}}}' for number in range(count))
     begin = time.process_time()
-    with pytest.raises(ValueError, match="20000 names in objects; expected at most 4096 columns"):
+    with pytest.raises(ValueError, match="the same names in each row"):
         json_columns(rows_of_names, in_lines=True)
     assert time.process_time() - begin < 1.0
