@@ -84,7 +84,11 @@ def quantity(cell: str, decimal: str) -> tuple[str, str] | None:
     """
     if len(cell) > _LONGEST_QUANTITY:
         return None
-    found = _QUANTITY.fullmatch(cell.strip())
+    text = cell.strip()
+    if text[:1] == "(" and text[-1:] == ")":  # (2.5 %) is (2.5) %
+        inside = quantity(text[1:-1], decimal)
+        return (f"({inside[0]})", inside[1]) if inside and inside[0][:1].isdigit() else None
+    found = _QUANTITY.fullmatch(text)
     if found is None or not is_number(found[1], decimal):
         return None
     value, blank, unit = found.groups()

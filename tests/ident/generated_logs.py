@@ -335,14 +335,17 @@ def typeset_minus(log: Log) -> None:
 def bookkept(log: Log) -> None:
     """Negative numbers in brackets, or with the sign behind."""
     whole(log)
-    form = str(log.rng.choice(["({})", "{}-"]))
+    form = str(log.rng.choice(["({})", "{}-"])) if log.units[0] != "%" else "({})"
     for row in log.rows:
+        if any(cell.startswith("-") for cell in row[1:3]):
+            log.told = "bookkeeping"
         row[1:3] = [form.format(cell[1:]) if cell.startswith("-") else cell for cell in row[1:3]]
-    log.told = "bookkeeping" if np.min(log.u) < 0 or np.min(log.y) < 0 else log.told
 
 
 def fortran(log: Log) -> None:
     whole(log)
+    if log.answer == "refuse":
+        raise UnfitError
     for row, value in zip(log.rows, log.y, strict=True):
         row[2] = f"{value:.9e}".replace("e", "D").replace(".", log.decimal)
 
@@ -368,12 +371,14 @@ def per_cent(log: Log) -> None:
 def none_there(log: Log) -> None:
     """A number for no reading, in the command or in the output."""
     whole(log)
+    if any(not row[1][-1:].isdigit() for row in log.rows):  # a unit, or bookkeeping
+        raise UnfitError
     code = float(log.rng.choice([-9999.0, 65535.0, 9999.0, 9.9e37]))
     column = int(log.rng.integers(1, 3))
     values = [log.u, log.y][column - 1]
     for k in log.rng.choice(np.arange(2, len(log.rows) - 2), 2, replace=False):
         values[k] = code
-        log.rows[k][column] = f"{code:.12g}"
+        log.rows[k][column] = f"{code:.12g}".replace(".", log.decimal)
     log.told = "reading?"
 
 
@@ -427,7 +432,14 @@ def sentence(log: Log) -> None:
     said = ["open loop, wheels free, battery full again", "Rig (12)", "pendulum rig, third run by hand"]
     words = str(log.rng.choice(said))
     sizes = {len(words.split(sign)) for sign in (" ", ",", ";", "\t", "|")}
-    if len(log.header) in sizes or log.below or log.above or log.under or log.answer == "refuse":
+    if (
+        log.unit != "s"
+        or len(log.header) in sizes
+        or log.below
+        or log.above
+        or log.under
+        or log.answer == "refuse"
+    ):
         raise UnfitError
     log.above, log.header = comment(log, words), []
     log.names, log.units, log.reference = ["column 1", "column 2", "column 3"], ["", ""], ""
