@@ -344,8 +344,6 @@ def bookkept(log: Log) -> None:
 
 def fortran(log: Log) -> None:
     whole(log)
-    if log.answer == "refuse":
-        raise UnfitError
     for row, value in zip(log.rows, log.y, strict=True):
         row[2] = f"{value:.9e}".replace("e", "D").replace(".", log.decimal)
 
@@ -442,7 +440,7 @@ def sentence(log: Log) -> None:
     ):
         raise UnfitError
     log.above, log.header = comment(log, words), []
-    log.names, log.units, log.reference = ["column 1", "column 2", "column 3"], ["", ""], ""
+    log.names, log.reference = ["column 1", "column 2", "column 3"], ""
     log.needs("ask")
 
 
