@@ -319,7 +319,8 @@ def outputs_only(log: Log) -> None:
 def whole(log: Log) -> None:
     """Rows have to be those of the truth, and nothing to be said of them but of their timer."""
     if (
-        len(log.header) < 3
+        log.answer == "refuse"
+        or len(log.header) < 3
         or len(log.rows) != len(log.y)
         or np.any(np.isnan(log.y))
         or log.told not in ("", "starts again")

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ident.data.finding import FindingKind
 from ident.data.record import Record, in_one_unit
 from workflow.config.joints_config import AnyConfig, Joint, OperatingPoint
 from workflow.config.run_config import (
