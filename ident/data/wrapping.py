@@ -50,7 +50,7 @@ _ENDS_OF_INTEGERS = frozenset(
     for sign in (-1.0, 1.0)
     for value in (2.0**bits, 2.0**bits - 1)
 )
-_INFINITE = 1e30
+_INFINITE = 1e30  # 9.9e37 of meters, 1e30 and 3.4e38 of simulators; no quantity of a machine is larger
 # Such a number counts where it is so many times larger than all others.
 _FAR = 10.0
 # A command may be a single pulse; one so many times the range of the others is none.
