@@ -179,6 +179,14 @@ SECTIONS = {
             "{1} of {0} certified: the others are refused with their active constraint",
         ),
         Row(
+            "Logs 2, 4 or 5 times slower than their controller, period stated, found or not known: certified",
+            "controller_periods",
+            r"^(\d+) machines: (\d+) certified, (\d+) violated",
+            "{1} of {0}",
+            r"^\d+ machines: \d+ certified, (\d+) violated",
+            "{} with a false number",
+        ),
+        Row(
             "Controllers with limits as compiled C code, constant errors and steps beyond the limit: wrong",
             "limited_controllers",
             r"^wrong: (\d+) of (\d+) laws, in (\d+) runs",
