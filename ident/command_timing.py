@@ -41,6 +41,9 @@ TAPS = 8
 # Ellipses of noise and timing add as variances, but an interval of the timing has ends that are as likely as
 # its middle: with 1.5 times its half width the sum of both is held while the noise is up to .6 of it.
 BEYOND_ENDS = 1.5
+# Share of its largest value below which a response counts as zero: rounding of doubles. That of an arm which
+# integrates falls by ten decades between its slowest motion and the Nyquist frequency.
+SMALLEST_RESPONSE = 1e-14
 # Ellipses are at least so wide along the gain, as a share of their width along the phase: twice the error
 # with which the basis follows a fraction of a step.
 GAIN_OF_PHASE = 0.1
@@ -187,6 +190,10 @@ def timing_of(
 
     law = law_of(records)
     if law is None or not law.repeats_command:
+        # Logs of several controllers have a law each, and none in common.
+        laws = [law_of([record]) for record in records]
+        if all(each is not None and each.repeats_command and each.tells_period for each in laws):
+            return CommandTiming(TimingSource.LAW, step_s, step_s)
         # It may have changed all the time, and the log may hold its mean over a step, or the output may have
         # been read later in the step than the command: delays of up to a step, which a hold does not have.
         delays = (HELD, Hold(0.0), Hold(0.0, averaged=True))
@@ -319,7 +326,7 @@ def with_unknown_timing(posterior: ResponsePosterior, timing: CommandTiming) -> 
     before it: dry friction is told from a command that leads the motion, and a filtered one may come too
     early.
     """
-    if timing.known:
+    if timing.known or not np.any(posterior.mean):
         return posterior
     # Slow motions, and points between which no tap of the kernel turns round.
     n_linear = 4 * (posterior.fir_length + TAPS) + 200
@@ -345,15 +352,17 @@ def with_unknown_timing(posterior: ResponsePosterior, timing: CommandTiming) -> 
     )
     rows = wider.frequency_rows(omega)[:, : n_stable + more]
     centre = posterior.centre(omega)
+    # A response may be zero somewhere, where no share of it is an error.
+    size = np.maximum(np.abs(centre), SMALLEST_RESPONSE * np.max(np.abs(centre)))
 
     # Errors count as a share of what they are held against, and less above the data.
     above = 1 / (1 + (angle / FITTED_UP_TO_RAD) ** 4)
     late = middle[:, None] * rows
-    mean = coefficients_of(rows, late @ wider.mean[: n_stable + more, None], above / np.abs(phase * centre))
-    factor = coefficients_of(rows, late @ wider.covariance_factor[: n_stable + more], above / np.abs(centre))
+    mean = coefficients_of(rows, late @ wider.mean[: n_stable + more, None], above / (phase * size))
+    factor = coefficients_of(rows, late @ wider.covariance_factor[: n_stable + more], above / size)
     ends = BEYOND_ENDS / chi2_radius(LEVEL) * middle * centre
-    along_phase = coefficients_of(rows, (1j * phase * ends)[:, None], above / np.abs(phase * centre))
-    along_gain = coefficients_of(rows, (gain * ends)[:, None], above / np.abs(gain * centre))
+    along_phase = coefficients_of(rows, (1j * phase * ends)[:, None], above / (phase * size))
+    along_gain = coefficients_of(rows, (gain * ends)[:, None], above / (gain * size))
     nothing = np.zeros((posterior.unstable.order, 2))
     return replace(
         wider,

@@ -209,7 +209,9 @@ class _Columns:
         target = np.concatenate([part[1] for part in parts])
         if len(rows) < MOST_STATES * rows.shape[1]:
             return None
-        length = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(np.float64).tiny)
+        # Of columns that stand at zero, as those of a reference that nobody moved, the law has nothing.
+        length = np.linalg.norm(rows, axis=0)
+        length[length == 0] = 1.0
         solved = np.linalg.lstsq(rows / length, target, rcond=None)[0] / length
 
         # From coefficients of the columns to those of the law.

@@ -21,6 +21,8 @@ from ident.data.arrays import ComplexArray, RealArray, lock
 # 16 points determine a Laurent series to 1/3^15 = 7e-8 when the next pole is three radii away.
 _POINTS = 16
 _SHARE_OF_DISTANCE = 1 / 3  # see `_POINTS`
+# Poles nearer than this in z are one pole but for rounding: no circle of doubles lies between them.
+_SAME_POLE = 1e-12
 _NOTHING = np.array([np.inf + 1j * np.inf])  # deviation of what records do not tell
 
 
@@ -121,7 +123,7 @@ def laurent_rows(poles: Poles, pole: complex) -> tuple[ComplexArray, ComplexArra
     """(P,) rows on the coefficients of poles taken twice: what stands before 1/(z - pole) and 1/(z - pole)^2;
     to first order the pole has moved by their ratio."""
     away = np.abs(poles.values - pole)
-    radius = _SHARE_OF_DISTANCE * float(away[away > 0].min(initial=1.0))
+    radius = _SHARE_OF_DISTANCE * float(away[away > _SAME_POLE].min(initial=1.0))
     turn = np.exp(2j * np.pi * np.arange(_POINTS) / _POINTS)
     rows = basis_response(poles, pole + radius * turn)
     return (

@@ -107,6 +107,23 @@ def test_the_period_is_read_off_or_not_known():
     assert open_loop.taken == HELD
 
 
+def test_logs_of_two_controllers_have_a_law_each():
+    logs = [loop_log(*pid(pole), seed=seed) for pole, seed in ((0.82, 1), (0.6, 2))]
+    timing = timing_of(logs, in_loop=True)
+    assert timing.source is TimingSource.LAW
+    assert timing.law is None
+    assert not timing.acts_at_once
+
+
+def test_a_reference_that_nobody_moved_and_a_model_of_nothing_are_no_faults():
+    record = loop_log(*pid())
+    still = replace(record, reference=np.zeros_like(record.reference))
+    assert timing_of([still], in_loop=True).source in (TimingSource.LAW, TimingSource.UNKNOWN)
+    nothing = ResponsePosterior(Poles([0.5]), np.zeros(1), np.eye(1), STEP_S)
+    unknown = CommandTiming(TimingSource.UNKNOWN, STEP_S, None, possible=(HELD, Hold(0.0)))
+    assert with_unknown_timing(nothing, unknown) is nothing
+
+
 def test_a_command_logged_several_times_is_used_at_the_rows_where_it_changes():
     """A log at three times the rate of its controller: the law and the period are those of the controller."""
     slow = loop_log(*pid())

@@ -318,7 +318,7 @@ def test_a_study_varies_what_a_joint_is_asked(run_of_the_arm, tmp_path):
 @pytest.mark.parametrize("command", ["design", "tune"])
 def test_commands_for_one_loop_say_what_to_use(command, run_of_the_arm, capfd):
     assert main([command, str(run_of_the_arm)]) == 2
-    assert re.search("a run for several joints.* flexlink study", capfd.readouterr().err)
+    assert re.search("a run for several joints.* type: flexlink run --config ", capfd.readouterr().err)
 
 
 @pytest.mark.slow
