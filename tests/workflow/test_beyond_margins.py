@@ -114,11 +114,11 @@ def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_h
     settling = stored.SettlingRange((0.1, 0.2, 0.4), (7.2, 1.3, None), 30.0)
     friction = SimpleNamespace(settling=replace(settling, times_s=(7.2, 1.3, 2.0)), times_slower=0.0)
     assert verdict(friction=friction, machine="simulated") == verdict()  # that arm has its friction
-    assert verdict(friction=friction) == verdict() + " (linear plants; with dry friction in 1.3 to 7.2 s)"
+    assert verdict(friction=friction) == verdict() + " (linear; with dry friction in 1.3 to 7.2 s)"
     friction.settling = settling
-    assert verdict(friction=friction).endswith(" (linear plants; with dry friction in 1.3 to over 30 s)")
+    assert verdict(friction=friction).endswith(" (linear; with dry friction in 1.3 to over 30 s)")
     friction.settling = replace(settling, times_s=(None, None, None))
-    assert verdict(friction=friction) == verdict() + " (linear plants; with dry friction not in 30 s)"
+    assert verdict(friction=friction) == verdict() + " (linear; with dry friction not in 30 s)"
     friction.times_slower = 2.5
     assert verdict(friction=friction).endswith("; slower than the recorded loop with friction: 2.5 times")
     doubt = finding(FindingKind.UNTRIED_FRICTION, output="enc")
